@@ -1,0 +1,76 @@
+"""Structure-preserving integration of Hamiltonian systems, classical and learned, behind one interface.
+
+The public names are loaded when first used (PEP 562): importing sympflow loads neither torch, SciPy nor matplotlib.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "HamiltonianSystem": "system",
+    "Ball": "domain",
+    "Box": "domain",
+    "EnergySublevel": "domain",
+    "solve": "solver",
+    "Solution": "solution",
+    "get": "integrators.registry",
+    "available": "integrators.registry",
+    "register": "integrators.registry",
+    "SympFlow": "flow.sympflow",
+    "MLPFlow": "flow.mlp",
+    "load": "flow.io",
+    "train": "training.trainer",
+    "compare": "comparison",
+    "energy_error": "metrics.energy",
+    "max_energy_error": "metrics.energy",
+    "energy_drift": "metrics.energy",
+    "volume_error": "metrics.symplectic",
+    "symplecticity_defect": "metrics.symplectic",
+    "loop_area_error": "metrics.symplectic",
+    "reference_error": "metrics.accuracy",
+    "time_reversal_error": "metrics.accuracy",
+}
+_MODULES = ("systems",)
+
+__all__ = ["__version__", *_HOME, *_MODULES]  # noqa: PLE0604
+
+if TYPE_CHECKING:
+    from sympflow import systems as systems
+    from sympflow.comparison import compare as compare
+    from sympflow.domain import Ball as Ball
+    from sympflow.domain import Box as Box
+    from sympflow.domain import EnergySublevel as EnergySublevel
+    from sympflow.flow.io import load as load
+    from sympflow.flow.mlp import MLPFlow as MLPFlow
+    from sympflow.flow.sympflow import SympFlow as SympFlow
+    from sympflow.integrators.registry import available as available
+    from sympflow.integrators.registry import get as get
+    from sympflow.integrators.registry import register as register
+    from sympflow.metrics.accuracy import reference_error as reference_error
+    from sympflow.metrics.accuracy import time_reversal_error as time_reversal_error
+    from sympflow.metrics.energy import energy_drift as energy_drift
+    from sympflow.metrics.energy import energy_error as energy_error
+    from sympflow.metrics.energy import max_energy_error as max_energy_error
+    from sympflow.metrics.symplectic import loop_area_error as loop_area_error
+    from sympflow.metrics.symplectic import symplecticity_defect as symplecticity_defect
+    from sympflow.metrics.symplectic import volume_error as volume_error
+    from sympflow.solution import Solution as Solution
+    from sympflow.solver import solve as solve
+    from sympflow.system import HamiltonianSystem as HamiltonianSystem
+    from sympflow.training.trainer import train as train
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return import_module(f"sympflow.{name}")
+    if name not in _HOME:
+        raise AttributeError(f"module 'sympflow' has no attribute {name!r}")
+    value = getattr(import_module(f"sympflow.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

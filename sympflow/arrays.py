@@ -1,0 +1,73 @@
+"""The few array operations that NumPy and torch spell differently.
+
+Dispatch is on the type of the argument, so that NumPy calls never import torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+Array = Any
+"""A NumPy array or a torch tensor."""
+
+
+def is_tensor(x: object) -> bool:
+    """Whether `x` is a torch tensor, decided without importing torch."""
+    return type(x).__module__.partition(".")[0] == "torch" and hasattr(x, "requires_grad")
+
+
+def concatenate(parts: Sequence[Array]) -> Array:
+    """Join arrays along the last axis."""
+    if is_tensor(parts[0]):
+        import torch
+
+        return torch.cat(tuple(parts), dim=-1)
+    return np.concatenate(parts, axis=-1)
+
+
+def stack(parts: Sequence[Array], axis: int = -1) -> Array:
+    """Join arrays along a new axis."""
+    if is_tensor(parts[0]):
+        import torch
+
+        return torch.stack(tuple(parts), dim=axis)
+    return np.stack(parts, axis=axis)
+
+
+def assemble(values: Sequence[Array | float], like: Array) -> Array:
+    """Stack numbers and arrays of shape `like.shape` along a new last axis, in the dtype of `like`."""
+    if is_tensor(like):
+        import torch
+
+        return torch.stack([v + torch.zeros_like(like) if is_number(v) else v for v in values], dim=-1)
+    out = np.empty((*np.shape(like), len(values)), dtype=like.dtype)
+    for i, value in enumerate(values):
+        out[..., i] = value
+    return out
+
+
+def is_number(x: object) -> bool:
+    """Whether `x` is a Python scalar rather than an array (generated code returns these for constants)."""
+    return isinstance(x, int | float)
+
+
+def per_state(h: Array | float, y: Array) -> Array | float:
+    """`h` of shape y.shape[:-1] (one value a state) made to broadcast against (..., k); numbers pass."""
+    return h[..., None] if getattr(h, "ndim", 0) else h
+
+
+def to_numpy(x: Array) -> np.ndarray:
+    """A NumPy view or copy of `x`, detached from any graph."""
+    return x.detach().cpu().numpy() if is_tensor(x) else np.asarray(x)
+
+
+def all_finite(y: Array) -> Array:
+    """Whether the states y (..., k) are finite: (...) booleans."""
+    if is_tensor(y):
+        import torch
+
+        return torch.isfinite(y).all(-1)
+    return np.isfinite(y).all(-1)

@@ -1,0 +1,154 @@
+"""H given by the user's own functions; missing derivatives by automatic differentiation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from sympflow.arrays import Array, is_tensor, stack
+
+
+class CallableHamiltonian:
+    """The functions of a system given by V(q) or H(q, p). See `HamiltonianSystem` for the arguments."""
+
+    def __init__(
+        self,
+        ndof: int,
+        potential: Callable[..., Array] | None,
+        hamiltonian: Callable[..., Array] | None,
+        gradient: Callable[..., Any] | None,
+        hessian_vector: Callable[..., Any] | None,
+    ) -> None:
+        if (potential is None) == (hamiltonian is None):
+            raise TypeError("`potential` or `hamiltonian` must be given, and not both.")
+        for name, function in (("potential", potential), ("hamiltonian", hamiltonian), ("gradient", gradient)):
+            if function is not None and not callable(function):
+                raise TypeError(f"`{name}` must be callable; got {type(function).__name__}.")
+        if potential is None and (gradient is not None or hessian_vector is not None):
+            raise TypeError("`gradient` and `hessian_vector` only go with `potential`: leave them out.")
+        self.ndof = ndof
+        self.separable = potential is not None
+        self.numba_functions: tuple[Any, Any, Any] | None = None
+        if gradient is not None and hasattr(gradient, "py_func"):
+            self.numba_functions = (potential, gradient, hessian_vector)
+            potential, gradient = _each_state(potential), _each_state_out(gradient)
+            hessian_vector = None if hessian_vector is None else _each_state_out(hessian_vector)
+        self._potential, self._hamiltonian = potential, hamiltonian
+        self._gradient, self._hessian_vector = gradient, hessian_vector
+
+    def hamiltonian(self, y: Array) -> Array:
+        return _with_torch(self._H, y, "hamiltonian", ())
+
+    def gradient(self, y: Array) -> Array:
+        return _with_torch(_gradient_of(self._H), y, "hamiltonian", (2 * self.ndof,))
+
+    def hessian(self, y: Array) -> Array:
+        return _with_torch(_hessian_of(self._H), y, "hamiltonian", (2 * self.ndof, 2 * self.ndof))
+
+    def _H(self, y: Array) -> Array:
+        assert self._hamiltonian is not None
+        return self._hamiltonian(y[..., : self.ndof], y[..., self.ndof :])
+
+    def potential(self, q: Array) -> Array:
+        assert self._potential is not None
+        if self._gradient is not None:
+            return _checked(self._potential(q), q, "potential", ())
+        return _with_torch(self._potential, q, "potential", ())
+
+    def potential_gradient(self, q: Array) -> Array:
+        if self._gradient is not None:
+            return _checked(self._gradient(q), q, "gradient", (self.ndof,))
+        assert self._potential is not None
+        return _with_torch(_gradient_of(self._potential), q, "potential", (self.ndof,))
+
+    def potential_hessian(self, q: Array) -> Array:
+        if self._hessian_vector is not None:
+            basis = np.eye(self.ndof) if not is_tensor(q) else q.new_zeros(1).expand(self.ndof, self.ndof).clone()
+            if is_tensor(q):
+                basis.fill_diagonal_(1.0)
+            return stack([self._hessian_vector(q, e + 0 * q) for e in basis])
+        if self._gradient is not None and not is_tensor(q):
+            raise ValueError(
+                "`hessian_vector` is needed here (force-gradient methods, volume and symplecticity metrics) and was "
+                "not given: pass it to HamiltonianSystem, or write `potential` with torch and leave `gradient` out."
+            )
+        if self._gradient is not None:
+            return _jacobian(self._gradient, q)
+        assert self._potential is not None
+        return _with_torch(_hessian_of(self._potential), q, "potential", (self.ndof, self.ndof))
+
+
+def _gradient_of(f: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    def gradient(x: Array) -> Array:
+        import torch
+
+        return torch.func.grad(lambda z: f(z).sum())(x)
+
+    return gradient
+
+
+def _hessian_of(f: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    return lambda x: _jacobian(_gradient_of(f), x)
+
+
+def _jacobian(f: Callable[[Array], Array], x: Array) -> Array:
+    """Jacobian of a batched vector field by forward mode, one direction at a time: (..., k, k)."""
+    import torch
+
+    columns = []
+    for i in range(x.shape[-1]):
+        direction = torch.zeros_like(x)
+        direction[..., i] = 1
+        columns.append(torch.func.jvp(f, (x,), (direction,))[1])
+    return torch.stack(columns, dim=-1)
+
+
+def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...]) -> Array:
+    """f(x) for a function written with torch; NumPy arrays go through tensors that share their memory."""
+    import torch
+
+    tensor = x if is_tensor(x) else torch.from_numpy(np.ascontiguousarray(x))
+    try:
+        value = f(tensor)
+    except (TypeError, RuntimeError, AttributeError, IndexError) as error:
+        raise TypeError(
+            f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({error}). Write it with torch functions of "
+            "(..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
+        ) from error
+    value = _checked(value, tensor, name, tail)
+    return value if is_tensor(x) else value.detach().numpy()
+
+
+def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
+    expected = (*x.shape[:-1], *tail)
+    if tuple(getattr(value, "shape", ())) != expected:
+        raise ValueError(
+            f"`{name}` must return shape {expected} for a state part of shape {tuple(x.shape)}; got "
+            f"{tuple(getattr(value, 'shape', ()))}. Reduce over the last axis only."
+        )
+    return value
+
+
+def _each_state(f: Callable[..., Any] | None) -> Callable[[Array], Array]:
+    def function(q: np.ndarray) -> np.ndarray:
+        assert f is not None
+        flat = np.ascontiguousarray(q, dtype=float).reshape(-1, q.shape[-1])
+        return np.array([f(row) for row in flat]).reshape(q.shape[:-1])
+
+    return function
+
+
+def _each_state_out(f: Callable[..., Any]) -> Callable[..., Array]:
+    """An array function from a Numba function f(q, …, out) of one state."""
+
+    def function(*arguments: np.ndarray) -> np.ndarray:
+        shape = np.broadcast_shapes(*(a.shape for a in arguments))
+        flat = [np.ascontiguousarray(np.broadcast_to(a, shape), dtype=float).reshape(-1, shape[-1]) for a in arguments]
+        out = np.empty_like(flat[0])
+        for i, row in enumerate(out):
+            f(*(a[i] for a in flat), row)
+        return out.reshape(shape)
+
+    return function

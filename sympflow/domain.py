@@ -1,0 +1,202 @@
+"""Domains Ω of phase space: where a flow is trained, and where its figures hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.arrays import Array, to_numpy
+
+
+@runtime_checkable
+class Domain(Protocol):
+    """A set Ω of states [q, p] that can be sampled and tested."""
+
+    def sample(self, n: int, seed: int = 0) -> np.ndarray:
+        """Draw `n` states uniformly: (n, 2d)."""
+
+    def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
+        """Whether the states x (..., 2d) lie in Ω: (...) booleans. `slack` widens an energy bound."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """A description that `domain_from_dict` turns back into the domain."""
+
+
+def _vector(name: str, value: ArrayLike) -> tuple[float, ...]:
+    array = np.asarray(value, dtype=float)
+    if array.ndim != 1 or array.size == 0 or array.size % 2:
+        raise ValueError(f"`{name}` must have shape (2d,), one entry for each of [q, p]; got {array.shape}.")
+    if not np.isfinite(array).all():
+        raise ValueError(f"`{name}` must be finite; got {array.tolist()}.")
+    return tuple(array.tolist())
+
+
+def _sample_count(n: int) -> int:
+    if n < 1 or int(n) != n:
+        raise ValueError(f"`n` must be a positive integer; got {n!r}.")
+    return int(n)
+
+
+@dataclass(frozen=True)
+class Ball:
+    """The states within Euclidean distance `radius` of `center`.
+
+    Parameters
+    ----------
+    center : array_like, shape (2d,)
+    radius : float
+    """
+
+    center: ArrayLike
+    radius: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center", _vector("center", self.center))
+        if not 0 < self.radius < np.inf:
+            raise ValueError(f"`radius` must be positive and finite; got {self.radius!r}.")
+
+    def sample(self, n: int, seed: int = 0) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        center = np.asarray(self.center)
+        direction = rng.standard_normal((_sample_count(n), center.size))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return center + self.radius * direction * rng.random((n, 1)) ** (1 / center.size)
+
+    def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
+        return np.linalg.norm(to_numpy(x) - np.asarray(self.center), axis=-1) <= self.radius
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": "Ball", **asdict(self)}
+
+
+@dataclass(frozen=True)
+class Box:
+    """The states with low ≤ x ≤ high, componentwise.
+
+    Parameters
+    ----------
+    low, high : array_like, shape (2d,)
+    """
+
+    low: ArrayLike
+    high: ArrayLike
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "low", _vector("low", self.low))
+        object.__setattr__(self, "high", _vector("high", self.high))
+        if np.shape(self.low) != np.shape(self.high):
+            raise ValueError(
+                f"`high` must have the length of `low`; got {np.size(self.high)} and {np.size(self.low)}."
+            )
+        if not np.all(np.less(self.low, self.high)):
+            raise ValueError(f"`low` must be below `high` in every component; got {self.low}, {self.high}.")
+
+    def sample(self, n: int, seed: int = 0) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        return rng.uniform(self.low, self.high, (_sample_count(n), np.size(self.low)))
+
+    def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
+        x = to_numpy(x)
+        return ((x >= np.asarray(self.low)) & (x <= np.asarray(self.high))).all(-1)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": "Box", **asdict(self)}
+
+
+@dataclass(frozen=True)
+class EnergySublevel:
+    """The states of a box whose energy is below a bound: {x ∈ box : H(x) < energy}.
+
+    The box picks the component: inside its box, the Hénon–Heiles set H < 1/6 is the bounded well only.
+
+    Parameters
+    ----------
+    energy : float
+        The bound, in the units of H.
+    box : Box
+        Must contain the component that is meant.
+    hamiltonian : callable, optional
+        H(x), x of shape (..., 2d). A `HamiltonianSystem` fills it in with its own.
+    """
+
+    energy: float
+    box: Box
+    hamiltonian: Callable[[Array], Array] | None = field(default=None, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.energy):
+            raise ValueError(f"`energy` must be finite; got {self.energy!r}.")
+        if not isinstance(self.box, Box):
+            raise TypeError(f"`box` must be a Box; got {type(self.box).__name__}.")
+
+    def attach(self, hamiltonian: Callable[[Array], Array]) -> EnergySublevel:
+        """The same domain with the H of a system."""
+        return replace(self, hamiltonian=hamiltonian)
+
+    def _energy(self, x: np.ndarray) -> np.ndarray:
+        if self.hamiltonian is None:
+            raise ValueError(
+                "`hamiltonian` is not known to this EnergySublevel: pass the domain to a HamiltonianSystem, "
+                "or give it hamiltonian=."
+            )
+        return to_numpy(self.hamiltonian(x))
+
+    def sample(self, n: int, seed: int = 0) -> np.ndarray:
+        _sample_count(n)
+        rng = np.random.default_rng(seed)
+        accepted: list[np.ndarray] = []
+        found = drawn = 0
+        while found < n:
+            x = rng.uniform(self.box.low, self.box.high, (max(4 * n, 1024), np.size(self.box.low)))
+            with np.errstate(all="ignore"):
+                x = x[self._energy(x) < self.energy]
+            accepted.append(x)
+            found += len(x)
+            drawn += max(4 * n, 1024)
+            if drawn > 1e7 and found < drawn * 1e-5:
+                raise ValueError(
+                    f"`box` holds almost no state with energy below {self.energy:g} ({found} of {drawn} drawn): "
+                    "make it fit the energy sublevel more closely."
+                )
+        return np.concatenate(accepted)[:n]
+
+    def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
+        x = to_numpy(x)
+        with np.errstate(all="ignore"):
+            below = self._energy(x) < self.energy + slack
+        return below & (self.box.contains(x) if slack == 0 else self._widened(slack).contains(x))
+
+    def _widened(self, slack: float) -> Box:
+        """The box grown by the relative size of the slack, so that a state on its face does not leave by rounding."""
+        low, high = np.asarray(self.box.low), np.asarray(self.box.high)
+        margin = (high - low) * slack / max(abs(self.energy), 1e-300)
+        return Box(low - margin, high + margin)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": "EnergySublevel", "energy": self.energy, "box": self.box.to_dict()}
+
+
+def domain_from_dict(description: dict[str, Any]) -> Domain:
+    """The domain that `to_dict` described.
+
+    Raises
+    ------
+    ValueError
+        If the description is not one of a known domain.
+    """
+    try:
+        fields = {k: v for k, v in description.items() if k != "kind"}
+        match description["kind"]:
+            case "Ball":
+                return Ball(**fields)
+            case "Box":
+                return Box(**fields)
+            case "EnergySublevel":
+                return EnergySublevel(float(fields["energy"]), Box(fields["box"]["low"], fields["box"]["high"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"`description` is not a domain: {error}.") from error
+    raise ValueError(f"`description` is of an unknown kind of domain: {description['kind']!r}.")

@@ -1,0 +1,210 @@
+"""One symbolic definition of H, and the NumPy and torch functions generated from it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import sympy as sp
+
+from sympflow.arrays import Array, assemble, concatenate, is_tensor
+
+
+class SymbolicHamiltonian:
+    """H(q, p) as a SymPy expression; its derivatives; array functions of them.
+
+    Parameters
+    ----------
+    expression : str or sympy.Expr
+        In the symbols q1 … qd, p1 … pd (or q, p when d = 1).
+    params : mapping of str to float, optional
+        Values of the remaining symbols.
+
+    Raises
+    ------
+    ValueError
+        If the expression cannot be parsed, or holds a symbol without a value.
+    TypeError
+        If H depends on the time t.
+
+    Attributes
+    ----------
+    H, V, T : sympy.Expr
+        V and T are None unless H = T(p) + V(q).
+    q, p : tuple of sympy.Symbol, length d
+    """
+
+    def __init__(self, expression: str | sp.Expr, params: Mapping[str, float] | None = None) -> None:
+        H = _parse(expression, params or {})
+        ndof = max((_index(s) for s in H.free_symbols if _index(s)), default=0)
+        if ndof == 0:
+            raise ValueError("`expression` must depend on q1 … qd and p1 … pd (or q and p).")
+        plain = {sp.Symbol("q", real=True), sp.Symbol("p", real=True)} & H.free_symbols
+        if plain and ndof > 1:
+            raise ValueError("`expression` mixes q, p with numbered coordinates: write q1, p1.")
+        self.ndof = ndof
+        self.q = tuple(sp.symbols(f"q1:{ndof + 1}", real=True))
+        self.p = tuple(sp.symbols(f"p1:{ndof + 1}", real=True))
+        H = H.xreplace({sp.Symbol("q", real=True): self.q[0], sp.Symbol("p", real=True): self.p[0]})
+        self.H: sp.Expr = _with_numeric_constants(H)
+        self.V, self.T = _split(self.H, self.q, self.p)
+        self.separable = self.V is not None
+
+    @cached_property
+    def inverse_mass(self) -> sp.Matrix | None:
+        """M⁻¹ if T = ½ pᵀM⁻¹p exactly, else None."""
+        if self.T is None:
+            return None
+        M = sp.hessian(self.T, self.p)
+        p = sp.Matrix(self.p)
+        if M.free_symbols or sp.expand(self.T - (p.T * M * p)[0] / 2) != 0:
+            return None
+        return M
+
+    # array functions, state y = [q, p] on the last axis -------------------------------------------
+
+    def hamiltonian(self, y: Array) -> Array:
+        return self._scalar("H")(y)
+
+    def gradient(self, y: Array) -> Array:
+        if self.separable:
+            q, p = y[..., : self.ndof], y[..., self.ndof :]
+            return concatenate([self.potential_gradient(q), self.kinetic_gradient(p)])
+        return self._vector("H")(y)
+
+    def hessian(self, y: Array) -> Array:
+        return self._matrix("H")(y)
+
+    def potential(self, q: Array) -> Array:
+        return self._scalar("V")(q)
+
+    def potential_gradient(self, q: Array) -> Array:
+        return self._vector("V")(q)
+
+    def potential_hessian(self, q: Array) -> Array:
+        return self._matrix("V")(q)
+
+    def kinetic(self, p: Array) -> Array:
+        return self._scalar("T")(p)
+
+    def kinetic_gradient(self, p: Array) -> Array:
+        return self._vector("T")(p)
+
+    def kinetic_hessian(self, p: Array) -> Array:
+        return self._matrix("T")(p)
+
+    # generation -----------------------------------------------------------------------------------
+
+    def _variables(self, name: str) -> tuple[sp.Symbol, ...]:
+        return {"H": self.q + self.p, "V": self.q, "T": self.p}[name]
+
+    def _scalar(self, name: str) -> Callable[[Array], Array]:
+        return self._function(name + "", lambda f, x: [f], lambda values, like, n: assemble(values, like)[..., 0])
+
+    def _vector(self, name: str) -> Callable[[Array], Array]:
+        return self._function(
+            name + "'", lambda f, x: [sp.diff(f, s) for s in x], lambda values, like, n: assemble(values, like)
+        )
+
+    def _matrix(self, name: str) -> Callable[[Array], Array]:
+        def reshape(values: Sequence[Array], like: Array, n: int) -> Array:
+            flat = assemble(values, like)
+            return flat.reshape(*flat.shape[:-1], n, n)
+
+        return self._function(name + "''", lambda f, x: list(sp.hessian(f, x)), reshape)
+
+    def _function(
+        self,
+        key: str,
+        expressions: Callable[[sp.Expr, tuple[sp.Symbol, ...]], list[sp.Expr]],
+        collect: Callable[[Sequence[Array], Array, int], Array],
+    ) -> Callable[[Array], Array]:
+        """A function of an array (..., n), generated for NumPy or torch when first called with one."""
+        if key in self._functions:
+            return self._functions[key]
+        variables = self._variables(key[0])
+        n = len(variables)
+        generated: dict[str, Callable[..., list[Any]]] = {}
+
+        def function(x: Array) -> Array:
+            library = "torch" if is_tensor(x) else "numpy"
+            if library not in generated:
+                code = expressions(getattr(self, key[0]), variables)
+                generated[library] = sp.lambdify(variables, code, modules=_modules(library), cse=True)
+            columns = [x[..., i] for i in range(n)]
+            return collect(generated[library](*columns), columns[0], n)
+
+        self._functions[key] = function
+        return function
+
+    @cached_property
+    def _functions(self) -> dict[str, Callable[[Array], Array]]:
+        return {}
+
+
+def _parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
+    names = {name: sp.Symbol(name, real=True) for name in params}
+    if isinstance(expression, str):
+        words = set(re.findall(r"[A-Za-z_]\w*", expression))
+        local = {w: sp.Symbol(w, real=True) for w in words if w not in vars(sp) or _is_coordinate(w) or w in params}
+        try:
+            H = sp.sympify(expression, locals=local)
+        except (sp.SympifyError, SyntaxError, TypeError, AttributeError) as error:
+            raise ValueError(f"`expression` cannot be parsed by SymPy: {expression!r} ({error}).") from error
+    else:
+        H = sp.sympify(expression)
+    if not isinstance(H, sp.Expr):
+        raise ValueError(f"`expression` must be a scalar expression; got {type(H).__name__}.")
+    H = H.xreplace({s: sp.Symbol(s.name, real=True) for s in H.free_symbols})
+    for name, value in params.items():
+        if names[name] not in H.free_symbols:
+            raise ValueError(f"`params` has {name!r}, which the expression does not use: remove it.")
+        H = H.xreplace({names[name]: sp.nsimplify(value) if float(value).is_integer() else sp.Float(value)})
+    unknown = sorted(s.name for s in H.free_symbols if not _is_coordinate(s.name))
+    if "t" in unknown:
+        raise TypeError("`expression` depends on the time t: only autonomous Hamiltonians are supported.")
+    if unknown:
+        raise ValueError(f"`expression` holds {', '.join(unknown)} without a value: give it in `params`.")
+    return H
+
+
+def _is_coordinate(name: str) -> bool:
+    return re.fullmatch(r"[qp]([1-9]\d*)?", name) is not None
+
+
+def _index(symbol: sp.Symbol) -> int:
+    """1 for q1, p1, q and p; 2 for q2, p2; …"""
+    return int(symbol.name[1:] or 1) if _is_coordinate(symbol.name) else 0
+
+
+def _with_numeric_constants(H: sp.Expr) -> sp.Expr:
+    """H with constants such as √2 or π as floating-point numbers: torch has no functions of Python numbers."""
+    constants = [a for a in sp.preorder_traversal(H) if a.is_number and not a.is_Rational and not a.is_Float]
+    return H.xreplace({a: a.evalf(17) for a in constants})
+
+
+def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tuple[sp.Expr | None, sp.Expr | None]:
+    """V(q) and T(p) with H = T + V, or (None, None). Constants go to V."""
+    qs, ps = set(q), set(p)
+    terms = sp.Add.make_args(H)
+    if any(t.free_symbols & qs and t.free_symbols & ps for t in terms):
+        terms = sp.Add.make_args(sp.expand(H))
+    mixed = [t for t in terms if t.free_symbols & qs and t.free_symbols & ps]
+    if mixed:
+        return None, None
+    T = sp.Add(*[t for t in terms if t.free_symbols & ps])
+    V = sp.Add(*[t for t in terms if not t.free_symbols & ps])
+    return V, T
+
+
+def _modules(library: str) -> list[Any]:
+    if library == "numpy":
+        return ["numpy"]
+    import torch
+
+    def heaviside(x: Any, value: float) -> Any:
+        return torch.heaviside(x, torch.as_tensor(value, dtype=x.dtype, device=x.device))
+
+    return [{"heaviside": heaviside}, "torch"]

@@ -1,0 +1,304 @@
+"""HamiltonianSystem: H, its structure, its derivatives, and the scene it is usually solved in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
+from sympflow.domain import Domain, EnergySublevel
+
+if TYPE_CHECKING:
+    import sympy
+
+    from sympflow.symbolic import SymbolicHamiltonian
+
+
+class HamiltonianSystem:
+    """A Hamiltonian system x' = J∇H(x), x = [q, p], with H autonomous.
+
+    Parameters
+    ----------
+    potential : callable, optional
+        V(q), q of shape (..., d), returning (...). Then H = ½ pᵀM⁻¹p + V(q) is separable. Without `gradient`
+        it must be written with torch functions, and is differentiated automatically. With Numba functions
+        (`potential`, `gradient` and `hessian_vector`) the system runs compiled.
+    hamiltonian : callable, optional
+        H(q, p), written with torch functions, for a system that is not separable. Give this or `potential`.
+    ndof : int
+        Degrees of freedom d.
+    mass : float or array_like of shape (d,) or (d, d), optional
+        M, symmetric positive definite; the default is 1. Only with `potential`.
+    gradient : callable, optional
+        ∇V(q), (..., d) to (..., d); as a Numba function: gradient(q, out).
+    hessian_vector : callable, optional
+        ∇²V(q)·v, (..., d), (..., d) to (..., d); as a Numba function: hessian_vector(q, v, out).
+    name : str
+    domain : Domain, optional
+        Ω, where flows are trained. Classical methods never need one.
+    y0 : array_like of shape (2d,), optional
+        Default initial state.
+    t_span : (float, float)
+        Default interval.
+    dt : float
+        Default step of the fixed-step classical methods.
+    energy_scale : float, optional
+        What energy errors are relative to; the default is |H(y0)|.
+
+    Attributes
+    ----------
+    separable : bool
+        Whether H = T(p) + V(q).
+    quadratic_kinetic : bool
+        Whether T = ½ pᵀM⁻¹p.
+    inverse_mass : None or ndarray of shape (d,) or (d, d)
+        M⁻¹, None when it is the identity or T is not quadratic.
+    symbols : SymbolicHamiltonian or None
+        The symbolic definition, if there is one.
+
+    Examples
+    --------
+    >>> system = HamiltonianSystem.from_sympy("p**2/2 + 1 - cos(q)")
+    >>> system.force(np.array([0.0]))
+    array([-0.])
+    """
+
+    def __init__(
+        self,
+        potential: Callable[..., Array] | None = None,
+        *,
+        hamiltonian: Callable[..., Array] | None = None,
+        ndof: int | None = None,
+        mass: float | ArrayLike | None = None,
+        gradient: Callable[..., Any] | None = None,
+        hessian_vector: Callable[..., Any] | None = None,
+        name: str = "custom",
+        domain: Domain | None = None,
+        y0: ArrayLike | None = None,
+        t_span: tuple[float, float] = (0.0, 100.0),
+        dt: float = 0.05,
+        energy_scale: float | None = None,
+    ) -> None:
+        from sympflow.callables import CallableHamiltonian
+
+        if ndof is None or isinstance(ndof, bool) or int(ndof) != ndof or ndof < 1:
+            raise ValueError(f"`ndof` must be a positive integer, the degrees of freedom; got {ndof!r}.")
+        definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector)
+        if definition.separable:
+            self._set(definition, _inverse_mass(mass, int(ndof)), True)
+        elif mass is not None:
+            raise TypeError("`mass` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
+        else:
+            self._set(definition, None, False)
+        self._set_scene(name, {}, domain, y0, t_span, dt, energy_scale)
+
+    @classmethod
+    def from_sympy(
+        cls,
+        expression: str | sympy.Expr,
+        *,
+        params: Mapping[str, float] | None = None,
+        name: str = "custom",
+        domain: Domain | None = None,
+        y0: ArrayLike | None = None,
+        t_span: tuple[float, float] = (0.0, 100.0),
+        dt: float = 0.05,
+        energy_scale: float | None = None,
+    ) -> HamiltonianSystem:
+        """A system from one symbolic definition of H in q1 … qd, p1 … pd (or q, p).
+
+        NumPy, torch and Numba functions for H, its gradients and Hessians are generated from it.
+
+        Parameters
+        ----------
+        expression : str or sympy.Expr
+        params : mapping of str to float, optional
+            Values of the other symbols.
+        name, domain, y0, t_span, dt, energy_scale
+            As for the class.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If the expression cannot be parsed, has symbols without a value, or depends on t.
+        """
+        from sympflow.symbolic import SymbolicHamiltonian
+
+        symbols = SymbolicHamiltonian(expression, params)
+        self = cls.__new__(cls)
+        M = symbols.inverse_mass
+        inverse_mass = None if M is None else _simplest_mass(np.array(M.tolist(), dtype=float))
+        self._set(symbols, inverse_mass, M is not None)
+        self.symbols = symbols
+        self._set_scene(name, dict(params or {}), domain, y0, t_span, dt, energy_scale)
+        return self
+
+    def _set(self, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
+        self._definition = definition
+        self.symbols: SymbolicHamiltonian | None = None
+        self.ndof: int = definition.ndof
+        self.separable: bool = definition.separable
+        self.inverse_mass = inverse_mass
+        self.quadratic_kinetic = quadratic_kinetic
+
+    def _set_scene(
+        self,
+        name: str,
+        params: dict[str, float],
+        domain: Domain | None,
+        y0: ArrayLike | None,
+        t_span: tuple[float, float],
+        dt: float,
+        energy_scale: float | None,
+    ) -> None:
+        self.name, self.params = name, params
+        if not 0 < dt < np.inf:
+            raise ValueError(f"`dt` must be positive and finite; got {dt!r}.")
+        self.t_span = (float(t_span[0]), float(t_span[1]))
+        self.dt = float(dt)
+        if energy_scale is not None and not 0 < energy_scale < np.inf:
+            raise ValueError(f"`energy_scale` must be positive and finite; got {energy_scale!r}.")
+        self.energy_scale = energy_scale
+        self.y0 = None if y0 is None else np.array(y0, dtype=float)
+        if self.y0 is not None and self.y0.shape != (2 * self.ndof,):
+            raise ValueError(f"`y0` must have shape ({2 * self.ndof},), [q, p]; got {self.y0.shape}.")
+        self.domain = domain.attach(self.hamiltonian) if isinstance(domain, EnergySublevel) else domain
+        if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
+            raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
+
+    # H and its derivatives ------------------------------------------------------------------------
+
+    def hamiltonian(self, y: Array) -> Array:
+        """H(y): (..., 2d) to (...)."""
+        if self.separable:
+            q, p = y[..., : self.ndof], y[..., self.ndof :]
+            return self.kinetic(p) + self.potential(q)
+        return self._definition.hamiltonian(y)
+
+    def gradient(self, y: Array) -> Array:
+        """∇H(y): (..., 2d) to (..., 2d)."""
+        if self.separable:
+            return concatenate([-self.force(y[..., : self.ndof]), self.velocity(y[..., self.ndof :])])
+        return self._definition.gradient(y)
+
+    def hessian(self, y: Array) -> Array:
+        """∇²H(y): (..., 2d) to (..., 2d, 2d)."""
+        if not self.separable:
+            return self._definition.hessian(y)
+        d = self.ndof
+        A, B = self.potential_hessian(y[..., :d]), self.kinetic_hessian(y[..., d:])
+        B = B + 0 * A
+        return concatenate([_rows(A, 0 * A), _rows(0 * B, B)]).swapaxes(-1, -2)
+
+    def vector_field(self, y: Array) -> Array:
+        """J∇H(y) = [∇_pH, −∇_qH]: (..., 2d) to (..., 2d)."""
+        d = self.ndof
+        if self.separable:
+            return concatenate([self.velocity(y[..., d:]), self.force(y[..., :d])])
+        g = self._definition.gradient(y)
+        return concatenate([g[..., d:], -g[..., :d]])
+
+    def __call__(self, t: float, y: Array) -> Array:
+        """The right-hand side fun(t, y) of `scipy.integrate.solve_ivp` and `torchdiffeq.odeint`."""
+        return self.vector_field(y)
+
+    # separable systems: V(q) and T(p) -------------------------------------------------------------
+
+    def potential(self, q: Array) -> Array:
+        """V(q): (..., d) to (...)."""
+        return self._separable()._definition.potential(q)
+
+    def force(self, q: Array) -> Array:
+        """−∇V(q): (..., d) to (..., d)."""
+        return -self._separable()._definition.potential_gradient(q)
+
+    def potential_hessian(self, q: Array) -> Array:
+        """∇²V(q): (..., d) to (..., d, d)."""
+        return self._separable()._definition.potential_hessian(q)
+
+    def kinetic(self, p: Array) -> Array:
+        """T(p): (..., d) to (...)."""
+        if self._separable().quadratic_kinetic:
+            return (p * self.velocity(p)).sum(-1) / 2
+        return self._definition.kinetic(p)
+
+    def velocity(self, p: Array) -> Array:
+        """∇T(p): (..., d) to (..., d)."""
+        if not self._separable().quadratic_kinetic:
+            return self._definition.kinetic_gradient(p)
+        if self.inverse_mass is None:
+            return p
+        M = _like(self.inverse_mass, p)
+        return p * M if M.ndim == 1 else p @ M
+
+    def kinetic_hessian(self, p: Array) -> Array:
+        """∇²T(p): (..., d) to (..., d, d); M⁻¹ of shape (d, d) when T is quadratic."""
+        if not self._separable().quadratic_kinetic:
+            return self._definition.kinetic_hessian(p)
+        M = np.ones(self.ndof) if self.inverse_mass is None else self.inverse_mass
+        return _like(np.diag(M) if M.ndim == 1 else M, p)
+
+    def _separable(self) -> HamiltonianSystem:
+        if not self.separable:
+            raise ValueError(
+                f"`system` {self.name!r} is not separable: H does not split into T(p) + V(q), so splitting methods do "
+                "not apply. Use a Runge–Kutta method or train a SympFlow."
+            )
+        return self
+
+    @property
+    def numba_functions(self) -> tuple[Any, Any, Any] | None:
+        """(potential, gradient, hessian_vector) if the system was given by Numba functions, else None."""
+        return getattr(self._definition, "numba_functions", None)
+
+    # identity -------------------------------------------------------------------------------------
+
+    @cached_property
+    def fingerprint(self) -> tuple[float, ...]:
+        """H at 8 fixed states less H at a ninth: what tells a trained flow whether this is its system."""
+        probes = np.random.Generator(np.random.PCG64(20260101)).random((9, 2 * self.ndof)) * 0.9 - 0.35
+        with np.errstate(all="ignore"):
+            H = to_numpy(self.hamiltonian(probes))
+        return tuple((H[1:] - H[0]).tolist())
+
+    def __repr__(self) -> str:
+        params = ", ".join(f"{k}={v:g}" for k, v in self.params.items())
+        kind = "separable" if self.separable else "not separable"
+        return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
+
+
+def _rows(left: Array, right: Array) -> Array:
+    return concatenate([left, right]).swapaxes(-1, -2)
+
+
+def _like(constant: np.ndarray, x: Array) -> Array:
+    """A constant array in the library, dtype and device of `x`."""
+    if is_tensor(x):
+        import torch
+
+        return torch.as_tensor(constant, dtype=x.dtype, device=x.device)
+    return constant.astype(x.dtype, copy=False)
+
+
+def _inverse_mass(mass: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
+    M = np.asarray(1.0 if mass is None else mass, dtype=float)
+    if M.ndim == 0:
+        M = np.full(ndof, M)
+    full = np.diag(M) if M.ndim == 1 else M
+    if full.shape != (ndof, ndof):
+        raise ValueError(f"`mass` must be a number or have shape ({ndof},) or ({ndof}, {ndof}); got {M.shape}.")
+    if not (np.isfinite(full).all() and np.allclose(full, full.T) and np.linalg.eigvalsh(full)[0] > 0):
+        raise ValueError("`mass` must be finite, symmetric and positive definite.")
+    return _simplest_mass(np.diag(1 / M) if M.ndim == 1 else np.linalg.inv(full))
+
+
+def _simplest_mass(inverse: np.ndarray) -> np.ndarray | None:
+    """None for the identity, the diagonal for a diagonal matrix, else the matrix."""
+    if np.array_equal(inverse, np.eye(len(inverse))):
+        return None
+    diagonal = np.diag(inverse).copy()
+    return diagonal if np.array_equal(inverse, np.diag(diagonal)) else inverse
