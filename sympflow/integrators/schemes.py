@@ -1,0 +1,383 @@
+"""Splitting schemes as tables of numbers, each with its order and its source.
+
+A separable Hamiltonian H(q, p) = T(p) + V(q) is the sum of two that are solved exactly: the *drift*
+q += a h ∇T(p) and the *kick* p −= b h ∇V(q).  A splitting scheme is a list of kicks and drifts, and this
+module knows nothing else: no system, no array library.
+
+When T is quadratic, T = ½ pᵀM⁻¹p, the kick may carry a *force gradient*: stage i is the exact flow over h of
+
+    b_i V(q) − g_i h² ½ |∇V(q)|²_{M⁻¹},       p += b_i h F(q) + g_i h³ ∇²V(q) M⁻¹∇V(q),      F = −∇V,
+
+that is exp(h b_i B + ½ h³ g_i [B, [A, B]]) with the Lie derivatives A and B along T and V.  (Chin's
+V + (h²/48)[V, [T, V]] in a kick of weight b is g = b/24, a χ of Omelyan, Mryglod and Folk is g = 2χ.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import sqrt
+
+__all__ = ["SCHEMES", "Scheme", "compose"]
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """A splitting method: stage i kicks by ``kicks[i]`` and ``gradients[i]``, then drifts by ``drifts[i]``.
+
+    Attributes
+    ----------
+    name : str
+        The method's name, the key in `SCHEMES`.
+    order : int or None
+        Classical order of convergence; None where nothing is claimed (a trained table).
+    kicks, drifts, gradients : tuple of float
+        Coefficients b, a and g of the stages in their order of execution; zeros cost nothing.
+    source : str
+        Where the coefficients come from.
+    nystrom : bool
+        True if the order holds only for a kinetic energy quadratic in p, where [B, [B, [B, A]]] = 0
+        (the Nyström condition).
+
+    Raises
+    ------
+    ValueError
+        If the tuples differ in length or are empty.
+    """
+
+    name: str
+    order: int | None
+    kicks: tuple[float, ...]
+    drifts: tuple[float, ...]
+    gradients: tuple[float, ...]
+    source: str
+    nystrom: bool = False
+
+    def __post_init__(self) -> None:
+        if not len(self.kicks) == len(self.drifts) == len(self.gradients) > 0:
+            raise ValueError(
+                f"`kicks`, `drifts` and `gradients` must have one coefficient per stage, got "
+                f"{len(self.kicks)}, {len(self.drifts)} and {len(self.gradients)}: pad with zeros."
+            )
+
+    @property
+    def substeps(self) -> tuple[tuple[str, float, float], ...]:
+        """The maps really executed, ('kick', b, g) or ('drift', a, 0): no zeros, like neighbours merged."""
+        merged: list[tuple[str, float, float]] = []
+        for b, g, a in zip(self.kicks, self.gradients, self.drifts, strict=True):
+            for kind, c, c3 in (("kick", b, g), ("drift", a, 0.0)):
+                if c == 0.0 and c3 == 0.0:
+                    continue
+                if merged and merged[-1][0] == kind:
+                    _, previous, previous3 = merged.pop()
+                    c, c3 = c + previous, c3 + previous3  # noqa: PLW2901
+                merged.append((kind, c, c3))
+        return tuple(merged)
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the step is its own adjoint, Φ(−h) = Φ(h)⁻¹ (the coefficients read the same backwards)."""
+        forwards, backwards = self.substeps, self.substeps[::-1]
+        return len(forwards) > 0 and all(
+            one[0] == other[0] and abs(one[1] - other[1]) + abs(one[2] - other[2]) < 1e-13
+            for one, other in zip(forwards, backwards, strict=True)
+        )
+
+    @property
+    def first_same_as_last(self) -> bool:
+        """Whether a step ends with the kind of map that it begins with, so that successive steps share it."""
+        return len(self.substeps) > 1 and self.substeps[0][0] == self.substeps[-1][0]
+
+    @property
+    def force_evaluations(self) -> int:
+        """Forces per step in a long run, the last kick merged with the next step's first one."""
+        kinds = [kind for kind, _, _ in self.substeps]
+        return kinds.count("kick") - (self.first_same_as_last and kinds[0] == "kick")
+
+    @property
+    def hessian_evaluations(self) -> int:
+        """Force gradients (Hessian–vector products) per step, counted like `force_evaluations`."""
+        with_gradient = [c3 != 0.0 for kind, _, c3 in self.substeps if kind == "kick"]
+        shared = self.first_same_as_last and self.substeps[0][0] == "kick"
+        return sum(with_gradient[1:-1] if shared else with_gradient) + (
+            shared and (with_gradient[0] or with_gradient[-1])
+        )
+
+    def inverse(self) -> Scheme:
+        """The scheme Ψ with Ψ(h) ∘ Φ(h) = identity: the stages backwards, with opposite signs."""
+        kicks = (0.0, *(-b for b in reversed(self.kicks)))
+        gradients = (0.0, *(-g for g in reversed(self.gradients)))
+        drifts = (*(-a for a in reversed(self.drifts)), 0.0)
+        if drifts[0] == 0.0:
+            kicks, gradients, drifts = kicks[1:], gradients[1:], drifts[1:]
+        elif kicks[-1] == 0.0 and gradients[-1] == 0.0:
+            kicks, gradients, drifts = kicks[:-1], gradients[:-1], drifts[:-1]
+        name, source = f"{self.name}⁻¹", f"the inverse of {self.name}"
+        return Scheme(name, self.order, kicks, drifts, gradients, source, self.nystrom)
+
+
+def _kick_first(kicks: tuple[float, ...], drifts: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
+    return kicks, (*drifts, 0.0)
+
+
+def _drift_first(drifts: tuple[float, ...], kicks: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
+    return (0.0, *kicks), drifts
+
+
+def _palindrome(half: tuple[float, ...], total: float = 1.0) -> tuple[float, ...]:
+    """Coefficients w₁ … w_m, w₀, w_m … w₁ with the middle one making the sum `total`."""
+    return (*half, total - 2.0 * sum(half), *reversed(half))
+
+
+def _even_palindrome(half: tuple[float, ...]) -> tuple[float, ...]:
+    """Coefficients w₁ … w_m, w_m … w₁ with sum 1, the given ones completed by w_m."""
+    half = (*half, 0.5 - sum(half))
+    return (*half, *reversed(half))
+
+
+def compose(name: str, order: int | None, weights: tuple[float, ...], source: str) -> Scheme:
+    """Leapfrog (drift–kick–drift) steps of lengths ``weights[i] h`` in a row, neighbouring drifts merged."""
+    padded = (0.0, *weights, 0.0)
+    drifts = tuple(0.5 * (one + other) for one, other in pairwise(padded))
+    return _scheme(name, order, _drift_first(drifts, weights), source)
+
+
+def _scheme(
+    name: str,
+    order: int | None,
+    kicks_and_drifts: tuple[tuple[float, ...], ...],
+    source: str,
+    *,
+    gradients: dict[int, float] | None = None,
+    nystrom: bool = False,
+) -> Scheme:
+    kicks, drifts = kicks_and_drifts
+    g = tuple((gradients or {}).get(i, 0.0) for i in range(len(kicks)))
+    return Scheme(name, order, kicks, drifts, g, source, nystrom or gradients is not None)
+
+
+def _adjoint_composition(alphas: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
+    """Φ(α_s h) Φ*(β_s h) … Φ(α₁h) Φ*(β₁h), β_i = α_{s+1−i}; Φ is kick then drift, Φ* drift then kick."""
+    betas = alphas[::-1]
+    kicks = tuple(a + b for a, b in zip(alphas, betas, strict=True))
+    inner = tuple(a + b for a, b in zip(alphas[:-1], betas[1:], strict=True))
+    return _drift_first((betas[0], *inner, alphas[-1]), kicks)
+
+
+_YOSHIDA = "H. Yoshida, Construction of higher order symplectic integrators, Phys. Lett. A 150 (1990) 262–268"
+_KAHAN_LI = (
+    "W. Kahan and R.-C. Li, Composition constants for raising the orders of unconventional schemes for "
+    "ordinary differential equations, Math. Comp. 66 (1997) 1089–1099"
+)
+_BLANES_MOAN = (
+    "S. Blanes and P. C. Moan, Practical symplectic partitioned Runge–Kutta and Runge–Kutta–Nyström methods, "
+    "J. Comput. Appl. Math. 142 (2002) 313–330"
+)
+_CHIN = (
+    "S. A. Chin, Symplectic integrators from composite operator factorizations, "
+    "Phys. Lett. A 226 (1997) 344–348"
+)
+_OMELYAN = (
+    "I. P. Omelyan, I. M. Mryglod and R. Folk, Construction of high-order force-gradient algorithms for "
+    "integration of motion in classical and quantum systems, Phys. Rev. E 66 (2002) 026701"
+)
+
+_YOSHIDA4_WEIGHT = 1.0 / (2.0 - 2.0 ** (1.0 / 3.0))
+_SUZUKI4_WEIGHT = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
+_ROOT19 = sqrt(19.0)
+_MCLACHLAN4_ALPHAS = (
+    (146.0 + 5.0 * _ROOT19) / 540.0,
+    (-2.0 + 10.0 * _ROOT19) / 135.0,
+    1.0 / 5.0,
+    (-23.0 - 20.0 * _ROOT19) / 270.0,
+    (14.0 - _ROOT19) / 108.0,
+)
+_OMELYAN4_LAMBDA = 0.2470939580390842
+_OMELYAN4_THETA = 0.5 - 1.0 / sqrt(24.0 * _OMELYAN4_LAMBDA)
+_OMELYAN4_CHI = (1.0 - sqrt(6.0 * _OMELYAN4_LAMBDA) * (1.0 - _OMELYAN4_LAMBDA)) / 12.0
+
+_TABLE = (
+    _scheme(
+        "verlet",
+        2,
+        _kick_first((0.5, 0.5), (1.0,)),
+        "L. Verlet, Phys. Rev. 159 (1967) 98–103; kick–drift–kick form (velocity Verlet)",
+    ),
+    _scheme(
+        "leapfrog",
+        2,
+        _drift_first((0.5, 0.5), (1.0,)),
+        "Störmer–Verlet in drift–kick–drift form; E. Hairer, C. Lubich and G. Wanner, Geometric numerical "
+        "integration illustrated by the Störmer–Verlet method, Acta Numerica 12 (2003) 399–450",
+    ),
+    compose(
+        "yoshida4",
+        4,
+        _palindrome((_YOSHIDA4_WEIGHT,)),
+        f"{_YOSHIDA}, eq. (2.11); E. Forest and R. D. Ruth (1990)",
+    ),
+    compose(
+        "yoshida6",
+        6,
+        _palindrome(
+            (0.78451361047755726381949763, 0.23557321335935813368479318, -1.17767998417887100694641568)
+        ),
+        f"{_YOSHIDA}, solution A of table 1",
+    ),
+    compose(
+        "suzuki4",
+        4,
+        _palindrome((_SUZUKI4_WEIGHT, _SUZUKI4_WEIGHT)),
+        "M. Suzuki, Fractal decomposition of exponential operators, Phys. Lett. A 146 (1990) 319–323",
+    ),
+    _scheme(
+        "mclachlan4",
+        4,
+        _adjoint_composition(_MCLACHLAN4_ALPHAS),
+        "R. I. McLachlan, On the numerical integration of ordinary differential equations by symmetric "
+        "composition methods, SIAM J. Sci. Comput. 16 (1995) 151–168, five stages of a method and its adjoint",
+    ),
+    _scheme(
+        "blanes_moan4",
+        4,
+        _kick_first(
+            _palindrome((0.0792036964311957, 0.353172906049774, -0.0420650803577195)),
+            _even_palindrome((0.209515106613362, -0.143851773179818)),
+        ),
+        f"{_BLANES_MOAN}, table 2, S6 of order 4",
+    ),
+    compose(
+        "kahan_li6",
+        6,
+        _palindrome(
+            (
+                0.39216144400731413927925056,
+                0.33259913678935943859974864,
+                -0.70624617255763935980996482,
+                0.08221359629355080023149045,
+            )
+        ),
+        f"{_KAHAN_LI}, s9odr6a",
+    ),
+    compose(
+        "kahan_li8",
+        8,
+        _palindrome(
+            (
+                0.13020248308889008087881763,
+                0.56116298177510838456196441,
+                -0.38947496264484728640807860,
+                0.15884190655515560089621075,
+                -0.39590389413323757733623154,
+                0.18453964097831570709183254,
+                0.25837438768632204729397911,
+                0.29501172360931029887096624,
+            )
+        ),
+        f"{_KAHAN_LI}, s17odr8a",
+    ),
+    _scheme(
+        "srkn6b",
+        4,
+        _kick_first(
+            _palindrome((0.0829844064174052, 0.396309801498368, -0.0390563049223486)),
+            _even_palindrome((0.245298957184271, 0.604872665711080)),
+        ),
+        f"{_BLANES_MOAN}, table 3, SRKN 6b",  # tuned for a quadratic T; being symmetric, of order 4 for any
+    ),
+    _scheme(
+        "srkn11b",
+        6,
+        _kick_first(
+            _even_palindrome(
+                (
+                    0.0414649985182624,
+                    0.198128671918067,
+                    -0.0400061921041533,
+                    0.0752539843015807,
+                    -0.0115113874206879,
+                )
+            ),
+            _palindrome(
+                (
+                    0.123229775946271,
+                    0.290553797799558,
+                    -0.127049212625417,
+                    -0.246331761062075,
+                    0.357208872795928,
+                )
+            ),
+        ),
+        f"{_BLANES_MOAN}, table 3, SRKN 11b",
+        nystrom=True,
+    ),
+    _scheme(
+        "srkn14a",
+        6,
+        _drift_first(
+            _palindrome(
+                (
+                    0.0378593198406116,
+                    0.102635633102435,
+                    -0.0258678882665587,
+                    0.314241403071447,
+                    -0.130144459517415,
+                    0.106417700369543,
+                    -0.00879424312851058,
+                )
+            ),
+            _even_palindrome(
+                (
+                    0.09171915262446165,
+                    0.183983170005006,
+                    -0.05653436583288827,
+                    0.004914688774712854,
+                    0.143761127168358,
+                    0.328567693746804,
+                )
+            ),
+        ),
+        f"{_BLANES_MOAN}, table 3, SRKN 14a",
+        nystrom=True,
+    ),
+    _scheme(
+        "chin4a",
+        4,
+        _kick_first((1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0), (0.5, 0.5)),
+        f"{_CHIN}, scheme A",
+        gradients={1: 1.0 / 36.0},
+    ),
+    _scheme(
+        "chin4c",
+        4,
+        _drift_first((1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0), (3.0 / 8.0, 1.0 / 4.0, 3.0 / 8.0)),
+        f"{_CHIN}, scheme C",
+        gradients={2: 1.0 / 96.0},
+    ),
+    _scheme(
+        "omelyan4",
+        4,
+        _drift_first(
+            _even_palindrome((_OMELYAN4_THETA,)),
+            _palindrome((_OMELYAN4_LAMBDA,)),
+        ),
+        f"{_OMELYAN}, eqs. (38)–(42), three forces and one force gradient",
+        gradients={2: 2.0 * _OMELYAN4_CHI},
+    ),
+    _scheme(
+        "omelyan6",
+        6,
+        _drift_first(
+            _even_palindrome((0.1097059723948682, 0.4140632267310831)),
+            _palindrome((0.2693315848935301, 1.1319803486515564)),
+        ),
+        f"{_OMELYAN}, eqs. (50)–(51), five forces and three force gradients",
+        gradients={
+            1: 2.0 * 0.0008642161339706166,
+            3: -2.0 * 0.01324638643416052,
+            5: 2.0 * 0.0008642161339706166,
+        },
+    ),
+)
+
+SCHEMES: dict[str, Scheme] = {scheme.name: scheme for scheme in _TABLE}
