@@ -11,8 +11,8 @@ ALL = pytest.mark.parametrize("scheme", SCHEMES.values(), ids=SCHEMES.keys())
 
 
 # --- order conditions ---------------------------------------------------------------------------------------
-# A series in two noncommuting letters A (drift) and B (kick), h counting the degree, is a list whose n-th entry
-# holds the coefficients of the words of length n in an array of shape (2,)*n.
+# A series in two noncommuting letters A (drift) and B (kick), h counting the degree, is a list whose n-th
+# entry holds the coefficients of the words of length n in an array of shape (2,)*n.
 
 
 def letter_product(series, word_coefficients, degree):

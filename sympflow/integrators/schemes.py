@@ -235,7 +235,7 @@ _TABLE = (
         4,
         _adjoint_composition(_MCLACHLAN4_ALPHAS),
         "R. I. McLachlan, On the numerical integration of ordinary differential equations by symmetric "
-        "composition methods, SIAM J. Sci. Comput. 16 (1995) 151–168, five stages of a method and its adjoint",
+        "composition methods, SIAM J. Sci. Comput. 16 (1995) 151–168, five stages and their adjoints",
     ),
     _scheme(
         "blanes_moan4",
