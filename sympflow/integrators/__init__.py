@@ -1,0 +1,1 @@
+"""Integrators: the contracts, the registry, and the built-in methods, one family a file."""

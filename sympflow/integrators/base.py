@@ -1,0 +1,292 @@
+"""The contract between `solve` and an integrator.
+
+An integrator is a frozen dataclass whose fields are its options (`dt`, `rtol`, …). Its duties:
+
+1. `step(system, t, y, h)` maps states y (..., 2d) over a step h; h may be negative, and may have the shape y.shape[:-1].
+2. `order` (None if trained), `symplectic` and `trained` are class attributes that tell the truth.
+3. `check(system)` raises a ValueError with the reason where the method does not apply.
+4. `run(problem)` produces the states that were asked for, and no others, as an `Outcome`.
+5. `steps(system, t_span, y0)` executes the same run again as a stream of the steps that it takes, and
+6. `tangent(system, t, y, h)` differentiates such a step, so that metrics judge the map that was really executed.
+7. `inverse(system, t, y, h)` undoes `step(system, t, y, h)` exactly, or raises a TypeError.
+
+`FixedStep` does 4 to 6 for any integrator that has a step: a new one needs duties 1 to 3 only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sympflow.arrays import Array, all_finite, is_tensor, stack, to_numpy
+from sympflow.integrators.grid import Grid
+from sympflow.system import HamiltonianSystem
+
+Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
+"""Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What `solve` asks of an integrator, validated."""
+
+    system: HamiltonianSystem
+    t0: float
+    t1: float
+    y0: Array
+    t_eval: np.ndarray | None = None
+    save_every: int = 1
+    dense_output: bool = False
+    backend: str = "auto"
+
+
+@dataclass
+class Outcome:
+    """What an integrator answers. `y` has time first: (n, ..., 2d)."""
+
+    t: np.ndarray
+    y: Array
+    status: int | np.ndarray
+    message: str
+    stats: dict[str, Any]
+    sol: Callable[[Any], Array] | None = None
+
+
+FINISHED = "The solver successfully reached the end of the integration interval."
+
+
+class Integrator:
+    """Base class of all integrators. See the module's docstring for the contract."""
+
+    name: ClassVar[str]
+    order: ClassVar[int | None]
+    symplectic: ClassVar[bool]
+    trained: ClassVar[bool] = False
+
+    @classmethod
+    def options(cls) -> tuple[str, ...]:
+        """The names of the options that this method takes."""
+        return tuple(f.name for f in fields(cls))  # type: ignore[arg-type]
+
+    def check(self, system: HamiltonianSystem) -> None:
+        """Raise a ValueError with the reason if the method does not apply to the system."""
+
+    def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        """One step of signed length h from the states y (..., 2d)."""
+        raise TypeError(f"`method` {self.name!r} has no bare step: use solve().")
+
+    def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        """The state from which `step(system, t, ·, h)` leads to y."""
+        raise TypeError(f"`method` {self.name!r} has no exact inverse: use a symplectic method.")
+
+    def tangent(
+        self, system: HamiltonianSystem, t: float, y: Array, h: Array
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The step from y (..., 2d) and its Jacobian A (..., 2d, 2d), by forward-mode differentiation of `step`."""
+        import torch
+
+        def step(x: torch.Tensor) -> torch.Tensor:
+            return self.step(system, t, x, torch.as_tensor(h, dtype=x.dtype))
+
+        x = torch.as_tensor(to_numpy(y))
+        columns = []
+        for i in range(x.shape[-1]):
+            direction = torch.zeros_like(x)
+            direction[..., i] = 1
+            y_next, column = torch.func.jvp(step, (x,), (direction,))
+            columns.append(column)
+        return to_numpy(y_next), to_numpy(torch.stack(columns, dim=-1))
+
+    def run(self, problem: Problem) -> Outcome:
+        """Solve the problem."""
+        raise NotImplementedError(f"{type(self).__name__} must define run().")
+
+    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        """Execute the run again as a stream of its steps."""
+        raise NotImplementedError(f"{type(self).__name__} must define steps().")
+
+
+@dataclass(frozen=True)
+class FixedStep(Integrator):
+    """An integrator on the grid t0 + k·dt.
+
+    Between grid points, at the times that `t_eval` or the dense output ask for, and at the end of an interval that dt
+    does not divide, the state is a shorter step from the last grid point: ψ_t = ψ_{t−k·dt} ∘ (ψ_dt)^k, no interpolation.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Step length, positive; the default is `system.dt`.
+    """
+
+    dt: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.dt is not None and not (
+            isinstance(self.dt, int | float | np.number)
+            and not isinstance(self.dt, bool)
+            and 0 < self.dt < math.inf
+        ):
+            raise ValueError(f"`dt` must be a positive and finite number; got {self.dt!r}.")
+
+    def step_length(self, system: HamiltonianSystem) -> float:
+        """The step that is used for a system."""
+        return float(self.dt if self.dt is not None else system.dt)
+
+    def evaluations(self, system: HamiltonianSystem, n_steps: int, n_extra: int) -> dict[str, int]:
+        """Counted work of `n_steps` steps on the grid and `n_extra` shorter ones, for the statistics."""
+        return {"force_evaluations": 0, "hessian_evaluations": 0}
+
+    def rollout(
+        self, problem: Problem, h: float, n_steps: int, save: np.ndarray
+    ) -> tuple[Array, np.ndarray, str]:
+        """States after the steps `save` (sorted counts in 0 … n_steps): (len(save), ..., 2d).
+
+        Also the index of the last finite state of each trajectory, and the backend that ran.
+        """
+        states, finite = rollout(
+            lambda k, y: self.step(problem.system, problem.t0 + k * h, y, h), problem.y0, n_steps, save
+        )
+        return states, finite, "torch" if is_tensor(problem.y0) else "numpy"
+
+    def run(self, problem: Problem) -> Outcome:
+        system, y0 = problem.system, problem.y0
+        grid = Grid(problem.t0, problem.t1, self.step_length(system))
+        t, count, remainder = grid.outputs(problem.t_eval, problem.save_every)
+        save = np.arange(grid.n_steps + 1) if problem.dense_output else np.unique(count)
+        saved, finite, backend = self.rollout(problem, grid.h, int(save[-1]), save)
+
+        y = saved[np.searchsorted(save, count)]
+        extra = np.flatnonzero(remainder)
+        if extra.size:
+            y = self._shorter_steps(system, y, extra, remainder[extra])
+        n_steps = int(min(save[-1], finite.max() + 1))
+        stats = {
+            "dt": abs(grid.h),
+            "n_steps": n_steps,
+            **self.evaluations(system, n_steps, int(extra.size)),
+            "backend": backend,
+        }
+        outcome = Outcome(t, y, 0, FINISHED, stats)
+        if problem.dense_output:
+            outcome.sol = GridSolution(self, system, grid, saved)
+        _report_failures(outcome, y0, grid, finite, int(save[-1]))
+        return outcome
+
+    def _shorter_steps(self, system: HamiltonianSystem, y: Array, extra: np.ndarray, h: np.ndarray) -> Array:
+        """Replace the states y[extra] by those a step h later."""
+        lengths = np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), y[extra].shape[:-1])
+        if not is_tensor(y):
+            y[extra] = self.step(system, 0.0, y[extra], lengths.astype(y.dtype))
+            return y
+        import torch
+
+        advanced = self.step(system, 0.0, y[extra], torch.as_tensor(lengths, dtype=y.dtype, device=y.device))
+        return y.index_copy(0, torch.as_tensor(extra, device=y.device), advanced)
+
+    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        grid = Grid(*t_span, self.step_length(system))
+        chunk, y, k = 256, y0, 0
+        while k < grid.n_steps:
+            n = min(chunk, grid.n_steps - k)
+            piece = Problem(system, grid.time(k), grid.time(k + n), y)
+            states, finite, _ = self.rollout(piece, grid.h, n, np.arange(n + 1))
+            good = int(finite.max()) if finite.max() < n else n
+            if good:
+                yield grid.t0 + np.arange(k, k + good) * grid.h, states[:good], np.full(good, grid.h)
+            if good < n:
+                return
+            y, k = states[n], k + n
+        if grid.remainder:
+            yield np.array([grid.time(k)]), y[None], np.array([grid.remainder])
+
+
+class GridSolution:
+    """Dense output of a fixed-step method: a shorter step from the last grid point before t.
+
+    Call it with a time or an array of times (n,); the result has shape (..., 2d) or (..., 2d, n).
+    """
+
+    def __init__(self, integrator: FixedStep, system: HamiltonianSystem, grid: Grid, states: Array) -> None:
+        self.integrator, self.system, self.grid, self.states = integrator, system, grid, states
+        self.t_min, self.t_max = sorted((grid.t0, grid.t1))
+
+    def __call__(self, t: float | np.ndarray) -> Array:
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        count, remainder = self.grid.locate(times)
+        y = self.states[count]
+        extra = np.flatnonzero(remainder)
+        if extra.size:
+            y = self.integrator._shorter_steps(self.system, y, extra, remainder[extra])
+        y = y.movedim(0, -1) if is_tensor(y) else np.moveaxis(y, 0, -1)
+        return y[..., 0] if np.ndim(t) == 0 else y
+
+
+def rollout(
+    step: Callable[[int, Array], Array], y: Array, n_steps: int, save: np.ndarray, block: int = 64
+) -> tuple[Array, np.ndarray]:
+    """Apply `step(k, y)` n_steps times; the states at the counts `save`, and the last finite count of each trajectory.
+
+    Finiteness is tested once a block; a block that ends non-finite is run again to find where. The run stops when no
+    trajectory is finite any more; later states are NaN.
+    """
+    tensor = is_tensor(y)
+    out: Any = [] if tensor else np.full((len(save), *y.shape), np.nan, dtype=y.dtype)
+    wanted = save.tolist()
+    position = 0
+    finite = np.where(to_numpy(all_finite(y)), n_steps, -1)
+    if wanted and wanted[0] == 0:
+        out.append(y) if tensor else out.__setitem__(0, y)
+        position = 1
+    k = 0
+    with np.errstate(all="ignore"):
+        while k < n_steps and (finite == n_steps).any():
+            start, y_start = k, y
+            for k in range(start, min(start + block, n_steps)):
+                y = step(k, y)
+                if position < len(wanted) and wanted[position] == k + 1:
+                    if tensor:
+                        out.append(y)
+                    else:
+                        out[position] = y
+                    position += 1
+            k += 1
+            failed = (finite == n_steps) & ~to_numpy(all_finite(y))
+            if failed.any():
+                z = y_start
+                for j in range(start, k):
+                    z = step(j, z)
+                    first = failed & (finite == n_steps) & ~to_numpy(all_finite(z))
+                    finite = np.where(first, j, finite)
+    if tensor:
+        out += [y * math.nan] * (len(wanted) - len(out))
+        out = stack(out, axis=0) if out else y[None][:0]
+    return out, np.asarray(finite)
+
+
+def _report_failures(outcome: Outcome, y0: Array, grid: Grid, finite: np.ndarray, n_run: int) -> None:
+    """Set status −1 and the message where a trajectory became non-finite; cut a single trajectory there."""
+    ok = to_numpy(all_finite(outcome.y))  # (n, ...): shorter steps may overflow too
+    if finite.ndim:
+        outcome.status = np.where((finite < n_run) | ~ok.all(0), -1, 0)
+        failed = np.argwhere(outcome.status)
+        if failed.size:
+            i = tuple(failed[0].tolist())
+            outcome.message = (
+                f"{len(failed)} of {finite.size} trajectories became non-finite, the first of them (index "
+                f"{', '.join(map(str, i))}) after t = {grid.time(int(finite[i])):.17g}. Reduce `dt`."
+            )
+        return
+    if finite < n_run or not ok.all():
+        last = int(finite) if finite < n_run else int(grid.locate(outcome.t[~ok][:1])[0][0])
+        outcome.status = -1
+        outcome.message = (
+            f"The solution became non-finite after t = {grid.time(last):.17g} (step {last + 1} of {grid.n_steps}). "
+            "Reduce `dt`, or end `t_span` earlier."
+        )
+        keep = int(np.argmin(ok)) if not ok.all() else len(ok)
+        outcome.t, outcome.y = outcome.t[:keep], outcome.y[:keep]

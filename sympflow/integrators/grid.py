@@ -1,0 +1,66 @@
+"""The time grid t0 + k·dt of the fixed-step methods, with integer step counts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class Grid:
+    """Times t0 + k·h, k = 0 … n_steps, and a last shorter step of length `remainder` if h does not divide t1 − t0.
+
+    Counts are integers and times are t0 + k·h, never a running sum. A quotient within a few ulp of an integer is that
+    integer: ⌊0.3/0.1⌋ is 2 in floating point, but three steps of 0.1 lead to 0.3.
+
+    Parameters
+    ----------
+    t0, t1 : float
+    dt : float
+        Positive step length; `h` bears the sign of t1 − t0.
+    """
+
+    def __init__(self, t0: float, t1: float, dt: float) -> None:
+        self.t0, self.t1 = float(t0), float(t1)
+        self.h = float(np.copysign(dt, t1 - t0))
+        quotient = (self.t1 - self.t0) / self.h
+        if quotient > 2**53:
+            raise ValueError(f"`dt` {dt:g} needs {quotient:.3g} steps from {t0:g} to {t1:g}: increase it.")
+        count, remainder = self.locate(np.array([self.t1]), bounded=False)
+        self.n_steps, self.remainder = int(count[0]), float(remainder[0])
+
+    def time(self, k: int) -> float:
+        """t0 + k·h, and exactly t1 at the end if h divides the interval."""
+        return self.t1 if k == self.n_steps and self.remainder == 0 else self.t0 + k * self.h
+
+    def locate(self, t: np.ndarray, bounded: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """Counts k and signed remainders r with t = t0 + k·h + r, 0 ≤ r/h < 1."""
+        if bounded:
+            low, high = sorted((self.t0, self.t1))
+            if t.size and not (t.min() >= low and t.max() <= high):
+                raise ValueError(f"`t` must lie in [{low:g}, {high:g}], the interval that was solved.")
+        x = (t - self.t0) / self.h
+        nearest = np.rint(x)
+        tolerance = (
+            4
+            * np.finfo(float).eps
+            * np.maximum(np.abs(nearest), np.maximum(np.abs(t), abs(self.t0)) / abs(self.h))
+        )
+        on_grid = np.abs(x - nearest) <= np.maximum(tolerance, np.finfo(float).eps)
+        count = np.where(on_grid, nearest, np.floor(x)).astype(np.int64)
+        remainder = np.where(on_grid, 0.0, t - (self.t0 + count * self.h))
+        return count, remainder
+
+    def outputs(
+        self, t_eval: np.ndarray | None, save_every: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Output times (n,), their counts and remainders: `t_eval`, or every `save_every`-th step and the end."""
+        if t_eval is not None:
+            return t_eval, *self.locate(t_eval)
+        count = np.arange(0, self.n_steps + 1, save_every)
+        t = self.t0 + count * self.h
+        remainder = np.zeros(len(count))
+        if self.remainder or count[-1] != self.n_steps:
+            count, t = np.append(count, self.n_steps), np.append(t, self.t1)
+            remainder = np.append(remainder, self.remainder)
+        elif self.n_steps:
+            t[-1] = self.t1
+        return t, count, remainder

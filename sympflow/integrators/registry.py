@@ -1,0 +1,150 @@
+"""Integrators by name: the built-in ones, those registered at run time, and those of installed plug-ins."""
+
+from __future__ import annotations
+
+import difflib
+import warnings
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from sympflow.integrators.base import Integrator
+from sympflow.integrators.schemes import SCHEMES
+
+GROUP = "sympflow.integrators"
+"""The entry-point group in which a distribution announces its integrators: `name = "package.module:Class"`."""
+
+_BUILT_IN = {
+    "rk45": "runge_kutta:RK45",
+    "dop853": "runge_kutta:DOP853",
+    "dopri5": "runge_kutta:Dopri5",
+    "sympflow": "sympflow:SympFlowIntegrator",
+    "mlp": "sympflow:MLPIntegrator",
+}
+_registered: dict[str, type[Integrator]] = {}
+
+
+def available() -> list[str]:
+    """The names of all methods: built in, registered, and from plug-ins. Nothing is imported to list them."""
+    return sorted({*SCHEMES, *_BUILT_IN, *_registered, *_plugins()})
+
+
+def get(method: str | type[Integrator]) -> type[Integrator]:
+    """The integrator class of a name; call it with its options: ``get("verlet")(dt=0.05)``.
+
+    Parameters
+    ----------
+    method : str or subclass of Integrator
+
+    Raises
+    ------
+    ValueError
+        If there is no such method.
+    ImportError
+        If the plug-in that provides it cannot be loaded.
+    """
+    if isinstance(method, type) and issubclass(method, Integrator):
+        return method
+    if not isinstance(method, str):
+        raise TypeError(f"`method` must be a name or an Integrator class; got {type(method).__name__}.")
+    if method in SCHEMES:
+        from sympflow.integrators.splitting import splitting
+
+        return splitting(method)
+    if method in _BUILT_IN:
+        module, _, attribute = _BUILT_IN[method].partition(":")
+        return getattr(import_module(f"sympflow.integrators.{module}"), attribute)
+    if method in _registered:
+        return _registered[method]
+    if method in _plugins():
+        return _load(_plugins()[method])
+    close = difflib.get_close_matches(method.lower(), available(), n=1)
+    hint = f" Did you mean {close[0]!r}?" if close else ""
+    raise ValueError(f"`method` {method!r} is unknown.{hint} Choose one of {', '.join(available())}.")
+
+
+def register(name: str, integrator: type[Integrator]) -> None:
+    """Make an integrator class available under a name, in this process.
+
+    Raises
+    ------
+    ValueError
+        If the name is that of a built-in method.
+    TypeError
+        If `integrator` is not a subclass of Integrator.
+    """
+    if name in SCHEMES or name in _BUILT_IN:
+        raise ValueError(
+            f"`name` {name!r} is a built-in method, which cannot be replaced: choose another name."
+        )
+    if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
+        raise TypeError(
+            f"`integrator` must be a subclass of sympflow.integrators.base.Integrator; got {integrator!r}."
+        )
+    _registered[name] = integrator
+
+
+def build(method: Any, options: dict[str, Any]) -> Integrator:
+    """The integrator that `solve(method=..., **options)` means: a name, a class, an instance or a trained flow.
+
+    Raises
+    ------
+    TypeError
+        If an option is not one of the method's.
+    """
+    if isinstance(method, Integrator):
+        if options:
+            raise TypeError(
+                f"`{next(iter(options))}` cannot be given with a configured integrator: set it when you build that one."
+            )
+        return method
+    if _is_flow(method):
+        options = {"flow": method, **options}
+        method = method.kind
+    cls = get(method)
+    unknown = [name for name in options if name not in cls.options()]
+    if unknown:
+        raise TypeError(
+            f"`{unknown[0]}` is not an option of method {cls.name!r}, which takes {', '.join(cls.options()) or 'none'}: "
+            "remove it or choose another method."
+        )
+    return cls(**options)
+
+
+def _is_flow(method: Any) -> bool:
+    return hasattr(method, "layers") or type(method).__name__ == "MLPFlow"
+
+
+@cache
+def _plugins() -> dict[str, EntryPoint]:
+    found: dict[str, EntryPoint] = {}
+    for point in entry_points(group=GROUP):
+        if point.name in SCHEMES or point.name in _BUILT_IN or point.name in found:
+            warnings.warn(
+                f"The integrator {point.name!r} of {_distribution(point)} is ignored: the name is taken.",
+                RuntimeWarning,
+                stacklevel=4,
+            )
+        else:
+            found[point.name] = point
+    return found
+
+
+def _load(point: EntryPoint) -> type[Integrator]:
+    try:
+        integrator = point.load()
+    except Exception as error:
+        raise ImportError(
+            f"`method` {point.name!r} of the plug-in {_distribution(point)} cannot be loaded ({error}): "
+            "reinstall or remove that distribution."
+        ) from error
+    if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
+        raise ImportError(
+            f"`method` {point.name!r} of the plug-in {_distribution(point)} is no Integrator class: report it there."
+        )
+    return integrator
+
+
+def _distribution(point: EntryPoint) -> str:
+    return point.dist.name if point.dist is not None else point.value

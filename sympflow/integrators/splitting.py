@@ -1,0 +1,116 @@
+"""The one stepper that runs any splitting scheme on a separable system."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar
+
+import numpy as np
+
+from sympflow.arrays import Array, concatenate, per_state, to_numpy
+from sympflow.integrators.base import FixedStep, Problem
+from sympflow.integrators.schemes import SCHEMES, Scheme
+from sympflow.system import HamiltonianSystem
+
+
+@dataclass(frozen=True)
+class Splitting(FixedStep):
+    """Kicks p += b h F(q) and drifts q += a h ∇T(p) in the order and with the coefficients of a `Scheme`.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Step length; the default is `system.dt`.
+    """
+
+    scheme: ClassVar[Scheme]
+    symplectic: ClassVar[bool] = True
+
+    def check(self, system: HamiltonianSystem) -> None:
+        if not system.separable:
+            raise ValueError(
+                f"`method` {self.name!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use a "
+                "Runge–Kutta method or train a SympFlow."
+            )
+        if (self.scheme.nystrom or any(self.scheme.gradients)) and not system.quadratic_kinetic:
+            raise ValueError(
+                f"`method` {self.name!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.name!r} has not: use a scheme "
+                "for any separable system, such as 'kahan_li8'."
+            )
+
+    def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        self.check(system)
+        q, p = y[..., : system.ndof], y[..., system.ndof :]
+        h = per_state(h, y)
+        for kind, c, c3 in self.scheme.substeps:
+            if kind == "drift":
+                q = q + (c * h) * system.velocity(p)
+            else:
+                p = p + _kick(system, q, c * h, c3 * h**3 if c3 else 0.0)
+        return concatenate([q, p])
+
+    def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        self.check(system)
+        q, p = y[..., : system.ndof], y[..., system.ndof :]
+        h = per_state(h, y)
+        for kind, c, c3 in reversed(self.scheme.substeps):
+            if kind == "drift":
+                q = q - (c * h) * system.velocity(p)
+            else:
+                p = p - _kick(system, q, c * h, c3 * h**3 if c3 else 0.0)
+        return concatenate([q, p])
+
+    def tangent(
+        self, system: HamiltonianSystem, t: float, y: Array, h: Array
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if any(self.scheme.gradients):  # would need third derivatives of V: differentiate the step itself
+            return super().tangent(system, t, y, h)
+        d = system.ndof
+        y = to_numpy(y)
+        q, p, h = y[..., :d], y[..., d:], np.asarray(h, dtype=y.dtype)[..., None]
+        A = np.broadcast_to(np.eye(2 * d, dtype=y.dtype), (*y.shape, 2 * d)).copy()
+        for kind, c, _ in self.scheme.substeps:
+            if kind == "drift":
+                q = q + c * h * system.velocity(p)
+                A[..., :d, :] += c * h[..., None] * (system.kinetic_hessian(p) @ A[..., d:, :])
+            else:
+                A[..., d:, :] -= c * h[..., None] * (system.potential_hessian(q) @ A[..., :d, :])
+                p = p + c * h * system.force(q)
+        return np.concatenate([q, p], axis=-1), A
+
+    def rollout(
+        self, problem: Problem, h: float, n_steps: int, save: np.ndarray
+    ) -> tuple[Array, np.ndarray, str]:
+        self.check(problem.system)
+        return super().rollout(problem, h, n_steps, save)
+
+    def evaluations(self, system: HamiltonianSystem, n_steps: int, n_extra: int) -> dict[str, int]:
+        kicks = [c3 != 0 for kind, _, c3 in self.scheme.substeps if kind == "kick"]
+        return {
+            "force_evaluations": (n_steps + n_extra) * len(kicks),
+            "hessian_evaluations": (n_steps + n_extra) * sum(kicks),
+        }
+
+
+def _kick(system: HamiltonianSystem, q: Array, c: float | Array, c3: float | Array) -> Array:
+    """c·F(q) + c3·∇²V(q) M⁻¹∇V(q), the second term only where the scheme has a force gradient."""
+    force = system.force(q)
+    if isinstance(c3, float) and c3 == 0.0:
+        return c * force
+    gradient = (system.potential_hessian(q) @ system.velocity(force)[..., None])[..., 0]
+    return c * force - c3 * gradient
+
+
+@cache
+def splitting(name: str) -> type[Splitting]:
+    """The integrator class of the scheme of that name."""
+    scheme = SCHEMES[name]
+    namespace = {
+        "name": name,
+        "order": scheme.order,
+        "scheme": scheme,
+        "__doc__": f"{name}: order {scheme.order}, {scheme.source}\n\n{Splitting.__doc__}",
+        "__module__": __name__,
+    }
+    return dataclass(frozen=True)(type(name, (Splitting,), namespace))

@@ -1,0 +1,152 @@
+"""Trained flows as integrators: a SympFlow, and the unconstrained MLP that it is compared with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch
+
+from sympflow.arrays import Array, is_tensor
+from sympflow.integrators.base import FixedStep, Problem
+from sympflow.system import HamiltonianSystem
+
+if TYPE_CHECKING:
+    from sympflow.flow.mlp import MLPFlow
+    from sympflow.flow.sympflow import SympFlow
+
+
+@dataclass(frozen=True)
+class FlowIntegrator(FixedStep):
+    """A trained flow ψ̄ on the grid t0 + k·Δt: ψ_t = ψ̄_{t−kΔt} ∘ (ψ̄_Δt)^k, and its exact inverse for t < t0.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Step length, at most the flow's Δt, which is the default. A smaller one composes ψ̄_dt, which is another map.
+    flow : SympFlow or MLPFlow, optional
+        The default is the flow shipped for the system.
+    """
+
+    flow: Any = field(default=None, repr=False)
+
+    order: ClassVar[int | None] = None
+    trained: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.flow is None:
+            return
+        if getattr(self.flow, "kind", None) != self.name:
+            raise TypeError(
+                f"`flow` must be a trained flow of kind {self.name!r}; got {type(self.flow).__name__}. Load one with "
+                "sympflow.load or train one with sympflow.train."
+            )
+        self._check_dt(self.flow)
+
+    def _check_dt(self, flow: Any) -> None:
+        if self.dt is not None and self.dt > flow.dt * (1 + 1e-12):
+            raise ValueError(
+                f"`dt` must be at most the flow's Δt = {flow.dt:g}, beyond which ψ̄ was not trained; got {self.dt:g}."
+            )
+
+    def flow_for(self, system: HamiltonianSystem) -> SympFlow | MLPFlow:
+        """The flow that is used for a system: the one given, else the one shipped."""
+        if self.flow is not None:
+            return self.flow
+        from sympflow.flow.io import shipped
+
+        return shipped(system, self.name)
+
+    def check(self, system: HamiltonianSystem) -> None:
+        flow = self.flow_for(system)
+        flow.check_system(system)
+        self._check_dt(flow)
+
+    def step_length(self, system: HamiltonianSystem) -> float:
+        return float(self.dt if self.dt is not None else self.flow_for(system).dt)
+
+    def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        return self._apply(self.flow_for(system), y, h)
+
+    def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        flow = self.flow_for(system)
+        return self._apply(flow.inverse, y, h)
+
+    def _apply(self, function: Any, y: Array, h: float | Array) -> Array:
+        """function(h, y) of tensors, for tensors or arrays."""
+        if is_tensor(y):
+            return function(h, y)
+        with torch.no_grad():
+            length = torch.from_numpy(np.array(h)) if np.ndim(h) else float(h)
+            return function(length, torch.from_numpy(np.ascontiguousarray(y))).numpy()
+
+    def rollout(
+        self, problem: Problem, h: float, n_steps: int, save: np.ndarray
+    ) -> tuple[Array, np.ndarray, str]:
+        y0, flow = problem.y0, self.flow_for(problem.system)
+        _check_match(y0, flow)
+        if is_tensor(y0):
+            return super().rollout(problem, h, n_steps, save)
+        with torch.no_grad():
+            tensors = Problem(
+                problem.system, problem.t0, problem.t1, torch.from_numpy(np.ascontiguousarray(y0))
+            )
+            states, finite, _ = super().rollout(tensors, h, n_steps, save)
+        return states.numpy(), finite, "torch"
+
+
+def _check_match(y0: Array, flow: Any) -> None:
+    """Raise unless the state has the dtype and device of the flow's weights."""
+    weight = next(flow.parameters())
+    dtype = y0.dtype if is_tensor(y0) else torch.from_numpy(np.empty(0, y0.dtype)).dtype
+    if dtype != weight.dtype:
+        raise TypeError(
+            f"`y0` is {dtype}, but the flow's weights are {weight.dtype}: convert one, e.g. flow.to({dtype})."
+        )
+    device = y0.device if is_tensor(y0) else torch.device("cpu")
+    if device != weight.device:
+        raise ValueError(
+            f"`y0` is on {device}, but the flow is on {weight.device}: move one of them, e.g. y0.to(...)."
+        )
+
+
+@dataclass(frozen=True)
+class SympFlowIntegrator(FlowIntegrator):
+    """A trained SympFlow: symplectic for every step length, with an exact inverse.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Step length, at most the flow's Δt, which is the default. A smaller one composes ψ̄_dt, which is another map.
+    flow : SympFlow, optional
+        The default is the flow shipped for the system.
+
+    References
+    ----------
+    .. [1] P. Canizares, D. Murari, C.-B. Schönlieb, F. Sherry, Z. Shumaylov, "Hamiltonian matching for symplectic
+       neural integrators" (2024).
+    """
+
+    name: ClassVar[str] = "sympflow"
+    symplectic: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class MLPIntegrator(FlowIntegrator):
+    """The paper's baseline: an unconstrained neural flow map. Not symplectic; no inverse, so no backward time.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Step length, at most the flow's Δt, which is the default.
+    flow : MLPFlow, optional
+        The default is the flow shipped for the system.
+    """
+
+    name: ClassVar[str] = "mlp"
+    symplectic: ClassVar[bool] = False
+
+    def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        raise TypeError("`method` 'mlp' has no exact inverse: use a symplectic method.")

@@ -1,0 +1,126 @@
+"""Solution: what `solve` returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sympflow.arrays import Array, to_numpy
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
+
+    from sympflow.integrators.base import Integrator
+    from sympflow.system import HamiltonianSystem
+
+
+@dataclass
+class Solution:
+    """The solution of an initial value problem, with SciPy's fields.
+
+    Attributes
+    ----------
+    t : ndarray of shape (n,)
+        Output times.
+    y : ndarray or tensor of shape (..., 2d, n)
+        States [q, p], time last, as in SciPy.
+    sol : callable or None
+        Dense output: sol(t) has shape (..., 2d) for a number t, (..., 2d, n) for an array.
+    t_events, y_events : None
+        Events, as in SciPy.
+    nfev : int
+        Force (right-hand side) evaluations.
+    status : int, or ndarray of the batch's shape
+        0: the end was reached. −1: the solution became non-finite, or the step size underflowed. 1: an event ended it.
+    message : str
+        In words, with the time and the remedy.
+    stats : dict
+        n_steps, force_evaluations, hessian_evaluations, wall_time (seconds), backend, and dt for fixed steps.
+    system, integrator, t_span, y0
+        The problem that was solved and the method that did it: metrics execute the run again from these.
+    """
+
+    t: np.ndarray
+    y: Array
+    status: int | np.ndarray
+    message: str
+    stats: dict[str, Any]
+    system: HamiltonianSystem = field(repr=False)
+    integrator: Integrator
+    t_span: tuple[float, float]
+    y0: Array = field(repr=False)
+    sol: Callable[[Any], Array] | None = field(default=None, repr=False)
+    t_events: list[np.ndarray] | None = field(default=None, repr=False)
+    y_events: list[np.ndarray] | None = field(default=None, repr=False)
+
+    @property
+    def nfev(self) -> int:
+        return int(self.stats["force_evaluations"])
+
+    @property
+    def success(self) -> bool:
+        """Whether every trajectory reached the end (or an event that ends it)."""
+        return bool(np.all(np.asarray(self.status) >= 0))
+
+    @property
+    def q(self) -> Array:
+        """Positions (..., d, n)."""
+        return self.y[..., : self.system.ndof, :]
+
+    @property
+    def p(self) -> Array:
+        """Momenta (..., d, n)."""
+        return self.y[..., self.system.ndof :, :]
+
+    @property
+    def states(self) -> Array:
+        """The states with [q, p] last: (..., n, 2d)."""
+        return self.y.swapaxes(-1, -2)
+
+    def energy(self) -> Array:
+        """H along the solution: (..., n)."""
+        with np.errstate(all="ignore"):
+            return self.system.hamiltonian(self.states)
+
+    def energy_error(self) -> np.ndarray:
+        """Relative energy error over time, (..., n); see `sympflow.energy_error`."""
+        from sympflow.metrics.energy import energy_error
+
+        return energy_error(self)
+
+    def to_scipy(self) -> OptimizeResult:
+        """The `OdeResult` that `scipy.integrate.solve_ivp` would have returned; of a single trajectory.
+
+        Raises
+        ------
+        ValueError
+            For a batch.
+        """
+        from scipy.integrate._ivp.ivp import OdeResult
+
+        if self.y.ndim != 2:
+            raise ValueError(
+                "`solution` is a batch, which SciPy's result cannot hold: convert one trajectory at a time."
+            )
+        return OdeResult(
+            t=self.t,
+            y=to_numpy(self.y),
+            sol=self.sol,
+            t_events=self.t_events,
+            y_events=self.y_events,
+            nfev=self.nfev,
+            njev=0,
+            nlu=0,
+            status=self.status,
+            message=self.message,
+            success=self.success,
+        )
+
+    def raise_for_status(self) -> Solution:
+        """Raise a RuntimeError with the message unless the run succeeded; else return the solution."""
+        if not self.success:
+            raise RuntimeError(self.message)
+        return self

@@ -1,0 +1,237 @@
+"""solve(): validates, picks the integrator, drives it, and returns a Solution."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.domain import EnergySublevel
+from sympflow.integrators.base import Integrator, Outcome, Problem
+from sympflow.integrators.registry import build
+from sympflow.solution import Solution
+from sympflow.system import HamiltonianSystem
+
+MAX_SAVED_VALUES = 10_000_000
+BACKENDS = ("auto", "compiled", "array")
+
+
+def solve(
+    system: HamiltonianSystem,
+    method: Any = "sympflow",
+    t_span: tuple[float, float] | None = None,
+    y0: ArrayLike | Array | None = None,
+    *,
+    t_eval: ArrayLike | None = None,
+    dense_output: bool = False,
+    save_every: int | None = None,
+    dtype: Any = None,
+    backend: str = "auto",
+    on_domain_exit: str | None = None,
+    **options: Any,
+) -> Solution:
+    """Solve x' = J∇H(x), x(t0) = y0.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    method : str, Integrator, or trained flow
+        A name from `sympflow.available()`; or a configured integrator such as ``get("verlet")(dt=0.05)``; or a flow.
+    t_span : (float, float), optional
+        Start and end; the end may lie before the start. The default is the system's.
+    y0 : array_like or tensor of shape (..., 2d), optional
+        Initial state [q, p], or a batch of them. The default is the system's. A NumPy array gives float64 (integers are
+        promoted); a tensor gives a tensor of its dtype and device, and gradients flow to it.
+    t_eval : array_like of shape (n,), optional
+        Times to report, ordered from start to end. The default is every step. No other state is stored.
+    dense_output : bool
+        Whether to return `sol`, a function of t. It stores the state after every step.
+    save_every : int, optional
+        Report every k-th step instead of each; not together with `t_eval`.
+    dtype : "float32" or "float64", optional
+        Precision for a NumPy `y0`.
+    backend : "auto", "compiled" or "array"
+        "auto" runs symbolic systems on NumPy float64 states compiled, everything else with array operations.
+    on_domain_exit : "warn", "stop" or "ignore", optional
+        What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
+        statistics, "stop" ends there with status −1. The default is "warn" for trained flows, whose figures hold in Ω,
+        and "ignore" for classical methods.
+    **options
+        Options of the method: `dt` for fixed steps (default `system.dt`, or the flow's Δt), `rtol` and `atol` for adaptive
+        ones, `flow` for "sympflow" and "mlp".
+
+    Returns
+    -------
+    Solution
+        A run that becomes non-finite ends with status −1 and keeps what was computed.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For bad arguments, at once: the message names the argument and the remedy.
+
+    Examples
+    --------
+    >>> import sympflow
+    >>> sol = sympflow.solve(sympflow.systems.henon_heiles(), "verlet", (0, 10), dt=0.1)
+    >>> sol.y.shape
+    (4, 101)
+    """
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    integrator = build(method, options)
+    integrator.check(system)
+    t0, t1 = _check_t_span(system.t_span if t_span is None else t_span)
+    y_start = _check_y0(system, system.y0 if y0 is None else y0, dtype)
+    times = None if t_eval is None else _check_t_eval(t_eval, t0, t1)
+    every = _check_save_every(save_every, times)
+    if backend not in BACKENDS:
+        raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
+    if not isinstance(dense_output, bool | np.bool_):
+        raise TypeError(f"`dense_output` must be True or False; got {dense_output!r}.")
+    action = on_domain_exit or ("warn" if integrator.trained else "ignore")
+    if action not in ("warn", "stop", "ignore"):
+        raise ValueError(f"`on_domain_exit` must be 'warn', 'stop' or 'ignore'; got {on_domain_exit!r}.")
+    problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend)
+    _check_memory(integrator, problem)
+
+    start = time.perf_counter()
+    outcome = integrator.run(problem)
+    outcome.stats["wall_time"] = time.perf_counter() - start
+    if action != "ignore":
+        _check_domain(outcome, integrator, system, action)
+    y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else np.moveaxis(outcome.y, 0, -1)
+    return Solution(
+        t=outcome.t,
+        y=y,
+        status=outcome.status,
+        message=outcome.message,
+        stats=outcome.stats,
+        system=system,
+        integrator=integrator,
+        t_span=(t0, t1),
+        y0=y_start,
+        sol=outcome.sol,
+    )
+
+
+def _check_t_span(t_span: Any) -> tuple[float, float]:
+    try:
+        t0, t1 = (float(t) for t in t_span)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"`t_span` must be two numbers, start and end; got {t_span!r}.") from error
+    if not (math.isfinite(t0) and math.isfinite(t1)):
+        raise ValueError(f"`t_span` must be finite; got ({t0}, {t1}). Choose an end that can be reached.")
+    return t0, t1
+
+
+def _check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
+    if y0 is None:
+        raise ValueError(f"`y0` is needed: the system {system.name!r} has no default initial state.")
+    size = 2 * system.ndof
+    if is_tensor(y0):
+        if dtype is not None:
+            raise TypeError("`dtype` is for NumPy states: convert the tensor `y0` instead.")
+        if not y0.is_floating_point():
+            raise TypeError(f"`y0` must be a real floating-point tensor; got {y0.dtype}. Use y0.double().")
+    else:
+        try:
+            array = np.asarray(y0)
+            if array.dtype == object or not np.issubdtype(array.dtype, np.number):
+                raise TypeError(f"dtype {array.dtype}")
+        except (TypeError, ValueError) as error:
+            raise TypeError(f"`y0` must be an array of numbers; got {error}.") from error
+        if np.iscomplexobj(array):
+            raise TypeError(
+                "`y0` must be real; got complex numbers. Use y0.real if the imaginary part is zero."
+            )
+        y0 = array.astype(_check_dtype(dtype))
+    if y0.ndim == 0 or y0.shape[-1] != size:
+        raise ValueError(
+            f"`y0` must have shape (..., {size}), [q, p] with {system.ndof} each, for {system.name!r}; got {tuple(y0.shape)}."
+        )
+    if math.prod(y0.shape) == 0:
+        raise ValueError(f"`y0` is an empty batch, of shape {tuple(y0.shape)}: pass at least one state.")
+    if not np.isfinite(to_numpy(y0)).all():
+        raise ValueError("`y0` must be finite; it holds NaN or infinity. Remove these states.")
+    return y0
+
+
+def _check_dtype(dtype: Any) -> np.dtype:
+    try:
+        chosen = np.dtype(np.float64 if dtype is None else dtype)
+    except TypeError:
+        chosen = np.dtype(object)
+    if chosen not in (np.float32, np.float64):
+        raise ValueError(f"`dtype` must be 'float32' or 'float64'; got {dtype!r}.")
+    return chosen
+
+
+def _check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
+    times = np.asarray(to_numpy(t_eval), dtype=float)
+    if times.ndim != 1:
+        raise ValueError(f"`t_eval` must be one-dimensional; got shape {times.shape}.")
+    low, high = min(t0, t1), max(t0, t1)
+    if times.size and not (times.min() >= low and times.max() <= high):
+        raise ValueError(
+            f"`t_eval` must lie within `t_span`, [{low:g}, {high:g}]: extend `t_span` or drop times."
+        )
+    if (np.diff(times) * (1 if t1 >= t0 else -1) < 0).any():
+        raise ValueError("`t_eval` must be ordered from the start of `t_span` to its end: sort it.")
+    return times
+
+
+def _check_save_every(save_every: Any, times: np.ndarray | None) -> int:
+    if save_every is None:
+        return 1
+    if times is not None:
+        raise ValueError("`save_every` and `t_eval` both choose the outputs: give one of them.")
+    if not isinstance(save_every, int | np.integer) or isinstance(save_every, bool) or save_every < 1:
+        raise ValueError(f"`save_every` must be a positive integer; got {save_every!r}.")
+    return int(save_every)
+
+
+def _check_memory(integrator: Integrator, problem: Problem) -> None:
+    """Refuse runs whose outputs would fill the memory."""
+    length = getattr(integrator, "step_length", lambda system: None)(problem.system)
+    if length is None:
+        return
+    n_steps = abs(problem.t1 - problem.t0) / length
+    stored = (
+        n_steps if problem.dense_output else n_steps / problem.save_every if problem.t_eval is None else 0.0
+    )
+    values = (stored + 1) * math.prod(problem.y0.shape)
+    if values > MAX_SAVED_VALUES:
+        raise ValueError(
+            f"`t_eval` is not given, so {values:.3g} values ({values * 8 / 2**30:.1f} GiB) would be stored, more than "
+            f"{MAX_SAVED_VALUES:.0e}: choose the times with `t_eval`, or thin them with `save_every`"
+            f"{', or leave dense_output out' if problem.dense_output else ''}."
+        )
+
+
+def _check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:
+    """Note the first output outside the domain, or end the run there."""
+    flow = getattr(integrator, "flow_for", lambda system: None)(system)
+    domain = getattr(flow, "domain", None) or system.domain
+    if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
+        domain = domain.attach(system.hamiltonian)
+    if domain is None or not len(outcome.t):
+        return
+    slack = float(getattr(flow, "figures", {}).get("energy_error", 0.0))
+    inside = domain.contains(outcome.y, slack=slack).reshape(len(outcome.t), -1).all(1)
+    if inside.all():
+        return
+    first = int(np.argmin(inside))
+    t = float(outcome.t[first])
+    outcome.stats["domain_exit"] = t
+    note = f"The state left the domain at t = {t:.17g}"
+    if action == "warn":
+        outcome.message += f" {note}: the figures of a trained flow do not hold there."
+    else:
+        outcome.t, outcome.y = outcome.t[: first + 1], outcome.y[: first + 1]
+        outcome.status = np.full(np.shape(outcome.status), -1) if np.ndim(outcome.status) else -1
+        outcome.message = f"{note}. Start inside the domain, or pass on_domain_exit='warn'."
