@@ -23,7 +23,11 @@ class CallableHamiltonian:
     ) -> None:
         if (potential is None) == (hamiltonian is None):
             raise TypeError("`potential` or `hamiltonian` must be given, and not both.")
-        for name, function in (("potential", potential), ("hamiltonian", hamiltonian), ("gradient", gradient)):
+        for name, function in (
+            ("potential", potential),
+            ("hamiltonian", hamiltonian),
+            ("gradient", gradient),
+        ):
             if function is not None and not callable(function):
                 raise TypeError(f"`{name}` must be callable; got {type(function).__name__}.")
         if potential is None and (gradient is not None or hessian_vector is not None):

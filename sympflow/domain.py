@@ -89,9 +89,7 @@ class Box:
         object.__setattr__(self, "low", _vector("low", self.low))
         object.__setattr__(self, "high", _vector("high", self.high))
         if np.shape(self.low) != np.shape(self.high):
-            raise ValueError(
-                f"`high` must have the length of `low`; got {np.size(self.high)} and {np.size(self.low)}."
-            )
+            raise ValueError(f"`high` must have the length of `low`; got {np.size(self.high)} and {np.size(self.low)}.")
         if not np.all(np.less(self.low, self.high)):
             raise ValueError(f"`low` must be below `high` in every component; got {self.low}, {self.high}.")
 

@@ -146,9 +146,7 @@ def _check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
         except (TypeError, ValueError) as error:
             raise TypeError(f"`y0` must be an array of numbers; got {error}.") from error
         if np.iscomplexobj(array):
-            raise TypeError(
-                "`y0` must be real; got complex numbers. Use y0.real if the imaginary part is zero."
-            )
+            raise TypeError("`y0` must be real; got complex numbers. Use y0.real if the imaginary part is zero.")
         y0 = array.astype(_check_dtype(dtype))
     if y0.ndim == 0 or y0.shape[-1] != size:
         raise ValueError(
@@ -177,9 +175,7 @@ def _check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
         raise ValueError(f"`t_eval` must be one-dimensional; got shape {times.shape}.")
     low, high = min(t0, t1), max(t0, t1)
     if times.size and not (times.min() >= low and times.max() <= high):
-        raise ValueError(
-            f"`t_eval` must lie within `t_span`, [{low:g}, {high:g}]: extend `t_span` or drop times."
-        )
+        raise ValueError(f"`t_eval` must lie within `t_span`, [{low:g}, {high:g}]: extend `t_span` or drop times.")
     if (np.diff(times) * (1 if t1 >= t0 else -1) < 0).any():
         raise ValueError("`t_eval` must be ordered from the start of `t_span` to its end: sort it.")
     return times
@@ -201,9 +197,7 @@ def _check_memory(integrator: Integrator, problem: Problem) -> None:
     if length is None:
         return
     n_steps = abs(problem.t1 - problem.t0) / length
-    stored = (
-        n_steps if problem.dense_output else n_steps / problem.save_every if problem.t_eval is None else 0.0
-    )
+    stored = n_steps if problem.dense_output else n_steps / problem.save_every if problem.t_eval is None else 0.0
     values = (stored + 1) * math.prod(problem.y0.shape)
     if values > MAX_SAVED_VALUES:
         raise ValueError(

@@ -105,7 +105,9 @@ class SymbolicHamiltonian:
 
     def _vector(self, name: str) -> Callable[[Array], Array]:
         return self._function(
-            name + "'", lambda f, x: [sp.diff(f, s) for s in x], lambda values, like, n: assemble(values, like)
+            name + "'",
+            lambda f, x: [sp.diff(f, s) for s in x],
+            lambda values, like, n: assemble(values, like),
         )
 
     def _matrix(self, name: str) -> Callable[[Array], Array]:

@@ -83,9 +83,7 @@ class Integrator:
         """The state from which `step(system, t, ·, h)` leads to y."""
         raise TypeError(f"`method` {self.name!r} has no exact inverse: use a symplectic method.")
 
-    def tangent(
-        self, system: HamiltonianSystem, t: float, y: Array, h: Array
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         """The step from y (..., 2d) and its Jacobian A (..., 2d, 2d), by forward-mode differentiation of `step`."""
         import torch
 
@@ -127,9 +125,7 @@ class FixedStep(Integrator):
 
     def __post_init__(self) -> None:
         if self.dt is not None and not (
-            isinstance(self.dt, int | float | np.number)
-            and not isinstance(self.dt, bool)
-            and 0 < self.dt < math.inf
+            isinstance(self.dt, int | float | np.number) and not isinstance(self.dt, bool) and 0 < self.dt < math.inf
         ):
             raise ValueError(f"`dt` must be a positive and finite number; got {self.dt!r}.")
 
@@ -141,9 +137,7 @@ class FixedStep(Integrator):
         """Counted work of `n_steps` steps on the grid and `n_extra` shorter ones, for the statistics."""
         return {"force_evaluations": 0, "hessian_evaluations": 0}
 
-    def rollout(
-        self, problem: Problem, h: float, n_steps: int, save: np.ndarray
-    ) -> tuple[Array, np.ndarray, str]:
+    def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         """States after the steps `save` (sorted counts in 0 … n_steps): (len(save), ..., 2d).
 
         Also the index of the last finite state of each trajectory, and the backend that ran.

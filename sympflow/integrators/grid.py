@@ -40,18 +40,14 @@ class Grid:
         x = (t - self.t0) / self.h
         nearest = np.rint(x)
         tolerance = (
-            4
-            * np.finfo(float).eps
-            * np.maximum(np.abs(nearest), np.maximum(np.abs(t), abs(self.t0)) / abs(self.h))
+            4 * np.finfo(float).eps * np.maximum(np.abs(nearest), np.maximum(np.abs(t), abs(self.t0)) / abs(self.h))
         )
         on_grid = np.abs(x - nearest) <= np.maximum(tolerance, np.finfo(float).eps)
         count = np.where(on_grid, nearest, np.floor(x)).astype(np.int64)
         remainder = np.where(on_grid, 0.0, t - (self.t0 + count * self.h))
         return count, remainder
 
-    def outputs(
-        self, t_eval: np.ndarray | None, save_every: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def outputs(self, t_eval: np.ndarray | None, save_every: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Output times (n,), their counts and remainders: `t_eval`, or every `save_every`-th step and the end."""
         if t_eval is not None:
             return t_eval, *self.locate(t_eval)

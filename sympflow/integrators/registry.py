@@ -75,13 +75,9 @@ def register(name: str, integrator: type[Integrator]) -> None:
         If `integrator` is not a subclass of Integrator.
     """
     if name in SCHEMES or name in _BUILT_IN:
-        raise ValueError(
-            f"`name` {name!r} is a built-in method, which cannot be replaced: choose another name."
-        )
+        raise ValueError(f"`name` {name!r} is a built-in method, which cannot be replaced: choose another name.")
     if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
-        raise TypeError(
-            f"`integrator` must be a subclass of sympflow.integrators.base.Integrator; got {integrator!r}."
-        )
+        raise TypeError(f"`integrator` must be a subclass of sympflow.integrators.base.Integrator; got {integrator!r}.")
     _registered[name] = integrator
 
 

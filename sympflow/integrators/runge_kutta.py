@@ -40,9 +40,7 @@ class RungeKutta(Integrator):
             if not (isinstance(value, int | float) and 0 <= value < math.inf):
                 raise ValueError(f"`{name}` must be a finite number, not negative; got {value!r}.")
         if self.rtol == 0 and self.atol == 0:
-            raise ValueError(
-                "`rtol` and `atol` are both 0, which no step can meet: make one of them positive."
-            )
+            raise ValueError("`rtol` and `atol` are both 0, which no step can meet: make one of them positive.")
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         """One step without error control."""
@@ -52,9 +50,7 @@ class RungeKutta(Integrator):
             K.append(system.vector_field(y + h * _weighted(row, K) if K else y))
         return y + h * _weighted(self.B, K)
 
-    def tangent(
-        self, system: HamiltonianSystem, t: float, y: Array, h: Array
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         """The step and its Jacobian, the step length held fixed: each stage differentiated as it is executed."""
         y = to_numpy(y)
         h = np.asarray(h, dtype=y.dtype)[..., None]
@@ -158,9 +154,7 @@ class _Scipy(RungeKutta):
                     failure = f"{failure} The solver stopped at t = {solver.t:.17g}."
                     break
                 if not np.isfinite(solver.y).all():
-                    failure = (
-                        f"The solution became non-finite after t = {solver.t_old:.17g}. End `t_span` earlier."
-                    )
+                    failure = f"The solution became non-finite after t = {solver.t_old:.17g}. End `t_span` earlier."
                     break
                 stats["n_steps"] += 1
                 due = [t for t in wanted[len(outputs) :] if (solver.t - t) * solver.direction >= 0]
@@ -325,8 +319,7 @@ class Dopri5(RungeKutta):
                 except AssertionError as error:  # torchdiffeq's step underflow, or a state that is not finite
                     reached = t0 if record.reached is None else record.reached
                     failure = (
-                        failure
-                        or f"torchdiffeq stopped after t = {reached:.17g} ({error}). End `t_span` earlier."
+                        failure or f"torchdiffeq stopped after t = {reached:.17g} ({error}). End `t_span` earlier."
                     )
                     distinct = distinct[(distinct - reached) * sign <= 0][: len(distinct) - 1]
                     record = _Record(system, keep)
@@ -371,9 +364,7 @@ class _Again:
     def __call__(self, t: Any) -> Array:
         times = np.atleast_1d(np.asarray(t, dtype=float))
         order = np.argsort(times * (1 if self.problem.t1 >= self.problem.t0 else -1))
-        y, _, failure = self.integrator._integrate(
-            self.problem.system, self.problem.t0, times[order], self.problem.y0
-        )
+        y, _, failure = self.integrator._integrate(self.problem.system, self.problem.t0, times[order], self.problem.y0)
         if failure:
             raise ValueError(f"`t` reaches beyond the solution: {failure}")
         y = y[np.argsort(order)]

@@ -173,10 +173,7 @@ _BLANES_MOAN = (
     "S. Blanes and P. C. Moan, Practical symplectic partitioned Runge–Kutta and Runge–Kutta–Nyström methods, "
     "J. Comput. Appl. Math. 142 (2002) 313–330"
 )
-_CHIN = (
-    "S. A. Chin, Symplectic integrators from composite operator factorizations, "
-    "Phys. Lett. A 226 (1997) 344–348"
-)
+_CHIN = "S. A. Chin, Symplectic integrators from composite operator factorizations, Phys. Lett. A 226 (1997) 344–348"
 _OMELYAN = (
     "I. P. Omelyan, I. M. Mryglod and R. Folk, Construction of high-order force-gradient algorithms for "
     "integration of motion in classical and quantum systems, Phys. Rev. E 66 (2002) 026701"
@@ -219,9 +216,7 @@ _TABLE = (
     compose(
         "yoshida6",
         6,
-        _palindrome(
-            (0.78451361047755726381949763, 0.23557321335935813368479318, -1.17767998417887100694641568)
-        ),
+        _palindrome((0.78451361047755726381949763, 0.23557321335935813368479318, -1.17767998417887100694641568)),
         f"{_YOSHIDA}, solution A of table 1",
     ),
     compose(

@@ -61,9 +61,7 @@ class Splitting(FixedStep):
                 p = p - _kick(system, q, c * h, c3 * h**3 if c3 else 0.0)
         return concatenate([q, p])
 
-    def tangent(
-        self, system: HamiltonianSystem, t: float, y: Array, h: Array
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         if any(self.scheme.gradients):  # would need third derivatives of V: differentiate the step itself
             return super().tangent(system, t, y, h)
         d = system.ndof
@@ -79,9 +77,7 @@ class Splitting(FixedStep):
                 p = p + c * h * system.force(q)
         return np.concatenate([q, p], axis=-1), A
 
-    def rollout(
-        self, problem: Problem, h: float, n_steps: int, save: np.ndarray
-    ) -> tuple[Array, np.ndarray, str]:
+    def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         self.check(problem.system)
         return super().rollout(problem, h, n_steps, save)
 

@@ -82,17 +82,13 @@ class FlowIntegrator(FixedStep):
             length = torch.from_numpy(np.array(h)) if np.ndim(h) else float(h)
             return function(length, torch.from_numpy(np.ascontiguousarray(y))).numpy()
 
-    def rollout(
-        self, problem: Problem, h: float, n_steps: int, save: np.ndarray
-    ) -> tuple[Array, np.ndarray, str]:
+    def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         y0, flow = problem.y0, self.flow_for(problem.system)
         _check_match(y0, flow)
         if is_tensor(y0):
             return super().rollout(problem, h, n_steps, save)
         with torch.no_grad():
-            tensors = Problem(
-                problem.system, problem.t0, problem.t1, torch.from_numpy(np.ascontiguousarray(y0))
-            )
+            tensors = Problem(problem.system, problem.t0, problem.t1, torch.from_numpy(np.ascontiguousarray(y0)))
             states, finite, _ = super().rollout(tensors, h, n_steps, save)
         return states.numpy(), finite, "torch"
 
@@ -107,9 +103,7 @@ def _check_match(y0: Array, flow: Any) -> None:
         )
     device = y0.device if is_tensor(y0) else torch.device("cpu")
     if device != weight.device:
-        raise ValueError(
-            f"`y0` is on {device}, but the flow is on {weight.device}: move one of them, e.g. y0.to(...)."
-        )
+        raise ValueError(f"`y0` is on {device}, but the flow is on {weight.device}: move one of them, e.g. y0.to(...).")
 
 
 @dataclass(frozen=True)
