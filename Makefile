@@ -1,0 +1,35 @@
+# A fresh clone needs Python >= 3.11 and make. Every target installs what it needs into .venv first.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint bench docs clean
+
+help:  ## Show the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
+
+.venv/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[plot,cli]'
+	@touch $@
+
+.venv/installed-test: .venv/installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
+	@touch $@
+
+demo: .venv/installed  ## Solve and compare on Hénon–Heiles with the shipped flow; figures in out/
+	$(BIN)/sympflow compare henon-heiles --methods sympflow,mlp,verlet,leapfrog,rk45 --t-end 1000 --out out/
+
+test: .venv/installed-test lint  ## Lint, types and tests
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+lint: .venv/installed-test  ## Lint and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: .venv/installed-test  ## The benchmarks that the docs quote
+	$(BIN)/python benchmarks/training_step.py
+
+clean:  ## Remove the environment and everything generated
+	rm -rf .venv out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
