@@ -46,10 +46,10 @@ class CallableHamiltonian:
         return _with_torch(self._H, y, "hamiltonian", ())
 
     def gradient(self, y: Array) -> Array:
-        return _with_torch(_gradient_of(self._H), y, "hamiltonian", (2 * self.ndof,))
+        return _with_torch(_gradient_of(self._H, "hamiltonian"), y, "hamiltonian", (2 * self.ndof,))
 
     def hessian(self, y: Array) -> Array:
-        return _with_torch(_hessian_of(self._H), y, "hamiltonian", (2 * self.ndof, 2 * self.ndof))
+        return _with_torch(_hessian_of(self._H, "hamiltonian"), y, "hamiltonian", (2 * self.ndof, 2 * self.ndof))
 
     def _H(self, y: Array) -> Array:
         assert self._hamiltonian is not None
@@ -65,7 +65,7 @@ class CallableHamiltonian:
         if self._gradient is not None:
             return _checked(self._gradient(q), q, "gradient", (self.ndof,))
         assert self._potential is not None
-        return _with_torch(_gradient_of(self._potential), q, "potential", (self.ndof,))
+        return _with_torch(_gradient_of(self._potential, "potential"), q, "potential", (self.ndof,))
 
     def potential_hessian(self, q: Array) -> Array:
         if self._hessian_vector is not None:
@@ -81,20 +81,20 @@ class CallableHamiltonian:
         if self._gradient is not None:
             return _jacobian(self._gradient, q)
         assert self._potential is not None
-        return _with_torch(_hessian_of(self._potential), q, "potential", (self.ndof, self.ndof))
+        return _with_torch(_hessian_of(self._potential, "potential"), q, "potential", (self.ndof, self.ndof))
 
 
-def _gradient_of(f: Callable[[Array], Array]) -> Callable[[Array], Array]:
+def _gradient_of(f: Callable[[Array], Array], name: str) -> Callable[[Array], Array]:
     def gradient(x: Array) -> Array:
         import torch
 
-        return torch.func.grad(lambda z: f(z).sum())(x)
+        return torch.func.grad(lambda z: _checked(f(z), z, name, ()).sum())(x)
 
     return gradient
 
 
-def _hessian_of(f: Callable[[Array], Array]) -> Callable[[Array], Array]:
-    return lambda x: _jacobian(_gradient_of(f), x)
+def _hessian_of(f: Callable[[Array], Array], name: str) -> Callable[[Array], Array]:
+    return lambda x: _jacobian(_gradient_of(f, name), x)
 
 
 def _jacobian(f: Callable[[Array], Array], x: Array) -> Array:

@@ -1,0 +1,53 @@
+"""What a call does not need is not imported. Each case runs in a fresh interpreter."""
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("torch", "scipy", "matplotlib", "numba", "sympy", "torchdiffeq", "safetensors")
+
+
+def loaded_after(code: str) -> set[str]:
+    script = f"{code}\nimport sys\nprint('loaded:', *(m for m in {HEAVY} if m in sys.modules))"
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return set(result.stdout.rpartition("loaded:")[2].split())
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    assert loaded_after("import sympflow; sympflow.__version__; dir(sympflow)") == set()
+
+
+def test_systems_need_sympy_only():
+    assert loaded_after("import sympflow; sympflow.systems.henon_heiles().force") == {"sympy"}
+
+
+@pytest.mark.parametrize("backend", ["array", "auto"])
+def test_a_verlet_solve_loads_no_torch(backend):
+    code = (
+        "import sympflow\n"
+        f"sol = sympflow.solve(sympflow.systems.henon_heiles(), 'verlet', (0, 1), backend={backend!r})\n"
+        "sol.energy(); sympflow.available()"
+    )
+    assert loaded_after(code) <= {"sympy", "numba"}
+
+
+def test_scipy_methods_load_no_torch():
+    code = "import sympflow\nsympflow.solve(sympflow.systems.pendulum(), 'rk45', (0, 1))"
+    assert loaded_after(code) == {"sympy", "scipy"}
+
+
+def test_energy_metrics_load_no_torch():
+    code = (
+        "import sympflow\n"
+        "sol = sympflow.solve(sympflow.systems.pendulum(), 'verlet', (0, 1), backend='array')\n"
+        "sympflow.max_energy_error(sol); sympflow.volume_error(sol)"
+    )
+    assert "torch" not in loaded_after(code)
+
+
+def test_unknown_attributes_are_attribute_errors():
+    import sympflow
+
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        sympflow.nonsense  # noqa: B018

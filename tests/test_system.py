@@ -1,0 +1,135 @@
+"""HamiltonianSystem: symbolic and callable definitions agree with each other and with automatic differentiation."""
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import Ball, HamiltonianSystem, systems
+
+SYSTEMS = {
+    "harmonic": systems.harmonic_oscillator(3.0),
+    "henon_heiles": systems.henon_heiles(),
+    "pendulum": systems.pendulum(),
+    "masses": HamiltonianSystem.from_sympy("p1**2/4 + p1*p2/5 + p2**2/6 + sin(q1)*exp(q2) + sqrt(2)*q2**2"),
+    "relativistic": HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**4"),
+    "not separable": HamiltonianSystem.from_sympy("(p**2 + q**2)**2/4 + q*p"),
+    "constant force": HamiltonianSystem.from_sympy("p**2/2 + 3*q"),
+    "callable": HamiltonianSystem(lambda q: (q**4).sum(-1) / 4 + torch.cos(q[..., 0]), ndof=2, mass=[1.0, 2.0]),
+    "general": HamiltonianSystem(hamiltonian=lambda q, p: (p**2).sum(-1) / 2 * (1 + q[..., 0] ** 2), ndof=1),
+}
+
+
+def states(system, *batch):
+    return np.random.default_rng(0).uniform(-0.6, 0.6, (*batch, 2 * system.ndof))
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_derivatives_are_those_of_H(name, batch):
+    system = SYSTEMS[name]
+    y = torch.tensor(states(system, *batch))
+
+    def H(x):
+        return system.hamiltonian(x).sum()
+
+    gradient = torch.func.grad(H)(y)
+    d = system.ndof
+    J_gradient = torch.cat([gradient[..., d:], -gradient[..., :d]], -1)
+    torch.testing.assert_close(system.gradient(y), gradient, rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(system.vector_field(y), J_gradient, rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(system(0.0, y), J_gradient, rtol=1e-13, atol=1e-13)
+    flat = y.reshape(-1, 2 * d)
+    hessian = torch.stack([torch.func.hessian(system.hamiltonian)(x) for x in flat]).reshape(*batch, 2 * d, 2 * d)
+    torch.testing.assert_close(system.hessian(y), hessian, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("method", ["hamiltonian", "gradient", "vector_field", "hessian"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_numpy_and_torch_agree_and_keep_the_dtype(name, method, dtype):
+    system = SYSTEMS[name]
+    y = torch.tensor(states(system, 4), dtype=dtype)
+    by_torch, by_numpy = getattr(system, method)(y), getattr(system, method)(y.numpy())
+    assert by_torch.dtype == dtype
+    assert by_numpy.dtype == y.numpy().dtype
+    eps = torch.finfo(dtype).eps
+    np.testing.assert_allclose(by_numpy, by_torch.numpy(), rtol=64 * eps, atol=64 * eps)
+
+
+def test_structure_is_recognised():
+    assert SYSTEMS["henon_heiles"].separable
+    assert SYSTEMS["henon_heiles"].inverse_mass is None  # unit masses are left out
+    assert SYSTEMS["masses"].inverse_mass.shape == (2, 2)
+    assert SYSTEMS["relativistic"].separable
+    assert not SYSTEMS["relativistic"].quadratic_kinetic
+    assert not SYSTEMS["not separable"].separable
+    assert SYSTEMS["callable"].inverse_mass.tolist() == [1.0, 0.5]
+
+
+def test_separable_after_expansion():
+    system = HamiltonianSystem.from_sympy("(p + q)**2/2 - p*q")
+    assert system.separable
+    assert system.inverse_mass is None
+
+
+def test_fingerprint_tells_systems_apart_and_not_definitions():
+    symbolic = systems.henon_heiles()
+    same = HamiltonianSystem(lambda q: (q**2).sum(-1) / 2 + q[..., 0] ** 2 * q[..., 1] - q[..., 1] ** 3 / 3, ndof=2)
+    np.testing.assert_allclose(symbolic.fingerprint, same.fingerprint, rtol=1e-12)
+    assert not np.allclose(systems.harmonic_oscillator(1).fingerprint, systems.harmonic_oscillator(1.001).fingerprint)
+
+
+def test_numpy_functions_do_not_need_torch_when_the_gradient_is_given():
+    system = HamiltonianSystem(lambda q: np.cos(q).sum(-1), gradient=lambda q: -np.sin(q), ndof=1)
+    assert system.force(np.array([0.5])) == pytest.approx(np.sin(0.5))
+    with pytest.raises(ValueError, match="^`hessian_vector` is needed"):
+        system.potential_hessian(np.array([0.5]))
+
+
+def test_hessian_from_hessian_vector_products():
+    system = HamiltonianSystem(
+        lambda q: (q**3).sum(-1), gradient=lambda q: 3 * q**2, hessian_vector=lambda q, v: 6 * q * v, ndof=2
+    )
+    q = np.array([[0.5, 2.0], [1.0, 3.0]])
+    np.testing.assert_array_equal(system.potential_hessian(q), [np.diag([3.0, 12.0]), np.diag([6.0, 18.0])])
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: HamiltonianSystem.from_sympy("p**2/2 + k*q**2"), ValueError, "^`expression` holds k without a value"),
+        (lambda: HamiltonianSystem.from_sympy("p**2/2 + t*q"), TypeError, "^`expression` depends on the time"),
+        (lambda: HamiltonianSystem.from_sympy("p**2/2 + ("), ValueError, "^`expression` cannot be parsed"),
+        (lambda: HamiltonianSystem.from_sympy("p1**2 + q + q2"), ValueError, "^`expression` mixes q, p"),
+        (lambda: HamiltonianSystem.from_sympy("3"), ValueError, "^`expression` must depend on q1"),
+        (lambda: HamiltonianSystem.from_sympy("p**2 + q", params={"k": 1}), ValueError, "^`params` has 'k'"),
+        (lambda: HamiltonianSystem.from_sympy("p**2 + q", y0=[1, 2, 3]), ValueError, r"^`y0` must have shape \(2,\)"),
+        (lambda: HamiltonianSystem.from_sympy("p**2 + q", dt=0), ValueError, "^`dt` must be positive"),
+        (lambda: HamiltonianSystem.from_sympy("p**2 + q", domain=Ball([0.0] * 4, 1)), ValueError, "^`domain` must be"),
+        (lambda: HamiltonianSystem.from_sympy("p**2 + q", energy_scale=0), ValueError, "^`energy_scale` must be"),
+        (lambda: HamiltonianSystem(lambda q: q, ndof=0), ValueError, "^`ndof` must be a positive integer"),
+        (lambda: HamiltonianSystem(ndof=1), TypeError, "^`potential` or `hamiltonian` must be given"),
+        (lambda: HamiltonianSystem(3, ndof=1), TypeError, "^`potential` must be callable"),
+        (lambda: HamiltonianSystem(lambda q: q, ndof=2, mass=[1.0]), ValueError, "^`mass` must be a number"),
+        (lambda: HamiltonianSystem(lambda q: q, ndof=2, mass=[1.0, -1.0]), ValueError, "^`mass` must be finite"),
+        (lambda: HamiltonianSystem(hamiltonian=lambda q, p: q, ndof=1, mass=2), TypeError, "^`mass` only goes with"),
+        (lambda: systems.harmonic_oscillator(-1), ValueError, "^`omega` must be positive"),
+    ],
+)
+def test_bad_definitions_are_named(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("potential", "error", "message"),
+    [
+        (lambda q: q, ValueError, r"^`potential` must return shape \(5,\) .*; got \(5, 2\)"),
+        (lambda q: (q**2).sum(), ValueError, r"^`potential` must return shape \(5,\)"),
+        (lambda q: np.cos(q.detach().numpy()), TypeError, "^`potential` failed on a torch tensor"),
+    ],
+)
+def test_functions_of_the_wrong_kind_are_explained(potential, error, message):
+    system = HamiltonianSystem(potential, ndof=2)
+    with pytest.raises(error, match=message):
+        system.vector_field(np.zeros((5, 4)))
