@@ -1,0 +1,1 @@
+"""The neural part: SympFlow, the unconstrained baseline, and their files."""

@@ -1,0 +1,313 @@
+"""FlowMap: what every learned flow map ψ_t has in common, from its extension to all times to its record."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from sympflow.domain import Domain
+
+if TYPE_CHECKING:
+    from sympflow.system import HamiltonianSystem
+
+MAX_STEPS = 10_000_000
+
+
+class FlowMap(nn.Module):
+    """A learned map ψ̄_t, t ∈ [0, Δt], of states [q, p], and its extension ψ_t to every t.
+
+    Duties of a subclass
+    --------------------
+    1. `_map(t, y)`: ψ̄_t on columns y (2d, N), for a time t that is a float or a tensor () or (N,).
+    2. `_map_inverse(t, y)`: ψ̄_t⁻¹, if it has one.
+    3. `_map_tangent(t, y)`: ψ̄_t(y) and d/dt ψ̄_t(y).
+    4. `architecture()`: a JSON-able description from which `flow.io` builds it again.
+
+    Attributes
+    ----------
+    ndof : int
+    dt : float
+        Δt, the longest time of the bare map.
+    domain : Domain or None
+        Ω, where it was trained.
+    fingerprint, system_name : tuple of float or None, str or None
+        The system it was trained for.
+    recipe, figures : dict
+        How it was trained, and what it achieved.
+    """
+
+    kind: ClassVar[str]
+
+    def __init__(self, ndof: int, dt: float) -> None:
+        super().__init__()
+        if isinstance(ndof, bool) or not isinstance(ndof, int) or ndof < 1:
+            raise ValueError(f"`ndof` must be a positive integer, the degrees of freedom; got {ndof!r}.")
+        if not (isinstance(dt, (int, float)) and 0 < dt < math.inf):
+            raise ValueError(f"`dt` must be a positive finite number, the Δt of the flow; got {dt!r}.")
+        self.ndof, self.dt = ndof, float(dt)
+        self.domain: Domain | None = None
+        self.fingerprint: tuple[float, ...] | None = None
+        self.system_name: str | None = None
+        self.recipe: dict[str, Any] = {}
+        self.figures: dict[str, Any] = {}
+
+    def _map(self, t: float | Tensor, y: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def _map_inverse(self, t: float | Tensor, y: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def _map_tangent(self, t: float | Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        raise NotImplementedError
+
+    def architecture(self) -> dict[str, Any]:
+        raise NotImplementedError
+
+    # the bare map on [0, Δt] --------------------------------------------------------------------------
+
+    def psi(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """ψ̄_t(x) for t ∈ [0, Δt], unchecked and without synchronising with the host: for inner loops.
+
+        `t` is a number or a tensor that broadcasts against the batch shape of `x` (..., 2d).
+        """
+        t, y, batch = self._columns(t, x)
+        return self._states(self._map(t, y), batch)
+
+    def psi_inverse(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """ψ̄_t⁻¹(x) for t ∈ [0, Δt], unchecked."""
+        t, y, batch = self._columns(t, x)
+        return self._states(self._map_inverse(t, y), batch)
+
+    def psi_and_velocity(self, t: float | Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """ψ̄_t(x) and d/dt ψ̄_t(x), each (..., 2d), for t ∈ [0, Δt], unchecked."""
+        t, y, batch = self._columns(t, x)
+        y, dy = self._map_tangent(t, y)
+        return self._states(y, batch), self._states(dy, batch)
+
+    def velocity(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """d/dt ψ̄_t(x), (..., 2d), for t ∈ [0, Δt], in closed form."""
+        t = self._bare_time(t, x)
+        return self.psi_and_velocity(t, x)[1]
+
+    # every t ------------------------------------------------------------------------------------------
+
+    def forward(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """ψ_t(x) for every t.
+
+        ψ_t = ψ̄_r ∘ (ψ̄_Δt)^k with k = ⌊t/Δt⌋, r = t − kΔt; for t < 0 it is (ψ̄_r)⁻¹ ∘ (ψ̄_Δt)⁻ᵏ with |t| for t.
+        k is an integer count: a t that is a multiple of Δt up to rounding is exactly k steps.
+
+        Parameters
+        ----------
+        t : float or tensor
+            One time, or a tensor that broadcasts against the batch shape of x.
+        x : tensor, shape (..., 2d)
+            In the dtype and on the device of the flow.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If an argument has the wrong type, shape, dtype or device, or t is not finite.
+        """
+        t = self._checked(t, x)
+        if isinstance(t, float):
+            return self._whole(self._count(t), t < 0, x)
+        k, r, back, x = self._split(t, x)
+        x = self._repeat(k * ~back, False, x)
+        x = self._repeat(k * back, True, x)
+        return self._remainder(r, back, x)
+
+    def inverse(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """The exact inverse of ψ_t, for every t: arguments as for the call."""
+        t = self._checked(t, x)
+        if isinstance(t, float):
+            return self._whole(self._count(t), t >= 0, x, remainder_first=True)
+        k, r, back, x = self._split(t, x)
+        x = self._remainder(r, ~back, x)
+        x = self._repeat(k * ~back, True, x)
+        return self._repeat(k * back, False, x)
+
+    def _count(self, t: float) -> tuple[int, float]:
+        return whole_steps(abs(t), self.dt)
+
+    def _whole(self, count: tuple[int, float], back: bool, x: Tensor, remainder_first: bool = False) -> Tensor:
+        """k steps and the remainder of one time for all states."""
+        k, r = count
+        _, y, batch = self._columns(self.dt, x)
+        step = self._map_inverse if back else self._map
+        if r and remainder_first:
+            y = step(r, y)
+        for _ in range(k):
+            y = step(self.dt, y)
+        if r and not remainder_first:
+            y = step(r, y)
+        return self._states(y, batch)
+
+    def _split(self, t: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Counts k, remainders r and directions of the times t, broadcast with the states x."""
+        batch = torch.broadcast_shapes(t.shape, x.shape[:-1])
+        eps = torch.finfo(t.dtype).eps if t.is_floating_point() else 0.0
+        magnitude = t.abs().to(torch.float64)
+        ratio = magnitude.detach() / self.dt
+        near = ratio.round()
+        exact = (ratio - near).abs() <= 2 * eps * near
+        k = torch.where(exact, near, ratio.floor())
+        if k.numel() and k.max() > MAX_STEPS:
+            raise _too_many_steps(float(magnitude.max()), self.dt)
+        r = torch.where(exact, 0.0, magnitude - k * self.dt).clamp(max=self.dt).to(x.dtype)
+        k, r, back = (v.expand(batch) for v in (k.to(torch.int64), r, t < 0))
+        return k, r, back, x.expand(*batch, x.shape[-1])
+
+    def _repeat(self, k: Tensor, back: bool, x: Tensor) -> Tensor:
+        """ψ̄_Δt, or its inverse, k times, with a count k for each state."""
+        step = self.psi_inverse if back else self.psi
+        for j in range(int(k.max()) if k.numel() else 0):
+            active = k > j
+            x = x.index_put((active,), step(self.dt, x[active]))
+        return x
+
+    def _remainder(self, r: Tensor, back: Tensor, x: Tensor) -> Tensor:
+        for step, active in ((self.psi, (r > 0) & ~back), (self.psi_inverse, (r > 0) & back)):
+            if active.any():
+                x = x.index_put((active,), step(r[active], x[active]))
+        return x
+
+    # layout and checks ----------------------------------------------------------------------------------
+
+    def _columns(self, t: float | Tensor, x: Tensor) -> tuple[float | Tensor, Tensor, torch.Size]:
+        """States (..., 2d) as columns (2d, N), times to match, and the batch shape."""
+        batch = x.shape[:-1]
+        if isinstance(t, Tensor) and t.ndim:
+            batch = torch.broadcast_shapes(t.shape, batch)
+            x = x.expand(*batch, x.shape[-1])
+            t = t.expand(batch).reshape(-1)
+        return t, x.reshape(-1, x.shape[-1]).T.contiguous(), batch
+
+    @staticmethod
+    def _states(y: Tensor, batch: torch.Size) -> Tensor:
+        return y.T.reshape(*batch, y.shape[0])
+
+    def _checked(self, t: Any, x: Any) -> float | Tensor:
+        """`t` as a finite float or tensor; `x` is a state for this flow, or an error."""
+        if not isinstance(x, Tensor):
+            raise TypeError(f"`x` must be a torch tensor, not {type(x).__name__}: use torch.as_tensor(x).")
+        if x.dtype != self.dtype:
+            raise TypeError(f"`x` is {x.dtype} but the flow is {self.dtype}: convert one, as by x.to({self.dtype}).")
+        if x.device != self.device:
+            raise ValueError(f"`x` is on {x.device} but the flow on {self.device}: move one, as by x.to(flow.device).")
+        if x.ndim == 0 or x.shape[-1] != 2 * self.ndof:
+            raise ValueError(
+                f"`x` must have shape (..., {2 * self.ndof}), states [q, p]; got {tuple(x.shape)}: "
+                "put them on the last axis."
+            )
+        if isinstance(t, Tensor) and (t.ndim or t.requires_grad):
+            if t.dtype == torch.bool or t.is_complex():
+                raise TypeError(f"`t` must be real times; got {t.dtype}: use a floating-point tensor.")
+            if t.device != x.device:
+                raise ValueError(f"`t` is on {t.device} but `x` on {x.device}: move one of them.")
+            if not torch.isfinite(t).all():
+                raise ValueError("`t` must be finite: remove its NaN and infinite entries.")
+            try:
+                torch.broadcast_shapes(t.shape, x.shape[:-1])
+            except RuntimeError:
+                raise ValueError(
+                    f"`t` of shape {tuple(t.shape)} does not broadcast against the batch shape "
+                    f"{tuple(x.shape[:-1])} of `x`: add axes, as by t[:, None]."
+                ) from None
+            return t
+        try:
+            value = float(t)
+        except (TypeError, ValueError):
+            raise TypeError(
+                f"`t` must be a number or a tensor of times; got {type(t).__name__}: pass seconds."
+            ) from None
+        if not math.isfinite(value):
+            raise ValueError(f"`t` must be finite; got {value}: pass a finite time.")
+        return value
+
+    def _bare_time(self, t: Any, x: Any) -> float | Tensor:
+        """`t`, checked to lie in [0, Δt]."""
+        t = self._checked(t, x)
+        low, high, slack = 0.0, 0.0, 1e-14
+        if isinstance(t, float):
+            low = high = t
+        elif t.numel():
+            low, high = float(t.min()), float(t.max())
+            slack = 1e-6 if t.dtype == torch.float32 else slack
+        if low < 0 or high > self.dt * (1 + slack):
+            raise ValueError(f"`t` must lie in [0, dt] = [0, {self.dt:g}]; got {low} to {high}: reduce it modulo dt.")
+        return t.to(x.dtype) if isinstance(t, Tensor) else t
+
+    # what it is --------------------------------------------------------------------------------------------
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return next(self.parameters()).dtype
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of trainable parameters."""
+        return sum(w.numel() for w in self.parameters())
+
+    def check_system(self, system: HamiltonianSystem) -> None:
+        """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
+        if system.ndof != self.ndof:
+            raise ValueError(
+                f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: "
+                "pass the flow of this system, or train one with sympflow.train(system)."
+            )
+        if self.fingerprint is not None and not same_system(self.fingerprint, system.fingerprint):
+            raise ValueError(
+                f"`system` {system.name!r} is not the one that this flow was trained for ({self.system_name!r}, or its "
+                "parameters differ): pass the flow of this system, or train one with sympflow.train(system)."
+            )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the flow to a safetensors file, with all that `sympflow.load` needs and its record."""
+        from sympflow.flow.io import save
+
+        save(self, path)
+
+    def __repr__(self) -> str:
+        system = f" of {self.system_name}" if self.system_name else ""
+        return f"<{type(self).__name__}{system}: ndof={self.ndof}, dt={self.dt:g}, {self.n_parameters} parameters>"
+
+
+def whole_steps(t: float, dt: float) -> tuple[int, float]:
+    """k = ⌊t/Δt⌋ and r = t − kΔt ∈ [0, Δt) for t ≥ 0, counting a multiple of Δt up to rounding as one: 0.3/0.1 is 3.
+
+    Raises
+    ------
+    ValueError
+        If k would exceed ten million.
+    """
+    ratio = t / dt
+    if ratio > MAX_STEPS:
+        raise _too_many_steps(t, dt)
+    near = round(ratio)
+    if abs(ratio - near) <= 2 * np.finfo(float).eps * near:
+        return near, 0.0
+    k = math.floor(ratio)
+    return k, min(max(t - k * dt, 0.0), dt)
+
+
+def same_system(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
+    """Whether two fingerprints agree to nine digits of the largest."""
+    u, v = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    if u.shape != v.shape:
+        return False
+    finite = u[np.isfinite(u)]
+    return np.allclose(u, v, rtol=0, atol=1e-9 * np.abs(finite).max(initial=0.0), equal_nan=True)
+
+
+def _too_many_steps(t: float, dt: float) -> ValueError:
+    return ValueError(f"`t` = {t:g} needs more than {MAX_STEPS:,} steps of dt = {dt:g}: use sympflow.solve.")

@@ -1,0 +1,99 @@
+"""The layers of a SympFlow: exact flows of simple Hamiltonians, applied one after another.
+
+Arrays are feature-major, as in `sympflow.flow.potentials`: q and p have shape (d, N).
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from torch import Tensor, nn
+
+from sympflow.flow.potentials import Potential, Time
+
+
+class Layer(nn.Module):
+    """The flow φ_t, t ≥ 0, of a Hamiltonian H_t, with φ_0 the identity.
+
+    A list of layers of any kinds in any order is a SympFlow; a new kind of layer is a subclass.
+
+    Duties
+    ------
+    1. `forward(t, q, p)`: φ_t(q, p).
+    2. `tangent(t, q, p, dq, dp)`: φ_t(x) and d/dt φ_t(x(t)) along a curve with velocity (dq, dp).
+    3. `pull_back(t, q, p)`: φ_t⁻¹(q, p), and H_t(q, p) of shape (N,).
+    4. `to_dict()`: the architecture, JSON-able.
+    """
+
+    kind: ClassVar[str]
+    ndof: int
+
+    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        raise NotImplementedError
+
+    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        """φ_t⁻¹(q, p)."""
+        q, p, _ = self.pull_back(t, q, p)
+        return q, p
+
+    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        raise NotImplementedError
+
+    def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        raise NotImplementedError
+
+    def to_dict(self) -> dict[str, Any]:
+        raise NotImplementedError
+
+
+class _PotentialLayer(Layer):
+    def __init__(self, potential: Potential) -> None:
+        super().__init__()
+        self.potential = potential
+        self.ndof = potential.ndof
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": self.kind, "potential": self.potential.to_dict()}
+
+
+class Kick(_PotentialLayer):
+    """φ_t(q, p) = (q, p − (∇V(t, q) − ∇V(0, q))), the flow of H_t = ∂_tV(t, q)."""
+
+    kind = "kick"
+
+    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return q, p - self.potential.impulse(t, q)
+
+    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return q, p + self.potential.impulse(t, q)
+
+    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        g, dg = self.potential.impulse_and_tangent(t, q, dq)
+        return q, p - g, dq, dp - dg
+
+    def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        g, rate = self.potential.impulse_and_rate(t, q)
+        return q, p + g, rate
+
+
+class Drift(_PotentialLayer):
+    """φ_t(q, p) = (q + (∇V(t, p) − ∇V(0, p)), p), the flow of H_t = ∂_tV(t, p)."""
+
+    kind = "drift"
+
+    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return q + self.potential.impulse(t, p), p
+
+    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return q - self.potential.impulse(t, p), p
+
+    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        g, dg = self.potential.impulse_and_tangent(t, p, dp)
+        return q + g, p, dq + dg, dp
+
+    def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        g, rate = self.potential.impulse_and_rate(t, p)
+        return q - g, p, rate
+
+
+LAYERS: dict[str, type[_PotentialLayer]] = {layer.kind: layer for layer in (Kick, Drift)}

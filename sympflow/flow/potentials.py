@@ -1,0 +1,245 @@
+"""Potentials V(t, x) with closed-form derivatives: the Hamiltonians that a SympFlow is composed of.
+
+Arrays here are feature-major: points x have shape (d, N), hidden features (h, N), one column a point. Products with
+the small weight matrices are several times faster that way round. A time t is a float or a tensor of shape () or (N,).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from sympflow.flow.activations import activation as activation_named
+
+Time = float | Tensor
+
+
+class Potential(nn.Module):
+    """V(t, x), of which layers need three combinations; a new kind of potential provides these.
+
+    Duties
+    ------
+    1. `impulse(t, x)`: ∇V(t, x) − ∇V(0, x), shape (d, N).
+    2. `impulse_and_rate(t, x)`: the impulse, and ∂_tV(t, x) of shape (N,).
+    3. `impulse_and_tangent(t, x, dx)`: the impulse, and its derivative along a curve x(t) with velocity dx.
+    4. `to_dict()`: its architecture, JSON-able, from which `flow.io` builds it again.
+    """
+
+    ndof: int
+
+    def impulse(self, t: Time, x: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
+        raise NotImplementedError
+
+    def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
+        raise NotImplementedError
+
+    def to_dict(self) -> dict[str, Any]:
+        raise NotImplementedError
+
+
+class MLPPotential(Potential):
+    """V(t, x) = c · N(t/τ, x/s), N a multilayer perceptron of any depth whose input is x with t appended.
+
+    N(t, x) = w · σ(W_n σ(… σ(K x + k t + b_1) …) + b_n). It has no output bias: a constant in V moves nothing.
+    Its x- and t-derivatives come from one forward and one reverse sweep through the layers, ∂_t∇V from carrying a
+    tangent along both, and the evaluations at t and at 0 share K x.
+
+    Parameters
+    ----------
+    ndof : int
+        d, the size of x.
+    hidden : sequence of int
+        Widths of the hidden layers; the published architecture is (10, 10).
+    activation : str
+        σ, a name in `sympflow.flow.activations.ACTIVATIONS`.
+    scale, center : sequence of d floats, optional
+        s, and the mean of x that the initial biases allow for.
+    tau, gain : float
+        τ and c.
+    generator : torch.Generator, optional
+        Source of the initial weights, uniform in ±1/√(fan in).
+
+    Attributes
+    ----------
+    weight_x : (h_1, d), weight_t : (h_1,), biases : n × (h_l,), weights : (n−1) × (h_{l+1}, h_l), weight_out : (h_n,)
+        The parameters K, k, b, W, w.
+    scale : (d,), tau : (), gain : ()
+        The buffers s, τ, c. `folded()` gives the weights with these multiplied in.
+
+    References
+    ----------
+    .. [1] P. Canizares, D. Murari, C.-B. Schönlieb, F. Sherry, Z. Shumaylov, Hamiltonian matching for symplectic
+       neural integrators, 2024, section 2.1.
+    """
+
+    weight_x: nn.Parameter
+    weight_t: nn.Parameter
+    weight_out: nn.Parameter
+    scale: Tensor
+    tau: Tensor
+    gain: Tensor
+
+    def __init__(
+        self,
+        ndof: int,
+        hidden: Sequence[int] = (10, 10),
+        activation: str = "tanh",
+        *,
+        scale: Sequence[float] | None = None,
+        center: Sequence[float] | None = None,
+        tau: float = 1.0,
+        gain: float = 1.0,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        hidden = hidden_widths(hidden)
+        self.ndof, self.hidden, self.activation = int(ndof), hidden, activation
+        self._ladder = activation_named(activation)
+
+        def uniform(*shape: int, fan_in: int) -> nn.Parameter:
+            # Drawn in float64 on the CPU, so that a seed means the same flow in every dtype and on every device.
+            w = (2 * torch.rand(*shape, dtype=torch.float64, generator=generator) - 1) / fan_in**0.5
+            return nn.Parameter(w.to(dtype=dtype, device=device))
+
+        self.weight_x = uniform(hidden[0], ndof, fan_in=ndof + 1)
+        self.weight_t = uniform(hidden[0], fan_in=ndof + 1)
+        fans = (ndof + 1, *hidden[:-1])
+        self.biases = nn.ParameterList(uniform(h, fan_in=fan) for h, fan in zip(hidden, fans, strict=True))
+        self.weights = nn.ParameterList(uniform(h, fan, fan_in=fan) for fan, h in pairwise(hidden))
+        self.weight_out = uniform(hidden[-1], fan_in=hidden[-1])
+
+        def constant(value: Any) -> Tensor:
+            return torch.as_tensor(value, dtype=dtype, device=device)
+
+        self.register_buffer("scale", constant([1.0] * ndof if scale is None else list(scale)))
+        self.register_buffer("tau", constant(tau))
+        self.register_buffer("gain", constant(gain))
+        if center is not None:
+            with torch.no_grad():
+                self.biases[0] -= self.weight_x @ (constant(list(center)) / self.scale)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"type": "mlp", "hidden": list(self.hidden), "activation": self.activation}
+
+    def folded(self) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor], Tensor]:
+        """The weights (K/s, k/τ, [b_l], [W_l], c·w): V(t, x) = c·w · σ(… σ((K/s) x + (k/τ) t + b_1) …)."""
+        K, k, w = self.weight_x / self.scale, self.weight_t / self.tau, self.gain * self.weight_out
+        return K, k, list(self.biases), list(self.weights), w
+
+    # V and its derivatives at one time ---------------------------------------------------------------
+
+    def value(self, t: Time, x: Tensor) -> Tensor:
+        """V(t, x): (N,)."""
+        K, k, b, W, w = self.folded()
+        h = self._ladder(K @ x + outer(k, t) + b[0][:, None], 0)[0]
+        for W_l, b_l in zip(W, b[1:], strict=True):
+            h = self._ladder(W_l @ h + b_l[:, None], 0)[0]
+        return w @ h
+
+    def gradient(self, t: Time, x: Tensor) -> Tensor:
+        """∇V(t, x): (d, N)."""
+        K, r = self._sensitivity(t, x)[:2]
+        return K.T @ r
+
+    def rate(self, t: Time, x: Tensor) -> Tensor:
+        """∂_tV(t, x): (N,)."""
+        _, r, k = self._sensitivity(t, x)
+        return k @ r
+
+    def gradient_tangent(self, t: Time, x: Tensor, dt: float, dx: Tensor) -> Tensor:
+        """The derivative of ∇V along the direction (dt, dx): (d, N). With dx = 0, dt = 1 it is ∂_t∇V."""
+        K, k, b, W, w = self.folded()
+        a = K @ x + outer(k, t) + b[0][:, None]
+        _, dr = self._sweeps_tangent(a, K @ dx + dt * k[:, None], b, W, w)
+        return K.T @ dr
+
+    def hessian(self, t: Time, x: Tensor) -> Tensor:
+        """∇²V(t, x): (d, d, N)."""
+        basis = torch.eye(self.ndof, dtype=x.dtype, device=x.device)
+        return torch.stack([self.gradient_tangent(t, x, 0.0, e[:, None].expand_as(x)) for e in basis], 1)
+
+    # the combinations that the layers use: t and 0 in one sweep -------------------------------------------
+
+    def impulse(self, t: Time, x: Tensor) -> Tensor:
+        K, k, b, W, w = self.folded()
+        r = self._sweeps(self._both_times(t, K @ x + b[0][:, None], k), b, W, w)
+        r_t, r_0 = r.chunk(2, 1)
+        return K.T @ (r_t - r_0)
+
+    def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
+        K, k, b, W, w = self.folded()
+        r = self._sweeps(self._both_times(t, K @ x + b[0][:, None], k), b, W, w)
+        r_t, r_0 = r.chunk(2, 1)
+        return K.T @ (r_t - r_0), k @ r_t
+
+    def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
+        K, k, b, W, w = self.folded()
+        a = self._both_times(t, K @ x + b[0][:, None], k)
+        da = K @ dx
+        r, dr = self._sweeps_tangent(a, torch.cat([da + k[:, None], da], 1), b, W, w)
+        (r_t, r_0), (dr_t, dr_0) = r.chunk(2, 1), dr.chunk(2, 1)
+        return K.T @ (r_t - r_0), K.T @ (dr_t - dr_0)
+
+    # sweeps ---------------------------------------------------------------------------------------------
+
+    def _sensitivity(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """K, r = ∂V/∂a (h_1, N) for the first pre-activation a, and k."""
+        K, k, b, W, w = self.folded()
+        return K, self._sweeps(K @ x + outer(k, t) + b[0][:, None], b, W, w), k
+
+    @staticmethod
+    def _both_times(t: Time, a: Tensor, k: Tensor) -> Tensor:
+        """Pre-activations at t beside those at 0: (h_1, 2N)."""
+        return torch.cat([a + outer(k, t), a], 1)
+
+    def _sweeps(self, a: Tensor, b: list[Tensor], W: list[Tensor], w: Tensor) -> Tensor:
+        """∂V/∂a (h_1, N), by a sweep forward through the layers and one back."""
+        h, slope = self._ladder(a, 1)
+        slopes = [slope]
+        for W_l, b_l in zip(W, b[1:], strict=True):
+            h, slope = self._ladder(torch.addmm(b_l[:, None], W_l, h), 1)
+            slopes.append(slope)
+        r = w[:, None] * slopes[-1]
+        for W_l, slope in zip(reversed(W), reversed(slopes[:-1]), strict=True):
+            r = slope * (W_l.T @ r)
+        return r
+
+    def _sweeps_tangent(
+        self, a: Tensor, da: Tensor, b: list[Tensor], W: list[Tensor], w: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """∂V/∂a and its derivative along da, both (h_1, N): the same two sweeps with a tangent beside."""
+        h, slope, curvature = self._ladder(a, 2)
+        dslope = curvature * da
+        slopes = [(slope, dslope)]
+        for W_l, b_l in zip(W, b[1:], strict=True):
+            da = W_l @ (slope * da)
+            h, slope, curvature = self._ladder(torch.addmm(b_l[:, None], W_l, h), 2)
+            slopes.append((slope, curvature * da))
+        slope, dslope = slopes[-1]
+        r, dr = w[:, None] * slope, w[:, None] * dslope
+        for W_l, (slope, dslope) in zip(reversed(W), reversed(slopes[:-1]), strict=True):
+            r, dr = W_l.T @ r, W_l.T @ dr
+            r, dr = slope * r, torch.addcmul(dslope * r, slope, dr)
+        return r, dr
+
+
+def outer(k: Tensor, t: Time) -> Tensor:
+    """k t: (h, 1) for one time, (h, N) for a time for each point."""
+    return k[:, None] * t
+
+
+def hidden_widths(hidden: Sequence[int]) -> tuple[int, ...]:
+    """`hidden`, checked."""
+    widths = tuple(hidden) if isinstance(hidden, Sequence) else ()
+    if not widths or any(isinstance(h, bool) or not isinstance(h, int) or h < 1 for h in widths):
+        raise ValueError(f"`hidden` must be the widths of one or more hidden layers, such as (10, 10); got {hidden!r}.")
+    return widths
