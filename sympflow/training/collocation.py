@@ -1,0 +1,95 @@
+"""The points at which the losses are evaluated: a function of the seed and the step alone, so that a run resumes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sympflow.domain import Domain
+
+BLOCK = 32  # steps drawn at once: a rejection-sampled domain then costs little
+
+
+class Stream(IntEnum):
+    """Independent random streams of one seed."""
+
+    RESIDUAL = 0
+    MATCHING = 1
+    VALIDATION = 2
+    REFERENCE = 3
+    SCALING = 4
+
+
+@dataclass(frozen=True)
+class Points:
+    """Collocation points.
+
+    Attributes
+    ----------
+    t, x : (N,), (N, 2d)
+        Of the residual loss L1.
+    matching_t, matching_x : (m, 1), (m, n, 2d)
+        Of the matching loss L2: few times with many states each.
+    """
+
+    t: Tensor
+    x: Tensor
+    matching_t: Tensor
+    matching_x: Tensor
+
+
+def stream_seed(seed: int, stream: Stream, block: int = 0) -> int:
+    """An integer seed of its own for each stream and block."""
+    return int(np.random.SeedSequence([seed, int(stream), block]).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def states(domain: Domain, n: int, seed: int, stream: Stream, block: int = 0) -> np.ndarray:
+    """n states (n, 2d) of the domain."""
+    return domain.sample(n, stream_seed(seed, stream, block))
+
+
+class PointSource:
+    """Draws the points of a step: uniform in Ω, and in [0, Δt] one time from each of equal cells."""
+
+    def __init__(
+        self,
+        domain: Domain,
+        dt: float,
+        points: int,
+        matching_times: int,
+        seed: int,
+        dtype: torch.dtype,
+        device: torch.device,
+        streams: tuple[Stream, Stream] = (Stream.RESIDUAL, Stream.MATCHING),
+        block: int = BLOCK,
+    ) -> None:
+        self.domain, self.dt, self.seed, self.streams = domain, dt, seed, streams
+        self.points, self.times = points, matching_times
+        self.block_length = block
+        self._like = {"dtype": dtype, "device": device}
+        self._block = -1
+        self._arrays: tuple[Tensor, ...] = ()
+
+    def __call__(self, index: int) -> Points:
+        """The points of the `index`-th draw."""
+        block, i = divmod(index, self.block_length)
+        if block != self._block:
+            self._draw(block)
+        t, x, matching_t, matching_x = self._arrays
+        return Points(t[i], x[i], matching_t[i], matching_x[i])
+
+    def _draw(self, block: int) -> None:
+        m, k = self.times, self.block_length
+        n = self.points // m
+        x = states(self.domain, k * self.points, self.seed, self.streams[0], block).reshape(k, self.points, -1)
+        xm = states(self.domain, k * m * n, self.seed, self.streams[1], block).reshape(k, m, n, -1)
+        # A stream of its own for the times: the domain's generator started from the same integer.
+        rng = np.random.default_rng([stream_seed(self.seed, self.streams[0], block), 1])
+        t = self.dt * (np.arange(self.points) + rng.random((k, self.points))) / self.points
+        tm = self.dt * (np.arange(m) + rng.random((k, m))) / m
+        self._arrays = tuple(torch.as_tensor(a, **self._like) for a in (t, x, tm[..., None], xm))  # type: ignore[arg-type]
+        self._block = block
