@@ -1,0 +1,82 @@
+"""Accuracy: the distance from the true solution, and from the start after going there and back."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.metrics.energy import failed
+from sympflow.metrics.reference import Reference
+from sympflow.metrics.reference import reference as compute_reference
+from sympflow.solution import Solution
+from sympflow.solver import solve
+
+
+def reference_error(sol: Solution, reference: Reference | Solution | ArrayLike | None = None) -> np.ndarray:
+    """‖y(t) − y_ref(t)‖₂ at the times `sol.t`: (..., n).
+
+    Parameters
+    ----------
+    sol : Solution
+    reference : Reference, Solution or array_like (..., 2d, n), optional
+        States at the same times. The default computes them with `sympflow.metrics.reference.reference`, which is exact
+        for a quadratic H and otherwise says how it was made and how accurate it is.
+
+    Raises
+    ------
+    ValueError
+        If the reference is not at the times of the solution.
+    """
+    y = to_numpy(sol.y).astype(float)
+    if reference is None:
+        reference = compute_reference(sol.system, sol.t_span, to_numpy(sol.y0), sol.t)
+    if isinstance(reference, Reference | Solution):
+        if len(reference.t) < len(sol.t) or not np.allclose(reference.t[: len(sol.t)], sol.t, rtol=1e-12, atol=0):
+            raise ValueError("`reference` must be at the times of `sol`: solve both with the same `t_eval`.")
+        reference = reference.y[..., : len(sol.t)]
+    y_ref = to_numpy(reference).astype(float)
+    if y_ref.shape != y.shape:
+        raise ValueError(f"`reference` must have the shape {y.shape} of `sol.y`; got {y_ref.shape}.")
+    with np.errstate(all="ignore"):
+        return np.linalg.norm(y - y_ref, axis=-2)
+
+
+def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:
+    """‖y − y0‖₂ after the run forwards to its end and the same method back from there, (...).
+
+    At rounding level for a method with Φ(−h) = Φ(h)⁻¹ on a grid that divides the interval, and for one that goes back
+    by its exact inverse, as a SympFlow does. inf for a trajectory that does not get there and back.
+
+    Raises
+    ------
+    TypeError
+        If the method cannot run backwards.
+    """
+    (t0, t1), y0 = sol.t_span, sol.y0
+    there = _end(sol, (t0, t1), y0)
+    finite = np.isfinite(to_numpy(there)).all(-1)
+    if not finite.all():
+        there = _replace(there, finite, y0)
+    back = _end(sol, (t1, t0), there)
+    with np.errstate(all="ignore"):
+        error = np.linalg.norm(to_numpy(back).astype(float) - to_numpy(y0), axis=-1)
+    return np.where(finite & np.isfinite(error) & ~failed(sol), error, np.inf)[()]
+
+
+def _end(sol: Solution, t_span: tuple[float, float], y0: Array) -> Array:
+    """The last state, NaN if the run did not reach it."""
+    end = solve(sol.system, sol.integrator, t_span, y0, t_eval=[t_span[1]], dtype=_dtype(y0), on_domain_exit="ignore")
+    return end.y[..., -1] if len(end.t) else y0 * np.nan
+
+
+def _dtype(y0: Array) -> np.dtype | None:
+    return None if is_tensor(y0) else y0.dtype
+
+
+def _replace(y: Array, keep: np.ndarray, other: Array) -> Array:
+    if not is_tensor(y):
+        return np.where(keep[..., None], y, other)
+    import torch
+
+    return torch.where(torch.as_tensor(keep, device=y.device)[..., None], y, other)

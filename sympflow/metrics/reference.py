@@ -1,0 +1,134 @@
+"""Reference solutions, each with an estimate of its own error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sympflow.arrays import to_numpy
+from sympflow.solver import solve
+from sympflow.system import HamiltonianSystem
+
+_HALVINGS = 7
+_ROUNDING = 1e-14
+_USELESS = 1e-2
+
+
+@dataclass(frozen=True)
+class Reference:
+    """States to measure errors against.
+
+    Attributes
+    ----------
+    t : ndarray (n,)
+    y : ndarray (..., 2d, n)
+    method : str
+        In words.
+    accuracy : float
+        Estimate of the largest error ‖y − y(t)‖.
+    """
+
+    t: np.ndarray
+    y: np.ndarray = field(repr=False)
+    method: str
+    accuracy: float
+
+
+def reference(
+    system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, t: np.ndarray, target: float = 0.0
+) -> Reference:
+    """The solution from y0 (..., 2d) at the times t (n,), as accurately as is cheap.
+
+    A quadratic H is solved exactly. A separable one by Kahan–Li 8 with a step that is halved until the last two runs
+    agree to `target`, or to rounding, or no better than the two before; their difference is the accuracy. Any other by
+    DOP853 at rtol 1e-13, whose accuracy is the difference from a run at 1e-12.
+
+    Parameters
+    ----------
+    target : float
+        Accuracy that is enough.
+    """
+    y0 = to_numpy(y0).astype(float)
+    exact = _linear_flow(system, t - t_span[0], y0)
+    if exact is not None:
+        phase = np.abs(t - t_span[0]).max(initial=0.0) * np.abs(np.linalg.eigvals(_linear_part(system))).max()
+        size = np.abs(exact).max(initial=1.0)
+        return Reference(t, exact, "exact (linear flow)", float(np.finfo(float).eps * size * (4 + phase)))
+    run = _kahan_li if system.separable else _dop853
+    return run(system, t_span, y0, t, target)
+
+
+def _kahan_li(
+    system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, t: np.ndarray, target: float
+) -> Reference:
+    dt = 4 * system.dt
+    previous, best = None, None
+    for _ in range(_HALVINGS):
+        sol = solve(system, "kahan_li8", t_span, y0, t_eval=t, dt=dt)
+        y = to_numpy(sol.y) if sol.success else None
+        if y is not None and previous is not None:
+            accuracy = _distance(y, previous)
+            if best is not None and not accuracy < best.accuracy:
+                break
+            best = Reference(t, y, f"Kahan–Li 8, dt = {dt:.3g}", accuracy)
+            if accuracy <= max(target, _ROUNDING * np.abs(y).max(initial=1.0)):
+                break
+        previous = y
+        dt /= 2
+    if best is None or not best.accuracy < _USELESS * np.abs(best.y).max(initial=1e-300):
+        raise ValueError(
+            f"`t_span` reaches beyond where {system.name!r} can be solved from `y0` (a singularity, escape or chaos): no "
+            "reference converges there. End it earlier, or pass your own `reference`."
+        )
+    return best
+
+
+def _dop853(
+    system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, t: np.ndarray, target: float
+) -> Reference:
+    scale = max(1e-3, float(np.abs(y0).max(initial=0.0)))
+    fine, coarse = (
+        solve(system, "dop853", t_span, y0, t_eval=t, rtol=rtol, atol=rtol * scale).raise_for_status()
+        for rtol in (1e-13, 1e-12)
+    )
+    return Reference(t, to_numpy(fine.y), "DOP853, rtol = 1e-13", _distance(fine.y, coarse.y))
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    with np.errstate(all="ignore"):
+        distance = np.linalg.norm(a - b, axis=-2).max(initial=0.0)
+    return float(np.inf if np.isnan(distance) else distance)
+
+
+def _linear_part(system: HamiltonianSystem) -> np.ndarray:
+    S = np.asarray(system.hessian(np.zeros(2 * system.ndof)))
+    d = system.ndof
+    return np.concatenate([S[d:], -S[:d]])
+
+
+def _linear_flow(system: HamiltonianSystem, t: np.ndarray, y0: np.ndarray) -> np.ndarray | None:
+    """The exact solution for H = ½ xᵀSx with S positive definite, which symbols tell; else None.
+
+    With S = LLᵀ the variables z = Lᵀx rotate, z' = LᵀJL z, so the error is that of the phase alone: ε·ω·t.
+    """
+    if system.symbols is None:
+        return None
+    import sympy
+
+    variables = [*system.symbols.q, *system.symbols.p]
+    H = system.symbols.H
+    if not H.is_polynomial(*variables) or any(sum(m) not in (0, 2) for m in sympy.Poly(H, *variables).monoms()):
+        return None
+    S = np.asarray(system.hessian(np.zeros(len(variables))))
+    try:
+        L = np.linalg.cholesky(S)
+    except np.linalg.LinAlgError:
+        return None
+    d = system.ndof
+    J = np.block([[np.zeros((d, d)), np.eye(d)], [-np.eye(d), np.zeros((d, d))]])
+    frequency, U = np.linalg.eigh(-1j * (L.T @ J @ L))  # z(t) = U exp(i ω t) U* z(0)
+    z0 = (y0 @ L) @ U.conj()
+    z = z0[..., None, :] * np.exp(1j * t[:, None] * frequency)
+    y = np.real(z @ U.T) @ np.linalg.inv(L)
+    return np.moveaxis(y, -2, -1)

@@ -1,0 +1,179 @@
+"""Volume, symplecticity and transported area of the map as executed."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from sympflow import (
+    HamiltonianSystem,
+    get,
+    loop_area_error,
+    solve,
+    symplecticity_defect,
+    systems,
+    volume_error,
+)
+from sympflow.integrators.base import FixedStep
+from sympflow.metrics.symplectic import loop_area, natural_scale
+
+EPS = np.finfo(float).eps
+SPLITTINGS = ["verlet", "leapfrog", "yoshida4", "kahan_li8", "chin4a"]
+
+
+@dataclass(frozen=True)
+class Damped(FixedStep):
+    """Verlet, then p multiplied by `factor`: log det = d log|factor| a step, exactly."""
+
+    factor: float = 0.9
+    name: ClassVar[str] = "damped"
+    order: ClassVar[int | None] = None
+    symplectic: ClassVar[bool] = False
+
+    def step(self, system, t, y, h):
+        y = get("verlet")().step(system, t, y, h)
+        return (
+            y * y.new_tensor([1.0] * system.ndof + [self.factor] * system.ndof)
+            if hasattr(y, "new_tensor")
+            else (y * np.repeat([1.0, self.factor], system.ndof))
+        )
+
+
+@pytest.mark.parametrize("method", SPLITTINGS)
+@pytest.mark.parametrize("system", [systems.henon_heiles(), systems.pendulum()], ids=lambda s: s.name)
+def test_splittings_keep_volume_and_the_symplectic_form_to_rounding(method, system):
+    sol = solve(system, method, (0, 20), t_eval=np.linspace(0, 20, 7))
+    n_steps, stages = 400, len(get(method).scheme.substeps)
+    assert abs(volume_error(sol)) <= stages * n_steps * EPS
+    assert symplecticity_defect(sol, relative=True) <= 10 * stages * EPS
+
+
+def test_rk45_and_a_damped_map_do_not():
+    system = systems.henon_heiles()
+    rk45 = solve(system, "rk45", (0, 20))
+    assert volume_error(rk45) < -1e-3
+    assert symplecticity_defect(rk45) > 1e-4
+    damped = solve(system, Damped(dt=0.1, factor=0.9), (0, 1.05))
+    steps = 11  # ten, and a shorter one
+    assert volume_error(damped) == pytest.approx(steps * 2 * np.log(0.9), rel=1e-12)
+    assert symplecticity_defect(damped) == pytest.approx(0.1, rel=1e-9)  # ‖(factor − 1) J‖
+
+
+def test_volume_of_one_rk45_step_is_that_of_its_stability_function():
+    """On the oscillator det A = |R(iz)|², R the degree-6 stability polynomial of Dormand–Prince."""
+    z = 0.7
+    sol = solve(systems.harmonic_oscillator(), "rk45", (0, z), first_step=z, rtol=1e3, atol=1e3)
+    assert len(sol.t) == 2
+    coefficients = [1, 1, 1 / 2, 1 / 6, 1 / 24, 1 / 120, 1 / 600]
+    R = sum(c * (1j * z) ** k for k, c in enumerate(coefficients))
+    assert volume_error(sol) == pytest.approx(2 * np.log(abs(R)), rel=1e-10)
+
+
+def test_a_negative_determinant_is_reported():
+    sol = solve(systems.harmonic_oscillator(), Damped(dt=0.1, factor=-1.0), (0, 1))
+    with pytest.warns(RuntimeWarning, match="determinant of step 1, from t = 0, is negative"):
+        assert volume_error(sol) == np.inf
+    singular = solve(systems.harmonic_oscillator(), Damped(dt=0.1, factor=0.0), (0, 1))
+    with pytest.warns(RuntimeWarning, match="is zero"):
+        assert volume_error(singular) == np.inf
+
+
+def test_volume_over_time_is_the_running_sum_of_the_steps_that_have_ended():
+    system = systems.pendulum()
+    sol = solve(system, Damped(dt=0.1), (0, 100), t_eval=[0, 0.05, 0.1, 0.25, 60, 99.99, 100])
+    expected = np.log(0.9) * np.array([0, 0, 1, 2, 600, 999, 1000])
+    np.testing.assert_allclose(volume_error(sol, over_time=True), expected, rtol=1e-11)
+    back = solve(system, Damped(dt=0.1), (10, 0), t_eval=[10, 9.85, 0])
+    np.testing.assert_allclose(volume_error(back, over_time=True), np.log(0.9) * np.array([0, 1, 100]), rtol=1e-11)
+
+
+def test_a_batch_is_judged_trajectory_by_trajectory():
+    system = systems.henon_heiles()
+    y0 = system.domain.sample(6, 0).reshape(2, 3, 4)
+    t = np.linspace(0, 10, 5)
+    for method in ("rk45", "verlet", Damped(dt=0.3)):
+        batch = solve(system, method, (0, 10), y0, t_eval=t)
+        alone = solve(system, method, (0, 10), y0[1, 2], t_eval=t)
+        assert volume_error(batch).shape == symplecticity_defect(batch).shape == (2, 3)
+        assert volume_error(batch)[1, 2] == pytest.approx(volume_error(alone), rel=1e-9, abs=1e-13)
+        assert symplecticity_defect(batch)[1, 2] == pytest.approx(symplecticity_defect(alone), rel=1e-9, abs=1e-13)
+        series = volume_error(batch, over_time=True)
+        assert series.shape == (2, 3, 5)
+        np.testing.assert_allclose(series[1, 2], volume_error(alone, over_time=True), rtol=1e-9, atol=1e-13)
+
+
+@pytest.mark.parametrize("omega", [1.0, 1e3, 1e6])
+def test_scaled_defect_is_the_same_at_every_frequency(omega):
+    """In (√ω q, p/√ω) the step of length z/ω is the same matrix for every ω."""
+    system = systems.harmonic_oscillator(omega)
+    np.testing.assert_allclose(natural_scale(system), np.sqrt(omega), rtol=1e-14)
+    sol = solve(system, "rk45", (0, 0.5 / omega), first_step=0.5 / omega, rtol=1e3, atol=1e3)
+    R = sum(c * (0.5j) ** k for k, c in enumerate([1, 1, 1 / 2, 1 / 6, 1 / 24, 1 / 120, 1 / 600]))
+    assert symplecticity_defect(sol) == pytest.approx(1 - abs(R) ** 2, rel=1e-8)
+    verlet = solve(system, "verlet", (0, 100 / omega), dt=1 / omega)
+    assert symplecticity_defect(verlet) < 10 * EPS
+
+
+def test_determinant_one_is_weaker_than_symplectic():
+    """(q₁, q₂, p₁, p₂) ↦ (q₁, q₂, 2p₁, p₂/2) keeps volume and is not symplectic: its defect is 1."""
+
+    @dataclass(frozen=True)
+    class Squeeze(FixedStep):
+        name: ClassVar[str] = "squeeze"
+        order: ClassVar[int | None] = None
+        symplectic: ClassVar[bool] = False
+
+        def step(self, system, t, y, h):
+            factors = [1.0, 1.0, 2.0, 0.5]
+            return y * (y.new_tensor(factors) if hasattr(y, "new_tensor") else np.array(factors))
+
+    sol = solve(systems.henon_heiles(), Squeeze(dt=1.0), (0, 3))
+    assert abs(volume_error(sol)) < 1e-15
+    assert symplecticity_defect(sol) == pytest.approx(1.0)
+
+
+def test_scale_must_be_positive():
+    sol = solve(systems.harmonic_oscillator(), "verlet", (0, 1))
+    with pytest.raises(ValueError, match="`scale` must be positive"):
+        symplecticity_defect(sol, scale=0.0)
+
+
+def test_natural_scale_is_one_where_there_is_none():
+    kepler = HamiltonianSystem.from_sympy("(p1**2+p2**2)/2 - 1/sqrt(q1**2+q2**2)")
+    assert natural_scale(kepler).tolist() == [1.0, 1.0]
+    assert natural_scale(HamiltonianSystem.from_sympy("p**2/2 - q**2")).tolist() == [1.0]
+
+
+def circle(n, center=(0.8, 0.0), radius=0.3):
+    angle = 2 * np.pi * np.arange(n) / n
+    return np.stack([center[0] + radius * np.cos(angle), center[1] - radius * np.sin(angle)], axis=-1)
+
+
+def test_loop_area_of_a_circle_is_exact():
+    for n in (8, 9, 64):
+        assert loop_area(circle(n)) == pytest.approx(np.pi * 0.09, rel=1e-14)
+
+
+def test_symplectic_methods_carry_a_loop_with_its_area():
+    system, t = systems.pendulum(), np.linspace(0, 20, 5)
+    sol = solve(system, "verlet", (0, 20), circle(256), t_eval=t, dt=0.5)  # a large step: not accurate, but symplectic
+    assert loop_area_error(sol).shape == (5,)
+    assert np.abs(loop_area_error(sol)).max() < 1e-12
+    damped = solve(system, Damped(dt=0.5, factor=0.99), (0, 20), circle(256), t_eval=t)
+    np.testing.assert_allclose(loop_area_error(damped), 0.99 ** (t / 0.5) - 1, rtol=1e-9, atol=1e-14)
+
+
+def test_an_unresolved_loop_warns():
+    sol = solve(systems.pendulum(), "verlet", (0, 200), circle(16, radius=0.7), t_eval=[200])
+    with pytest.warns(RuntimeWarning, match="too stretched"):
+        loop_area_error(sol)
+
+
+def test_loops_are_checked():
+    with pytest.raises(ValueError, match="`sol` must have one degree of freedom"):
+        loop_area_error(solve(systems.henon_heiles(), "verlet", (0, 1)))
+    with pytest.raises(ValueError, match="`sol` must start from a loop"):
+        loop_area_error(solve(systems.pendulum(), "verlet", (0, 1)))
+    with pytest.raises(ValueError, match="without area"):
+        loop_area_error(solve(systems.pendulum(), "verlet", (0, 1), np.ones((16, 2))))
