@@ -61,8 +61,8 @@ def solve(
         statistics, "stop" ends there with status −1. The default is "warn" for trained flows, whose figures hold in Ω,
         and "ignore" for classical methods.
     **options
-        Options of the method: `dt` for fixed steps (default `system.dt`, or the flow's Δt), `rtol` and `atol` for adaptive
-        ones, `flow` for "sympflow" and "mlp".
+        Options of the method: `dt` for fixed steps (default `system.dt`, or the flow's Δt), `rtol` and `atol` for
+        adaptive ones, `flow` for "sympflow" and "mlp".
 
     Returns
     -------
@@ -150,7 +150,8 @@ def _check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
         y0 = array.astype(_check_dtype(dtype))
     if y0.ndim == 0 or y0.shape[-1] != size:
         raise ValueError(
-            f"`y0` must have shape (..., {size}), [q, p] with {system.ndof} each, for {system.name!r}; got {tuple(y0.shape)}."
+            f"`y0` must have shape (..., {size}) for {system.name!r}, [q, p] with {system.ndof} each; got "
+            f"{tuple(y0.shape)}."
         )
     if math.prod(y0.shape) == 0:
         raise ValueError(f"`y0` is an empty batch, of shape {tuple(y0.shape)}: pass at least one state.")

@@ -82,7 +82,7 @@ def test_fingerprint_tells_systems_apart_and_not_definitions():
 def test_numpy_functions_do_not_need_torch_when_the_gradient_is_given():
     system = HamiltonianSystem(lambda q: np.cos(q).sum(-1), gradient=lambda q: -np.sin(q), ndof=1)
     assert system.force(np.array([0.5])) == pytest.approx(np.sin(0.5))
-    with pytest.raises(ValueError, match="^`hessian_vector` is needed"):
+    with pytest.raises(ValueError, match=r"^`hessian_vector` is needed"):
         system.potential_hessian(np.array([0.5]))
 
 

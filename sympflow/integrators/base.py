@@ -2,7 +2,7 @@
 
 An integrator is a frozen dataclass whose fields are its options (`dt`, `rtol`, …). Its duties:
 
-1. `step(system, t, y, h)` maps states y (..., 2d) over a step h; h may be negative, and may have the shape y.shape[:-1].
+1. `step(system, t, y, h)` maps states y (..., 2d) over a step h, negative or not, of shape () or y.shape[:-1].
 2. `order` (None if trained), `symplectic` and `trained` are class attributes that tell the truth.
 3. `check(system)` raises a ValueError with the reason where the method does not apply.
 4. `run(problem)` produces the states that were asked for, and no others, as an `Outcome`.
@@ -113,7 +113,7 @@ class FixedStep(Integrator):
     """An integrator on the grid t0 + k·dt.
 
     Between grid points, at the times that `t_eval` or the dense output ask for, and at the end of an interval that dt
-    does not divide, the state is a shorter step from the last grid point: ψ_t = ψ_{t−k·dt} ∘ (ψ_dt)^k, no interpolation.
+    does not divide, the state is a shorter step from the last grid point: ψ_t = ψ_{t−k·dt} ∘ (ψ_dt)^k.
 
     Parameters
     ----------
@@ -148,17 +148,18 @@ class FixedStep(Integrator):
         return states, finite, "torch" if is_tensor(problem.y0) else "numpy"
 
     def run(self, problem: Problem) -> Outcome:
-        system, y0 = problem.system, problem.y0
+        system = problem.system
         grid = Grid(problem.t0, problem.t1, self.step_length(system))
         t, count, remainder = grid.outputs(problem.t_eval, problem.save_every)
         save = np.arange(grid.n_steps + 1) if problem.dense_output else np.unique(count)
-        saved, finite, backend = self.rollout(problem, grid.h, int(save[-1]), save)
+        last = int(save[-1]) if save.size else 0
+        saved, finite, backend = self.rollout(problem, grid.h, last, save)
 
         y = saved[np.searchsorted(save, count)]
         extra = np.flatnonzero(remainder)
         if extra.size:
             y = self._shorter_steps(system, y, extra, remainder[extra])
-        n_steps = int(min(save[-1], finite.max() + 1))
+        n_steps = int(min(last, finite.max() + 1))
         stats = {
             "dt": abs(grid.h),
             "n_steps": n_steps,
@@ -168,12 +169,12 @@ class FixedStep(Integrator):
         outcome = Outcome(t, y, 0, FINISHED, stats)
         if problem.dense_output:
             outcome.sol = GridSolution(self, system, grid, saved)
-        _report_failures(outcome, y0, grid, finite, int(save[-1]))
+        _report_failures(outcome, grid, finite, last)
         return outcome
 
     def _shorter_steps(self, system: HamiltonianSystem, y: Array, extra: np.ndarray, h: np.ndarray) -> Array:
         """Replace the states y[extra] by those a step h later."""
-        lengths = np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), y[extra].shape[:-1])
+        lengths = np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), y[extra].shape[:-1]).copy()
         if not is_tensor(y):
             y[extra] = self.step(system, 0.0, y[extra], lengths.astype(y.dtype))
             return y
@@ -262,7 +263,7 @@ def rollout(
     return out, np.asarray(finite)
 
 
-def _report_failures(outcome: Outcome, y0: Array, grid: Grid, finite: np.ndarray, n_run: int) -> None:
+def _report_failures(outcome: Outcome, grid: Grid, finite: np.ndarray, n_run: int) -> None:
     """Set status −1 and the message where a trajectory became non-finite; cut a single trajectory there."""
     ok = to_numpy(all_finite(outcome.y))  # (n, ...): shorter steps may overflow too
     if finite.ndim:

@@ -102,8 +102,8 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
     unknown = [name for name in options if name not in cls.options()]
     if unknown:
         raise TypeError(
-            f"`{unknown[0]}` is not an option of method {cls.name!r}, which takes {', '.join(cls.options()) or 'none'}: "
-            "remove it or choose another method."
+            f"`{unknown[0]}` is not an option of method {cls.name!r}, which takes "
+            f"{', '.join(cls.options()) or 'none'}: remove it or choose another method."
         )
     return cls(**options)
 

@@ -1,0 +1,81 @@
+"""The registry: listing without importing, built-ins that cannot be shadowed, plug-ins that break on use only."""
+
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from sympflow import available, get, register, solve, systems
+from sympflow.integrators import registry
+from sympflow.integrators.base import FixedStep
+from sympflow.integrators.schemes import SCHEMES
+
+
+@dataclass(frozen=True)
+class SymplecticEuler(FixedStep):
+    name: ClassVar[str] = "symplectic_euler"
+    order: ClassVar[int | None] = 1
+    symplectic: ClassVar[bool] = True
+
+    def step(self, system, t, y, h):
+        d = system.ndof
+        p = y[..., d:] + np.asarray(h)[..., None] * system.force(y[..., :d])
+        return np.concatenate([y[..., :d] + np.asarray(h)[..., None] * system.velocity(p), p], -1)
+
+
+@pytest.fixture
+def plugins(monkeypatch):
+    """Entry points as if installed: one that works, one that breaks, one with a built-in name, one that is none."""
+    points = [
+        EntryPoint("good", f"{__name__}:SymplecticEuler", registry.GROUP),
+        EntryPoint("broken", "a_module_that_does_not_exist:Thing", registry.GROUP),
+        EntryPoint("verlet", f"{__name__}:SymplecticEuler", registry.GROUP),
+        EntryPoint("nothing", "math:pi", registry.GROUP),
+    ]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    registry._plugins.cache_clear()
+    yield
+    registry._plugins.cache_clear()
+
+
+def test_all_built_in_methods_are_listed():
+    assert {*SCHEMES, "rk45", "dop853", "dopri5", "sympflow", "mlp"} <= set(available())
+
+
+@pytest.mark.parametrize("name", sorted(SCHEMES))
+def test_integrators_declare_what_they_are(name):
+    integrator = get(name)(dt=0.1)
+    assert (integrator.name, integrator.order, integrator.symplectic) == (name, SCHEMES[name].order, True)
+    assert integrator.options() == ("dt",)
+    assert "dt" in repr(integrator)
+
+
+def test_registered_classes_solve():
+    register("symplectic_euler", SymplecticEuler)
+    sol = solve(systems.pendulum(), "symplectic_euler", (0, 1), dt=0.01, t_eval=[0.505, 1.0], dense_output=True)
+    reference = solve(systems.pendulum(), "kahan_li8", (0, 1), t_eval=[0.505, 1.0])
+    np.testing.assert_allclose(sol.y, reference.y, atol=0.02)  # order 1: the error is of the size of dt
+    np.testing.assert_array_equal(sol.sol(sol.t), sol.y)
+    assert get(SymplecticEuler) is SymplecticEuler
+    assert solve(systems.pendulum(), SymplecticEuler(dt=0.01), (0, 1)).success
+
+
+def test_built_ins_cannot_be_replaced():
+    with pytest.raises(ValueError, match=r"^`name` 'verlet' is a built-in method"):
+        register("verlet", SymplecticEuler)
+    with pytest.raises(TypeError, match=r"^`integrator` must be a subclass"):
+        register("mine", lambda: None)
+
+
+def test_plugins_break_on_use_and_not_before(plugins):
+    with pytest.warns(RuntimeWarning, match="'verlet' of .* is ignored: the name is taken"):
+        names = available()
+    assert {"good", "broken", "nothing"} <= set(names)
+    assert get("good") is SymplecticEuler or get("good").name == "symplectic_euler"
+    assert get("verlet").name == "verlet"
+    with pytest.raises(ImportError, match=r"^`method` 'broken' of the plug-in .* cannot be loaded"):
+        get("broken")
+    with pytest.raises(ImportError, match=r"^`method` 'nothing' of the plug-in .* is no Integrator class"):
+        get("nothing")

@@ -1,0 +1,308 @@
+"""The solver's contract, for every classical method: outputs, dense output, directions, batches, order, failure."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+
+import sympflow
+from sympflow import HamiltonianSystem, get, solve, systems
+from sympflow.integrators.grid import Grid
+from sympflow.integrators.schemes import SCHEMES
+
+HH = systems.henon_heiles()
+PENDULUM = systems.pendulum()
+SPLITTINGS = sorted(SCHEMES)
+ADAPTIVE = ["rk45", "dop853", "dopri5"]
+METHODS = [*SPLITTINGS, *ADAPTIVE]
+EPS = np.finfo(float).eps
+
+
+def options(method):
+    return {"rtol": 1e-10, "atol": 1e-12} if method in ADAPTIVE else {"dt": 0.05}
+
+
+def exact(y0, t):
+    return solve(HH, "dop853", (0, t), y0=y0, t_eval=[t], rtol=1e-13, atol=1e-15).y[..., -1]
+
+
+@pytest.mark.parametrize("method", METHODS)
+class TestOutputs:
+    def test_every_step_from_start_to_end(self, method):
+        sol = solve(HH, method, (0.0, 1.03), **options(method))
+        assert sol.t[0] == 0.0
+        assert sol.t[-1] == 1.03
+        assert (np.diff(sol.t) > 0).all()
+        assert sol.y.shape == (4, len(sol.t))
+        np.testing.assert_array_equal(sol.y[:, 0], HH.y0)
+        assert (sol.status, sol.success, sol.sol) == (0, True, None)
+        assert sol.nfev == sol.stats["force_evaluations"] > 0
+
+    def test_t_eval_gives_these_times_only(self, method):
+        t_eval = [0.0, 0.1, 0.3, 0.3, 0.77, 1.03]
+        sol = solve(HH, method, (0.0, 1.03), t_eval=t_eval, **options(method))
+        np.testing.assert_array_equal(sol.t, t_eval)
+        np.testing.assert_allclose(sol.y[:, -1], exact(HH.y0, 1.03), atol=1e-3)
+        np.testing.assert_array_equal(sol.y[:, 2], sol.y[:, 3])
+
+    def test_dense_output_equals_the_outputs(self, method):
+        sol = solve(HH, method, (0.0, 1.03), t_eval=np.linspace(0, 1.03, 9), dense_output=True, **options(method))
+        np.testing.assert_array_equal(sol.sol(sol.t), sol.y)
+        np.testing.assert_array_equal(sol.sol(0.5 * 1.03), sol.y[:, 4])
+        assert sol.sol(np.array([0.1, 0.2])).shape == (4, 2)
+
+    def test_backward_time_returns(self, method):
+        there = solve(HH, method, (0.5, 3.0), t_eval=[3.0], **options(method))
+        back = solve(HH, method, (3.0, 0.5), y0=there.y[:, -1], t_eval=[2.0, 0.5], dense_output=True, **options(method))
+        np.testing.assert_array_equal(back.sol(2.0), back.y[:, 0])
+        # symmetric schemes return to rounding, the others to their error at this step
+        tolerance = 1e-7 if method in ADAPTIVE else 1e-12 if SCHEMES[method].symmetric else 1e-4
+        np.testing.assert_allclose(back.y[:, -1], HH.y0, atol=tolerance)
+
+    def test_an_empty_interval_gives_the_initial_state(self, method):
+        sol = solve(HH, method, (2.0, 2.0), dense_output=True, **options(method))
+        assert sol.t.tolist() == [2.0]
+        np.testing.assert_array_equal(sol.y[:, 0], HH.y0)
+        np.testing.assert_array_equal(sol.sol(2.0), HH.y0)
+
+    def test_no_times_asked_for_no_states(self, method):
+        sol = solve(HH, method, (0.0, 1.0), t_eval=[], **options(method))
+        assert sol.y.shape == (4, 0)
+        assert sol.success
+
+    def test_a_batch_is_the_loop_over_its_states(self, method):
+        y0 = HH.domain.sample(6, 3).reshape(2, 3, 4)
+        kwargs = {"t_eval": [0.5, 1.03], "dense_output": True, **options(method)}
+        batch = solve(HH, method, (0.0, 1.03), y0=y0, **kwargs)
+        assert batch.y.shape == (2, 3, 4, 2)
+        assert batch.status.shape == (2, 3)
+        # dopri5 chooses its steps for the batch together, so only its tolerance is comparable
+        tolerance = 1e-8 if method == "dopri5" else 16 * EPS
+        for i in np.ndindex(2, 3):
+            one = solve(HH, method, (0.0, 1.03), y0=y0[i], **kwargs)
+            np.testing.assert_allclose(batch.y[i], one.y, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(batch.sol(0.5), batch.y[..., 0], atol=16 * EPS)
+
+    def test_a_batch_without_t_eval_shares_its_times(self, method):
+        sol = solve(HH, method, (0.0, 0.5), y0=HH.domain.sample(3), **options(method))
+        assert sol.y.shape == (3, 4, len(sol.t))
+        assert sol.t[-1] == 0.5
+
+    def test_save_every_thins_the_output_and_keeps_the_end(self, method):
+        full = solve(HH, method, (0.0, 1.03), **options(method))
+        thin = solve(HH, method, (0.0, 1.03), save_every=3, **options(method))
+        np.testing.assert_array_equal(thin.t[:-1], full.t[::3][: len(thin.t) - 1])
+        assert thin.t[-1] == 1.03
+        np.testing.assert_allclose(thin.y[:, -1], full.y[:, -1], atol=16 * EPS)
+
+    def test_dtype_is_kept(self, method):
+        sol = solve(HH, method, (0.0, 0.5), dtype="float32", **{**options(method), **_loose(method)})
+        assert sol.y.dtype == np.float32
+        assert solve(PENDULUM, method, (0.0, 0.5), y0=[1, 0], **options(method)).y.dtype == np.float64
+
+
+def _loose(method):
+    return {"rtol": 1e-4, "atol": 1e-6} if method in ADAPTIVE else {}
+
+
+@pytest.mark.parametrize("method", SPLITTINGS)
+def test_order_by_slope(method):
+    """The error at t = 2 behaves as h^order between steps where it is far above rounding."""
+    order = SCHEMES[method].order
+    n = {"kahan_li8": 5, "srkn11b": 8, "srkn14a": 6, "omelyan6": 12}.get(method) or {2: 400, 4: 60, 6: 20}[order]
+    reference = exact(HH.y0, 2.0)
+    errors = [np.abs(solve(HH, method, (0, 2), dt=2 / k, t_eval=[2.0]).y[:, -1] - reference).max() for k in (n, 2 * n)]
+    assert errors[1] > 1e-12  # far above rounding
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.5)
+
+
+@pytest.mark.parametrize("method", SPLITTINGS)
+@pytest.mark.parametrize("h", [0.3, -0.2])
+def test_inverse_undoes_the_step_to_rounding(method, h):
+    integrator = get(method)()
+    y = HH.domain.sample(20, 1)
+    np.testing.assert_allclose(integrator.inverse(HH, 0.0, integrator.step(HH, 0.0, y, h), h), y, atol=50 * EPS)
+
+
+@pytest.mark.parametrize("method", [*SPLITTINGS, "rk45", "dop853", "dopri5"])
+def test_tangent_is_the_derivative_of_the_step(method):
+    """Against automatic differentiation of the very same step through torch."""
+    integrator, h = get(method)(), 0.25
+    y = HH.domain.sample(3, 2)
+    y_next, A = integrator.tangent(HH, 0.0, y, np.full(3, h))
+    expected = torch.func.vmap(torch.func.jacrev(lambda x: integrator.step(HH, 0.0, x, h)))(torch.tensor(y))
+    np.testing.assert_allclose(y_next, integrator.step(HH, 0.0, y, h), atol=16 * EPS)
+    np.testing.assert_allclose(A, expected.numpy(), atol=64 * EPS)
+    assert integrator.symplectic == (method in SPLITTINGS)
+
+
+@pytest.mark.parametrize("method", ["verlet", "yoshida4", "rk45"])
+def test_steps_stream_the_run_again(method):
+    sol = solve(HH, method, (0.0, 40.03), **({} if method == "rk45" else {"dt": 0.05}))
+    t, y, h = (np.concatenate(c) for c in zip(*sol.integrator.steps(HH, sol.t_span, sol.y0), strict=True))
+    np.testing.assert_allclose(t, sol.t[:-1], rtol=4 * EPS)
+    np.testing.assert_allclose(y, sol.y.T[:-1], atol=1e3 * EPS)
+    assert np.sum(h) == pytest.approx(40.03)
+
+
+@pytest.mark.parametrize("method", [*SPLITTINGS, "dopri5"])
+def test_gradients_flow_to_the_initial_state(method):
+    y0 = torch.tensor([[1.0, 0.2], [0.3, -0.4]], dtype=torch.float64, requires_grad=True)
+
+    def final(y):
+        extra = {"dt": 0.1} if method in SPLITTINGS else {"rtol": 1e-9, "atol": 1e-11}
+        return solve(PENDULUM, method, (0.0, 0.35), y0=y, t_eval=[0.2, 0.35], **extra).y
+
+    assert torch.autograd.gradcheck(final, (y0,), atol=1e-6)
+
+
+def test_tensors_keep_dtype_and_type():
+    y0 = torch.tensor([[1.0, 0.0]], dtype=torch.float32)
+    sol = solve(PENDULUM, "verlet", (0, 1), y0=y0, dense_output=True)
+    assert sol.y.dtype == torch.float32
+    assert sol.y.shape == (1, 2, len(sol.t))
+    assert not sol.y.requires_grad
+    assert torch.equal(sol.sol(sol.t), sol.y)
+    assert sol.energy().shape == (1, len(sol.t))
+
+
+# the grid -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("t1", "dt", "n"), [(0.3, 0.1, 3), (-0.3, 0.1, 3), (1.0, 0.3, 3), (1e6, 0.1, 10**7), (0.7, 0.1, 7)]
+)
+def test_step_counts_are_integers(t1, dt, n):
+    grid = Grid(0.0, t1, dt)
+    assert grid.n_steps == n
+    assert grid.time(n) + grid.remainder == pytest.approx(t1, rel=EPS)
+
+
+def test_times_are_multiples_not_running_sums():
+    sol = solve(PENDULUM, "verlet", (0.1, 1000.1), dt=0.1)
+    np.testing.assert_array_equal(sol.t[:-1], 0.1 + np.arange(10_000) * 0.1)
+    assert sol.t[-1] == 1000.1
+    assert sol.stats["n_steps"] == 10_000
+
+
+def test_the_last_step_is_shorter():
+    sol = solve(PENDULUM, "verlet", (0, 1), dt=0.3)
+    step = get("verlet")().step
+    np.testing.assert_array_equal(sol.y[:, -1], step(PENDULUM, 0.0, sol.y[:, -2], 1.0 - 3 * 0.3))
+
+
+def test_a_million_steps_store_what_was_asked_for():
+    solve(PENDULUM, "verlet", (0, 1), dt=1e-2)
+    tracemalloc.start()
+    sol = solve(PENDULUM, "verlet", (0, 1e4), dt=1e-2, t_eval=np.linspace(0, 1e4, 11))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert sol.stats["n_steps"] == 1_000_000
+    assert sol.y.shape == (2, 11)
+    assert peak < 2e6  # storing every state would take 16 MB
+
+
+# failure ------------------------------------------------------------------------------------------
+
+ESCAPE = {"t_span": (0, 20), "y0": [0, 0, 0, 0.7]}  # the singularity is at t* = 5.450984210235402
+T_STAR = 5.450984210235402
+
+
+@pytest.mark.parametrize("method", ["verlet", "leapfrog", "kahan_li8", *ADAPTIVE])
+def test_a_blow_up_keeps_what_was_computed(method):
+    sol = solve(HH, method, **ESCAPE, **({"dt": 0.01} if method in SPLITTINGS else {}))
+    assert sol.status == -1
+    assert not sol.success
+    assert np.isfinite(sol.y).all()
+    assert len(sol.t) == sol.y.shape[1] > 1
+    assert abs(sol.t[-1] - T_STAR) < 0.1
+    assert " t = 5.4" in sol.message or " t = 5.5" in sol.message
+    with pytest.raises(RuntimeError, match="t = 5"):
+        sol.raise_for_status()
+
+
+@pytest.mark.parametrize("method", ["verlet", "rk45"])
+def test_other_trajectories_of_a_batch_are_unharmed(method):
+    y0 = np.array([HH.y0, ESCAPE["y0"], HH.y0])
+    sol = solve(HH, method, (0, 20), y0=y0, t_eval=[1.0, 5.0, 20.0])
+    assert sol.status.tolist() == [0, -1, 0]
+    assert not sol.success
+    assert np.isfinite(sol.y[[0, 2]]).all()
+    assert np.isfinite(sol.y[1]).all(0).tolist() == [True, True, False]
+
+
+def test_a_tensor_that_blows_up():
+    sol = solve(HH, "verlet", (0, 20), y0=torch.tensor(ESCAPE["y0"], dtype=torch.float64), dt=0.01)
+    assert sol.status == -1
+    assert torch.isfinite(sol.y).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("value", [1e308, 1e200, 5e-324])
+def test_extreme_states_end_at_once(method, value):
+    sol = solve(HH, method, (0, 1), y0=[value, 0.0, 0.0, 0.0])
+    assert sol.status == (0 if value < 1 else -1)
+    assert np.isfinite(sol.y).all()
+
+
+def test_leaving_the_domain():
+    outside = {"t_span": (0, 3), "y0": [0.0, 0.0, 0.0, 0.6], "dt": 0.1}
+    ignored = solve(HH, "verlet", **outside)
+    assert (ignored.status, "domain" in ignored.message) == (0, False)
+    warned = solve(HH, "verlet", on_domain_exit="warn", **outside)
+    assert warned.status == 0
+    assert warned.stats["domain_exit"] == 0.0
+    assert "left the domain at t = 0" in warned.message
+    stopped = solve(HH, "verlet", on_domain_exit="stop", **outside)
+    assert stopped.status == -1
+    assert len(stopped.t) == 1
+
+
+# the Solution -------------------------------------------------------------------------------------
+
+
+def test_solution_has_the_fields_of_scipy():
+    from scipy.integrate import solve_ivp
+
+    ours = solve(PENDULUM, "rk45", (0, 10), dense_output=True)
+    theirs = solve_ivp(PENDULUM, (0, 10), PENDULUM.y0, dense_output=True)
+    np.testing.assert_array_equal(ours.t, theirs.t)
+    np.testing.assert_array_equal(ours.y, theirs.y)
+    assert (ours.nfev, ours.status, ours.message) == (theirs.nfev, theirs.status, theirs.message)
+    converted = ours.to_scipy()
+    assert set(theirs) <= set(converted)
+    np.testing.assert_array_equal(converted.sol(3.3), theirs.sol(3.3))
+    np.testing.assert_array_equal(np.concatenate([ours.q, ours.p]), ours.y)
+    with pytest.raises(ValueError, match=r"^`solution` is a batch"):
+        solve(PENDULUM, "verlet", (0, 1), y0=[[1.0, 0.0]]).to_scipy()
+
+
+def test_a_system_works_in_solve_ivp_and_odeint():
+    from scipy.integrate import solve_ivp
+    from torchdiffeq import odeint
+
+    y = solve_ivp(HH, (0, 5), HH.y0, method="Radau", rtol=1e-8, atol=1e-10).y[:, -1]
+    np.testing.assert_allclose(y, exact(HH.y0, 5), atol=1e-5)
+    y = odeint(HH, torch.tensor(HH.y0), torch.tensor([0.0, 5.0], dtype=torch.float64))[-1]
+    np.testing.assert_allclose(y, exact(HH.y0, 5), atol=1e-5)
+
+
+def test_mass_and_general_kinetic_energy():
+    masses = HamiltonianSystem.from_sympy("p1**2/4 + p1*p2/5 + p2**2/6 + q1**4 + q1*q2 + q2**2", y0=[1, 0, 0, 1])
+    relativistic = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**4", y0=[1, 0.5])
+    for system in (masses, relativistic):
+        reference = solve(system, "dop853", (0, 3), t_eval=[3.0], rtol=1e-12, atol=1e-13).y
+        np.testing.assert_allclose(solve(system, "kahan_li8", (0, 3), t_eval=[3.0]).y, reference, atol=1e-9)
+    np.testing.assert_allclose(
+        solve(masses, "srkn11b", (0, 3), t_eval=[3.0]).y,
+        solve(masses, "dop853", (0, 3), t_eval=[3.0], rtol=1e-12, atol=1e-13).y,
+        atol=1e-8,
+    )
+    with pytest.raises(ValueError, match=r"^`method` 'srkn11b' needs a kinetic energy"):
+        solve(relativistic, "srkn11b")
+
+
+def test_top_level_names_exist():
+    for name in sympflow.__all__:
+        assert getattr(sympflow, name) is not None
