@@ -69,10 +69,7 @@ class CallableHamiltonian:
 
     def potential_hessian(self, q: Array) -> Array:
         if self._hessian_vector is not None:
-            basis = np.eye(self.ndof) if not is_tensor(q) else q.new_zeros(1).expand(self.ndof, self.ndof).clone()
-            if is_tensor(q):
-                basis.fill_diagonal_(1.0)
-            return stack([self._hessian_vector(q, e + 0 * q) for e in basis])
+            return stack([self._hessian_vector(q, e) for e in _basis(q)])
         if self._gradient is not None and not is_tensor(q):
             raise ValueError(
                 "`hessian_vector` is needed here (force-gradient methods, volume and symplecticity metrics) and was "
@@ -82,6 +79,16 @@ class CallableHamiltonian:
             return _jacobian(self._gradient, q)
         assert self._potential is not None
         return _with_torch(_hessian_of(self._potential, "potential"), q, "potential", (self.ndof, self.ndof))
+
+
+def _basis(x: Array) -> list[Array]:
+    """The unit vectors along the last axis, each of the shape of x."""
+    vectors = []
+    for i in range(x.shape[-1]):
+        e = 0 * x
+        e[..., i] = 1
+        vectors.append(e)
+    return vectors
 
 
 def _gradient_of(f: Callable[[Array], Array], name: str) -> Callable[[Array], Array]:
@@ -101,12 +108,7 @@ def _jacobian(f: Callable[[Array], Array], x: Array) -> Array:
     """Jacobian of a batched vector field by forward mode, one direction at a time: (..., k, k)."""
     import torch
 
-    columns = []
-    for i in range(x.shape[-1]):
-        direction = torch.zeros_like(x)
-        direction[..., i] = 1
-        columns.append(torch.func.jvp(f, (x,), (direction,))[1])
-    return torch.stack(columns, dim=-1)
+    return torch.stack([torch.func.jvp(f, (x,), (e,))[1] for e in _basis(x)], dim=-1)
 
 
 def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...]) -> Array:

@@ -95,7 +95,8 @@ class Box:
 
     def sample(self, n: int, seed: int = 0) -> np.ndarray:
         rng = np.random.default_rng(seed)
-        return rng.uniform(self.low, self.high, (_sample_count(n), np.size(self.low)))
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        return rng.uniform(low, high, (_sample_count(n), low.size))
 
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
         x = to_numpy(x)
@@ -146,10 +147,11 @@ class EnergySublevel:
     def sample(self, n: int, seed: int = 0) -> np.ndarray:
         _sample_count(n)
         rng = np.random.default_rng(seed)
+        low, high = np.asarray(self.box.low), np.asarray(self.box.high)
         accepted: list[np.ndarray] = []
         found = drawn = 0
         while found < n:
-            x = rng.uniform(self.box.low, self.box.high, (max(4 * n, 1024), np.size(self.box.low)))
+            x = rng.uniform(low, high, (max(4 * n, 1024), low.size))
             with np.errstate(all="ignore"):
                 x = x[self._energy(x) < self.energy]
             accepted.append(x)

@@ -55,7 +55,8 @@ def solve(
     dtype : "float32" or "float64", optional
         Precision for a NumPy `y0`.
     backend : "auto", "compiled" or "array"
-        "auto" runs symbolic systems on NumPy float64 states compiled, everything else with array operations.
+        "auto" runs splitting methods on symbolic systems (and on Numba functions) and float64 NumPy states compiled,
+        everything else with array operations. What ran is in `stats["backend"]`.
     on_domain_exit : "warn", "stop" or "ignore", optional
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
         statistics, "stop" ends there with status −1. The default is "warn" for trained flows, whose figures hold in Ω,

@@ -158,7 +158,7 @@ class FlowMap(nn.Module):
         exact = (ratio - near).abs() <= 2 * eps * near
         k = torch.where(exact, near, ratio.floor())
         if k.numel() and k.max() > MAX_STEPS:
-            raise _too_many_steps(float(magnitude.max()), self.dt)
+            raise _too_many_steps(float(magnitude.detach().max()), self.dt)
         r = torch.where(exact, 0.0, magnitude - k * self.dt).clamp(max=self.dt).to(x.dtype)
         k, r, back = (v.expand(batch) for v in (k.to(torch.int64), r, t < 0))
         return k, r, back, x.expand(*batch, x.shape[-1])
@@ -237,7 +237,7 @@ class FlowMap(nn.Module):
         if isinstance(t, float):
             low = high = t
         elif t.numel():
-            low, high = float(t.min()), float(t.max())
+            low, high = float(t.detach().min()), float(t.detach().max())
             slack = 1e-6 if t.dtype == torch.float32 else slack
         if low < 0 or high > self.dt * (1 + slack):
             raise ValueError(f"`t` must lie in [0, dt] = [0, {self.dt:g}]; got {low} to {high}: reduce it modulo dt.")

@@ -95,7 +95,7 @@ class Integrator:
         for i in range(x.shape[-1]):
             direction = torch.zeros_like(x)
             direction[..., i] = 1
-            y_next, column = torch.func.jvp(step, (x,), (direction,))
+            y_next, column = torch.func.jvp(step, (x,), (direction,))[:2]
             columns.append(column)
         return to_numpy(y_next), to_numpy(torch.stack(columns, dim=-1))
 
@@ -133,8 +133,8 @@ class FixedStep(Integrator):
         """The step that is used for a system."""
         return float(self.dt if self.dt is not None else system.dt)
 
-    def evaluations(self, system: HamiltonianSystem, n_steps: int, n_extra: int) -> dict[str, int]:
-        """Counted work of `n_steps` steps on the grid and `n_extra` shorter ones, for the statistics."""
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Force and force-gradient evaluations of `n_steps` steps on the grid and `n_extra` shorter ones."""
         return {"force_evaluations": 0, "hessian_evaluations": 0}
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
@@ -163,7 +163,7 @@ class FixedStep(Integrator):
         stats = {
             "dt": abs(grid.h),
             "n_steps": n_steps,
-            **self.evaluations(system, n_steps, int(extra.size)),
+            **self.evaluations(n_steps, len(save), int(extra.size), backend),
             "backend": backend,
         }
         outcome = Outcome(t, y, 0, FINISHED, stats)

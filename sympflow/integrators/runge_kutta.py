@@ -276,7 +276,8 @@ class Dopri5(RungeKutta):
     B: ClassVar[np.ndarray] = ScipyRK45.B
 
     def run(self, problem: Problem) -> Outcome:
-        t_eval, stats = problem.t_eval, {}
+        t_eval = problem.t_eval
+        stats: dict[str, Any] = {}
         if t_eval is None:
             t_eval = Grid(problem.t0, problem.t1, problem.system.dt).outputs(None, problem.save_every)[0]
             stats["output_step"] = problem.system.dt

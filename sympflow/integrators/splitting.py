@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, per_state, to_numpy
+from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
 from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.schemes import SCHEMES, Scheme
 from sympflow.system import HamiltonianSystem
+
+if TYPE_CHECKING:
+    from sympflow.kernels.splitting import SplittingKernel
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,11 @@ class Splitting(FixedStep):
     ----------
     dt : float, optional
         Step length; the default is `system.dt`.
+    compensated : bool
+        Whether to sum with Kahan's compensation, which slows the growth of round-off over many steps. Compiled only.
     """
+
+    compensated: bool = False
 
     scheme: ClassVar[Scheme]
     symplectic: ClassVar[bool] = True
@@ -79,13 +86,50 @@ class Splitting(FixedStep):
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         self.check(problem.system)
-        return super().rollout(problem, h, n_steps, save)
+        kernel = self._kernel(problem)
+        if kernel is None:
+            return super().rollout(problem, h, n_steps, save)
+        y0 = problem.y0
+        if y0.ndim == 1:
+            states, last = kernel.run(self.scheme, h, y0, n_steps, save, self.compensated)
+            return states, np.asarray(last), "compiled"
+        rows = y0.reshape(-1, y0.shape[-1])
+        states, finite = kernel.run_batch(self.scheme, h, rows, n_steps, save, self.compensated)
+        return states.swapaxes(0, 1).reshape(len(save), *y0.shape), finite.reshape(y0.shape[:-1]), "compiled"
 
-    def evaluations(self, system: HamiltonianSystem, n_steps: int, n_extra: int) -> dict[str, int]:
+    def _kernel(self, problem: Problem) -> SplittingKernel | None:
+        """The compiled loops for the problem, or None where it needs, or asks for, array operations."""
+        system, y0 = problem.system, problem.y0
+        reason = None
+        if problem.backend == "array":
+            reason = "`backend` is 'array'"
+        elif is_tensor(y0):
+            reason = "`y0` is a tensor"
+        elif y0.dtype != np.float64:
+            reason = f"`y0` is {y0.dtype}"
+        elif system.symbols is None and system.numba_functions is None:
+            reason = f"the system {system.name!r} is given by plain functions"
+        if reason is None:
+            from sympflow.kernels.splitting import splitting_kernel
+
+            return splitting_kernel(system)
+        if problem.backend == "compiled":
+            raise ValueError(f"`backend` 'compiled' does not apply, because {reason}: use 'auto' or 'array'.")
+        if self.compensated:
+            raise ValueError(f"`compensated` sums need compiled loops, but {reason}: leave `compensated` out.")
+        return None
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         kicks = [c3 != 0 for kind, _, c3 in self.scheme.substeps if kind == "kick"]
+        if backend != "compiled":
+            n = n_steps + n_extra
+            return {"force_evaluations": n * len(kicks), "hessian_evaluations": n * sum(kicks)}
+        # compiled, the last kick of a step is merged with the next step's first, except where a state is saved
+        forces, hessians = self.scheme.force_evaluations, self.scheme.hessian_evaluations
+        opened = (n_saved + 1) if n_steps and len(kicks) > forces else 0
         return {
-            "force_evaluations": (n_steps + n_extra) * len(kicks),
-            "hessian_evaluations": (n_steps + n_extra) * sum(kicks),
+            "force_evaluations": n_steps * forces + opened + n_extra * len(kicks),
+            "hessian_evaluations": n_steps * hessians + opened * kicks[0] + n_extra * sum(kicks),
         }
 
 

@@ -78,8 +78,8 @@ def _kahan_li(
         dt /= 2
     if best is None or not best.accuracy < _USELESS * np.abs(best.y).max(initial=1e-300):
         raise ValueError(
-            f"`t_span` reaches beyond where {system.name!r} can be solved from `y0` (a singularity, escape or chaos): no "
-            "reference converges there. End it earlier, or pass your own `reference`."
+            f"`t_span` reaches beyond where {system.name!r} can be solved from `y0` (a singularity or chaos), and "
+            "no reference converges there. End it earlier, or pass your own `reference`."
         )
     return best
 

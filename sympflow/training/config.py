@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-OPTIMIZERS = ("adam", "lbfgs")
+OPTIMIZERS = ("adam", "bfgs")
 SCHEDULES = ("one-cycle", "cosine", "constant")
 
 
@@ -17,7 +17,7 @@ class TrainingConfig:
     Parameters
     ----------
     optimizer : str
-        "adam", one gradient step on fresh points at a time, or "lbfgs", whose steps are 20 quasi-Newton iterations
+        "adam", one gradient step on fresh points at a time, or "bfgs", whose steps are 20 quasi-Newton iterations
         on points that stay for `refresh` steps: slower a step, and far better for the last digits.
     steps : int
         Length of the run.

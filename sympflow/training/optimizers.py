@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sympflow.flow.base import FlowMap
 from sympflow.training.config import TrainingConfig
+from sympflow.training.quasi_newton import BFGS
 
 
 class Adam:
@@ -31,36 +32,13 @@ class Adam:
         self.method.step()
         return float(value.detach())
 
+    def state_dict(self) -> dict[str, Any]:
+        return self.method.state_dict()
 
-class LBFGS:
-    """L-BFGS (Nocedal & Wright, Numerical Optimization, ch. 7) with a strong-Wolfe search, 20 iterations a step."""
-
-    # torch discards curvature pairs with yᵀs < 1e-10, which would end the progress at losses of about 1e-7.
-    MAGNIFICATION = 1e8
-
-    def __init__(self, flow: FlowMap, config: TrainingConfig) -> None:
-        self.method = torch.optim.LBFGS(
-            list(flow.parameters()),
-            lr=1.0,
-            max_iter=20,
-            history_size=100,
-            tolerance_grad=0.0,
-            tolerance_change=0.0,
-            line_search_fn="strong_wolfe",
-        )
-
-    def step(self, index: int, loss: Callable[[], Tensor]) -> float:
-        """Take a step; the loss before it."""
-
-        def closure() -> Tensor:
-            self.method.zero_grad(set_to_none=True)
-            value = loss() * self.MAGNIFICATION
-            value.backward()
-            return value
-
-        return float(self.method.step(closure).detach()) / self.MAGNIFICATION
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.method.load_state_dict(state)
 
 
 def optimizer(flow: FlowMap, config: TrainingConfig) -> Any:
     """The optimizer that the configuration names."""
-    return {"adam": Adam, "lbfgs": LBFGS}[config.optimizer](flow, config)
+    return {"adam": Adam, "bfgs": BFGS}[config.optimizer](flow, config)

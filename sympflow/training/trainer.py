@@ -87,7 +87,7 @@ def train(
     optimizer, steps, points, residual_weight, matching_weight, matching_times, learning_rate, schedule, clip, refresh,
     seed, validate_every, validation_points, reference_states, checkpoint_every
         See `TrainingConfig`. What is left out gets the optimizer's own default: 20,000 steps on 700 fresh points
-        for Adam, 200 on 4000 fixed points for L-BFGS. A baseline has no Hamiltonian, so its matching weight is 0.
+        for Adam, 200 on 4000 fixed points for BFGS. A baseline has no Hamiltonian, so its matching weight is 0.
     checkpoint : path, optional
         Write the state of the run there every `checkpoint_every` steps, atomically.
     resume : path, optional
@@ -129,7 +129,7 @@ def train(
         raise ValueError("`matching_weight` needs a Hamiltonian, which an MLP flow has not: leave it out.")
     if matching_weight is None:
         matching_weight = 0.0 if kind == "mlp" else 1.0
-    adam = optimizer != "lbfgs"
+    adam = optimizer != "bfgs"
     config = TrainingConfig(
         optimizer=optimizer,
         steps=steps if steps is not None else 20_000 if adam else 200,
@@ -326,7 +326,7 @@ class _Run:
                 "step": self.step,
                 "flow": self.flow.state_dict(),
                 "best": self.best,
-                "optimizer": self.optimizer.method.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
                 "history": self.history,
                 "seconds": self.seconds,
             },
@@ -342,7 +342,7 @@ class _Run:
                 raise ValueError(f"`resume` is a run with another {name}: pass the same system and flow as then.")
         try:
             self.flow.load_state_dict(state["flow"])
-            self.optimizer.method.load_state_dict(state["optimizer"])
+            self.optimizer.load_state_dict(state["optimizer"])
             self.best = {name: state["best"][name].to(self.flow.device) for name in self.flow.state_dict()}
         except (RuntimeError, KeyError, ValueError) as error:
             raise ValueError(f"`resume` {str(path)!r} does not fit the flow: start afresh.") from error
