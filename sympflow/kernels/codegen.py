@@ -1,0 +1,180 @@
+"""From a symbolic system to the source of its algebra: kicks and drifts on tuples of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import sympy as sp
+from sympy.printing.pycode import PythonCodePrinter
+
+from sympflow.symbolic import SymbolicHamiltonian
+
+__all__ = ["algebra_source"]
+
+_MAX_POWER = 16  # integer powers up to this are written as products
+
+
+class _KernelPrinter(PythonCodePrinter):
+    """Python for Numba: float literals, and products and square roots in place of small powers."""
+
+    def _print_Integer(self, expr: sp.Integer) -> str:
+        return f"{int(expr)}.0"
+
+    def _print_Rational(self, expr: sp.Rational) -> str:
+        return repr(float(expr))
+
+    def _print_Float(self, expr: sp.Float) -> str:
+        return repr(float(expr))
+
+    def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
+        base, exponent = expr.as_base_exp()
+        if exponent.is_negative is True and exponent.is_number:
+            return f"(1.0/{self._print_Pow(sp.Pow(base, -exponent, evaluate=False))})"
+        factor = self.parenthesize(base, 100)
+        if exponent.is_Integer and 1 <= exponent <= _MAX_POWER:
+            return f"({_product(factor, int(exponent))})"
+        if exponent.is_Rational and exponent.q == 2 and exponent.p <= _MAX_POWER:
+            root = f"math.sqrt({self._print(base)})"
+            whole = int(exponent.p) // 2
+            return f"({_product(factor, whole)}*{root})" if whole else root
+        return f"{factor}**{self.parenthesize(exponent, 100)}"
+
+
+def _product(factor: str, power: int) -> str:
+    """x·x·… with few multiplications: x⁴ as (x·x)·(x·x)."""
+    if power == 1:
+        return factor
+    half = _product(factor, power // 2)
+    square = f"({half}*{half})" if power > 3 else f"{half}*{half}"
+    return f"{square}*{factor}" if power % 2 else square
+
+
+def algebra_source(symbols: SymbolicHamiltonian) -> str:
+    """The functions that `loops` and `lanes` ask for, for H = T(p) + V(q); states are tuples of d floats.
+
+    Raises
+    ------
+    ValueError
+        If a function in H has no counterpart in compiled code.
+    """
+    q, p, d = symbols.q, symbols.p, symbols.ndof
+    velocity = [sp.diff(symbols.T, s) for s in p]
+    slope = [sp.diff(symbols.V, s) for s in q]
+    parts = [
+        f"NDOF = {d}",
+        _tuple_algebra(d),
+        _function("kick", "q, b, work", q, [-s for s in slope], [f"b*{{{i}}}" for i in range(d)]),
+        _function("drift", "p, a, work", p, velocity, [f"a*{{{i}}}" for i in range(d)]),
+    ]
+    if (M := symbols.inverse_mass) is not None:
+        parts.append(_gradient_kick(symbols.q, slope, M))
+    return "\n\n\n".join(parts) + "\n"
+
+
+def _gradient_kick(q: Sequence[sp.Symbol], slope: Sequence[sp.Expr], M: sp.Matrix) -> str:
+    """−b∇V + g ∇²V M⁻¹∇V: the Hessian's upper triangle is computed, the products are taken with numbers."""
+    d = len(q)
+    triangle = [(i, j) for i in range(d) for j in range(i, d)]
+    entries = [sp.diff(slope[i], q[j]) for i, j in triangle]
+    position = {ij: d + n for n, ij in enumerate(triangle) if entries[n] != 0}
+
+    def velocity(j: int) -> str:
+        terms = [f"{float(M[j, k])!r}*{{{k}}}" if M[j, k] != 1 else f"{{{k}}}" for k in range(d) if M[j, k] != 0]
+        return f"({' + '.join(terms)})"
+
+    results = []
+    for i in range(d):
+        row = [(position.get((min(i, j), max(i, j))), velocity(j)) for j in range(d)]
+        product = " + ".join(f"{{{n}}}*{v}" for n, v in row if n is not None)
+        results.append(f"g*({product}) - b*{{{i}}}" if product else f"-b*{{{i}}}")
+    return _function("gradient_kick", "q, b, g, work", q, [*slope, *entries], results)
+
+
+def _function(
+    name: str, arguments: str, variables: Sequence[sp.Symbol], expressions: list[sp.Expr], results: list[str]
+) -> str:
+    """A jitted function that returns the tuple `results`, ``{n}`` in them standing for the n-th expression."""
+    printer = _KernelPrinter({"fully_qualified_modules": True, "human": True})
+    shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("s_", real=True), list=True)
+    values = [sp.Symbol(f"v_{n}", real=True) for n in range(len(reduced))]
+    lines = ["@njit(**OPTIONS)", f"def {name}({arguments}):"]
+    lines.append(f"    {', '.join(s.name for s in variables)}, = {arguments[0]}")
+    for symbol, expression in [*shared, *zip(values, reduced, strict=True)]:
+        code = printer.doprint(expression)
+        if "Not supported" in code or printer._not_supported:
+            raise ValueError(f"`system` holds {expression}, which has no compiled counterpart: use backend='array'.")
+        lines.append(f"    {symbol.name} = {code}")
+    names = [value.name for value in values]
+    lines.append(f"    return ({''.join(result.format(*names) + ', ' for result in results)})")
+    return "\n".join(lines)
+
+
+def _tuple_algebra(d: int) -> str:
+    """Componentwise operations on tuples of length d, written out."""
+
+    def each(pattern: str) -> str:
+        return "(" + "".join(pattern.format(i=i, j=i + d) + ", " for i in range(d)) + ")"
+
+    finite = " + ".join(f"0.0*q[{i}] + 0.0*p[{i}]" for i in range(d))
+    stores = "\n".join(f"    y[{i}] = q[{i}]\n    y[{i + d}] = p[{i}]" for i in range(d))
+    lane_stores = "\n".join(f"    Y[{i}, lane] = q[{i}]\n    Y[{i + d}, lane] = p[{i}]" for i in range(d))
+    return f'''@njit(**OPTIONS)
+def unpack(y):
+    return {each("y[{i}]")}, {each("y[{j}]")}
+
+
+@njit(**OPTIONS)
+def pack(q, p, y):
+{stores}
+
+
+@njit(**OPTIONS)
+def unpack_lane(Y, lane):
+    return {each("Y[{i}, lane]")}, {each("Y[{j}, lane]")}
+
+
+@njit(**OPTIONS)
+def pack_lane(q, p, Y, lane):
+{lane_stores}
+
+
+@njit(**OPTIONS)
+def copy(x):
+    return x
+
+
+@njit(**OPTIONS)
+def is_finite(q, p):
+    return {finite} == 0.0
+
+
+@njit(**OPTIONS)
+def workspace():
+    return None
+
+
+@njit(**OPTIONS)
+def no_error(x):
+    if COMPENSATED:
+        return {each("0.0")}
+    return None
+
+
+@njit(**OPTIONS)
+def plus(x, y):
+    return {each("x[{i}] + y[{i}]")}
+
+
+@njit(**OPTIONS)
+def minus(x, y):
+    return {each("x[{i}] - y[{i}]")}
+
+
+@njit(**OPTIONS)
+def move(x, error, change):
+    """x + change; if `COMPENSATED` by Kahan's compensated sum."""
+    if COMPENSATED:
+        corrected = minus(change, error)
+        total = plus(x, corrected)
+        return total, minus(minus(total, x), corrected)
+    return plus(x, change), None'''

@@ -1,0 +1,90 @@
+"""Many trajectories at once: their states side by side, so that one instruction moves several of them.
+
+Source text, pasted after the tuple algebra of a symbolic system and `loops`. A block holds `LANES` trajectories,
+component first, as an array (2d, LANES) that stays in the first-level cache; the compiler turns the loop over the
+lanes of a stage into vector instructions. Lanes never mix, so one that overflows leaves the others as they are.
+"""
+# ruff: noqa: F821
+# mypy: ignore-errors
+
+import numpy as np
+from numba import njit
+
+LANES = 64
+VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
+
+
+@njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
+def stage_lanes(Y, error, width, b, g, a):
+    for lane in range(width):
+        q, p = unpack_lane(Y, lane)
+        if COMPENSATED:
+            q_error, p_error = unpack_lane(error, lane)
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, a, None)
+            pack_lane(q_error, p_error, error, lane)
+        else:
+            q, p, _, _ = stage(q, p, None, None, b, g, a, None)
+        pack_lane(q, p, Y, lane)
+
+
+@njit(**OPTIONS)
+def close_lane(Y, error, lane, kicks, drifts, gradients):
+    q, p = unpack_lane(Y, lane)
+    q_error, p_error = no_error(q), no_error(p)
+    if COMPENSATED:
+        q_error, p_error = unpack_lane(error, lane)
+    return close(q, p, q_error, p_error, kicks, drifts, gradients, None)
+
+
+@njit(**OPTIONS)
+def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite):
+    """`rollout` of every row of `y0` (N, 2d), `LANES` at a time; outputs as in `rollout_each`."""
+    link = len(kicks) - 2
+    Y, start, error = np.empty((2 * NDOF, LANES)), np.empty((2 * NDOF, LANES)), np.empty((2 * NDOF, LANES))
+    for block_start in range(0, y0.shape[0], LANES):
+        count = min(LANES, y0.shape[0] - block_start)
+        width = (count + VECTOR - 1) // VECTOR * VECTOR
+        for lane in range(width):
+            i = block_start + min(lane, count - 1)
+            q, p = unpack(y0[i])
+            pack_lane(q, p, Y, lane)
+            pack_lane(q, p, start, lane)
+            n_finite[i] = n_steps
+            for row in range(len(save)):
+                if save[row] > 0:
+                    break
+                pack(q, p, out[i, row])
+        error[:] = 0.0
+        n = saved = first = 0
+        while saved < len(save) and save[saved] <= 0:
+            saved += 1
+        n_alive = count
+        while n < n_steps and n_alive > 0:
+            block = min(CHECK_EVERY, n_steps - n)
+            if saved < len(save):
+                block = min(block, save[saved] - n)
+            b, g, a = kicks[first], gradients[first], drifts[first]
+            for _ in range(block):
+                stage_lanes(Y, error, width, b, g, a)
+                for j in range(1, link):
+                    stage_lanes(Y, error, width, kicks[j], gradients[j], drifts[j])
+                b, g, a = kicks[link], gradients[link], drifts[link]
+            next_saved = saved
+            while next_saved < len(save) and save[next_saved] == n + block:
+                next_saved += 1
+            for lane in range(count):
+                i = block_start + lane
+                if n_finite[i] < n_steps:
+                    continue
+                q, p = close_lane(Y, error, lane, kicks, drifts, gradients)
+                if not is_finite(q, p):
+                    q, p = unpack_lane(start, lane)
+                    before = first_non_finite(q, p, kicks, drifts, gradients, first, block, None) - 1
+                    n_finite[i] = n + before
+                    n_alive -= 1
+                    fill_with_nan(out[i], saved)
+                else:
+                    for row in range(saved, next_saved):
+                        pack(q, p, out[i, row])
+            start[:] = Y
+            n, saved, first = n + block, next_saved, link

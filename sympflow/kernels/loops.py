@@ -1,0 +1,123 @@
+"""The loops of a splitting method: a step, a run. Source text, pasted after the algebra of a system.
+
+The algebra that comes before says what a state is: q and p are tuples held in registers (a symbolic system) or
+arrays changed in place (Numba functions). It defines ``unpack``, ``pack``, ``copy``, ``is_finite``, ``move``,
+``no_error``, ``kick``, ``gradient_kick``, ``drift`` and ``workspace``.
+
+A run executes the table [opening, inner …, link, closing] of stages (kick, then drift). A step is the link (the
+first step, the opening) and the inner stages; consecutive steps share their common kick or drift in the link, and
+an output is the closing stage applied to a copy, so that what is saved never changes the trajectory. The constants
+`FORCE_GRADIENTS` and `COMPENSATED` say whether gradients and errors are used: Numba leaves dead branches out.
+"""
+# ruff: noqa: F821
+# mypy: ignore-errors
+
+from numba import njit
+
+CHECK_EVERY = 256  # steps between two looks for a non-finite state, where nothing is saved
+
+
+@njit(**OPTIONS)
+def stage(q, p, q_error, p_error, b, g, a, work):
+    """Kick by b (and g), then drift by a."""
+    if FORCE_GRADIENTS and g != 0.0:
+        change = gradient_kick(q, b, g, work)
+    else:
+        change = kick(q, b, work)
+    p, p_error = move(p, p_error, change)
+    q, q_error = move(q, q_error, drift(p, a, work))
+    return q, p, q_error, p_error
+
+
+@njit(**OPTIONS)
+def inner_stages(q, p, q_error, p_error, kicks, drifts, gradients, work):
+    for j in range(1, len(kicks) - 2):
+        q, p, q_error, p_error = stage(q, p, q_error, p_error, kicks[j], gradients[j], drifts[j], work)
+    return q, p, q_error, p_error
+
+
+@njit(**OPTIONS)
+def close(q, p, q_error, p_error, kicks, drifts, gradients, work):
+    """The end of a step, from the running state before its last stage, which is left as it is."""
+    q, p, q_error, p_error = copy(q), copy(p), copy(q_error), copy(p_error)
+    q, p, _, _ = stage(q, p, q_error, p_error, kicks[-1], gradients[-1], drifts[-1], work)
+    return q, p
+
+
+@njit(**OPTIONS)
+def first_non_finite(q, p, kicks, drifts, gradients, first, n_steps, work):
+    """The first of `n_steps` steps from a running state whose end is not finite; `n_steps` if none is."""
+    link = len(kicks) - 2
+    q_error, p_error = no_error(q), no_error(p)
+    for n in range(1, n_steps):
+        q, p, q_error, p_error = stage(q, p, q_error, p_error, kicks[first], gradients[first], drifts[first], work)
+        first = link
+        for j in range(1, link):
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, kicks[j], gradients[j], drifts[j], work)
+        end_q, end_p = close(q, p, q_error, p_error, kicks, drifts, gradients, work)
+        if not is_finite(end_q, end_p):
+            return n
+    return n_steps
+
+
+@njit(**OPTIONS)
+def fill_with_nan(rows, first):
+    for i in range(first, rows.shape[0]):
+        for j in range(rows.shape[1]):
+            rows[i, j] = math.nan
+
+
+@njit(**OPTIONS)
+def rollout(kicks, drifts, gradients, y0, n_steps, save, out):
+    """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
+
+    Returns the index of the last step that ends in a finite state; rows of later steps are NaN.
+    """
+    link = len(kicks) - 2
+    work = workspace()
+    q, p = unpack(y0)
+    q_error, p_error = no_error(q), no_error(p)
+    n = saved = first = 0
+    while saved < len(save) and save[saved] <= 0:
+        pack(q, p, out[saved])
+        saved += 1
+    while n < n_steps:
+        block = min(CHECK_EVERY, n_steps - n)
+        if saved < len(save):
+            block = min(block, save[saved] - n)
+        start_q, start_p = copy(q), copy(p)
+        b, g, a = kicks[first], gradients[first], drifts[first]
+        for _ in range(block):
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, a, work)
+            for j in range(1, link):
+                q, p, q_error, p_error = stage(q, p, q_error, p_error, kicks[j], gradients[j], drifts[j], work)
+            b, g, a = kicks[link], gradients[link], drifts[link]
+        end_q, end_p = close(q, p, q_error, p_error, kicks, drifts, gradients, work)
+        if not is_finite(end_q, end_p):
+            fill_with_nan(out, saved)
+            return n - 1 + first_non_finite(start_q, start_p, kicks, drifts, gradients, first, block, work)
+        n, first = n + block, link
+        while saved < len(save) and save[saved] == n:
+            pack(end_q, end_p, out[saved])
+            saved += 1
+    return n_steps
+
+
+@njit(**OPTIONS)
+def rollout_each(kicks, drifts, gradients, y0, n_steps, save, out, n_finite):
+    """`rollout` of every row of `y0` (N, 2d) by itself."""
+    for i in range(y0.shape[0]):
+        n_finite[i] = rollout(kicks, drifts, gradients, y0[i], n_steps, save, out[i])
+
+
+@njit(**OPTIONS)
+def step_each(kicks, drifts, gradients, h, y, out):
+    """One step of length ``h[i]`` from every row of `y` (N, 2d); the coefficients are those for h = 1."""
+    work = workspace()
+    for i in range(y.shape[0]):
+        q, p = unpack(y[i])
+        q_error, p_error = no_error(q), no_error(p)
+        for j in range(len(kicks)):
+            b, g, a = h[i] * kicks[j], h[i] ** 3 * gradients[j], h[i] * drifts[j]
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, a, work)
+        pack(q, p, out[i])

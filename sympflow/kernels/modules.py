@@ -1,0 +1,85 @@
+"""Generated source as importable modules, kept in a per-user folder so that Numba's disk cache applies."""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import importlib.util
+import os
+import shutil
+import sys
+import tempfile
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from types import ModuleType
+
+import numba
+
+__all__ = ["cache_folder", "load_module", "template"]
+
+
+def template(name: str) -> str:
+    """The source text of the module `name` of this package."""
+    return files(__package__).joinpath(f"{name}.py").read_text(encoding="utf-8")
+
+
+def cache_folder() -> Path:
+    """Where generated modules live.
+
+    The first that is set of $SYMPFLOW_CACHE_DIR, $NUMBA_CACHE_DIR/sympflow, $XDG_CACHE_HOME/sympflow and the
+    platform's folder for caches.
+    """
+    if folder := os.environ.get("SYMPFLOW_CACHE_DIR"):
+        return Path(folder)
+    for variable in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "LOCALAPPDATA"):
+        if folder := os.environ.get(variable):
+            return Path(folder) / "sympflow"
+    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "sympflow"
+
+
+@cache
+def load_module(source: str) -> ModuleType:
+    """Import `source`, written once to `cache_folder` under a name made from its contents.
+
+    Where that folder cannot be written, a temporary one serves for the life of the process.
+    """
+    versions = f"{numba.__version__} {sys.version}"
+    key = hashlib.sha256(f"{versions}\n{source}".encode()).hexdigest()[:24]
+    name = f"sympflow_kernel_{key}"
+    try:
+        path = _write_once(cache_folder(), name, source)
+    except (OSError, RuntimeError):  # RuntimeError: no home folder
+        path = _write_once(_temporary_folder(), name, source)
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # Numba looks a function's module up by name
+    spec.loader.exec_module(module)
+    return module
+
+
+@cache
+def _temporary_folder() -> Path:
+    folder = tempfile.mkdtemp(prefix="sympflow-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+def _write_once(folder: Path, name: str, source: str) -> Path:
+    """The file with this source, written atomically unless it is there already, unchanged.
+
+    It must not be rewritten: Numba takes a file with a new date for a new file. Numba's own files beside it must
+    be writable as well.
+    """
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(folder)
+    path = folder / f"{name}.py"
+    if not (path.exists() and path.read_text(encoding="utf-8") == source):
+        handle, unfinished = tempfile.mkstemp(dir=folder, suffix=".tmp")
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(source)
+        os.replace(unfinished, path)
+    return path

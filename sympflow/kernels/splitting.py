@@ -1,0 +1,272 @@
+"""The splitting kernel: any scheme on one system, compiled."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from itertools import pairwise
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.integrators.schemes import Scheme
+from sympflow.kernels.modules import load_module, template
+from sympflow.system import HamiltonianSystem
+
+__all__ = ["SplittingKernel", "splitting_kernel"]
+
+_BLOCK = 64  # rows that a thread takes at a time: the lanes of a block
+_WORTH_A_THREAD = 500_000  # stages × trajectories below which a second thread does not pay
+
+
+def splitting_kernel(system: HamiltonianSystem) -> SplittingKernel:
+    """The compiled splitting loops of a separable system, built once per system.
+
+    Raises
+    ------
+    ValueError
+        If the system cannot be compiled, with the reason.
+    """
+    kernel = _KERNELS.get(system)
+    if kernel is None:
+        kernel = _KERNELS[system] = SplittingKernel(system)
+    return kernel
+
+
+_KERNELS: WeakKeyDictionary[HamiltonianSystem, SplittingKernel] = WeakKeyDictionary()
+
+
+class SplittingKernel:
+    """Compiled loops that run any `Scheme` on one system; states are [q, p], float64.
+
+    Force gradients and compensated sums are compiled when first used. A symbolic system's code is kept on disk for
+    the next process; that of a system given by Numba functions is not.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        Separable, and symbolic or given by Numba functions.
+    """
+
+    def __init__(self, system: HamiltonianSystem) -> None:
+        self.ndof = system.ndof
+        if not system.separable:
+            raise ValueError("`system` is not separable, so no splitting method applies: use a Runge–Kutta method.")
+        if system.symbols is not None:
+            from sympflow.kernels.codegen import algebra_source
+
+            self._has_force_gradient = system.quadratic_kinetic
+            self._compile = partial(_symbolic_loops, algebra_source(system.symbols))
+        elif system.numba_functions is not None:
+            _, gradient, hessian_vector = system.numba_functions
+            self._has_force_gradient = hessian_vector is not None
+            self._compile = partial(_array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass)
+        else:
+            raise ValueError(
+                "`system` cannot be compiled: it is given by plain functions. Define it with "
+                "HamiltonianSystem.from_sympy or by Numba functions, or use backend='array'."
+            )
+        self._variants: dict[tuple[bool, bool], _Loops] = {}
+
+    def _loops(self, scheme: Scheme, compensated: bool) -> _Loops:
+        variant = (any(scheme.gradients), compensated)
+        if variant not in self._variants:
+            if variant[0] and not self._has_force_gradient:
+                raise ValueError(
+                    "`scheme` has force gradients, which need a kinetic energy quadratic in p and, for a system of "
+                    "Numba functions, `hessian_vector`: take a scheme without them, for instance 'kahan_li8'."
+                )
+            self._variants[variant] = self._compile(*variant)
+        return self._variants[variant]
+
+    def run(
+        self,
+        scheme: Scheme,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        compensated: bool = False,
+    ) -> tuple[np.ndarray, int]:
+        """`n_steps` steps of length `h` from one state.
+
+        Parameters
+        ----------
+        scheme : Scheme
+        h : float
+            Step, negative to go back.
+        y0 : ndarray of shape (2d,)
+        n_steps : int
+        save : ndarray of int64, sorted, in 0 … n_steps
+            The steps whose states are kept.
+        compensated : bool
+            Whether to sum with Kahan's compensation, which lowers the growth of round-off.
+
+        Returns
+        -------
+        Y : ndarray of shape (len(save), 2d)
+            NaN after the last finite state.
+        n_finite : int
+            Index of the last step that ends in a finite state, `n_steps` if all do; the run stops there.
+        """
+        loops = self._loops(scheme, compensated)
+        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+        out = np.empty((len(save), 2 * self.ndof))
+        n_finite = loops.rollout(*_scaled(_run_table(scheme), h), y0, n_steps, save, out)
+        return out, n_finite
+
+    def run_batch(
+        self,
+        scheme: Scheme,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        compensated: bool = False,
+        threads: int | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads.
+
+        Returns
+        -------
+        Y : ndarray of shape (N, len(save), 2d)
+        n_finite : ndarray of int64, shape (N,)
+        """
+        loops = self._loops(scheme, compensated)
+        table = _scaled(_run_table(scheme), h)
+        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+        out = np.empty((len(y0), len(save), 2 * self.ndof))
+        n_finite = np.empty(len(y0), dtype=np.int64)
+
+        def rows(i: slice) -> None:
+            loops.rollout_batch(*table, y0[i], n_steps, save, out[i], n_finite[i])
+
+        run_rows(rows, len(y0), n_steps * len(table[0]), threads)
+        return out, n_finite
+
+    def step(self, scheme: Scheme, h: ArrayLike, y: np.ndarray) -> np.ndarray:
+        """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
+        y = np.ascontiguousarray(y, dtype=np.float64)
+        h = np.ascontiguousarray(np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1]))
+        out = np.empty_like(y)
+        self._loops(scheme, False).step_each(*_step_table(scheme), h, y, out)
+        return out
+
+
+def run_rows(rows: Callable[[slice], None], n_rows: int, work_per_row: int, threads: int | None) -> None:
+    """Call ``rows(slice)`` over 0 … n_rows, on several threads if the work is worth it; `rows` releases the GIL."""
+    n_blocks = -(-n_rows // _BLOCK)
+    if threads is None:
+        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        threads = min(threads, 1 + n_rows * work_per_row // _WORTH_A_THREAD)
+    threads = max(1, min(threads, n_blocks))
+    if threads == 1:
+        rows(slice(0, n_rows))
+        return
+    bounds = [_BLOCK * (n_blocks * k // threads) for k in range(threads)] + [n_rows]
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(rows, [slice(*ends) for ends in pairwise(bounds)]))
+
+
+_Stage = tuple[float, float, float]  # kick b, gradient g, drift a
+_Table = tuple[np.ndarray, np.ndarray, np.ndarray]  # kicks, drifts, gradients of the stages
+
+
+def _stages(scheme: Scheme) -> list[_Stage]:
+    """The scheme as kick-drift pairs without idle maps, except a zero kick in front or a zero drift at the end."""
+    stages: list[_Stage] = []
+    for kind, c, g in scheme.substeps:
+        if kind == "kick":
+            stages.append((c, g, 0.0))
+        elif stages and stages[-1][2] == 0.0:
+            stages[-1] = (stages[-1][0], stages[-1][1], c)
+        else:
+            stages.append((0.0, 0.0, c))
+    return stages or [(0.0, 0.0, 0.0)]
+
+
+def _arrays(stages: list[_Stage]) -> _Table:
+    kicks, gradients, drifts = (np.array(column) for column in zip(*stages, strict=True))
+    return kicks, drifts, gradients
+
+
+@lru_cache(maxsize=256)
+def _step_table(scheme: Scheme) -> _Table:
+    """The stages of one step by itself, for h = 1."""
+    return _arrays(_stages(scheme))
+
+
+@lru_cache(maxsize=256)
+def _run_table(scheme: Scheme) -> _Table:
+    """The table [opening, inner …, link, closing] of a run, for h = 1: see `loops`."""
+    stages = _stages(scheme)
+    (b0, g0, a0), (b, g, a) = stages[0], stages[-1]
+    opening: _Stage = (0.0, 0.0, 0.0)
+    inner, link, closing = stages[:-1], stages[-1], stages[-1]
+    if len(stages) > 1 and a == 0.0:  # kick … kick: the last kick and the next first stage are one
+        opening, inner, link = stages[0], stages[1:-1], (b + b0, g + g0, a0)
+    elif len(stages) > 1 and b0 == g0 == 0.0:  # drift … drift
+        opening, inner, link = stages[0], stages[1:-1], (b, g, a + a0)
+    return _arrays([opening, *inner, link, closing])
+
+
+def _scaled(table: _Table, h: float) -> _Table:
+    kicks, drifts, gradients = table
+    return h * kicks, h * drifts, h**3 * gradients
+
+
+@dataclass(frozen=True)
+class _Loops:
+    """The compiled functions of one variant (with or without force gradients, compensated sums)."""
+
+    rollout: Callable[..., int]
+    rollout_batch: Callable[..., None]
+    step_each: Callable[..., None]
+
+
+def _header(gradients: bool, compensated: bool, cache: bool) -> str:
+    options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}, "cache": cache}
+    return (
+        "import math\n\nfrom numba import njit\n\n"
+        f"OPTIONS = {options}\nFORCE_GRADIENTS = {gradients}\nCOMPENSATED = {compensated}"
+    )
+
+
+def _symbolic_loops(algebra: str, gradients: bool, compensated: bool) -> _Loops:
+    header = _header(gradients, compensated, cache=True)
+    loops = load_module("\n\n\n".join([header, algebra, template("loops"), template("lanes")]))
+    return _Loops(loops.rollout, loops.rollout_lanes, loops.step_each)
+
+
+_INVERSE_MASS_TIMES_V = {
+    0: "out[i] = v[i]",
+    1: "out[i] = INVERSE_MASS[i] * v[i]",
+    2: "out[i] = 0.0\n        for j in range(NDOF):\n            out[i] += INVERSE_MASS[i, j] * v[j]",
+}
+
+
+def _array_loops(
+    ndof: int,
+    gradient: Any,
+    hessian_vector: Any | None,
+    inverse_mass: np.ndarray | None,
+    gradients: bool,
+    compensated: bool,
+) -> _Loops:
+    """The loops around the user's Numba functions; compiled for this process only."""
+    rows = _INVERSE_MASS_TIMES_V[0 if inverse_mass is None else inverse_mass.ndim]
+    mass = f"@njit(**OPTIONS)\ndef apply_inverse_mass(v, out):\n    for i in range(NDOF):\n        {rows}"
+    header = _header(gradients, compensated, cache=False)
+    functions: dict[str, Any] = {
+        "NDOF": ndof,
+        "INVERSE_MASS": inverse_mass,
+        "gradient": gradient,
+        "hessian_vector": hessian_vector,
+    }
+    exec("\n\n\n".join([header, mass, template("arrays"), template("loops")]), functions)
+    return _Loops(functions["rollout"], functions["rollout_each"], functions["step_each"])

@@ -1,0 +1,313 @@
+"""The splitting kernel against plain NumPy loops, and what it promises about saves, blow-ups, lanes and caches."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numba import njit
+
+from sympflow.integrators.schemes import SCHEMES, Scheme
+from sympflow.kernels.splitting import splitting_kernel
+from sympflow.system import HamiltonianSystem
+from sympflow.systems import harmonic_oscillator, henon_heiles
+
+VERLET, KAHAN_LI8 = SCHEMES["verlet"], SCHEMES["kahan_li8"]
+EULER = Scheme("symplectic_euler", 1, (1.0,), (1.0,), (0.0,), "kick, then drift: nothing to merge")
+DRIFT = Scheme("drift", None, (0.0,), (1.0,), (0.0,), "")
+PRIMED = Scheme("primed", None, (0.4, 0.6, 0.1), (0.5, 0.5, 0.0), (0.01, 0.0, 0.02), "", nystrom=True)
+
+
+def plain_run(system, scheme, h, y0, n_steps):
+    """Every state of a run, by NumPy, nothing merged: (n_steps + 1, ..., 2d)."""
+    d, states = system.ndof, [np.array(y0, dtype=float)]
+    for _ in range(n_steps):
+        q, p = states[-1][..., :d], states[-1][..., d:]
+        for b, g, a in zip(scheme.kicks, scheme.gradients, scheme.drifts, strict=True):
+            F = system.force(q)
+            p = p + b * h * F
+            if g:
+                p = p - g * h**3 * (system.potential_hessian(q) @ system.velocity(F)[..., None])[..., 0]
+            q = q + a * h * system.velocity(p)
+        states.append(np.concatenate([q, p], axis=-1))
+    return np.array(states)
+
+
+@njit
+def chain_potential(q):
+    V = q[0] ** 4 / 4
+    for i in range(len(q) - 1):
+        V += (q[i + 1] - q[i]) ** 2 / 2 + (q[i + 1] - q[i]) ** 4 / 4
+    return V
+
+
+@njit
+def chain_gradient(q, out):
+    out[:] = 0.0
+    out[0] = q[0] ** 3
+    for i in range(len(q) - 1):
+        r = q[i + 1] - q[i]
+        out[i] -= r + r**3
+        out[i + 1] += r + r**3
+
+
+@njit
+def chain_hessian_vector(q, v, out):
+    out[:] = 0.0
+    out[0] = 3 * q[0] ** 2 * v[0]
+    for i in range(len(q) - 1):
+        w = (1 + 3 * (q[i + 1] - q[i]) ** 2) * (v[i + 1] - v[i])
+        out[i] -= w
+        out[i + 1] += w
+
+
+MASS = np.array([[2.0, 0.3, 0.0], [0.3, 1.0, 0.2], [0.0, 0.2, 1.5]])
+
+
+def numba_chain(mass=MASS):
+    return HamiltonianSystem(
+        potential=chain_potential,
+        gradient=chain_gradient,
+        hessian_vector=chain_hessian_vector,
+        mass=mass,
+        ndof=3,
+        y0=[0.3, -0.2, 0.1, 0.0, 0.4, -0.1],
+    )
+
+
+def symbolic_chain():
+    """The same system, from symbols."""
+    M = np.linalg.inv(MASS)
+    kinetic = " + ".join(f"{float(M[i, j]) / 2!r}*p{i + 1}*p{j + 1}" for i in range(3) for j in range(3))
+    potential = "q1**4/4 + (q2-q1)**2/2 + (q2-q1)**4/4 + (q3-q2)**2/2 + (q3-q2)**4/4"
+    return HamiltonianSystem.from_sympy(f"{kinetic} + {potential}", y0=[0.3, -0.2, 0.1, 0.0, 0.4, -0.1])
+
+
+@pytest.fixture(scope="module")
+def systems():
+    """Built once: a kernel belongs to a system."""
+    return {
+        "henon_heiles": henon_heiles(),
+        "pendulum": HamiltonianSystem.from_sympy("p**2/2 - cos(q)", y0=[1.0, 0.3]),
+        "numba_chain": numba_chain(),
+        "symbolic_chain": symbolic_chain(),
+        "relativistic": HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**2/2 + q**4/4", y0=[0.5, 0.4]),
+        "kepler": HamiltonianSystem.from_sympy(
+            "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)",
+            y0=[1.0, 0.0, 0.0, 0.9],
+        ),
+    }
+
+
+# --- agreement ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", [*SCHEMES.values(), EULER, DRIFT, PRIMED], ids=lambda s: s.name)
+@pytest.mark.parametrize("name", ["henon_heiles", "numba_chain"])
+@pytest.mark.parametrize("h", [0.1, -0.1])
+def test_kernel_agrees_with_numpy(systems, name, scheme, h):
+    system = systems[name]
+    expected = plain_run(system, scheme, h, system.y0, 40)
+    kernel = splitting_kernel(system)
+    Y, n_finite = kernel.run(scheme, h, system.y0, 40, np.arange(41))
+    assert n_finite == 40
+    assert np.abs(Y - expected).max() < 2e-14 * len(scheme.kicks) ** 0.5
+    y = kernel.step(scheme, [h, h / 3], np.array([system.y0, system.y0]))
+    assert np.abs(y[0] - expected[1]).max() < 2e-15
+    assert np.abs(y[1] - plain_run(system, scheme, h / 3, system.y0, 1)[1]).max() < 2e-15
+
+
+@pytest.mark.parametrize("name", ["pendulum", "symbolic_chain", "relativistic", "kepler"])
+def test_kernel_agrees_with_numpy_on_every_kind_of_system(systems, name):
+    system = systems[name]
+    schemes = [KAHAN_LI8] + ([SCHEMES["omelyan6"]] if system.quadratic_kinetic else [])
+    for scheme in schemes:
+        Y, _ = splitting_kernel(system).run(scheme, 0.05, system.y0, 50, np.array([50]))
+        assert np.abs(Y[0] - plain_run(system, scheme, 0.05, system.y0, 50)[-1]).max() < 3e-14
+
+
+@pytest.mark.parametrize("mass", [None, [1.0, 2.0, 4.0]])
+def test_masses_of_numba_systems(mass):
+    system = numba_chain(mass)
+    Y, _ = splitting_kernel(system).run(VERLET, 0.1, system.y0, 20, np.array([20]))
+    assert np.abs(Y[0] - plain_run(system, VERLET, 0.1, system.y0, 20)[-1]).max() < 1e-14
+
+
+@pytest.mark.parametrize("scheme", [VERLET, SCHEMES["leapfrog"], EULER, SCHEMES["chin4a"]], ids=lambda s: s.name)
+@pytest.mark.parametrize("n_states", [1, 7, 64, 150])
+@pytest.mark.parametrize("compensated", [False, True])
+def test_batch_agrees_with_single_runs(systems, scheme, n_states, compensated):
+    system = systems["henon_heiles"]
+    kernel, save = splitting_kernel(system), np.array([0, 3, 300, 600])
+    y0 = system.y0 + np.random.default_rng(0).uniform(-0.02, 0.02, (n_states, 4))
+    Y, n_finite = kernel.run_batch(scheme, 0.1, y0, 600, save, compensated, threads=2)
+    assert Y.shape == (n_states, 4, 4)
+    assert (n_finite == 600).all()
+    for i in {0, n_states // 2, n_states - 1}:
+        single, _ = kernel.run(scheme, 0.1, y0[i], 600, save, compensated)
+        assert np.abs(Y[i] - single).max() < 1e-12
+
+
+def test_batch_of_a_numba_system(systems):
+    system = systems["numba_chain"]
+    y0 = system.y0 * np.array([[1.0], [0.5]])
+    Y, _ = splitting_kernel(system).run_batch(VERLET, 0.1, y0, 10, np.array([10]))
+    assert np.abs(Y[:, 0] - plain_run(system, VERLET, 0.1, y0, 10)[-1]).max() < 1e-14
+
+
+# --- saves ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", [VERLET, SCHEMES["leapfrog"], EULER], ids=lambda s: s.name)
+@pytest.mark.parametrize("save", [[], [0], [0, 0, 5, 5], [1, 2, 3, 700], [999], [1000], [0, 255, 256, 257, 512]])
+def test_saving_never_changes_the_trajectory(systems, scheme, save):
+    system = systems["henon_heiles"]
+    kernel, save = splitting_kernel(system), np.array(save, dtype=np.int64)
+    every, _ = kernel.run(scheme, 0.1, system.y0, 1000, np.arange(1001))
+    some, n_finite = kernel.run(scheme, 0.1, system.y0, 1000, save)
+    assert n_finite == 1000
+    assert np.array_equal(some, every[save])
+
+
+def test_no_steps(systems):
+    system = systems["henon_heiles"]
+    Y, n_finite = splitting_kernel(system).run(VERLET, 0.1, system.y0, 0, np.array([0]))
+    assert np.array_equal(Y, system.y0[None])
+    assert n_finite == 0
+
+
+def test_forth_and_back(systems):
+    system, kernel = systems["henon_heiles"], splitting_kernel(systems["henon_heiles"])
+    end, _ = kernel.run(KAHAN_LI8, 0.1, system.y0, 500, np.array([500]))
+    back, _ = kernel.run(KAHAN_LI8, -0.1, end[0], 500, np.array([500]))
+    assert np.abs(back[0] - system.y0).max() < 1e-12
+
+
+def test_compensated_summation_lowers_the_round_off(systems):
+    system, kernel = systems["henon_heiles"], splitting_kernel(systems["henon_heiles"])
+    save = np.arange(0, 100_001, 100)
+
+    def energy_error(compensated):
+        Y, _ = kernel.run(KAHAN_LI8, 0.05, system.y0, 100_000, save, compensated)
+        H = system.hamiltonian(Y)
+        return np.sqrt(np.mean((H / H[0] - 1) ** 2))
+
+    assert energy_error(True) < 0.5 * energy_error(False)
+
+
+# --- non-finite states ----------------------------------------------------------------------------------------
+
+
+def escaping():
+    """q'' = q³ from rest doubles its digits every few steps once large: it overflows at a definite step."""
+    return HamiltonianSystem.from_sympy("p**2/2 - q**4/4", y0=[1.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def runaway():
+    return escaping()
+
+
+@pytest.mark.parametrize("scheme", [VERLET, SCHEMES["leapfrog"], EULER, KAHAN_LI8], ids=lambda s: s.name)
+@pytest.mark.parametrize("stride", [1, 7, 1000])
+def test_the_last_finite_step_is_exact(runaway, scheme, stride):
+    h, n_steps = 0.005, 2000
+    with np.errstate(all="ignore"):
+        expected = plain_run(runaway, scheme, h, runaway.y0, n_steps)
+    finite = np.isfinite(expected).all(axis=1)
+    last = finite.argmin() - 1
+    assert not finite[last + 1 :].any()
+    save = np.arange(0, n_steps + 1, stride)
+    Y, n_finite = splitting_kernel(runaway).run(scheme, h, runaway.y0, n_steps, save)
+    assert n_finite == last
+    assert np.isfinite(Y[save <= last]).all()
+    assert np.isnan(Y[save > last]).all()
+
+
+def test_a_lane_that_overflows_leaves_the_others_unharmed(runaway):
+    kernel, save = splitting_kernel(runaway), np.array([0, 100, 400])
+    y0 = np.array([[1.0, 0.0], [1e-3, 0.0], [1e308, 0.0], [5e-324, 5e-324], [0.1, 0.0]])
+    Y, n_finite = kernel.run_batch(VERLET, 0.01, y0, 400, save)
+    singles = [kernel.run(VERLET, 0.01, y, 400, save) for y in y0]
+    assert n_finite.tolist() == [n for _, n in singles]
+    assert n_finite[0] < 400
+    assert n_finite[2] == 0
+    assert (n_finite[[1, 3, 4]] == 400).all()
+    for i, (single, n) in enumerate(singles):
+        assert np.array_equal(np.isnan(Y[i]), np.isnan(single))
+        rows = save <= n
+        np.testing.assert_allclose(Y[i][rows], single[rows], rtol=1e-11, atol=0)
+
+
+def test_an_unstable_step_is_found_out():
+    system = harmonic_oscillator(omega=100.0)
+    Y, n_finite = splitting_kernel(system).run(VERLET, 0.0201, np.array([1.0, 0.0]), 100_000, np.array([0, 100_000]))
+    assert 0 < n_finite < 100_000
+    assert np.isnan(Y[1]).all()
+
+
+def test_an_attractive_centre_divides_by_zero_without_an_exception(systems):
+    Y, n_finite = splitting_kernel(systems["kepler"]).run(VERLET, 0.1, np.zeros(4), 10, np.array([10]))
+    assert n_finite == 0
+    assert np.isnan(Y).all()
+
+
+# --- what cannot be compiled -----------------------------------------------------------------------------------
+
+
+def test_refusals(systems):
+    with pytest.raises(ValueError, match="`scheme` has force gradients"):
+        splitting_kernel(systems["relativistic"]).run(SCHEMES["chin4a"], 0.1, np.zeros(2), 1, np.array([1]))
+    with pytest.raises(ValueError, match="`system` is not separable"):
+        splitting_kernel(HamiltonianSystem.from_sympy("p**2*q**2/2 + q**2"))
+    plain = HamiltonianSystem(potential=lambda q: (q**2).sum(-1), ndof=1)
+    with pytest.raises(ValueError, match="`system` cannot be compiled"):
+        splitting_kernel(plain)
+
+
+def test_a_kernel_is_built_once_per_system(systems):
+    assert splitting_kernel(systems["pendulum"]) is splitting_kernel(systems["pendulum"])
+
+
+# --- the cache on disk -----------------------------------------------------------------------------------------
+
+SCRIPT = """
+import numpy as np
+from sympflow.integrators.schemes import SCHEMES
+from sympflow.kernels.splitting import splitting_kernel
+from sympflow.systems import pendulum
+
+system = pendulum()
+kernel = splitting_kernel(system)
+Y, n = kernel.run(SCHEMES["verlet"], 0.1, np.array([1.0, 0.0]), 10, np.array([10]))
+rollout = kernel._loops(SCHEMES["verlet"], False).rollout
+print(repr(Y.tolist()), sum(rollout.stats.cache_hits.values()), sum(rollout.stats.cache_misses.values()))
+"""
+
+
+def run_in_fresh_process(folder):
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA")}
+    result = subprocess.run(
+        [sys.executable, "-c", SCRIPT],
+        env=environment | {"SYMPFLOW_CACHE_DIR": str(folder)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    values, hits, misses = result.stdout.strip().rsplit(" ", 2)
+    return values, int(hits), int(misses)
+
+
+def test_a_fresh_process_finds_the_compiled_code(tmp_path):
+    first = run_in_fresh_process(tmp_path / "cache")
+    second = run_in_fresh_process(tmp_path / "cache")
+    assert first == (second[0], 0, 1)
+    assert second[1:] == (1, 0)
+
+
+def test_a_folder_that_cannot_be_written_is_no_obstacle(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    values, _, misses = run_in_fresh_process(tmp_path / "file" / "cache")
+    assert values.startswith("[[")
+    assert misses == 1
