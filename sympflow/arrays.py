@@ -37,7 +37,7 @@ def stack(parts: Sequence[Array], axis: int = -1) -> Array:
     return np.stack(parts, axis=axis)
 
 
-def assemble(values: Sequence[Array | float], like: Array) -> Array:
+def assemble(values: Sequence[Any], like: Array) -> Array:
     """Stack numbers and arrays of shape `like.shape` along a new last axis, in the dtype of `like`."""
     if is_tensor(like):
         import torch
@@ -54,7 +54,7 @@ def is_number(x: object) -> bool:
     return isinstance(x, int | float)
 
 
-def per_state(h: Array | float, y: Array) -> Array | float:
+def per_state(h: Any, y: Array) -> Any:
     """`h` of shape y.shape[:-1] (one value a state) made to broadcast against (..., k); numbers pass."""
     return h[..., None] if getattr(h, "ndim", 0) else h
 

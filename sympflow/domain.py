@@ -91,7 +91,7 @@ class Box:
         if np.shape(self.low) != np.shape(self.high):
             raise ValueError(f"`high` must have the length of `low`; got {np.size(self.high)} and {np.size(self.low)}.")
         if not np.all(np.less(self.low, self.high)):
-            raise ValueError(f"`low` must be below `high` in every component; got {self.low}, {self.high}.")
+            raise ValueError(f"`low` must be below `high` in every component; got {self.low!r}, {self.high!r}.")
 
     def sample(self, n: int, seed: int = 0) -> np.ndarray:
         rng = np.random.default_rng(seed)
