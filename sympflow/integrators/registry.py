@@ -16,9 +16,9 @@ GROUP = "sympflow.integrators"
 """The entry-point group in which a distribution announces its integrators: `name = "package.module:Class"`."""
 
 _BUILT_IN = {
-    "rk45": "runge_kutta:RK45",
-    "dop853": "runge_kutta:DOP853",
-    "dopri5": "runge_kutta:Dopri5",
+    "rk45": "scipy_methods:RK45",
+    "dop853": "scipy_methods:DOP853",
+    "dopri5": "torchdiffeq_methods:Dopri5",
     "sympflow": "sympflow:SympFlowIntegrator",
     "mlp": "sympflow:MLPIntegrator",
 }

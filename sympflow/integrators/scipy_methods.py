@@ -1,0 +1,202 @@
+"""SciPy's explicit Runge–Kutta methods as integrators."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.integrate import DOP853 as ScipyDOP853
+from scipy.integrate import RK45 as ScipyRK45
+from scipy.integrate import OdeSolution
+
+from sympflow.arrays import Array, is_tensor
+from sympflow.integrators.base import FINISHED, Outcome, Problem, Steps
+from sympflow.integrators.grid import Grid
+from sympflow.integrators.runge_kutta import RungeKutta
+from sympflow.system import HamiltonianSystem
+
+
+@dataclass(frozen=True)
+class _Scipy(RungeKutta):
+    """A SciPy solver, trajectory by trajectory.
+
+    Parameters
+    ----------
+    rtol, atol : float
+        The local error is kept below atol + rtol·|y|; the defaults are SciPy's.
+    max_step : float
+        Longest step.
+    first_step : float, optional
+        Length of the first step; the solver chooses it by default.
+    """
+
+    max_step: float = math.inf
+    first_step: float | None = None
+
+    solver: ClassVar[Any]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.max_step > 0:
+            raise ValueError(f"`max_step` must be positive; got {self.max_step!r}.")
+        if self.first_step is not None and not 0 < self.first_step < math.inf:
+            raise ValueError(f"`first_step` must be positive and finite; got {self.first_step!r}.")
+
+    def _start(self, system: HamiltonianSystem, t0: float, t1: float, y0: np.ndarray) -> Any:
+        """The SciPy solver at t0, or None if the vector field or the first step is not finite there."""
+        first = None if self.first_step is None else min(self.first_step, abs(t1 - t0))
+        with np.errstate(all="ignore"):
+            solver = self.solver(system, t0, y0, t1, self.max_step, self.rtol, self.atol, first_step=first)
+        return solver if np.isfinite(solver.f).all() and 0 < solver.h_abs < math.inf else None
+
+    def run(self, problem: Problem) -> Outcome:
+        if is_tensor(problem.y0):
+            raise TypeError(
+                f"`y0` is a tensor, but method {self.name!r} is SciPy's and runs on NumPy arrays: pass y0.numpy(), or "
+                "use method='dopri5'."
+            )
+        if problem.y0.ndim == 1:
+            return self._run_one(problem, problem.y0, problem.t_eval)
+        batch = problem.y0.shape[:-1]
+        t_eval = problem.t_eval
+        if t_eval is None:  # the trajectories take different steps: report on a common grid
+            t_eval = Grid(problem.t0, problem.t1, problem.system.dt).outputs(None, problem.save_every)[0]
+        runs = [self._run_one(problem, y0, t_eval) for y0 in problem.y0.reshape(-1, problem.y0.shape[-1])]
+        y = np.full((len(t_eval), len(runs), problem.y0.shape[-1]), np.nan)
+        for i, run in enumerate(runs):
+            y[: len(run.y), i] = run.y
+        failed = [i for i, run in enumerate(runs) if run.status]
+        stats = {key: sum(run.stats[key] for run in runs) for key in ("n_steps", "force_evaluations")}
+        stats |= {"hessian_evaluations": 0, "backend": "scipy"}
+        if problem.t_eval is None:
+            stats["output_step"] = problem.system.dt
+        message = FINISHED if not failed else f"Trajectory {failed[0]} failed: {runs[failed[0]].message}"
+        status = np.array([run.status for run in runs]).reshape(batch)
+        outcome = Outcome(t_eval, y.reshape(len(t_eval), *problem.y0.shape), status, message, stats)
+        if problem.dense_output:
+            outcome.sol = _BatchSolution([run.sol for run in runs], batch)
+        return outcome
+
+    def _run_one(self, problem: Problem, y0: np.ndarray, t_eval: np.ndarray | None) -> Outcome:
+        """SciPy's driver loop for one trajectory: every step, or the dense output at `t_eval`."""
+        t0, t1 = problem.t0, problem.t1
+        stats: dict[str, Any] = {
+            "n_steps": 0,
+            "force_evaluations": 0,
+            "hessian_evaluations": 0,
+            "backend": "scipy",
+        }
+        times, states, interpolants = [t0], [y0], []
+        solver = self._start(problem.system, t0, t1, y0.astype(float)) if t1 != t0 else None
+        failure = None
+        if t1 != t0 and solver is None:
+            failure = f"The vector field or the first step is not finite at t = {t0:.17g}. Check `y0` and its scale."
+        wanted = [] if t_eval is None else t_eval.tolist()
+        outputs: list[np.ndarray] = [y0 for t in wanted if t == t0]
+        with np.errstate(all="ignore"):
+            while solver is not None and solver.status == "running":
+                failure = solver.step()
+                if solver.status == "failed":
+                    failure = f"{failure} The solver stopped at t = {solver.t:.17g}."
+                    break
+                if not np.isfinite(solver.y).all():
+                    failure = f"The solution became non-finite after t = {solver.t_old:.17g}. End `t_span` earlier."
+                    break
+                stats["n_steps"] += 1
+                due = [t for t in wanted[len(outputs) :] if (solver.t - t) * solver.direction >= 0]
+                if problem.dense_output or due:
+                    interpolants.append(solver.dense_output())
+                    outputs += [solver.y if t == solver.t else interpolants[-1](t) for t in due]
+                    if not problem.dense_output:
+                        interpolants.clear()
+                if t_eval is None or problem.dense_output:
+                    times.append(solver.t)
+                    states.append(solver.y)
+        stats["force_evaluations"] = 0 if solver is None else int(solver.nfev)
+        if t_eval is None:
+            keep = sorted({*range(0, len(times), problem.save_every), len(times) - 1})
+            t, y = np.array(times)[keep], np.array(states)[keep]
+        else:
+            t, y = t_eval[: len(outputs)], np.array(outputs).reshape(-1, len(y0))
+        outcome = Outcome(t, y.astype(y0.dtype), -1 if failure else 0, failure or FINISHED, stats)
+        if problem.dense_output:
+            outcome.sol = OdeSolution(times, interpolants) if interpolants else _Constant(y0)
+        return outcome
+
+    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        """The realised steps. In a batch the trajectories advance in parallel; one that has ended waits with h = 0."""
+        batch = y0.shape[:-1]
+        starts = np.asarray(y0, dtype=float).reshape(-1, y0.shape[-1])
+        solvers = [self._start(system, *t_span, y) if t_span[0] != t_span[1] else None for y in starts]
+        t = np.full(len(starts), t_span[0], dtype=float)
+        y = starts.copy()
+        while any(solver is not None and solver.status == "running" for solver in solvers):
+            h, y_next = np.zeros(len(starts)), y.copy()
+            for i, solver in enumerate(solvers):
+                if solver is None or solver.status != "running":
+                    continue
+                with np.errstate(all="ignore"):
+                    solver.step()
+                if solver.status == "failed" or not np.isfinite(solver.y).all():
+                    solvers[i] = None
+                else:
+                    h[i], y_next[i] = solver.t - t[i], solver.y
+            yield t.reshape(1, *batch).copy(), y.reshape(1, *y0.shape), h.reshape(1, *batch)
+            t, y = t + h, y_next
+
+
+class _Constant:
+    """Dense output of an interval of length zero."""
+
+    def __init__(self, y: np.ndarray) -> None:
+        self.y = y
+
+    def __call__(self, t: Any) -> np.ndarray:
+        return self.y if np.ndim(t) == 0 else np.repeat(self.y[:, None], len(t), axis=1)
+
+
+class _BatchSolution:
+    """The dense outputs of the trajectories of a batch, stacked: (..., 2d) or (..., 2d, n)."""
+
+    def __init__(self, solutions: list[Any], batch: tuple[int, ...]) -> None:
+        self.solutions, self.batch = solutions, batch
+
+    def __call__(self, t: Any) -> np.ndarray:
+        y = np.stack([sol(t) for sol in self.solutions])
+        return y.reshape(*self.batch, *y.shape[1:])
+
+
+@dataclass(frozen=True)
+class RK45(_Scipy):
+    """Dormand–Prince 5(4), SciPy's `RK45`: the paper's ODE45, at the default tolerances.
+
+    Parameters
+    ----------
+    rtol, atol, max_step, first_step
+        As in `scipy.integrate.solve_ivp`.
+    """
+
+    name: ClassVar[str] = "rk45"
+    order: ClassVar[int | None] = 5
+    solver: ClassVar[Any] = ScipyRK45
+    A: ClassVar[np.ndarray] = ScipyRK45.A
+    B: ClassVar[np.ndarray] = ScipyRK45.B
+
+
+@dataclass(frozen=True)
+class DOP853(_Scipy):
+    """Dormand–Prince 8(5,3), SciPy's `DOP853`.
+
+    Parameters
+    ----------
+    rtol, atol, max_step, first_step
+        As in `scipy.integrate.solve_ivp`.
+    """
+
+    name: ClassVar[str] = "dop853"
+    order: ClassVar[int | None] = 8
+    solver: ClassVar[Any] = ScipyDOP853
+    A: ClassVar[np.ndarray] = ScipyDOP853.A
+    B: ClassVar[np.ndarray] = ScipyDOP853.B
