@@ -1,0 +1,381 @@
+"""compare(): several methods on one system, at the same instants, against one reference."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.candidates import Candidate, candidates
+from sympflow.matching import match as match_to
+from sympflow.matching import tunable
+from sympflow.metrics.accuracy import reference_error, time_reversal_error
+from sympflow.metrics.energy import energy_drift, energy_error, failed, max_energy_error
+from sympflow.metrics.reference import Reference
+from sympflow.metrics.reference import reference as compute_reference
+from sympflow.metrics.symplectic import symplecticity_defect, volume_error
+from sympflow.solution import Solution
+from sympflow.solver import _check_t_span, _check_y0, solve
+from sympflow.system import HamiltonianSystem
+from sympflow.timing import interleaved
+
+if TYPE_CHECKING:
+    from sympflow.comparison_report import Comparison
+
+METRICS = ("error", "energy", "drift", "volume", "symplecticity", "reversal")
+MATCHES = ("time", "evaluations", "energy_error")
+PAPER = ("sympflow", "mlp", "verlet", "leapfrog", "rk45")
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was measured of one method; None where it was not asked for, does not apply or could not be had.
+
+    Attributes
+    ----------
+    system, method, label : str
+    status : str
+        "ok"; "failed", if it ran and did not reach the end; "not applicable", if it could not run.
+    reason : str
+        Why it failed, and whatever else should be known.
+    dt : float or None
+        Step of a fixed-step method; for an adaptive one see `tolerance`.
+    tolerance : float or None
+        rtol of an adaptive method.
+    backend : str
+        What ran: "compiled", "numpy", "torch", "scipy" or "torchdiffeq".
+    run_time, run_time_spread : float
+        Median and interquartile range of the repeats, in seconds.
+    force_evaluations, hessian_evaluations : int
+        Of one run, all trajectories of a SciPy batch together.
+    error : float
+        max over the instants of ‖y − y_ref‖; of a batch the median over its trajectories.
+    energy_error : float
+        max |ΔH| over the instants, relative as in `sympflow.energy_error`; of a batch the median.
+    energy_drift, energy_drift_error : float
+        Slope of the energy error per unit time, and its standard error; of a batch, those of the median slope.
+    volume_error : float
+        Σ log|det| over the steps; of a batch the one that is largest in magnitude.
+    symplecticity_defect : float
+        max ‖AᵀJA − J‖/‖A‖² over the steps and trajectories.
+    time_reversal_error : float
+        ‖y − y0‖ after there and back; of a batch the median.
+    training_time : float
+        Seconds that training the flow took.
+    """
+
+    system: str
+    method: str
+    label: str
+    status: str = "ok"
+    reason: str = ""
+    dt: float | None = None
+    tolerance: float | None = None
+    backend: str | None = None
+    run_time: float | None = None
+    run_time_spread: float | None = None
+    force_evaluations: int | None = None
+    hessian_evaluations: int | None = None
+    error: float | None = None
+    energy_error: float | None = None
+    energy_drift: float | None = None
+    energy_drift_error: float | None = None
+    volume_error: float | None = None
+    symplecticity_defect: float | None = None
+    time_reversal_error: float | None = None
+    training_time: float | None = None
+
+
+@dataclass
+class Run:
+    """A candidate on its way to a row."""
+
+    candidate: Candidate
+    row: Row
+    sol: Solution | None = None
+    energy: np.ndarray | None = field(default=None, repr=False)
+    volume: np.ndarray | None = field(default=None, repr=False)
+
+    def note(self, text: str) -> None:
+        self.row = replace(self.row, reason=f"{self.row.reason} {text}".strip())
+
+
+def compare(
+    system: HamiltonianSystem,
+    methods: Sequence[Any] = PAPER,
+    metrics: Sequence[str] = METRICS[:5],
+    *,
+    t_span: tuple[float, float] | None = None,
+    y0: ArrayLike | None = None,
+    dt: float | None = None,
+    n_outputs: int = 1000,
+    repeats: int = 5,
+    match: str | None = None,
+    reference: Reference | ArrayLike | None = None,
+    backend: str = "auto",
+    progress: Callable[[str], None] | None = None,
+) -> Comparison:
+    """Run every method on the system and measure it, at the same instants and against one reference.
+
+    A method that does not apply, or fails, gets a row that says why.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    methods : sequence
+        Each a name, a configured integrator such as ``get("verlet")(dt=0.01)``, a trained flow, or a pair
+        (label, any of these).
+    metrics : sequence of str
+        Any of "error", "energy", "drift", "volume", "symplecticity" and "reversal". Others are not computed.
+    t_span, y0 : optional
+        Interval and initial state (or batch); the system's by default.
+    dt : float, optional
+        Step of the fixed-step classical methods that are given by name; `system.dt` by default.
+    n_outputs : int
+        Number of instants, equally spaced and ending at the end of the interval.
+    repeats : int
+        Runs that are timed, interleaved over the methods, after one that is not.
+    match : "time", "evaluations" or "energy_error", optional
+        Tune the steps and tolerances of the methods after the first until they equal it in this.
+        By default each method runs at its stated step or tolerance.
+    reference : Reference or array_like (..., 2d, n_outputs), optional
+        Computed by default: exact, or tighter than the smallest error by a factor of 100 where float64 can hold that.
+    backend : "auto", "compiled" or "array"
+        As for `solve`; a method that lacks the backend asked for gets a row that says so.
+    progress : callable, optional
+        Called with a line of text when something begins.
+
+    Returns
+    -------
+    Comparison
+        With `.rows`, `.table()`, `.to_csv()`, `.to_json()` and `.plot()`.
+
+    Notes
+    -----
+    The run time is that of `solve`, with everything that the outputs need.
+
+    Examples
+    --------
+    >>> import sympflow
+    >>> report = sympflow.compare(sympflow.systems.pendulum(), ["verlet", "rk45"], ("energy",), repeats=1)
+    >>> [row.status for row in report.rows]
+    ['ok', 'ok']
+    """
+    from sympflow.comparison_report import Comparison
+
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    asked = _check_metrics(metrics)
+    for name, value in (("n_outputs", n_outputs), ("repeats", repeats)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
+    if match is not None and match not in MATCHES:
+        raise ValueError(f"`match` must be one of {', '.join(map(repr, MATCHES))}, or None; got {match!r}.")
+    t0, t1 = _check_t_span(system.t_span if t_span is None else t_span)
+    if t0 == t1:
+        raise ValueError("`t_span` has length zero, so there is nothing to compare: choose a later end.")
+    start = _check_y0(system, system.y0 if y0 is None else y0, None)
+    t = t0 + (t1 - t0) * np.arange(1, n_outputs + 1) / n_outputs
+    say = progress or (lambda text: None)
+
+    def run(integrator: Any) -> Solution:
+        return solve(system, integrator, (t0, t1), start, t_eval=t, backend=backend)
+
+    runs = [Run(c, Row(system.name, c.method, c.label)) for c in candidates(methods, dt)]
+    for one in runs:
+        say(f"{system.name}: running {one.candidate.label}")
+        _first_run(one, run)
+    if match is not None:
+        _match(runs, match, run, system, repeats, say)
+    ready = [one for one in runs if one.row.status == "ok"]
+    say(f"{system.name}: timing")
+    times = interleaved([partial(run, one.candidate.integrator) for one in ready], repeats) if ready else []
+    for one, run_time in zip(ready, times, strict=True):
+        one.row = replace(one.row, run_time=run_time.median, run_time_spread=run_time.spread)
+    truth = None
+    if "error" in asked and any(one.sol is not None for one in runs):
+        say(f"{system.name}: reference")
+        truth = _errors(runs, system, (t0, t1), start, t, reference)
+    for one in runs:
+        if one.sol is not None:
+            say(f"{system.name}: measuring {one.candidate.label}")
+            _measure(one, one.sol, asked)
+    return Comparison(system, (t0, t1), start, t, asked, repeats, match, truth, tuple(runs))
+
+
+def _check_metrics(metrics: Sequence[str]) -> tuple[str, ...]:
+    asked = (metrics,) if isinstance(metrics, str) else tuple(metrics)
+    unknown = [m for m in asked if m not in METRICS]
+    if unknown:
+        raise ValueError(f"`metrics` has no {unknown[0]!r}: choose from {', '.join(METRICS)}.")
+    return asked
+
+
+def _first_run(one: Run, run: Callable[[Any], Solution]) -> None:
+    """Run once, which also compiles; note what the solution says, or why there is none."""
+    integrator = one.candidate.integrator
+    try:
+        if one.candidate.problem:
+            raise ImportError(one.candidate.problem)
+        sol = run(integrator)
+    except (ValueError, TypeError, ImportError, NotImplementedError) as error:
+        one.row = replace(one.row, status="not applicable", reason=str(error))
+        return
+    except Exception as error:
+        one.row = replace(one.row, status="failed", reason=f"{type(error).__name__}: {error}")
+        return
+    stats = sol.stats
+    one.sol = sol
+    one.row = replace(
+        one.row,
+        status="failed" if failed(sol).all() or (sol.y.ndim == 2 and not sol.success) else "ok",
+        reason="" if sol.success else sol.message,
+        dt=stats.get("dt"),
+        tolerance=getattr(integrator, "rtol", None),
+        backend=stats.get("backend"),
+        force_evaluations=int(stats["force_evaluations"]),
+        hessian_evaluations=int(stats["hessian_evaluations"]),
+    )
+    if sol.success and "domain_exit" in stats:
+        one.note(f"The state left the flow's domain at t = {stats['domain_exit']:.4g}.")
+    if integrator.trained:
+        figures = integrator.flow_for(sol.system).figures
+        one.row = replace(one.row, training_time=figures.get("training_seconds"))
+
+
+def _match(
+    runs: list[Run],
+    what: str,
+    run: Callable[[Any], Solution],
+    system: HamiltonianSystem,
+    repeats: int,
+    say: Callable[[str], None],
+) -> None:
+    """Tune every method that can be to the first one that ran and has the figure."""
+
+    def measure(integrator: Any) -> float:
+        sol = run(integrator)
+        if not sol.success:
+            return math.inf
+        if what == "energy_error":
+            return float(np.median(max_energy_error(sol)))
+        if what == "evaluations":
+            return float(sol.stats["force_evaluations"] + sol.stats["hessian_evaluations"])
+        return interleaved([partial(run, integrator)], min(repeats, 3))[0].median
+
+    targets = ((one, measure(one.candidate.integrator)) for one in runs if one.row.status == "ok")
+    anchor, target = next(((one, x) for one, x in targets if 0 < x < math.inf), (None, math.nan))
+    for one in runs:
+        if anchor is None or one is anchor or one.row.status == "not applicable":
+            continue
+        if not tunable(one.candidate.integrator):
+            one.note(f"Not matched: {one.candidate.label} has no step to tune.")
+            continue
+        say(f"{system.name}: matching {one.candidate.label}")
+        integrator, reached = match_to(one.candidate.integrator, system, measure, target, what == "energy_error")
+        one.candidate = replace(one.candidate, integrator=integrator)
+        one.row = Row(system.name, one.candidate.method, one.candidate.label)
+        _first_run(one, run)
+        if not abs(math.log(reached / target)) < 0.1:
+            one.note(f"Matched only to {reached:.2g} where {anchor.candidate.label} has {target:.2g}.")
+
+
+def _errors(
+    runs: list[Run],
+    system: HamiltonianSystem,
+    t_span: tuple[float, float],
+    y0: np.ndarray,
+    t: np.ndarray,
+    given: Reference | ArrayLike | None,
+) -> Reference | None:
+    """Fill in the errors; tighten a computed reference until it is 100 times better than the best of them."""
+    if given is not None and not isinstance(given, Reference):
+        given = Reference(t, np.asarray(given, dtype=float), "given", 0.0)
+    measured = [(one, one.sol) for one in runs if one.sol is not None]
+    target = 1e-8
+    for _ in range(2):
+        try:
+            truth = given or compute_reference(system, t_span, y0, t, target)
+        except (ValueError, RuntimeError) as problem:
+            for one, _ in measured:
+                one.note(f"No error: {problem}")
+            return None
+        for one, sol in measured:
+            error = _largest(reference_error(sol, truth), sol)
+            one.row = replace(one.row, error=float(np.median(error)))
+        target = min((one.row.error for one, _ in measured if one.row.error is not None), default=math.inf) / 100
+        if given is not None or truth.accuracy <= target:
+            break
+    for one, _ in measured:
+        if one.row.error is not None and one.row.error < 3 * truth.accuracy:
+            one.note("The error is no larger than the uncertainty of the reference.")
+    return truth
+
+
+def _largest(series: np.ndarray, sol: Solution) -> np.ndarray:
+    """Maxima over time of a non-negative series, inf for trajectories that failed."""
+    worst = np.where(np.isnan(series), np.inf, series).max(axis=-1, initial=0.0)
+    return np.where(failed(sol), np.inf, worst)
+
+
+def _measure(one: Run, sol: Solution, asked: tuple[str, ...]) -> None:
+    """Compute the metrics asked for; a metric that cannot be had leaves a note."""
+    for metric in asked:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", RuntimeWarning)
+            try:
+                _MEASURES[metric](one, sol)
+            except Exception as error:
+                one.note(f"No {metric}: {error}")
+        for message in dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, RuntimeWarning)):
+            if message not in one.row.reason:
+                one.note(message)
+
+
+def _energy(one: Run, sol: Solution) -> None:
+    one.energy = np.abs(energy_error(sol))
+    one.row = replace(one.row, energy_error=float(np.median(max_energy_error(sol))))
+
+
+def _drift(one: Run, sol: Solution) -> None:
+    if one.row.status == "failed":
+        return
+    drift = energy_drift(sol)
+    slope, error = np.ravel(drift.slope), np.ravel(drift.standard_error)
+    middle = int(np.argsort(slope)[len(slope) // 2])
+    one.row = replace(one.row, energy_drift=float(slope[middle]), energy_drift_error=float(error[middle]))
+
+
+def _volume(one: Run, sol: Solution) -> None:
+    if one.row.status == "failed":
+        return
+    one.volume = series = np.asarray(volume_error(sol, over_time=True))
+    last = np.ravel(series[..., -1])
+    worst = np.argmax(np.where(np.isnan(last), np.inf, np.abs(last)))
+    one.row = replace(one.row, volume_error=float(last[worst]))
+
+
+def _symplecticity(one: Run, sol: Solution) -> None:
+    if one.row.status == "failed":
+        return
+    one.row = replace(one.row, symplecticity_defect=float(np.max(symplecticity_defect(sol, relative=True))))
+
+
+def _reversal(one: Run, sol: Solution) -> None:
+    one.row = replace(one.row, time_reversal_error=float(np.median(time_reversal_error(sol))))
+
+
+_MEASURES: dict[str, Callable[[Run, Solution], None]] = {
+    "error": lambda one, sol: None,  # filled in with the reference, once for all methods
+    "energy": _energy,
+    "drift": _drift,
+    "volume": _volume,
+    "symplecticity": _symplecticity,
+    "reversal": _reversal,
+}
