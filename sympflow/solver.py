@@ -217,7 +217,7 @@ def _check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianS
         domain = domain.attach(system.hamiltonian)
     if domain is None or not len(outcome.t):
         return
-    slack = float(getattr(flow, "figures", {}).get("energy_error", 0.0))
+    slack = float(getattr(flow, "figures", {}).get("energy_error_max") or 0.0)
     inside = domain.contains(outcome.y, slack=slack).reshape(len(outcome.t), -1).all(1)
     if inside.all():
         return

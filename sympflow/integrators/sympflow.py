@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from sympflow.flow.sympflow import SympFlow
 
 
+_SHIPPED: dict[tuple[str, tuple[float, ...]], Any] = {}  # read from their files once in a process
+
+
 @dataclass(frozen=True)
 class FlowIntegrator(FixedStep):
     """A trained flow ψ̄ on the grid t0 + k·Δt: ψ_t = ψ̄_{t−kΔt} ∘ (ψ̄_Δt)^k, and its exact inverse for t < t0.
@@ -55,9 +58,12 @@ class FlowIntegrator(FixedStep):
         """The flow that is used for a system: the one given, else the one shipped."""
         if self.flow is not None:
             return self.flow
-        from sympflow.flow.io import shipped
+        key = (self.name, system.fingerprint)
+        if key not in _SHIPPED:
+            from sympflow.flow.io import shipped
 
-        return shipped(system, self.name)
+            _SHIPPED[key] = shipped(system, self.name)
+        return _SHIPPED[key]
 
     def check(self, system: HamiltonianSystem) -> None:
         flow = self.flow_for(system)
@@ -73,6 +79,10 @@ class FlowIntegrator(FixedStep):
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         flow = self.flow_for(system)
         return self._apply(flow.inverse, y, h)
+
+    def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
+        self.flow_for(system)  # files cannot be read inside a function transform
+        return super().tangent(system, t, y, h)
 
     def _apply(self, function: Any, y: Array, h: float | Array) -> Array:
         """function(h, y) of tensors, for tensors or arrays."""

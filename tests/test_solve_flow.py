@@ -1,0 +1,114 @@
+"""Flows as steppers: solve gives ψ_t for every t, and metrics see a symplectic map."""
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import MLPFlow, SympFlow, get, solve, symplecticity_defect, systems, volume_error
+
+HH = systems.henon_heiles()
+EPS = np.finfo(float).eps
+
+
+def random_flow(cls=SympFlow, seed=0, **options):
+    """An untrained flow with O(1) weights: all structure, no accuracy."""
+    flow = cls(2, hidden=(6, 5), dt=0.5, seed=seed, **options)
+    return flow.requires_grad_(False)
+
+
+FLOW, MLP = random_flow(), random_flow(MLPFlow)
+Y0 = HH.domain.sample(6, 0).reshape(2, 3, 4)
+
+
+@pytest.mark.parametrize("flow", [FLOW, MLP], ids=["sympflow", "mlp"])
+def test_solve_is_the_flow_at_every_t(flow):
+    times = np.array([0.0, 0.1, 0.5, 0.77, 1.5, 2.3])
+    sol = solve(HH, flow.kind, (0.0, 2.3), y0=Y0, flow=flow, t_eval=times, dense_output=True, on_domain_exit="ignore")
+    for i, t in enumerate(times):
+        np.testing.assert_allclose(sol.y[..., i], flow(float(t), torch.tensor(Y0)).numpy(), atol=32 * EPS)
+    np.testing.assert_array_equal(sol.sol(times), sol.y)
+    assert sol.stats["dt"] == 0.5
+    assert sol.stats["n_steps"] == 4
+
+
+def test_a_flow_is_a_method():
+    sol = solve(HH, FLOW, (0.0, 2.0), on_domain_exit="ignore")
+    np.testing.assert_array_equal(sol.y, solve(HH, "sympflow", (0.0, 2.0), flow=FLOW, on_domain_exit="ignore").y)
+    assert sol.t.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
+
+
+def test_backward_time_is_the_exact_inverse():
+    there = solve(HH, FLOW, (0.2, 2.2), y0=Y0, on_domain_exit="ignore")
+    back = solve(HH, FLOW, (2.2, 0.2), y0=there.y[..., -1], t_eval=[1.9, 0.2], on_domain_exit="ignore")
+    end = torch.tensor(np.ascontiguousarray(there.y[..., -1]))
+    np.testing.assert_allclose(back.y[..., 0], FLOW.inverse(0.3, end).numpy(), atol=32 * EPS)
+    np.testing.assert_allclose(back.y[..., 1], Y0, atol=1e3 * EPS)
+
+
+def test_the_unconstrained_flow_has_no_way_back():
+    with pytest.raises((TypeError, ValueError), match=r"inverse|negative|backward"):
+        solve(HH, MLP, (1.0, 0.0))
+    with pytest.raises(TypeError, match=r"^`method` 'mlp' has no exact inverse"):
+        get("mlp")(flow=MLP).inverse(HH, 0.0, HH.y0, 0.1)
+
+
+def test_a_smaller_step_composes_another_map():
+    sol = solve(HH, FLOW, (0.0, 1.0), dt=0.25, on_domain_exit="ignore")
+    y = torch.tensor(HH.y0)
+    for _ in range(4):
+        y = FLOW(0.25, y)
+    np.testing.assert_allclose(sol.y[:, -1], y.numpy(), atol=32 * EPS)
+
+
+def test_step_and_inverse():
+    integrator = get("sympflow")(flow=FLOW)
+    for h in (0.5, 0.2, -0.3):
+        y = integrator.step(HH, 0.0, Y0, h)
+        np.testing.assert_allclose(integrator.inverse(HH, 0.0, y, h), Y0, atol=1e3 * EPS)
+    assert (integrator.order, integrator.symplectic, get("mlp").symplectic) == (None, True, False)
+
+
+def test_metrics_of_the_map_as_executed():
+    sol = solve(HH, FLOW, (0.0, 5.3), on_domain_exit="ignore")
+    assert symplecticity_defect(sol, relative=True) < 1e-13
+    assert abs(volume_error(sol)) < 11 * 1e-13  # 11 steps
+    assert abs(volume_error(solve(HH, MLP, (0.0, 2.0), on_domain_exit="ignore"))) > 1e-3
+
+
+def test_tensors_and_gradients_to_state_and_weights():
+    flow = random_flow(seed=1).requires_grad_(True)
+    y0 = torch.tensor(HH.y0, requires_grad=True)
+
+    def final(y, *weights):
+        return solve(HH, flow, (0.0, 1.2), y0=y, t_eval=[0.7, 1.2], on_domain_exit="ignore").y
+
+    assert torch.autograd.gradcheck(final, (y0, *list(flow.parameters())[:2]))
+
+
+def test_float32():
+    flow = random_flow(dtype=torch.float32)
+    sol = solve(HH, flow, (0.0, 2.0), dtype="float32", on_domain_exit="ignore")
+    assert sol.y.dtype == np.float32
+    assert solve(HH, flow, (0, 1), y0=torch.tensor(HH.y0, dtype=torch.float32)).y.dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"flow": FLOW, "dt": 1.0}, ValueError, r"^`dt` must be at most the flow's Δt = 0.5"),
+        ({"flow": MLP}, TypeError, r"^`flow` must be a trained flow of kind 'sympflow'; got MLPFlow"),
+        ({"flow": "a path"}, TypeError, r"^`flow` must be a trained flow"),
+        ({"flow": SympFlow(1)}, ValueError, r"^`system` .* degrees of freedom"),
+        ({"flow": FLOW, "dtype": "float32"}, TypeError, r"^`y0` is torch.float32, but the flow's weights"),
+        ({"flow": FLOW, "y0": torch.zeros(4)}, TypeError, r"^`y0` is torch.float32"),
+        ({"flow": FLOW, "rtol": 1e-3}, TypeError, r"^`rtol` is not an option"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, error, message):
+    with pytest.raises(error, match=message):
+        solve(HH, "sympflow", (0.0, 1.0), **arguments)
+
+
+def test_a_system_without_a_shipped_flow_says_how_to_train_one():
+    with pytest.raises(ValueError, match=r"^`system` .* no shipped sympflow flow .* train"):
+        solve(systems.harmonic_oscillator(3.7), "sympflow")
