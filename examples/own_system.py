@@ -1,14 +1,14 @@
 """Train a SympFlow on a system that is not built in, check it on fresh states, and compare it with Verlet.
 
-    python examples/own_system.py            # about two minutes on two cores
-    python examples/own_system.py --steps 50 # a quick look, not a good flow
+python examples/own_system.py            # about two minutes on two cores
+python examples/own_system.py --steps 50 # a quick look, not a good flow
 """
 
 from __future__ import annotations
 
 import argparse
 
-from sympflow import EnergySublevel, Box, HamiltonianSystem, compare, train
+from sympflow import Box, EnergySublevel, HamiltonianSystem, compare, train
 
 # A quartic oscillator: one symbolic definition; the domain says where the flow is trained and where its figures hold.
 system = HamiltonianSystem.from_sympy(
