@@ -19,11 +19,17 @@ def reference_step(system: HamiltonianSystem, x: np.ndarray, t: float) -> np.nda
 
     def integrate(x: np.ndarray) -> np.ndarray | None:
         def velocity(_: float, y: np.ndarray) -> np.ndarray:
-            return system.vector_field(y.reshape(x.shape)).ravel()
+            v = system.vector_field(y.reshape(x.shape)).ravel()
+            if not np.isfinite(v).all():
+                raise FloatingPointError  # SciPy would go on for ever
+            return v
 
-        with np.errstate(all="ignore"):
-            atol = np.broadcast_to(1e-13 * scale, x.shape).ravel()
-            run = solve_ivp(velocity, (0.0, t), x.ravel(), "DOP853", t_eval=[t], rtol=1e-12, atol=atol)
+        atol = np.broadcast_to(1e-13 * scale, x.shape).ravel()
+        try:
+            with np.errstate(all="ignore"):
+                run = solve_ivp(velocity, (0.0, t), x.ravel(), "DOP853", t_eval=[t], rtol=1e-12, atol=atol)
+        except FloatingPointError:
+            return None
         return run.y[:, -1].reshape(x.shape) if run.status == 0 else None
 
     together = integrate(x)

@@ -1,0 +1,209 @@
+"""Files of flows: the round trip is exact, and nothing but a whole, sound file is accepted."""
+
+import json
+import math
+import struct
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from sympflow.domain import Ball, Box
+from sympflow.flow.io import KEY, load, save
+from sympflow.flow.layers import Drift, Kick
+from sympflow.flow.mlp import MLPFlow
+from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.scaling import Scaling
+from sympflow.flow.sympflow import SympFlow
+from sympflow.systems import harmonic_oscillator, henon_heiles
+
+MAKERS = {
+    "sympflow": lambda: SympFlow(2, pairs=2, hidden=(5, 4), activation="sin", dt=0.5, seed=3),
+    "scaled": lambda: SympFlow(2, hidden=(4,), scale=Scaling((0.1, 2.0), (3.0, 4.0), 0.1, (0.5, 0.0))),
+    "mixed layers": lambda: SympFlow.from_layers(
+        [Drift(MLPPotential(2, (3,))), Kick(MLPPotential(2, (4, 5), "softplus")), Kick(MLPPotential(2))], dt=2.0
+    ),
+    "float32": lambda: SympFlow(2, dtype=torch.float32),
+    "mlp": lambda: MLPFlow(2, (5, 6, 7), activation="logcosh", dt=0.5),
+}
+
+
+@pytest.fixture
+def file(tmp_path):
+    """A sound file, and its tensors and record to tamper with."""
+    flow, path = MAKERS["sympflow"](), tmp_path / "flow.safetensors"
+    flow.domain, flow.fingerprint, flow.system_name = henon_heiles().domain, henon_heiles().fingerprint, "henon_heiles"
+    flow.save(path)
+    return path
+
+
+def record(path):
+    content = path.read_bytes()
+    (length,) = struct.unpack("<Q", content[:8])
+    return json.loads(json.loads(content[8 : 8 + length])["__metadata__"][KEY])
+
+
+def tampered(path, change_record=lambda record: None, change_tensors=lambda tensors: None):
+    notes, tensors = record(path), load_file(path)
+    change_record(notes)
+    change_tensors(tensors)
+    save_file(tensors, path, {KEY: notes if isinstance(notes, str) else json.dumps(notes)})
+    return path
+
+
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS.keys())
+def test_round_trip(make, tmp_path):
+    flow, path = make(), tmp_path / "flow.safetensors"
+    flow.domain = Box([-1.0] * 4, [1.0] * 4)
+    flow.recipe, flow.figures = {"stages": [{"steps": 3}]}, {"one_step_error": 1e-3, "energy_error": math.inf}
+    flow.save(path)
+    same = load(path)
+    x = torch.randn(5, 4, dtype=flow.dtype)
+    assert torch.equal(same(1.3, x), flow(1.3, x))
+    assert same.dtype == flow.dtype
+    assert (same.domain, same.recipe) == (flow.domain, flow.recipe)
+    assert same.figures == {"one_step_error": 1e-3, "energy_error": None}
+    assert not any(w.requires_grad for w in same.parameters())
+    assert record(path)["version"]
+
+
+def test_a_file_with_no_domain_or_system_loads(tmp_path):
+    SympFlow(1).save(tmp_path / "bare.safetensors")
+    flow = load(tmp_path / "bare.safetensors")
+    assert flow.domain is None
+    flow.check_system(harmonic_oscillator())
+
+
+def test_a_flow_knows_its_system(file):
+    flow = load(file)
+    flow.check_system(henon_heiles())
+    other = type(henon_heiles()).from_sympy("(p1**2+p2**2)/2 + q1**2/2 + q2**2/2 + q1**2*q2")
+    with pytest.raises(ValueError, match=r"`system` 'custom' is not the one.*'henon_heiles'.*train"):
+        flow.check_system(other)
+    with pytest.raises(ValueError, match=r"`system` .* has 1 degrees of freedom but the flow 2"):
+        flow.check_system(harmonic_oscillator())
+
+
+def test_weights_that_are_not_finite_are_neither_saved_nor_loaded(file):
+    flow = load(file)
+    flow.layers[0].potential.biases[0][0] = math.nan
+    with pytest.raises(ValueError, match="`flow` has weights that are not finite"):
+        save(flow, file)
+    load(file)  # the failed save left the old file whole
+
+    def poison(tensors):
+        tensors["layers.0.potential.weight_out"][0] = math.inf
+
+    with pytest.raises(ValueError, match=r"`path` .*weight_out is not finite"):
+        load(tampered(file, change_tensors=poison))
+
+
+@pytest.mark.parametrize("keep", [0, 4, 8, 100, 0.5, -1])
+def test_a_truncated_file_is_refused(file, keep):
+    content = file.read_bytes()
+    file.write_bytes(content[: int(len(content) * keep) if isinstance(keep, float) else keep])
+    with pytest.raises(ValueError, match="`path` "):
+        load(file)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        struct.pack("<Q", 2**63) + b"{}",
+        struct.pack("<Q", 2**21) + b" " * 2**21,
+        struct.pack("<Q", 2) + b"[]",
+        struct.pack("<Q", 9) + b'{"a": 1,}',
+        struct.pack("<Q", 100_000) + b"[" * 100_000,
+        struct.pack("<Q", 2) + b"{}",
+        struct.pack("<Q", 20) + b'{"__metadata__": {}} ',
+        b"\x80\x04\x95pickle",
+    ],
+)
+def test_a_hostile_file_is_refused(tmp_path, content):
+    path = tmp_path / "hostile.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"`path` .*flow\.save"):
+        load(path)
+
+
+def change(*keys, value):
+    def apply(record):
+        for key in keys[:-1]:
+            record = record[key]
+        record[keys[-1]] = value
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (change("format", value=99), "format 99 is later"),
+        (change("format", value="1"), "no format number"),
+        (change("kind", value="pickle"), "kind 'pickle' is unknown"),
+        (change("dt", value=-1.0), "dt -1.0"),
+        (change("dt", value="1"), "dt '1'"),
+        (change("dt", value=math.nan), "not valid JSON"),
+        (change("architecture", value=None), "architecture is missing"),
+        (change("architecture", "ndof", value=10**12), "ndof 1000000000000"),
+        (change("architecture", "ndof", value=True), "ndof True"),
+        (change("architecture", "ndof", value=3), "has shape"),
+        (change("architecture", "layers", value=[]), "list of layers"),
+        (change("architecture", "layers", value=[{}] * 10**4), "list of layers"),
+        (change("architecture", "layers", 0, value="kick"), "layer of unknown kind"),
+        (change("architecture", "layers", 0, "kind", value="__import__"), "layer of unknown kind"),
+        (change("architecture", "layers", 0, "potential", "type", value="x"), "potential of unknown type"),
+        (change("architecture", "layers", 0, "potential", "activation", value="relu"), "`activation` 'relu'"),
+        (change("architecture", "layers", 0, "potential", "hidden", value=[10**9]), "hidden width"),
+        (change("architecture", "layers", 0, "potential", "hidden", value=[4096] * 900), "absurdly large"),
+        (change("architecture", "layers", 0, "potential", "hidden", value=[]), "hidden layers"),
+        (change("architecture", "layers", 0, "potential", "hidden", value=[5]), "do not fit"),
+        (change("domain", value={"kind": "Klein bottle"}), "domain"),
+        (change("domain", value=[1]), "domain"),
+        (change("fingerprint", value=["a"]), "fingerprint"),
+        (change("recipe", value=None), "recipe"),
+        (change("figures", value=3), "figures"),
+        (change("system", value=3), "system is not a name"),
+    ],
+)
+def test_a_false_record_is_refused(file, edit, message):
+    with pytest.raises(ValueError, match=message):
+        load(tampered(file, change_record=edit))
+
+
+def rename(tensors):
+    tensors["layers.0.potential.extra"] = tensors.pop("layers.0.potential.weight_t")
+
+
+def reshape(tensors):
+    tensors["layers.0.potential.weight_x"] = tensors["layers.0.potential.weight_x"].T.contiguous()
+
+
+def retype(tensors):
+    tensors["layers.0.potential.weight_x"] = tensors["layers.0.potential.weight_x"].to(torch.int64)
+
+
+def collapse(tensors):
+    tensors["layers.0.potential.scale"].zero_()
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [(rename, "do not fit"), (reshape, "has shape"), (retype, "F32 or all F64"), (collapse, "scale is not positive")],
+)
+def test_false_tensors_are_refused(file, edit, message):
+    with pytest.raises(ValueError, match=message):
+        load(tampered(file, change_tensors=edit))
+
+
+def test_what_is_not_a_file_is_refused(tmp_path):
+    for path in (tmp_path, tmp_path / "missing.safetensors"):
+        with pytest.raises(ValueError, match=r"`path` .* is not a file"):
+            load(path)
+
+
+def test_the_domain_of_a_file_is_a_domain(tmp_path):
+    flow = SympFlow(1)
+    flow.domain = Ball([0.0, 0.0], 2.0)
+    flow.save(tmp_path / "ball.safetensors")
+    assert load(tmp_path / "ball.safetensors").domain == flow.domain

@@ -1,0 +1,423 @@
+"""Training: the losses, the improvement, resumption to the bit, and how a run ends."""
+
+import json
+import math
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+import torch
+
+import sympflow
+from sympflow.domain import Box
+from sympflow.flow.mlp import MLPFlow
+from sympflow.flow.scaling import Scaling
+from sympflow.flow.sympflow import SympFlow
+from sympflow.system import HamiltonianSystem
+from sympflow.systems import harmonic_oscillator, henon_heiles
+from sympflow.training import checkpoint as checkpoints
+from sympflow.training.collocation import Points, PointSource, Stream, states
+from sympflow.training.config import OPTIMIZERS, TrainingConfig
+from sympflow.training.line_search import Trial, strong_wolfe
+from sympflow.training.losses import Loss
+from sympflow.training.quasi_newton import BFGS
+from sympflow.training.trainer import train
+from sympflow.training.validation import reference_step
+
+QUICK = {"pairs": 1, "hidden": (5,), "points": 60, "validation_points": 60, "reference_states": 5, "progress": False}
+CPU = torch.device("cpu")
+
+
+def weights(flow):
+    return torch.cat([w.reshape(-1) for w in flow.state_dict().values()])
+
+
+class Rotation(SympFlow):
+    """The exact flow of the harmonic oscillator, as a SympFlow in what the losses ask of it."""
+
+    def __init__(self):
+        super().__init__(1, pairs=1)
+
+    def psi_and_velocity(self, t, x):
+        c, s, (q, p) = torch.cos(t), torch.sin(t), x.unbind(-1)
+        y = torch.stack([c * q + s * p, c * p - s * q], -1)
+        return y, torch.stack([y[..., 1], -y[..., 0]], -1)
+
+    def hamiltonian_unchecked(self, t, x):
+        return x.square().sum(-1) / 2 + torch.sin(7 * t)  # 𝓗 is free up to c(t)
+
+
+def points(n=50, ndof=1, dt=1.0):
+    return PointSource(Box([-1.0] * 2 * ndof, [1.0] * 2 * ndof), dt, n, 5, 0, torch.float64, CPU, block=2)(0)
+
+
+def test_losses_vanish_for_the_exact_flow():
+    loss = Loss(harmonic_oscillator(), Scaling.unit(1))
+    L1, L2 = loss.terms(Rotation(), points())
+    assert L1 < 1e-30
+    assert L2 < 1e-30
+
+
+def test_losses_are_the_papers():
+    """Against the definitions, written out with autodiff, on a random flow."""
+    system, flow, sample = henon_heiles(), SympFlow(2, seed=4), points(ndof=2)
+    L1, L2 = Loss(system, Scaling.unit(2)).terms(flow, sample)
+    y, dy = torch.func.jvp(lambda t: flow.psi(t, sample.x), (sample.t,), (torch.ones_like(sample.t),))
+    torch.testing.assert_close(L1, (dy - system.vector_field(y)).square().sum(-1).mean())
+    difference = flow.hamiltonian(sample.matching_t, sample.matching_x) - system.hamiltonian(sample.matching_x)
+    torch.testing.assert_close(L2, difference.var(1, correction=0).mean())
+
+
+def test_a_weight_of_zero_leaves_a_loss_out():
+    flow, system, sample = SympFlow(1), harmonic_oscillator(), points()
+    L1, L2 = Loss(system, Scaling.unit(1), 2.0, 0.0).terms(flow, sample)
+    assert L2 is None
+    assert Loss(system, Scaling.unit(1), 2.0, 0.0)(flow, sample) == 2 * L1
+    L1, L2 = Loss(system, Scaling.unit(1), 0.0, 3.0).terms(flow, sample)
+    assert L1 is None
+    assert Loss(system, Scaling.unit(1), 0.0, 3.0)(flow, sample) == 3 * L2
+
+
+def test_losses_do_not_depend_on_units():
+    """The oscillator at ω = 100 and Δt = 0.01 trains as the one at ω = 1 and Δt = 1."""
+    omega, sample, losses = 100.0, points(), []
+    for w in (1.0, omega):
+        scaling = Scaling((1.0,), (w,), 1 / w)
+        flow = SympFlow(1, dt=1 / w, scale=scaling, seed=3)
+        unit = torch.tensor([1.0, w], dtype=torch.float64)
+        scaled = Points(sample.t / w, sample.x * unit, sample.matching_t / w, sample.matching_x * unit)
+        losses.append(torch.stack(Loss(harmonic_oscillator(w), scaling).terms(flow, scaled)))
+    torch.testing.assert_close(losses[0], losses[1], rtol=1e-10, atol=0)
+
+
+def test_scaling_is_taken_from_the_domain():
+    scaling = Scaling.of_samples(Box([9.0, -300.0], [11.0, 300.0]).sample(4096, 0), 0.5)
+    assert scaling.q == pytest.approx((1 / math.sqrt(3),), rel=0.05)
+    assert scaling.p == pytest.approx((300 / math.sqrt(3),), rel=0.05)
+    assert scaling.q_center == pytest.approx((10.0,), rel=0.01)
+    assert scaling.p_center == (0.0,)
+    assert Scaling.from_dict(json.loads(json.dumps(scaling.to_dict()))) == scaling
+    for bad in ({"q": (0.0,), "p": (1.0,)}, {"q": (1.0,), "p": (math.nan,)}, {"q": (1.0,), "p": (1.0, 1.0)}):
+        with pytest.raises(ValueError, match=r"`[qp]`"):
+            Scaling(**bad)
+
+
+def test_points_are_a_function_of_seed_and_step():
+    domain = henon_heiles().domain
+
+    def source(seed):
+        return PointSource(domain, 0.5, 40, 4, seed, torch.float64, CPU, block=4)
+
+    one, other = source(0), source(0)
+    assert torch.equal(one(9).x, other(9).x)
+    one(3)
+    assert torch.equal(one(9).t, other(9).t)
+    assert not torch.equal(one(8).x, one(9).x)
+    assert not torch.equal(source(1)(9).x, one(9).x)
+    sample = one(9)
+    assert domain.contains(sample.x).all()
+    assert sample.matching_t.shape == (4, 1)
+    assert sample.matching_x.shape == (4, 10, 4)
+    assert 0 <= sample.t.min() < sample.t.max() <= 0.5
+    assert not np.array_equal(states(domain, 3, 0, Stream.RESIDUAL), states(domain, 3, 0, Stream.VALIDATION))
+
+
+def test_reference_step():
+    x = np.array([[1.0, 0.0], [0.3, -0.7]])
+    c, s = math.cos(2.0), math.sin(2.0)
+    np.testing.assert_allclose(reference_step(harmonic_oscillator(), x, 2.0), x @ [[c, -s], [s, c]], atol=1e-11)
+    escaping = np.array([[0.1, 0.1, 0.0, 0.0], [0.0, 30.0, 0.0, 0.0]])
+    y = reference_step(henon_heiles(), escaping, 3.0)
+    assert np.isfinite(y[0]).all()
+    assert np.isnan(y[1]).all()
+    undefined = HamiltonianSystem.from_sympy("p**2/2 + sqrt(q)")
+    assert np.isnan(reference_step(undefined, np.array([[-1.0, 0.0]]), 1.0)).all()  # and does not hang
+
+
+# what training does ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["sympflow", "mlp"])
+@pytest.mark.parametrize(("optimizer", "steps"), [("adam", 150), ("bfgs", 4)])
+def test_training_improves(kind, optimizer, steps):
+    flow = train(harmonic_oscillator(), kind=kind, optimizer=optimizer, steps=steps, learning_rate=2e-2, **QUICK)
+    first, last = flow.history[0], flow.history[-1]
+    assert isinstance(flow, MLPFlow if kind == "mlp" else SympFlow)
+    assert last["loss"] < first["loss"] / 3
+    assert last["one_step_error"] < first["one_step_error"] / 2
+    assert flow.figures["one_step_error"] == min(flow.history, key=lambda f: f["loss"])["one_step_error"]
+    assert not any(w.requires_grad for w in flow.parameters())
+    assert flow.domain == harmonic_oscillator().domain
+    flow.check_system(harmonic_oscillator())
+
+
+def test_a_system_that_is_not_separable():
+    def hamiltonian(q, p):
+        return ((1 + q.square()) * p.square()).sum(-1) / 2 + q.square().sum(-1) / 2
+
+    system = HamiltonianSystem(hamiltonian=hamiltonian, ndof=1, domain=Box([-1.0, -1.0], [1.0, 1.0]))
+    flow = train(system, 0.5, optimizer="bfgs", steps=3, **QUICK)
+    assert flow.history[-1]["loss"] < flow.history[0]["loss"] / 4
+    A = torch.autograd.functional.jacobian(lambda x: flow(3.2, x), torch.tensor([0.4, 0.3], dtype=torch.float64))
+    assert torch.linalg.det(A).item() == pytest.approx(1, abs=1e-13)
+
+
+def test_the_same_seed_gives_the_same_weights():
+    def run(seed):
+        return weights(train(harmonic_oscillator(), steps=20, seed=seed, **QUICK))
+
+    assert torch.equal(run(0), run(0))
+    assert not torch.equal(run(0), run(1))
+
+
+def test_stages_are_recorded(tmp_path):
+    first = train(harmonic_oscillator(), 0.5, steps=10, **QUICK)
+    before = weights(first)
+    second = train(harmonic_oscillator(), flow=first, optimizer="bfgs", steps=2, **QUICK)
+    assert torch.equal(weights(first), before)
+    assert [stage["optimizer"] for stage in second.recipe["stages"]] == ["adam", "bfgs"]
+    assert second.dt == 0.5
+    assert second.figures["training_seconds"] >= first.figures["training_seconds"]
+    second.save(tmp_path / "flow.safetensors")
+    assert sympflow.load(tmp_path / "flow.safetensors").recipe == second.recipe
+
+
+def test_float32():
+    flow = train(harmonic_oscillator(), steps=20, dtype=torch.float32, **QUICK)
+    assert flow.dtype == torch.float32
+
+
+# resumption ----------------------------------------------------------------------------------------------------
+
+
+class Killed(Exception):
+    pass
+
+
+@pytest.mark.parametrize(("optimizer", "steps"), [("adam", 40), ("bfgs", 8)])
+@pytest.mark.parametrize("kind", ["sympflow", "mlp"])
+def test_a_resumed_run_ends_bit_identical(tmp_path, optimizer, steps, kind):
+    arguments = {
+        "kind": kind,
+        "optimizer": optimizer,
+        "steps": steps,
+        "refresh": 3,
+        "validate_every": steps // 8,
+        **QUICK,
+    }
+    arguments["checkpoint_every"] = steps // 4
+    whole = train(henon_heiles(), **arguments)
+
+    def kill(step, figures):
+        if step >= steps * 3 // 4 - 1:
+            raise Killed
+
+    path = tmp_path / "run.ckpt"
+    with pytest.raises(Killed):
+        train(henon_heiles(), checkpoint=path, callback=kill, **arguments)
+    assert 0 < checkpoints.read(path)["step"] < steps
+    resumed = train(henon_heiles(), checkpoint=path, resume=path, **arguments)
+    assert torch.equal(weights(resumed), weights(whole))
+    assert resumed.history == whole.history
+
+
+def test_a_killed_process_resumes_bit_identical(tmp_path):
+    """A real process, ended by SIGKILL in the middle."""
+    path = tmp_path / "run.ckpt"
+    program = textwrap.dedent(
+        """
+        import os, signal, sys
+        from sympflow.systems import harmonic_oscillator
+        from sympflow.training.trainer import train
+
+        def kill(step, figures):
+            if step == 30:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        train(harmonic_oscillator(), steps=40, validate_every=10, checkpoint=sys.argv[1], checkpoint_every=7,
+              callback=kill, pairs=1, hidden=(5,), points=60, validation_points=60, reference_states=5)
+        """
+    )
+    run = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, check=False)
+    assert run.returncode == -9, run.stderr.decode()
+    arguments = {"steps": 40, "validate_every": 10, **QUICK}
+    resumed = train(harmonic_oscillator(), resume=path, **arguments)
+    assert torch.equal(weights(resumed), weights(train(harmonic_oscillator(), **arguments)))
+    assert [p.name for p in tmp_path.iterdir()] == ["run.ckpt"]
+
+
+def test_resuming_another_run_is_refused(tmp_path):
+    path, system = tmp_path / "run.ckpt", harmonic_oscillator()
+    train(system, steps=10, checkpoint=path, **QUICK)
+    for changed, message in (
+        ({"steps": 20}, "`resume` is a run with another steps"),
+        ({"steps": 10, "learning_rate": 1.0, "seed": 2}, "another learning_rate, seed"),
+        ({"steps": 10, "hidden": (6,)}, "another architecture"),
+        ({"steps": 10, "kind": "mlp", "matching_weight": 0.0}, "another"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            train(system, resume=path, **{**QUICK, **changed})
+    with pytest.raises(ValueError, match="another fingerprint"):
+        train(harmonic_oscillator(2.0), resume=path, steps=10, **QUICK)
+
+
+@pytest.mark.parametrize("content", [b"", b"junk", None])
+def test_what_is_not_a_checkpoint_is_refused(tmp_path, content):
+    path = tmp_path / "run.ckpt"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"`resume` .* is not a"):
+        train(harmonic_oscillator(), resume=path, steps=10, **QUICK)
+
+
+def test_a_checkpoint_is_never_unpickled(tmp_path):
+    path = tmp_path / "run.ckpt"
+    torch.save({"format": 1, "config": Killed()}, path)
+    with pytest.raises(ValueError, match=r"`resume` .* is not a checkpoint"):
+        checkpoints.read(path)
+
+
+# how a run ends ------------------------------------------------------------------------------------------------
+
+
+def test_an_interrupted_run_returns_its_best_state():
+    def interrupt(step, figures):
+        if step == 20:
+            raise KeyboardInterrupt
+
+    with pytest.warns(RuntimeWarning, match="after 20 of 50 steps because it was interrupted"):
+        flow = train(harmonic_oscillator(), steps=50, validate_every=10, callback=interrupt, **QUICK)
+    assert flow.recipe["stages"][0]["steps_taken"] == 20
+    assert flow.figures["residual_loss"] < flow.history[0]["residual_loss"]
+
+
+def test_a_loss_that_is_not_finite_ends_the_run_with_the_best_state():
+    overshoot = {"learning_rate": 1e200, "clip": None, "schedule": "constant", "validate_every": 1}
+    with pytest.warns(RuntimeWarning, match="the loss was not finite at step"):
+        flow = train(harmonic_oscillator(), steps=50, **overshoot, **QUICK)
+    assert torch.isfinite(weights(flow)).all()
+    assert math.isfinite(flow.figures["residual_loss"])
+
+
+def test_a_loss_that_is_not_finite_from_the_start_is_an_error():
+    system = HamiltonianSystem.from_sympy("p**2/2 + log(q)", domain=Box([-2.0, -1.0], [-1.0, 1.0]))
+    with pytest.raises(FloatingPointError, match="not finite at the first validation"):
+        train(system, steps=5, residual_weight=0.0, **QUICK)
+
+
+def test_a_time_budget_ends_the_run():
+    with pytest.warns(RuntimeWarning, match="the time budget was used up"):
+        flow = train(harmonic_oscillator(), steps=10**6, time_budget=0.1, **QUICK)
+    assert flow.recipe["stages"][0]["steps_taken"] < 10**6
+
+
+def test_progress_shows_only_when_asked(capsys):
+    train(harmonic_oscillator(), steps=4, **QUICK)
+    assert capsys.readouterr() == ("", "")
+    train(harmonic_oscillator(), steps=4, **{**QUICK, "progress": True})
+    assert "one-step" in capsys.readouterr().err
+
+
+def test_progress_without_rich(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rich.console", None)
+    train(harmonic_oscillator(), steps=4, **{**QUICK, "progress": True})
+    assert "4/4" in capsys.readouterr().err
+
+
+# bad arguments ---------------------------------------------------------------------------------------------------
+
+
+def test_a_system_without_a_domain_says_what_to_pass():
+    system = HamiltonianSystem.from_sympy("p**2/2 + q**4/4")
+    with pytest.raises(ValueError, match=r"`domain` .*sympflow\.Box"):
+        train(system)
+    assert train(system, domain=Box([-1.0, -1.0], [1.0, 1.0]), steps=2, **QUICK).domain == Box([-1.0, -1.0], [1.0, 1.0])
+    with pytest.raises(ValueError, match="`domain` has states of length 4"):
+        train(system, domain=Box([-1.0] * 4, [1.0] * 4))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"optimizer": "sgd"}, f"`optimizer` 'sgd' is unknown: choose one of {', '.join(OPTIMIZERS)}"),
+        ({"kind": "gan"}, "`kind` 'gan' is unknown"),
+        ({"schedule": "hope"}, "`schedule`"),
+        ({"dt": 0.0}, "`dt`"),
+        ({"dt": math.nan}, "`dt`"),
+        ({"steps": 0}, "`steps`"),
+        ({"points": 1.5}, "`points`"),
+        ({"learning_rate": -1.0}, "`learning_rate`"),
+        ({"clip": math.inf}, "`clip`"),
+        ({"residual_weight": math.nan}, "`residual_weight`"),
+        ({"residual_weight": 0.0, "matching_weight": 0.0}, "both 0"),
+        ({"kind": "mlp", "matching_weight": 1.0}, "`matching_weight` needs a Hamiltonian"),
+        ({"seed": -1}, "`seed`"),
+        ({"refresh": 0}, "`refresh`"),
+        ({"matching_times": 400}, "`matching_times`"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        train(harmonic_oscillator(), **arguments)
+
+
+def test_a_flow_of_another_system_is_refused():
+    flow = train(harmonic_oscillator(), steps=2, **QUICK)
+    with pytest.raises(ValueError, match="`system`"):
+        train(harmonic_oscillator(2.0), flow=flow)
+    with pytest.raises(ValueError, match="`dt`"):
+        train(harmonic_oscillator(), 0.5, flow=flow)
+
+
+# optimizers --------------------------------------------------------------------------------------------------------
+
+
+def test_schedules():
+    rates = [TrainingConfig(steps=100, learning_rate=1.0, schedule="one-cycle").rate(k) for k in range(100)]
+    assert max(rates) == pytest.approx(1.0, rel=1e-3)
+    assert rates[0] < 0.3
+    assert rates[-1] == pytest.approx(1e-3)
+    assert TrainingConfig(schedule="constant", learning_rate=0.1).rate(7) == 0.1
+    cosine = TrainingConfig(steps=100, schedule="cosine", learning_rate=1.0)
+    assert [cosine.rate(k) for k in range(100)] == sorted((cosine.rate(k) for k in range(100)), reverse=True)
+
+
+@pytest.mark.parametrize("guess", [1e-3, 1.0, 50.0])
+@pytest.mark.parametrize(
+    "function",
+    [lambda a: (a - 2) ** 2, lambda a: -a / (a**2 + 2), lambda a: torch.exp(a) - 5 * a, lambda a: (a - 1) ** 4 - a],
+)
+def test_line_search_meets_the_wolfe_conditions(function, guess):
+    def along(length):
+        a = torch.tensor(length, dtype=torch.float64, requires_grad=True)
+        value = function(a)
+        value.backward()
+        return Trial(length, float(value.detach()), float(a.grad), a.grad)
+
+    start = along(0.0)
+    found = strong_wolfe(along, start, guess)
+    assert found.loss <= start.loss + 1e-4 * found.length * start.slope
+    assert abs(found.slope) <= 0.9 * abs(start.slope)
+
+
+def test_bfgs_finds_a_minimum():
+    """The Rosenbrock valley, a step at a time, to rounding."""
+    module = torch.nn.Module()
+    module.x = torch.nn.Parameter(torch.tensor([-1.2, 1.0], dtype=torch.float64))
+    module.n_parameters = 2
+    method = BFGS(module, TrainingConfig(optimizer="bfgs"))
+
+    def rosenbrock():
+        x, y = module.x
+        return (1 - x) ** 2 + 100 * (y - x**2) ** 2
+
+    for k in range(5):
+        method.step(k, rosenbrock)
+    torch.testing.assert_close(module.x.detach(), torch.ones(2, dtype=torch.float64), rtol=0, atol=1e-8)
+
+
+def test_bfgs_refuses_what_would_not_fit():
+    with pytest.raises(ValueError, match=r"`optimizer` 'bfgs' .* use 'adam'"):
+        train(harmonic_oscillator(), optimizer="bfgs", hidden=(100, 100), points=60, validation_points=60)
