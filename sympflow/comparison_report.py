@@ -58,9 +58,12 @@ class Comparison:
         """The scene in a line."""
         return _name(self.system)
 
-    def table(self) -> str:
-        """The rows as text, with what was done above and the reasons below."""
-        return combined_table([self])
+    def table(self, width: int | None = None) -> str:
+        """The rows as text, with what was done above and the reasons below.
+
+        Where `width` characters do not hold them, the methods are columns.
+        """
+        return combined_table([self], width)
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the rows, every figure to full precision."""
@@ -89,21 +92,52 @@ class Comparison:
 
         return comparison_figure(self, kind)
 
-    def plot(self, path: str | os.PathLike[str], kind: str | None = None) -> list[Path]:
-        """Save figures: every kind into a folder, or one (by default the overview) to a file with an extension."""
+    def plot(self, path: str | os.PathLike[str], kind: str | None = None, prefix: str = "") -> list[Path]:
+        """Save figures: every kind into a folder, or one (by default the overview) to a file with an extension.
+
+        In a folder their names are the kinds, after `prefix`.
+        """
         from sympflow.plotting import save_comparison
 
-        return save_comparison(self, path, kind)
+        return save_comparison(self, path, kind, prefix)
 
 
-def combined_table(comparisons: Sequence[Comparison]) -> str:
-    """The rows of several comparisons as one table, with the settings above and the reasons below."""
+def combined_table(comparisons: Sequence[Comparison], width: int | None = None) -> str:
+    """The rows of several comparisons as one table, with the settings above and the reasons below.
+
+    Where `width` characters do not hold it, there is a table for each system with the methods as columns.
+    """
     rows = [row for c in comparisons for row in c.rows]
     several = len(comparisons) > 1
     names = [c.title for c in comparisons for _ in c.rows]
     first = [i == 0 for c in comparisons for i in range(len(c.rows))]
     columns = [
         Column("system", [n if f and several else "" for n, f in zip(names, first, strict=True)], left=True),
+        *_columns(rows),
+    ]
+    notes = [
+        f"  {f'{name}, ' if several else ''}{row.label}: {row.reason}"
+        for name, row in zip(names, rows, strict=True)
+        if row.reason
+    ]
+    below = ["", "Notes", *notes] if notes else []
+    table = text_table(columns)
+    if width is None or max(map(len, table.splitlines())) <= width:
+        return "\n".join([*map(_settings, comparisons), "", table, *below])
+    blocks = [line for c in comparisons for line in (_settings(c), "", _upright(_columns(c.rows)), "")]
+    return "\n".join([*blocks[:-1], *below])
+
+
+def _upright(columns: Sequence[Column]) -> str:
+    """The table turned round: a line for each of its columns."""
+    names, *others = [c for c in columns if any(c.cells)]
+    titles = Column("", [c.title for c in others], left=True)
+    cells = [Column(name, [c.cells[i] for c in others]) for i, name in enumerate(names.cells)]
+    return text_table([titles, *cells])
+
+
+def _columns(rows: Sequence[Row]) -> list[Column]:
+    return [
         Column("method", [row.label for row in rows], left=True),
         Column("step", [_step(row) for row in rows]),
         Column("backend", [row.backend or "" for row in rows], left=True),
@@ -119,13 +153,10 @@ def combined_table(comparisons: Sequence[Comparison]) -> str:
         Column("training", [seconds(row.training_time) for row in rows]),
         Column("status", ["" if row.status == "ok" else row.status for row in rows], left=True),
     ]
-    notes = [
-        f"  {f'{name}, ' if several else ''}{row.label}: {row.reason}"
-        for name, row in zip(names, rows, strict=True)
-        if row.reason
-    ]
-    heading = [_settings(c) for c in comparisons]
-    return "\n".join([*heading, "", text_table(columns), *(["", "Notes", *notes] if notes else [])])
+
+
+_GREEK = {"omega": "ω", "mu": "μ", "epsilon": "ε", "alpha": "α", "beta": "β"}
+_NAMES = {"henon_heiles": "Hénon–Heiles"}
 
 
 def _settings(c: Comparison) -> str:
@@ -139,8 +170,8 @@ def _settings(c: Comparison) -> str:
 
 
 def _name(system: HamiltonianSystem) -> str:
-    params = ", ".join(f"{k} = {v:g}" for k, v in system.params.items())
-    return system.name.replace("_", " ") + (f" ({params})" if params else "")
+    params = ", ".join(f"{_GREEK.get(k, k)} = {v:g}" for k, v in system.params.items())
+    return _NAMES.get(system.name, system.name.replace("_", " ")) + (f", {params}" if params else "")
 
 
 def _step(row: Row) -> str:

@@ -66,7 +66,9 @@ def comparison_figure(comparison: Comparison, kind: str = "overview") -> Figure:
     return figure
 
 
-def save_comparison(comparison: Comparison, path: str | os.PathLike[str], kind: str | None = None) -> list[Path]:
+def save_comparison(
+    comparison: Comparison, path: str | os.PathLike[str], kind: str | None = None, prefix: str = ""
+) -> list[Path]:
     """Save every figure that the metrics allow into a folder, or one to a file (.png, .pdf or .svg)."""
     path = Path(path)
     if path.suffix.lower() in FIGURE_FILES:
@@ -74,7 +76,7 @@ def save_comparison(comparison: Comparison, path: str | os.PathLike[str], kind: 
     if path.suffix:
         raise ValueError(f"`path` must be a folder or end in {', '.join(FIGURE_FILES)}; got {str(path)!r}.")
     kinds = _drawable(comparison) if kind is None else (kind,)
-    return [save(comparison_figure(comparison, k), path / f"{k}.png") for k in kinds]
+    return [save(comparison_figure(comparison, k), path / f"{prefix}{k}.png") for k in kinds]
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
@@ -123,10 +125,10 @@ def _error_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str, 
     ax.set_xscale("log")
     ax.set_yscale("log")
     if shown:
-        _widen(ax.set_xlim, [row.run_time or 0.0 for row in shown], 2.0)
-        _widen(ax.set_ylim, [max(row.error or 0.0, ROUNDING_FLOOR) for row in shown], 3.0)
+        _widen(ax.set_xlim, [row.run_time or 0.0 for row in shown])
+        _widen(ax.set_ylim, [max(row.error or 0.0, ROUNDING_FLOOR) for row in shown])
     _annotate(ax, [(row.run_time or 0.0, max(row.error or 0.0, ROUNDING_FLOOR), row.label) for row in shown], styles)
-    _dress(ax, "run time [s]", "largest error ‖y − y_ref‖")
+    _dress(ax, "run time [s]", r"$\max_t\,\|y - y_{\mathrm{ref}}\|$")
 
 
 def _energy_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str, str]]) -> None:
@@ -135,7 +137,8 @@ def _energy_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str,
         colour = styles[run.row.label][0]
         t, e = sol.t, np.maximum(_middle(series), ROUNDING_FLOOR)
         ax.plot(t, e, color=colour, lw=0.4, alpha=0.3, zorder=1)
-        ax.plot(t, np.fmax.accumulate(e), color=colour, lw=1.6, zorder=3 if run.row.method == "sympflow" else 2)
+        order = 3 if run.row.method == "sympflow" else 2
+        ax.plot(t, np.fmax.accumulate(e), _dash(run), color=colour, lw=1.6, zorder=order)
     ax.set_yscale("log")
     _limits(ax)
     _dress(ax, "t", "|energy error|" + (", relative" if comparison.system.energy_scale is None else ", scaled"))
@@ -149,9 +152,9 @@ def _volume_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str,
         v = np.abs(series).reshape(-1, len(sol.t))
         worst = v[np.argmax(np.where(np.isfinite(v[:, -1]), v[:, -1], np.inf))]
         worst = np.where(np.isfinite(worst), np.maximum(worst, ROUNDING_FLOOR), np.nan)
-        ax.plot(sol.t, worst, color=styles[run.row.label][0], lw=1.4)
+        ax.plot(sol.t, worst, _dash(run), color=styles[run.row.label][0], lw=1.4)
     ax.axhspan(ROUNDING_FLOOR / 10, 4 * n_steps * np.finfo(float).eps, color="#EEEEEE", zorder=0, lw=0)
-    ax.text(0.985, 0.02, "rounding", transform=ax.transAxes, ha="right", va="bottom", fontsize=8, color="#888888")
+    ax.text(0.985, 0.1, "rounding", transform=ax.transAxes, ha="right", va="bottom", fontsize=8, color="#888888")
     ax.set_yscale("log")
     _limits(ax)
     _dress(ax, "t", "|log volume ratio|")
@@ -163,6 +166,11 @@ _PANELS = {"error": _error_panel, "energy": _energy_panel, "volume": _volume_pan
 def _series(comparison: Comparison, name: str) -> list[tuple[Run, Solution, np.ndarray]]:
     found = [(run, run.sol, getattr(run, name)) for run in comparison.runs]
     return [(run, sol, series) for run, sol, series in found if sol is not None and series is not None and len(sol.t)]
+
+
+def _dash(run: Run) -> str:
+    """Leapfrog is dashed: its curves lie on Verlet's."""
+    return "--" if run.row.method == "leapfrog" else "-"
 
 
 def _middle(series: np.ndarray) -> np.ndarray:
@@ -181,8 +189,8 @@ def portrait(comparison: Comparison) -> Figure:
     """
     system = comparison.system
     runs = [run for run in comparison.runs if run.sol is not None]
-    columns = min(len(runs), 5)
-    rows = -(-len(runs) // columns)
+    rows = -(-len(runs) // 5)
+    columns = -(-len(runs) // rows)
     figure = _figure(0.5 + 2.5 * columns, 0.5 + 2.7 * rows)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     styles = _styles([comparison])
@@ -192,12 +200,10 @@ def portrait(comparison: Comparison) -> Figure:
     x_label, y_label = {1: ("q", "p"), 2: ("q₂", "p₂")}.get(system.ndof, ("q₁", "q₂"))
     for k, (ax, run) in enumerate(zip(axes.flat, runs, strict=False)):
         points = _phase_points(comparison, run.candidate.integrator)
-        ax.plot(*truth.T, ".", color="#C8C8C8", ms=3 if system.ndof == 2 else 1.5, mew=0, zorder=1, rasterized=True)
+        ax.plot(*truth.T, ".", color="#C8C8C8", ms=6 if system.ndof == 2 else 2.5, mew=0, zorder=1, rasterized=True)
         ax.plot(*points.T, ".", color=styles[run.row.label][0], ms=2.2, mew=0, zorder=2, rasterized=True)
         ax.set_title(run.row.label, fontsize=9, color=styles[run.row.label][0])
         _dress(ax, x_label if k // columns == rows - 1 else "", y_label if k % columns == 0 else "")
-        if system.ndof > 1:
-            ax.set_aspect("equal")
     _frame(axes[0, 0], truth)
     section = " — section q₁ = 0, p₁ > 0" if system.ndof == 2 else ""
     figure.suptitle(f"{comparison.title}{section}; reference in grey", fontsize=10, color=_TEXT, x=0.01, ha="left")
@@ -346,16 +352,19 @@ def _limits(ax: Axes) -> None:
         ax.set_ylim(low / 3, max(high, 10 * low) * 3)
 
 
-def _widen(set_limits: Any, values: Sequence[float], factor: float) -> None:
-    set_limits(min(values) / factor, max(values) * factor)
+def _widen(set_limits: Any, values: Sequence[float]) -> None:
+    """Limits of a log axis that leave a sixth of it on either side, for labels."""
+    low, high = np.log10(min(values)), np.log10(max(values))
+    margin = max(0.25 * (high - low), 0.4)
+    set_limits(10 ** (low - margin), 10 ** (high + margin))
 
 
 def _annotate(ax: Axes, points: Sequence[tuple[float, float, str]], styles: dict[str, tuple[str, str]]) -> None:
     """A label beside each point; where two points nearly coincide the second label goes below."""
-    placed: list[tuple[float, float]] = []
+    placed: list[np.ndarray] = []
     for x, y, label in sorted(points):
-        at = (np.log10(x), np.log10(y))
-        crowded = sum(abs(at[0] - p[0]) < 0.5 and abs(at[1] - p[1]) < 0.8 for p in placed)
+        at = ax.transAxes.inverted().transform(ax.transData.transform((x, y)))
+        crowded = sum(bool((np.abs(at - p) < (0.25, 0.12)).all()) for p in placed)
         placed.append(at)
         ax.annotate(
             label,

@@ -1,0 +1,21 @@
+"""The command line, `sympflow`: see `sympflow --help`. The commands themselves are in `sympflow.commands`."""
+
+from __future__ import annotations
+
+import sys
+
+
+def main() -> None:
+    """Entry point. Exit status: 0 fine, 1 something failed, 2 wrong usage, 130 interrupted."""
+    try:
+        import rich  # noqa: F401
+        import typer  # noqa: F401
+    except ImportError as error:
+        sys.exit(f'The command line needs {error.name}: pip install "sympflow[cli]".')
+    from sympflow.commands import app
+
+    app()
+
+
+if __name__ == "__main__":
+    main()

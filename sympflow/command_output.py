@@ -1,0 +1,83 @@
+"""What the commands share: reports of errors and progress, and the files that they write."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from sympflow.command_arguments import Scene
+from sympflow.tables import Column, text_table
+
+out = Console(soft_wrap=True, highlight=False)
+err = Console(stderr=True, soft_wrap=True, highlight=False)
+
+
+@contextlib.contextmanager
+def reporting() -> Iterator[None]:
+    """Errors as one line and an exit status: 2 for arguments, 1 for what failed, 130 for Ctrl-C."""
+    try:
+        yield
+    except typer.Exit:
+        raise
+    except (ValueError, TypeError) as error:
+        err.print(f"Error: {error}", style="red", markup=False)
+        raise typer.Exit(2) from error
+    except (RuntimeError, ImportError, OSError, ArithmeticError) as error:
+        err.print(f"Failed: {error}", style="red", markup=False)
+        raise typer.Exit(1) from error
+    except KeyboardInterrupt as error:
+        err.print("Interrupted.", style="red")
+        raise typer.Exit(130) from error
+
+
+@contextlib.contextmanager
+def progress() -> Iterator[Callable[[str], None]]:
+    """A line on the terminal that says what is being done; nothing where there is no terminal."""
+    if not err.is_terminal:
+        yield lambda text: None
+        return
+    with err.status("Starting") as status:
+        yield status.update
+
+
+def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """A table of strings, aligned left."""
+    columns = [Column(title, cells, left=True) for title, *cells in zip(titles, *rows, strict=True)]
+    out.print(text_table(columns), markup=False)
+
+
+def write_solution(sol: Any, path: Path) -> None:
+    """Columns t, q…, p… as text, or arrays t and y."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".npz":
+        np.savez(path, t=sol.t, y=sol.y, system=sol.system.name, method=sol.integrator.name)
+        return
+    d = sol.system.ndof
+    names = ["t", *(f"{v}{i}" if d > 1 else v for v in "qp" for i in range(1, d + 1))]
+    np.savetxt(path, np.column_stack([sol.t, sol.y.T]), delimiter=",", header=",".join(names), comments="", fmt="%.17g")
+
+
+def write_comparisons(
+    comparisons: list[Any], found: list[Scene], folder: Path, say: Callable[[str], None]
+) -> list[Path]:
+    """For each system its CSV, JSON and figures; for several also one CSV and one figure of all."""
+    from sympflow.plotting import overview, save
+    from sympflow.tables import write_csv
+
+    written: list[Path] = []
+    for comparison, scene in zip(comparisons, found, strict=True):
+        say(f"{scene.key}: figures")
+        written += [comparison.to_csv(folder / f"{scene.key}.csv"), comparison.to_json(folder / f"{scene.key}.json")]
+        written += comparison.plot(folder, prefix=f"{scene.key}-")
+    drawable = [c for c in comparisons if {"error", "energy", "volume"} & set(c.metrics)]
+    if drawable:
+        written.append(save(overview(drawable), folder / "comparison.png"))
+    if len(comparisons) > 1:
+        written.append(write_csv([row for c in comparisons for row in c.rows], folder / "comparison.csv"))
+    return written
