@@ -47,7 +47,8 @@ def measure(
         largest = torch.maximum(largest, (system.hamiltonian(y) - H0).abs())
         if k in (1, 10, 100):
             reference, reached = reference_step(system, reference, (k - reached) * flow.dt), k
-            figures[f"error_{k}"] = _mean(np.linalg.norm((y.cpu().numpy() - reference) / units, axis=-1))
+            with np.errstate(all="ignore"):
+                figures[f"error_{k}"] = _mean(np.linalg.norm((y.cpu().numpy() - reference) / units, axis=-1))
     energy = (largest / omega**2).cpu().numpy()
     figures["energy_error"] = _mean(energy)
     figures["energy_error_max"] = float(energy.max()) if np.isfinite(energy).all() else None

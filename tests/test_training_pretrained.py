@@ -1,0 +1,81 @@
+"""The flows that ship: measured again, and held against what the issue asks of them."""
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow.flow.io import load, shipped
+from sympflow.flow.mlp import MLPFlow
+from sympflow.flow.sympflow import SympFlow
+from sympflow.systems import harmonic_oscillator, henon_heiles
+from sympflow.training import pretrained
+
+RECIPES = pretrained.recipes()
+
+# error of one step and of the energy over 1000 steps, as `measure` defines them: level with the published checkpoints
+TARGETS = {
+    "harmonic_oscillator": (3.5e-4, 1.9e-3),
+    "henon_heiles": (2.3e-3, 1.4e-3),
+    "pendulum": (2.3e-3, 1.4e-3),
+    "harmonic_oscillator_100": (3.5e-4, 1.9e-3),
+}
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_shipped_sympflows_reach_their_targets(name):
+    """And the figures that their files hold are what they achieve."""
+    flow = load(pretrained.path(name, "sympflow"))
+    figures = RECIPES[name].measure(flow)
+    one_step, energy = TARGETS[name]
+    assert figures["error_1"] <= one_step
+    assert figures["energy_error"] <= energy
+    assert {k: flow.figures[k] for k in figures} == pytest.approx(figures, rel=0.02)
+
+
+@pytest.mark.parametrize("kind", pretrained.KINDS)
+@pytest.mark.parametrize("name", RECIPES)
+def test_shipped_flows_are_found_by_their_system(name, kind):
+    recipe = RECIPES[name]
+    flow = shipped(recipe.system, kind)
+    assert isinstance(flow, {"sympflow": SympFlow, "mlp": MLPFlow}[kind])
+    assert flow.dt == recipe.dt
+    assert flow.domain.attach(recipe.system.hamiltonian).contains(recipe.initial()).all()
+    assert [stage["optimizer"] for stage in flow.recipe["stages"]] == ["adam", "bfgs"]
+    assert pretrained.path(name, kind).stat().st_size < 20_000
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_shipped_baselines_compare(name):
+    """As many parameters within 2 %, the same training, and a map that solves the problem."""
+    flow, baseline = (load(pretrained.path(name, kind)) for kind in pretrained.KINDS)
+    assert abs(baseline.n_parameters - flow.n_parameters) <= 0.02 * flow.n_parameters
+    assert baseline.recipe["stages"][1]["steps"] == flow.recipe["stages"][1]["steps"]
+    assert RECIPES[name].measure(baseline, steps=1)["error_1"] <= 1e-3
+
+
+def test_no_shipped_flow():
+    with pytest.raises(ValueError, match=r"`system` 'harmonic_oscillator' has no shipped .*henon_heiles.*train"):
+        shipped(harmonic_oscillator(3.0))
+
+
+def test_a_blow_up_is_not_a_small_error():
+    flow = MLPFlow(1)
+    with torch.no_grad():
+        flow.weights[-1].mul_(1e6)
+        flow.biases[-1].fill_(1e300)
+    recipe = RECIPES["harmonic_oscillator"]
+    figures = recipe.measure(flow, steps=100)
+    assert figures["energy_error"] is None
+    assert figures["error_100"] is None
+
+
+def test_the_command_trains_and_measures(tmp_path, monkeypatch, capsys):
+    quick = pretrained.Recipe(henon_heiles(), lambda: np.full((2, 4), 0.1), adam=2, bfgs=1, points=40)
+    monkeypatch.setattr(pretrained, "recipes", lambda: {"henon_heiles": quick})
+    pretrained.main(["henon_heiles", "--kind", "sympflow", "--out", str(tmp_path)])
+    trained = capsys.readouterr().out
+    assert load(tmp_path / "henon_heiles-sympflow.safetensors").system_name == "henon_heiles"
+    pretrained.main(["henon_heiles", "--kind", "sympflow", "--out", str(tmp_path), "--measure"])
+    assert capsys.readouterr().out.split("error_1 ")[1] == trained.split("error_1 ")[1]
+    with pytest.raises(SystemExit):
+        pretrained.main(["three_body"])
