@@ -20,10 +20,7 @@ CHECK_EVERY = 256  # steps between two looks for a non-finite state, where nothi
 @njit(**OPTIONS)
 def stage(q, p, q_error, p_error, b, g, a, work):
     """Kick by b (and g), then drift by a."""
-    if FORCE_GRADIENTS and g != 0.0:
-        change = gradient_kick(q, b, g, work)
-    else:
-        change = kick(q, b, work)
+    change = gradient_kick(q, b, g, work) if FORCE_GRADIENTS and g != 0.0 else kick(q, b, work)
     p, p_error = move(p, p_error, change)
     q, q_error = move(q, q_error, drift(p, a, work))
     return q, p, q_error, p_error

@@ -1,4 +1,4 @@
-"""Generated source as importable modules, kept in a per-user folder so that Numba's disk cache applies."""
+"""Generated source as importable modules, kept in a per-user folder so that Numba's disk cache applies; threads."""
 
 from __future__ import annotations
 
@@ -9,14 +9,23 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 
 import numba
 
-__all__ = ["cache_folder", "load_module", "template"]
+__all__ = ["OPTIONS", "cache_folder", "load_module", "run_rows", "template"]
+
+OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+"""How kernels are compiled: 1/0 is inf, a·b + c may be fused; nothing else about rounding or NaN is relaxed."""
+
+_BLOCK = 64  # rows that a thread takes at a time: the lanes of a block
+_WORTH_A_THREAD = 500_000  # units of work, about a nanosecond each, below which another thread does not pay
 
 
 def template(name: str) -> str:
@@ -83,3 +92,18 @@ def _write_once(folder: Path, name: str, source: str) -> Path:
             file.write(source)
         os.replace(unfinished, path)
     return path
+
+
+def run_rows(rows: Callable[[slice], None], n_rows: int, work_per_row: int, threads: int | None) -> None:
+    """Call ``rows(slice)`` over 0 … n_rows, on several threads if the work is worth it; `rows` releases the GIL."""
+    n_blocks = -(-n_rows // _BLOCK)
+    if threads is None:
+        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        threads = min(threads, 1 + n_rows * work_per_row // _WORTH_A_THREAD)
+    threads = max(1, min(threads, n_blocks))
+    if threads == 1:
+        rows(slice(0, n_rows))
+        return
+    bounds = [_BLOCK * (n_blocks * k // threads) for k in range(threads)] + [n_rows]
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(rows, [slice(*ends) for ends in pairwise(bounds)]))

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from itertools import pairwise
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -15,13 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.integrators.schemes import Scheme
-from sympflow.kernels.modules import load_module, template
+from sympflow.kernels.modules import OPTIONS, load_module, run_rows, template
 from sympflow.system import HamiltonianSystem
 
 __all__ = ["SplittingKernel", "splitting_kernel"]
-
-_BLOCK = 64  # rows that a thread takes at a time: the lanes of a block
-_WORTH_A_THREAD = 500_000  # stages × trajectories below which a second thread does not pay
 
 
 def splitting_kernel(system: HamiltonianSystem) -> SplittingKernel:
@@ -158,21 +152,6 @@ class SplittingKernel:
         return out
 
 
-def run_rows(rows: Callable[[slice], None], n_rows: int, work_per_row: int, threads: int | None) -> None:
-    """Call ``rows(slice)`` over 0 … n_rows, on several threads if the work is worth it; `rows` releases the GIL."""
-    n_blocks = -(-n_rows // _BLOCK)
-    if threads is None:
-        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        threads = min(threads, 1 + n_rows * work_per_row // _WORTH_A_THREAD)
-    threads = max(1, min(threads, n_blocks))
-    if threads == 1:
-        rows(slice(0, n_rows))
-        return
-    bounds = [_BLOCK * (n_blocks * k // threads) for k in range(threads)] + [n_rows]
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(rows, [slice(*ends) for ends in pairwise(bounds)]))
-
-
 _Stage = tuple[float, float, float]  # kick b, gradient g, drift a
 _Table = tuple[np.ndarray, np.ndarray, np.ndarray]  # kicks, drifts, gradients of the stages
 
@@ -230,10 +209,9 @@ class _Loops:
 
 
 def _header(gradients: bool, compensated: bool, cache: bool) -> str:
-    options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}, "cache": cache}
     return (
         "import math\n\nfrom numba import njit\n\n"
-        f"OPTIONS = {options}\nFORCE_GRADIENTS = {gradients}\nCOMPENSATED = {compensated}"
+        f"OPTIONS = {OPTIONS | {'cache': cache}}\nFORCE_GRADIENTS = {gradients}\nCOMPENSATED = {compensated}"
     )
 
 

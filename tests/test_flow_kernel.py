@@ -1,0 +1,167 @@
+"""The compiled SympFlow against the torch one."""
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow.flow.activations import ACTIVATIONS
+from sympflow.flow.layers import Drift, Kick
+from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.scaling import Scaling
+from sympflow.flow.sympflow import SympFlow
+from sympflow.kernels.mlp_flow import mlp_flow_kernel
+from sympflow.kernels.modules import OPTIONS, load_module, template
+
+ROUNDING = 2e-14  # a few dozen operations on numbers up to 10
+
+
+def states(n, ndof, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, (n, 2 * ndof))
+
+
+def torch_steps(flow, h, y0, n_steps):
+    """Every state of a run, by torch: (n_steps + 1, ..., 2d)."""
+    y = [torch.as_tensor(y0)]
+    with torch.no_grad():
+        for _ in range(n_steps):
+            y.append(flow(h, y[-1]))
+    return torch.stack(y).numpy()
+
+
+def step_errors(flow, h, Y):
+    """How far each state of a run (n, ..., 2d) is from torch's step from the one before."""
+    with torch.no_grad():
+        return np.abs(Y[1:] - flow(h, torch.as_tensor(Y[:-1])).numpy())
+
+
+def lively(flow):
+    """Weights half as large again as at first, so that the activations leave their linear range."""
+    with torch.no_grad():
+        for parameter in flow.parameters():
+            parameter.mul_(1.5)
+    return flow
+
+
+@pytest.fixture(scope="module")
+def flow():
+    """The published architecture in units that are not 1."""
+    scale = Scaling(q=(0.5, 2.0), p=(1.5, 0.7), t=0.8)
+    return lively(SympFlow(2, pairs=3, hidden=(10, 10), dt=0.8, scale=scale))
+
+
+@pytest.mark.parametrize("h", [0.8, 0.3, -0.8, -0.1])
+def test_run_agrees_with_torch(flow, h):
+    y0 = states(1, 2)[0]
+    Y, n_finite = mlp_flow_kernel(flow).run(h, y0, 20, np.arange(21))
+    assert n_finite == 20
+    assert np.array_equal(Y[0], y0)
+    assert step_errors(flow, h, Y).max() < ROUNDING
+    sparse, _ = mlp_flow_kernel(flow).run(h, y0, 20, np.array([0, 3, 3, 20]))
+    assert np.array_equal(sparse, Y[[0, 3, 3, 20]])
+
+
+@pytest.mark.parametrize("n", [1, 5, 32, 100])
+def test_batch_agrees_with_torch(flow, n):
+    y0 = states(n, 2)
+    Y, n_finite = mlp_flow_kernel(flow).run_batch(0.8, y0, 5, np.arange(6), threads=2)
+    assert (n_finite == 5).all()
+    assert np.array_equal(Y[:, 0], y0)
+    assert step_errors(flow, 0.8, Y.swapaxes(0, 1)).max() < ROUNDING
+
+
+def test_each_state_can_have_its_own_time(flow):
+    y = states(50, 2)
+    h = np.random.default_rng(1).uniform(-0.8, 0.8, 50)
+    with torch.no_grad():
+        expected = flow(torch.as_tensor(h), torch.as_tensor(y)).numpy()
+    assert np.abs(mlp_flow_kernel(flow).step(h, y) - expected).max() < ROUNDING
+    assert np.array_equal(mlp_flow_kernel(flow).step(0.0, y), y)
+
+
+def test_inverse_undoes_the_map(flow):
+    kernel, y = mlp_flow_kernel(flow), states(40, 2)
+    assert np.abs(kernel.step(-0.8, kernel.step(0.8, y)) - y).max() < ROUNDING
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_every_activation(activation):
+    flow = lively(SympFlow(1, pairs=1, hidden=(5,), activation=activation))
+    y0 = states(3, 1)
+    Y, _ = mlp_flow_kernel(flow).run_batch(1.0, y0, 3, np.array([3]))
+    assert np.abs(Y[:, 0] - torch_steps(flow, 1.0, y0, 3)[-1]).max() < ROUNDING
+
+
+@pytest.mark.parametrize("hidden", [(4, 7, 3), (20, 18)])
+def test_any_depth_and_widths(hidden):
+    flow = lively(SympFlow(2, pairs=1, hidden=hidden))
+    y0 = states(10, 2)
+    Y, _ = mlp_flow_kernel(flow).run_batch(1.0, y0, 2, np.array([2]))
+    assert np.abs(Y[:, 0] - torch_steps(flow, 1.0, y0, 2)[-1]).max() < ROUNDING
+    single, _ = mlp_flow_kernel(flow).run(1.0, y0[0], 2, np.array([2]))
+    assert np.abs(single[0] - Y[0, 0]).max() < ROUNDING
+
+
+def test_layers_in_any_order():
+    generator = torch.Generator().manual_seed(3)
+
+    def potential(width):
+        return MLPPotential(2, (width, width), generator=generator)
+
+    flow = SympFlow.from_layers(
+        [Drift(potential(6)), Kick(potential(10)), Kick(potential(3)), Drift(potential(6))], dt=1
+    )
+    y0 = states(1, 2)[0]
+    Y, _ = mlp_flow_kernel(flow).run(-0.7, y0, 3, np.array([3]))
+    assert np.abs(Y[0] - torch_steps(flow, -0.7, y0, 3)[-1]).max() < ROUNDING
+
+
+def test_new_weights_are_noticed():
+    flow = SympFlow(1, pairs=1)
+    y = states(2, 1)
+    before, kernel = mlp_flow_kernel(flow).step(1.0, y), mlp_flow_kernel(flow)
+    assert mlp_flow_kernel(flow) is kernel
+    flow.layers[0].potential.weight_x.data.mul_(2)  # which leaves no trace in torch's version counter
+    after = mlp_flow_kernel(flow).step(1.0, y)
+    assert np.abs(after - before).max() > 1e-3
+    flow.load_state_dict({k: 2 * v for k, v in flow.state_dict().items()}, assign=True)
+    assert np.abs(mlp_flow_kernel(flow).step(1.0, y) - torch_steps(flow, 1.0, y, 1)[1]).max() < ROUNDING
+
+
+def test_states_that_are_not_finite(flow):
+    y0 = states(40, 2)
+    y0[3], y0[7, 0], y0[8, 2] = np.nan, np.inf, 1e308
+    Y, n_finite = mlp_flow_kernel(flow).run_batch(0.8, y0, 4, np.arange(5))
+    harmed = np.isin(np.arange(40), [3, 7])
+    assert (n_finite[harmed] == 0).all()
+    assert np.array_equal(Y[:, 0], y0, equal_nan=True)
+    assert np.isnan(Y[harmed, 1:]).all()
+    assert (n_finite[~harmed] == 4).all()
+    fine = ~harmed & (np.arange(40) != 8)
+    assert step_errors(flow, 0.8, Y[fine].swapaxes(0, 1)).max() < ROUNDING
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="float64 on the CPU"):
+        mlp_flow_kernel(SympFlow(1, pairs=1, dtype=torch.float32))
+    mixed = SympFlow.from_layers([Kick(MLPPotential(1, (4,))), Drift(MLPPotential(1, (4, 4)))], dt=1.0)
+    with pytest.raises(ValueError, match="one depth"):
+        mlp_flow_kernel(mixed)
+
+
+@pytest.fixture(scope="module")
+def fast_tanh():
+    header = f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': True}}\n"
+    return load_module(header + template("activations")).fast_tanh
+
+
+def test_fast_tanh_is_accurate_to_a_few_units_in_the_last_place(fast_tanh):
+    mpmath = pytest.importorskip("mpmath")
+    rng = np.random.default_rng(0)
+    x = np.concatenate([rng.uniform(-0.4, 0.4, 500), rng.uniform(-25, 25, 500), 10.0 ** rng.uniform(-300, 2, 500)])
+    with mpmath.workprec(150):
+        for value in x:
+            exact = mpmath.tanh(float(value))
+            error = abs(mpmath.mpf(fast_tanh(value)) - exact)
+            assert error <= 3 * mpmath.mpf(float(np.spacing(abs(float(exact)))))
+    assert [fast_tanh(v) for v in (np.inf, -np.inf, 1e308, 0.0, 5e-324)] == [1.0, -1.0, 1.0, 0.0, 5e-324]
+    assert np.isnan(fast_tanh(np.nan))
