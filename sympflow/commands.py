@@ -264,3 +264,7 @@ def train_command(
         ]
         print_table(("figure", "value"), figures)
         out.print(f"Written: {to}. Use it with: sympflow compare {system} --methods {to},verlet")
+
+
+def _brief(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

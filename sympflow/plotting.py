@@ -153,8 +153,10 @@ def _volume_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str,
         worst = v[np.argmax(np.where(np.isfinite(v[:, -1]), v[:, -1], np.inf))]
         worst = np.where(np.isfinite(worst), np.maximum(worst, ROUNDING_FLOOR), np.nan)
         ax.plot(sol.t, worst, _dash(run), color=styles[run.row.label][0], lw=1.4)
-    ax.axhspan(ROUNDING_FLOOR / 10, 4 * n_steps * np.finfo(float).eps, color="#EEEEEE", zorder=0, lw=0)
-    ax.text(0.985, 0.1, "rounding", transform=ax.transAxes, ha="right", va="bottom", fontsize=8, color="#888888")
+    rounding = 4 * n_steps * np.finfo(float).eps
+    ax.axhspan(ROUNDING_FLOOR / 10, rounding, color="#EEEEEE", zorder=0, lw=0)
+    where = ax.get_yaxis_transform()
+    ax.text(0.98, rounding / 2, "rounding", transform=where, ha="right", va="top", fontsize=8, color="#888888")
     ax.set_yscale("log")
     _limits(ax)
     _dress(ax, "t", "|log volume ratio|")
@@ -200,8 +202,16 @@ def portrait(comparison: Comparison) -> Figure:
     x_label, y_label = {1: ("q", "p"), 2: ("q₂", "p₂")}.get(system.ndof, ("q₁", "q₂"))
     for k, (ax, run) in enumerate(zip(axes.flat, runs, strict=False)):
         points = _phase_points(comparison, run.candidate.integrator)
-        ax.plot(*truth.T, ".", color="#C8C8C8", ms=6 if system.ndof == 2 else 2.5, mew=0, zorder=1, rasterized=True)
-        ax.plot(*points.T, ".", color=styles[run.row.label][0], ms=2.2, mew=0, zorder=2, rasterized=True)
+        ax.plot(*truth.T, ".", color="#C8C8C8", ms=8 if system.ndof == 2 else 2.5, mew=0, zorder=1, rasterized=True)
+        ax.plot(
+            *points.T,
+            ".",
+            color=styles[run.row.label][0],
+            ms=2.2 if len(points) > 100 else 4,
+            mew=0,
+            zorder=2,
+            rasterized=True,
+        )
         ax.set_title(run.row.label, fontsize=9, color=styles[run.row.label][0])
         _dress(ax, x_label if k // columns == rows - 1 else "", y_label if k % columns == 0 else "")
     _frame(axes[0, 0], truth)
