@@ -187,7 +187,7 @@ def compare(
     def run(integrator: Any) -> Solution:
         return solve(system, integrator, (t0, t1), start, t_eval=t, backend=backend)
 
-    runs = [Run(c, Row(system.name, c.method, c.label)) for c in candidates(methods, dt)]
+    runs = [Run(c, Row(_identify(system), c.method, c.label)) for c in candidates(methods, dt)]
     for one in runs:
         say(f"{system.name}: running {one.candidate.label}")
         _first_run(one, run)
@@ -207,6 +207,11 @@ def compare(
             say(f"{system.name}: measuring {one.candidate.label}")
             _measure(one, one.sol, asked)
     return Comparison(system, (t0, t1), start, t, asked, repeats, match, truth, tuple(runs))
+
+
+def _identify(system: HamiltonianSystem) -> str:
+    params = ", ".join(f"{k}={v:g}" for k, v in system.params.items())
+    return f"{system.name}({params})" if params else system.name
 
 
 def _check_metrics(metrics: Sequence[str]) -> tuple[str, ...]:
@@ -280,7 +285,7 @@ def _match(
         say(f"{system.name}: matching {one.candidate.label}")
         integrator, reached = match_to(one.candidate.integrator, system, measure, target, what == "energy_error")
         one.candidate = replace(one.candidate, integrator=integrator)
-        one.row = Row(system.name, one.candidate.method, one.candidate.label)
+        one.row = Row(_identify(system), one.candidate.method, one.candidate.label)
         _first_run(one, run)
         if not abs(math.log(reached / target)) < 0.1:
             one.note(f"Matched only to {reached:.2g} where {anchor.candidate.label} has {target:.2g}.")
