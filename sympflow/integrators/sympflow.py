@@ -15,6 +15,7 @@ from sympflow.system import HamiltonianSystem
 if TYPE_CHECKING:
     from sympflow.flow.mlp import MLPFlow
     from sympflow.flow.sympflow import SympFlow
+    from sympflow.kernels.mlp_flow import MLPFlowKernel
 
 
 _SHIPPED: dict[tuple[str, tuple[float, ...]], Any] = {}  # read from their files once in a process
@@ -95,12 +96,36 @@ class FlowIntegrator(FixedStep):
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         y0, flow = problem.y0, self.flow_for(problem.system)
         _check_match(y0, flow)
+        kernel = _kernel(problem, flow)
+        if kernel is not None:
+            rows = y0.reshape(-1, y0.shape[-1])
+            states, finite = kernel.run_batch(h, rows, n_steps, save)
+            states = states.swapaxes(0, 1).reshape(len(save), *y0.shape)
+            return states, np.asarray(finite).reshape(y0.shape[:-1]), "compiled"
         if is_tensor(y0):
             return super().rollout(problem, h, n_steps, save)
         with torch.no_grad():
             tensors = Problem(problem.system, problem.t0, problem.t1, torch.from_numpy(np.ascontiguousarray(y0)))
             states, finite, _ = super().rollout(tensors, h, n_steps, save)
         return states.numpy(), finite, "torch"
+
+
+def _kernel(problem: Problem, flow: Any) -> MLPFlowKernel | None:
+    """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
+    if problem.backend == "array":
+        return None
+    try:
+        if is_tensor(problem.y0):
+            raise ValueError("`y0` is a tensor: pass a NumPy array, or use backend='array'.")
+        if flow.kind != "sympflow":
+            raise ValueError("`method` 'mlp' has no compiled form: use backend='array'.")
+        from sympflow.kernels.mlp_flow import mlp_flow_kernel
+
+        return mlp_flow_kernel(flow)
+    except ValueError as reason:
+        if problem.backend == "compiled":
+            raise ValueError(f"`backend` 'compiled' does not apply. {reason}") from None
+        return None
 
 
 def _check_match(y0: Array, flow: Any) -> None:
