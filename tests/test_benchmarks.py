@@ -1,0 +1,198 @@
+"""The arithmetic of the comparison with other packages, and a tiny run of it. Nothing here judges a time."""
+# ruff: noqa: E402  (the benchmarks are no package that is installed)
+
+import importlib.util
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+if not BENCHMARKS.exists():
+    pytest.skip("the benchmarks are not part of the source distribution", allow_module_level=True)
+sys.path.insert(0, str(BENCHMARKS))
+
+import peers
+from contenders import compiled_loops, interpreted_loops, ours, runge_kutta
+from contenders.calibration import Judged, largest_control
+from contenders.contender import Skipped, Work
+from contenders.goals import Goal, goals, worst_ratio
+from contenders.measurement import Results, Row, check_agreement, measure
+from contenders.page import duration, page, three
+from contenders.prose import power
+from contenders.scene import Scene
+
+TINY = Scene(t_end=20.0, n_instants=20, trajectories=70)  # more than a block of the hand-written loops, and not two
+
+
+def row(package, label, seconds, trajectories=1, target=1e-6, control="dt"):
+    return Row(label, package, trajectories, target, control, 0.1, 1e-7, 1e-5, 10, 10, 0, seconds, 0.0, 1.0)
+
+
+# the step or tolerance for a target -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [1, 2, 6, 8])
+@pytest.mark.parametrize("guess", [1e-3, 0.4, 30.0])
+def test_largest_control_meets_the_target_closely_on_a_power_law(order, guess):
+    judged = largest_control(lambda x: Judged(x, x**order, None, Work(1, 1)), 1e-6, guess, order, 0.95)
+    assert 0.95e-6 <= judged.energy_error <= 1e-6
+
+
+def test_largest_control_brackets_where_the_error_is_no_power_law():
+    def judge(x):  # in steps, and infinite beyond a stability limit
+        return Judged(x, 10.0 ** math.floor(2 * math.log10(x)) if x < 0.5 else math.inf, None, Work(1, 1))
+
+    judged = largest_control(judge, 2e-5, 5.0, 1, 0.999)
+    assert judged.energy_error <= 2e-5
+    assert 10**-2 * 0.98 < judged.control < 10**-2
+
+
+def test_largest_control_says_when_the_target_is_out_of_reach():
+    assert largest_control(lambda x: Judged(x, 1e-3, None, Work(1, 1)), 1e-6, 0.1, 2, 0.9) is None
+
+
+# errors -----------------------------------------------------------------------------------------------
+
+
+def test_energy_error_is_the_largest_and_of_a_batch_the_median():
+    scene = Scene(t_end=1.0, n_instants=3, trajectories=3)
+    start = np.tile(scene.y0, (3, 1))
+    states = np.tile(start, (4, 1, 1))
+    states[2, 0] = [0, 0, 0, 0]  # |0 − H₀|/H₀ = 1 in the first trajectory, 0 in the second, a blow-up in the third
+    states[1, 2] = np.nan
+    assert scene.energy_error(states, start) == 1.0
+    assert scene.energy_error(states[:, 1], scene.y0) == 0.0
+    assert scene.energy_error(states[:, 2], scene.y0) == math.inf
+
+
+def test_first_after_takes_the_next_step_or_the_last():
+    times = np.array([0.0, 0.4, 1.0, 1.7, 2.0])
+    np.testing.assert_array_equal(runge_kutta.first_after(times, np.array([0.5, 1.0, 1.5, 2.0, 2.5])), [2, 2, 3, 4, 4])
+
+
+# every loop takes the steps of our methods ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("trajectories", [1, TINY.trajectories])
+def test_hand_written_and_interpreted_loops_take_our_steps(trajectories):
+    leader = next(c for c in ours.contenders(TINY) if c.label == "verlet" and c.trajectories == trajectories)
+    for module in (compiled_loops, interpreted_loops):
+        for contender in module.contenders(TINY):
+            if contender.trajectories == trajectories:
+                check_agreement(TINY, contender, leader, 0.05)
+
+
+@pytest.mark.parametrize("trajectories", [1, TINY.trajectories])
+def test_hand_written_kahan_li8_takes_our_steps(trajectories):
+    by_hand = compiled_loops.run_kahan_li8(TINY, trajectories, 0.2, TINY.t_end)
+    np.testing.assert_allclose(by_hand, ours.run(TINY, "kahan_li8", trajectories, 0.2, TINY.t_end), atol=1e-13)
+
+
+def test_a_loop_with_other_steps_is_found_out():
+    leader, other = (next(c for c in ours.contenders(TINY) if c.label == name) for name in ("verlet", "suzuki4"))
+    with pytest.raises(RuntimeError, match="suzuki4 differs from verlet"):
+        check_agreement(TINY, other, leader, 0.05)
+
+
+@pytest.mark.filterwarnings("default")
+def test_diffrax_takes_our_steps_and_judges_its_own():
+    pytest.importorskip("diffrax")
+    from contenders import diffrax_solvers
+
+    leaders = {c.trajectories: c for c in ours.contenders(TINY) if c.label == "verlet"}
+    *leapfrogs, dopri8 = diffrax_solvers.contenders(TINY)
+    for leapfrog in leapfrogs:
+        check_agreement(TINY, leapfrog, leaders[leapfrog.trajectories], 0.05)
+    assert_solves(dopri8)
+
+
+@pytest.mark.filterwarnings("default")
+def test_heyoka_is_judged_on_the_states_of_the_scene():
+    pytest.importorskip("heyoka")
+    from contenders import heyoka_taylor
+
+    for contender in heyoka_taylor.contenders(TINY):
+        assert_solves(contender)
+
+
+def test_python_runge_kutta_methods_are_judged_on_their_steps():
+    for contender in runge_kutta.contenders(TINY):
+        assert_solves(contender)
+
+
+def assert_solves(contender, tol=1e-10):
+    """Errors of the size of the tolerance, a hundred steps of growth allowed; what is timed ends where it is judged."""
+    outputs = contender.outputs(tol, TINY.t_end)
+    assert TINY.energy_error(outputs.states, TINY.sample(contender.trajectories)) < 100 * tol
+    interpolated = 1e4 if contender.package == "torchdiffeq" else 1.0  # its state at the end, by a quartic
+    assert TINY.state_error(outputs.final, contender.trajectories) < 1000 * tol * interpolated
+    assert outputs.work.steps > 10
+    run = contender.run(tol, TINY.t_end)
+    final = run.y[:, -1] if contender.package == "SciPy" else np.asarray(run)
+    np.testing.assert_allclose(final[: len(outputs.final)], outputs.final, atol=1e-12)
+
+
+# targets and page -------------------------------------------------------------------------------------
+
+
+def test_verdicts():
+    assert Goal("", 1.1, 1.2).verdict == "pass"
+    assert Goal("", 1.3, 1.2).verdict == "miss"
+    assert Goal("", 7.0, 5.0, at_least=True).verdict == "pass"
+    assert Goal("", 4.0, 5.0, at_least=True).verdict == "miss"
+    assert Goal("", None, 5.0).verdict == "not measured"
+
+
+def test_worst_ratio_compares_equal_targets_only():
+    results = Results(
+        [
+            row("sympflow", "verlet", 1.0, target=1e-3),
+            row("sympflow", "verlet", 3.0, target=1e-6),
+            row("sympflow", "verlet", 100.0, target=1e-9),
+            row("diffrax", "leapfrog", 2.0, target=1e-3),
+            row("diffrax", "leapfrog", 2.0, target=1e-6),
+            row("diffrax", "Dopri8", 0.1, target=1e-9, control="tol"),
+        ]
+    )
+    assert worst_ratio(results, "diffrax", 1) == 1.5
+    assert worst_ratio(results, "torch", 1) is None
+
+
+def test_numbers_are_written_with_three_digits():
+    assert [three(x) for x in (0.001234, 1.0, 12.34, 123.4, 123456.0)] == ["0.00123", "1.00", "12.3", "123", "123,000"]
+    assert [duration(s) for s in (2.5, 0.0123, 4.56e-5, 3e-9)] == ["2.50 s", "12.3 ms", "45.6 µs", "3.00 ns"]
+    assert power(1e-3) == "1e-3"
+    assert power(1e-12) == "1e-12"
+
+
+def test_a_missing_peer_is_a_line_with_the_reason(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    contenders, skipped = peers.gather(TINY)
+    assert [s.package for s in skipped] == ["diffrax", "heyoka"]
+    assert {c.package for c in contenders} == {"sympflow", "Numba", "NumPy", "torch", "SciPy", "torchdiffeq"}
+
+
+def test_a_tiny_run_fills_the_page_and_survives_json():
+    chosen = [c for c in ours.contenders(TINY) if c.label in ("verlet", "kahan_li8")]
+    contenders = [*chosen, *compiled_loops.contenders(TINY)]
+    results = measure(TINY, contenders, [1e-3, 1e-6], repeats=1, cap=0.05, note=lambda line: None)
+    results.skipped = [Skipped("heyoka", "not installed")]
+    results.environment = {"processor": "any", "cores": 1, "system": "any", "load": 0.0, "versions": {"python": "3"}}
+    results.environment |= {"minutes": 0.1, "repeats": 1}
+    assert {(r.label, r.trajectories, r.target) for r in results.rows} == {
+        (label, n, target)
+        for label in ("verlet", "kahan_li8", "Verlet loop")
+        for n in (1, TINY.trajectories)
+        for target in (1e-3, 1e-6)
+    }
+    assert all(0.9 * r.target < r.energy_error <= r.target for r in results.rows if r.label == "verlet")
+    assert [goal.verdict for goal in goals(results)][-1] == "not measured"
+    text = page(results, Path("figures/figure.png"))
+    assert "| kahan_li8 | sympflow |" in text
+    assert "- heyoka: not installed." in text
+    again = Results.from_dict(json.loads(json.dumps(results.to_dict())))
+    assert page(again, Path("figures/figure.png")) == text
