@@ -18,8 +18,8 @@ def harmonic_oscillator(omega: float = 1.0) -> HamiltonianSystem:
 
     Notes
     -----
-    The domain is the ellipse H < ω²·1.7²/2, that is |q| < 1.7: with ω = 1 it contains [−1.2, 1.2]². The default interval
-    is 100 units of 1/ω and the default step 0.05/ω.
+    The domain is the ellipse H < ω²·1.7²/2, that is |q| < 1.7: with ω = 1 it contains [−1.2, 1.2]². The default
+    interval is 100 units of 1/ω and the default step 0.05/ω.
     """
     if not (isinstance(omega, int | float) and 0 < omega < math.inf):
         raise ValueError(f"`omega` must be positive and finite; got {omega!r}.")
