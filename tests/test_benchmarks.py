@@ -179,7 +179,7 @@ def test_a_missing_peer_is_a_line_with_the_reason(monkeypatch):
 def test_a_tiny_run_fills_the_page_and_survives_json():
     chosen = [c for c in ours.contenders(TINY) if c.label in ("verlet", "kahan_li8")]
     contenders = [*chosen, *compiled_loops.contenders(TINY)]
-    results = measure(TINY, contenders, [1e-3, 1e-6], repeats=1, cap=0.05, note=lambda line: None)
+    results = measure(TINY, contenders, [1e-3, 1e-6], 1, cap=0.05, step_counts=(1000, 100), note=lambda line: None)
     results.skipped = [Skipped("heyoka", "not installed")]
     results.environment = {"processor": "any", "cores": 1, "system": "any", "load": 0.0, "versions": {"python": "3"}}
     results.environment |= {"minutes": 0.1, "repeats": 1}

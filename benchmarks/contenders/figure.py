@@ -7,7 +7,6 @@ from pathlib import Path
 from contenders.measurement import Results
 
 COLOURS = {
-    "sympflow": "#0b5394",
     "Numba": "#000000",
     "heyoka": "#c0392b",
     "diffrax": "#e08e0b",
@@ -27,7 +26,9 @@ def draw(results: Results, path: Path) -> None:
     from matplotlib.ticker import LogLocator
 
     counts = sorted({row.trajectories for row in results.rows})
-    figure, panels = plt.subplots(1, len(counts), figsize=(6.6 * len(counts), 6.4), squeeze=False, layout="constrained")
+    figure, panels = plt.subplots(
+        1, len(counts), figsize=(6.6 * len(counts), 6.4), squeeze=False, sharey=True, layout="constrained"
+    )
     for axes, n in zip(panels[0], counts, strict=True):
         seen: dict[str, int] = {}
         curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
@@ -39,12 +40,13 @@ def draw(results: Results, path: Path) -> None:
             seen[package] += 1
             x, y = zip(*points, strict=True)
             ours = package == "sympflow"
+            shade = plt.get_cmap("winter")(seen[package] / 8) if ours else COLOURS.get(package)
             axes.loglog(
                 x,
                 y,
                 marker=marker,
                 markersize=5,
-                color=COLOURS.get(package),
+                color=shade,
                 linewidth=1.6 if ours else 1.1,
                 linestyle="-" if ours else "--",
                 zorder=3 if ours else 2,

@@ -114,6 +114,7 @@ def measure(
     targets: Sequence[float],
     repeats: int = 7,
     cap: float = 0.3,
+    step_counts: tuple[int, int] = (1_000_000, 20_000),
     note: Callable[[str], None] = print,
 ) -> Results:
     """Calibrate and time every contender at every target that it has a guess for.
@@ -122,6 +123,8 @@ def measure(
     ----------
     cap : float
         Seconds above which a run is timed over a part of the interval only.
+    step_counts : (int, int)
+        Over how many steps our loops and the hand-written ones are compared: of one trajectory, of the batch.
     note : callable
         Told what is going on.
     """
@@ -154,10 +157,11 @@ def measure(
                 plan.append((contender, target, found[key]))
 
     timed = [prepare(scene, contender, judged.control, cap) for contender, _, judged in plan]
-    steps = step_loops(scene)
+    steps = step_loops(scene, step_counts)
     note(f"timing {len(timed)} runs, {repeats} rounds")
-    times = interleaved([t.call for t in (*timed, *steps.values())], repeats)
-    for (contender, target, judged), t, run_time in zip(plan, timed, times, strict=False):
+    times = interleaved([t.call for t in timed], repeats)
+    step_times = interleaved([t.call for t in steps.values()], 3 * repeats)
+    for (contender, target, judged), t, run_time in zip(plan, timed, times, strict=True):
         results.rows.append(
             Row(
                 contender.label,
@@ -176,7 +180,7 @@ def measure(
                 t.part,
             )
         )
-    for (name, t), run_time in zip(steps.items(), times[len(timed) :], strict=True):
+    for (name, t), run_time in zip(steps.items(), step_times, strict=True):
         results.step_seconds[name] = run_time.median * t.scale
     return results
 
@@ -189,11 +193,11 @@ def check_agreement(scene: Scene, contender: Contender, leader: Contender, dt: f
         raise RuntimeError(f"{contender.package} {contender.label} differs from {leader.label} by {difference:.1e}.")
 
 
-def step_loops(scene: Scene, steps: int = 1_000_000, batch_steps: int = 20_000, dt: float = 0.01) -> dict[str, Timed]:
+def step_loops(scene: Scene, counts: tuple[int, int], dt: float = 0.01) -> dict[str, Timed]:
     """Verlet and Kahan–Li 8 of equal step, ours and hand-written; scaled to seconds a step and trajectory."""
     loops = {"verlet": compiled_loops.run_verlet, "kahan_li8": compiled_loops.run_kahan_li8}
     timed = {}
-    for n, count in ((1, steps), (scene.trajectories, batch_steps)):
+    for n, count in zip((1, scene.trajectories), counts, strict=True):
         for method, loop in loops.items():
             t_end, scale = count * dt, 1.0 / (count * n)
             by_hand = partial(loop, scene, n, dt, t_end)
