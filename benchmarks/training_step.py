@@ -47,13 +47,17 @@ def columns_value(V: MLPPotential, t: Tensor, x: Tensor) -> Tensor:
     return V.value(t, x.T)
 
 
+def gradient(V: Tensor, x: Tensor) -> Tensor:
+    return torch.autograd.grad(V.sum(), x, create_graph=True)[0]
+
+
 def autodiff_map(flow: SympFlow, value: Value, t: Tensor, x: Tensor) -> Tensor:
     """ψ̄_t(x) with ∇V by autograd: t (N,), x (N, 2d)."""
     q, p = x.chunk(2, -1)
     for layer in flow.layers:
         z = q if isinstance(layer, Kick) else p
-        difference = value(layer.potential, t, z) - value(layer.potential, torch.zeros_like(t), z)
-        (g,) = torch.autograd.grad(difference.sum(), z, create_graph=True)
+        V_t, V_0 = value(layer.potential, t, z), value(layer.potential, torch.zeros_like(t), z)
+        g = gradient(V_t, z) - gradient(V_0, z)
         q, p = (q, p - g) if isinstance(layer, Kick) else (q + g, p)
     return torch.cat([q, p], -1)
 

@@ -133,11 +133,16 @@ def test_closed_forms_against_autograd(activation, hidden):
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_ladders_are_derivatives(activation):
+def test_activations_against_autograd(activation):
+    sigma = ACTIVATIONS[activation]
     a = torch.linspace(-4, 4, 41, dtype=torch.float64, requires_grad=True)
-    value, first, second = ACTIVATIONS[activation](a, 2)
-    torch.testing.assert_close(first, torch.autograd.grad(value.sum(), a, retain_graph=True)[0])
-    torch.testing.assert_close(second, torch.autograd.grad(first.sum(), a)[0])
+    da = torch.cos(3 * a.detach())
+    value, slope, dvalue, dslope = sigma.tangent(a, da)
+    torch.testing.assert_close(sigma.value(a), value)
+    torch.testing.assert_close(sigma.slope(a), (value, slope))
+    torch.testing.assert_close(slope, torch.autograd.grad(value.sum(), a, retain_graph=True)[0])
+    torch.testing.assert_close(dvalue, slope * da)
+    torch.testing.assert_close(dslope, torch.autograd.grad(slope.sum(), a)[0] * da)
 
 
 def test_gradients_of_the_closed_forms():

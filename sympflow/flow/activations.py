@@ -1,69 +1,106 @@
-"""Activation functions σ with their first two derivatives, by name.
+"""Activation functions σ with their derivatives, by name.
 
-A potential must be C² (Canizares et al. 2024, section 2.1), and the velocity of the flow needs σ'': so an activation
-is a function `ladder(a, order)` that returns (σ, σ', σ'')[: order + 1], sharing what the three have in common.
+A potential must be C² (Canizares et al. 2024, section 2.1), so every σ here is smooth. Each is given by what the sweeps
+through a network need of it, which shares more than separate derivatives would.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-Ladder = Callable[[Tensor, int], tuple[Tensor, ...]]
+
+class Activation:
+    """σ, and its derivatives as the sweeps need them."""
+
+    def value(self, a: Tensor) -> Tensor:
+        """σ(a)."""
+        return self.slope(a)[0]
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        """σ(a) and σ'(a)."""
+        raise NotImplementedError
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """σ(a) and σ'(a), then their derivatives σ'(a) ȧ and σ''(a) ȧ along ȧ."""
+        raise NotImplementedError
 
 
-def tanh(a: Tensor, order: int) -> tuple[Tensor, ...]:
+class Tanh(Activation):
     """tanh a."""
-    value = torch.tanh(a)
-    if order == 0:
-        return (value,)
-    first = 1 - value * value
-    return (value, first) if order == 1 else (value, first, -2 * value * first)
+
+    def value(self, a: Tensor) -> Tensor:
+        return torch.tanh(a)
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        h = torch.tanh(a)
+        return h, 1 - h * h
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        h, slope = self.slope(a)
+        dh = slope * da
+        return h, slope, dh, -2 * h * dh
 
 
-def sin(a: Tensor, order: int) -> tuple[Tensor, ...]:
+class Sin(Activation):
     """sin a."""
-    value = torch.sin(a)
-    if order == 0:
-        return (value,)
-    first = torch.cos(a)
-    return (value, first) if order == 1 else (value, first, -value)
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.sin(a), torch.cos(a)
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        h, slope = self.slope(a)
+        return h, slope, slope * da, -h * da
 
 
-def sigmoid(a: Tensor, order: int) -> tuple[Tensor, ...]:
+class Sigmoid(Activation):
     """1 / (1 + exp(−a))."""
-    value = torch.sigmoid(a)
-    if order == 0:
-        return (value,)
-    first = value * (1 - value)
-    return (value, first) if order == 1 else (value, first, first * (1 - 2 * value))
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        h = torch.sigmoid(a)
+        return h, h * (1 - h)
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        h, slope = self.slope(a)
+        dh = slope * da
+        return h, slope, dh, (1 - 2 * h) * dh
 
 
-def softplus(a: Tensor, order: int) -> tuple[Tensor, ...]:
+class Softplus(Activation):
     """log(1 + exp a)."""
-    value = torch.logaddexp(a, torch.zeros_like(a))
-    return (value,) if order == 0 else (value, *sigmoid(a, order - 1))
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.logaddexp(a, torch.zeros_like(a)), torch.sigmoid(a)
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        h, slope = self.slope(a)
+        dh = slope * da
+        return h, slope, dh, (1 - slope) * dh
 
 
-def logcosh(a: Tensor, order: int) -> tuple[Tensor, ...]:
+class LogCosh(Activation):
     """log cosh a, whose derivative is tanh a."""
-    value = torch.logaddexp(a, -a) - math.log(2)
-    return (value,) if order == 0 else (value, *tanh(a, order - 1))
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.logaddexp(a, -a) - math.log(2), torch.tanh(a)
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        h, slope = self.slope(a)
+        return h, slope, slope * da, (1 - slope * slope) * da
 
 
-ACTIVATIONS: dict[str, Ladder] = {
-    "tanh": tanh,
-    "sin": sin,
-    "sigmoid": sigmoid,
-    "softplus": softplus,
-    "logcosh": logcosh,
+ACTIVATIONS: dict[str, Activation] = {
+    "tanh": Tanh(),
+    "sin": Sin(),
+    "sigmoid": Sigmoid(),
+    "softplus": Softplus(),
+    "logcosh": LogCosh(),
 }
 
 
-def activation(name: str) -> Ladder:
+def activation(name: str) -> Activation:
     """The activation of that name.
 
     Raises

@@ -45,7 +45,7 @@ class MLPFlow(FlowMap):
     ) -> None:
         super().__init__(ndof, dt)
         self.hidden, self.activation = hidden_widths(hidden), activation
-        self._ladder = activation_named(activation)
+        self._sigma = activation_named(activation)
         scale = Scaling.unit(ndof, dt) if scale is None else scale
         generator = torch.Generator().manual_seed(seed)
 
@@ -103,9 +103,9 @@ class MLPFlow(FlowMap):
         s = self.scale[:, None]
         tau_t = t / self.tau
         h = torch.addmm(self.biases[0][:, None], self.weights[0], (y - self.center[:, None]) / s)
-        h = self._ladder(h + outer(self.weight_t, tau_t), 0)[0]
+        h = self._sigma.value(h + outer(self.weight_t, tau_t))
         for W, b in zip(self.weights[1:-1], self.biases[1:-1], strict=True):
-            h = self._ladder(torch.addmm(b[:, None], W, h), 0)[0]
+            h = self._sigma.value(torch.addmm(b[:, None], W, h))
         return y + s * (torch.tanh(tau_t) * torch.addmm(self.biases[-1][:, None], self.weights[-1], h))
 
     def _map_inverse(self, t: float | Tensor, y: Tensor) -> Tensor:
@@ -115,10 +115,10 @@ class MLPFlow(FlowMap):
         s, k = self.scale[:, None], self.weight_t
         tau_t = t / self.tau
         a = torch.addmm(self.biases[0][:, None], self.weights[0], (y - self.center[:, None]) / s)
-        h, slope = self._ladder(a + outer(k, tau_t), 1)
+        h, slope = self._sigma.slope(a + outer(k, tau_t))
         dh = slope * k[:, None]
         for W, b in zip(self.weights[1:-1], self.biases[1:-1], strict=True):
-            h, slope = self._ladder(torch.addmm(b[:, None], W, h), 1)
+            h, slope = self._sigma.slope(torch.addmm(b[:, None], W, h))
             dh = slope * (W @ dh)
         N = torch.addmm(self.biases[-1][:, None], self.weights[-1], h)
         ramp = torch.tanh(tau_t)

@@ -103,7 +103,7 @@ class MLPPotential(Potential):
         super().__init__()
         hidden = hidden_widths(hidden)
         self.ndof, self.hidden, self.activation = int(ndof), hidden, activation
-        self._ladder = activation_named(activation)
+        self._sigma = activation_named(activation)
 
         def uniform(*shape: int, fan_in: int) -> nn.Parameter:
             # Drawn in float64 on the CPU, so that a seed means the same flow in every dtype and on every device.
@@ -140,9 +140,9 @@ class MLPPotential(Potential):
     def value(self, t: Time, x: Tensor) -> Tensor:
         """V(t, x): (N,)."""
         K, k, b, W, w = self.folded()
-        h = self._ladder(K @ x + outer(k, t) + b[0][:, None], 0)[0]
+        h = self._sigma.value(K @ x + outer(k, t) + b[0][:, None])
         for W_l, b_l in zip(W, b[1:], strict=True):
-            h = self._ladder(W_l @ h + b_l[:, None], 0)[0]
+            h = self._sigma.value(W_l @ h + b_l[:, None])
         return w @ h
 
     def gradient(self, t: Time, x: Tensor) -> Tensor:
@@ -203,13 +203,13 @@ class MLPPotential(Potential):
 
     def _sweeps(self, a: Tensor, b: list[Tensor], W: list[Tensor], w: Tensor) -> Tensor:
         """∂V/∂a (h_1, N), by a sweep forward through the layers and one back."""
-        h, slope = self._ladder(a, 1)
+        h, slope = self._sigma.slope(a)
         slopes = [slope]
         for W_l, b_l in zip(W, b[1:], strict=True):
-            h, slope = self._ladder(torch.addmm(b_l[:, None], W_l, h), 1)
+            h, slope = self._sigma.slope(torch.addmm(b_l[:, None], W_l, h))
             slopes.append(slope)
-        r = w[:, None] * slopes[-1]
-        for W_l, slope in zip(reversed(W), reversed(slopes[:-1]), strict=True):
+        r = slopes[-1] if W else w[:, None] * slopes[-1]
+        for W_l, slope in zip(_backward_weights(W, w), reversed(slopes[:-1]), strict=True):
             r = slope * (W_l.T @ r)
         return r
 
@@ -217,19 +217,21 @@ class MLPPotential(Potential):
         self, a: Tensor, da: Tensor, b: list[Tensor], W: list[Tensor], w: Tensor
     ) -> tuple[Tensor, Tensor]:
         """∂V/∂a and its derivative along da, both (h_1, N): the same two sweeps with a tangent beside."""
-        h, slope, curvature = self._ladder(a, 2)
-        dslope = curvature * da
+        h, slope, dh, dslope = self._sigma.tangent(a, da)
         slopes = [(slope, dslope)]
         for W_l, b_l in zip(W, b[1:], strict=True):
-            da = W_l @ (slope * da)
-            h, slope, curvature = self._ladder(torch.addmm(b_l[:, None], W_l, h), 2)
-            slopes.append((slope, curvature * da))
-        slope, dslope = slopes[-1]
-        r, dr = w[:, None] * slope, w[:, None] * dslope
-        for W_l, (slope, dslope) in zip(reversed(W), reversed(slopes[:-1]), strict=True):
+            h, slope, dh, dslope = self._sigma.tangent(torch.addmm(b_l[:, None], W_l, h), W_l @ dh)
+            slopes.append((slope, dslope))
+        r, dr = slopes[-1] if W else (w[:, None] * slope, w[:, None] * dslope)
+        for W_l, (slope, dslope) in zip(_backward_weights(W, w), reversed(slopes[:-1]), strict=True):
             r, dr = W_l.T @ r, W_l.T @ dr
             r, dr = slope * r, torch.addcmul(dslope * r, slope, dr)
         return r, dr
+
+
+def _backward_weights(W: list[Tensor], w: Tensor) -> list[Tensor]:
+    """The weights as the reverse sweep meets them, w multiplied into the first: cheaper than into the features."""
+    return [w[:, None] * W[-1], *reversed(W[:-1])] if W else []
 
 
 def outer(k: Tensor, t: Time) -> Tensor:
