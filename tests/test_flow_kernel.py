@@ -94,7 +94,7 @@ def test_every_activation(activation):
 @pytest.mark.parametrize("hidden", [(4, 7, 3), (20, 18)])
 def test_any_depth_and_widths(hidden):
     flow = lively(SympFlow(2, pairs=1, hidden=hidden))
-    y0 = states(10, 2)
+    y0 = states(3, 2)
     Y, _ = mlp_flow_kernel(flow).run_batch(1.0, y0, 2, np.array([2]))
     assert np.abs(Y[:, 0] - torch_steps(flow, 1.0, y0, 2)[-1]).max() < ROUNDING
     single, _ = mlp_flow_kernel(flow).run(1.0, y0[0], 2, np.array([2]))

@@ -1,4 +1,4 @@
-"""The loops of a SympFlow with MLP potentials: its map, a run. Source text, pasted after `activations`.
+"""The loops of a SympFlow with MLP potentials: its map, a run. Source text, pasted after `activations` and `aligned`.
 
 What comes before defines `NDOF`, `DEPTH` (hidden layers), `WIDTH` (of each, narrower ones padded with zero weights),
 `CHUNK` (a divisor of it), `STATES` (how many states go side by side) and `activation`.
@@ -98,8 +98,8 @@ def rollout(weights, backwards, t_steps, y0, n_steps, save, out, n_finite):
 
     ``n_finite[i]`` is the last step that ends in a finite state; rows of later steps are NaN.
     """
-    q, p, t = np.empty(NDOF * STATES), np.empty(NDOF * STATES), np.empty(STATES)
-    scratch = np.zeros(PADDED), np.zeros(PADDED), np.zeros((DEPTH, PADDED))
+    q, p, t = aligned_zeros(NDOF * STATES), aligned_zeros(NDOF * STATES), aligned_zeros(STATES)
+    scratch = aligned_zeros(PADDED), aligned_zeros(PADDED), aligned_zeros(DEPTH * PADDED).reshape((DEPTH, PADDED))
     for first in range(0, y0.shape[0], STATES):
         count = min(STATES, y0.shape[0] - first)
         for s in range(STATES):

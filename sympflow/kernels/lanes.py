@@ -1,17 +1,21 @@
 """Many trajectories at once: their states side by side, so that one instruction moves several of them.
 
-Source text, pasted after the tuple algebra of a symbolic system and `loops`. A block holds `LANES` trajectories,
-component first, as an array (2d, LANES) that stays in the first-level cache; the compiler turns the loop over the
-lanes of a stage into vector instructions. Lanes never mix, so one that overflows leaves the others as they are.
+Source text, pasted after the tuple algebra of a symbolic system, `loops` and `aligned`. A block holds `LANES`
+trajectories, component first, as an array (2d, LANES) that stays in the first-level cache; the compiler turns the loop
+over the lanes of a stage into vector instructions. Lanes never mix: one that overflows leaves the others as they are.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
 
-import numpy as np
 from numba import njit
 
 LANES = 64
 VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
+
+
+@njit(**OPTIONS)
+def empty_lanes():
+    return aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
 
 
 @njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
@@ -40,7 +44,7 @@ def close_lane(Y, error, lane, kicks, drifts, gradients):
 def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite):
     """`rollout` of every row of `y0` (N, 2d), `LANES` at a time; outputs as in `rollout_each`."""
     link = len(kicks) - 2
-    Y, start, error = np.empty((2 * NDOF, LANES)), np.empty((2 * NDOF, LANES)), np.empty((2 * NDOF, LANES))
+    Y, start, error = empty_lanes(), empty_lanes(), empty_lanes()
     for block_start in range(0, y0.shape[0], LANES):
         count = min(LANES, y0.shape[0] - block_start)
         width = (count + VECTOR - 1) // VECTOR * VECTOR

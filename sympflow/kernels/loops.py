@@ -14,7 +14,7 @@ an output is the closing stage applied to a copy, so that what is saved never ch
 
 from numba import njit
 
-CHECK_EVERY = 256  # steps between two looks for a non-finite state, where nothing is saved
+CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where nothing is saved
 
 
 @njit(**OPTIONS)

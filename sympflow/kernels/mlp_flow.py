@@ -57,7 +57,9 @@ class _Architecture:
             f"NDOF = {self.ndof}\nDEPTH = {self.depth}\nWIDTH = {self.width}\nCHUNK = {chunk}\nSTATES = {states}"
         )
         activation = f"activation = {self.activation}\n"
-        source = "\n\n".join([constants, template("activations"), activation, template("flow_loops")])
+        source = "\n\n".join(
+            [constants, template("activations"), activation, template("aligned"), template("flow_loops")]
+        )
         return load_module(source).rollout
 
 

@@ -217,7 +217,7 @@ def _header(gradients: bool, compensated: bool, cache: bool) -> str:
 
 def _symbolic_loops(algebra: str, gradients: bool, compensated: bool) -> _Loops:
     header = _header(gradients, compensated, cache=True)
-    loops = load_module("\n\n\n".join([header, algebra, template("loops"), template("lanes")]))
+    loops = load_module("\n\n\n".join([header, algebra, *map(template, ("loops", "aligned", "lanes"))]))
     return _Loops(loops.rollout, loops.rollout_lanes, loops.step_each)
 
 
