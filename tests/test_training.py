@@ -27,6 +27,7 @@ from sympflow.training.trainer import train
 from sympflow.training.validation import reference_step
 
 QUICK = {"pairs": 1, "hidden": (5,), "points": 60, "validation_points": 60, "reference_states": 5, "progress": False}
+MORE = {k: v for k, v in QUICK.items() if k not in ("pairs", "hidden")}
 CPU = torch.device("cpu")
 
 
@@ -175,7 +176,7 @@ def test_the_same_seed_gives_the_same_weights():
 def test_stages_are_recorded(tmp_path):
     first = train(harmonic_oscillator(), 0.5, steps=10, **QUICK)
     before = weights(first)
-    second = train(harmonic_oscillator(), flow=first, optimizer="bfgs", steps=2, **QUICK)
+    second = train(harmonic_oscillator(), flow=first, optimizer="bfgs", steps=2, **MORE)
     assert torch.equal(weights(first), before)
     assert [stage["optimizer"] for stage in second.recipe["stages"]] == ["adam", "bfgs"]
     assert second.dt == 0.5
@@ -356,6 +357,9 @@ def test_a_system_without_a_domain_says_what_to_pass():
         ({"seed": -1}, "`seed`"),
         ({"refresh": 0}, "`refresh`"),
         ({"matching_times": 400}, "`matching_times`"),
+        ({"time_budget": 0.0}, "`time_budget`"),
+        ({"flow": SympFlow(1), "pairs": 3}, "`pairs` describes a new flow"),
+        ({"flow": SympFlow(1), "kind": "mlp"}, "`kind` describes a new flow"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, message):

@@ -21,15 +21,17 @@ TARGETS = {
 }
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_shipped_sympflows_reach_their_targets(name):
+@pytest.mark.parametrize("scene", RECIPES)
+def test_shipped_sympflows_reach_their_targets(scene):
     """And the figures that their files hold are what they achieve."""
-    flow = load(pretrained.path(name, "sympflow"))
-    figures = RECIPES[name].measure(flow)
-    one_step, energy = TARGETS[name]
+    flow = load(pretrained.path(scene, "sympflow"))
+    figures = RECIPES[scene].measure(flow)
+    one_step, energy = TARGETS[scene]
     assert figures["error_1"] <= one_step
     assert figures["energy_error"] <= energy
-    assert {k: flow.figures[k] for k in figures} == pytest.approx(figures, rel=0.02)
+    # Over many steps a chaotic orbit depends on the rounding, and so on the machine.
+    for name, value in figures.items():
+        assert flow.figures[name] == pytest.approx(value, rel=1e-3 if name in ("error_1", "error_10") else 0.5)
 
 
 @pytest.mark.parametrize("kind", pretrained.KINDS)

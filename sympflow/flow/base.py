@@ -39,6 +39,8 @@ class FlowMap(nn.Module):
         The system it was trained for.
     recipe, figures : dict
         How it was trained, and what it achieved.
+    history : list of dict
+        Held-out figures over its training in this session; not saved.
     """
 
     kind: ClassVar[str]
@@ -55,6 +57,7 @@ class FlowMap(nn.Module):
         self.system_name: str | None = None
         self.recipe: dict[str, Any] = {}
         self.figures: dict[str, Any] = {}
+        self.history: list[dict[str, float]] = []
 
     def _map(self, t: float | Tensor, y: Tensor) -> Tensor:
         raise NotImplementedError

@@ -6,7 +6,13 @@ import math
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-OPTIMIZERS = ("adam", "bfgs")
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "adam": {"steps": 20_000, "points": 700, "refresh": 1, "validate_every": 500, "checkpoint_every": 1000},
+    "bfgs": {"steps": 200, "points": 4000, "refresh": None, "validate_every": 5, "checkpoint_every": 5},
+}
+"""What each optimizer does if not told otherwise."""
+
+OPTIMIZERS = tuple(DEFAULTS)
 SCHEDULES = ("one-cycle", "cosine", "constant")
 
 
@@ -91,6 +97,14 @@ class TrainingConfig:
                 raise ValueError(f"`{name}` must be positive and finite; got {value!r}.")
         if self.matching_times > min(self.points, self.validation_points) // 2:
             raise ValueError("`matching_times` must leave two points for each time: make it at most half of `points`.")
+
+    @classmethod
+    def of(cls, optimizer: str, **choices: Any) -> TrainingConfig:
+        """The configuration of an optimizer, with its defaults where `steps` and the like are None."""
+        for name, value in DEFAULTS.get(optimizer, DEFAULTS["adam"]).items():
+            if choices.get(name) is None:
+                choices[name] = value
+        return cls(optimizer=optimizer, **choices)
 
     def rate(self, step: int) -> float:
         """The learning rate of a step."""

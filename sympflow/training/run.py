@@ -1,0 +1,200 @@
+"""Run: the state of a training run, its loop, its checkpoints and its end."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sympflow.domain import Domain
+from sympflow.flow.base import FlowMap
+from sympflow.flow.scaling import Scaling
+from sympflow.system import HamiltonianSystem
+from sympflow.training import checkpoint as checkpoints
+from sympflow.training.collocation import PointSource, Stream, states
+from sympflow.training.config import TrainingConfig
+from sympflow.training.losses import Loss
+from sympflow.training.optimizers import optimizer as make_optimizer
+from sympflow.training.progress import progress as make_progress
+from sympflow.training.validation import Validation
+
+Path = str | os.PathLike[str]
+
+
+@dataclass
+class Run:
+    """The state of a run, and what acts on it."""
+
+    flow: FlowMap
+    system: HamiltonianSystem
+    domain: Domain
+    scaling: Scaling
+    config: TrainingConfig
+    loss: Loss
+    validation: Validation
+    source: PointSource
+    optimizer: Any
+    step: int = 0
+    seconds: float = 0.0
+    best: dict[str, Tensor] = field(default_factory=dict)
+    history: list[dict[str, float]] = field(default_factory=list)
+
+    @classmethod
+    def start(
+        cls,
+        flow: FlowMap,
+        system: HamiltonianSystem,
+        domain: Domain,
+        scaling: Scaling,
+        config: TrainingConfig,
+    ) -> Run:
+        loss = Loss(system, scaling, config.residual_weight, config.matching_weight)
+        common = (flow.dt, config.points, config.matching_times, config.seed, flow.dtype, flow.device)
+        source = PointSource(domain, *common, block=1 if config.refresh is None else 32)
+        held_out = PointSource(
+            domain,
+            flow.dt,
+            config.validation_points,
+            *common[2:],
+            streams=(Stream.VALIDATION, Stream.VALIDATION),
+            block=1,
+        )
+        x = states(domain, config.reference_states, config.seed, Stream.REFERENCE)
+        validation = Validation(system, loss, held_out(0), x, flow.dt, flow)
+        return cls(flow, system, domain, scaling, config, loss, validation, source, make_optimizer(flow, config))
+
+    def go(
+        self,
+        checkpoint: Path | None,
+        time_budget: float | None,
+        progress: bool | None,
+        callback: Callable[[int, dict[str, float]], None] | None,
+    ) -> str | None:
+        """Run to the end; why it ended early, if it did."""
+        config, flow, begin = self.config, self.flow, time.perf_counter()
+        before = self.seconds
+        if not self.history:
+            self._validate()
+            if not math.isfinite(self.history[0]["loss"]):
+                raise FloatingPointError(
+                    "The loss is not finite at the first validation: the system's H or its gradient is not finite "
+                    "on the domain, or the flow leaves it; shrink `domain` or `dt`."
+                )
+        try:
+            with make_progress(progress, config.steps, f"{self.system.name} {flow.kind}", self.step) as bar:
+                while self.step < config.steps:
+                    index = 0 if config.refresh is None else self.step // config.refresh
+                    points = self.source(index)
+                    value = self.optimizer.step(self.step, lambda points=points: self.loss(flow, points))
+                    self.step += 1
+                    self.seconds = before + time.perf_counter() - begin
+                    if not math.isfinite(value):
+                        return f"the loss was not finite at step {self.step}: lower `learning_rate`"
+                    bar.advance(self.step, value)
+                    last = self.step == config.steps
+                    spent = time_budget is not None and self.seconds - before > time_budget
+                    if last or spent or self.step % config.validate_every == 0:
+                        figures = self._validate()
+                        bar.validated(self.step, figures)
+                        if callback is not None:
+                            callback(self.step, dict(figures))
+                    if checkpoint is not None and (last or spent or self.step % config.checkpoint_every == 0):
+                        self.save(checkpoint)
+                    if spent and not last:
+                        return "the time budget was used up"
+        except KeyboardInterrupt:
+            return "it was interrupted"
+        return None
+
+    def _validate(self) -> dict[str, float]:
+        figures = {"step": self.step, **self.validation(self.flow)}
+        if math.isfinite(figures["loss"]) and figures["loss"] < self._best_loss():
+            self.best = {name: value.detach().clone() for name, value in self.flow.state_dict().items()}
+        self.history.append(figures)
+        return figures
+
+    def _best_loss(self) -> float:
+        return min((f["loss"] for f in self.history if math.isfinite(f["loss"])), default=math.inf)
+
+    def finish(self, reason: str | None) -> FlowMap:
+        """The flow in its best state, with its record."""
+        if reason is not None:
+            warnings.warn(
+                f"Training ended after {self.step} of {self.config.steps} steps because {reason}. "
+                "The best state so far is returned.",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+        flow = self.flow
+        flow.load_state_dict(self.best)
+        flow.requires_grad_(False)
+        flow.zero_grad(set_to_none=True)
+        flow.domain, flow.fingerprint, flow.system_name = (
+            self.domain,
+            self.system.fingerprint,
+            self.system.name,
+        )
+        best = min((f for f in self.history if math.isfinite(f["loss"])), key=lambda f: f["loss"])
+        earlier = float(flow.figures.get("training_seconds", 0.0))
+        stage = {
+            **self.config.to_dict(),
+            "steps_taken": self.step,
+            "ended_early": reason,
+            "best_step": best["step"],
+        }
+        flow.recipe = {
+            "stages": [*flow.recipe.get("stages", []), stage],
+            "scaling": self.scaling.to_dict(),
+            "torch": torch.__version__,
+        }
+        flow.figures = {k: v for k, v in best.items() if k not in ("step", "loss")}
+        flow.figures["training_seconds"] = round(earlier + self.seconds, 3)
+        flow.history = self.history
+        return flow
+
+    # checkpoints ------------------------------------------------------------------------------------------
+
+    def _identity(self) -> dict[str, Any]:
+        return {
+            "config": json.dumps(self.config.to_dict()),
+            "architecture": json.dumps({"kind": self.flow.kind, "dt": self.flow.dt, **self.flow.architecture()}),
+            "fingerprint": list(self.system.fingerprint),
+        }
+
+    def save(self, path: Path) -> None:
+        checkpoints.write(
+            path,
+            {
+                **self._identity(),
+                "step": self.step,
+                "flow": self.flow.state_dict(),
+                "best": self.best,
+                "optimizer": self.optimizer.state_dict(),
+                "history": self.history,
+                "seconds": self.seconds,
+            },
+        )
+
+    def load(self, path: Path) -> None:
+        state, mine = checkpoints.read(path), self._identity()
+        differing = self.config.differences(json.loads(state["config"]))
+        if differing:
+            raise ValueError(f"`resume` is a run with another {', '.join(differing)}: pass the same arguments as then.")
+        for name in ("architecture", "fingerprint"):
+            if state[name] != mine[name]:
+                raise ValueError(f"`resume` is a run with another {name}: pass the same system and flow as then.")
+        try:
+            self.flow.load_state_dict(state["flow"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.best = {name: state["best"][name].to(self.flow.device) for name in self.flow.state_dict()}
+        except (RuntimeError, KeyError, ValueError) as error:
+            raise ValueError(f"`resume` {str(path)!r} does not fit the flow: start afresh.") from error
+        self.step, self.seconds, self.history = state["step"], state["seconds"], state["history"]
