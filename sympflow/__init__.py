@@ -23,6 +23,7 @@ _HOME = {
     "load": "flow.io",
     "train": "training.trainer",
     "compare": "comparison",
+    "work_precision": "precision",
     "energy_error": "metrics.energy",
     "max_energy_error": "metrics.energy",
     "energy_drift": "metrics.energy",
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     from sympflow.metrics.symplectic import loop_area_error as loop_area_error
     from sympflow.metrics.symplectic import symplecticity_defect as symplecticity_defect
     from sympflow.metrics.symplectic import volume_error as volume_error
+    from sympflow.precision import work_precision as work_precision
     from sympflow.solution import Solution as Solution
     from sympflow.solver import solve as solve
     from sympflow.system import HamiltonianSystem as HamiltonianSystem

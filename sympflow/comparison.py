@@ -3,107 +3,31 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.candidates import Candidate, candidates
+from sympflow.candidates import candidates
+from sympflow.comparison_report import Comparison
 from sympflow.matching import match as match_to
 from sympflow.matching import tunable
-from sympflow.metrics.accuracy import reference_error, time_reversal_error
-from sympflow.metrics.energy import energy_drift, energy_error, failed, max_energy_error
+from sympflow.measurements import MEASURES, Row, Run, largest, measure
+from sympflow.metrics.accuracy import reference_error
+from sympflow.metrics.energy import failed, max_energy_error
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
-from sympflow.metrics.symplectic import symplecticity_defect, volume_error
 from sympflow.solution import Solution
 from sympflow.solver import _check_t_span, _check_y0, solve
 from sympflow.system import HamiltonianSystem
 from sympflow.timing import interleaved
 
-if TYPE_CHECKING:
-    from sympflow.comparison_report import Comparison
-
-METRICS = ("error", "energy", "drift", "volume", "symplecticity", "reversal")
+METRICS = tuple(MEASURES)
 MATCHES = ("time", "evaluations", "energy_error")
 PAPER = ("sympflow", "mlp", "verlet", "leapfrog", "rk45")
-
-
-@dataclass(frozen=True)
-class Row:
-    """What was measured of one method; None where it was not asked for, does not apply or could not be had.
-
-    Attributes
-    ----------
-    system, method, label : str
-    status : str
-        "ok"; "failed", if it ran and did not reach the end; "not applicable", if it could not run.
-    reason : str
-        Why it failed, and whatever else should be known.
-    dt : float or None
-        Step of a fixed-step method; for an adaptive one see `tolerance`.
-    tolerance : float or None
-        rtol of an adaptive method.
-    backend : str
-        What ran: "compiled", "numpy", "torch", "scipy" or "torchdiffeq".
-    run_time, run_time_spread : float
-        Median and interquartile range of the repeats, in seconds.
-    force_evaluations, hessian_evaluations : int
-        Of one run, all trajectories of a SciPy batch together.
-    error : float
-        max over the instants of ‖y − y_ref‖; of a batch the median over its trajectories.
-    energy_error : float
-        max |ΔH| over the instants, relative as in `sympflow.energy_error`; of a batch the median.
-    energy_drift, energy_drift_error : float
-        Slope of the energy error per unit time, and its standard error; of a batch, those of the median slope.
-    volume_error : float
-        Σ log|det| over the steps; of a batch the one that is largest in magnitude.
-    symplecticity_defect : float
-        max ‖AᵀJA − J‖/‖A‖² over the steps and trajectories.
-    time_reversal_error : float
-        ‖y − y0‖ after there and back; of a batch the median.
-    training_time : float
-        Seconds that training the flow took.
-    """
-
-    system: str
-    method: str
-    label: str
-    status: str = "ok"
-    reason: str = ""
-    dt: float | None = None
-    tolerance: float | None = None
-    backend: str | None = None
-    run_time: float | None = None
-    run_time_spread: float | None = None
-    force_evaluations: int | None = None
-    hessian_evaluations: int | None = None
-    error: float | None = None
-    energy_error: float | None = None
-    energy_drift: float | None = None
-    energy_drift_error: float | None = None
-    volume_error: float | None = None
-    symplecticity_defect: float | None = None
-    time_reversal_error: float | None = None
-    training_time: float | None = None
-
-
-@dataclass
-class Run:
-    """A candidate on its way to a row."""
-
-    candidate: Candidate
-    row: Row
-    sol: Solution | None = None
-    energy: np.ndarray | None = field(default=None, repr=False)
-    volume: np.ndarray | None = field(default=None, repr=False)
-
-    def note(self, text: str) -> None:
-        self.row = replace(self.row, reason=f"{self.row.reason} {text}".strip())
 
 
 def compare(
@@ -167,8 +91,6 @@ def compare(
     >>> [row.status for row in report.rows]
     ['ok', 'ok']
     """
-    from sympflow.comparison_report import Comparison
-
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     asked = _check_metrics(metrics)
@@ -205,7 +127,7 @@ def compare(
     for one in runs:
         if one.sol is not None:
             say(f"{system.name}: measuring {one.candidate.label}")
-            _measure(one, one.sol, asked)
+            measure(one, one.sol, asked)
     return Comparison(system, (t0, t1), start, t, asked, repeats, match, truth, tuple(runs))
 
 
@@ -264,7 +186,7 @@ def _match(
 ) -> None:
     """Tune every method that can be to the first one that ran and has the figure."""
 
-    def measure(integrator: Any) -> float:
+    def figure(integrator: Any) -> float:
         sol = run(integrator)
         if not sol.success:
             return math.inf
@@ -274,7 +196,7 @@ def _match(
             return float(sol.stats["force_evaluations"] + sol.stats["hessian_evaluations"])
         return interleaved([partial(run, integrator)], min(repeats, 3))[0].median
 
-    targets = ((one, measure(one.candidate.integrator)) for one in runs if one.row.status == "ok")
+    targets = ((one, figure(one.candidate.integrator)) for one in runs if one.row.status == "ok")
     anchor, target = next(((one, x) for one, x in targets if 0 < x < math.inf), (None, math.nan))
     for one in runs:
         if anchor is None or one is anchor or one.row.status == "not applicable":
@@ -283,7 +205,7 @@ def _match(
             one.note(f"Not matched: {one.candidate.label} has no step to tune.")
             continue
         say(f"{system.name}: matching {one.candidate.label}")
-        integrator, reached = match_to(one.candidate.integrator, system, measure, target, what == "energy_error")
+        integrator, reached = match_to(one.candidate.integrator, system, figure, target, what == "energy_error")
         one.candidate = replace(one.candidate, integrator=integrator)
         one.row = Row(_identify(system), one.candidate.method, one.candidate.label)
         _first_run(one, run)
@@ -312,7 +234,7 @@ def _errors(
                 one.note(f"No error: {problem}")
             return None
         for one, sol in measured:
-            error = _largest(reference_error(sol, truth), sol)
+            error = largest(reference_error(sol, truth), sol)
             one.row = replace(one.row, error=float(np.median(error)))
         target = min((one.row.error for one, _ in measured if one.row.error is not None), default=math.inf) / 100
         if given is not None or truth.accuracy <= target:
@@ -321,66 +243,3 @@ def _errors(
         if one.row.error is not None and one.row.error < 3 * truth.accuracy:
             one.note("The error is no larger than the uncertainty of the reference.")
     return truth
-
-
-def _largest(series: np.ndarray, sol: Solution) -> np.ndarray:
-    """Maxima over time of a non-negative series, inf for trajectories that failed."""
-    worst = np.where(np.isnan(series), np.inf, series).max(axis=-1, initial=0.0)
-    return np.where(failed(sol), np.inf, worst)
-
-
-def _measure(one: Run, sol: Solution, asked: tuple[str, ...]) -> None:
-    """Compute the metrics asked for; a metric that cannot be had leaves a note."""
-    for metric in asked:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", RuntimeWarning)
-            try:
-                _MEASURES[metric](one, sol)
-            except Exception as error:
-                one.note(f"No {metric}: {error}")
-        for message in dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, RuntimeWarning)):
-            if message not in one.row.reason:
-                one.note(message)
-
-
-def _energy(one: Run, sol: Solution) -> None:
-    one.energy = np.abs(energy_error(sol))
-    one.row = replace(one.row, energy_error=float(np.median(max_energy_error(sol))))
-
-
-def _drift(one: Run, sol: Solution) -> None:
-    if one.row.status == "failed":
-        return
-    drift = energy_drift(sol)
-    slope, error = np.ravel(drift.slope), np.ravel(drift.standard_error)
-    middle = int(np.argsort(slope)[len(slope) // 2])
-    one.row = replace(one.row, energy_drift=float(slope[middle]), energy_drift_error=float(error[middle]))
-
-
-def _volume(one: Run, sol: Solution) -> None:
-    if one.row.status == "failed":
-        return
-    one.volume = series = np.asarray(volume_error(sol, over_time=True))
-    last = np.ravel(series[..., -1])
-    worst = np.argmax(np.where(np.isnan(last), np.inf, np.abs(last)))
-    one.row = replace(one.row, volume_error=float(last[worst]))
-
-
-def _symplecticity(one: Run, sol: Solution) -> None:
-    if one.row.status == "failed":
-        return
-    one.row = replace(one.row, symplecticity_defect=float(np.max(symplecticity_defect(sol, relative=True))))
-
-
-def _reversal(one: Run, sol: Solution) -> None:
-    one.row = replace(one.row, time_reversal_error=float(np.median(time_reversal_error(sol))))
-
-
-_MEASURES: dict[str, Callable[[Run, Solution], None]] = {
-    "error": lambda one, sol: None,  # filled in with the reference, once for all methods
-    "energy": _energy,
-    "drift": _drift,
-    "volume": _volume,
-    "symplecticity": _symplecticity,
-    "reversal": _reversal,
-}

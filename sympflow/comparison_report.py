@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.comparison import Row, Run
+from sympflow.measurements import Row, Run
 from sympflow.metrics.reference import Reference
 from sympflow.system import HamiltonianSystem
 from sympflow.tables import Column, number, plain, records, seconds, text_table, write_csv, write_json
@@ -56,7 +56,7 @@ class Comparison:
     @property
     def title(self) -> str:
         """The scene in a line."""
-        return _name(self.system)
+        return title(self.system)
 
     def table(self, width: int | None = None) -> str:
         """The rows as text, with what was done above and the reasons below.
@@ -169,7 +169,8 @@ def _settings(c: Comparison) -> str:
     return text
 
 
-def _name(system: HamiltonianSystem) -> str:
+def title(system: HamiltonianSystem) -> str:
+    """The name and parameters of a system, as they are printed."""
     params = ", ".join(f"{_GREEK.get(k, k)} = {v:g}" for k, v in system.params.items())
     return _NAMES.get(system.name, system.name.replace("_", " ")) + (f", {params}" if params else "")
 

@@ -9,14 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import to_numpy
-from sympflow.comparison import Run
 from sympflow.comparison_report import Comparison
-from sympflow.crossings import section_crossings
-from sympflow.integrators.registry import build
+from sympflow.figure_style import TEXT, dress, method_styles, new_figure
+from sympflow.measurements import Run
+from sympflow.portraits import portrait
 from sympflow.solution import Solution
-from sympflow.solver import solve
-from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,18 +22,6 @@ if TYPE_CHECKING:
 KINDS = ("overview", "energy", "volume", "error", "portrait")
 ROUNDING_FLOOR = 1e-17
 FIGURE_FILES = (".png", ".pdf", ".svg")
-
-# Okabe and Ito's palette, which colour-blind readers can tell apart; a method has its colour in every figure.
-_STYLES = {
-    "sympflow": ("#D55E00", "o"),
-    "mlp": ("#CC79A7", "s"),
-    "verlet": ("#0072B2", "^"),
-    "leapfrog": ("#56B4E9", "v"),
-    "rk45": ("#009E73", "D"),
-}
-_OTHER_COLOURS = ("#E69F00", "#000000", "#7F3C8D", "#8C6D31", "#666666", "#A5AA99")
-_OTHER_MARKERS = ("P", "X", "*", "<", ">", "h")
-_TEXT = "#333333"
 
 
 def comparison_figure(comparison: Comparison, kind: str = "overview") -> Figure:
@@ -57,10 +42,10 @@ def comparison_figure(comparison: Comparison, kind: str = "overview") -> Figure:
         raise ValueError(f"`kind` {kind!r} shows what was not measured: add it to `metrics` of compare().")
     if kind == "portrait":
         return portrait(comparison)
-    figure = _figure(6.4, 4.2)
+    figure = new_figure(6.4, 4.2)
     ax = figure.add_subplot()
     _PANELS[kind](ax, comparison, _styles([comparison]))
-    ax.set_title(comparison.title, loc="left", fontsize=10, color=_TEXT)
+    ax.set_title(comparison.title, loc="left", fontsize=10, color=TEXT)
     if kind != "error":
         _legend(figure, [comparison])
     return figure
@@ -96,7 +81,7 @@ def overview(comparisons: Sequence[Comparison]) -> Figure:
     if not kinds:
         raise ValueError("`comparisons` hold nothing to draw: ask compare() for 'error', 'energy' or 'volume'.")
     n, m = len(comparisons), len(kinds)
-    figure = _figure(0.6 + 4.1 * m, 0.7 + 2.9 * n)
+    figure = new_figure(0.6 + 4.1 * m, 0.7 + 2.9 * n)
     axes = figure.subplots(n, m, squeeze=False)
     styles = _styles(comparisons)
     for row, comparison in zip(axes, comparisons, strict=True):
@@ -105,7 +90,7 @@ def overview(comparisons: Sequence[Comparison]) -> Figure:
                 _PANELS[kind](ax, comparison, styles)
             else:
                 ax.set_axis_off()
-        row[0].set_title(comparison.title, loc="left", fontsize=10, color=_TEXT, fontweight="bold")
+        row[0].set_title(comparison.title, loc="left", fontsize=10, color=TEXT, fontweight="bold")
     _legend(figure, comparisons)
     return figure
 
@@ -128,7 +113,7 @@ def _error_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str, 
         _widen(ax.set_xlim, [row.run_time or 0.0 for row in shown])
         _widen(ax.set_ylim, [max(row.error or 0.0, ROUNDING_FLOOR) for row in shown])
     _annotate(ax, [(row.run_time or 0.0, max(row.error or 0.0, ROUNDING_FLOOR), row.label) for row in shown], styles)
-    _dress(ax, "run time [s]", r"$\max_t\,\|y - y_{\mathrm{ref}}\|$")
+    dress(ax, "run time [s]", r"$\max_t\,\|y - y_{\mathrm{ref}}\|$")
 
 
 def _energy_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str, str]]) -> None:
@@ -141,7 +126,7 @@ def _energy_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str,
         ax.plot(t, np.fmax.accumulate(e), _dash(run), color=colour, lw=1.6, zorder=order)
     ax.set_yscale("log")
     _limits(ax)
-    _dress(ax, "t", "|energy error|" + (", relative" if comparison.system.energy_scale is None else ", scaled"))
+    dress(ax, "t", "|energy error|" + (", relative" if comparison.system.energy_scale is None else ", scaled"))
 
 
 def _volume_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str, str]]) -> None:
@@ -159,7 +144,7 @@ def _volume_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str,
     ax.text(0.98, rounding / 2, "rounding", transform=where, ha="right", va="top", fontsize=8, color="#888888")
     ax.set_yscale("log")
     _limits(ax)
-    _dress(ax, "t", "|log volume ratio|")
+    dress(ax, "t", "|log volume ratio|")
 
 
 _PANELS = {"error": _error_panel, "energy": _energy_panel, "volume": _volume_panel}
@@ -180,145 +165,13 @@ def _middle(series: np.ndarray) -> np.ndarray:
     return series if series.ndim == 1 else np.median(series.reshape(-1, series.shape[-1]), axis=0)
 
 
-# phase space ----------------------------------------------------------------------------------------------
-
-
-def portrait(comparison: Comparison) -> Figure:
-    """Phase space, a panel for each method with the reference behind in grey.
-
-    One degree of freedom: the orbit in the (q, p) plane. Two: the Poincaré section q₁ = 0, p₁ > 0, from a run with
-    outputs every `system.dt`. More: q₁ against q₂.
-    """
-    system = comparison.system
-    runs = [run for run in comparison.runs if run.sol is not None]
-    rows = -(-len(runs) // 5)
-    columns = -(-len(runs) // rows)
-    figure = _figure(0.5 + 2.5 * columns, 0.5 + 2.7 * rows)
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    styles = _styles([comparison])
-    truth = _reference_points(comparison)
-    for ax in axes.flat[len(runs) :]:
-        ax.set_axis_off()
-    x_label, y_label = {1: ("q", "p"), 2: ("q₂", "p₂")}.get(system.ndof, ("q₁", "q₂"))
-    for k, (ax, run) in enumerate(zip(axes.flat, runs, strict=False)):
-        points = _phase_points(comparison, run.candidate.integrator)
-        ax.plot(*truth.T, ".", color="#C8C8C8", ms=8 if system.ndof == 2 else 2.5, mew=0, zorder=1, rasterized=True)
-        ax.plot(
-            *points.T,
-            ".",
-            color=styles[run.row.label][0],
-            ms=2.2 if len(points) > 100 else 4,
-            mew=0,
-            zorder=2,
-            rasterized=True,
-        )
-        ax.set_title(run.row.label, fontsize=9, color=styles[run.row.label][0])
-        _dress(ax, x_label if k // columns == rows - 1 else "", y_label if k % columns == 0 else "")
-    _frame(axes[0, 0], truth)
-    section = " — section q₁ = 0, p₁ > 0" if system.ndof == 2 else ""
-    figure.suptitle(f"{comparison.title}{section}; reference in grey", fontsize=10, color=_TEXT, x=0.01, ha="left")
-    return figure
-
-
-def section_figure(sections: Sequence[tuple[str, Solution]], energy: float | None = None) -> Figure:
-    """Poincaré sections q₁ = 0, p₁ > 0 of two degrees of freedom, one panel for each (title, solution).
-
-    Parameters
-    ----------
-    sections : sequence of (str, Solution)
-        Single trajectories or batches, with outputs every fraction of the fastest oscillation.
-    energy : float, optional
-        Draws the boundary H(0, q₂, 0, p₂) = energy of what can be reached.
-    """
-    if not sections:
-        raise ValueError("`sections` is empty: give at least one (title, solution).")
-    figure = _figure(0.5 + 3.4 * len(sections), 3.7)
-    axes = figure.subplots(1, len(sections), sharex=True, sharey=True, squeeze=False)[0]
-    for k, (ax, (title, sol)) in enumerate(zip(axes, sections, strict=True)):
-        if sol.system.ndof != 2:
-            raise ValueError(f"`sections` are of two degrees of freedom; {sol.system.name!r} has {sol.system.ndof}.")
-        points = section_crossings(sol)[:, [1, 3]]
-        ax.plot(*points.T, ".", color="#0072B2", ms=1.6, mew=0, rasterized=True)
-        if energy is not None:
-            _draw_boundary(ax, sol.system, energy, points)
-        ax.set_title(title, fontsize=10, color=_TEXT)
-        _dress(ax, "q₂", "p₂" if k == 0 else "")
-        ax.set_aspect("equal")
-    return figure
-
-
-def _draw_boundary(ax: Axes, system: HamiltonianSystem, energy: float, points: np.ndarray) -> None:
-    reach = 1.6 * np.abs(points).max(initial=0.1)
-    grid = np.linspace(-reach, reach, 400)
-    q2, p2 = np.meshgrid(grid, grid)
-    H = system.hamiltonian(np.stack([0 * q2, q2, 0 * q2, p2], axis=-1))
-    ax.contour(q2, p2, H, levels=[energy], colors="#999999", linewidths=0.8)
-
-
-def _phase_points(comparison: Comparison, integrator: Any) -> np.ndarray:
-    """What a portrait shows of one run, (m, 2)."""
-    system = comparison.system
-    if system.ndof != 2:
-        t = comparison.t
-        pair = [0, 1]
-    else:
-        t0, t1 = comparison.t_span
-        n = min(int(np.ceil(abs(t1 - t0) / system.dt)), 400_000)
-        t, pair = np.linspace(t0, t1, n + 1), [1, 3]
-    sol = solve(system, integrator, comparison.t_span, comparison.y0, t_eval=t, on_domain_exit="ignore")
-    states = section_crossings(sol) if system.ndof == 2 else to_numpy(sol.states).reshape(-1, 2 * system.ndof)
-    return states[:, pair]
-
-
-def _reference_points(comparison: Comparison) -> np.ndarray:
-    system = comparison.system
-    accurate = build("kahan_li8", {}) if system.separable else build("dop853", {"rtol": 1e-12, "atol": 1e-12})
-    return _phase_points(comparison, accurate)
-
-
-def _frame(ax: Axes, points: np.ndarray) -> None:
-    """Limits around the reference, so that a run that leaves does not shrink everything else."""
-    points = points[np.isfinite(points).all(1)]
-    if not len(points):
-        return
-    low, high = points.min(0), points.max(0)
-    margin = 0.25 * np.maximum(high - low, 1e-12)
-    ax.set_xlim(low[0] - margin[0], high[0] + margin[0])
-    ax.set_ylim(low[1] - margin[1], high[1] + margin[1])
-
-
-# appearance -----------------------------------------------------------------------------------------------
-
-
-def _figure(width: float, height: float) -> Figure:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError('Figures need matplotlib: pip install "sympflow[plot]".') from error
-    return Figure(figsize=(width, height), layout="constrained", facecolor="white")
-
-
 def _drawable(comparison: Comparison) -> tuple[str, ...]:
     ran = any(run.sol is not None for run in comparison.runs)
     return (*(k for k in ("error", "energy", "volume") if k in comparison.metrics), *(("portrait",) if ran else ()))
 
 
 def _styles(comparisons: Sequence[Comparison]) -> dict[str, tuple[str, str]]:
-    """Colour and marker of every label."""
-    styles: dict[str, tuple[str, str]] = {}
-    taken: set[str] = set()
-    others = 0
-    for run in (run for c in comparisons for run in c.runs):
-        label, method = run.row.label, run.row.method
-        if label in styles:
-            continue
-        if method in _STYLES and method not in taken:
-            styles[label] = _STYLES[method]
-            taken.add(method)
-        else:
-            styles[label] = (_OTHER_COLOURS[others % 6], _OTHER_MARKERS[others // 6 % 6 if others >= 6 else others])
-            others += 1
-    return styles
+    return method_styles([(run.row.label, run.row.method) for c in comparisons for run in c.runs])
 
 
 def _legend(figure: Figure, comparisons: Sequence[Comparison]) -> None:
@@ -337,20 +190,8 @@ def _legend(figure: Figure, comparisons: Sequence[Comparison]) -> None:
         ncols=min(len(handles), 4 if figure.get_figwidth() < 7 else 7) or 1,
         frameon=False,
         fontsize=9,
-        labelcolor=_TEXT,
+        labelcolor=TEXT,
     )
-
-
-def _dress(ax: Axes, x_label: str, y_label: str) -> None:
-    ax.set_xlabel(x_label, fontsize=9, color=_TEXT)
-    ax.set_ylabel(y_label, fontsize=9, color=_TEXT)
-    ax.tick_params(labelsize=8, colors=_TEXT, which="both", width=0.6)
-    ax.grid(True, which="major", color="#E6E6E6", lw=0.6, zorder=0)
-    ax.set_axisbelow(True)
-    for side, spine in ax.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color("#999999")
-        spine.set_linewidth(0.8)
 
 
 def _limits(ax: Axes) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sympflow.command_arguments import method, scenes
 from sympflow.commands import app
+from sympflow.commands.arguments import method, scenes
 
 FAST = ["--t-end", "5", "--n-outputs", "40", "--repeats", "1"]
 
@@ -67,9 +67,9 @@ def test_solve_writes_csv_and_npz(tmp_path):
     assert len(text) == 12
     words = ["pendulum", "--method", "rk45:rtol=1e-8", "--y0", "-1,0.5", "--n-outputs", 10, "--out", tmp_path / "y.npz"]
     assert run("solve", *words).exit_code == 0
-    data = np.load(tmp_path / "y.npz")
-    assert data["y"].shape == (2, 11)
-    assert data["y"][:, 0].tolist() == [-1, 0.5]
+    with np.load(tmp_path / "y.npz") as data:
+        assert data["y"].shape == (2, 11)
+        assert data["y"][:, 0].tolist() == [-1, 0.5]
 
 
 def test_solve_that_fails_ends_with_status_one():
@@ -140,3 +140,11 @@ def test_without_the_extra_the_message_says_what_to_install():
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 1
     assert 'pip install "sympflow[cli]"' in result.stderr
+
+
+def test_bench_writes_the_diagram(tmp_path):
+    words = ["pendulum", "--methods", "verlet,kahan_li8", "--t-end", 5, "--batch", 5, "--n-outputs", 5, "--repeats", 1]
+    result = run("bench", *words, "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert "For an energy error of" in result.output
+    assert {p.suffix for p in tmp_path.glob("pendulum-work-precision*")} == {".csv", ".json", ".png"}

@@ -8,7 +8,8 @@ import pytest
 
 from sympflow import compare, get, solve, systems
 from sympflow.crossings import section_crossings
-from sympflow.plotting import overview, section_figure
+from sympflow.plotting import overview
+from sympflow.portraits import section_figure
 
 
 @pytest.fixture(scope="module")

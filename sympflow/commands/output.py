@@ -11,7 +11,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from sympflow.command_arguments import Scene
+from sympflow.commands.arguments import Scene
 from sympflow.tables import Column, text_table
 
 out = Console(soft_wrap=True, highlight=False)

@@ -1,0 +1,30 @@
+"""The commands of `sympflow`. They parse, call the library, and print; nothing is computed here."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from sympflow import __version__
+from sympflow.commands import comparing, listing, solving, training
+from sympflow.commands.output import out
+
+PARAMETERS = {"allow_extra_args": True, "ignore_unknown_options": True}
+"""Options that are unknown to a command may be parameters of a system: --omega 100."""
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
+app.command()(listing.systems)
+app.command()(listing.methods)
+app.command(context_settings=PARAMETERS)(solving.solve)
+app.command(context_settings=PARAMETERS)(comparing.compare)
+app.command(context_settings=PARAMETERS)(comparing.bench)
+app.command(context_settings=PARAMETERS)(training.train)
+
+
+@app.callback(invoke_without_command=True)
+def _sympflow(version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False) -> None:
+    """Structure-preserving integration of Hamiltonian systems, classical and learned."""
+    if version:
+        out.print(__version__)
+        raise typer.Exit

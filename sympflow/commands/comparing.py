@@ -1,0 +1,122 @@
+"""`sympflow compare` and `sympflow bench`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sympflow.commands.arguments import interval, methods, scenes, state
+from sympflow.commands.options import Backend, State, Step, Systems, TEnd
+from sympflow.commands.output import out, progress, reporting, write_comparisons
+
+
+def compare(
+    systems: Systems,
+    method_names: Annotated[
+        str,
+        typer.Option("--methods", help="Separated by commas; options as rk45:rtol=1e-8; also .safetensors files."),
+    ] = "sympflow,mlp,verlet,leapfrog,rk45",
+    t_end: TEnd = None,
+    y0: State = None,
+    dt: Step = None,
+    metrics: Annotated[
+        str, typer.Option(help="Any of error,energy,drift,volume,symplecticity,reversal.")
+    ] = "error,energy,drift,volume,symplecticity",
+    n_outputs: Annotated[int, typer.Option(help="Number of instants at which every method is measured.")] = 1000,
+    repeats: Annotated[int, typer.Option(help="Timed runs of each method, interleaved.")] = 5,
+    match: Annotated[
+        str | None, typer.Option(help="Tune the methods to the first in: time, evaluations or energy_error.")
+    ] = None,
+    backend: Backend = "auto",
+    to: Annotated[Path | None, typer.Option("--out", help="Folder for the figures, CSV and JSON.")] = None,
+) -> None:
+    """Compare methods on one or more systems: a table, figures, CSV and JSON.
+
+    Examples:
+
+      sympflow compare henon-heiles --methods sympflow,mlp,verlet,leapfrog,rk45 --t-end 1000 --out out/
+
+      sympflow compare harmonic-oscillator henon-heiles stiff-oscillator --out out/
+
+      sympflow compare pendulum --methods verlet,kahan_li8:dt=0.5,rk45:rtol=1e-8 --match evaluations
+    """
+    with reporting():
+        from sympflow.comparison import compare as compare_methods
+        from sympflow.comparison_report import combined_table
+
+        chosen, found = methods(method_names), scenes(systems)
+        start = state(y0)
+        with progress() as say:
+            comparisons = [
+                compare_methods(
+                    scene.system,
+                    chosen,
+                    [m.strip() for m in metrics.split(",") if m.strip()],
+                    t_span=interval(scene, t_end),
+                    y0=start,
+                    dt=dt,
+                    n_outputs=n_outputs,
+                    repeats=repeats,
+                    match=match,
+                    backend=backend,
+                    progress=say,
+                )
+                for scene in found
+            ]
+        print(combined_table(comparisons, out.width if out.is_terminal else None))
+        if to is not None:
+            with progress() as say:
+                written = write_comparisons(comparisons, found, to, say)
+            out.print(f"\nWritten to {to}: {', '.join(p.name for p in written)}")
+        if not any(row.status == "ok" for c in comparisons for row in c.rows):
+            raise typer.Exit(1)
+
+
+def bench(
+    systems: Systems,
+    method_names: Annotated[
+        str, typer.Option("--methods", help="As for compare; a bare name is swept over steps or tolerances.")
+    ] = "verlet,leapfrog,blanes_moan4,srkn11b,kahan_li8,rk45,dop853,sympflow,mlp",
+    t_end: TEnd = None,
+    y0: State = None,
+    batch: Annotated[int, typer.Option(help="Also a batch of this many states of the domain; 0 for none.")] = 1000,
+    n_outputs: Annotated[int, typer.Option(help="Number of instants at which errors are measured.")] = 100,
+    repeats: Annotated[int, typer.Option(help="Timed runs of each point, interleaved.")] = 5,
+    budget: Annotated[float, typer.Option(help="Seconds that the repeats of one point may take.")] = 20.0,
+    backend: Backend = "auto",
+    to: Annotated[Path | None, typer.Option("--out", help="Folder for the figures, CSV and JSON.")] = None,
+) -> None:
+    """Work and precision: error against run time and evaluations, over a sweep of steps and tolerances.
+
+    Examples:
+
+      sympflow bench henon-heiles --t-end 1000 --out out/
+
+      sympflow bench pendulum --methods verlet,kahan_li8,dop853 --batch 0 --t-end 50
+    """
+    with reporting():
+        from sympflow.precision import work_precision
+
+        chosen, start = methods(method_names), state(y0)
+        for scene in scenes(systems):
+            with progress() as say:
+                report = work_precision(
+                    scene.system,
+                    chosen,
+                    t_span=interval(scene, t_end),
+                    y0=start,
+                    batch=batch or None,
+                    n_outputs=n_outputs,
+                    repeats=repeats,
+                    budget=budget,
+                    backend=backend,
+                    progress=say,
+                )
+            print(report.table())
+            if to is not None:
+                name = f"{scene.key}-work-precision"
+                written = [report.to_csv(to / f"{name}.csv"), report.to_json(to / f"{name}.json")]
+                written += [report.plot(to / f"{name}.png"), report.plot(to / f"{name}-state.png", "error")]
+                out.print(f"\nWritten to {to}: {', '.join(p.name for p in written)}")

@@ -1,0 +1,118 @@
+"""work_precision(): sweeps, references, and what is read off the diagram."""
+
+import csv
+import math
+
+import numpy as np
+import pytest
+
+from sympflow import HamiltonianSystem, SympFlow, get, systems, work_precision
+from sympflow.precision_points import Point, break_even, cost_at
+
+QUICK = {"t_span": (0, 10), "n_outputs": 10, "repeats": 1}
+
+
+@pytest.fixture(scope="module")
+def report():
+    methods = ["verlet", "kahan_li8", "rk45", "sympflow", ("mine", get("verlet")(dt=0.3))]
+    return work_precision(systems.henon_heiles(), methods, batch=20, tolerances=(1e-4, 1e-7), **QUICK)
+
+
+def points(report, label, trajectories=1):
+    return [row for row in report.rows if row.label == label and row.trajectories == trajectories]
+
+
+def test_steps_are_swept_from_coarse_to_the_level_of_rounding(report):
+    kahan_li = points(report, "kahan_li8")
+    assert [row.dt for row in kahan_li] == [1.6 / 2**k for k in range(len(kahan_li))]
+    assert kahan_li[-1].energy_error < 1e-12 < kahan_li[-2].energy_error
+    assert [row.dt for row in points(report, "mine")] == [0.3]
+    assert [row.tolerance for row in points(report, "rk45")] == [1e-4, 1e-7]
+    assert len(points(report, "sympflow")) == 1
+
+
+@pytest.mark.parametrize(("label", "order"), [("verlet", 2), ("kahan_li8", 8)])
+@pytest.mark.parametrize("trajectories", [1, 20])
+def test_errors_fall_with_the_order(report, label, order, trajectories):
+    rows = [r for r in points(report, label, trajectories) if r.status == "ok" and r.dt < 0.5]
+    slope = np.polyfit(np.log([r.dt for r in rows]), np.log([r.error for r in rows]), 1)[0]
+    assert slope == pytest.approx(order, abs=0.6)
+
+
+def test_an_error_is_at_least_a_hundred_times_that_of_the_reference_or_is_marked(report):
+    for row in report.rows:
+        reference = report.references[row.trajectories > 1]
+        if row.error is not None:
+            assert (row.status == "uncertain") == (row.error < 100 * reference.accuracy)
+
+
+def test_evaluations_are_those_of_one_trajectory(report):
+    for trajectories in (1, 20):
+        row = next(r for r in points(report, "verlet", trajectories) if r.dt == 0.1)
+        assert (
+            row.force_evaluations == 100 + 1 + 10
+        )  # each of the 10 outputs closes a step that was merged with the next
+        assert row.hessian_evaluations == 0
+    alone, batch = points(report, "rk45")[0], points(report, "rk45", 20)[0]
+    assert batch.force_evaluations == pytest.approx(alone.force_evaluations, rel=0.3)
+    assert "Timed on 4 trajectories" in batch.reason
+
+
+def test_force_gradients_are_counted_apart():
+    row = work_precision(systems.pendulum(), ["chin4a"], steps=[0.1], **QUICK).rows[0]
+    assert row.hessian_evaluations == 100
+    assert row.force_evaluations == 200 + 1 + 10
+
+
+def test_files_table_and_figure(report, tmp_path):
+    with report.to_csv(tmp_path / "points.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == len(report.rows)
+    assert report.to_json(tmp_path / "points.json").exists()
+    assert "paid after t =" in report.table()
+    figure = report.figure()
+    assert len(figure.axes) == 4
+    assert report.plot(tmp_path / "figure.png", "error").exists()
+    with pytest.raises(ValueError, match="`measure` must be one of"):
+        report.figure("beauty")
+
+
+def test_cost_is_interpolated_between_points_of_a_power_law():
+    law = [Point("s", "m", "m", energy_error=e, run_time=e**-0.5) for e in (1e-2, 1e-4, 1e-6)]
+    assert cost_at(law, 1e-3) == pytest.approx(1e-3**-0.5)
+    assert cost_at(law, 1.0) == pytest.approx(10)  # nothing cheaper is known
+    assert cost_at(law, 1e-7) == math.inf
+
+
+def test_training_has_paid_for_itself_when_the_time_saved_is_that_of_training():
+    rival = [Point("s", "verlet", "verlet", energy_error=e, run_time=0.01 / e) for e in (1e-2, 1e-4)]
+    flow = Point("s", "sympflow", "sympflow", energy_error=1e-3, run_time=4.0, training_time=60.0)
+    slow = Point("s", "sympflow", "slow", energy_error=1e-3, run_time=40.0, training_time=60.0)
+    *_, quick, never = break_even([*rival, flow, slow], length=100.0)
+    assert quick.break_even == pytest.approx(60 / ((10 - 4) / 100))
+    assert never.break_even == math.inf
+
+
+def test_methods_that_do_not_apply_and_unstable_steps_are_rows():
+    system = HamiltonianSystem.from_sympy("p**2*(1 + q**2)/2 + q**2/2", y0=[0.5, 0.0])
+    row = work_precision(system, ["verlet", SympFlow(2)], **QUICK).rows
+    assert [r.status for r in row] == ["not applicable"] * 2
+    unstable = work_precision(systems.harmonic_oscillator(), ["verlet"], steps=[2.5, 0.1], t_span=(0, 2000), repeats=1)
+    assert [r.status for r in unstable.rows] == ["failed", "ok"]
+    assert unstable.rows[0].run_time is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"steps": [0.1, -1]}, "`steps` must be positive"),
+        ({"tolerances": [0]}, "`tolerances` must be positive"),
+        ({"batch": 0}, "`batch` must be a positive number"),
+        ({"batch": [1.0, 0.0]}, "`batch` must be a number, or states"),
+        ({"y0": [[1.0, 0.0]]}, "`y0` must be one state"),
+        ({"repeats": 0}, "`repeats` must be a positive integer"),
+        ({"t_span": (1, 1)}, "`t_span` has length zero"),
+    ],
+)
+def test_bad_arguments_are_refused_at_once(arguments, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        work_precision(systems.pendulum(), ["verlet"], **arguments)
