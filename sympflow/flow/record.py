@@ -1,0 +1,159 @@
+"""From the parts of a file to a flow, with suspicion: everything is checked before it is used."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+
+from sympflow.domain import domain_from_dict
+from sympflow.flow.base import FlowMap
+from sympflow.flow.layers import LAYERS
+from sympflow.flow.mlp import MLPFlow
+from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.sympflow import SympFlow
+
+MAX_LAYERS = 1000
+MAX_WIDTH = 4096
+MAX_PARAMETERS = 10_000_000
+DTYPES = {"F32": torch.float32, "F64": torch.float64}
+
+
+class Refused(Exception):
+    """Why a file is refused."""
+
+
+def parse(text: str | bytes, what: str) -> dict[str, Any]:
+    def refuse(constant: str) -> None:
+        raise ValueError(constant)
+
+    try:
+        value = json.loads(text, parse_constant=refuse)
+    except (ValueError, RecursionError):
+        raise Refused(f"its {what} is not valid JSON") from None
+    if not isinstance(value, dict):
+        raise Refused(f"its {what} is not a JSON object")
+    return value
+
+
+def dtype_of(header: dict[str, Any]) -> torch.dtype:
+    names = {str(entry.get("dtype")) if isinstance(entry, dict) else "nothing" for entry in header.values()}
+    if len(names) != 1 or not names <= set(DTYPES):
+        raise Refused(f"its tensors must all be F32 or all F64, not {sorted(names)}")
+    return DTYPES[names.pop()]
+
+
+def build(record: dict[str, Any], dtype: torch.dtype) -> FlowMap:
+    """The flow of the record's architecture, on the meta device: sizes are checked before memory is taken."""
+    plan, dt = record.get("architecture"), record.get("dt")
+    if not isinstance(plan, dict):
+        raise Refused("its architecture is missing")
+    if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf:
+        raise Refused(f"its dt {dt!r} is not a positive number")
+    ndof = _integer(plan.get("ndof"), "ndof", MAX_WIDTH)
+    try:
+        if record["kind"] == "mlp":
+            hidden = _widths(plan.get("hidden"), 2 * ndof)
+            return MLPFlow(ndof, hidden, str(plan.get("activation")), dt, dtype)
+        layers = plan.get("layers")
+        if not isinstance(layers, list) or not 1 <= len(layers) <= MAX_LAYERS:
+            raise Refused("its list of layers is missing or absurdly long")
+        # All sizes first: nothing is allocated for a file that asks for too much.
+        potentials = [_potential(layer) for layer in layers]
+        widths = [_widths(potential.get("hidden"), ndof) for potential in potentials]
+        if sum(_parameters(w, ndof) for w in widths) > MAX_PARAMETERS:
+            raise Refused("its architecture is absurdly large")
+        return SympFlow.from_layers(
+            (
+                LAYERS[layer["kind"]](MLPPotential(ndof, hidden, str(potential.get("activation")), dtype=dtype))
+                for layer, potential, hidden in zip(layers, potentials, widths, strict=True)
+            ),
+            dt,
+        )
+    except ValueError as error:
+        raise Refused(f"its architecture is not admissible ({error})") from None
+
+
+def _potential(layer: Any) -> dict[str, Any]:
+    """The potential of a layer's description."""
+    if not isinstance(layer, dict) or str(layer.get("kind")) not in LAYERS:
+        raise Refused("it has a layer of unknown kind")
+    potential = layer.get("potential")
+    if not isinstance(potential, dict) or potential.get("type") != "mlp":
+        raise Refused("it has a potential of unknown type")
+    return potential
+
+
+def _widths(hidden: Any, inputs: int) -> tuple[int, ...]:
+    if not isinstance(hidden, list) or not 1 <= len(hidden) <= MAX_LAYERS:
+        raise Refused("its hidden layers are missing or absurdly many")
+    widths = tuple(_integer(h, "hidden width", MAX_WIDTH) for h in hidden)
+    if _parameters(widths, inputs) > MAX_PARAMETERS:
+        raise Refused("its architecture is absurdly large")
+    return widths
+
+
+def _parameters(widths: tuple[int, ...], inputs: int) -> int:
+    return sum(m * n for m, n in zip((inputs + 2, *widths), (*widths, inputs), strict=True))
+
+
+def _integer(value: Any, what: str, largest: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= largest:
+        raise Refused(f"its {what} {value!r} is not an integer from 1 to {largest}")
+    return value
+
+
+def fill(flow: FlowMap, content: bytes, header: dict[str, Any]) -> None:
+    """Put the file's tensors into the flow."""
+    expected = flow.state_dict()
+    if set(header) != set(expected):
+        odd = sorted(set(header) ^ set(expected))[:3]
+        raise Refused(f"its tensors do not fit its architecture (missing or unknown: {', '.join(odd)})")
+    for name, value in expected.items():
+        if header[name].get("shape") != list(value.shape):
+            raise Refused(f"its tensor {name} has shape {header[name].get('shape')}, not {list(value.shape)}")
+    try:
+        tensors = load_tensors(content)
+    except (SafetensorError, ValueError, RuntimeError) as error:
+        raise Refused(f"it is truncated or damaged ({error})") from None
+    for name, value in tensors.items():
+        if not torch.isfinite(value).all():
+            raise Refused(f"its tensor {name} is not finite")
+        if name.split(".")[-1] in ("scale", "tau", "gain") and not (value > 0).all():
+            raise Refused(f"its unit {name} is not positive")
+    flow.load_state_dict(tensors)
+    flow.requires_grad_(False)
+
+
+def describe(flow: FlowMap, record: dict[str, Any]) -> None:
+    """Give the flow the record of its file."""
+    if record.get("domain") is not None:
+        try:
+            flow.domain = domain_from_dict(record["domain"])
+        except (ValueError, TypeError, AttributeError) as error:
+            raise Refused(f"its domain is not admissible ({error})") from None
+        if _width(flow.domain) != 2 * flow.ndof:
+            raise Refused(f"its domain has states of length {_width(flow.domain)}, not {2 * flow.ndof}")
+    fingerprint = record.get("fingerprint")
+    if fingerprint is not None:
+        if not isinstance(fingerprint, list) or not all(
+            v is None or (isinstance(v, (int, float)) and not isinstance(v, bool)) for v in fingerprint
+        ):
+            raise Refused("its fingerprint is not a list of numbers")
+        flow.fingerprint = tuple(math.nan if v is None else float(v) for v in fingerprint)
+    for name, kind in (("recipe", dict), ("figures", dict)):
+        if not isinstance(record.get(name), kind):
+            raise Refused(f"its {name} is missing")
+    if not isinstance(record.get("system"), str | None):
+        raise Refused("its system is not a name")
+    flow.system_name, flow.recipe, flow.figures = record["system"], record["recipe"], record["figures"]
+
+
+def _width(domain: Any) -> int:
+    """The length of a domain's states."""
+    corners = getattr(domain, "box", domain)
+    return len(getattr(corners, "low", None) or corners.center)
