@@ -10,7 +10,6 @@ from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.kernels.mlp_flow import mlp_flow_kernel
-from sympflow.kernels.modules import OPTIONS, load_module, template
 
 ROUNDING = 2e-14  # a few dozen operations on numbers up to 10
 
@@ -146,22 +145,3 @@ def test_refusals():
     mixed = SympFlow.from_layers([Kick(MLPPotential(1, (4,))), Drift(MLPPotential(1, (4, 4)))], dt=1.0)
     with pytest.raises(ValueError, match="one depth"):
         mlp_flow_kernel(mixed)
-
-
-@pytest.fixture(scope="module")
-def fast_tanh():
-    header = f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': True}}\n"
-    return load_module(header + template("activations")).fast_tanh
-
-
-def test_fast_tanh_is_accurate_to_a_few_units_in_the_last_place(fast_tanh):
-    mpmath = pytest.importorskip("mpmath")
-    rng = np.random.default_rng(0)
-    x = np.concatenate([rng.uniform(-0.4, 0.4, 500), rng.uniform(-25, 25, 500), 10.0 ** rng.uniform(-300, 2, 500)])
-    with mpmath.workprec(150):
-        for value in x:
-            exact = mpmath.tanh(float(value))
-            error = abs(mpmath.mpf(fast_tanh(value)) - exact)
-            assert error <= 3 * mpmath.mpf(float(np.spacing(abs(float(exact)))))
-    assert [fast_tanh(v) for v in (np.inf, -np.inf, 1e308, 0.0, 5e-324)] == [1.0, -1.0, 1.0, 0.0, 5e-324]
-    assert np.isnan(fast_tanh(np.nan))

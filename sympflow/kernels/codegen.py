@@ -26,6 +26,15 @@ class _KernelPrinter(PythonCodePrinter):
     def _print_Float(self, expr: sp.Float) -> str:
         return repr(float(expr))
 
+    def _print_sin(self, expr: sp.sin) -> str:
+        return f"fast_sin({self._print(expr.args[0])})"
+
+    def _print_cos(self, expr: sp.cos) -> str:
+        return f"fast_cos({self._print(expr.args[0])})"
+
+    def _print_tanh(self, expr: sp.tanh) -> str:
+        return f"fast_tanh({self._print(expr.args[0])})"
+
     def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
         base, exponent = expr.as_base_exp()
         if exponent.is_negative is True and exponent.is_number:
@@ -50,7 +59,7 @@ def _product(factor: str, power: int) -> str:
 
 
 def algebra_source(symbols: SymbolicHamiltonian) -> str:
-    """The functions that `loops` and `lanes` ask for, for H = T(p) + V(q); states are tuples of d floats.
+    """The functions that `loops` and `lanes` ask for, for H = T(p) + V(q), calling `elementary`; states are tuples.
 
     Raises
     ------

@@ -57,9 +57,8 @@ class _Architecture:
             f"NDOF = {self.ndof}\nDEPTH = {self.depth}\nWIDTH = {self.width}\nCHUNK = {chunk}\nSTATES = {states}"
         )
         activation = f"activation = {self.activation}\n"
-        source = "\n\n".join(
-            [constants, template("activations"), activation, template("aligned"), template("flow_loops")]
-        )
+        before, after = map(template, ("elementary", "activations")), map(template, ("aligned", "flow_loops"))
+        source = "\n\n".join([constants, *before, activation, *after])
         return load_module(source).rollout
 
 

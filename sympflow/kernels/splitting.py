@@ -217,7 +217,9 @@ def _header(gradients: bool, compensated: bool, cache: bool) -> str:
 
 def _symbolic_loops(algebra: str, gradients: bool, compensated: bool) -> _Loops:
     header = _header(gradients, compensated, cache=True)
-    loops = load_module("\n\n\n".join([header, algebra, *map(template, ("loops", "aligned", "lanes"))]))
+    names = ("elementary",) if "fast_" in algebra else ()
+    parts = [header, *map(template, names), algebra, *map(template, ("loops", "aligned", "lanes"))]
+    loops = load_module("\n\n\n".join(parts))
     return _Loops(loops.rollout, loops.rollout_lanes, loops.step_each)
 
 
