@@ -45,8 +45,8 @@ def reference_error(sol: Solution, reference: Reference | Solution | ArrayLike |
 def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:
     """‖y − y0‖₂ after the run forwards to its end and the same method back from there, (...).
 
-    At rounding level for a method with Φ(−h) = Φ(h)⁻¹ on a grid that divides the interval, and for one that goes back
-    by its exact inverse, as a SympFlow does. inf for a trajectory that does not get there and back.
+    On a grid that divides the interval it is at rounding level for a method with Φ(−h) = Φ(h)⁻¹, and for one that goes
+    back by its exact inverse, as a SympFlow does. inf for a trajectory that does not get there and back.
 
     Raises
     ------
