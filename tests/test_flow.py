@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sympflow.flow.activations import ACTIVATIONS
-from sympflow.flow.base import whole_steps
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
+from sympflow.flow.steps import whole_steps
 from sympflow.flow.sympflow import SympFlow
 
 EPS = torch.finfo(torch.float64).eps
@@ -249,6 +249,14 @@ def test_scaling_changes_the_units_only():
     torch.testing.assert_close(
         scaled.hamiltonian(0.004, s * x), 25.0 / 0.01 * plain.hamiltonian(0.4, x), rtol=1e-12, atol=1e-12
     )
+
+
+def test_the_derivative_at_a_whole_step_is_the_next_ones():
+    flow, x = rough(SympFlow(1, hidden=(4,))), states(3, 1)
+    t = torch.tensor([0.0, 1.0, 2.0], dtype=torch.float64)
+    y, dy = torch.autograd.functional.jvp(lambda t: flow(t, x), t, torch.ones_like(t))
+    torch.testing.assert_close(y, flow(t, x))
+    torch.testing.assert_close(dy, flow.velocity(0.0, flow(t, x)))
 
 
 # the baseline ---------------------------------------------------------------------------------------------

@@ -11,11 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.domain import Domain
+from sympflow.flow.steps import whole_steps, whole_steps_of_each
 
 if TYPE_CHECKING:
     from sympflow.system import HamiltonianSystem
-
-MAX_STEPS = 10_000_000
 
 
 class FlowMap(nn.Module):
@@ -119,7 +118,7 @@ class FlowMap(nn.Module):
         """
         t = self._checked(t, x)
         if isinstance(t, float):
-            return self._whole(self._count(t), t < 0, x)
+            return self._whole(whole_steps(abs(t), self.dt), t < 0, x)
         k, r, back, x = self._split(t, x)
         x = self._repeat(k * ~back, False, x)
         x = self._repeat(k * back, True, x)
@@ -129,14 +128,11 @@ class FlowMap(nn.Module):
         """The exact inverse of ψ_t, for every t: arguments as for the call."""
         t = self._checked(t, x)
         if isinstance(t, float):
-            return self._whole(self._count(t), t >= 0, x, remainder_first=True)
+            return self._whole(whole_steps(abs(t), self.dt), t >= 0, x, remainder_first=True)
         k, r, back, x = self._split(t, x)
         x = self._remainder(r, ~back, x)
         x = self._repeat(k * ~back, True, x)
         return self._repeat(k * back, False, x)
-
-    def _count(self, t: float) -> tuple[int, float]:
-        return whole_steps(abs(t), self.dt)
 
     def _whole(self, count: tuple[int, float], back: bool, x: Tensor, remainder_first: bool = False) -> Tensor:
         """k steps and the remainder of one time for all states."""
@@ -154,16 +150,8 @@ class FlowMap(nn.Module):
     def _split(self, t: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Counts k, remainders r and directions of the times t, broadcast with the states x."""
         batch = torch.broadcast_shapes(t.shape, x.shape[:-1])
-        eps = torch.finfo(t.dtype).eps if t.is_floating_point() else 0.0
-        magnitude = t.abs().to(torch.float64)
-        ratio = magnitude.detach() / self.dt
-        near = ratio.round()
-        exact = (ratio - near).abs() <= 2 * eps * near
-        k = torch.where(exact, near, ratio.floor())
-        if k.numel() and k.max() > MAX_STEPS:
-            raise _too_many_steps(float(magnitude.detach().max()), self.dt)
-        r = torch.where(exact, 0.0, magnitude - k * self.dt).clamp(max=self.dt).to(x.dtype)
-        k, r, back = (v.expand(batch) for v in (k.to(torch.int64), r, t < 0))
+        k, r = whole_steps_of_each(torch.where(t < 0, -t, t), self.dt)
+        k, r, back = (v.expand(batch) for v in (k, r.to(x.dtype), t < 0))
         return k, r, back, x.expand(*batch, x.shape[-1])
 
     def _repeat(self, k: Tensor, back: bool, x: Tensor) -> Tensor:
@@ -175,7 +163,8 @@ class FlowMap(nn.Module):
         return x
 
     def _remainder(self, r: Tensor, back: Tensor, x: Tensor) -> Tensor:
-        for step, active in ((self.psi, (r > 0) & ~back), (self.psi_inverse, (r > 0) & back)):
+        moving = (r > 0) | r.requires_grad  # at r = 0 the state stays, but has a derivative
+        for step, active in ((self.psi, moving & ~back), (self.psi_inverse, moving & back)):
             if active.any():
                 x = x.index_put((active,), step(r[active], x[active]))
         return x
@@ -285,24 +274,6 @@ class FlowMap(nn.Module):
         return f"<{type(self).__name__}{system}: ndof={self.ndof}, dt={self.dt:g}, {self.n_parameters} parameters>"
 
 
-def whole_steps(t: float, dt: float) -> tuple[int, float]:
-    """k = ⌊t/Δt⌋ and r = t − kΔt ∈ [0, Δt) for t ≥ 0, counting a multiple of Δt up to rounding as one: 0.3/0.1 is 3.
-
-    Raises
-    ------
-    ValueError
-        If k would exceed ten million.
-    """
-    ratio = t / dt
-    if ratio > MAX_STEPS:
-        raise _too_many_steps(t, dt)
-    near = round(ratio)
-    if abs(ratio - near) <= 2 * np.finfo(float).eps * near:
-        return near, 0.0
-    k = math.floor(ratio)
-    return k, min(max(t - k * dt, 0.0), dt)
-
-
 def same_system(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
     """Whether two fingerprints agree to nine digits of the largest."""
     u, v = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
@@ -310,7 +281,3 @@ def same_system(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
         return False
     finite = u[np.isfinite(u)]
     return np.allclose(u, v, rtol=0, atol=1e-9 * np.abs(finite).max(initial=0.0), equal_nan=True)
-
-
-def _too_many_steps(t: float, dt: float) -> ValueError:
-    return ValueError(f"`t` = {t:g} needs more than {MAX_STEPS:,} steps of dt = {dt:g}: use sympflow.solve.")
