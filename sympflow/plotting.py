@@ -103,7 +103,7 @@ def _error_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str, 
     shown = [r.row for r in comparison.runs if r.row.run_time and r.row.error is not None and np.isfinite(r.row.error)]
     for row in shown:
         colour, marker = styles[row.label]
-        spread = None if row.run_time_spread is None else row.run_time_spread / 2
+        spread = min(row.run_time_spread or 0.0, row.run_time or 0.0) / 2
         error = max(row.error or 0.0, ROUNDING_FLOOR)
         ax.errorbar(row.run_time or 0.0, error, xerr=spread, color=colour, lw=1, capsize=0, zorder=2)
         ax.plot(row.run_time or 0.0, error, marker, color=colour, ms=8, mec="white", mew=0.8, zorder=3)
