@@ -127,6 +127,17 @@ def test_kernel_agrees_with_numpy_on_every_kind_of_system(systems, name):
         assert np.abs(Y[0] - plain_run(system, scheme, 0.05, system.y0, 50)[-1]).max() < 3e-14
 
 
+def test_functions_of_every_kind():
+    V = "0.3*sin(q1)*cos(q2)**2 + Abs(q2)**3 + Piecewise((q1**2, q1 > 0), (0, True)) + Max(q1, q2) + asin(q1)"
+    V += (
+        " + tan(q1*q2) + q1**2.5 + q2**(5/2) + 2**q2 + q1**(-3) + (q1**2 + q2**2)**(-3/2) + atan2(q1, q2) + log(q1 + 3)"
+    )
+    V += " + tanh(q2)"
+    system = HamiltonianSystem.from_sympy(f"(p1**2 + p2**2/2)/2 + cosh(p1) + {V}", y0=[0.5, 0.4, 0.1, 0.2])
+    y = splitting_kernel(system).step(VERLET, 0.01, system.y0[None])[0]
+    assert np.abs(y - plain_run(system, VERLET, 0.01, system.y0, 1)[-1]).max() < 1e-14
+
+
 @pytest.mark.parametrize("mass", [None, [1.0, 2.0, 4.0]])
 def test_masses_of_numba_systems(mass):
     system = numba_chain(mass)
@@ -264,6 +275,8 @@ def test_refusals(systems):
         splitting_kernel(systems["relativistic"]).run(SCHEMES["chin4a"], 0.1, np.zeros(2), 1, np.array([1]))
     with pytest.raises(ValueError, match="`system` is not separable"):
         splitting_kernel(HamiltonianSystem.from_sympy("p**2*q**2/2 + q**2"))
+    with pytest.raises(ValueError, match="no compiled function"):
+        splitting_kernel(HamiltonianSystem.from_sympy("p**2/2 + besselj(0, q)"))
     plain = HamiltonianSystem(potential=lambda q: (q**2).sum(-1), ndof=1)
     with pytest.raises(ValueError, match="`system` cannot be compiled"):
         splitting_kernel(plain)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import sympy as sp
+from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympy.printing.pycode import PythonCodePrinter
 
 from sympflow.symbolic import SymbolicHamiltonian
 
-__all__ = ["algebra_source"]
+__all__ = ["algebra_source", "gradient_kick_source"]
 
 _MAX_POWER = 16  # integer powers up to this are written as products
 
@@ -25,6 +26,9 @@ class _KernelPrinter(PythonCodePrinter):
 
     def _print_Float(self, expr: sp.Float) -> str:
         return repr(float(expr))
+
+    def _print_Heaviside(self, expr: sp.Heaviside) -> str:
+        return "(1.0 if {0} > 0.0 else (0.5 if {0} == 0.0 else 0.0))".format(self._print(expr.args[0]))
 
     def _print_sin(self, expr: sp.sin) -> str:
         return f"fast_sin({self._print(expr.args[0])})"
@@ -75,14 +79,20 @@ def algebra_source(symbols: SymbolicHamiltonian) -> str:
         _function("kick", "q, b, work", q, [-s for s in slope], [f"b*{{{i}}}" for i in range(d)]),
         _function("drift", "p, a, work", p, velocity, [f"a*{{{i}}}" for i in range(d)]),
     ]
-    if (M := symbols.inverse_mass) is not None:
-        parts.append(_gradient_kick(symbols.q, slope, M))
     return "\n\n\n".join(parts) + "\n"
 
 
-def _gradient_kick(q: Sequence[sp.Symbol], slope: Sequence[sp.Expr], M: sp.Matrix) -> str:
-    """−b∇V + g ∇²V M⁻¹∇V: the Hessian's upper triangle is computed, the products are taken with numbers."""
-    d = len(q)
+def gradient_kick_source(symbols: SymbolicHamiltonian) -> str:
+    """−b∇V + g ∇²V M⁻¹∇V: the Hessian's upper triangle is computed, the products are taken with numbers.
+
+    Raises
+    ------
+    ValueError
+        As `algebra_source`.
+    """
+    q, d, M = symbols.q, symbols.ndof, symbols.inverse_mass
+    assert M is not None
+    slope = [sp.diff(symbols.V, s) for s in q]
     triangle = [(i, j) for i in range(d) for j in range(i, d)]
     entries = [sp.diff(slope[i], q[j]) for i, j in triangle]
     position = {ij: d + n for n, ij in enumerate(triangle) if entries[n] != 0}
@@ -96,7 +106,7 @@ def _gradient_kick(q: Sequence[sp.Symbol], slope: Sequence[sp.Expr], M: sp.Matri
         row = [(position.get((min(i, j), max(i, j))), velocity(j)) for j in range(d)]
         product = " + ".join(f"{{{n}}}*{v}" for n, v in row if n is not None)
         results.append(f"g*({product}) - b*{{{i}}}" if product else f"-b*{{{i}}}")
-    return _function("gradient_kick", "q, b, g, work", q, [*slope, *entries], results)
+    return _function("gradient_kick", "q, b, g, work", q, [*slope, *entries], results) + "\n"
 
 
 def _function(
@@ -109,9 +119,12 @@ def _function(
     lines = ["@njit(**OPTIONS)", f"def {name}({arguments}):"]
     lines.append(f"    {', '.join(s.name for s in variables)}, = {arguments[0]}")
     for symbol, expression in [*shared, *zip(values, reduced, strict=True)]:
-        code = printer.doprint(expression)
-        if "Not supported" in code or printer._not_supported:
-            raise ValueError(f"`system` holds {expression}, which has no compiled counterpart: use backend='array'.")
+        try:
+            code = printer.doprint(expression)
+        except PrintMethodNotImplementedError:
+            raise ValueError(
+                f"`system` has the term {expression}, for which there is no compiled function: use backend='array'."
+            ) from None
         lines.append(f"    {symbol.name} = {code}")
     names = [value.name for value in values]
     lines.append(f"    return ({''.join(result.format(*names) + ', ' for result in results)})")

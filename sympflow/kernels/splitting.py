@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike
 from sympflow.integrators.schemes import Scheme
 from sympflow.kernels.modules import OPTIONS, load_module, run_rows, template
 from sympflow.system import HamiltonianSystem
+
+if TYPE_CHECKING:
+    from sympflow.symbolic import SymbolicHamiltonian
 
 __all__ = ["SplittingKernel", "splitting_kernel"]
 
@@ -55,7 +58,7 @@ class SplittingKernel:
             from sympflow.kernels.codegen import algebra_source
 
             self._has_force_gradient = system.quadratic_kinetic
-            self._compile = partial(_symbolic_loops, algebra_source(system.symbols))
+            self._compile = partial(_symbolic_loops, system.symbols, algebra_source(system.symbols))
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
@@ -215,11 +218,15 @@ def _header(gradients: bool, compensated: bool, cache: bool) -> str:
     )
 
 
-def _symbolic_loops(algebra: str, gradients: bool, compensated: bool) -> _Loops:
+def _symbolic_loops(symbols: SymbolicHamiltonian, algebra: str, gradients: bool, compensated: bool) -> _Loops:
+    from sympflow.kernels.codegen import gradient_kick_source
+
+    if gradients:
+        algebra = f"{algebra}\n\n{gradient_kick_source(symbols)}"
     header = _header(gradients, compensated, cache=True)
-    names = ("elementary",) if "fast_" in algebra else ()
-    parts = [header, *map(template, names), algebra, *map(template, ("loops", "aligned", "lanes"))]
-    loops = load_module("\n\n\n".join(parts))
+    before = ["elementary"] if "fast_" in algebra else []
+    after = ["loops", "aligned", "lanes"]
+    loops = load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
     return _Loops(loops.rollout, loops.rollout_lanes, loops.step_each)
 
 
