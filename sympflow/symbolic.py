@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import sympy as sp
@@ -133,8 +133,8 @@ class SymbolicHamiltonian:
         def function(x: Array) -> Array:
             library = "torch" if is_tensor(x) else "numpy"
             if library not in generated:
-                code = expressions(getattr(self, key[0]), variables)
-                generated[library] = sp.lambdify(variables, code, modules=_modules(library), cse=True)
+                code = [printable(f) for f in expressions(getattr(self, key[0]), variables)]
+                generated[library] = sp.lambdify(variables, code, modules=_modules(library, code), cse=True)
             columns = [x[..., i] for i in range(n)]
             return collect(generated[library](*columns), columns[0], n)
 
@@ -187,6 +187,11 @@ def _with_numeric_constants(H: sp.Expr) -> sp.Expr:
     return H.xreplace({a: a.evalf(17) for a in constants})
 
 
+def printable(f: sp.Expr) -> sp.Expr:
+    """A derivative as code needs it: its constants numbers, and the δ of a kink's second derivative left out."""
+    return _with_numeric_constants(f.replace(sp.DiracDelta, lambda *arguments: sp.S.Zero))
+
+
 def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tuple[sp.Expr | None, sp.Expr | None]:
     """V(q) and T(p) with H = T + V, or (None, None). Constants go to V."""
     qs, ps = set(q), set(p)
@@ -201,12 +206,32 @@ def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tu
     return V, T
 
 
-def _modules(library: str) -> list[Any]:
+def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
+    """Where the generated code finds its functions; SciPy is brought in for special functions only."""
+    from sympy.printing.numpy import NumPyPrinter
+
+    known = NumPyPrinter().known_functions
+    names = {type(f).__name__ for expression in code for f in expression.atoms(sp.Function)}
+    special = sorted(
+        n for n in names - known.keys() if n not in ("Max", "Min", "Abs", "Heaviside", "sign", "Piecewise")
+    )
     if library == "numpy":
-        return ["numpy"]
+        return ["scipy", "numpy"] if special else ["numpy"]
+    if special:
+        raise TypeError(
+            f"`expression` holds {', '.join(special)}, which torch has not: solve on NumPy states, with a method that "
+            "does not need tensors."
+        )
     import torch
+
+    def pairwise(choose: Any) -> Any:
+        def function(*values: Any) -> Any:
+            like = next(v for v in values if isinstance(v, torch.Tensor))
+            return reduce(choose, (torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in values))
+
+        return function
 
     def heaviside(x: Any, value: float) -> Any:
         return torch.heaviside(x, torch.as_tensor(value, dtype=x.dtype, device=x.device))
 
-    return [{"heaviside": heaviside}, "torch"]
+    return [{"heaviside": heaviside, "max": pairwise(torch.maximum), "min": pairwise(torch.minimum)}, "torch"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sympflow import Ball, HamiltonianSystem, systems
+from sympflow import Ball, HamiltonianSystem, solve, systems
 
 SYSTEMS = {
     "harmonic": systems.harmonic_oscillator(3.0),
@@ -133,3 +133,33 @@ def test_functions_of_the_wrong_kind_are_explained(potential, error, message):
     system = HamiltonianSystem(potential, ndof=2)
     with pytest.raises(error, match=message):
         system.vector_field(np.zeros((5, 4)))
+
+
+@pytest.mark.parametrize(
+    ("expression", "slope"),
+    [
+        ("Max(q, 0)**2 + Abs(q)", lambda q: 2 * max(q, 0) + np.sign(q)),
+        ("sign(q)*q", lambda q: np.sign(q)),
+        ("Heaviside(q)*q**2", lambda q: 2 * q * (q > 0)),
+        ("Min(q**2, 1, q**4)", lambda q: 4 * q**3),
+        ("erf(q)", lambda q: 2 / np.sqrt(np.pi) * np.exp(-(q**2))),
+    ],
+)
+@pytest.mark.parametrize("q", [0.3, -0.4])
+def test_kinks_and_constants_after_differentiation(expression, slope, q):
+    """The δ of a kink is left out of second derivatives, everywhere alike; constants such as √π become numbers."""
+    system = HamiltonianSystem.from_sympy(f"p**2/2 + {expression}")
+    y = np.array([q, 0.2])
+    assert system.gradient(y)[0] == pytest.approx(slope(q))
+    assert system.gradient(torch.tensor(y))[0] == pytest.approx(slope(q))
+    assert np.isfinite(system.hessian(y)).all()
+    for method in ("verlet", "omelyan4"):
+        compiled, array = (solve(system, method, (0, 0.1), y0=y, backend=b) for b in ("auto", "array"))
+        np.testing.assert_allclose(compiled.y, array.y, atol=1e-14)
+
+
+def test_special_functions_run_on_arrays_and_torch_says_that_it_has_none():
+    system = HamiltonianSystem.from_sympy("p**2/2 - besselj(0, q)")
+    assert system.force(np.array([0.3]))[0] == pytest.approx(-0.148318816)
+    with pytest.raises(TypeError, match=r"^`expression` holds besselj, which torch has not"):
+        system.force(torch.tensor([0.3]))

@@ -102,35 +102,43 @@ class Splitting(FixedStep):
         system, y0 = problem.system, problem.y0
         reason = None
         if problem.backend == "array":
-            reason = "`backend` is 'array'"
+            reason = "`backend` is 'array': choose 'auto'."
         elif is_tensor(y0):
-            reason = "`y0` is a tensor"
+            reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
         elif y0.dtype != np.float64:
-            reason = f"`y0` is {y0.dtype}"
+            reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
         elif system.symbols is None and system.numba_functions is None:
-            reason = f"the system {system.name!r} is given by plain functions"
+            reason = f"`system` {system.name!r} is given by plain functions: use backend='array'."
         if reason is None:
             from sympflow.kernels.splitting import splitting_kernel
 
-            return splitting_kernel(system)
+            try:
+                return splitting_kernel(system)
+            except ValueError as error:  # H holds a function that has no compiled form
+                reason = str(error)
         if problem.backend == "compiled":
-            raise ValueError(f"`backend` 'compiled' does not apply, because {reason}: use 'auto' or 'array'.")
+            raise ValueError(f"`backend` 'compiled' does not apply. {reason}")
         if self.compensated:
-            raise ValueError(f"`compensated` sums need compiled loops, but {reason}: leave `compensated` out.")
+            raise ValueError(f"`compensated` sums need compiled loops. {reason}")
         return None
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        kicks = [c3 != 0 for kind, _, c3 in self.scheme.substeps if kind == "kick"]
-        if backend != "compiled":
-            n = n_steps + n_extra
-            return {"force_evaluations": n * len(kicks), "hessian_evaluations": n * sum(kicks)}
-        # compiled, the last kick of a step is merged with the next step's first, except where a state is saved
-        forces, hessians = self.scheme.force_evaluations, self.scheme.hessian_evaluations
-        opened = (n_saved + 1) if n_steps and len(kicks) > forces else 0
-        return {
-            "force_evaluations": n_steps * forces + opened + n_extra * len(kicks),
-            "hessian_evaluations": n_steps * hessians + opened * kicks[0] + n_extra * sum(kicks),
-        }
+        return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
+
+
+def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+    """Force and force-gradient evaluations of a run, as `FixedStep.evaluations`."""
+    kicks = [c3 != 0 for kind, _, c3 in scheme.substeps if kind == "kick"]
+    if backend != "compiled":
+        n = n_steps + n_extra
+        return {"force_evaluations": n * len(kicks), "hessian_evaluations": n * sum(kicks)}
+    # compiled, the last kick of a step is merged with the next step's first, except where a state is saved
+    forces, hessians = scheme.force_evaluations, scheme.hessian_evaluations
+    opened = (n_saved + 1) if n_steps and len(kicks) > forces else 0
+    return {
+        "force_evaluations": n_steps * forces + opened + n_extra * len(kicks),
+        "hessian_evaluations": n_steps * hessians + opened * kicks[0] + n_extra * sum(kicks),
+    }
 
 
 def _kick(system: HamiltonianSystem, q: Array, c: float | Array, c3: float | Array) -> Array:

@@ -8,7 +8,7 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympy.printing.pycode import PythonCodePrinter
 
-from sympflow.symbolic import SymbolicHamiltonian
+from sympflow.symbolic import SymbolicHamiltonian, printable
 
 __all__ = ["algebra_source", "gradient_kick_source"]
 
@@ -114,6 +114,7 @@ def _function(
 ) -> str:
     """A jitted function that returns the tuple `results`, ``{n}`` in them standing for the n-th expression."""
     printer = _KernelPrinter({"fully_qualified_modules": True, "human": True})
+    expressions = [printable(f) for f in expressions]
     shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("s_", real=True), list=True)
     values = [sp.Symbol(f"v_{n}", real=True) for n in range(len(reduced))]
     lines = ["@njit(**OPTIONS)", f"def {name}({arguments}):"]

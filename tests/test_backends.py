@@ -1,0 +1,111 @@
+"""Compiled and array results agree to rounding; the choice is reported, can be forced, and explains itself."""
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import HamiltonianSystem, solve, systems
+from sympflow.integrators.schemes import SCHEMES
+
+HH = systems.henon_heiles()
+PLAIN = HamiltonianSystem(lambda q: (q**4).sum(-1), ndof=1, y0=[1.0, 0.0])
+BESSEL = HamiltonianSystem.from_sympy("p**2/2 - besselj(0, q)", y0=[1.0, 0.0])
+
+
+@pytest.mark.parametrize("method", sorted(SCHEMES))
+@pytest.mark.parametrize("batch", [(), (3, 5)])
+def test_compiled_and_array_results_agree_to_rounding(method, batch):
+    y0 = HH.domain.sample(15, 4).reshape(3, 5, 4)[(0,) * (2 - len(batch))]
+    kwargs = {"t_span": (0.0, 10.02), "y0": y0, "dt": 0.1, "save_every": 7}
+    compiled, array = (solve(HH, method, backend=b, **kwargs) for b in ("compiled", "array"))
+    assert (compiled.stats["backend"], array.stats["backend"]) == ("compiled", "numpy")
+    np.testing.assert_array_equal(compiled.t, array.t)
+    # 100 steps of up to 17 stages, each adding an ulp, amplified at most some tens of times by the flow
+    np.testing.assert_allclose(compiled.y, array.y, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", sorted(SCHEMES))
+def test_evaluations_are_counted_as_they_are_made(method):
+    calls = {"force": 0, "hessian": 0}
+
+    def gradient(q):
+        calls["force"] += 1
+        return q**3
+
+    def hessian_vector(q, v):
+        calls["hessian"] += 1
+        return 3 * q**2 * v
+
+    system = HamiltonianSystem(lambda q: (q**4).sum(-1) / 4, gradient=gradient, hessian_vector=hessian_vector, ndof=1)
+    sol = solve(system, method, (0.0, 1.0), y0=[1.0, 0.0], dt=0.1)
+    assert sol.stats["force_evaluations"] == calls["force"]
+    assert sol.stats["hessian_evaluations"] == calls["hessian"]
+
+
+def test_the_compiled_count_merges_the_last_kick_with_the_next_first():
+    dense = solve(HH, "verlet", (0.0, 10.0), dt=0.1)
+    sparse = solve(HH, "verlet", (0.0, 10.0), dt=0.1, t_eval=[10.0])
+    assert dense.nfev == 2 * 100 + 2
+    assert sparse.nfev == 100 + 2
+
+
+@pytest.mark.parametrize(
+    ("system", "arguments", "backend"),
+    [
+        (HH, {}, "compiled"),
+        (HH, {"dtype": "float32"}, "numpy"),
+        (HH, {"y0": torch.tensor(HH.y0)}, "torch"),
+        (HH, {"backend": "array"}, "numpy"),
+        (PLAIN, {}, "numpy"),
+        (BESSEL, {}, "numpy"),
+    ],
+)
+def test_auto_chooses_what_applies(system, arguments, backend):
+    assert solve(system, "verlet", (0.0, 1.0), **arguments).stats["backend"] == backend
+
+
+@pytest.mark.parametrize(
+    ("system", "arguments", "message"),
+    [
+        (HH, {"backend": "compiled", "dtype": "float32"}, r"^`backend` 'compiled' does not apply. `y0` is float32"),
+        (HH, {"backend": "compiled", "y0": torch.tensor(HH.y0)}, r"^`backend` 'compiled' .* `y0` is a tensor"),
+        (PLAIN, {"backend": "compiled"}, r"^`backend` 'compiled' .* given by plain functions"),
+        (BESSEL, {"backend": "compiled"}, r"^`backend` 'compiled' does not apply"),
+        (PLAIN, {"compensated": True}, r"^`compensated` sums need compiled loops"),
+        (HH, {"backend": "array", "compensated": True}, r"^`compensated` sums need compiled loops"),
+    ],
+)
+def test_a_backend_that_does_not_apply_says_why(system, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        solve(system, "verlet", (0.0, 1.0), **arguments)
+
+
+def test_numba_functions_run_compiled():
+    from numba import njit
+
+    @njit
+    def potential(q):
+        return (q[0] ** 4 + q[1] ** 4) / 4
+
+    @njit
+    def gradient(q, out):
+        out[:] = q**3
+
+    @njit
+    def hessian_vector(q, v, out):
+        out[:] = 3 * q**2 * v
+
+    numba = HamiltonianSystem(potential, gradient=gradient, hessian_vector=hessian_vector, ndof=2, mass=[1.0, 2.0])
+    symbolic = HamiltonianSystem.from_sympy("p1**2/2 + p2**2/4 + (q1**4 + q2**4)/4")
+    for method in ("verlet", "srkn11b", "omelyan4"):
+        kwargs = {"t_span": (0.0, 5.0), "y0": [[1.0, 0.0, 0.0, 1.0], [0.5, 0.2, 0.1, 0.0]], "dt": 0.05}
+        compiled = solve(numba, method, backend="compiled", **kwargs)
+        np.testing.assert_allclose(compiled.y, solve(symbolic, method, **kwargs).y, atol=1e-12)
+        np.testing.assert_allclose(compiled.y, solve(numba, method, backend="array", **kwargs).y, atol=1e-12)
+
+
+def test_compensated_summation_lowers_the_error_of_rounding():
+    # Kahan-Li 8 at dt = 0.05 has no error of truncation above rounding: what is left in H is round-off
+    kwargs = {"t_span": (0.0, 5000.0), "dt": 0.05, "t_eval": np.linspace(2500, 5000, 100)}
+    plain, compensated = (solve(HH, "kahan_li8", compensated=c, **kwargs).energy_error() for c in (False, True))
+    assert np.sqrt((compensated**2).mean()) < 0.5 * np.sqrt((plain**2).mean())
