@@ -263,6 +263,10 @@ class FlowMap(nn.Module):
                 "parameters differ): pass the flow of this system, or train one with sympflow.train(system)."
             )
 
+    def bound(self, system: HamiltonianSystem) -> FlowMap:
+        """This flow, ready to be used on `system`: one that is made of the system's own functions takes them."""
+        return self
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the flow to a safetensors file, with all that `sympflow.load` needs and its record."""
         from sympflow.flow.io import save

@@ -69,8 +69,21 @@ def save(flow: FlowMap, path: str | os.PathLike[str]) -> None:
         raise
 
 
-def load(path: str | os.PathLike[str], *, device: torch.device | str | None = None) -> Any:
+def load(
+    path: str | os.PathLike[str],
+    *,
+    system: HamiltonianSystem | None = None,
+    device: torch.device | str | None = None,
+) -> Any:
     """Read a flow from a file that `flow.save` wrote.
+
+    Parameters
+    ----------
+    path
+    system : HamiltonianSystem, optional
+        The system of the flow, which is checked. A primed flow needs its V and T: given here, or later by
+        `flow.bind(system)`; `solve` gives them as well.
+    device : optional
 
     Returns
     -------
@@ -81,7 +94,8 @@ def load(path: str | os.PathLike[str], *, device: torch.device | str | None = No
     ------
     ValueError
         If the file is missing, truncated, of another or a later format, or anything in it is not as it should be:
-        tensors of the wrong name, shape or dtype, weights that are not finite, an absurd architecture.
+        tensors of the wrong name, shape or dtype, weights that are not finite, an absurd architecture. Or if `system`
+        is not the one that the flow was made for.
     """
     content, header, record = _read(path)
     try:
@@ -92,6 +106,9 @@ def load(path: str | os.PathLike[str], *, device: torch.device | str | None = No
         raise _refusal(path, str(reason)) from None
     except OverflowError:
         raise _refusal(path, "a number in its record is too large") from None
+    if system is not None:
+        flow.check_system(system)
+        flow.bound(system)
     return flow.to(device) if device is not None else flow
 
 
@@ -106,9 +123,7 @@ def shipped(system: HamiltonianSystem, kind: str = "sympflow") -> Any:
     for path, record in _catalogue():
         fingerprint = tuple(math.nan if v is None else v for v in record.get("fingerprint") or ())
         if record["kind"] == kind and same_system(fingerprint, system.fingerprint):
-            flow = load(path)
-            flow.check_system(system)
-            return flow
+            return load(path, system=system)
     there = ", ".join(path.stem for path, record in _catalogue() if record["kind"] == kind)
     raise ValueError(
         f"`system` {system.name!r} has no shipped {kind} flow (there are: {there or 'none'}): train one by "

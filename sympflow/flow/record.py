@@ -15,10 +15,12 @@ from sympflow.flow.base import FlowMap
 from sympflow.flow.layers import LAYERS
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.sympflow import SympFlow
 
 MAX_LAYERS = 1000
 MAX_WIDTH = 4096
+MAX_DEGREE = 64
 MAX_PARAMETERS = 10_000_000
 DTYPES = {"F32": torch.float32, "F64": torch.float64}
 
@@ -59,6 +61,8 @@ def build(record: dict[str, Any], dtype: torch.dtype) -> FlowMap:
         if record["kind"] == "mlp":
             hidden = _widths(plan.get("hidden"), 2 * ndof)
             return MLPFlow(ndof, hidden, str(plan.get("activation")), dt, dtype)
+        if "primed" in plan:
+            return _primed(ndof, plan["primed"], dt, dtype)
         layers = plan.get("layers")
         if not isinstance(layers, list) or not 1 <= len(layers) <= MAX_LAYERS:
             raise Refused("its list of layers is missing or absurdly long")
@@ -76,6 +80,18 @@ def build(record: dict[str, Any], dtype: torch.dtype) -> FlowMap:
         )
     except ValueError as error:
         raise Refused(f"its architecture is not admissible ({error})") from None
+
+
+def _primed(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> PrimedFlow:
+    """A primed flow, which `bind` will give its system."""
+    if not isinstance(plan, dict) or plan.get("first") not in ("kick", "drift"):
+        raise Refused("its plan of a primed flow is missing")
+    for name in ("palindromic", "force_gradient"):
+        if not isinstance(plan.get(name), bool):
+            raise Refused(f"its {name} is neither true nor false")
+    maps = _integer(plan.get("maps"), "number of maps", MAX_LAYERS)
+    degree = _integer(plan.get("degree"), "degree", MAX_DEGREE)
+    return PrimedFlow(ndof, plan["first"], maps, degree, plan["palindromic"], plan["force_gradient"], dt, dtype=dtype)
 
 
 def _potential(layer: Any) -> dict[str, Any]:

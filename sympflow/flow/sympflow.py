@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +12,11 @@ from sympflow.flow.base import FlowMap
 from sympflow.flow.layers import Drift, Kick, Layer
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
+
+if TYPE_CHECKING:
+    from sympflow.flow.primed import PrimedFlow
+    from sympflow.integrators.schemes import Scheme
+    from sympflow.system import HamiltonianSystem
 
 
 class SympFlow(FlowMap):
@@ -108,6 +113,52 @@ class SympFlow(FlowMap):
         FlowMap.__init__(self, layers[0].ndof, dt)
         self.layers = nn.ModuleList(layers)
         return self
+
+    @staticmethod
+    def primed(
+        system: HamiltonianSystem,
+        stages: int | None = None,
+        *,
+        dt: float = 1.0,
+        palindromic: bool = True,
+        scheme: Scheme | str | None = None,
+        degree: int = 7,
+        force_gradient: bool | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> PrimedFlow:
+        """A SympFlow whose potentials are the system's own V and T times polynomials in t.
+
+        Untrained it is a classical splitting scheme; `train(system, flow=flow)` fits it to the system and its domain.
+        Frozen at any t it is a splitting scheme again, `flow.scheme(t)`, and as fast as one.
+
+        Parameters
+        ----------
+        system : HamiltonianSystem
+            Separable.
+        stages : int, optional
+            Number of kicks, 6 by default: the flow starts as so many equal leapfrog steps.
+        dt : float
+            Δt.
+        palindromic : bool
+            Whether it is time-reversible, with half the parameters.
+        scheme : Scheme or str, optional
+            A table, or its name in `sympflow.integrators.schemes.SCHEMES`, to start from in place of leapfrog.
+        degree : int
+            Of the polynomials that multiply V and T.
+        force_gradient : bool, optional
+            Whether the kicks have a term in ½|∇V|²_{M⁻¹}; by default they do where T is quadratic.
+        dtype, device
+            Of the parameters.
+
+        Raises
+        ------
+        ValueError
+            If the system is not separable, or an argument is not admissible.
+        """
+        from sympflow.flow.primed import primed
+
+        return primed(system, stages, dt, palindromic, scheme, degree, force_gradient, dtype, device)
 
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.ndof, "layers": [layer.to_dict() for layer in self.layers]}  # type: ignore[operator]

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sympflow.flow.mlp import MLPFlow
     from sympflow.flow.sympflow import SympFlow
     from sympflow.kernels.mlp_flow import MLPFlowKernel
+    from sympflow.kernels.primed_flow import PrimedFlowKernel
 
 
 _SHIPPED: dict[tuple[str, tuple[float, ...]], Any] = {}  # read from their files once in a process
@@ -58,7 +59,7 @@ class FlowIntegrator(FixedStep):
     def flow_for(self, system: HamiltonianSystem) -> SympFlow | MLPFlow:
         """The flow that is used for a system: the one given, else the one shipped."""
         if self.flow is not None:
-            return self.flow
+            return self.flow.bound(system)
         key = (self.name, system.fingerprint)
         if key not in _SHIPPED:
             from sympflow.flow.io import shipped
@@ -67,9 +68,9 @@ class FlowIntegrator(FixedStep):
         return _SHIPPED[key]
 
     def check(self, system: HamiltonianSystem) -> None:
-        flow = self.flow_for(system)
-        flow.check_system(system)
-        self._check_dt(flow)
+        if self.flow is not None:
+            self.flow.check_system(system)
+        self._check_dt(self.flow_for(system))
 
     def step_length(self, system: HamiltonianSystem) -> float:
         return float(self.dt if self.dt is not None else self.flow_for(system).dt)
@@ -93,6 +94,13 @@ class FlowIntegrator(FixedStep):
             length = torch.from_numpy(np.array(h)) if np.ndim(h) else float(h)
             return function(length, torch.from_numpy(np.ascontiguousarray(y))).numpy()
 
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        if not hasattr(self.flow, "scheme"):  # an MLP flow evaluates no forces
+            return super().evaluations(n_steps, n_saved, n_extra, backend)
+        from sympflow.integrators.splitting import scheme_evaluations
+
+        return scheme_evaluations(self.flow.scheme(self.dt), n_steps, n_saved, n_extra, backend)
+
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         y0, flow = problem.y0, self.flow_for(problem.system)
         _check_match(y0, flow)
@@ -110,7 +118,7 @@ class FlowIntegrator(FixedStep):
         return states.numpy(), finite, "torch"
 
 
-def _kernel(problem: Problem, flow: Any) -> MLPFlowKernel | None:
+def _kernel(problem: Problem, flow: Any) -> MLPFlowKernel | PrimedFlowKernel | None:
     """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
     if problem.backend == "array":
         return None
@@ -119,6 +127,10 @@ def _kernel(problem: Problem, flow: Any) -> MLPFlowKernel | None:
             raise ValueError("`y0` is a tensor: pass a NumPy array, or use backend='array'.")
         if flow.kind != "sympflow":
             raise ValueError("`method` 'mlp' has no compiled form: use backend='array'.")
+        if hasattr(flow, "scheme"):
+            from sympflow.kernels.primed_flow import PrimedFlowKernel
+
+            return PrimedFlowKernel(flow, problem.system)
         from sympflow.kernels.mlp_flow import mlp_flow_kernel
 
         return mlp_flow_kernel(flow)

@@ -1,0 +1,98 @@
+"""The columns of a splitting table whose numbers are polynomials in t."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from sympflow.flow.potentials import Time
+
+
+class Coefficients(nn.Module):
+    """c_i(τ) = Σ_k c_ik τ^(e_k), i = 1 … n: a column of a splitting table, and how it enters, as t^m c_i(t/Δt).
+
+    Only what is free is a parameter. In a palindrome, c_i = c_{n+1−i}. With a `total`, Σ c_i(0) = total for every
+    value of the parameters: the constant term of the middle (or else the last) c_i is what the others leave.
+
+    Parameters
+    ----------
+    n : int
+    exponents : tuple of int
+        e_k ≥ 0, the first of them 0.
+    dt : float
+        Δt.
+    power : int
+        m.
+    palindromic : bool
+    total : float, optional
+
+    Attributes
+    ----------
+    free : (f,)
+        The free c_ik, i slowest.
+    basis, offset : (n, K, f), (n, K)
+        c = offset + basis · free.
+    """
+
+    basis: Tensor
+    offset: Tensor
+
+    def __init__(
+        self,
+        n: int,
+        exponents: tuple[int, ...],
+        dt: float,
+        power: int,
+        palindromic: bool,
+        total: float | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> None:
+        super().__init__()
+        self.exponents, self.dt, self.power = exponents, dt, power
+        representative = np.minimum(np.arange(n), np.arange(n)[::-1]) if palindromic else np.arange(n)
+        count = np.bincount(representative)
+        last = len(count) - 1
+        self._free = [
+            (i, k) for i in range(last + 1) for k in range(len(exponents)) if total is None or (i, k) != (last, 0)
+        ]
+        basis, offset = np.zeros((n, len(exponents), len(self._free))), np.zeros((n, len(exponents)))
+        for column, (i, k) in enumerate(self._free):
+            basis[representative == i, k, column] = 1.0
+            if k == 0 and total is not None:
+                basis[representative == last, 0, column] = -count[i] / count[last]
+        if total is not None:
+            offset[representative == last, 0] = total / count[last]
+        like: dict[str, Any] = {"dtype": dtype, "device": device}
+        self.register_buffer("basis", torch.as_tensor(basis, **like), persistent=False)
+        self.register_buffer("offset", torch.as_tensor(offset, **like), persistent=False)
+        self.free = nn.Parameter(torch.zeros(len(self._free), **like))
+
+    @property
+    def table(self) -> Tensor:
+        """All c_ik: (n, K)."""
+        return self.offset + self.basis @ self.free
+
+    @torch.no_grad()
+    def set(self, table: np.ndarray) -> None:
+        """Take the free c_ik from a table (n, K)."""
+        self.free.copy_(torch.as_tensor([float(table[i, k]) for i, k in self._free]))
+
+    def at(self, tau: float) -> np.ndarray:
+        """c_i(τ): (n,)."""
+        return self.table.detach().cpu().double().numpy() @ tau ** np.array(self.exponents, dtype=float)
+
+    def value(self, i: int, t: Time) -> Time:
+        """t^m c_i(t/Δt)."""
+        c = self.offset[i] + self.basis[i] @ self.free
+        tau = t / self.dt
+        return t**self.power * sum(c_k * tau**e for c_k, e in zip(c, self.exponents, strict=True))
+
+    def rate(self, i: int, t: Time) -> Time:
+        """Its time derivative."""
+        c = self.offset[i] + self.basis[i] @ self.free
+        tau, m = t / self.dt, self.power
+        return t ** (m - 1) * sum((m + e) * c_k * tau**e for c_k, e in zip(c, self.exponents, strict=True))

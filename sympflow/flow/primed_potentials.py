@@ -1,0 +1,103 @@
+"""Potentials made of a system's own functions, V(q), T(p) and −½|∇V(q)|²_{M⁻¹}, times functions of t."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from sympflow.flow.coefficients import Coefficients
+from sympflow.flow.potentials import Potential, Time
+
+if TYPE_CHECKING:
+    from sympflow.system import HamiltonianSystem
+
+
+class Binding:
+    """The system whose V and T a flow is primed with; shared by copies of the flow, stored in no file."""
+
+    def __init__(self, system: HamiltonianSystem | None) -> None:
+        self._system = system
+
+    @property
+    def known(self) -> bool:
+        return self._system is not None
+
+    @property
+    def system(self) -> HamiltonianSystem:
+        if self._system is None:
+            raise ValueError(
+                "`flow` is primed with the V and T of a system, which its file does not hold: "
+                "give it by sympflow.load(path, system=system) or flow.bind(system)."
+            )
+        return self._system
+
+    def bind(self, system: HamiltonianSystem) -> None:
+        self._system = system
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Binding:
+        return Binding(self._system)
+
+
+@dataclass(frozen=True)
+class Term:
+    """A function U(x) that a system defines, with its gradient; x is (N, d)."""
+
+    value: Callable[[HamiltonianSystem, Tensor], Tensor]
+    gradient: Callable[[HamiltonianSystem, Tensor], Tensor]
+
+
+def _force_gradient_value(system: HamiltonianSystem, q: Tensor) -> Tensor:
+    F = system.force(q)
+    return -(F * system.velocity(F)).sum(-1) / 2
+
+
+def _force_gradient(system: HamiltonianSystem, q: Tensor) -> Tensor:
+    return (system.potential_hessian(q) @ system.velocity(system.force(q))[..., None])[..., 0]
+
+
+POTENTIAL = Term(lambda system, q: system.potential(q), lambda system, q: -system.force(q))
+FORCE_GRADIENT = Term(_force_gradient_value, _force_gradient)
+"""−½|∇V|²_{M⁻¹}; −∇²V M⁻¹∇V."""
+KINETIC = Term(lambda system, p: system.kinetic(p), lambda system, p: system.velocity(p))
+
+
+class PrimedPotential(Potential):
+    """V(t, x) = Σ_j c_j(t) U_j(x), with U_j functions of the system and c_j(0) = 0.
+
+    Parameters
+    ----------
+    ndof : int
+    binding : Binding
+    terms : sequence of (Term, Coefficients, int)
+        U_j, and c_j as the column and row of a table.
+    """
+
+    def __init__(self, ndof: int, binding: Binding, terms: list[tuple[Term, Coefficients, int]]) -> None:
+        super().__init__()
+        self.ndof, self.binding = ndof, binding
+        self._terms = terms
+
+    def impulse(self, t: Time, x: Tensor) -> Tensor:
+        system = self.binding.system
+        return sum(c.value(i, t) * U.gradient(system, x.T).T for U, c, i in self._terms)  # type: ignore[return-value]
+
+    def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
+        system = self.binding.system
+        rate = sum(c.rate(i, t) * U.value(system, x.T) for U, c, i in self._terms)
+        return self.impulse(t, x), rate  # type: ignore[return-value]
+
+    def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
+        system = self.binding.system
+        impulse = tangent = torch.zeros_like(x)
+        for U, c, i in self._terms:
+            gradient, change = torch.func.jvp(lambda y, U=U: U.gradient(system, y.T).T, (x,), (dx,))[:2]
+            impulse = impulse + c.value(i, t) * gradient
+            tangent = tangent + c.rate(i, t) * gradient + c.value(i, t) * change
+        return impulse, tangent
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"type": "primed"}

@@ -1,0 +1,291 @@
+"""Primed SympFlows: splitting schemes whose coefficients depend on t, and SympFlows in every respect."""
+
+import copy
+import json
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+
+import sympflow
+from sympflow import HamiltonianSystem, SympFlow, get, solve, symplecticity_defect, systems, train
+from sympflow.integrators.schemes import SCHEMES
+
+EPS = np.finfo(float).eps
+HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
+MASSES = HamiltonianSystem.from_sympy(
+    "p1**2/4 + p1*p2/5 + p2**2 + q1**4/4 + q1*q2/3 + q2**2/2",
+    name="masses",
+    domain=sympflow.Ball([0.0] * 4, 1.0),
+    y0=[0.3, 0.1, -0.2, 0.4],
+)
+RELATIVISTIC = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**2/2", domain=sympflow.Ball([0.0, 0.0], 1.0))
+
+
+def random_flow(system, *, size=0.05, seed=0, **options):
+    """A flow with all its coefficients free of any pattern."""
+    flow = SympFlow.primed(system, **options).requires_grad_(False)
+    generator = torch.Generator().manual_seed(seed)
+    for parameter in flow.parameters():
+        parameter.add_(size * torch.randn(parameter.shape, generator=generator, dtype=torch.float64))
+    return flow
+
+
+def states(system, n=7, seed=0):
+    return torch.as_tensor(system.domain.sample(n, seed))
+
+
+FLOWS = {
+    "palindrome": lambda: random_flow(HH, stages=4, degree=5),
+    "free": lambda: random_flow(HH, stages=3, palindromic=False, degree=3),
+    "kick first": lambda: random_flow(PENDULUM, scheme="verlet", degree=3),
+    "from a force-gradient scheme": lambda: random_flow(MASSES, scheme="omelyan4"),
+    "without force gradient": lambda: random_flow(MASSES, scheme="blanes_moan4", force_gradient=False),
+    "kinetic energy not quadratic": lambda: random_flow(RELATIVISTIC, scheme="mclachlan4", palindromic=False),
+    "another dt": lambda: random_flow(HH, stages=2, dt=0.3, degree=1),
+}
+
+
+@pytest.fixture(params=FLOWS.values(), ids=FLOWS.keys())
+def flow(request):
+    return request.param()
+
+
+@pytest.mark.parametrize("name", SCHEMES)
+def test_untrained_it_is_the_scheme_at_every_t(name):
+    flow = SympFlow.primed(HH, scheme=name, dt=0.5, palindromic=SCHEMES[name].symmetric)
+    y = HH.domain.sample(4, 0)
+    for t in (0.07, 0.5):
+        expected = get(name)().step(HH, 0.0, y, t)
+        np.testing.assert_allclose(flow(t, torch.tensor(y)).detach().numpy(), expected, atol=32 * EPS)
+
+
+def test_stages_are_equal_leapfrog_steps():
+    flow, y = SympFlow.primed(HH, 5), HH.domain.sample(4, 0)
+    expected = solve(HH, "leapfrog", (0.0, 1.0), y0=y, dt=0.2).y[..., -1]
+    np.testing.assert_allclose(flow(1.0, torch.tensor(y)).detach().numpy(), expected, atol=32 * EPS)
+    assert flow.scheme().force_evaluations == 5
+
+
+def test_velocity_is_the_time_derivative(flow):
+    x = states(flow.system)
+    t = flow.dt * torch.linspace(0.0, 1.0, len(x), dtype=torch.float64)
+    y, dy = torch.func.jvp(lambda t: flow.psi(t, x), (t,), (torch.ones_like(t),))
+    torch.testing.assert_close(flow.psi_and_velocity(t, x), (y, dy), rtol=0, atol=64 * EPS)
+
+
+def test_the_hamiltonian_generates_the_flow(flow):
+    x, d = states(flow.system), flow.ndof
+    t = flow.dt * torch.linspace(0.0, 1.0, len(x), dtype=torch.float64)
+    y, dy = flow.psi_and_velocity(t, x)
+    gradient = torch.func.grad(lambda y: flow.hamiltonian(t, y).sum())(y)
+    torch.testing.assert_close(dy, torch.cat([gradient[:, d:], -gradient[:, :d]], 1), rtol=0, atol=1e3 * EPS)
+
+
+def test_at_time_zero_the_hamiltonian_is_the_systems(flow):
+    """Consistency, Σb(0) = Σa(0) = 1, whatever the parameters."""
+    x = states(flow.system)
+    torch.testing.assert_close(flow.hamiltonian(0.0, x), flow.system.hamiltonian(x), rtol=0, atol=32 * EPS)
+    for column in (flow.kicks, flow.drifts):
+        assert abs(column.at(0.0).sum() - 1) < 8 * EPS
+
+
+def test_inverse(flow):
+    x = states(flow.system)
+    for t in (0.4 * flow.dt, 2.3 * flow.dt, -1.7 * flow.dt):
+        torch.testing.assert_close(flow.inverse(t, flow(t, x)), x, rtol=0, atol=1e3 * EPS)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    scheme=st.sampled_from(["leapfrog", "verlet", "srkn6b", "omelyan6"]),
+    seed=st.integers(0, 10**6),
+    share=st.floats(0.01, 1.0),
+    degree=st.integers(1, 9),
+)
+def test_palindromes_are_time_reversible(scheme, seed, share, degree):
+    """ψ_{−t} = ψ_t⁻¹, and with the momenta reversed ρ ψ_t ρ = ψ_t⁻¹."""
+    flow = random_flow(HH, scheme=scheme, degree=degree, size=0.02, seed=seed)
+    x, t = states(HH, 3), share * flow.dt
+    rho = torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=torch.float64)
+    y = flow.psi(t, x)
+    torch.testing.assert_close(flow.psi(-t, y), x, rtol=0, atol=1e3 * EPS)
+    torch.testing.assert_close(rho * flow.psi(t, rho * y), x, rtol=0, atol=1e3 * EPS)
+    assert flow.scheme(t).symmetric
+
+
+def test_palindromes_halve_the_parameters():
+    full, half = SympFlow.primed(HH, 6, degree=5, palindromic=False), SympFlow.primed(HH, 6, degree=5)
+    assert full.n_parameters == 5 * (6 + 7 + 6) - 2
+    assert half.n_parameters == 3 * (3 + 4 + 3) - 2
+
+
+# frozen, it is a scheme: the compiled loops ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("span", [(0.0, 5.0), (0.5, 4.77), (4.0, 0.3)])
+@pytest.mark.parametrize("rows", [(), (3,), (2, 5)])
+def test_compiled_runs_agree_with_the_flow_to_rounding(flow, span, rows):
+    system = flow.system
+    y0 = system.domain.sample(10, 1)[: int(np.prod(rows))].reshape(*rows, -1)
+    times = np.linspace(*span, 9) if span[0] else None
+    kwargs = {"y0": y0, "t_eval": times, "on_domain_exit": "ignore"}
+    compiled, array = (solve(system, flow, span, backend=backend, **kwargs) for backend in ("compiled", "array"))
+    assert (compiled.stats["backend"], array.stats["backend"]) == ("compiled", "torch")
+    np.testing.assert_allclose(compiled.y, array.y, rtol=1e-12, atol=1e4 * EPS)
+    direct = [flow(float(t - span[0]), torch.tensor(y0)).numpy() for t in compiled.t]
+    np.testing.assert_allclose(compiled.y, np.stack(direct, -1), rtol=1e-12, atol=1e4 * EPS)
+
+
+def test_the_kernel_steps_each_state_by_its_own_time(flow):
+    from sympflow.kernels.primed_flow import PrimedFlowKernel
+
+    y = flow.system.domain.sample(6, 2)
+    h = flow.dt * np.array([1.0, 0.25, 0.0, -0.25, 0.25, -1.0])
+    expected = flow(torch.tensor(h), torch.tensor(y)).numpy()
+    np.testing.assert_allclose(PrimedFlowKernel(flow, flow.system).step(h, y), expected, atol=1e3 * EPS)
+
+
+def test_trained_weights_are_never_compiled_in():
+    flow = random_flow(HH, stages=2)
+    before = solve(HH, flow, (0.0, 3.0)).y
+    flow.kicks.free.add_(0.01)
+    assert np.abs(solve(HH, flow, (0.0, 3.0)).y - before).max() > 1e-4
+
+
+def test_evaluations_are_counted():
+    stats = solve(HH, random_flow(HH, scheme="verlet"), (0.0, 10.0), backend="array").stats
+    assert (stats["force_evaluations"], stats["hessian_evaluations"]) == (20, 20)
+    stats = solve(HH, random_flow(HH, stages=3), (0.0, 10.0)).stats
+    assert (stats["force_evaluations"], stats["hessian_evaluations"]) == (30, 30)
+
+
+def test_the_map_as_executed_is_symplectic(flow):
+    system = flow.system
+    sol = solve(system, flow, (0.0, 3.3 * flow.dt), y0=system.domain.sample(1, 5)[0], on_domain_exit="ignore")
+    assert symplecticity_defect(sol) < 1e-12
+
+
+# files and copies ------------------------------------------------------------------------------------------------
+
+
+def test_files_hold_the_numbers_and_solve_gives_the_system(flow, tmp_path):
+    path, system, x = tmp_path / "flow.safetensors", flow.system, states(flow.system)
+    flow.save(path)
+    loaded = sympflow.load(path)
+    assert loaded.scheme(0.4 * flow.dt) == flow.scheme(0.4 * flow.dt)
+    with pytest.raises(ValueError, match=r"^`flow` is primed with the V and T of a system"):
+        loaded(0.1, x)
+    y0 = system.domain.sample(2, 0)
+    sol = solve(system, loaded, (0.0, 2.5 * flow.dt), y0=y0, on_domain_exit="ignore")
+    np.testing.assert_array_equal(sol.y, solve(system, flow, (0.0, 2.5 * flow.dt), y0=y0, on_domain_exit="ignore").y)
+    assert torch.equal(sympflow.load(path, system=system)(0.3, x), flow(0.3, x))
+
+
+def test_another_system_is_refused(tmp_path):
+    path = tmp_path / "flow.safetensors"
+    random_flow(systems.harmonic_oscillator(2.0)).save(path)
+    for use in (
+        lambda: sympflow.load(path, system=PENDULUM),
+        lambda: sympflow.load(path).bind(PENDULUM),
+        lambda: solve(PENDULUM, sympflow.load(path), (0.0, 1.0)),
+    ):
+        with pytest.raises(ValueError, match=r"^`system` 'pendulum' is not the one"):
+            use()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"maps": 10**9},
+        {"maps": 4},
+        {"degree": 10**6},
+        {"degree": True},
+        {"first": "jump"},
+        {"palindromic": 1},
+        {"force_gradient": None},
+        {"degree": 3},
+    ],
+)
+def test_a_damaged_plan_is_refused(tmp_path, change):
+    path = tmp_path / "flow.safetensors"
+    random_flow(HH, degree=5).save(path)
+    content = path.read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    record = json.loads(json.loads(content[8 : 8 + length])["__metadata__"]["sympflow"])
+    record["architecture"]["primed"] |= change
+    path.write_bytes(save_tensors(load_tensors(content), {"sympflow": json.dumps(record)}))
+    with pytest.raises(ValueError, match="is not a usable flow"):
+        sympflow.load(path)
+
+
+def test_copies_share_the_system_and_not_the_numbers():
+    flow = random_flow(HH)
+    other = copy.deepcopy(flow)
+    other.kicks.free.zero_()
+    assert other.system is flow.system
+    assert not torch.equal(other(1.0, states(HH)), flow(1.0, states(HH)))
+
+
+def test_float32():
+    flow, double = SympFlow.primed(HH, 3, dtype=torch.float32), SympFlow.primed(HH, 3)
+    y, expected = flow(1.0, states(HH).float()), double(1.0, states(HH))
+    assert y.dtype == torch.float32
+    torch.testing.assert_close(y.double(), expected, rtol=0, atol=1e-6)
+    assert solve(HH, flow.requires_grad_(False), (0.0, 2.0), dtype="float32").y.dtype == np.float32
+
+
+# training by its residual ----------------------------------------------------------------------------------------
+
+
+def test_it_trains_like_any_sympflow():
+    start = SympFlow.primed(PENDULUM, 2, degree=3)
+    options = {"points": 60, "validation_points": 60, "reference_states": 20, "progress": False}
+    flow = train(PENDULUM, flow=start, optimizer="bfgs", steps=5, **options)
+    assert flow.figures["one_step_error"] < flow.history[0]["one_step_error"] / 10
+    assert flow.system is PENDULUM
+
+
+# bad arguments ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"stages": 0}, r"^`stages` must be a positive integer"),
+        ({"stages": 3, "scheme": "verlet"}, r"^`stages` and `scheme` were both given"),
+        ({"scheme": "rk4"}, r"^`scheme` 'rk4' is unknown"),
+        ({"degree": 0}, r"^`degree` must be a positive integer"),
+        ({"scheme": "chin4a", "force_gradient": False}, r"^`force_gradient` is False but 'chin4a'"),
+        ({"dt": -1.0}, r"^`dt` must be a positive"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        SympFlow.primed(HH, **arguments)
+
+
+def test_systems_it_does_not_apply_to():
+    with pytest.raises(ValueError, match=r"^`system` .* not separable"):
+        SympFlow.primed(HamiltonianSystem.from_sympy("p**2*q**2/2 + q**2"))
+    with pytest.raises(ValueError, match=r"^`force_gradient` needs"):
+        SympFlow.primed(RELATIVISTIC, force_gradient=True)
+    with pytest.raises(ValueError, match=r"^`scheme` 'srkn6b'|^`scheme` 'srkn11b' needs"):
+        SympFlow.primed(RELATIVISTIC, scheme="srkn11b")
+
+
+def test_asymmetric_schemes_make_no_palindrome():
+    from sympflow.integrators.schemes import Scheme
+
+    euler = Scheme("symplectic Euler", 1, (1.0,), (1.0,), (0.0,), "test")
+    with pytest.raises(ValueError, match=r"^`scheme` 'symplectic Euler' is not symmetric"):
+        SympFlow.primed(HH, scheme=euler)
+    flow = SympFlow.primed(HH, scheme=euler, palindromic=False)
+    assert flow.scheme(0.5).kicks == (1.0,)
+    for t in (0.0, -0.5, 1.5):
+        with pytest.raises(ValueError, match=r"^`t` must lie in \(0, dt\]"):
+            flow.scheme(t)
