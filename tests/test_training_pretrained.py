@@ -28,7 +28,7 @@ def test_shipped_sympflows_reach_their_targets(scene):
     figures = RECIPES[scene].measure(flow)
     one_step, energy = TARGETS[scene]
     assert figures["error_1"] <= one_step
-    assert figures["energy_error"] <= energy
+    assert figures["energy_error"] <= energy * RECIPES[scene].omega ** 2
     # Over many steps a chaotic orbit depends on the rounding, and so on the machine.
     for name, value in figures.items():
         assert flow.figures[name] == pytest.approx(value, rel=1e-3 if name in ("error_1", "error_10") else 0.5)

@@ -26,7 +26,7 @@ def measure(
     steps : int
         Over which the energy is followed.
     omega : float
-        Frequency of the system: states are measured as [q, p/ω] and energies as H/ω².
+        Frequency of the system: states are measured as [q, p/ω], energies in H's own units.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def measure(
             reference, reached = reference_step(system, reference, (k - reached) * flow.dt), k
             with np.errstate(all="ignore"):
                 figures[f"error_{k}"] = _mean(np.linalg.norm((y.cpu().numpy() - reference) / units, axis=-1))
-    energy = (largest / omega**2).cpu().numpy()
+    energy = largest.cpu().numpy()
     figures["energy_error"] = _mean(energy)
     figures["energy_error_max"] = float(energy.max()) if np.isfinite(energy).all() else None
     return figures
