@@ -29,8 +29,8 @@ class Solution:
         States [q, p], time last, as in SciPy.
     sol : callable or None
         Dense output: sol(t) has shape (..., 2d) for a number t, (..., 2d, n) for an array.
-    t_events, y_events : None
-        Events, as in SciPy.
+    t_events, y_events : list of ndarray or None
+        For each event its times (n,) and states (n, 2d); None if no events were asked for.
     nfev : int
         Force (right-hand side) evaluations.
     status : int, or ndarray of the batch's shape

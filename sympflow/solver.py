@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.domain import EnergySublevel
+from sympflow.events import EventSearch, parse
 from sympflow.integrators.base import Integrator, Outcome, Problem
 from sympflow.integrators.registry import build
 from sympflow.solution import Solution
@@ -30,6 +31,8 @@ def solve(
     dense_output: bool = False,
     save_every: int | None = None,
     dtype: Any = None,
+    events: Any = None,
+    event_step: float | None = None,
     backend: str = "auto",
     on_domain_exit: str | None = None,
     **options: Any,
@@ -54,6 +57,14 @@ def solve(
         Report every k-th step instead of each; not together with `t_eval`.
     dtype : "float32" or "float64", optional
         Precision for a NumPy `y0`.
+    events : callable or list of callables, optional
+        Functions g(t, y) of one state whose zeros are sought, as in SciPy: with the attribute `terminal` True, or a
+        count, the solution ends at the zero of that number; with `direction` positive (negative) only zeros where g
+        increases (decreases) count. They are located on the dense output, while the run streams by: no state is stored
+        for them. For single trajectories; `poincare_section` takes batches.
+    event_step : float, optional
+        Longest time between two samples of the event functions. The default is every step, which misses two zeros
+        within one; smaller values sample within steps, without changing the run.
     backend : "auto", "compiled" or "array"
         "auto" runs splitting methods on symbolic systems (and on Numba functions) and float64 NumPy states compiled,
         everything else with array operations. What ran is in `stats["backend"]`.
@@ -97,7 +108,8 @@ def solve(
     action = on_domain_exit or ("warn" if integrator.trained else "ignore")
     if action not in ("warn", "stop", "ignore"):
         raise ValueError(f"`on_domain_exit` must be 'warn', 'stop' or 'ignore'; got {on_domain_exit!r}.")
-    problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend)
+    search = _check_events(integrator, y_start, events, event_step)
+    problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend, search)
     _check_memory(integrator, problem)
 
     start = time.perf_counter()
@@ -117,6 +129,8 @@ def solve(
         t_span=(t0, t1),
         y0=y_start,
         sol=outcome.sol,
+        t_events=None if search is None else search.times(),
+        y_events=None if search is None else search.states(y_start),
     )
 
 
@@ -191,6 +205,26 @@ def _check_save_every(save_every: Any, times: np.ndarray | None) -> int:
     if not isinstance(save_every, int | np.integer) or isinstance(save_every, bool) or save_every < 1:
         raise ValueError(f"`save_every` must be a positive integer; got {save_every!r}.")
     return int(save_every)
+
+
+def _check_events(integrator: Integrator, y0: Array, events: Any, event_step: Any) -> EventSearch | None:
+    parsed = parse(events)
+    if not parsed:
+        if event_step is not None:
+            raise ValueError("`event_step` samples events, but there are none: pass `events`, or leave it out.")
+        return None if events is None else EventSearch(())
+    if y0.ndim != 1:
+        raise ValueError(
+            f"`events` are found along one trajectory, but `y0` is a batch of shape {tuple(y0.shape)}: solve one state "
+            "at a time, or use poincare_section, which takes batches."
+        )
+    if not integrator.finds_events:
+        raise ValueError(f"`events` are not found by method {integrator.name!r}: use another method.")
+    if event_step is None:
+        return EventSearch(parsed)
+    if not (isinstance(event_step, int | float | np.number) and event_step > 0):
+        raise ValueError(f"`event_step` must be a positive number, a time; got {event_step!r}.")
+    return EventSearch(parsed, float(event_step))
 
 
 def _check_memory(integrator: Integrator, problem: Problem) -> None:

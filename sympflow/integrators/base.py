@@ -9,8 +9,9 @@ An integrator is a frozen dataclass whose fields are its options (`dt`, `rtol`, 
 5. `steps(system, t_span, y0)` executes the same run again as a stream of the steps that it takes, and
 6. `tangent(system, t, y, h)` differentiates such a step, so that metrics judge the map that was really executed.
 7. `inverse(system, t, y, h)` undoes `step(system, t, y, h)` exactly, or raises a TypeError.
+8. `finds_events` is False, or `run` hands every step to `problem.events`, if there are any, and ends where that says.
 
-`FixedStep` does 4 to 6 for any integrator that has a step: a new one needs duties 1 to 3 only.
+`FixedStep` does 4, 5, 6 and 8 for any integrator that has a step: a new one needs duties 1 to 3 only.
 """
 
 from __future__ import annotations
@@ -18,13 +19,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from sympflow.arrays import Array, all_finite, is_tensor, stack, to_numpy
 from sympflow.integrators.grid import Grid
 from sympflow.system import HamiltonianSystem
+
+if TYPE_CHECKING:
+    from sympflow.events import EventSearch
 
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
 """Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
@@ -42,6 +46,7 @@ class Problem:
     save_every: int = 1
     dense_output: bool = False
     backend: str = "auto"
+    events: EventSearch | None = None
 
 
 @dataclass
@@ -66,6 +71,7 @@ class Integrator:
     order: ClassVar[int | None]
     symplectic: ClassVar[bool]
     trained: ClassVar[bool] = False
+    finds_events: ClassVar[bool] = False
 
     @classmethod
     def options(cls) -> tuple[str, ...]:
@@ -123,11 +129,10 @@ class FixedStep(Integrator):
 
     dt: float | None = None
 
+    finds_events: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
-        if self.dt is not None and not (
-            isinstance(self.dt, int | float | np.number) and not isinstance(self.dt, bool) and 0 < self.dt < math.inf
-        ):
-            raise ValueError(f"`dt` must be a positive and finite number; got {self.dt!r}.")
+        check_dt(self.dt)
 
     def step_length(self, system: HamiltonianSystem) -> float:
         """The step that is used for a system."""
@@ -148,6 +153,10 @@ class FixedStep(Integrator):
         return states, finite, "torch" if is_tensor(problem.y0) else "numpy"
 
     def run(self, problem: Problem) -> Outcome:
+        if problem.events is not None:
+            from sympflow.integrators.grid_events import run_with_events
+
+            return run_with_events(self, problem, problem.events)
         system = problem.system
         grid = Grid(problem.t0, problem.t1, self.step_length(system))
         t, count, remainder = grid.outputs(problem.t_eval, problem.save_every)
@@ -176,7 +185,8 @@ class FixedStep(Integrator):
         """Replace the states y[extra] by those a step h later."""
         lengths = np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), y[extra].shape[:-1]).copy()
         if not is_tensor(y):
-            y[extra] = self.step(system, 0.0, y[extra], lengths.astype(y.dtype))
+            with np.errstate(all="ignore"):
+                y[extra] = self.step(system, 0.0, y[extra], lengths.astype(y.dtype))
             return y
         import torch
 
@@ -198,6 +208,13 @@ class FixedStep(Integrator):
             y, k = states[n], k + n
         if grid.remainder:
             yield np.array([grid.time(k)]), y[None], np.array([grid.remainder])
+
+
+def check_dt(dt: Any) -> None:
+    """Raise unless `dt` is None or a step length."""
+    number = isinstance(dt, int | float | np.number) and not isinstance(dt, bool)
+    if dt is not None and not (number and 0 < dt < math.inf):
+        raise ValueError(f"`dt` must be a positive and finite number; got {dt!r}.")
 
 
 class GridSolution:

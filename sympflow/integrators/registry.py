@@ -11,6 +11,7 @@ from typing import Any
 
 from sympflow.integrators.base import Integrator
 from sympflow.integrators.schemes import SCHEMES
+from sympflow.integrators.tableaux import ADAPTIVE, FIXED
 
 GROUP = "sympflow.integrators"
 """The entry-point group in which a distribution announces its integrators: `name = "package.module:Class"`."""
@@ -18,16 +19,17 @@ GROUP = "sympflow.integrators"
 _BUILT_IN = {
     "rk45": "scipy_methods:RK45",
     "dop853": "scipy_methods:DOP853",
-    "dopri5": "torchdiffeq_methods:Dopri5",
     "sympflow": "sympflow:SympFlowIntegrator",
     "mlp": "sympflow:MLPIntegrator",
 }
+_TORCHDIFFEQ = (*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams")
+_NAMES = frozenset((*SCHEMES, *_BUILT_IN, *_TORCHDIFFEQ))
 _registered: dict[str, type[Integrator]] = {}
 
 
 def available() -> list[str]:
     """The names of all methods: built in, registered, and from plug-ins. Nothing is imported to list them."""
-    return sorted({*SCHEMES, *_BUILT_IN, *_registered, *_plugins()})
+    return sorted({*_NAMES, *_registered, *_plugins()})
 
 
 def get(method: str | type[Integrator]) -> type[Integrator]:
@@ -52,6 +54,10 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
         from sympflow.integrators.splitting import splitting
 
         return splitting(method)
+    if method in _TORCHDIFFEQ:
+        from sympflow.integrators.torchdiffeq_methods import torchdiffeq_method
+
+        return torchdiffeq_method(method)
     if method in _BUILT_IN:
         module, _, attribute = _BUILT_IN[method].partition(":")
         return getattr(import_module(f"sympflow.integrators.{module}"), attribute)
@@ -74,7 +80,7 @@ def register(name: str, integrator: type[Integrator]) -> None:
     TypeError
         If `integrator` is not a subclass of Integrator.
     """
-    if name in SCHEMES or name in _BUILT_IN:
+    if name in _NAMES:
         raise ValueError(f"`name` {name!r} is a built-in method, which cannot be replaced: choose another name.")
     if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
         raise TypeError(f"`integrator` must be a subclass of sympflow.integrators.base.Integrator; got {integrator!r}.")
@@ -116,7 +122,7 @@ def _is_flow(method: Any) -> bool:
 def _plugins() -> dict[str, EntryPoint]:
     found: dict[str, EntryPoint] = {}
     for point in entry_points(group=GROUP):
-        if point.name in SCHEMES or point.name in _BUILT_IN or point.name in found:
+        if point.name in _NAMES or point.name in found:
             warnings.warn(
                 f"The integrator {point.name!r} of {_distribution(point)} is ignored: the name is taken.",
                 RuntimeWarning,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,30 +13,12 @@ from sympflow.integrators.base import Integrator
 from sympflow.system import HamiltonianSystem
 
 
-@dataclass(frozen=True)
-class RungeKutta(Integrator):
-    """An explicit embedded Runge–Kutta method with step-size control.
-
-    Parameters
-    ----------
-    rtol, atol : float
-        The local error is kept below atol + rtol·|y|.
-    """
-
-    rtol: float = 1e-3
-    atol: float = 1e-6
+class ExplicitStep(Integrator):
+    """One step of an explicit Runge–Kutta method with the tableau A, B, and its derivative."""
 
     symplectic: ClassVar[bool] = False
-    A: ClassVar[np.ndarray]
-    B: ClassVar[np.ndarray]
-
-    def __post_init__(self) -> None:
-        for name in ("rtol", "atol"):
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and 0 <= value < math.inf):
-                raise ValueError(f"`{name}` must be a finite number, not negative; got {value!r}.")
-        if self.rtol == 0 and self.atol == 0:
-            raise ValueError("`rtol` and `atol` are both 0, which no step can meet: make one of them positive.")
+    A: ClassVar[Any]
+    B: ClassVar[Any]
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         """One step without error control."""
@@ -62,5 +44,27 @@ class RungeKutta(Integrator):
         return y + h * _weighted(self.B, K), identity + h[..., None] * _weighted(self.B, dK)
 
 
-def _weighted(weights: np.ndarray, K: list[Array]) -> Array:
+@dataclass(frozen=True)
+class RungeKutta(ExplicitStep):
+    """An explicit embedded Runge–Kutta method with step-size control.
+
+    Parameters
+    ----------
+    rtol, atol : float
+        The local error is kept below atol + rtol·|y|.
+    """
+
+    rtol: float = 1e-3
+    atol: float = 1e-6
+
+    def __post_init__(self) -> None:
+        for name in ("rtol", "atol"):
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and 0 <= value < math.inf):
+                raise ValueError(f"`{name}` must be a finite number, not negative; got {value!r}.")
+        if self.rtol == 0 and self.atol == 0:
+            raise ValueError("`rtol` and `atol` are both 0, which no step can meet: make one of them positive.")
+
+
+def _weighted(weights: Any, K: list[Array]) -> Array:
     return sum((float(w) * k for w, k in zip(weights, K, strict=False) if w), 0.0 * K[0])

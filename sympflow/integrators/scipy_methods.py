@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.integrate import RK45 as ScipyRK45
 from scipy.integrate import OdeSolution
 
 from sympflow.arrays import Array, is_tensor
+from sympflow.events import ENDED
 from sympflow.integrators.base import FINISHED, Outcome, Problem, Steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.runge_kutta import RungeKutta
@@ -36,6 +38,7 @@ class _Scipy(RungeKutta):
     first_step: float | None = None
 
     solver: ClassVar[Any]
+    finds_events: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -95,6 +98,10 @@ class _Scipy(RungeKutta):
             failure = f"The vector field or the first step is not finite at t = {t0:.17g}. Check `y0` and its scale."
         wanted = [] if t_eval is None else t_eval.tolist()
         outputs: list[np.ndarray] = [y0 for t in wanted if t == t0]
+        search = problem.events
+        if search is not None and t1 == t0:
+            search.step(t0, y0, t1, y0, lambda t: y0)
+        y_old = y0
         with np.errstate(all="ignore"):
             while solver is not None and solver.status == "running":
                 failure = solver.step()
@@ -105,15 +112,22 @@ class _Scipy(RungeKutta):
                     failure = f"The solution became non-finite after t = {solver.t_old:.17g}. End `t_span` earlier."
                     break
                 stats["n_steps"] += 1
-                due = [t for t in wanted[len(outputs) :] if (solver.t - t) * solver.direction >= 0]
+                t, y, interpolant = solver.t, solver.y, None
+                if search is not None:
+                    interpolant = _Lazily(solver.dense_output)
+                    t, y = search.step(solver.t_old, y_old, t, y, interpolant) or (t, y)
+                due = [s for s in wanted[len(outputs) :] if (t - s) * solver.direction >= 0]
                 if problem.dense_output or due:
-                    interpolants.append(solver.dense_output())
-                    outputs += [solver.y if t == solver.t else interpolants[-1](t) for t in due]
-                    if not problem.dense_output:
-                        interpolants.clear()
+                    interpolant = solver.dense_output() if interpolant is None else interpolant.output
+                    outputs += [y if s == t else interpolant(s) for s in due]
+                    if problem.dense_output:
+                        interpolants.append(interpolant)
                 if t_eval is None or problem.dense_output:
-                    times.append(solver.t)
-                    states.append(solver.y)
+                    times.append(t)
+                    states.append(y)
+                if search is not None and search.end is not None:
+                    break
+                y_old = y
         stats["force_evaluations"] = 0 if solver is None else int(solver.nfev)
         if t_eval is None:
             keep = sorted({*range(0, len(times), problem.save_every), len(times) - 1})
@@ -121,6 +135,8 @@ class _Scipy(RungeKutta):
         else:
             t, y = t_eval[: len(outputs)], np.array(outputs).reshape(-1, len(y0))
         outcome = Outcome(t, y.astype(y0.dtype), -1 if failure else 0, failure or FINISHED, stats)
+        if search is not None and search.end is not None:
+            outcome.status, outcome.message = 1, ENDED
         if problem.dense_output:
             outcome.sol = OdeSolution(times, interpolants) if interpolants else _Constant(y0)
         return outcome
@@ -145,6 +161,20 @@ class _Scipy(RungeKutta):
                     h[i], y_next[i] = solver.t - t[i], solver.y
             yield t.reshape(1, *batch).copy(), y.reshape(1, *y0.shape), h.reshape(1, *batch)
             t, y = t + h, y_next
+
+
+class _Lazily:
+    """The interpolant of a step, built when it is first needed (DOP853's costs evaluations)."""
+
+    def __init__(self, build: Any) -> None:
+        self._build = build
+
+    @cached_property
+    def output(self) -> Any:
+        return self._build()
+
+    def __call__(self, t: float) -> np.ndarray:
+        return self.output(t)
 
 
 class _Constant:

@@ -1,0 +1,180 @@
+"""Events: the zeros of functions g(t, y) along a solution, found step by step while it is computed."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import brentq
+
+from sympflow.arrays import Array, stack, to_numpy
+
+EventFunction = Callable[[float, Array], Any]
+Dense = Callable[[float], Array]
+"""The state at a time within one step."""
+
+_EPS = float(np.finfo(float).eps)
+
+ENDED = "A termination event occurred."
+
+
+@dataclass(frozen=True)
+class Event:
+    """A function g(t, y) with SciPy's attributes.
+
+    Attributes
+    ----------
+    g : callable
+        g(t, y) for one state y (2d,) returns a number, zero at the event.
+    limit : float
+        The solution ends at this occurrence; infinite if the event does not end it.
+    direction : float
+        Positive: only where g increases. Negative: only where it decreases. Zero: both.
+    label : str
+        How messages name it.
+    """
+
+    g: EventFunction
+    limit: float = math.inf
+    direction: float = 0.0
+    label: str = "`events`"
+
+    def value(self, t: float, y: Array) -> float:
+        value = self.g(t, y)
+        try:
+            return float(to_numpy(value))
+        except (TypeError, ValueError) as error:
+            raise TypeError(
+                f"{self.label} must return one number for a time and a state of shape {tuple(y.shape)}; {error}. "
+                "Return a scalar, e.g. y[0]."
+            ) from error
+
+    def crossed(self, before: float, after: float) -> bool:
+        """Whether the sign changed in the direction that is asked for, from `before` to `after`."""
+        up, down = before <= 0 <= after, before >= 0 >= after
+        return (up and self.direction >= 0) or (down and self.direction <= 0)
+
+
+def parse(events: Any) -> tuple[Event, ...]:
+    """Events from a function or a list of functions that may bear `terminal` and `direction`.
+
+    `terminal` is True, or the number of occurrences after which to end; `direction` is a number whose sign counts.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If one is not callable, or has a `terminal` that is no count.
+    """
+    if events is None:
+        return ()
+    functions = (events,) if callable(events) else events
+    if not isinstance(functions, Sequence):
+        raise TypeError(f"`events` must be a function g(t, y) or a list of them; got {type(events).__name__}.")
+    return tuple(_parse_one(g, f"`events[{i}]`" if len(functions) > 1 else "`events`") for i, g in enumerate(functions))
+
+
+def _parse_one(g: Any, label: str) -> Event:
+    if not callable(g):
+        raise TypeError(f"{label} must be a function g(t, y); got {type(g).__name__}.")
+    terminal, direction = getattr(g, "terminal", None), getattr(g, "direction", 0)
+    if terminal is None or terminal is False or terminal == 0:
+        limit = math.inf
+    elif isinstance(terminal, int | float | np.number) and terminal > 0 and int(terminal) == terminal:
+        limit = float(terminal)
+    else:
+        raise ValueError(f"{label} has `terminal` = {terminal!r}: make it True, False or a positive count.")
+    if not isinstance(direction, int | float | np.number) or math.isnan(direction):
+        raise ValueError(f"{label} has `direction` = {direction!r}: make it a positive or negative number, or 0.")
+    return Event(g, limit, float(direction), label)
+
+
+class EventSearch:
+    """The events of one run. The integrator hands over every step; the zeros inside are located by Brent's method.
+
+    A zero that falls exactly on the end of a step counts once, in that step; one at t0 counts, as in SciPy.
+
+    Parameters
+    ----------
+    events : tuple of Event
+    max_interval : float
+        Longest time between two samples of the event functions: longer steps are sampled in between, at equal parts.
+
+    Attributes
+    ----------
+    end : (float, state) or None
+        Where a terminal event ended the run; `step` returns it too.
+    n_dense : int
+        Evaluations of the dense output.
+    """
+
+    def __init__(self, events: tuple[Event, ...], max_interval: float = math.inf) -> None:
+        self.events, self.max_interval = events, max_interval
+        self.found: list[list[tuple[float, Array]]] = [[] for _ in events]
+        self.values: list[float] | None = None
+        self.end: tuple[float, Array] | None = None
+        self.n_dense = 0
+
+    def step(self, t_old: float, y_old: Array, t: float, y: Array, dense: Dense) -> tuple[float, Array] | None:
+        """Search one step from (t_old, y_old) to (t, y): where the run ends in it, if it does."""
+        first = self.values is None
+        if first:
+            self.values = [event.value(t_old, y_old) for event in self.events]
+
+        def inside(s: float) -> Array:
+            if s in (t, t_old):
+                return y if s == t else y_old
+            self.n_dense += 1
+            return dense(s)
+
+        for a, b in self._parts(t_old, t):
+            y_b = inside(b)
+            if self._part(a, b, y_b, inside, first):
+                return self.end
+            first = False
+        return None
+
+    def _parts(self, t_old: float, t: float) -> Iterator[tuple[float, float]]:
+        n = max(1, math.ceil(abs(t - t_old) / self.max_interval * (1 - 4 * _EPS)))
+        ends = [t_old + (t - t_old) * i / n for i in range(n)] + [t]
+        return itertools.pairwise(ends)
+
+    def _part(self, a: float, b: float, y_b: Array, inside: Dense, first: bool) -> bool:
+        before = self.values
+        assert before is not None
+        self.values = after = [event.value(b, y_b) for event in self.events]
+        zeros: list[tuple[float, int]] = []
+        for i, event in enumerate(self.events):
+            if (before[i] or first) and event.crossed(before[i], after[i]):
+                zeros.append((self._locate(event, a, b, before[i], after[i], inside), i))
+        for t, i in sorted(zeros, key=lambda zero: zero[0] if b >= a else -zero[0]):
+            y = inside(t)
+            self.found[i].append((t, y))
+            if len(self.found[i]) >= self.events[i].limit:
+                self.end = (t, y)
+                return True
+        return False
+
+    def _locate(self, event: Event, a: float, b: float, g_a: float, g_b: float, inside: Dense) -> float:
+        """The zero in [a, b], to rounding."""
+        if g_a == 0 or a == b:
+            return a
+        if g_b == 0:
+            return b
+        known = {a: g_a, b: g_b}
+
+        def g(s: float) -> float:
+            return known[s] if s in known else event.value(s, inside(s))
+
+        return float(brentq(g, a, b, xtol=4 * _EPS, rtol=4 * _EPS))
+
+    def times(self) -> list[np.ndarray]:
+        """`t_events` of the solution: one array for each event."""
+        return [np.array([t for t, _ in zeros], dtype=float) for zeros in self.found]
+
+    def states(self, y0: Array) -> list[Array]:
+        """`y_events` of the solution: an array (n, 2d) for each event, like `y0`."""
+        return [stack([y for _, y in zeros], axis=0) if zeros else y0[None][:0] for zeros in self.found]
