@@ -29,10 +29,13 @@ def page(results: Results, figure: Path) -> str:
 def machine(results: Results) -> str:
     e = results.environment
     versions = ", ".join(f"{name} {version}" for name, version in e["versions"].items())
+    spreads = sorted(row.spread / row.seconds for row in results.rows)
+    middle, most = spreads[len(spreads) // 2], spreads[-1]
     return (
-        f"Measured on one thread of {e['processor']} ({e['cores']} cores, {e['system']}; load average {e['load']:.1f} "
-        f"at the start), {e['repeats']} interleaved rounds, {e['minutes']:.1f} minutes in all. Versions: {versions}. "
-        "Ratios carry over to other machines better than times."
+        f"Measured on one thread of {e['processor']} ({e['cores']} cores, shared with other jobs; {e['system']}; load "
+        f"average {e['load']:.1f} at the start), in {e['repeats']} interleaved rounds and {e['minutes']:.1f} minutes. The "
+        f"interquartile range over the rounds is {middle:.1%} of the time for half of the rows, {most:.0%} at most. "
+        f"Versions: {versions}. Ratios carry over to other machines better than times."
     )
 
 
@@ -101,11 +104,9 @@ def work_table(results: Results, n: int) -> str:
 
 def same_steps(package: str, label: str) -> bool:
     """Whether the steps are those of another row: our Verlet's, or SciPy's with the other right-hand side."""
-    return (
-        package in ("Numba", "NumPy", "torch")
-        or label.startswith("leapfrog")
-        or "scalar" in label.rsplit(", ", maxsplit=1)[-1]
-    )
+    if package == "SciPy":
+        return "scalar" in label
+    return package in ("Numba", "NumPy", "torch") or label.startswith("leapfrog")
 
 
 def first_call_table(results: Results) -> str:
