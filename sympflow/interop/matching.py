@@ -1,0 +1,67 @@
+"""Is the right-hand side that a peer was given the system that our method solves?"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+
+from sympflow.arrays import to_numpy
+from sympflow.integrators.base import FixedStep
+from sympflow.system import HamiltonianSystem
+
+
+def own_velocity(integrator: FixedStep, system: HamiltonianSystem | None, y: np.ndarray) -> np.ndarray:
+    """The velocity at y of the motion that the integrator computes: ∂_tψ̄ at t = 0 for a flow, else J∇H."""
+    if not integrator.trained:
+        assert system is not None
+        return system.vector_field(y)
+    import torch
+
+    flow = integrator.flow_for(system)  # type: ignore[attr-defined]
+    with torch.no_grad():
+        return to_numpy(flow.velocity(0.0, torch.from_numpy(np.array(y)).to(flow.dtype)))
+
+
+def warn_of_another_system(
+    integrator: FixedStep, system: HamiltonianSystem | None, y: np.ndarray, slope: np.ndarray, stacklevel: int
+) -> None:
+    """Warn if `slope`, the right-hand side at y, is not the velocity of the method's own motion.
+
+    A flow is trained to a residual: it may differ by a tenth of the largest velocity.
+    """
+    velocity = own_velocity(integrator, system, y)
+    allowed = (0.1 if integrator.trained else 1e-6) * max(np.abs(slope).max(), np.abs(velocity).max(), 1e-3)
+    if velocity.shape == slope.shape and np.abs(velocity - slope).max() > allowed:
+        warnings.warn(
+            f"The method {integrator.name!r} moves the initial state with velocity {_short(velocity)}, but the "
+            f"right-hand side there is {_short(slope)}: it solves its own system, not this one. Pass the system, or "
+            "the flow, that belongs to the right-hand side.",
+            UserWarning,
+            stacklevel=stacklevel,
+        )
+
+
+def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
+    """The fixed-step integrator that `method` and `options` mean.
+
+    Raises
+    ------
+    TypeError
+        If the method chooses its own steps: the peer has such methods itself.
+    """
+    from sympflow.integrators.registry import build
+
+    integrator = build(method, options)
+    if not isinstance(integrator, FixedStep):
+        raise TypeError(
+            f"`method` {integrator.name!r} is no fixed-step map, which is what can be handed to {peer}: use a "
+            f"splitting method or a trained flow, or {peer}'s own method."
+        )
+    return integrator
+
+
+def _short(v: np.ndarray) -> str:
+    shown = ", ".join(f"{x:.3g}" for x in v.ravel()[:4])
+    return f"({shown}{', …' if v.size > 4 else ''})"

@@ -1,0 +1,200 @@
+"""Our methods inside `scipy.integrate.solve_ivp`, through SciPy's public `OdeSolver` and `DenseOutput`."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import deque
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.integrate import DenseOutput, OdeSolver
+
+from sympflow.integrators.base import FixedStep, Problem
+from sympflow.integrators.grid import Grid
+from sympflow.interop.matching import fixed_step, warn_of_another_system
+from sympflow.system import HamiltonianSystem
+
+LOOK_AHEAD = 64
+
+
+def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: Any) -> type[FlowSolver]:
+    """An `OdeSolver` class for ``solve_ivp(fun, t_span, y0, method=...)`` that runs one of our methods.
+
+    The steps, the dense output (ψ̄ at the fractional time, no interpolation), `t_eval`, events, `args`, empty and
+    backward intervals are those of `solve`. `max_step` samples the flow within its steps, so that events between them
+    are seen; the steps themselves stay on the grid t0 + k·dt, since shorter ones would be another map.
+
+    Parameters
+    ----------
+    method : trained flow, str or Integrator
+        A flow, a name such as "verlet" or "sympflow" (the shipped flow), or a configured integrator.
+    system : HamiltonianSystem, optional
+        What is solved. A flow knows its own; otherwise it may only be left out if `fun` is a HamiltonianSystem.
+    **options
+        Options of the method, such as `dt`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the method does not apply to the system, is adaptive, or has no such option.
+
+    Examples
+    --------
+    >>> from scipy.integrate import solve_ivp
+    >>> import sympflow
+    >>> system = sympflow.systems.henon_heiles()
+    >>> Verlet = as_scipy("verlet", system, dt=0.1)
+    >>> solve_ivp(system, (0, 10), system.y0, method=Verlet).y.shape
+    (4, 101)
+    """
+    if system is not None and not isinstance(system, HamiltonianSystem):
+        raise TypeError(
+            f"`system` must be a HamiltonianSystem; got {type(system).__name__}. See sympflow.interop.systems."
+        )
+    integrator = fixed_step(method, options, "SciPy")
+    if system is not None:
+        integrator.check(system)
+    name = f"{integrator.name.title().replace('_', '')}Solver"
+    return type(name, (FlowSolver,), {"integrator": integrator, "system": system, "__doc__": FlowSolver.__doc__})
+
+
+class FlowSolver(OdeSolver):
+    """A fixed-step method of sympflow as a SciPy solver, on the grid t0 + k·dt. Made by `as_scipy`.
+
+    Parameters
+    ----------
+    fun, t0, y0, t_bound, vectorized
+        As for every `OdeSolver`. `fun` is evaluated once, to warn if it is not the system of the method.
+    max_step : float
+        Longest time between two reported states; they are samples of the flow within its steps.
+    """
+
+    integrator: ClassVar[FixedStep]
+    system: ClassVar[HamiltonianSystem | None]
+    t: Any
+    y: Any
+
+    def __init__(
+        self,
+        fun: Callable[..., Any],
+        t0: float,
+        y0: Any,
+        t_bound: float,
+        vectorized: bool = False,
+        max_step: float = math.inf,
+        **extraneous: Any,
+    ) -> None:
+        if extraneous:
+            warnings.warn(
+                f"The options {', '.join(sorted(extraneous))} have no effect on a fixed-step method: leave them out.",
+                UserWarning,
+                stacklevel=3,
+            )
+        if not max_step > 0:
+            raise ValueError(f"`max_step` must be positive; got {max_step!r}.")
+        if not (math.isfinite(t0) and math.isfinite(t_bound)):
+            raise ValueError(f"`t_span` must be finite; got ({t0}, {t_bound}). Choose an end that can be reached.")
+        super().__init__(fun, t0, y0, t_bound, vectorized)
+        self._check(fun)
+        system = self._solved
+        self._grid = Grid(t0, t_bound, self.integrator.step_length(system))
+        self._parts = max(1, math.ceil(abs(self._grid.h) / max_step * (1 - 1e-12)))
+        self._k, self._part = 0, 0  # the grid point before the state, and the sample after it
+        self._t_anchor, self._anchor = float(t0), self.y
+        self._next_anchor = (self._t_anchor, self.y)
+        self._ahead: deque[np.ndarray] = deque()
+        self._block = 1
+
+    def _check(self, fun: Callable[..., Any]) -> None:
+        self._solved: Any = self.system
+        if self._solved is None and isinstance(fun, HamiltonianSystem):
+            self._solved = fun
+        integrator = self.integrator
+        if (self._solved is None and not integrator.trained) or (integrator.trained and self._flow() is None):
+            raise TypeError(
+                f"`system` is needed for method {integrator.name!r}: as_scipy({integrator.name!r}, system), or pass a "
+                "HamiltonianSystem as `fun`."
+            )
+        size = 2 * (self._solved.ndof if self._solved is not None else self._flow().ndof)
+        if self.n != size:
+            raise ValueError(f"`y0` must have length {size}, [q, p]; got {self.n}.")
+        if not np.isfinite(self.y).all():
+            raise ValueError("`y0` must be finite; it holds NaN or infinity.")
+        if self._solved is not None and self._solved is not self.system:
+            integrator.check(self._solved)
+        self.y = self.y.astype(float)
+        with np.errstate(all="ignore"):
+            slope = np.asarray(self.fun(self.t, self.y), dtype=float)
+        if slope.shape != self.y.shape:
+            raise ValueError(f"`fun` must return shape {self.y.shape}, as `y0`; got {slope.shape}.")
+        if np.isfinite(slope).all():
+            warn_of_another_system(integrator, self._solved, self.y, slope, stacklevel=5)
+
+    def _flow(self) -> Any:
+        """The flow, or None if it cannot be known without a system."""
+        integrator: Any = self.integrator
+        return integrator.flow if self._solved is None else integrator.flow_for(self._solved)
+
+    def _step_impl(self) -> tuple[bool, str | None]:
+        grid = self._grid
+        if self._part == 0:
+            self._t_anchor, self._anchor = self._next_anchor
+            whole = self._k < grid.n_steps
+            self._h = grid.h if whole else grid.remainder
+            self._end = grid.time(self._k + 1) if whole else grid.t1
+            y_end = self._whole_step() if whole else self._shorter(self._h)
+            if not np.isfinite(y_end).all():
+                return False, (
+                    f"The solution became non-finite after t = {self.t:.17g} (step {self._k + 1}). Reduce `dt`, or end "
+                    "`t_span` earlier."
+                )
+            self._next_anchor = (self._end, y_end)
+        self._part += 1
+        if self._part == self._parts:
+            self._k, self._part = self._k + 1, 0
+            self.t, self.y = self._next_anchor
+        else:
+            h = self._h * self._part / self._parts
+            self.t, self.y = self._t_anchor + h, self._shorter(h)
+        return True, None
+
+    def _whole_step(self) -> np.ndarray:
+        """The state at the next grid point. Steps are computed a few ahead, where a compiled loop is cheap."""
+        if not self._ahead:
+            n = min(self._block, self._grid.n_steps - self._k)
+            self._block = min(2 * self._block, LOOK_AHEAD)
+            piece = Problem(self._solved, self._t_anchor, self._t_anchor + n * self._grid.h, self._anchor)
+            states, _, backend = self.integrator.rollout(piece, self._grid.h, n, np.arange(1, n + 1))
+            self._ahead.extend(states)
+            self.nfev += self.integrator.evaluations(n, n, 0, backend)["force_evaluations"]
+        return self._ahead.popleft()
+
+    def _shorter(self, h: float) -> np.ndarray:
+        self.nfev += self.integrator.evaluations(0, 0, 1, "array")["force_evaluations"]
+        with np.errstate(all="ignore"):
+            return self.integrator.step(self._solved, self._t_anchor, self._anchor, h)
+
+    def _dense_output_impl(self) -> DenseOutput:
+        return FlowOutput(self, self._t_anchor, self._anchor)
+
+
+class FlowOutput(DenseOutput):
+    """The state between two outputs: a shorter step from the grid point before."""
+
+    def __init__(self, solver: Any, t_anchor: float, anchor: np.ndarray) -> None:
+        super().__init__(solver.t_old, solver.t)
+        self._integrator, self._system = solver.integrator, solver._solved
+        self._t_anchor, self._anchor, self._y = t_anchor, anchor, solver.y
+
+    def _call_impl(self, t: np.ndarray) -> np.ndarray:
+        times = np.atleast_1d(t).astype(float)
+        states = np.repeat(self._anchor[None], len(times), axis=0)
+        h = times - self._t_anchor
+        moving = (h != 0) & (times != self.t)
+        states[times == self.t] = self._y
+        if moving.any():
+            with np.errstate(all="ignore"):
+                states[moving] = self._integrator.step(self._system, self._t_anchor, states[moving], h[moving])
+        return states.T if t.ndim else states[0]

@@ -1,0 +1,181 @@
+"""Our methods inside `solve_ivp`: the same numbers as `solve`, and all that SciPy's driver asks of a solver."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from sympflow import MLPFlow, SympFlow, get, solve, systems
+from sympflow.interop.scipy import as_scipy
+
+HH, OSCILLATOR = systems.henon_heiles(), systems.harmonic_oscillator()
+EPS = np.finfo(float).eps
+METHODS = ["verlet", "kahan_li8", "srkn14a", "rk4", "sympflow"]
+BLOW_UP = [0.0, 0.0, 0.0, 0.7]
+
+
+def solver(method, **options):
+    return as_scipy(method, HH, **({} if method == "sympflow" else {"dt": 0.1}), **options)
+
+
+def same(method, t_span, y0=HH.y0, **arguments):
+    extra = {} if method == "sympflow" else {"dt": 0.1}
+    return solve(HH, method, t_span, y0=y0, on_domain_exit="ignore", **extra, **arguments)
+
+
+@pytest.mark.parametrize("method", METHODS)
+class TestEveryMethod:
+    @pytest.mark.parametrize("t_span", [(0.0, 10.0), (0.5, 7.77), (3.0, -4.2)])
+    def test_steps_and_states_are_those_of_solve(self, method, t_span):
+        ours, theirs = same(method, t_span), solve_ivp(HH, t_span, HH.y0, method=solver(method))
+        np.testing.assert_allclose(theirs.t, ours.t, rtol=4 * EPS)
+        np.testing.assert_allclose(theirs.y, ours.y, atol=200 * EPS)
+        assert (theirs.status, theirs.success, theirs.message) == (0, True, ours.message)
+
+    def test_t_eval_and_dense_output(self, method):
+        times = np.array([0.0, 0.3, 1.0, 2.345, 5.0])
+        theirs = solve_ivp(HH, (0, 5), HH.y0, method=solver(method), t_eval=times, dense_output=True)
+        ours = same(method, (0, 5), t_eval=times)
+        np.testing.assert_allclose(theirs.y, ours.y, atol=200 * EPS)
+        np.testing.assert_allclose(theirs.sol(times), theirs.y, atol=200 * EPS)
+        every = solve_ivp(HH, (0, 5.5), HH.y0, method=solver(method), dense_output=True)
+        np.testing.assert_allclose(every.sol(every.t), every.y, atol=200 * EPS)
+
+    def test_events(self, method):
+        def section(t, y):
+            return y[0]
+
+        def third(t, y):
+            return y[1] - 0.1
+
+        section.direction, third.terminal = 1, 3
+        for t_span in ((0, 60), (0, -60)):
+            theirs = solve_ivp(HH, t_span, HH.y0, method=solver(method), events=[section, third])
+            ours = same(method, t_span, events=[section, third])
+            assert theirs.status == ours.status == 1
+            for i in range(2):
+                np.testing.assert_allclose(theirs.t_events[i], ours.t_events[i], rtol=1e-10)
+                np.testing.assert_allclose(theirs.y_events[i], ours.y_events[i], atol=1e-9)
+
+    def test_max_step_samples_the_same_run(self, method):
+        coarse = solve_ivp(HH, (0, 3), HH.y0, method=solver(method))
+        fine = solve_ivp(HH, (0, 3), HH.y0, method=solver(method), max_step=0.04, dense_output=True)
+        n = round((len(fine.t) - 1) / (len(coarse.t) - 1))
+        assert n == np.ceil(np.diff(coarse.t)[0] / 0.04 - 1e-9)
+        np.testing.assert_allclose(fine.y[:, ::n], coarse.y, atol=200 * EPS)
+        np.testing.assert_allclose(fine.sol(fine.t), fine.y, atol=200 * EPS)
+
+    def test_an_empty_interval(self, method):
+        sol = solve_ivp(HH, (2, 2), HH.y0, method=solver(method), dense_output=True)
+        np.testing.assert_array_equal(sol.y[:, -1], HH.y0)
+        np.testing.assert_array_equal(sol.sol(2.0), HH.y0)
+
+    def test_args_are_handed_to_fun_and_events(self, method):
+        def fun(t, y, scale):
+            return scale * HH(t, y)
+
+        sol = solve_ivp(fun, (0, 3), HH.y0, method=solver(method), args=(1.0,), events=lambda t, y, scale: y[0] * scale)
+        np.testing.assert_allclose(sol.y, same(method, (0, 3)).y, atol=200 * EPS)
+        assert sol.t_events[0].size
+
+
+def test_evaluations_are_counted():
+    """`fun` once, for the check; then what the method evaluates: Verlet one force a step and one at each opening."""
+    assert solve_ivp(HH, (0, 50), HH.y0, method=as_scipy("sympflow", HH)).nfev == 1
+    nfev = solve_ivp(HH, (0, 10), HH.y0, method=as_scipy("rk4", HH, dt=0.1)).nfev
+    assert nfev == 1 + 4 * 100
+    assert 100 < solve_ivp(HH, (0, 10), HH.y0, method=as_scipy("verlet", HH, dt=0.1)).nfev <= 1 + 2 * 100 + 16
+
+
+def test_the_exact_flow_finds_all_zeros(rotation):
+    sol = solve_ivp(OSCILLATOR, (0, 200), [1.0, 0.0], method=as_scipy(rotation), events=lambda t, y: y[0])
+    np.testing.assert_allclose(sol.t_events[0], np.pi * (np.arange(64) + 0.5), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(sol.y, [np.cos(sol.t), -np.sin(sol.t)], atol=1e-13)
+
+
+def test_two_events_within_a_step_are_seen_with_max_step(rotation):
+    arguments = {"events": lambda t, y: (t - 0.2) * (t - 0.8), "method": as_scipy(rotation)}
+    assert solve_ivp(OSCILLATOR, (0, 2), [1.0, 0.0], **arguments).t_events[0].size == 0
+    assert solve_ivp(OSCILLATOR, (0, 2), [1.0, 0.0], max_step=0.3, **arguments).t_events[0].size == 2
+
+
+def test_a_blow_up_ends_with_status_minus_one():
+    sol = solve_ivp(HH, (0, 20), BLOW_UP, method=as_scipy("verlet", HH, dt=0.01))
+    assert (sol.status, sol.success) == (-1, False)
+    assert "non-finite after t = 5." in sol.message
+    assert np.isfinite(sol.y).all()
+
+
+def test_a_warning_where_fun_is_another_system(rotation):
+    other = systems.harmonic_oscillator(3.0)
+    for method in (as_scipy(rotation), as_scipy("verlet", OSCILLATOR)):
+        with pytest.warns(UserWarning, match="solves its own system, not this one"):
+            solve_ivp(other, (0, 1), [1.0, 0.5], method=method)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            solve_ivp(lambda t, y: [y[1], -y[0]], (0, 1), [1.0, 0.5], method=method)
+
+
+def test_a_flow_and_a_name_without_system():
+    flow = get("sympflow")().flow_for(HH)
+    by_flow = solve_ivp(HH, (0, 5), HH.y0, method=as_scipy(flow))
+    np.testing.assert_array_equal(by_flow.y, solve_ivp(HH, (0, 5), HH.y0, method=as_scipy("sympflow")).y)
+    by_name = solve_ivp(HH, (0, 1), HH.y0, method=as_scipy("verlet", dt=0.1))
+    np.testing.assert_allclose(by_name.y, same("verlet", (0, 1)).y, atol=8 * EPS)
+
+
+class TestBadInput:
+    def test_at_the_door(self):
+        with pytest.raises(TypeError, match=r"^`method` 'rk45' is no fixed-step map"):
+            as_scipy("rk45", HH)
+        with pytest.raises(ValueError, match=r"^`method` 'nothing' is unknown"):
+            as_scipy("nothing", HH)
+        with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem; got function"):
+            as_scipy("verlet", lambda t, y: y)
+        with pytest.raises(TypeError, match=r"^`rtol` is not an option"):
+            as_scipy("verlet", HH, rtol=1e-3)
+        with pytest.raises(ValueError, match=r"^`system` .* degrees of freedom"):
+            as_scipy(SympFlow(1), HH)
+        with pytest.raises(ValueError, match="no shipped sympflow flow"):
+            as_scipy("sympflow", systems.harmonic_oscillator(3.7))
+
+    @pytest.mark.parametrize(
+        ("fun", "y0", "error", "message"),
+        [
+            (HH, np.zeros((4, 1)), ValueError, "`y0` must be 1-dimensional"),
+            (HH, np.array(HH.y0, dtype=complex), ValueError, "complex"),
+            (HH, [1.0, 0.0], ValueError, r"^`y0` must have length 4"),
+            (HH, [np.nan, 0.0, 0.0, 0.0], ValueError, "`y0` must be finite"),
+            (lambda t, y: y[:2], HH.y0, ValueError, r"^`fun` must return shape \(4,\)"),
+        ],
+    )
+    def test_of_states_and_right_hand_sides(self, fun, y0, error, message):
+        with pytest.raises(error, match=message):
+            solve_ivp(fun, (0, 1), y0, method=as_scipy("verlet", HH))
+
+    def test_of_methods_that_are_no_class(self):
+        for method in ("sympflow", SympFlow(2), as_scipy("verlet", HH)(HH, 0.0, HH.y0, 1.0)):
+            with pytest.raises(ValueError, match=r"^`method` must be one of .* or OdeSolver class"):
+                solve_ivp(HH, (0, 1), HH.y0, method=method)
+
+    def test_of_options_and_times(self):
+        verlet = as_scipy("verlet", HH)
+        with pytest.warns(UserWarning, match="atol, rtol have no effect"):
+            solve_ivp(HH, (0, 1), HH.y0, method=verlet, rtol=1e-3, atol=1e-6)
+        with pytest.raises(ValueError, match=r"^`max_step` must be positive"):
+            solve_ivp(HH, (0, 1), HH.y0, method=verlet, max_step=-1)
+        with pytest.raises(ValueError, match=r"^`t_span` must be finite"):
+            solve_ivp(HH, (0, np.inf), HH.y0, method=verlet)
+        with pytest.raises(TypeError, match=r"^`system` is needed for method 'verlet'"):
+            solve_ivp(lambda t, y: y, (0, 1), HH.y0, method=as_scipy("verlet"))
+
+    def test_of_a_flow_without_an_inverse_and_of_single_precision(self):
+        mlp = MLPFlow(2, hidden=(4,)).requires_grad_(False)
+        with pytest.raises((TypeError, ValueError), match=r"inverse|negative"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            solve_ivp(HH, (1, 0), HH.y0, method=as_scipy(mlp))
+        with pytest.raises(TypeError, match=r"float32.*convert"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            solve_ivp(HH, (0, 1), HH.y0, method=as_scipy(SympFlow(2, dtype=torch.float32)))
