@@ -22,6 +22,7 @@ class Stream(IntEnum):
     VALIDATION = 2
     REFERENCE = 3
     SCALING = 4
+    RESTARTS = 5
 
 
 @dataclass(frozen=True)

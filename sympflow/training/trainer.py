@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,11 +13,13 @@ import torch
 from sympflow.domain import Domain, EnergySublevel
 from sympflow.flow.base import FlowMap
 from sympflow.flow.mlp import MLPFlow
+from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.system import HamiltonianSystem
 from sympflow.training.collocation import Stream, states
 from sympflow.training.config import TrainingConfig
+from sympflow.training.gauss_newton import GaussNewtonConfig, GaussNewtonRun
 from sympflow.training.run import Path, Run
 
 SCALING_SAMPLES = 4096
@@ -48,6 +51,9 @@ def train(
     validate_every: int | None = None,
     validation_points: int = 2000,
     reference_states: int = 100,
+    restarts: int | None = None,
+    label_times: int | None = None,
+    frozen_weight: float | None = None,
     checkpoint: Path | None = None,
     checkpoint_every: int | None = None,
     resume: Path | None = None,
@@ -55,9 +61,10 @@ def train(
     progress: bool | None = None,
     callback: Callable[[int, dict[str, float]], None] | None = None,
 ) -> Any:
-    """Train a flow map of `system` on [0, dt] by its residual and by Hamiltonian matching.
+    """Train a flow map of `system` on [0, dt] by its residual and by Hamiltonian matching, or by labels.
 
-    Any system will do, separable or not: a SympFlow with MLP potentials is symplectic all the same.
+    Any system will do, separable or not: a SympFlow with MLP potentials is symplectic all the same. For a separable
+    symbolic one, optimizer="gauss-newton" fits a primed flow (`SympFlow.primed`) to the exact flow in seconds.
 
     Parameters
     ----------
@@ -76,6 +83,9 @@ def train(
     seed, validate_every, validation_points, reference_states, checkpoint_every
         See `TrainingConfig`. What is left out gets the optimizer's own default: 20,000 steps on 700 fresh points
         for Adam, 200 on 4000 fixed points for BFGS. A baseline has no Hamiltonian, so its matching weight is 0.
+    restarts, label_times, frozen_weight
+        Only for "gauss-newton", which takes of those above `steps`, `points`, `seed` and `reference_states`: see
+        `GaussNewtonConfig`.
     checkpoint : path, optional
         Write the state of the run there every `checkpoint_every` steps, atomically.
     resume : path, optional
@@ -102,6 +112,7 @@ def train(
     FloatingPointError
         If the loss is not finite from the start.
     """
+    given = dict(locals())
     domain = _domain(system, domain)
     if time_budget is not None and not 0 < time_budget < math.inf:
         raise ValueError(f"`time_budget` must be a positive number of seconds; got {time_budget!r}.")
@@ -119,6 +130,24 @@ def train(
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}.")
     if kind not in ("sympflow", "mlp"):
         raise ValueError(f"`kind` {kind!r} is unknown: choose sympflow or mlp.")
+    of_labels = {"restarts": restarts, "label_times": label_times, "frozen_weight": frozen_weight}
+    if optimizer == "gauss-newton":
+        _refuse_options(given, _NOT_GAUSS_NEWTON, optimizer)
+        choices: dict[str, Any] = {"points": points, "steps": steps, **of_labels}
+        choices = {name: value for name, value in choices.items() if value is not None}
+        labelled = GaussNewtonConfig(seed=seed, reference_states=reference_states, **choices)
+        flow = SympFlow.primed(system, dt=float(dt)) if flow is None else flow
+        if not isinstance(flow, PrimedFlow) or flow.dtype != torch.float64:
+            raise TypeError(
+                "`optimizer` 'gauss-newton' fits primed flows in float64: pass flow=SympFlow.primed(system, dt=...)."
+            )
+        flow = copy.deepcopy(flow).bound(system)
+        scaling = Scaling.of_samples(states(domain, SCALING_SAMPLES, seed, Stream.SCALING), flow.dt)
+        search = GaussNewtonRun.start(flow, system, domain, scaling, labelled)
+        if resume is not None:
+            search.load(resume)
+        return search.finish(search.go(checkpoint, time_budget, progress, callback))
+    _refuse_options(given, tuple(of_labels), optimizer)
     if kind == "mlp" and matching_weight:
         raise ValueError("`matching_weight` needs a Hamiltonian, which an MLP flow has not: leave it out.")
     config = TrainingConfig.of(
@@ -157,6 +186,32 @@ def train(
     if resume is not None:
         run.load(resume)
     return run.finish(run.go(checkpoint, time_budget, progress, callback))
+
+
+_NOT_GAUSS_NEWTON = (
+    "kind",
+    "pairs",
+    "hidden",
+    "activation",
+    "residual_weight",
+    "matching_weight",
+    "matching_times",
+    "learning_rate",
+    "schedule",
+    "clip",
+    "refresh",
+    "validate_every",
+    "validation_points",
+    "checkpoint_every",
+)
+
+
+def _refuse_options(given: dict[str, Any], names: Sequence[str], optimizer: str) -> None:
+    """Raise if one of the named arguments of `train` has another value than its default."""
+    defaults = inspect.signature(train).parameters
+    for name in names:
+        if given[name] != defaults[name].default:
+            raise TypeError(f"`{name}` is not an option of the optimizer {optimizer!r}: leave it out.")
 
 
 def _domain(system: HamiltonianSystem, domain: Domain | None) -> Domain:

@@ -12,8 +12,8 @@ from sympflow.training.collocation import Points
 from sympflow.training.losses import Loss
 
 
-def reference_step(system: HamiltonianSystem, x: np.ndarray, t: float) -> np.ndarray:
-    """φ_H,t(x) by DOP853 at rtol = 1e-12, for states x (n, 2d): (n, 2d), with NaN where the solution does not exist."""
+def reference_step(system: HamiltonianSystem, x: np.ndarray, t: float, rtol: float = 1e-12) -> np.ndarray:
+    """φ_H,t(x) by DOP853, for states x (n, 2d): (n, 2d), with NaN where the solution does not exist."""
     scale = np.abs(x).max(0)
     scale = np.where(scale > 0, scale, 1.0)
 
@@ -24,10 +24,10 @@ def reference_step(system: HamiltonianSystem, x: np.ndarray, t: float) -> np.nda
                 raise FloatingPointError  # SciPy would go on for ever
             return v
 
-        atol = np.broadcast_to(1e-13 * scale, x.shape).ravel()
+        atol = np.broadcast_to(0.1 * rtol * scale, x.shape).ravel()
         try:
             with np.errstate(all="ignore"):
-                run = solve_ivp(velocity, (0.0, t), x.ravel(), "DOP853", t_eval=[t], rtol=1e-12, atol=atol)
+                run = solve_ivp(velocity, (0.0, t), x.ravel(), "DOP853", t_eval=[t], rtol=rtol, atol=atol)
         except FloatingPointError:
             return None
         return run.y[:, -1].reshape(x.shape) if run.status == 0 else None

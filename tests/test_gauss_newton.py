@@ -1,0 +1,341 @@
+"""Gauss–Newton training: labels, derivatives of a table, the least-squares search, and the flows that come of it."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import sympflow
+from sympflow import HamiltonianSystem, SympFlow, get, solve, systems, train
+from sympflow.flow.scaling import Scaling
+from sympflow.training import checkpoint as checkpoints
+from sympflow.training.collocation import Stream, states
+from sympflow.training.gauss_newton import GaussNewtonConfig, GaussNewtonRun
+from sympflow.training.labels import Labels
+from sympflow.training.levenberg_marquardt import levenberg_marquardt
+from sympflow.training.table_fit import Table
+from sympflow.training.table_jacobian import TableStep
+
+HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
+MASSES = HamiltonianSystem.from_sympy(
+    "p1**2/4 + p1*p2/5 + p2**2 + q1**4/4 + q1*q2/3 + q2**2/2 + p3**2 + q3**2*q1**2/2",
+    name="masses",
+    domain=sympflow.Ball([0.0] * 6, 1.0),
+)
+QUICK = {"optimizer": "gauss-newton", "restarts": 3, "points": 60, "reference_states": 30, "progress": False}
+
+
+def weights(flow):
+    return torch.cat([w.reshape(-1) for w in flow.state_dict().values()])
+
+
+# labels ----------------------------------------------------------------------------------------------------------
+
+
+def test_labels_are_the_exact_flow_of_the_oscillator():
+    omega, t = 3.0, np.array([0.2, 0.7, 1.3])
+    x = np.random.default_rng(0).normal(size=(20, 2))
+    labels = Labels.of(systems.harmonic_oscillator(omega), x, t)
+    c, s = np.cos(omega * t)[:, None], np.sin(omega * t)[:, None]
+    q, p = x.T
+    np.testing.assert_allclose(labels.y[..., 0], c * q + s / omega * p, atol=1e-12)
+    np.testing.assert_allclose(labels.y[..., 1], c * p - s * omega * q, atol=3e-12)
+
+
+@pytest.mark.parametrize("system", [HH, PENDULUM], ids=["henon-heiles", "pendulum"])
+def test_labels_agree_with_another_method(system):
+    """DOP853 against Kahan–Li of order 8 with 400 tiny steps, whose truncation is below rounding."""
+    x, t = system.domain.sample(30, 0), np.array([0.5, 1.0])
+    other = solve(system, "kahan_li8", (0.0, 1.0), y0=x, dt=1 / 400, t_eval=t).y
+    np.testing.assert_allclose(Labels.of(system, x, t).y, np.moveaxis(other, -1, 0), atol=2e-13)
+
+
+def test_states_that_escape_have_no_labels():
+    x = np.array([[0.1, 0.1, 0.0, 0.0], [0.0, 30.0, 0.0, 0.0]])
+    labels = Labels.of(HH, x, np.array([1.0, 3.0]))
+    assert labels.x.tolist() == [x[0].tolist()]
+    assert labels.y.shape == (2, 1, 4)
+
+
+# the step of a table and its derivatives --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["srkn6b", "omelyan6", "chin4a"])
+def test_a_table_step_is_the_splitting_step(name):
+    scheme, h, y = sympflow.get(name).scheme, 0.2, HH.domain.sample(5, 0)
+    sequence = [kind for kind, _, _ in scheme.substeps]
+    c = [h * b for _, b, _ in scheme.substeps] + [h**3 * g for kind, _, g in scheme.substeps if kind == "kick"]
+    step = TableStep(HH, sequence, True)
+    np.testing.assert_allclose(step(np.array(c)[:, None], y.T).T, get(name)().step(HH, 0.0, y, h), atol=1e-15)
+
+
+@pytest.mark.parametrize("force_gradient", [True, False])
+@pytest.mark.parametrize("system", [HH, PENDULUM, MASSES], ids=lambda s: s.name)
+@pytest.mark.parametrize("first", ["kick", "drift"])
+def test_derivatives_by_the_table(system, force_gradient, first):
+    """Against autodiff of the same step written in torch, each state with coefficients of its own."""
+    sequence = [first, *["drift", "kick"] * 2][:5] if first == "kick" else ["drift", "kick"] * 2
+    step = TableStep(system, sequence, force_gradient)
+    y = system.domain.sample(4, 0).T
+    c = np.random.default_rng(0).uniform(0.1, 0.3, (step.n_coefficients, y.shape[1]))
+    end, J = step.with_jacobian(c, y)
+    np.testing.assert_allclose(end, step(c, y), atol=1e-14)
+
+    def executed(c, y):
+        q, p = y.chunk(2, -1)
+        kicks = iter(range(len(sequence), step.n_coefficients))
+        for i, kind in enumerate(sequence):
+            if kind == "drift":
+                q = q + c[i] * system.velocity(p)
+            else:
+                F = system.force(q)
+                p = p + c[i] * F
+                if force_gradient:
+                    p = p - c[next(kicks)] * (system.potential_hessian(q) @ system.velocity(F)[..., None])[..., 0]
+        return torch.cat([q, p], -1)
+
+    for k in range(y.shape[1]):
+        expected = torch.func.jacfwd(executed)(torch.tensor(c[:, k]), torch.tensor(y[:, k]))
+        np.testing.assert_allclose(J[:, :, k].T, expected.numpy(), rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("palindromic", [True, False])
+def test_the_fits_derivatives(palindromic):
+    """Residuals and Jacobian by the flow's parameters, against the flow itself."""
+    flow = SympFlow.primed(PENDULUM, 2, degree=3, palindromic=palindromic, dt=0.8).requires_grad_(False)
+    run = GaussNewtonRun.start(
+        flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), GaussNewtonConfig(points=5, label_times=3)
+    )
+    table, labels_x = Table(flow), torch.as_tensor(run.whole._x[:, :5].T)
+    theta = table.parameters() + 0.02 * np.random.default_rng(0).normal(size=flow.n_parameters)
+    r, J = run.whole.linearized(theta)
+    np.testing.assert_allclose(r, run.whole.residuals(theta), atol=1e-15)
+    table.assign(theta)
+    executed = torch.stack([flow.psi(float(t), labels_x) for t in 0.8 * np.arange(1, 4) / 3])
+    expected = np.moveaxis(executed.numpy() - run.whole._y.T.reshape(3, 5, 2), -1, -2) / math.sqrt(15)
+    np.testing.assert_allclose(r, expected.ravel(), atol=1e-15)
+    e = 1e-6
+    for i in range(len(theta)):
+        d = e * np.eye(len(theta))[i]
+        slope = (run.whole.residuals(theta + d) - run.whole.residuals(theta - d)) / (2 * e)
+        np.testing.assert_allclose(J[:, i], slope, atol=1e-9)
+
+
+def test_a_table_is_continued_to_all_times():
+    flow = SympFlow.primed(HH, scheme="srkn6b", degree=5)
+    table = Table(flow)
+    rng = np.random.default_rng(0)
+    offset, design = table.polynomial(np.array([flow.dt]))
+    target = table.random(rng)
+    for rows in (table.columns[0][1], table.columns[1][1]):
+        target[rows] *= 1.001 / target[rows].sum()
+    theta = table.continued(target)
+    np.testing.assert_allclose(offset[0] + design[0] @ theta, target, atol=1e-8)
+    constant = table.parameters()
+    np.testing.assert_allclose(table.continued(offset[0] + design[0] @ constant), constant, atol=1e-12)
+
+
+# the search -----------------------------------------------------------------------------------------------------
+
+
+def rosenbrock(x):
+    return np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
+
+
+def box(x):
+    t = np.arange(1, 11) / 10
+    return np.exp(-t * x[0]) - np.exp(-t * x[1]) - x[2] * (np.exp(-t) - np.exp(-10 * t))
+
+
+def freudenstein(x):  # with a local minimum of 48.98, from 0.5, -2
+    return np.array([-13 + x[0] + ((5 - x[1]) * x[1] - 2) * x[1], -29 + x[0] + ((x[1] + 1) * x[1] - 14) * x[1]])
+
+
+@pytest.mark.parametrize(
+    ("r", "start", "cost"),
+    [(rosenbrock, [-1.2, 1.0], 0.0), (box, [0.0, 10.0, 20.0], 0.0), (freudenstein, [0.5, -2.0], 48.98425)],
+)
+def test_the_search_finds_the_minima_of_more_garbow_and_hillstrom(r, start, cost):
+    def linearized(x):
+        x = torch.tensor(x)
+        e = 1e-6
+        columns = [(r((x + e * d).numpy()) - r((x - e * d).numpy())) / (2 * e) for d in torch.eye(len(x))]
+        return r(x.numpy()), np.stack(columns, 1)
+
+    found = levenberg_marquardt(r, linearized, np.array(start))
+    assert found.cost == pytest.approx(cost, rel=1e-5, abs=1e-15)
+    assert found.iterations < 40
+
+
+def test_the_search_stops_by_itself():
+    A, b = np.random.default_rng(0).normal(size=(30, 4)), np.ones(30)
+    found = levenberg_marquardt(lambda x: A @ x - b, lambda x: (A @ x - b, A), np.zeros(4))
+    np.testing.assert_allclose(found.x, np.linalg.lstsq(A, b, rcond=None)[0], atol=1e-8)
+    assert found.iterations < 30
+
+
+def test_the_search_keeps_to_where_residuals_are_finite():
+    def r(x):
+        with np.errstate(all="ignore"):
+            return np.array([np.log(x[0]) - 1.0])
+
+    found = levenberg_marquardt(r, lambda x: (r(x), 1 / x[:, None]), np.array([9.0]))
+    assert found.x[0] == pytest.approx(math.e)
+    assert levenberg_marquardt(r, None, np.array([-1.0])).cost == math.inf
+
+
+def test_a_degenerate_direction_does_no_harm():
+    found = levenberg_marquardt(
+        lambda x: np.array([x[0] + x[1] - 2.0, 0.0, 0.0]),
+        lambda x: (np.array([x[0] + x[1] - 2.0, 0.0, 0.0]), np.array([[1.0, 1.0, 0.0], [0] * 3, [0] * 3])),
+        np.zeros(3),
+    )
+    assert found.x.sum() == pytest.approx(2.0)
+    assert found.x[2] == 0
+
+
+# training --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("system", "stages", "error"), [(HH, 3, 4e-5), (HH, 4, 2e-6), (PENDULUM, 3, 1e-4)])
+def test_training_reaches_the_prototypes(system, stages, error):
+    """Bounds are twice what was found; equal leapfrog steps have 1e-2."""
+    flow = train(system, flow=SympFlow.primed(system, stages), **QUICK)
+    assert flow.figures["one_step_error"] < error
+    assert flow.figures["fractional_error"] < flow.figures["one_step_error"]
+    x = system.domain.sample(50, 123)  # other held-out states, another reference
+    reference = solve(system, "kahan_li8", (0.0, 1.0), y0=x, dt=1 / 400, t_eval=[0.37, 1.0]).y
+    for t, y in zip((0.37, 1.0), np.moveaxis(reference, -1, 0), strict=True):
+        assert np.linalg.norm(flow(t, torch.tensor(x)).numpy() - y, axis=-1).mean() < error
+    assert flow.domain == system.domain
+    assert flow.recipe["stages"][0]["optimizer"] == "gauss-newton"
+    assert not any(w.requires_grad for w in flow.parameters())
+
+
+def test_the_harmonic_oscillator_in_any_units():
+    """A linear system: three kicks suffice for eleven digits at each frequency alike."""
+    errors = []
+    for omega in (1.0, 100.0):
+        system = systems.harmonic_oscillator(omega)
+        flow = train(system, flow=SympFlow.primed(system, 3, dt=1 / omega), **QUICK)
+        errors.append(flow.figures["one_step_error"] / omega)
+    assert max(errors) < 1e-5
+
+
+def test_a_free_flow_is_no_worse_than_a_palindrome():
+    half, full = (
+        train(PENDULUM, flow=SympFlow.primed(PENDULUM, 2, palindromic=p), **QUICK).history[-1]["loss"]
+        for p in (True, False)
+    )
+    assert full < 1.05 * half
+
+
+def test_the_weight_at_dt_counts():
+    def errors(weight):
+        flow = SympFlow.primed(HH, 2, degree=1)  # one table for all t: a compromise
+        return train(HH, flow=flow, frozen_weight=weight, **QUICK).figures["one_step_error"]
+
+    assert errors(100.0) < errors(0.01)
+
+
+def test_by_default_it_makes_a_primed_flow():
+    flow = train(PENDULUM, 0.5, **QUICK)
+    assert (flow.dt, len(flow.sequence), flow.system) == (0.5, 13, PENDULUM)
+    assert flow.figures["one_step_error"] < 1e-8
+
+
+def test_what_is_trained_is_a_copy_and_stages_are_recorded(tmp_path):
+    start = SympFlow.primed(PENDULUM, 2)
+    before = weights(start).clone()
+    first = train(PENDULUM, flow=start, **QUICK)
+    second = train(PENDULUM, flow=first, **{**QUICK, "restarts": 1, "seed": 1})
+    assert torch.equal(weights(start), before)
+    assert [stage["seed"] for stage in second.recipe["stages"]] == [0, 1]
+    second.save(tmp_path / "flow.safetensors")
+    loaded = sympflow.load(tmp_path / "flow.safetensors", system=PENDULUM)
+    assert (loaded.recipe, loaded.figures) == (second.recipe, second.figures)
+
+
+def test_the_same_seed_gives_the_same_weights():
+    def run(seed):
+        return weights(train(PENDULUM, flow=SympFlow.primed(PENDULUM, 2), **QUICK, seed=seed))
+
+    assert torch.equal(run(0), run(0))
+    assert not torch.equal(run(0), run(1))
+
+
+class Killed(Exception):
+    pass
+
+
+def test_a_resumed_run_ends_bit_identical(tmp_path):
+    path, arguments = tmp_path / "run.ckpt", {**QUICK, "restarts": 4}
+    start = SympFlow.primed(HH, 3)
+    whole = train(HH, flow=start, **arguments)
+
+    def kill(step, figures):
+        if step == 3:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(HH, flow=start, checkpoint=path, callback=kill, **arguments)
+    assert checkpoints.read(path)["step"] == 2
+    resumed = train(HH, flow=start, resume=path, **arguments)
+    assert torch.equal(weights(resumed), weights(whole))
+    assert resumed.history == whole.history
+    with pytest.raises(ValueError, match="`resume` is a run with another config"):
+        train(HH, flow=start, resume=path, **{**arguments, "seed": 1})
+    with pytest.raises(ValueError, match="`resume` is a run with another architecture"):
+        train(HH, flow=SympFlow.primed(HH, 4), resume=path, **arguments)
+
+
+def test_an_interrupted_run_returns_its_best():
+    def interrupt(step, figures):
+        raise KeyboardInterrupt
+
+    start = SympFlow.primed(HH, 3)
+    with pytest.warns(RuntimeWarning, match="after 1 of 3 starts because it was interrupted"):
+        flow = train(HH, flow=start, callback=interrupt, **QUICK)
+    assert flow.figures["one_step_error"] < 1e-4
+
+
+def test_a_time_budget_ends_the_run():
+    with pytest.warns(RuntimeWarning, match="the time budget was used up"):
+        flow = train(HH, flow=SympFlow.primed(HH, 6), time_budget=0.05, **{**QUICK, "restarts": 10**6})
+    assert flow.recipe["stages"][0]["restarts_taken"] < 10**6
+    assert math.isfinite(flow.figures["one_step_error"])
+
+
+def test_progress(capsys):
+    train(PENDULUM, flow=SympFlow.primed(PENDULUM, 1), **{**QUICK, "progress": True})
+    assert "one-step" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"learning_rate": 1e-2}, TypeError, r"^`learning_rate` is not an option of the optimizer 'gauss-newton'"),
+        ({"pairs": 3}, TypeError, r"^`pairs` is not an option"),
+        ({"optimizer": "adam"}, TypeError, r"^`restarts` is not an option of the optimizer 'adam'"),
+        ({"restarts": 0}, ValueError, r"^`restarts` must be a positive integer"),
+        ({"frozen_weight": math.nan}, ValueError, r"^`frozen_weight` must be positive"),
+        ({"label_times": 2.0}, ValueError, r"^`label_times` must be"),
+        ({"seed": -1}, ValueError, r"^`seed` must be"),
+        ({"flow": SympFlow(2)}, TypeError, r"^`optimizer` 'gauss-newton' fits primed flows"),
+        ({"flow": SympFlow.primed(PENDULUM)}, ValueError, r"^`system` .* degrees of freedom"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, error, message):
+    with pytest.raises(error, match=message):
+        train(HH, **{**QUICK, **arguments})
+
+
+def test_systems_it_does_not_apply_to():
+    with pytest.raises(ValueError, match=r"^`system` .* must be symbolic"):
+        plain = HamiltonianSystem(lambda q: q.square().sum(-1), ndof=1, domain=sympflow.Ball([0.0, 0.0], 1.0))
+        train(plain, **QUICK)
+
+
+def test_training_states_are_not_the_held_out_ones():
+    assert not np.array_equal(states(HH.domain, 3, 0, Stream.RESIDUAL), states(HH.domain, 3, 0, Stream.REFERENCE))
