@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+
+EPS = float(np.finfo(float).eps)
 
 
 class Grid:
@@ -20,7 +24,7 @@ class Grid:
 
     def __init__(self, t0: float, t1: float, dt: float) -> None:
         self.t0, self.t1 = float(t0), float(t1)
-        self.h = float(np.copysign(dt, t1 - t0))
+        self.h = math.copysign(dt, t1 - t0)
         quotient = (self.t1 - self.t0) / self.h
         if quotient > 2**53:
             raise ValueError(f"`dt` {dt:g} needs {quotient:.3g} steps from {t0:g} to {t1:g}: increase it.")
@@ -39,18 +43,17 @@ class Grid:
                 raise ValueError(f"`t` must lie in [{low:g}, {high:g}], the interval that was solved.")
         x = (t - self.t0) / self.h
         nearest = np.rint(x)
-        tolerance = (
-            4 * np.finfo(float).eps * np.maximum(np.abs(nearest), np.maximum(np.abs(t), abs(self.t0)) / abs(self.h))
-        )
-        on_grid = np.abs(x - nearest) <= np.maximum(tolerance, np.finfo(float).eps)
+        rounding = 4 * EPS * (np.abs(nearest) + (np.abs(t) + abs(self.t0)) / abs(self.h))
+        on_grid = np.abs(x - nearest) <= rounding
+        if on_grid.all():
+            return nearest.astype(np.int64), np.zeros(len(t))
         count = np.where(on_grid, nearest, np.floor(x)).astype(np.int64)
-        remainder = np.where(on_grid, 0.0, t - (self.t0 + count * self.h))
-        return count, remainder
+        return count, np.where(on_grid, 0.0, t - (self.t0 + count * self.h))
 
     def outputs(self, t_eval: np.ndarray | None, save_every: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Output times (n,), their counts and remainders: `t_eval`, or every `save_every`-th step and the end."""
         if t_eval is not None:
-            return t_eval, *self.locate(t_eval)
+            return t_eval, *self.locate(t_eval, bounded=False)
         count = np.arange(0, self.n_steps + 1, save_every)
         t = self.t0 + count * self.h
         remainder = np.zeros(len(count))

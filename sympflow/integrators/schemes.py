@@ -15,6 +15,7 @@ V + (h²/48)[V, [T, V]] in a kick of weight b is g = b/24, a χ of Omelyan, Mryg
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from math import sqrt
 
@@ -60,7 +61,7 @@ class Scheme:
                 f"{len(self.kicks)}, {len(self.drifts)} and {len(self.gradients)}: pad with zeros."
             )
 
-    @property
+    @cached_property
     def substeps(self) -> tuple[tuple[str, float, float], ...]:
         """The maps really executed, ('kick', b, g) or ('drift', a, 0): no zeros, like neighbours merged."""
         merged: list[tuple[str, float, float]] = []
@@ -74,7 +75,7 @@ class Scheme:
                 merged.append((kind, c, c3))
         return tuple(merged)
 
-    @property
+    @cached_property
     def symmetric(self) -> bool:
         """Whether the step is its own adjoint, Φ(−h) = Φ(h)⁻¹ (the coefficients read the same backwards)."""
         forwards, backwards = self.substeps, self.substeps[::-1]
@@ -83,18 +84,18 @@ class Scheme:
             for one, other in zip(forwards, backwards, strict=True)
         )
 
-    @property
+    @cached_property
     def first_same_as_last(self) -> bool:
         """Whether a step ends with the kind of map that it begins with, so that successive steps share it."""
         return len(self.substeps) > 1 and self.substeps[0][0] == self.substeps[-1][0]
 
-    @property
+    @cached_property
     def force_evaluations(self) -> int:
         """Forces per step in a long run, the last kick merged with the next step's first one."""
         kinds = [kind for kind, _, _ in self.substeps]
         return kinds.count("kick") - (self.first_same_as_last and kinds[0] == "kick")
 
-    @property
+    @cached_property
     def hessian_evaluations(self) -> int:
         """Force gradients (Hessian–vector products) per step, counted like `force_evaluations`."""
         with_gradient = [c3 != 0.0 for kind, _, c3 in self.substeps if kind == "kick"]
