@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def run(arguments: argparse.Namespace) -> Results:
-    from contenders.environment import describe
+    from contenders.environment import describe, load
     from contenders.measurement import measure
     from contenders.scene import Scene
 
@@ -69,7 +69,8 @@ def run(arguments: argparse.Namespace) -> Results:
     environment = describe()
     results = measure(scene, contenders, TARGETS, arguments.repeats, arguments.cap)
     results.skipped = skipped
-    results.environment = environment | {"minutes": (time.perf_counter() - start) / 60, "repeats": arguments.repeats}
+    minutes = (time.perf_counter() - start) / 60
+    results.environment = environment | {"minutes": minutes, "repeats": arguments.repeats, "load_after": load()}
     return results
 
 

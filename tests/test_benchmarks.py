@@ -182,7 +182,7 @@ def test_a_tiny_run_fills_the_page_and_survives_json():
     results = measure(TINY, contenders, [1e-3, 1e-6], 1, cap=0.05, step_counts=(1000, 100), note=lambda line: None)
     results.skipped = [Skipped("heyoka", "not installed")]
     results.environment = {"processor": "any", "cores": 1, "system": "any", "load": 0.0, "versions": {"python": "3"}}
-    results.environment |= {"minutes": 0.1, "repeats": 1}
+    results.environment |= {"minutes": 0.1, "repeats": 1, "load_after": 0.0}
     assert {(r.label, r.trajectories, r.target) for r in results.rows} == {
         (label, n, target)
         for label in ("verlet", "kahan_li8", "Verlet loop")

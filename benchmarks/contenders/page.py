@@ -31,11 +31,12 @@ def machine(results: Results) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in e["versions"].items())
     spreads = sorted(row.spread / row.seconds for row in results.rows)
     middle, most = spreads[len(spreads) // 2], spreads[-1]
+    load = f"load average {e['load']:.1f} at the start, {e['load_after']:.1f} at the end"
     return (
-        f"Measured on one thread of {e['processor']} ({e['cores']} cores, shared with other jobs; {e['system']}; load "
-        f"average {e['load']:.1f} at the start), in {e['repeats']} interleaved rounds and {e['minutes']:.1f} minutes. The "
-        f"interquartile range over the rounds is {middle:.1%} of the time for half of the rows, {most:.0%} at most. "
-        f"Versions: {versions}. Ratios carry over to other machines better than times."
+        f"Measured on one thread of {e['processor']} ({e['cores']} cores, {e['system']}; {load}), in {e['repeats']} "
+        f"interleaved rounds and {e['minutes']:.1f} minutes. The interquartile range over the rounds is below "
+        f"{middle:.1%} of the time for half of the rows and at most {most:.0%}. Versions: {versions}. Ratios carry over "
+        "to other machines better than times."
     )
 
 

@@ -37,7 +37,8 @@ in blocks of 64 side by side, which the compiler turns into vector instructions.
 writes first. SciPy gets two right-hand sides: the one generated from the symbolic Hamiltonian, which takes whole
 batches, and one in plain scalars; the other packages get theirs hand-written. diffrax has no Verlet, but its
 semi-implicit Euler between two half kicks is one. heyoka's batch is twice the width that it recommends, which was the
-fastest. Every loop is checked to take the same steps as our `verlet`.
+fastest. The time of the hand-written batch loop differs by up to a third from process to process, probably with where
+its buffers land in memory, and so do the ratios to it. Every loop is checked to take the same steps as our `verlet`.
 """
 
 NOTES = """\
