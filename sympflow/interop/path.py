@@ -1,0 +1,125 @@
+"""ψ_s(y0) as a differentiable function of the elapsed time s, of y0 and of a flow's weights; and its first zero."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.optimize import brentq
+from torch import Tensor
+
+from sympflow.integrators.base import FixedStep, Problem
+from sympflow.integrators.grid import Grid
+from sympflow.system import HamiltonianSystem
+
+MAX_EVENT_STEPS = 1_000_000
+_EPS = 4 * float(np.finfo(float).eps)
+
+
+class Path:
+    """The trajectory of an integrator from y0, on the grid k·dt of elapsed times, in one direction of time.
+
+    Parameters
+    ----------
+    integrator : FixedStep
+    system : HamiltonianSystem or None
+        None for a flow that needs none.
+    y0 : tensor of shape (..., 2d)
+    direction : 1 or -1
+    """
+
+    def __init__(self, integrator: FixedStep, system: HamiltonianSystem | None, y0: Tensor, direction: int) -> None:
+        self.integrator, self.y0 = integrator, y0
+        self.system: HamiltonianSystem = system  # type: ignore[assignment]
+        self.h = math.copysign(integrator.step_length(self.system), direction)
+
+    def __call__(self, s: Tensor) -> Tensor:
+        """ψ_s(y0), (n, ..., 2d), for elapsed times s (n,), each 0 or with the sign of the direction.
+
+        Differentiable in s (where an s is a whole number of steps: in the step that begins or ends there).
+        """
+        times = s.detach().cpu().to(torch.float64).numpy()
+        reach = float(times[np.argmax(np.abs(times))]) if len(times) else 0.0
+        count, remainder = Grid(0.0, reach or self.h, abs(self.h)).locate(times)
+        states = self._rollout(count)
+        grid_times = torch.as_tensor(count * self.h, dtype=torch.float64, device=s.device)
+        r = (s.to(torch.float64) - grid_times).to(self.y0.dtype)
+        r = torch.where(torch.as_tensor(remainder == 0, device=r.device), r - r.detach(), r)
+        if not (s.requires_grad or np.any(remainder)):
+            return states
+        h = r.reshape(-1, *[1] * (states.ndim - 2)).expand(states.shape[:-1])
+        return self.integrator.step(self.system, 0.0, states, h)
+
+    def _rollout(self, count: np.ndarray) -> Tensor:
+        """The states after the steps `count`: compiled where nothing is to be differentiated."""
+        save, n_steps = np.unique(count), int(count.max(initial=0))
+        y0: Tensor | np.ndarray = self.y0
+        plain = not self._differentiable() and self.y0.device.type == "cpu"
+        if plain:
+            y0 = self.y0.detach().numpy()
+        states, _, _ = self.integrator.rollout(Problem(self.system, 0.0, n_steps * self.h, y0), self.h, n_steps, save)
+        if plain:
+            states = torch.from_numpy(np.ascontiguousarray(states))
+        return states[torch.as_tensor(np.searchsorted(save, count), device=self.y0.device)]
+
+    def _differentiable(self) -> bool:
+        flow = self.integrator.flow_for(self.system) if self.integrator.trained else None  # type: ignore[attr-defined]
+        weights = () if flow is None else flow.parameters()
+        return torch.is_grad_enabled() and (self.y0.requires_grad or any(w.requires_grad for w in weights))
+
+    def first_zero(self, g: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """The elapsed time s at which g(s, ψ_s(y0)), a number, first vanishes; g is tested at every step.
+
+        Its derivatives are those of the implicit function: ds = −dg / (dg/ds).
+
+        Raises
+        ------
+        RuntimeError
+            If there is none within a million steps, or the state became non-finite before.
+        """
+        with torch.no_grad():
+            value = self._bracket(g)
+        s = torch.tensor(value, dtype=torch.float64, device=self.y0.device)
+        c = g(s, self(s[None])[0])
+        if not c.requires_grad:
+            return s
+        moving = s.clone().requires_grad_(True)
+        (slope,) = torch.autograd.grad(g(moving, self(moving[None])[0]), moving)
+        return s - (c - c.detach()) / slope
+
+    def _bracket(self, g: Callable[[Tensor, Tensor], Tensor]) -> float:
+        def value(s: float, y: Tensor) -> float:
+            return float(g(torch.tensor(s, dtype=torch.float64, device=y.device), y))
+
+        before = value(0.0, self.y0.detach())
+        if before == 0:
+            return 0.0
+        k, chunk, y = 0, 8, self.y0.detach()
+        while k < MAX_EVENT_STEPS:
+            ahead = Path(self.integrator, self.system, y, 1 if self.h > 0 else -1)
+            states = ahead._rollout(np.arange(chunk + 1))
+            for j in range(chunk):
+                after = value((k + j + 1) * self.h, states[j + 1])
+                if before * after <= 0:
+                    return self._locate(value, (k + j) * self.h, states[j], before, after)
+                if not math.isfinite(after):
+                    raise RuntimeError(
+                        f"`event_fn` found no zero: the solution became non-finite after an elapsed time of "
+                        f"{(k + j) * self.h:.6g}. Check y0, or use a smaller dt."
+                    )
+                before = after
+            k, y, chunk = k + chunk, states[-1], min(2 * chunk, 1024)
+        raise RuntimeError(f"`event_fn` found no zero within {MAX_EVENT_STEPS:,} steps: check that there is one.")
+
+    def _locate(self, value: Callable[[float, Tensor], float], a: float, y: Tensor, g_a: float, g_b: float) -> float:
+        b = a + self.h
+        known = {a: g_a, b: g_b}
+
+        def f(s: float) -> float:
+            if s in known:
+                return known[s]
+            return value(s, self.integrator.step(self.system, 0.0, y, s - a))
+
+        return b if g_b == 0 else float(brentq(f, a, b, xtol=_EPS, rtol=_EPS))

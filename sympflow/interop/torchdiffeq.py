@@ -1,0 +1,237 @@
+"""torchdiffeq's `odeint` and `odeint_event` with our methods: identical signatures, change the import or nothing.
+
+`method="sympflow"` and all our fixed-step methods are run here; everything else is handed on to torchdiffeq. Their
+options go into `options`: `flow`, `dt` (or `step_size`), and `system` where `func` is not a HamiltonianSystem.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+import torchdiffeq
+from torch import Tensor
+
+from sympflow.integrators.base import FixedStep, Integrator
+from sympflow.integrators.registry import available
+from sympflow.integrators.tableaux import ADAPTIVE, FIXED
+from sympflow.interop.matching import fixed_step, warn_of_another_system
+from sympflow.interop.path import Path
+from sympflow.system import HamiltonianSystem
+
+State = Tensor | tuple[Tensor, ...]
+_THEIRS = {*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams"}
+_RTOL, _ATOL = 1e-7, 1e-9
+
+
+def odeint(
+    func: Callable[[Tensor, Any], Any],
+    y0: State,
+    t: Tensor,
+    *,
+    rtol: float = _RTOL,
+    atol: float = _ATOL,
+    method: Any = None,
+    options: dict[str, Any] | None = None,
+    event_fn: Callable[[Tensor, Any], Tensor] | None = None,
+) -> Any:
+    """`torchdiffeq.odeint` with our methods as well.
+
+    Parameters
+    ----------
+    func : callable
+        func(t, y). With our classical methods it must be a HamiltonianSystem, or `options["system"]` one. A flow never
+        calls it but once, to warn if it is not the flow's system.
+    y0 : tensor of shape (..., 2d), or tuple (q, p) of tensors of shape (..., d)
+    t : tensor of shape (n,)
+        Increasing or decreasing; t[0] is the time of y0, and the grid t[0] + k·dt is anchored there.
+    rtol, atol
+        For torchdiffeq's methods.
+    method : str, trained flow or Integrator, optional
+        One of `sympflow.available()` that has fixed steps, or any of torchdiffeq's; "dopri5" by default.
+    options : dict, optional
+        Of the method: `dt` (or torchdiffeq's name `step_size`), `flow`, `system`, …
+    event_fn : callable, optional
+        event_fn(t, y). The solution ends where its smallest entry, signed to be positive at the start, vanishes.
+
+    Returns
+    -------
+    y : tensor (n, ..., 2d), or tuple of tensors (n, ..., d)
+        With `event_fn`: (event time, [y0, state at the event]). Gradients reach y0, t and the weights of the flow, the
+        event time by the implicit function theorem; they are those of the map that was executed.
+    """
+    if not _is_ours(method):
+        return torchdiffeq.odeint(
+            _of_pairs(func, y0), y0, t, rtol=rtol, atol=atol, method=method, options=options, event_fn=event_fn
+        )
+    if (rtol, atol) != (_RTOL, _ATOL):
+        warnings.warn(
+            f"`rtol` and `atol` have no effect on the fixed-step method {_name(method)!r}: leave them out.",
+            UserWarning,
+            stacklevel=2,
+        )
+    _check_times(t)
+    integrator, system = _build(func, method, options)
+    y, pack = _joined(y0)
+    _check_state(y, system, integrator)
+    if not isinstance(func, HamiltonianSystem):
+        _check_right_hand_side(func, y0, t, integrator, system)
+    path = Path(integrator, system, y, -1 if len(t) > 1 and t[0] > t[1] else 1)
+    if event_fn is None:
+        return pack(torch.cat([y[None], path(t[1:] - t[0])]) if len(t) > 1 else y[None])
+    if len(t) != 2:
+        raise ValueError(f"`t` must have 2 entries with `event_fn`, the start and a direction; got {len(t)}.")
+    return _until_event(path, t[0], event_fn, pack)
+
+
+def odeint_event(
+    func: Callable[[Tensor, Any], Any],
+    y0: State,
+    t0: Tensor,
+    *,
+    event_fn: Callable[[Tensor, Any], Tensor],
+    reverse_time: bool = False,
+    odeint_interface: Callable[..., Any] = odeint,
+    **kwargs: Any,
+) -> Any:
+    """`torchdiffeq.odeint_event` with our methods as well: the event time, and [y0, state at the event].
+
+    Arguments as there. Gradients reach y0, t0 and the weights.
+    """
+    if not _is_ours(kwargs.get("method")):
+        theirs = torchdiffeq.odeint if odeint_interface is odeint else odeint_interface
+        return torchdiffeq.odeint_event(
+            _of_pairs(func, y0), y0, t0, event_fn=event_fn, reverse_time=reverse_time, odeint_interface=theirs, **kwargs
+        )
+    if odeint_interface is not odeint:
+        raise _no_adjoint(kwargs["method"])
+    start = t0.reshape(-1)
+    t = torch.cat([start, start.detach() + (-1.0 if reverse_time else 1.0)])
+    return odeint(func, y0, t, event_fn=event_fn, **kwargs)
+
+
+def odeint_adjoint(func: Any, y0: State, t: Tensor, *, method: Any = None, **kwargs: Any) -> Any:
+    """`torchdiffeq.odeint_adjoint`, which is refused for our methods.
+
+    Raises
+    ------
+    ValueError
+        For our methods: the adjoint method integrates the derivative of `func`, not that of the map that was run.
+    """
+    if _is_ours(method):
+        raise _no_adjoint(method)
+    return torchdiffeq.odeint_adjoint(func, y0, t, method=method, **kwargs)
+
+
+def register(method: str) -> None:
+    """Add one of our methods to torchdiffeq's own table, for code whose calls of `odeint` cannot be changed.
+
+    That table is private to torchdiffeq, so this is never done unasked, and may break with a release of it.
+    """
+    from sympflow.interop.torchdiffeq_table import add
+
+    if not _is_ours(method) or not isinstance(method, str):
+        raise ValueError(f"`method` {method!r} is torchdiffeq's own already: register one of ours, such as 'verlet'.")
+    add(method)
+
+
+def _is_ours(method: Any) -> bool:
+    if isinstance(method, str):
+        return method not in _THEIRS and method in available()
+    return method is not None
+
+
+def _name(method: Any) -> str:
+    return method if isinstance(method, str) else getattr(method, "name", type(method).__name__)
+
+
+def _build(func: Any, method: Any, options: dict[str, Any] | None) -> tuple[FixedStep, HamiltonianSystem | None]:
+    """The integrator and the system that a call means."""
+    options = dict(options or {})
+    options.pop("norm", None)  # torchdiffeq adds its own
+    system = options.pop("system", func if isinstance(func, HamiltonianSystem) else None)
+    if "step_size" in options:
+        options["dt"] = float(options.pop("step_size"))
+    integrator = fixed_step(method, options, "torchdiffeq")
+    if system is None and not (integrator.trained and integrator.flow is not None):  # type: ignore[attr-defined]
+        raise TypeError(
+            f"`func` must be a HamiltonianSystem for method {integrator.name!r}; got {type(func).__name__}. Pass one, "
+            "or options={'system': system}; sympflow.interop.systems converts a module."
+        )
+    if system is not None:
+        integrator.check(system)
+    return integrator, system
+
+
+def _check_times(t: Any) -> None:
+    if not (isinstance(t, Tensor) and t.ndim == 1 and len(t) and t.is_floating_point()):
+        raise TypeError("`t` must be a one-dimensional floating-point tensor of times: use torch.tensor([...]).")
+    steps = torch.diff(t.detach())
+    if not torch.isfinite(t).all() or not ((steps > 0).all() or (steps < 0).all()):
+        raise ValueError("`t` must be finite and strictly increasing or decreasing: sort it and drop repeats.")
+
+
+def _joined(y0: Any) -> tuple[Tensor, Callable[[Tensor], Any]]:
+    """The state [q, p] as one tensor, and how to give states back in the form of `y0`."""
+    if isinstance(y0, Tensor):
+        return y0, lambda y: y
+    if not (isinstance(y0, tuple) and len(y0) == 2 and all(isinstance(part, Tensor) for part in y0)):
+        raise TypeError(f"`y0` must be a tensor [q, p] or a tuple (q, p) of tensors; got {type(y0).__name__}.")
+    if y0[0].shape != y0[1].shape or y0[0].ndim == 0:
+        raise ValueError(f"`y0` (q, p) must have equal shapes (..., d); got {[tuple(part.shape) for part in y0]}.")
+    return torch.cat(y0, dim=-1), lambda y: tuple(y.chunk(2, dim=-1))
+
+
+def _check_state(y: Tensor, system: HamiltonianSystem | None, integrator: Integrator) -> None:
+    size = 2 * (system.ndof if system is not None else integrator.flow.ndof)  # type: ignore[attr-defined]
+    if not y.is_floating_point():
+        raise TypeError(f"`y0` must be real floating-point; got {y.dtype}. Use y0.double().")
+    if y.ndim == 0 or y.shape[-1] != size:
+        raise ValueError(f"`y0` must have shape (..., {size}), [q, p]; got {tuple(y.shape)}.")
+
+
+def _check_right_hand_side(
+    func: Any, y0: State, t: Tensor, integrator: FixedStep, system: HamiltonianSystem | None
+) -> None:
+    """Warn if `func` at (t[0], y0) is not the velocity of the method's own motion."""
+    with torch.no_grad():
+        slope = func(t[0], y0)
+    slope = _joined(slope)[0]
+    y = _joined(y0)[0]
+    first = tuple(0 for _ in y.shape[:-1])
+    warn_of_another_system(integrator, system, _numpy(y[first]), _numpy(slope[first]), stacklevel=4)
+
+
+def _numpy(x: Tensor) -> np.ndarray:
+    return x.detach().cpu().numpy()
+
+
+def _until_event(path: Path, t0: Tensor, event_fn: Any, pack: Callable[[Tensor], Any]) -> tuple[Tensor, Any]:
+    with torch.no_grad():
+        signs = torch.sign(event_fn(t0, pack(path.y0)))
+
+    def g(s: Tensor, y: Tensor) -> Tensor:
+        return torch.min(event_fn((t0 + s).to(t0.dtype), pack(y)) * signs)
+
+    s = path.first_zero(g)
+    y = path(s[None])[0]
+    return (t0 + s).to(t0.dtype), pack(torch.stack([path.y0, y]))
+
+
+def _of_pairs(func: Any, y0: Any) -> Any:
+    """A HamiltonianSystem as a function of (q, p), where `y0` is such a tuple; anything else as it is."""
+    if not (isinstance(func, HamiltonianSystem) and isinstance(y0, tuple)):
+        return func
+    _joined(y0)
+    return lambda t, y: tuple(func(t, torch.cat(y, dim=-1)).chunk(2, dim=-1))
+
+
+def _no_adjoint(method: Any) -> ValueError:
+    return ValueError(
+        f"`method` {_name(method)!r} cannot be used with odeint_adjoint: the adjoint integrates the derivative of "
+        "`func` backward, which is not the derivative of the map that was run, and never sees a flow's weights; the "
+        "gradients would be wrong without notice. Use odeint, which differentiates the map itself."
+    )

@@ -1,0 +1,271 @@
+"""Our methods inside torchdiffeq's `odeint` and `odeint_event`: the numbers of `solve`, and exact gradients."""
+
+from importlib import import_module
+
+import numpy as np
+import pytest
+import torch
+import torchdiffeq
+
+from sympflow import MLPFlow, SympFlow, get, solve, systems
+from sympflow.interop.torchdiffeq import odeint, odeint_adjoint, odeint_event, register
+
+HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
+EPS = np.finfo(float).eps
+METHODS = ["verlet", "kahan_li8", "chin4a", "sympflow"]
+
+
+def flow(seed=0, **options):
+    """An untrained flow: all structure, no accuracy."""
+    return SympFlow(1, hidden=(5,), dt=0.5, seed=seed, **options)
+
+
+def times(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def options(method):
+    return {} if method == "sympflow" else {"dt": 0.1}
+
+
+@pytest.mark.parametrize("method", METHODS)
+class TestValues:
+    @pytest.mark.parametrize("t", [(0.0, 0.25, 1.0, 3.7), (0.5, 0.45, -2.0), (1.0,)])
+    def test_equal_solve(self, method, t):
+        y = odeint(HH, torch.tensor(HH.y0), times(*t), method=method, options=options(method))
+        sol = solve(HH, method, (t[0], t[-1]), t_eval=t, on_domain_exit="ignore", **options(method))
+        np.testing.assert_allclose(y.numpy(), sol.y.T, atol=200 * EPS)
+
+    def test_batches_and_tuples(self, method):
+        y0 = torch.tensor(HH.domain.sample(6, 1).reshape(2, 3, 4))
+        t = times(0.0, 0.5, 1.0)
+        y = odeint(HH, y0, t, method=method, options=options(method))
+        assert y.shape == (3, 2, 3, 4)
+        q, p = odeint(HH, (y0[..., :2], y0[..., 2:]), t, method=method, options=options(method))
+        assert torch.equal(torch.cat([q, p], -1), y)
+        one = odeint(HH, y0[1, 2], t, method=method, options=options(method))
+        torch.testing.assert_close(y[:, 1, 2], one, rtol=0, atol=200 * EPS)
+
+    def test_with_a_graph_or_without_the_numbers_agree(self, method):
+        y0, t = torch.tensor(HH.y0), times(0.0, 0.35, 1.2)
+        plain = odeint(HH, y0, t, method=method, options=options(method))
+        graph = odeint(HH, y0.clone().requires_grad_(True), t, method=method, options=options(method))
+        assert graph.requires_grad
+        assert not plain.requires_grad
+        torch.testing.assert_close(plain, graph.detach(), rtol=0, atol=200 * EPS)
+
+
+@pytest.mark.parametrize("method", ["verlet", "kahan_li8", "chin4a"])
+@pytest.mark.parametrize("t", [(0.0, 0.25, 0.3), (0.2, -0.13, -0.4)])
+def test_gradients_to_y0_and_t(method, t):
+    """At times between grid points, where ψ is smooth in t; a time on the grid has the slope of the step there."""
+    y0 = torch.tensor([[1.0, 0.2], [0.3, -0.4]], dtype=torch.float64, requires_grad=True)
+    t = times(t[0], t[1], t[2] + 0.01).requires_grad_(True)
+    assert torch.autograd.gradcheck(lambda y, s: odeint(PENDULUM, y, s, method=method, options={"dt": 0.1}), (y0, t))
+
+
+@pytest.mark.parametrize("t", [(0.0, 0.25, 1.2), (0.2, -0.13, -1.4)])
+def test_gradients_of_a_flow_to_y0_t_and_weights(t):
+    psi = flow()
+    y0 = torch.tensor([[1.0, 0.2], [0.3, -0.4]], dtype=torch.float64, requires_grad=True)
+
+    def states(y, s, *weights):
+        return odeint(PENDULUM, y, s, method="sympflow", options={"flow": psi})
+
+    assert torch.autograd.gradcheck(states, (y0, times(*t).requires_grad_(True), *psi.parameters()))
+
+
+def test_gradient_in_t_on_the_grid_is_the_velocity(rotation):
+    t = times(0.0, 0.5, 2.0).requires_grad_(True)
+    y = odeint(OSCILLATOR, times(1.0, 0.0), t, method=rotation)
+    slope = torch.autograd.functional.jacobian(
+        lambda s: odeint(OSCILLATOR, times(1.0, 0.0), s, method=rotation)[2, 0], t.detach()
+    )
+    torch.testing.assert_close(slope[2], y[2, 1].detach())  # dq/dt = p
+    torch.testing.assert_close(slope[0], -y[2, 1].detach())
+
+
+class TestEvents:
+    @pytest.mark.parametrize("reverse", [False, True])
+    @pytest.mark.parametrize("method", ["verlet", "rotation"])
+    def test_the_first_zero(self, method, reverse, rotation):
+        method = rotation if method == "rotation" else method
+        t, y = odeint_event(
+            OSCILLATOR, times(1.0, 0.0), times(0.3)[0], event_fn=lambda t, y: y[0], reverse_time=reverse, method=method
+        )
+        expected = 0.3 + (-1 if reverse else 1) * np.pi / 2
+        assert float(t) == pytest.approx(expected, abs=1e-3 if method == "verlet" else 1e-13)
+        assert y.shape == (2, 2)
+        assert abs(float(y[1, 0])) < 1e-14
+
+    @pytest.mark.parametrize("as_tuple", [False, True])
+    def test_as_torchdiffeq_finds_it(self, as_tuple):
+        y0 = torch.tensor(HH.y0)
+        y0 = (y0[:2], y0[2:]) if as_tuple else y0
+
+        def event_fn(t, y):
+            q = y[0] if as_tuple else y[:2]
+            return torch.stack([q[0] - 0.1, q[1] + 5.0, t - 50.0])  # the first of several
+
+        ours = odeint_event(HH, y0, times(0.0)[0], event_fn=event_fn, method="kahan_li8")
+        theirs = odeint_event(HH, y0, times(0.0)[0], event_fn=event_fn, method="dopri5", atol=1e-10, rtol=1e-10)
+        torch.testing.assert_close(ours[0], theirs[0], rtol=0, atol=1e-8)
+        torch.testing.assert_close(ours[1], theirs[1], rtol=0, atol=1e-8)
+
+    @pytest.mark.parametrize("reverse", [False, True])
+    def test_gradients_of_time_and_state(self, reverse):
+        y0 = times(1.0, 0.2).requires_grad_(True)
+        t0 = times(0.1)[0].requires_grad_(True)
+        psi = flow(seed=3)
+
+        def of_verlet(y, t):
+            return odeint_event(
+                PENDULUM, y, t, event_fn=lambda t, y: y[0] - 0.3 + 0.1 * t, reverse_time=reverse, method="verlet"
+            )
+
+        def of_flow(y, t, *weights):
+            return odeint_event(PENDULUM, y, t, event_fn=lambda t, y: y[1] - 0.21, method=psi)
+
+        assert torch.autograd.gradcheck(of_verlet, (y0, t0))
+        crossed = odeint_event(PENDULUM, y0, t0, event_fn=lambda t, y: t - 0.83, method=psi)
+        assert float(crossed[0].detach()) == pytest.approx(0.83)
+        end = torch.autograd.gradcheck(
+            lambda y, *w: odeint_event(PENDULUM, y, t0.detach(), event_fn=lambda t, y: t + y[0] - 1.9, method=psi),
+            (y0, *psi.parameters()),
+        )
+        assert end
+
+    def test_no_event_is_an_error(self):
+        with pytest.raises(RuntimeError, match=r"^`event_fn` found no zero: the solution became non-finite"):
+            odeint_event(
+                HH, times(0.0, 0.0, 0.0, 0.7), times(0.0)[0], event_fn=lambda t, y: y[1] + 9.0 + 0 * t, method="verlet"
+            )
+
+
+def test_everything_else_is_handed_on():
+    y0, t = torch.tensor(HH.y0), times(0.0, 1.0, 2.0)
+    assert torch.equal(odeint(HH, y0, t), torchdiffeq.odeint(HH, y0, t))
+    settings = {"method": "rk4", "options": {"step_size": 0.1}}
+    assert torch.equal(odeint(HH, y0, t, **settings), torchdiffeq.odeint(HH, y0, t, **settings))
+    q, p = odeint(HH, (y0[:2], y0[2:]), t, method="dopri5")  # a HamiltonianSystem takes the pair, too
+    torch.testing.assert_close(torch.cat([q, p], -1), torchdiffeq.odeint(HH, y0, t), rtol=1e-5, atol=1e-5)
+    module = torch.nn.Linear(4, 4).double()
+    theirs = torchdiffeq.odeint_adjoint(lambda t, y: module(y), y0, t, adjoint_params=())
+    assert torch.equal(odeint_adjoint(lambda t, y: module(y), y0, t, adjoint_params=()), theirs)
+
+
+def test_the_adjoint_is_refused():
+    for method in ("sympflow", "verlet", flow()):
+        with pytest.raises(ValueError, match=r"cannot be used with odeint_adjoint.*Use odeint"):
+            odeint_adjoint(PENDULUM, times(1.0, 0.0), times(0.0, 1.0), method=method, adjoint_params=())
+    with pytest.raises(ValueError, match="cannot be used with odeint_adjoint"):
+        odeint_event(
+            PENDULUM,
+            times(1.0, 0.0),
+            times(0.0)[0],
+            event_fn=lambda t, y: y[0],
+            odeint_interface=torchdiffeq.odeint_adjoint,
+            method="verlet",
+        )
+
+
+class TestRegistration:
+    """In torchdiffeq's private table, only when asked for."""
+
+    @pytest.fixture(autouse=True)
+    def registered(self):
+        table = import_module("torchdiffeq._impl.odeint").SOLVERS
+        with pytest.raises(ValueError, match="Invalid method"):
+            torchdiffeq.odeint(HH, torch.tensor(HH.y0), times(0.0, 1.0), method="verlet")
+        register("verlet")
+        register("sympflow")
+        yield
+        del table["verlet"], table["sympflow"]
+
+    @pytest.mark.parametrize("t", [(0.0, 0.35, 2.0), (1.0, 0.65, -1.0)])
+    def test_torchdiffeqs_own_odeint_runs_them(self, t):
+        y0 = torch.tensor(HH.y0)
+        for method in ("verlet", "sympflow"):
+            theirs = torchdiffeq.odeint(HH, y0, times(*t), method=method)
+            assert torch.equal(theirs, odeint(HH, y0, times(*t), method=method))
+        pair = (y0[:2], y0[2:])
+        q, p = torchdiffeq.odeint(HH, pair, times(*t), method="verlet")
+        assert torch.equal(torch.cat([q, p], -1), odeint(HH, y0, times(*t), method="verlet"))
+
+    @pytest.mark.parametrize("reverse", [False, True])
+    def test_events(self, reverse):
+        y0 = times(1.0, 0.0)
+        arguments = {"event_fn": lambda t, y: y[0], "method": "verlet", "reverse_time": reverse}
+        theirs = torchdiffeq.odeint_event(OSCILLATOR, y0, times(0.3)[0], **arguments)
+        ours = odeint_event(OSCILLATOR, y0, times(0.3)[0], **arguments)
+        torch.testing.assert_close(theirs[0], ours[0])
+        torch.testing.assert_close(theirs[1], ours[1])
+
+    def test_gradients_and_the_adjoint(self):
+        y0 = times(1.0, 0.2).requires_grad_(True)
+        assert torch.autograd.gradcheck(
+            lambda y: torchdiffeq.odeint(PENDULUM, y, times(0.0, 0.33), method="verlet"), (y0,)
+        )
+        end = torchdiffeq.odeint_adjoint(PENDULUM, y0, times(0.0, 0.33), method="verlet", adjoint_params=())[-1]
+        with pytest.raises(TypeError, match=r"^`func` must be a HamiltonianSystem"):
+            end.sum().backward()  # an error, not a wrong gradient
+
+    def test_their_names_cannot_be_taken(self):
+        with pytest.raises(ValueError, match="is torchdiffeq's own already"):
+            register("dopri5")
+
+
+def test_a_warning_where_func_is_another_system(rotation):
+    with pytest.warns(UserWarning, match="solves its own system, not this one"):
+        odeint(lambda t, y: 9.0 * y, times(1.0, 0.5), times(0.0, 1.0), method=rotation)
+    odeint(lambda t, y: torch.stack([y[1], -y[0]]), times(1.0, 0.5), times(0.0, 1.0), method=rotation)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"method": "rk45"}, TypeError, r"^`method` 'rk45' is no fixed-step map"),
+        ({"method": "nothing"}, ValueError, r"Invalid method"),
+        ({"options": {"norm": None, "interp": "cubic"}}, TypeError, r"^`interp` is not an option of method"),
+        ({"t": times(0.0, 1.0, 0.5)}, ValueError, r"^`t` must be finite and strictly"),
+        ({"t": times(0.0, np.nan)}, ValueError, r"^`t` must be finite and strictly"),
+        ({"t": torch.tensor([0, 1])}, TypeError, r"^`t` must be a one-dimensional floating"),
+        ({"t": [0.0, 1.0]}, TypeError, r"^`t` must be a one-dimensional floating"),
+        ({"y0": times(1.0)}, ValueError, r"^`y0` must have shape \(\.\.\., 2\)"),
+        ({"y0": torch.tensor([1, 0])}, TypeError, r"^`y0` must be real floating-point"),
+        ({"y0": torch.zeros(2, dtype=torch.complex128)}, TypeError, r"^`y0` must be real floating-point"),
+        ({"y0": (times(1.0), times(1.0), times(1.0))}, TypeError, r"^`y0` must be a tensor \[q, p\] or a tuple"),
+        ({"y0": (times(1.0), times(1.0, 2.0))}, ValueError, r"^`y0` \(q, p\) must have equal shapes"),
+        ({"y0": [1.0, 0.0]}, TypeError, r"^`y0` must be a tensor"),
+        ({"func": lambda t, y: y}, TypeError, r"^`func` must be a HamiltonianSystem for method 'verlet'"),
+        ({"method": flow(), "y0": times(1.0, 2.0, 3.0, 4.0)}, ValueError, r"^`y0` must have shape"),
+        ({"method": SympFlow(2)}, ValueError, r"^`system` .* degrees of freedom"),
+        ({"method": MLPFlow(1), "t": times(1.0, 0.0)}, (TypeError, ValueError), r"inverse|negative"),
+        ({"t": times(0.0, 1.0, 2.0), "event_fn": lambda t, y: y[0]}, ValueError, r"^`t` must have 2 entries"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, error, message):
+    defaults = {"func": PENDULUM, "y0": times(1.0, 0.0), "t": times(0.0, 1.0), "method": "verlet"}
+    arguments = defaults | arguments
+    with pytest.raises(error, match=message):
+        odeint(arguments.pop("func"), arguments.pop("y0"), arguments.pop("t"), **arguments)
+
+
+def test_tolerances_have_no_effect_and_say_so():
+    with pytest.warns(UserWarning, match="`rtol` and `atol` have no effect"):
+        odeint(PENDULUM, times(1.0, 0.0), times(0.0, 1.0), method="verlet", rtol=1e-3)
+
+
+def right_hand_side(t, y):
+    return torch.stack([y[1], -torch.sin(y[0])])
+
+
+def test_single_precision_and_a_system_in_the_options():
+    y0 = torch.tensor([1.0, 0.0])
+    y = odeint(PENDULUM, y0, torch.tensor([0.0, 0.3, 1.0]), method="verlet", options={"step_size": 0.1})
+    assert y.dtype == torch.float32
+    by_option = odeint(right_hand_side, y0.double(), times(0, 1), method="verlet", options={"system": PENDULUM})
+    assert torch.equal(by_option, odeint(PENDULUM, y0.double(), times(0, 1), method="verlet"))
+    assert get("verlet")(dt=0.1).name == "verlet"
+    configured = odeint(PENDULUM, y0.double(), times(0, 1), method=get("verlet")(dt=0.1))
+    assert torch.equal(configured, odeint(PENDULUM, y0.double(), times(0, 1), method="verlet", options={"dt": 0.1}))
