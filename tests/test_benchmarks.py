@@ -16,6 +16,7 @@ if not BENCHMARKS.exists():
 sys.path.insert(0, str(BENCHMARKS))
 
 import peers
+import primed
 from contenders import compiled_loops, interpreted_loops, ours, runge_kutta
 from contenders.calibration import Judged, largest_control
 from contenders.contender import Skipped, Work
@@ -24,6 +25,8 @@ from contenders.measurement import Results, Row, check_agreement, measure
 from contenders.page import duration, page, three
 from contenders.prose import power
 from contenders.scene import Scene
+
+from sympflow.systems import pendulum
 
 TINY = Scene(t_end=20.0, n_instants=20, trajectories=70)  # more than a block of the hand-written loops, and not two
 
@@ -196,3 +199,21 @@ def test_a_tiny_run_fills_the_page_and_survives_json():
     assert "- heyoka: not installed." in text
     again = Results.from_dict(json.loads(json.dumps(results.to_dict())))
     assert page(again, Path("figures/figure.png")) == text
+
+
+# primed flows against schemes -------------------------------------------------------------------------
+
+
+def test_fewest_steps_are_the_fewest():
+    assert primed.fewest_steps(lambda n: (100 / n) ** 4, 1.0, 13) in (100, 101)
+    assert primed.fewest_steps(lambda n: (100 / n) ** 4, 1.0, 5000) in (100, 101)
+    assert primed.fewest_steps(lambda n: 1.0, 0.5, 10) is None
+
+
+def test_a_tiny_comparison_of_a_primed_flow(monkeypatch):
+    monkeypatch.setattr(primed, "T_END", 20.0)
+    monkeypatch.setattr(primed, "INSTANTS", 20)
+    row = primed.measure(pendulum(), 2, 1.0, 3, 1)
+    assert row.energy_error > 0
+    assert row.rival_kicks > row.kicks
+    assert primed.table([row]).count("\n") == 2
