@@ -35,8 +35,8 @@ def machine(results: Results) -> str:
     return (
         f"Measured on one thread of {e['processor']} ({e['cores']} cores, {e['system']}; {load}), in {e['repeats']} "
         f"interleaved rounds and {e['minutes']:.1f} minutes. The interquartile range over the rounds is below "
-        f"{middle:.1%} of the time for half of the rows and at most {most:.0%}. Versions: {versions}. Ratios carry over "
-        "to other machines better than times."
+        f"{middle:.1%} of the time for half of the rows and at most {most:.0%}. Versions: {versions}. Ratios carry "
+        "over to other machines better than times."
     )
 
 
