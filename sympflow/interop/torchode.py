@@ -1,0 +1,124 @@
+"""Our methods as torchode step methods: batches in which every sample has its own times, and gradients.
+
+torchode drives with a fixed step per sample::
+
+    register("verlet", system)
+    controller = torchode.FixedStepController()
+    torchode.solve_ivp(system, y0, t_eval, method="verlet", controller=controller, dt0=torch.full((len(y0),), 0.1))
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+try:
+    from torchode.interface import register_method
+    from torchode.single_step_methods import SingleStepMethod
+    from torchode.single_step_methods.base import StepResult
+except ImportError as error:  # pragma: no cover
+    raise ImportError("sympflow.interop.torchode needs torchode: pip install torchode.") from error
+
+from sympflow.integrators.base import FixedStep
+from sympflow.interop.matching import fixed_step
+from sympflow.system import HamiltonianSystem
+
+
+def register(name: str, system: HamiltonianSystem, method: Any = None, **options: Any) -> None:
+    """Make one of our methods known to torchode, through its public `register_method`, under `name`.
+
+    Parameters
+    ----------
+    name : str
+        What `torchode.solve_ivp(method=name)` will say; also the method, if that is not given.
+    system : HamiltonianSystem
+        What is solved: torchode's term is not evaluated.
+    method : str, trained flow or Integrator, optional
+    **options
+        Options of the method. The step length is torchode's `dt0`, so `dt` is not one of them.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the method does not apply to the system, chooses its own steps, or has no such option.
+    """
+    made = step_method(name if method is None else method, system, **options)
+    register_method(name, lambda term: made)
+
+
+def step_method(method: Any, system: HamiltonianSystem, **options: Any) -> SymplecticStep:
+    """One of our methods as a torchode `SingleStepMethod`; arguments as for `register`."""
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(
+            f"`system` must be a HamiltonianSystem; got {type(system).__name__}. See sympflow.interop.systems."
+        )
+    if "dt" in options:
+        raise TypeError("`dt` is not an option here: the step length is torchode's `dt0`, one for each sample.")
+    integrator = fixed_step(method, options, "torchode")
+    integrator.check(system)
+    return SymplecticStep(integrator, system)
+
+
+class Beginning(NamedTuple):
+    """Where a step began: what the states within it are computed from."""
+
+    t0: Tensor
+    y0: Tensor
+
+
+class SymplecticStep(SingleStepMethod):
+    """A fixed-step method of sympflow as a torchode step; dense output by a shorter step, without interpolation."""
+
+    def __init__(self, integrator: FixedStep, system: HamiltonianSystem) -> None:
+        super().__init__()
+        self.integrator, self.system = integrator, system
+        # the longest step that a flow was trained for; the state's own module, so that its weights are parameters
+        self.flow = integrator.flow_for(system) if integrator.trained else None  # type: ignore[attr-defined]
+
+    def init(self, term: Any, problem: Any, f0: Tensor | None, *, stats: dict[str, Any], args: Any) -> None:
+        if problem.n_features != 2 * self.system.ndof:
+            raise ValueError(
+                f"`y0` must have shape (batch, {2 * self.system.ndof}), [q, p]; got {problem.n_features} features."
+            )
+
+    def step(
+        self,
+        term: Any,
+        running: Tensor,
+        y0: Tensor,
+        t0: Tensor,
+        dt: Tensor,
+        state: None,
+        *,
+        stats: dict[str, Any],
+        args: Any,
+    ) -> tuple[StepResult, Beginning, None, None]:
+        if self.flow is not None and (dt.detach().abs() > self.flow.dt * (1 + 1e-12)).any():
+            raise ValueError(
+                f"`dt0` must be at most the flow's Δt = {self.flow.dt:g}; got {float(dt.detach().abs().max()):g}. "
+                "Drive it with torchode.FixedStepController and a smaller dt0."
+            )
+        return StepResult(self._advance(y0, dt), None), Beginning(t0, y0), None, None
+
+    def _advance(self, y: Tensor, h: Tensor) -> Tensor:
+        return self.integrator.step(self.system, 0.0, y, h.to(y.dtype))
+
+    def merge_states(self, accept: Tensor, current: None, previous: None) -> None:
+        return None
+
+    def convergence_order(self) -> int:
+        return self.integrator.order or 1
+
+    def build_interpolation(self, data: Beginning) -> Within:
+        return Within(self, data)
+
+
+class Within:
+    """The states inside a step: shorter steps from its beginning."""
+
+    def __init__(self, method: SymplecticStep, data: Beginning) -> None:
+        self.method, self.data = method, data
+
+    def evaluate(self, t: Tensor, idx: Tensor) -> Tensor:
+        return self.method._advance(self.data.y0[idx], t - self.data.t0[idx])

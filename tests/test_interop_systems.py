@@ -1,0 +1,78 @@
+"""Peers' systems converted: H(q, p) and modules forward(t, y) describe the same motion as our own definition."""
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import HamiltonianSystem, solve, systems
+from sympflow.interop.systems import from_hamiltonian, from_module
+
+HH = systems.henon_heiles()
+
+
+def henon_heiles(q, p):
+    return (p**2).sum(-1) / 2 + (q**2).sum(-1) / 2 + q[..., 0] ** 2 * q[..., 1] - q[..., 1] ** 3 / 3
+
+
+class Field(torch.nn.Module):
+    """x' = J∇H of Hénon–Heiles, as one would write it for torchdiffeq."""
+
+    def forward(self, t, y):
+        q1, q2, p1, p2 = y.unbind(-1)
+        return torch.stack([p1, p2, -q1 - 2 * q1 * q2, -q2 - q1**2 + q2**2], -1)
+
+
+class Relativistic(torch.nn.Module):
+    """H = √(1 + p²) + q⁴/4 + q p/10: neither separable nor of quadratic kinetic energy."""
+
+    def forward(self, t, y):
+        q, p = y.unbind(-1)
+        return torch.stack([p / torch.sqrt(1 + p**2) + q / 10, -(q**3) - p / 10], -1)
+
+
+@pytest.mark.parametrize("system", [from_hamiltonian(henon_heiles, 2, y0=HH.y0), from_module(Field(), 2, y0=HH.y0)])
+def test_a_separable_one_is_recognised_and_moves_as_ours(system):
+    assert system.separable
+    assert system.quadratic_kinetic
+    y = HH.domain.sample(5)
+    np.testing.assert_allclose(system.hamiltonian(y), HH.hamiltonian(y), atol=1e-14)
+    np.testing.assert_allclose(system.vector_field(y), HH.vector_field(y), atol=1e-14)
+    assert np.allclose(system.fingerprint, HH.fingerprint, rtol=1e-12)  # so that HH's trained flows fit it
+    for method in ("verlet", "srkn11b", "sympflow"):
+        ours, theirs = (solve(s, method, (0, 5), on_domain_exit="ignore") for s in (HH, system))
+        np.testing.assert_allclose(theirs.y, ours.y, atol=1e-12)
+
+
+def test_masses_are_read_off():
+    def H(q, p):
+        return p[..., 0] ** 2 / 4 + p[..., 0] * p[..., 1] / 5 + p[..., 1] ** 2 / 6 + (q**4).sum(-1)
+
+    system = from_hamiltonian(H, 2)
+    np.testing.assert_allclose(system.inverse_mass, [[1 / 2, 1 / 5], [1 / 5, 1 / 3]], atol=1e-11)
+
+
+def test_a_general_one():
+    H = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**4/4 + q*p/10", y0=[1.0, 0.5])
+    system = from_module(Relativistic(), 1, y0=[1.0, 0.5])
+    assert not system.separable
+    y = np.random.default_rng(0).uniform(-1, 1, (20, 2))
+    np.testing.assert_allclose(
+        system.hamiltonian(y) - system.hamiltonian(y[0]), H.hamiltonian(y) - H.hamiltonian(y[0]), atol=1e-12
+    )
+    sol = solve(system, "dop853", (0, 10), rtol=1e-10, atol=1e-12)
+    assert np.abs(np.ptp(sol.energy())) < 1e-9
+
+
+def test_what_is_not_hamiltonian_is_refused():
+    with pytest.raises(ValueError, match=r"^`module` is not a Hamiltonian field"):
+        from_module(lambda t, y: torch.stack([y[..., 1], -y[..., 0] - 0.1 * y[..., 1]], -1), 1)
+    with pytest.raises(ValueError, match=r"^`module` depends on t"):
+        from_module(lambda t, y: torch.stack([y[..., 1], torch.cos(t) - y[..., 0]], -1), 1)
+    with pytest.raises(ValueError, match=r"^`module` must map \(\.\.\., 2\)"):
+        from_module(lambda t, y: y[..., :1], 1)
+    with pytest.raises(ValueError, match=r"^`H` must map q, p"):
+        from_hamiltonian(lambda q, p: q * p, 2)
+    with pytest.raises(TypeError, match=r"^`H` must be a function H\(q, p\)"):
+        from_hamiltonian(lambda t, q, p: q, 2)
+    with pytest.raises(ValueError, match=r"^`ndof` must be a positive integer"):
+        from_module(Field(), 0)
