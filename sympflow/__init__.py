@@ -24,6 +24,7 @@ _HOME = {
     "train": "training.trainer",
     "compare": "comparison",
     "work_precision": "precision",
+    "poincare_section": "poincare",
     "energy_error": "metrics.energy",
     "max_energy_error": "metrics.energy",
     "energy_drift": "metrics.energy",
@@ -33,11 +34,12 @@ _HOME = {
     "reference_error": "metrics.accuracy",
     "time_reversal_error": "metrics.accuracy",
 }
-_MODULES = ("systems",)
+_MODULES = ("systems", "interop")
 
 __all__ = ["__version__", *_HOME, *_MODULES]  # noqa: PLE0604
 
 if TYPE_CHECKING:
+    from sympflow import interop as interop
     from sympflow import systems as systems
     from sympflow.comparison import compare as compare
     from sympflow.domain import Ball as Ball
@@ -57,6 +59,7 @@ if TYPE_CHECKING:
     from sympflow.metrics.symplectic import loop_area_error as loop_area_error
     from sympflow.metrics.symplectic import symplecticity_defect as symplecticity_defect
     from sympflow.metrics.symplectic import volume_error as volume_error
+    from sympflow.poincare import poincare_section as poincare_section
     from sympflow.precision import work_precision as work_precision
     from sympflow.solution import Solution as Solution
     from sympflow.solver import solve as solve

@@ -306,6 +306,12 @@ class Adams(Integrator):
     def step_length(self, system: HamiltonianSystem) -> float:
         return float(self.dt if self.dt is not None else system.dt)
 
+    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        raise TypeError(
+            f"`method` {self.name!r} is a multistep method, with no bare step to repeat or differentiate: use a "
+            "one-step method."
+        )
+
     def run(self, problem: Problem) -> Outcome:
         import torch
 

@@ -1,4 +1,15 @@
-"""sympflow where people already work: `interop.scipy`, `interop.torchdiffeq`, `interop.torchode`, `interop.systems`.
+"""sympflow where people already work: `interop.scipy`, `.torchdiffeq`, `.torchode`, and `.systems` for conversion.
 
-Import the module that you need; none is loaded before.
+Each is imported when it is first used.
 """
+
+from importlib import import_module
+from types import ModuleType
+
+__all__ = ["scipy", "systems", "torchdiffeq", "torchode"]
+
+
+def __getattr__(name: str) -> ModuleType:
+    if name in __all__:
+        return import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,268 @@
+"""poincare_section(): where trajectories cross a plane of phase space, located on the method's own map."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field, make_dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.arrays import is_tensor
+from sympflow.integrators.base import Integrator
+from sympflow.integrators.registry import build
+from sympflow.solver import _check_t_span, _check_y0
+from sympflow.system import HamiltonianSystem
+from sympflow.tables import Column, text_table, write_csv
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def poincare_section(
+    system: HamiltonianSystem,
+    method: Any = "sympflow",
+    t_span: tuple[float, float] | None = None,
+    y0: ArrayLike | None = None,
+    *,
+    coordinate: int | str = 0,
+    level: float = 0.0,
+    direction: int = 1,
+    sample: float | None = None,
+    **options: Any,
+) -> PoincareSection:
+    """The states in which trajectories cross the plane y[coordinate] = level.
+
+    Each crossing is located to rounding on the dense output of the method, a shorter step of it. The run streams: only
+    the crossings are stored.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    method : str, Integrator or trained flow
+    t_span : (float, float), optional
+        The default is the system's.
+    y0 : array_like of shape (..., 2d), optional
+        One state, or a batch of them: the trajectories advance together. The default is the system's.
+    coordinate : int or str
+        Index into [q, p], or a name such as "q1" or "p2".
+    level : float
+    direction : 1, -1 or 0
+        Only crossings upwards, only downwards, or both.
+    sample : float, optional
+        Longest time between two samples; two crossings within it are missed. The default is `system.dt`, or the
+        method's step where that is shorter.
+    **options
+        Options of the method.
+
+    Returns
+    -------
+    PoincareSection
+        With `.rows`, `.table()`, `.plot()` and `.to_csv()`.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For bad arguments, at once.
+
+    Examples
+    --------
+    >>> import sympflow
+    >>> system = sympflow.systems.henon_heiles()
+    >>> section = poincare_section(system, "kahan_li8", (0, 100))
+    >>> section.states.shape[1]
+    4
+    """
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    integrator = build(method, options)
+    integrator.check(system)
+    span = _check_t_span(system.t_span if t_span is None else t_span)
+    if is_tensor(y0):
+        raise TypeError("`y0` is a tensor, but crossings are located on NumPy arrays: pass y0.numpy().")
+    start = _check_y0(system, system.y0 if y0 is None else y0, None)
+    index = _check_coordinate(coordinate, system.ndof)
+    if direction not in (-1, 0, 1):
+        raise ValueError(f"`direction` must be 1 (upwards), -1 (downwards) or 0 (both); got {direction!r}.")
+    if sample is None:
+        sample = system.dt
+    if not sample > 0:
+        raise ValueError(f"`sample` must be a positive time; got {sample!r}.")
+    rows = start.reshape(-1, start.shape[-1])
+    found = _Crossings(integrator, system, index, float(level), direction, float(sample))
+    for t, y, h in integrator.steps(system, span, rows):
+        found.search(t, y, h)
+    trajectory, times, states = found.result(system.ndof, np.sign(span[1] - span[0]))
+    return PoincareSection(system, integrator, span, rows, index, float(level), direction, trajectory, times, states)
+
+
+@dataclass(frozen=True)
+class PoincareSection:
+    """The crossings of a plane, those of each trajectory together and in order of time.
+
+    Attributes
+    ----------
+    system, integrator, t_span
+        What was run.
+    y0 : ndarray (N, 2d)
+        The initial states.
+    coordinate, level, direction
+        The plane.
+    trajectory : ndarray (n,)
+        Which of the initial states each crossing belongs to.
+    t : ndarray (n,)
+    states : ndarray (n, 2d)
+    """
+
+    system: HamiltonianSystem
+    integrator: Integrator
+    t_span: tuple[float, float]
+    y0: np.ndarray = field(repr=False)
+    coordinate: int
+    level: float
+    direction: int
+    trajectory: np.ndarray = field(repr=False)
+    t: np.ndarray = field(repr=False)
+    states: np.ndarray = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @cached_property
+    def rows(self) -> tuple[Any, ...]:
+        """One for each crossing: trajectory, t, and the coordinates q1 … pd."""
+        d = self.system.ndof
+        columns = [("trajectory", int), ("t", float), *((name, float) for name in names(d))]
+        Crossing = make_dataclass("Crossing", columns, frozen=True)
+        return tuple(
+            Crossing(int(k), float(t), *map(float, y))
+            for k, t, y in zip(self.trajectory, self.t, self.states, strict=True)
+        )
+
+    def table(self, limit: int = 20) -> str:
+        """The first `limit` crossings as text."""
+        shown = range(min(limit, len(self)))
+        columns = [
+            Column("trajectory", [str(self.trajectory[i]) for i in shown]),
+            Column("t", [f"{self.t[i]:.6f}" for i in shown]),
+            *(
+                Column(name, [f"{self.states[i, j]:.6f}" for i in shown])
+                for j, name in enumerate(names(self.system.ndof))
+                if j != self.coordinate
+            ),
+        ]
+        more = f"\n… {len(self) - limit} more" if len(self) > limit else ""
+        return text_table(columns) + more if len(self) else "no crossing"
+
+    def to_csv(self, path: str | os.PathLike[str]) -> Path:
+        """Write all crossings to a CSV file, numbers to full precision."""
+        if not len(self):
+            raise ValueError("`section` has no crossing to write: run it longer, or move `level`.")
+        return write_csv(self.rows, path)
+
+    def plot(self, x: int | str | None = None, y: int | str | None = None) -> Figure:
+        """The crossings in the plane of two coordinates, each trajectory in a shade of its own.
+
+        Parameters
+        ----------
+        x, y : int or str, optional
+            The coordinates; the default is the first other position, or p if there is none, and its momentum.
+
+        Raises
+        ------
+        ImportError
+            Without matplotlib.
+        """
+        from sympflow.figure_style import TEXT, dress, new_figure
+
+        d, label = self.system.ndof, names(self.system.ndof)
+        position = next((j for j in range(d) if j != self.coordinate), d)
+        i = position if x is None else _check_coordinate(x, d)
+        j = (position + d if position < d else 0) if y is None else _check_coordinate(y, d)
+        figure = new_figure(4.6, 4.4)
+        ax = figure.add_subplot()
+        ax.scatter(
+            self.states[:, i],
+            self.states[:, j],
+            c=self.trajectory,
+            cmap="viridis",
+            s=3.0,
+            linewidths=0,
+            vmax=max(1.15 * (len(self.y0) - 1), 1),
+            rasterized=True,
+        )
+        way = {1: f", {label[self.coordinate]} increasing", -1: f", {label[self.coordinate]} decreasing", 0: ""}
+        plane = f"{label[self.coordinate]} = {self.level:g}{way[self.direction]}"
+        ax.set_title(f"{self.system.name.replace('_', ' ')}, {self.integrator.name}: {plane}", fontsize=9, color=TEXT)
+        dress(ax, label[i], label[j])
+        return figure
+
+
+class _Crossings:
+    """Finds the crossings in the steps of a run as they stream by."""
+
+    def __init__(
+        self,
+        integrator: Integrator,
+        system: HamiltonianSystem,
+        coordinate: int,
+        level: float,
+        direction: int,
+        sample: float,
+    ) -> None:
+        self.integrator, self.system = integrator, system
+        self.coordinate, self.level, self.direction, self.sample = coordinate, level, direction, sample
+        self.found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def search(self, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> None:
+        """Steps (n,) of N trajectories: times (n,) or (n, N), states at their beginnings (n, N, 2d), lengths."""
+        h, t = (np.broadcast_to(a.reshape(len(y), -1), y.shape[:-1]) for a in (h, t))
+        parts = max(1, int(np.ceil(np.abs(h).max() / self.sample * (1 - 1e-12))))
+        before = y[..., self.coordinate] - self.level
+        for part in range(parts):
+            with np.errstate(all="ignore"):
+                after = self._step(y, h * ((part + 1) / parts))[..., self.coordinate] - self.level
+                up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
+            crossed = {1: up, -1: down, 0: up | down}[self.direction] & (h != 0)
+            if crossed.any():
+                self._locate(t, y, h, crossed, part / parts, (part + 1) / parts, before)
+            before = after
+
+    def _locate(
+        self, t: np.ndarray, y: np.ndarray, h: np.ndarray, crossed: np.ndarray, a: float, b: float, before: np.ndarray
+    ) -> None:
+        """Bisect all crossings together, in the fraction of the step."""
+        y, t, h, sign = y[crossed], t[crossed], h[crossed], np.sign(before[crossed])
+        low, high = np.full(len(y), a), np.full(len(y), b)
+        for _ in range(54):
+            middle = (low + high) / 2
+            g = self._step(y, h * middle)[:, self.coordinate] - self.level
+            low, high = np.where(g * sign > 0, middle, low), np.where(g * sign > 0, high, middle)
+        self.found.append((np.nonzero(crossed)[1], t + h * high, self._step(y, h * high)))
+
+    def _step(self, y: np.ndarray, h: np.ndarray) -> np.ndarray:
+        return self.integrator.step(self.system, 0.0, y, h)
+
+    def result(self, ndof: int, direction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if not self.found:
+            return np.empty(0, dtype=int), np.empty(0), np.empty((0, 2 * ndof))
+        trajectory, t, states = (np.concatenate(parts) for parts in zip(*self.found, strict=True))
+        order = np.lexsort((t * direction, trajectory))
+        return trajectory[order], t[order], states[order]
+
+
+def names(ndof: int) -> list[str]:
+    """q, p for one degree of freedom; q1 … qd, p1 … pd for more."""
+    return [f"{x}{i + 1}" if ndof > 1 else x for x in "qp" for i in range(ndof)]
+
+
+def _check_coordinate(coordinate: int | str, ndof: int) -> int:
+    known = names(ndof)
+    if isinstance(coordinate, str) and coordinate in known:
+        return known.index(coordinate)
+    if isinstance(coordinate, int | np.integer) and not isinstance(coordinate, bool) and 0 <= coordinate < 2 * ndof:
+        return int(coordinate)
+    raise ValueError(f"`coordinate` must be one of {', '.join(known)}, or an index into them; got {coordinate!r}.")

@@ -1,0 +1,93 @@
+"""Poincaré sections: the crossings are on the plane, on the method's map, and all of them."""
+
+import numpy as np
+import pytest
+import torch
+
+import sympflow
+from sympflow import poincare_section, solve, systems
+
+HH, OSCILLATOR = systems.henon_heiles(), systems.harmonic_oscillator()
+METHODS = [("kahan_li8", {"dt": 0.1}), ("verlet", {"dt": 0.05}), ("sympflow", {}), ("dop853", {"rtol": 1e-10})]
+
+
+@pytest.mark.parametrize(("method", "options"), METHODS)
+def test_the_crossings_are_those_that_events_find(method, options):
+    def g(t, y):
+        return y[0]
+
+    g.direction = 1
+    section = poincare_section(HH, method, (0.0, 60.0), sample=0.1, **options)
+    sol = solve(HH, method, (0.0, 60.0), t_eval=[], events=g, event_step=0.1, on_domain_exit="ignore", **options)
+    assert len(section) == len(sol.t_events[0]) > 5
+    tolerance = 1e-5 if method == "dop853" else 1e-12  # a bare step there, the interpolant here
+    np.testing.assert_allclose(section.t, sol.t_events[0], atol=tolerance)
+    np.testing.assert_allclose(section.states, sol.y_events[0], atol=tolerance)
+    assert np.abs(section.states[:, 0]).max() < 1e-13
+
+
+def test_all_zeros_of_cos_t_upwards_and_downwards(rotation):
+    zeros = np.pi * (np.arange(64) + 0.5)
+    for t_end in (200.0, -200.0):
+        for direction, expected in ((0, zeros), (-1, zeros[0::2]), (1, zeros[1::2])):
+            section = poincare_section(OSCILLATOR, rotation, (0.0, t_end), [1.0, 0.0], direction=direction)
+            np.testing.assert_allclose(np.abs(section.t), expected, rtol=0, atol=1e-10)
+
+
+def test_a_batch_is_the_loop():
+    y0 = HH.domain.sample(5, 1)
+    together = poincare_section(HH, "verlet", (0, 50), y0.reshape(5, 1, 4), coordinate="q2", level=0.1)
+    for k in range(5):
+        alone = poincare_section(HH, "verlet", (0, 50), y0[k], coordinate=1, level=0.1)
+        np.testing.assert_allclose(together.t[together.trajectory == k], alone.t, atol=1e-11)
+        np.testing.assert_allclose(together.states[together.trajectory == k], alone.states, atol=1e-11)
+
+
+def test_energy_is_kept_on_the_section():
+    section = poincare_section(HH, "kahan_li8", (0, 300), dt=0.1)
+    np.testing.assert_allclose(HH.hamiltonian(section.states), HH.hamiltonian(HH.y0), rtol=1e-9)
+
+
+def test_rows_table_csv_and_figure(tmp_path):
+    section = poincare_section(HH, "verlet", (0, 200), HH.domain.sample(3))
+    row = section.rows[0]
+    assert (row.trajectory, row.t) == (0, section.t[0])
+    assert [row.q1, row.q2, row.p1, row.p2] == section.states[0].tolist()
+    assert section.table(3).splitlines()[0].split() == ["trajectory", "t", "q2", "p1", "p2"]
+    assert section.table(3).splitlines()[-1] == f"… {len(section) - 3} more"
+    read = np.genfromtxt(section.to_csv(tmp_path / "section.csv"), delimiter=",", names=True)
+    np.testing.assert_array_equal(read["p2"], section.states[:, 3])
+    figure = section.plot()
+    (ax,) = figure.axes
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("q2", "p2")
+    np.testing.assert_array_equal(ax.collections[0].get_offsets(), section.states[:, [1, 3]])
+    assert section.plot("q2", "p1").axes[0].get_ylabel() == "p1"
+
+
+def test_no_crossing():
+    section = poincare_section(HH, "verlet", (0, 1), level=50.0)
+    assert (len(section), section.rows, section.table()) == (0, (), "no crossing")
+    with pytest.raises(ValueError, match=r"^`section` has no crossing"):
+        section.to_csv("nowhere.csv")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"coordinate": "q3"}, ValueError, r"^`coordinate` must be one of q1, q2, p1, p2"),
+        ({"coordinate": 4}, ValueError, r"^`coordinate` must be one of"),
+        ({"direction": 2}, ValueError, r"^`direction` must be 1"),
+        ({"sample": 0}, ValueError, r"^`sample` must be a positive"),
+        ({"y0": torch.zeros(4)}, TypeError, r"^`y0` is a tensor"),
+        ({"method": "explicit_adams"}, TypeError, r"no bare step|define steps"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, error, message):
+    with pytest.raises(error, match=message):
+        poincare_section(HH, **{"method": "verlet", "t_span": (0, 1), **arguments})
+
+
+def test_interop_modules_load_when_used():
+    assert sympflow.interop.scipy.as_scipy
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        sympflow.interop.nothing  # noqa: B018
