@@ -1,0 +1,1 @@
+"""Ruth's third-order symplectic method as a plug-in of sympflow."""

@@ -1,0 +1,49 @@
+"""The example plug-in, installed as a user would, is found by name and passes its own tests."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("hatchling", reason="the plug-in is built with hatchling: pip install hatchling")
+
+PLUGIN = Path(__file__).parent.parent / "examples" / "plugin"
+
+
+def run(*arguments, path):
+    environment = os.environ | {"PYTHONPATH": str(path)}
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=environment, check=False)
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """A folder into which the plug-in was installed, without network."""
+    target = tmp_path_factory.mktemp("site")
+    pip = ["-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--target"]
+    result = run(*pip, str(target), str(PLUGIN), path="")
+    assert result.returncode == 0, result.stderr
+    return target
+
+
+def test_it_is_listed_without_being_imported_and_solves(installed):
+    program = """
+import sys
+import sympflow
+assert "ruth3" in sympflow.available()
+assert "sympflow_ruth" not in sys.modules
+system = sympflow.systems.henon_heiles()
+sol = sympflow.solve(system, "ruth3", (0, 10), dt=0.05, events=lambda t, y: y[0])
+assert sol.success and sol.t_events[0].size
+assert sol.nfev >= 3 * 200
+report = sympflow.compare(system, ["ruth3", "verlet"], t_span=(0, 10), metrics=("energy", "volume"), repeats=1)
+assert report.rows[0].method == "ruth3" and report.rows[0].energy_error < report.rows[1].energy_error
+"""
+    result = run("-c", program, path=installed)
+    assert result.returncode == 0, result.stderr
+
+
+def test_it_passes_its_own_tests(installed):
+    result = run("-m", "pytest", "-q", "-p", "no:cacheprovider", str(PLUGIN / "tests"), path=installed)
+    assert result.returncode == 0, result.stdout
