@@ -161,9 +161,8 @@ def main() -> None:
             ]
         )
     )
-    print(
-        f"\n{result['zeros_of_cos']['found']} zeros of cos t found, the worst wrong by {result['zeros_of_cos']['error']:.1e}"
-    )
+    found = result["zeros_of_cos"]
+    print(f"\n{found['found']} zeros of cos t found, the worst wrong by {found['error']:.1e}")
     if arguments.json:
         arguments.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 
