@@ -80,8 +80,9 @@ def gradient_kick(q, b, g, work):
     apply_inverse_mass(slope, velocity)
     hessian_vector(q, velocity, product)
     for i in range(NDOF):
-        product[i] = g * product[i] - b * slope[i]
-    return product
+        slope[i] *= -b
+        product[i] *= g
+    return slope, product
 
 
 @njit(**OPTIONS)

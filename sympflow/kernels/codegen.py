@@ -83,7 +83,7 @@ def algebra_source(symbols: SymbolicHamiltonian) -> str:
 
 
 def gradient_kick_source(symbols: SymbolicHamiltonian) -> str:
-    """−b∇V + g ∇²V M⁻¹∇V: the Hessian's upper triangle is computed, the products are taken with numbers.
+    """−b∇V and g ∇²V M⁻¹∇V: the Hessian's upper triangle is computed, the products are taken with numbers.
 
     Raises
     ------
@@ -101,11 +101,12 @@ def gradient_kick_source(symbols: SymbolicHamiltonian) -> str:
         terms = [f"{float(M[j, k])!r}*{{{k}}}" if M[j, k] != 1 else f"{{{k}}}" for k in range(d) if M[j, k] != 0]
         return f"({' + '.join(terms)})"
 
-    results = []
+    plain, gradient = [f"-b*{{{i}}}" for i in range(d)], []
     for i in range(d):
         row = [(position.get((min(i, j), max(i, j))), velocity(j)) for j in range(d)]
         product = " + ".join(f"{{{n}}}*{v}" for n, v in row if n is not None)
-        results.append(f"g*({product}) - b*{{{i}}}" if product else f"-b*{{{i}}}")
+        gradient.append(f"g*({product})" if product else "0.0")
+    results = [f"({', '.join(change)},)" for change in (plain, gradient)]
     return _function("gradient_kick", "q, b, g, work", q, [*slope, *entries], results) + "\n"
 
 

@@ -20,8 +20,12 @@ CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where noth
 @njit(**OPTIONS)
 def stage(q, p, q_error, p_error, b, g, a, work):
     """Kick by b (and g), then drift by a."""
-    change = gradient_kick(q, b, g, work) if FORCE_GRADIENTS and g != 0.0 else kick(q, b, work)
-    p, p_error = move(p, p_error, change)
+    if FORCE_GRADIENTS and g != 0.0:
+        plain, gradient = gradient_kick(q, b, g, work)
+        p, p_error = move(p, p_error, plain)  # first, for it is known sooner
+        p, p_error = move(p, p_error, gradient)
+    else:
+        p, p_error = move(p, p_error, kick(q, b, work))
     q, q_error = move(q, q_error, drift(p, a, work))
     return q, p, q_error, p_error
 
