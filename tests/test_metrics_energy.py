@@ -94,6 +94,34 @@ def test_drift_wants_blocks_and_outputs():
         energy_drift(sol, blocks=5)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("method", ["verlet", "kahan_li8", "rk45", "dop853"])
+@pytest.mark.parametrize("t_eval", [None, [10.0, 20.0]], ids=["every step", "few outputs"])
+def test_the_drift_of_a_blow_up_is_infinite_alone_and_in_a_batch(method, t_eval):
+    system = systems.henon_heiles()
+    lost = [0.0, 0.0, 0.0, 0.7]
+    for y0 in (lost, [lost], [lost, lost]):
+        drift = energy_drift(solve(system, method, (0, 20), y0, t_eval=t_eval))
+        assert np.all(drift.slope == np.inf)
+        assert np.all(drift.standard_error == np.inf)
+    good, bad = energy_drift(solve(system, method, (0, 20), [system.y0, lost])).slope
+    assert np.isfinite(good)
+    assert bad == np.inf
+
+
+@pytest.mark.parametrize("measure", [energy_error, max_energy_error, energy_drift, energy_scale])
+@pytest.mark.parametrize("wrong", [3, None, np.zeros((4, 10))], ids=["number", "none", "array"])
+def test_what_is_no_solution_is_refused(measure, wrong):
+    with pytest.raises(TypeError, match=r"^`sol` must be a Solution; got .*\. Pass what solve"):
+        measure(wrong)
+
+
+def test_blocks_are_counted():
+    sol = solve(systems.harmonic_oscillator(), "verlet", (0, 5))
+    with pytest.raises(TypeError, match="`blocks` must be an integer"):
+        energy_drift(sol, blocks=25.5)
+
+
 def test_tensors_and_batches_give_arrays():
     import torch
 

@@ -16,7 +16,7 @@ from sympflow import (
     volume_error,
 )
 from sympflow.integrators.base import FixedStep
-from sympflow.metrics.symplectic import loop_area, natural_scale
+from sympflow.metrics.symplectic import loop_area, natural_scale, step_tangents
 
 EPS = np.finfo(float).eps
 SPLITTINGS = ["verlet", "leapfrog", "yoshida4", "kahan_li8", "chin4a"]
@@ -133,10 +133,53 @@ def test_determinant_one_is_weaker_than_symplectic():
     assert symplecticity_defect(sol) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("method", ["verlet", "kahan_li8", "chin4a", "sympflow"])
+def test_the_metrics_are_those_of_the_precision_that_was_executed(method):
+    """The rounding of an entry of A is eps(float32) ≈ 1.2e-7; that of a float64 step would be 2e-16."""
+    eps = float(np.finfo(np.float32).eps)
+    system = systems.henon_heiles()
+    sol = solve(system, method, (0, 5), dtype="float32")
+    assert sol.y.dtype == np.float32
+    n_steps, operations = sol.stats["n_steps"], 100
+    assert eps / 10 < symplecticity_defect(sol) < operations * eps
+    assert EPS * n_steps * operations < abs(volume_error(sol)) < n_steps * operations * eps
+    for _, _, A in step_tangents(sol):
+        assert A.dtype == np.float64
+        assert np.array_equal(A, A.astype(np.float32))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("method", ["verlet", "kahan_li8", "chin4a", "rk45", "dop853"])
+def test_a_blow_up_has_infinite_errors_alone_and_in_a_batch(method):
+    system = systems.henon_heiles()
+    options = {} if method in ("rk45", "dop853") else {"dt": 0.01}
+    lost = [0.0, 0.0, 0.0, 0.7]
+    for measure in (volume_error, symplecticity_defect):
+        assert measure(solve(system, method, (0, 20), lost, **options)) == np.inf
+        good, bad = measure(solve(system, method, (0, 20), [system.y0, lost], **options))
+        assert np.isfinite(good)
+        assert bad == np.inf
+    series = volume_error(solve(system, method, (0, 20), [system.y0, lost], **options), over_time=True)
+    assert np.isfinite(series[0]).all()
+    assert not np.isnan(series).any()
+    assert series[1, -1] == np.inf
+
+
 def test_scale_must_be_positive():
     sol = solve(systems.harmonic_oscillator(), "verlet", (0, 1))
     with pytest.raises(ValueError, match="`scale` must be positive"):
         symplecticity_defect(sol, scale=0.0)
+    with pytest.raises(ValueError, match="`scale` must be a number or 1 of them"):
+        symplecticity_defect(sol, scale=[1.0, 2.0, 3.0])
+    with pytest.raises(TypeError, match="`scale` must be a number or 1 of them"):
+        symplecticity_defect(sol, scale="natural")
+
+
+@pytest.mark.parametrize("measure", [volume_error, symplecticity_defect, loop_area_error])
+@pytest.mark.parametrize("wrong", [3, None, np.zeros((4, 10))], ids=["number", "none", "array"])
+def test_what_is_no_solution_is_refused(measure, wrong):
+    with pytest.raises(TypeError, match=r"^`sol` must be a Solution; got .*\. Pass what solve"):
+        measure(wrong)
 
 
 def test_natural_scale_is_one_where_there_is_none():

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.metrics.arguments import check_solution
 from sympflow.metrics.energy import failed
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
@@ -25,9 +26,12 @@ def reference_error(sol: Solution, reference: Reference | Solution | ArrayLike |
 
     Raises
     ------
+    TypeError
+        If `sol` is not a Solution, or `reference` is nothing that holds states.
     ValueError
         If the reference is not at the times of the solution.
     """
+    check_solution(sol)
     y = to_numpy(sol.y).astype(float)
     if reference is None:
         reference = compute_reference(sol.system, sol.t_span, to_numpy(sol.y0), sol.t)
@@ -35,11 +39,29 @@ def reference_error(sol: Solution, reference: Reference | Solution | ArrayLike |
         if len(reference.t) < len(sol.t) or not np.allclose(reference.t[: len(sol.t)], sol.t, rtol=1e-12, atol=0):
             raise ValueError("`reference` must be at the times of `sol`: solve both with the same `t_eval`.")
         reference = reference.y[..., : len(sol.t)]
-    y_ref = to_numpy(reference).astype(float)
+    y_ref = states_of(reference)
     if y_ref.shape != y.shape:
         raise ValueError(f"`reference` must have the shape {y.shape} of `sol.y`; got {y_ref.shape}.")
     with np.errstate(all="ignore"):
         return np.linalg.norm(y - y_ref, axis=-2)
+
+
+def states_of(reference: object) -> np.ndarray:
+    """The states that were given as a reference, in float64."""
+    try:
+        states = to_numpy(reference).astype(float)
+    except (TypeError, ValueError):
+        states = np.zeros(())
+    if states.ndim < 2:
+        raise TypeError(
+            f"`reference` must be a Reference, a Solution or an array of states (..., 2d, n); got {_brief(reference)}. "
+            "Leave it out to have one computed."
+        )
+    return states
+
+
+def _brief(x: object) -> str:
+    return f"an array of shape {np.shape(x)}" if isinstance(x, np.ndarray) else type(x).__name__
 
 
 def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:
@@ -51,14 +73,20 @@ def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:
     Raises
     ------
     TypeError
-        If the method cannot run backwards.
+        If `sol` is not a Solution, or its method cannot run backwards.
     """
+    check_solution(sol)
     (t0, t1), y0 = sol.t_span, sol.y0
     there = _end(sol, (t0, t1), y0)
     finite = np.isfinite(to_numpy(there)).all(-1)
     if not finite.all():
         there = _replace(there, finite, y0)
-    back = _end(sol, (t1, t0), there)
+    try:
+        back = _end(sol, (t1, t0), there)
+    except (ValueError, TypeError, NotImplementedError) as refused:  # it ran forwards, so it is the direction
+        raise TypeError(
+            f"`sol` is of method {sol.integrator.name!r}, which cannot run backwards in time: use a symplectic method."
+        ) from refused
     with np.errstate(all="ignore"):
         error = np.linalg.norm(to_numpy(back).astype(float) - to_numpy(y0), axis=-1)
     return np.where(finite & np.isfinite(error) & ~failed(sol), error, np.inf)[()]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sympflow.arrays import to_numpy
+from sympflow.metrics.arguments import check_solution
 from sympflow.solution import Solution
 
 SMALLEST_SCALE = 1e-12
@@ -29,7 +30,13 @@ def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
     -----
     RuntimeWarning
         If the scale is missing (see `energy_scale`), so that the error of some trajectory is absolute.
+
+    Raises
+    ------
+    TypeError
+        If `sol` is not a Solution.
     """
+    check_solution(sol)
     with np.errstate(all="ignore"):
         error = _energy(sol, sol.states) - _energy(sol, sol.y0)[..., None]
         if not relative:
@@ -49,6 +56,7 @@ def energy_scale(sol: Solution) -> np.ndarray:
 
     It is NaN where |H(y0)| < 1e-12: there `energy_error` is absolute, and warns.
     """
+    check_solution(sol)
     declared = sol.system.energy_scale
     H0 = np.abs(_energy(sol, sol.y0))
     if declared is not None:
@@ -80,9 +88,10 @@ class EnergyDrift:
     Attributes
     ----------
     slope : float or ndarray (...)
-        Change of the energy error per unit of time.
+        Change of the energy error per unit of time; inf for a trajectory that became non-finite or could not be
+        continued.
     standard_error : float or ndarray (...)
-        Of the slope, from the scatter of the block means about the line.
+        Of the slope, from the scatter of the block means about the line; inf where the slope is.
     t, means : ndarray (blocks,), (..., blocks)
         The block means of time and energy error that the line was fitted to.
     """
@@ -109,6 +118,8 @@ def energy_drift(sol: Solution, blocks: int = MIN_BLOCKS, relative: bool = True)
 
     Raises
     ------
+    TypeError
+        If `sol` is not a Solution, or `blocks` no integer.
     ValueError
         For fewer than 20 blocks, or fewer outputs than blocks.
 
@@ -116,19 +127,23 @@ def energy_drift(sol: Solution, blocks: int = MIN_BLOCKS, relative: bool = True)
     ----------
     .. [1] C. J. Geyer, "Practical Markov chain Monte Carlo", Statist. Sci. 7 (1992) 473–483 (batch means).
     """
+    check_solution(sol)
+    if isinstance(blocks, bool) or not isinstance(blocks, int | np.integer):
+        raise TypeError(f"`blocks` must be an integer; got {blocks!r}. Use {MIN_BLOCKS} or more.")
     if blocks < MIN_BLOCKS:
         raise ValueError(
             f"`blocks` must be at least {MIN_BLOCKS} for a standard error that means something; got {blocks}."
         )
     n = len(sol.t)
-    if n < blocks and not failed(sol).all():
+    lost = failed(sol)
+    if n < blocks and not lost.all():
         raise ValueError(
             f"`sol` has {n} outputs, fewer than the {blocks} blocks of the fit: ask for more with `t_eval`."
         )
     batch = sol.y.shape[:-2]
     if n < blocks:
-        blown_up = np.full(batch, np.nan)[()]
-        return EnergyDrift(blown_up, blown_up, np.full(blocks, np.nan), np.full((*batch, blocks), np.nan))
+        infinite = np.full(batch, np.inf)[()]
+        return EnergyDrift(infinite, infinite, np.full(blocks, np.nan), np.full((*batch, blocks), np.nan))
     edges = np.linspace(0, n, blocks + 1).astype(int)
     count = np.diff(edges)
     t = np.add.reduceat(sol.t, edges[:-1]) / count
@@ -138,7 +153,8 @@ def energy_drift(sol: Solution, blocks: int = MIN_BLOCKS, relative: bool = True)
         slope = (means @ centred) / (centred @ centred)
         residual = means - means.mean(-1, keepdims=True) - slope[..., None] * centred
         error = np.sqrt((residual**2).sum(-1) / (blocks - 2) / (centred @ centred))
-    return EnergyDrift(np.asarray(slope)[()], np.asarray(error)[()], t, means)
+    lost = lost | ~np.isfinite(slope) | ~np.isfinite(error)
+    return EnergyDrift(np.where(lost, np.inf, slope)[()], np.where(lost, np.inf, error)[()], t, means)
 
 
 def _energy(sol: Solution, y: object) -> np.ndarray:

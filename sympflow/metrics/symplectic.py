@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import to_numpy
+from sympflow.metrics.arguments import check_solution
+from sympflow.metrics.energy import failed
 from sympflow.solution import Solution
 from sympflow.system import HamiltonianSystem
 
@@ -21,13 +23,12 @@ from sympflow.system import HamiltonianSystem
 def step_tangents(sol: Solution) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """The steps of a run as a stream of chunks: t and h (n, ...), Jacobians A (n, ..., 2d, 2d).
 
-    The states are those of the run; the Jacobians are float64 (of a trained flow: in the dtype of its weights).
+    Each step is differentiated in the precision in which it was executed, so A holds the rounding of that precision;
+    it is returned as float64, in which everything that follows is computed.
     """
     system, integrator = sol.system, sol.integrator
     for times, states, lengths in integrator.steps(system, sol.t_span, sol.y0):
         y = to_numpy(states)
-        if not integrator.trained:
-            y = y.astype(float)
         batch = y.shape[:-1]
         t, h = (np.broadcast_to(x.reshape(*x.shape, *[1] * (len(batch) - x.ndim)), batch) for x in (times, lengths))
         with np.errstate(all="ignore"):
@@ -38,7 +39,8 @@ def step_tangents(sol: Solution) -> Iterator[tuple[np.ndarray, np.ndarray, np.nd
 def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.ndarray:
     """Σ log|det A_k| over the executed steps: the logarithm of the factor by which phase-space volume changed.
 
-    0 for a map that keeps volume, and at rounding level (about 1e-16 a step) for every symplectic method.
+    0 for a map that keeps volume, and at rounding level (about 1e-16 a step, 1e-7 in float32) for every symplectic
+    method. inf for a trajectory that became non-finite or could not be continued.
 
     Parameters
     ----------
@@ -49,38 +51,50 @@ def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.nda
     Warns
     -----
     RuntimeWarning
-        If a determinant is zero or negative: the map folds phase space there. The error is inf from that step on, since
-        the logarithm would hide the sign.
+        If a determinant is zero or negative in a run that reached its end: the map folds phase space there. The error
+        is inf from that step on, since the logarithm would hide the sign.
+
+    Raises
+    ------
+    TypeError
+        If `sol` is not a Solution.
     """
+    check_solution(sol)
     batch = sol.y.shape[:-2]
+    lost = failed(sol)
     total = np.zeros(batch)
     series = np.zeros((len(sol.t), *batch))
     direction = 1 if sol.t_span[1] >= sol.t_span[0] else -1
     first_fold = None
     n_steps = 0
     for t, h, A in step_tangents(sol):
-        sign, logarithm = np.linalg.slogdet(A)
+        finite = np.isfinite(A).all((-2, -1))
+        sign, logarithm = np.linalg.slogdet(np.where(finite[..., None, None], A, 0.0))
         bad = ~(sign > 0)
-        if bad.any():
-            if first_fold is None:
-                k = int(bad.reshape(len(bad), -1).any(1).argmax())
-                first_fold = (n_steps + k, float(t[k].flat[0]), float(sign[k][bad[k]].flat[0]))
-            logarithm = np.where(bad, np.inf, logarithm)
+        logarithm[bad] = np.inf
+        folds = bad & ~lost
+        if first_fold is None and folds.any():
+            k = int(folds.reshape(len(folds), -1).any(1).argmax())
+            here = folds[k]
+            first_fold = (n_steps + k, float(t[k].flat[0]), float(sign[k][here].flat[0]), bool(finite[k][here].flat[0]))
         running = total + np.cumsum(logarithm, axis=0)
         if over_time:
             _hold(series, direction * (t + h), running, direction * sol.t)
         total = running[-1]
         n_steps += len(t)
     if first_fold is not None:
-        k, time, sign_there = first_fold
-        what = "not finite" if np.isnan(sign_there) else "zero" if sign_there == 0 else "negative"
+        k, time, sign_there, is_finite = first_fold
+        what = "not finite" if not is_finite else "zero" if sign_there == 0 else "negative"
         warnings.warn(
             f"The determinant of step {k + 1}, from t = {time:.9g}, is {what}: the volume error is infinite. "
             "Reduce `dt`, or take a method that preserves volume.",
             RuntimeWarning,
             stacklevel=2,
         )
-    return np.moveaxis(series, 0, -1) if over_time else total[()]
+    if not over_time:
+        return np.where(lost, np.inf, total)[()]
+    gone = lost[..., None] & ~np.isfinite(to_numpy(sol.states)).all(-1)
+    return np.where(gone, np.inf, np.moveaxis(series, 0, -1))
 
 
 def _hold(series: np.ndarray, ends: np.ndarray, values: np.ndarray, t: np.ndarray) -> None:
@@ -100,8 +114,9 @@ def symplecticity_defect(
 ) -> np.floating | np.ndarray:
     """max over the executed steps of ‖AᵀJA − J‖₂, (...); divided by ‖A‖₂² if `relative`.
 
-    A symplectic step has defect 0 up to the rounding of AᵀJA, which is proportional to ‖A‖². The Jacobian A is taken in
-    the variables (s q, p/s), which keep the form J and remove the imbalance of a stiff oscillator.
+    A symplectic step has defect 0 up to the rounding of A, in the precision of the run, which is proportional to ‖A‖².
+    The Jacobian A is taken in the variables (s q, p/s), which keep the form J and remove the imbalance of a stiff
+    oscillator. The defect is inf for a trajectory that became non-finite or could not be continued.
 
     Parameters
     ----------
@@ -109,26 +124,45 @@ def symplecticity_defect(
     relative : bool
     scale : array_like (d,) or float, optional
         The factors s > 0. The default is `natural_scale(system)`, √ω for an oscillator of frequency ω.
+
+    Raises
+    ------
+    TypeError
+        If `sol` is not a Solution, or `scale` is no number or array of numbers.
+    ValueError
+        If `scale` is not positive and finite, or has another shape.
     """
+    check_solution(sol)
     d = sol.system.ndof
-    s = natural_scale(sol.system) if scale is None else np.broadcast_to(np.asarray(scale, dtype=float), (d,))
+    s = natural_scale(sol.system) if scale is None else _factors(scale, d)
     if not (np.isfinite(s) & (s > 0)).all():
         raise ValueError(f"`scale` must be positive and finite, one factor for each q; got {s.tolist()}.")
     weights = np.concatenate([s, 1 / s])
     J = np.block([[np.zeros((d, d)), np.eye(d)], [-np.eye(d), np.zeros((d, d))]])
     worst = np.zeros(sol.y.shape[:-2])
     for _, _, A in step_tangents(sol):
-        scaled = weights[:, None] * A / weights
-        finite = np.isfinite(scaled).all((-2, -1))
-        scaled = np.where(finite[..., None, None], scaled, 0.0)
         with np.errstate(all="ignore"):
+            scaled = weights[:, None] * A / weights
+            finite = np.isfinite(scaled).all((-2, -1))
+            scaled = np.where(finite[..., None, None], scaled, 0.0)
             form = scaled.swapaxes(-1, -2) @ J @ scaled - J
             finite &= np.isfinite(form).all((-2, -1))
             defect = np.linalg.norm(np.where(finite[..., None, None], form, 0.0), 2, axis=(-2, -1))
             if relative:
                 defect /= np.linalg.norm(scaled, 2, axis=(-2, -1)) ** 2
         worst = np.maximum(worst, np.where(finite, defect, np.inf).max(0))
-    return worst[()]
+    return np.where(failed(sol), np.inf, worst)[()]
+
+
+def _factors(scale: ArrayLike, d: int) -> np.ndarray:
+    """`scale` as an array (d,)."""
+    try:
+        s = np.asarray(scale, dtype=float)
+    except (TypeError, ValueError):
+        raise TypeError(f"`scale` must be a number or {d} of them, one for each q; got {scale!r}.") from None
+    if s.shape not in ((), (1,), (d,)):
+        raise ValueError(f"`scale` must be a number or {d} of them, one for each q; got the shape {s.shape}.")
+    return np.broadcast_to(s, (d,))
 
 
 def natural_scale(system: HamiltonianSystem) -> np.ndarray:
@@ -180,9 +214,12 @@ def loop_area_error(sol: Solution) -> np.ndarray:
 
     Raises
     ------
+    TypeError
+        If `sol` is not a Solution.
     ValueError
         If the solution is not one of a loop.
     """
+    check_solution(sol)
     if sol.system.ndof != 1:
         raise ValueError(f"`sol` must have one degree of freedom for a loop in the plane; it has {sol.system.ndof}.")
     y0 = to_numpy(sol.y0).astype(float)
