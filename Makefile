@@ -28,8 +28,11 @@ lint: .venv/installed-test  ## Lint and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+docs: .venv/installed-test  ## The documentation, into site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
 bench: .venv/installed-test  ## The benchmarks that the docs quote
 	$(BIN)/python benchmarks/training_step.py
 
 clean:  ## Remove the environment and everything generated
-	rm -rf .venv out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv out site build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
