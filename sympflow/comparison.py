@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,8 +15,8 @@ from sympflow.candidates import candidates
 from sympflow.comparison_report import Comparison
 from sympflow.matching import match as match_to
 from sympflow.matching import tunable
-from sympflow.measurements import MEASURES, Row, Run, largest, measure
-from sympflow.metrics.accuracy import reference_error
+from sympflow.measurements import MEASURES, Row, Run, largest, measure, note_backends
+from sympflow.metrics.accuracy import reference_error, states_of
 from sympflow.metrics.energy import failed, max_energy_error
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
@@ -41,7 +41,7 @@ def compare(
     n_outputs: int = 1000,
     repeats: int = 5,
     match: str | None = None,
-    reference: Reference | ArrayLike | None = None,
+    reference: Reference | Solution | ArrayLike | None = None,
     backend: str = "auto",
     progress: Callable[[str], None] | None = None,
 ) -> Comparison:
@@ -68,7 +68,8 @@ def compare(
     match : "time", "evaluations" or "energy_error", optional
         Tune the steps and tolerances of the methods after the first until they equal it in this.
         By default each method runs at its stated step or tolerance.
-    reference : Reference or array_like (..., 2d, n_outputs), optional
+    reference : Reference, Solution or array_like (..., 2d, n_outputs), optional
+        States at the instants that are compared.
         Computed by default: exact, or tighter than the smallest error by a factor of 100 where float64 can hold that.
     backend : "auto", "compiled" or "array"
         As for `solve`; a method that lacks the backend asked for gets a row that says so.
@@ -104,6 +105,7 @@ def compare(
         raise ValueError("`t_span` has length zero, so there is nothing to compare: choose a later end.")
     start = _check_y0(system, system.y0 if y0 is None else y0, None)
     t = t0 + (t1 - t0) * np.arange(1, n_outputs + 1) / n_outputs
+    given = None if reference is None else _given(reference, start, t)
     say = progress or (lambda text: None)
 
     def run(integrator: Any) -> Solution:
@@ -115,6 +117,7 @@ def compare(
         _first_run(one, run)
     if match is not None:
         _match(runs, match, run, system, repeats, say)
+    note_backends(runs)
     ready = [one for one in runs if one.row.status == "ok"]
     say(f"{system.name}: timing")
     times = interleaved([partial(run, one.candidate.integrator) for one in ready], repeats) if ready else []
@@ -123,7 +126,7 @@ def compare(
     truth = None
     if "error" in asked and any(one.sol is not None for one in runs):
         say(f"{system.name}: reference")
-        truth = _errors(runs, system, (t0, t1), start, t, reference)
+        truth = _errors(runs, system, (t0, t1), start, t, given)
     for one in runs:
         if one.sol is not None:
             say(f"{system.name}: measuring {one.candidate.label}")
@@ -136,7 +139,22 @@ def _identify(system: HamiltonianSystem) -> str:
     return f"{system.name}({params})" if params else system.name
 
 
+def _given(reference: Reference | Solution | ArrayLike, y0: np.ndarray, t: np.ndarray) -> Reference:
+    """The reference that was given, if it is one and fits."""
+    if isinstance(reference, Reference | Solution):
+        if len(reference.t) != len(t) or not np.allclose(reference.t, t, rtol=1e-12, atol=0):
+            raise ValueError(f"`reference` must be at the {len(t)} instants that are compared: see `.t` of the result.")
+        found = reference if isinstance(reference, Reference) else Reference(t, states_of(reference.y), "given", 0.0)
+    else:
+        found = Reference(t, states_of(reference), "given", 0.0)
+    if found.y.shape != (*y0.shape, len(t)):
+        raise ValueError(f"`reference` must have the shape {(*y0.shape, len(t))} of the states; got {found.y.shape}.")
+    return found
+
+
 def _check_metrics(metrics: Sequence[str]) -> tuple[str, ...]:
+    if not isinstance(metrics, Iterable):
+        raise TypeError(f"`metrics` must be a list of names from {', '.join(METRICS)}; got {metrics!r}.")
     asked = (metrics,) if isinstance(metrics, str) else tuple(metrics)
     unknown = [m for m in asked if m not in METRICS]
     if unknown:
@@ -219,11 +237,9 @@ def _errors(
     t_span: tuple[float, float],
     y0: np.ndarray,
     t: np.ndarray,
-    given: Reference | ArrayLike | None,
+    given: Reference | None,
 ) -> Reference | None:
     """Fill in the errors; tighten a computed reference until it is 100 times better than the best of them."""
-    if given is not None and not isinstance(given, Reference):
-        given = Reference(t, np.asarray(given, dtype=float), "given", 0.0)
     measured = [(one, one.sol) for one in runs if one.sol is not None]
     target = 1e-8
     for _ in range(2):

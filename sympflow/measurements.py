@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,6 +18,8 @@ from sympflow.solution import Solution
 @dataclass(frozen=True)
 class Row:
     """What was measured of one method; None where it was not asked for, does not apply or could not be had.
+
+    Errors, drift and defect are inf where the run became non-finite or could not be continued.
 
     Attributes
     ----------
@@ -94,6 +96,15 @@ def largest(series: np.ndarray, sol: Solution) -> np.ndarray:
     return np.where(failed(sol), np.inf, worst)
 
 
+def note_backends(runs: Sequence[Run]) -> None:
+    """Say of a flow that runs in eager torch that others run compiled: its run time is not one of the same kind."""
+    if not any(run.row.backend == "compiled" for run in runs):
+        return
+    for run in runs:
+        if run.row.backend == "torch":
+            run.note("Runs in eager torch, while others run compiled: the run times are not like for like.")
+
+
 def measure(one: Run, sol: Solution, asked: tuple[str, ...]) -> None:
     """Compute the metrics asked for; a metric that cannot be had leaves a note."""
     for metric in asked:
@@ -114,7 +125,8 @@ def _energy(one: Run, sol: Solution) -> None:
 
 
 def _drift(one: Run, sol: Solution) -> None:
-    if one.row.status == "failed":
+    if failed(sol).all():
+        one.row = replace(one.row, energy_drift=np.inf, energy_drift_error=np.inf)
         return
     drift = energy_drift(sol)
     slope, error = np.ravel(drift.slope), np.ravel(drift.standard_error)
@@ -123,22 +135,27 @@ def _drift(one: Run, sol: Solution) -> None:
 
 
 def _volume(one: Run, sol: Solution) -> None:
-    if one.row.status == "failed":
+    if failed(sol).all():
+        one.row = replace(one.row, volume_error=np.inf)
         return
     one.volume = series = np.asarray(volume_error(sol, over_time=True))
-    last = np.ravel(series[..., -1])
-    worst = np.argmax(np.where(np.isnan(last), np.inf, np.abs(last)))
+    last = np.ravel(np.where(failed(sol), np.inf, series[..., -1]))
+    worst = np.argmax(np.abs(last))
     one.row = replace(one.row, volume_error=float(last[worst]))
 
 
 def _symplecticity(one: Run, sol: Solution) -> None:
-    if one.row.status == "failed":
+    if failed(sol).all():
+        one.row = replace(one.row, symplecticity_defect=np.inf)
         return
     one.row = replace(one.row, symplecticity_defect=float(np.max(symplecticity_defect(sol, relative=True))))
 
 
 def _reversal(one: Run, sol: Solution) -> None:
-    one.row = replace(one.row, time_reversal_error=float(np.median(time_reversal_error(sol))))
+    try:
+        one.row = replace(one.row, time_reversal_error=float(np.median(time_reversal_error(sol))))
+    except TypeError:
+        one.note(f"No reversal: method {one.row.method!r} cannot run backwards in time.")
 
 
 MEASURES: dict[str, Callable[[Run, Solution], None]] = {

@@ -77,6 +77,40 @@ def test_a_problem_without_a_reference_still_gets_the_other_metrics():
     assert "no reference converges" in report.rows[0].reason
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("batch", [False, True], ids=["single", "batch"])
+def test_a_blow_up_is_infinite_in_every_column(batch):
+    lost = np.array([0.0, 0.0, 0.0, 0.7])
+    y0 = np.stack([lost, lost, systems.henon_heiles().y0]) if batch else lost
+    metrics = ("energy", "drift", "volume", "symplecticity", "reversal")
+    methods = [get("verlet")(dt=0.01), "kahan_li8", "rk45"]
+    for row in compare(systems.henon_heiles(), methods, metrics, y0=y0, t_span=(0, 20), **QUICK).rows:
+        assert (row.energy_error, row.energy_drift, row.volume_error, row.symplecticity_defect) == (math.inf,) * 4
+        assert row.time_reversal_error == math.inf
+        assert "encountered" not in row.reason
+
+
+def test_a_flow_in_eager_torch_beside_compiled_methods_says_so():
+    arguments = {"metrics": ["energy", "reversal"], "t_span": (0, 5), **QUICK}
+    mlp, verlet = compare(systems.pendulum(), ["mlp", "verlet"], **arguments).rows
+    assert (mlp.backend, verlet.backend) == ("torch", "compiled")
+    assert "Runs in eager torch, while others run compiled" in mlp.reason
+    assert "No reversal: method 'mlp' cannot run backwards in time." in mlp.reason
+    assert mlp.time_reversal_error is None
+    assert verlet.reason == ""
+    alone = compare(systems.pendulum(), ["mlp", "rk45"], **arguments).rows[0]
+    assert "eager" not in alone.reason
+
+
+def test_a_solution_may_be_the_reference():
+    system, t = systems.pendulum(), np.arange(1, 51) / 5
+    truth = solve(system, "kahan_li8", (0, 10), t_eval=t)
+    report = compare(system, ["verlet"], ["error"], t_span=(0, 10), reference=truth, **QUICK)
+    verlet = solve(system, "verlet", (0, 10), t_eval=t)
+    assert report.rows[0].error == reference_error(verlet, truth).max()
+    assert report.reference.method == "given"
+
+
 def test_a_batch_is_summed_up_by_its_median_and_its_worst():
     system = systems.henon_heiles()
     y0 = system.domain.sample(5, 0)
@@ -157,6 +191,11 @@ def test_table_fits_the_width_by_turning_round(report):
         ({"methods": ["verlet"], "t_span": (1, 1)}, "`t_span` has length zero"),
         ({"methods": ["verlet"], "y0": [1.0]}, "`y0` must have shape"),
         ({"methods": ["verlet"], "dt": -1.0}, "`dt` must be a positive"),
+        ({"methods": ["verlet"], "metrics": 3}, "`metrics` must be a list of names"),
+        ({"methods": ["verlet"], "reference": 3}, "`reference` must be a Reference, a Solution or an array.*; got int"),
+        ({"methods": ["verlet"], "reference": "exact"}, "`reference` must be a Reference, a Solution or an array"),
+        ({"methods": ["verlet"], "reference": np.zeros((2, 7))}, r"`reference` must have the shape \(2, 1000\)"),
+        ({"methods": ["verlet"], "reference": solve(systems.pendulum())}, "`reference` must be at the 1000 instants"),
     ],
 )
 def test_bad_arguments_are_refused_at_once(arguments, message):
