@@ -92,14 +92,24 @@ class Comparison:
 
         return comparison_figure(self, kind)
 
-    def plot(self, path: str | os.PathLike[str], kind: str | None = None, prefix: str = "") -> list[Path]:
-        """Save figures: every kind into a folder, or one (by default the overview) to a file with an extension.
+    def plot(self, path: str | os.PathLike[str] | None = None, kind: str = "overview", prefix: str = "") -> Figure:
+        """The figure, by default the overview; with a path it is also saved.
 
-        In a folder their names are the kinds, after `prefix`.
+        Parameters
+        ----------
+        path : path-like, optional
+            A file (.png, .pdf or .svg); or a folder, in which the overview saves every kind to a file of its own.
+        kind : str
+            As for `figure`.
+        prefix : str
+            What the names of the files in a folder begin with; the kinds follow.
         """
         from sympflow.plotting import save_comparison
 
-        return save_comparison(self, path, kind, prefix)
+        figure = self.figure(kind)
+        if path is not None:
+            save_comparison(self, path, kind, prefix)
+        return figure
 
 
 def combined_table(comparisons: Sequence[Comparison], width: int | None = None) -> str:

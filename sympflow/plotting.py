@@ -27,6 +27,8 @@ FIGURE_FILES = (".png", ".pdf", ".svg")
 def comparison_figure(comparison: Comparison, kind: str = "overview") -> Figure:
     """One figure of a comparison: "overview", "energy", "volume", "error" or "portrait".
 
+    The overview of a comparison that measured none of its panels is the portrait.
+
     Raises
     ------
     ValueError
@@ -37,7 +39,7 @@ def comparison_figure(comparison: Comparison, kind: str = "overview") -> Figure:
     if kind not in KINDS:
         raise ValueError(f"`kind` must be one of {', '.join(map(repr, KINDS))}; got {kind!r}.")
     if kind == "overview":
-        return overview([comparison])
+        return portrait(comparison) if _drawable(comparison) == ("portrait",) else overview([comparison])
     if kind not in _drawable(comparison):
         raise ValueError(f"`kind` {kind!r} shows what was not measured: add it to `metrics` of compare().")
     if kind == "portrait":
@@ -52,15 +54,21 @@ def comparison_figure(comparison: Comparison, kind: str = "overview") -> Figure:
 
 
 def save_comparison(
-    comparison: Comparison, path: str | os.PathLike[str], kind: str | None = None, prefix: str = ""
+    comparison: Comparison, path: str | os.PathLike[str], kind: str = "overview", prefix: str = ""
 ) -> list[Path]:
-    """Save every figure that the metrics allow into a folder, or one to a file (.png, .pdf or .svg)."""
+    """Save one figure to a file (.png, .pdf or .svg); into a folder the overview saves every kind that was measured.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+    """
     path = Path(path)
     if path.suffix.lower() in FIGURE_FILES:
-        return [save(comparison_figure(comparison, kind or "overview"), path)]
+        return [save(comparison_figure(comparison, kind), path)]
     if path.suffix:
         raise ValueError(f"`path` must be a folder or end in {', '.join(FIGURE_FILES)}; got {str(path)!r}.")
-    kinds = _drawable(comparison) if kind is None else (kind,)
+    kinds = _drawable(comparison) if kind == "overview" else (kind,)
     return [save(comparison_figure(comparison, k), path / f"{prefix}{k}.png") for k in kinds]
 
 
@@ -77,7 +85,7 @@ def overview(comparisons: Sequence[Comparison]) -> Figure:
 
     Panels of metrics that were not asked for are left out.
     """
-    kinds = [k for k in ("error", "energy", "volume") if any(k in _drawable(c) for c in comparisons)]
+    kinds = [k for k in _PANELS if any(k in _panels(c) for c in comparisons)]
     if not kinds:
         raise ValueError("`comparisons` hold nothing to draw: ask compare() for 'error', 'energy' or 'volume'.")
     n, m = len(comparisons), len(kinds)
@@ -138,10 +146,11 @@ def _volume_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str,
         worst = v[np.argmax(np.where(np.isfinite(v[:, -1]), v[:, -1], np.inf))]
         worst = np.where(np.isfinite(worst), np.maximum(worst, ROUNDING_FLOOR), np.nan)
         ax.plot(sol.t, worst, _dash(run), color=styles[run.row.label][0], lw=1.4)
-    rounding = 4 * n_steps * np.finfo(float).eps
-    ax.axhspan(ROUNDING_FLOOR / 10, rounding, color="#EEEEEE", zorder=0, lw=0)
-    where = ax.get_yaxis_transform()
-    ax.text(0.98, rounding / 2, "rounding", transform=where, ha="right", va="top", fontsize=8, color="#888888")
+    if n_steps:  # else no run reached its end
+        rounding = 4 * n_steps * np.finfo(float).eps
+        ax.axhspan(ROUNDING_FLOOR / 10, rounding, color="#EEEEEE", zorder=0, lw=0)
+        where = ax.get_yaxis_transform()
+        ax.text(0.98, rounding / 2, "rounding", transform=where, ha="right", va="top", fontsize=8, color="#888888")
     ax.set_yscale("log")
     _limits(ax)
     dress(ax, "t", "|log volume ratio|")
@@ -167,7 +176,11 @@ def _middle(series: np.ndarray) -> np.ndarray:
 
 def _drawable(comparison: Comparison) -> tuple[str, ...]:
     ran = any(run.sol is not None for run in comparison.runs)
-    return (*(k for k in ("error", "energy", "volume") if k in comparison.metrics), *(("portrait",) if ran else ()))
+    return (*_panels(comparison), *(("portrait",) if ran else ()))
+
+
+def _panels(comparison: Comparison) -> tuple[str, ...]:
+    return tuple(k for k in _PANELS if k in comparison.metrics)
 
 
 def _styles(comparisons: Sequence[Comparison]) -> dict[str, tuple[str, str]]:

@@ -129,11 +129,14 @@ class WorkPrecision:
 
         return precision_figure(self, measure)
 
-    def plot(self, path: str | os.PathLike[str], measure: str = "energy_error") -> Path:
-        """Save the figure."""
+    def plot(self, path: str | os.PathLike[str] | None = None, measure: str = "energy_error") -> Figure:
+        """The figure, as `figure`; with a path it is also saved."""
         from sympflow.plotting import save
 
-        return save(self.figure(measure), path)
+        figure = self.figure(measure)
+        if path is not None:
+            save(figure, path)
+        return figure
 
 
 def _size(n: int) -> str:

@@ -78,6 +78,55 @@ def test_solve_that_fails_ends_with_status_one():
     assert "became non-finite after t = 5." in result.output
 
 
+def test_solve_takes_the_flow_by_default_and_either_spelling_of_a_system():
+    result = run("solve", "henon_heiles", "--t-end", 5)
+    assert result.exit_code == 0, result.output
+    final = [line for line in result.output.splitlines() if line.startswith("y(5) = ")]
+    assert final[0] in run("solve", "henon-heiles", "--method", "sympflow", "--t-end", 5).output
+    one, other = scenes(["henon_heiles", "harmonic_oscillator:omega=3"])
+    assert one.key == "henon-heiles"
+    assert other.key == "harmonic-oscillator-omega=3"
+
+
+@pytest.mark.parametrize("command", ["solve", "compare", "bench", "train"])
+def test_an_output_that_cannot_be_written_is_refused_before_anything_is_computed(command, tmp_path, monkeypatch):
+    computed = []
+    for function in ("comparison.compare", "precision.work_precision", "solver.solve", "training.trainer.train"):
+        monkeypatch.setattr(f"sympflow.{function}", lambda *args, **options: computed.append(args))
+    (tmp_path / "file").write_text("")
+    name = {"solve": "y.csv", "train": "flow.safetensors"}.get(command, "folder")
+    (tmp_path / "y.csv").mkdir()
+    (tmp_path / "flow.safetensors").mkdir()
+    for path in (tmp_path / "file" / name, tmp_path / name if "." in name else tmp_path / "file"):
+        result = run(command, "pendulum", "--out", path)
+        assert result.exit_code == 2
+        assert result.stderr.startswith("Error: `--out` ")
+        assert "name a" in result.stderr
+    assert not computed
+
+
+@pytest.mark.parametrize("command", ["compare", "bench"])
+def test_missing_matplotlib_is_reported_before_anything_is_computed(command, tmp_path, monkeypatch):
+    computed = []
+    for function in ("comparison.compare", "precision.work_precision"):
+        monkeypatch.setattr(f"sympflow.{function}", lambda *args, **options: computed.append(args))
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    result = run(command, "pendulum", "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert 'pip install "sympflow[plot]"' in result.stderr
+    assert not computed
+
+
+def test_a_blow_up_prints_no_warnings_of_numpy(tmp_path):
+    words = ["henon-heiles", "--y0", "0,0,0,0.7", "--methods", "verlet,rk45", "--t-end", "20", "--repeats", "1"]
+    code = "from sympflow.cli import main; main()"
+    words = ["compare", *words, "--out", str(tmp_path)]
+    result = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert "Warning" not in result.stderr
+    assert "inf" in result.stdout
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

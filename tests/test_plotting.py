@@ -8,7 +8,7 @@ import pytest
 
 from sympflow import compare, get, solve, systems
 from sympflow.crossings import section_crossings
-from sympflow.plotting import overview
+from sympflow.plotting import overview, save_comparison
 from sympflow.portraits import section_figure
 
 
@@ -19,10 +19,24 @@ def report():
 
 
 def test_every_figure_is_saved(report, tmp_path):
-    paths = report.plot(tmp_path / "figures", prefix="hh-")
+    paths = save_comparison(report, tmp_path / "figures", prefix="hh-")
     assert [p.name for p in paths] == ["hh-error.png", "hh-energy.png", "hh-volume.png", "hh-portrait.png"]
-    assert report.plot(tmp_path / "one.svg")[0].read_text().startswith("<?xml")
     assert all(p.stat().st_size > 5000 for p in paths)
+    report.plot(tmp_path / "same", prefix="hh-")
+    assert sorted(p.name for p in (tmp_path / "same").iterdir()) == sorted(p.name for p in paths)
+    report.plot(tmp_path / "energy", "energy")
+    assert [p.name for p in (tmp_path / "energy").iterdir()] == ["energy.png"]
+
+
+def test_plot_returns_the_figure_and_saves_it_where_a_path_says(report, tmp_path):
+    overview_figure = report.plot()
+    assert len(overview_figure.axes) == 3
+    assert len(report.plot(kind="energy").axes) == 1
+    saved = report.plot(tmp_path / "new" / "one.svg")
+    assert len(saved.axes) == 3
+    assert (tmp_path / "new" / "one.svg").read_text().startswith("<?xml")
+    defect_only = compare(systems.pendulum(), ["verlet"], ["symplecticity"], t_span=(0, 5), n_outputs=10, repeats=1)
+    assert "reference in grey" in defect_only.plot()._suptitle.get_text()
 
 
 def test_energy_panel_shows_the_running_maximum(report):

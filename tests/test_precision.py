@@ -69,7 +69,10 @@ def test_files_table_and_figure(report, tmp_path):
     assert "paid after t =" in report.table()
     figure = report.figure()
     assert len(figure.axes) == 4
-    assert report.plot(tmp_path / "figure.png", "error").exists()
+    assert len(report.plot().axes) == 4
+    assert not list(tmp_path.glob("*.png"))
+    assert len(report.plot(tmp_path / "figure.png", "error").axes) == 4
+    assert (tmp_path / "figure.png").exists()
     with pytest.raises(ValueError, match="`measure` must be one of"):
         report.figure("beauty")
 

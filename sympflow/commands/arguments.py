@@ -53,7 +53,7 @@ def scenes(words: Sequence[str]) -> list[Scene]:
     if not names:
         raise ValueError(f"`system` is missing: name one or more of {', '.join(SCENES)}.")
     found = [_scene(name, shared) for name in names]
-    known = {p for name in names for p in parameters(name.partition(":")[0])}
+    known = {p for name in names for p in parameters(_key(name))}
     for name in shared:
         if name not in known:
             takes = f"its parameters are {', '.join(sorted(known))}" if known else "it has no parameters"
@@ -94,8 +94,14 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, float]]:
     return names, shared
 
 
+def _key(word: str) -> str:
+    """The scene's name in a word such as ``henon-heiles:t_end=5``; `henon_heiles` is the same, as in Python."""
+    return word.partition(":")[0].replace("_", "-")
+
+
 def _scene(word: str, shared: dict[str, float]) -> Scene:
-    name, *pairs = word.split(":")
+    _, *pairs = word.split(":")
+    name = _key(word)
     if name not in SCENES:
         close = difflib.get_close_matches(name, SCENES, n=1)
         hint = f"Did you mean {close[0]!r}? " if close else ""

@@ -9,7 +9,7 @@ import typer
 
 from sympflow.commands.arguments import interval, methods, scenes, state
 from sympflow.commands.options import Backend, State, Step, Systems, TEnd
-from sympflow.commands.output import out, progress, reporting, write_comparisons
+from sympflow.commands.output import out, progress, ready_folder, reporting, write_comparisons
 
 
 def compare(
@@ -48,6 +48,8 @@ def compare(
 
         chosen, found = methods(method_names), scenes(systems)
         start = state(y0)
+        if to is not None:
+            ready_folder(to)
         with progress() as say:
             comparisons = [
                 compare_methods(
@@ -97,10 +99,13 @@ def bench(
       sympflow bench pendulum --methods verlet,kahan_li8,dop853 --batch 0 --t-end 50
     """
     with reporting():
+        from sympflow.plotting import save
         from sympflow.precision import work_precision
 
-        chosen, start = methods(method_names), state(y0)
-        for scene in scenes(systems):
+        chosen, found, start = methods(method_names), scenes(systems), state(y0)
+        if to is not None:
+            ready_folder(to)
+        for scene in found:
             with progress() as say:
                 report = work_precision(
                     scene.system,
@@ -118,5 +123,6 @@ def bench(
             if to is not None:
                 name = f"{scene.key}-work-precision"
                 written = [report.to_csv(to / f"{name}.csv"), report.to_json(to / f"{name}.json")]
-                written += [report.plot(to / f"{name}.png"), report.plot(to / f"{name}-state.png", "error")]
+                figures = {to / f"{name}.png": "energy_error", to / f"{name}-state.png": "error"}
+                written += [save(report.figure(measure), path) for path, measure in figures.items()]
                 out.print(f"\nWritten to {to}: {', '.join(p.name for p in written)}")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -52,9 +54,50 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     out.print(text_table(columns), markup=False)
 
 
+def ready_folder(folder: Path) -> None:
+    """Make the folder of `--out`, and be sure that files and figures can be written there, before anything is computed.
+
+    Raises
+    ------
+    ValueError
+        If the folder cannot be made or written to.
+    ImportError
+        Without matplotlib, which draws the figures.
+    """
+    from sympflow.figure_style import new_figure
+
+    new_figure(1, 1)
+    _ready(folder, folder, "a folder")
+
+
+def ready_file(path: Path) -> None:
+    """Make the folder of the file of `--out`, and be sure that it can be written, before anything is computed.
+
+    Raises
+    ------
+    ValueError
+        If it cannot.
+    """
+    if path.is_dir():
+        raise ValueError(f"`--out` {str(path)!r} is a folder: name a file in it.")
+    _ready(path.parent, path, "a file")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise ValueError(f"`--out` {str(path)!r} is write-protected: name another file.")
+
+
+def _ready(folder: Path, asked: Path, what: str) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ValueError(
+            f"`--out` {str(asked)!r} cannot be written ({error.strerror}): name {what} that can be."
+        ) from error
+
+
 def write_solution(sol: Any, path: Path) -> None:
     """Columns t, q…, p… as text, or arrays t and y."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".npz":
         np.savez(path, t=sol.t, y=sol.y, system=sol.system.name, method=sol.integrator.name)
         return
@@ -67,14 +110,14 @@ def write_comparisons(
     comparisons: list[Any], found: list[Scene], folder: Path, say: Callable[[str], None]
 ) -> list[Path]:
     """For each system its CSV, JSON and figures; for several also one CSV and one figure of all."""
-    from sympflow.plotting import overview, save
+    from sympflow.plotting import overview, save, save_comparison
     from sympflow.tables import write_csv
 
     written: list[Path] = []
     for comparison, scene in zip(comparisons, found, strict=True):
         say(f"{scene.key}: figures")
         written += [comparison.to_csv(folder / f"{scene.key}.csv"), comparison.to_json(folder / f"{scene.key}.json")]
-        written += comparison.plot(folder, prefix=f"{scene.key}-")
+        written += save_comparison(comparison, folder, prefix=f"{scene.key}-")
     drawable = [c for c in comparisons if {"error", "energy", "volume"} & set(c.metrics)]
     if drawable:
         written.append(save(overview(drawable), folder / "comparison.png"))

@@ -10,13 +10,15 @@ import typer
 
 from sympflow.commands.arguments import interval, method, one_scene, state
 from sympflow.commands.options import Backend, State, Step, TEnd
-from sympflow.commands.output import out, reporting, write_solution
+from sympflow.commands.output import out, ready_file, reporting, write_solution
 
 
 def solve(
     ctx: typer.Context,
     system: Annotated[str, typer.Argument(help="See `sympflow systems`; its parameters as --omega 100.")],
-    method_name: Annotated[str, typer.Option("--method", help="A name, name:option=number, or a .safetensors file.")],
+    method_name: Annotated[
+        str, typer.Option("--method", help="A name, name:option=number, or a .safetensors file.")
+    ] = "sympflow",
     t_end: TEnd = None,
     y0: State = None,
     dt: Step = None,
@@ -30,9 +32,11 @@ def solve(
 
     Examples:
 
+      sympflow solve henon-heiles
+
       sympflow solve henon-heiles --method verlet --t-end 1000 --dt 0.01 --out orbit.csv
 
-      sympflow solve harmonic-oscillator --omega 100 --method sympflow --out orbit.npz
+      sympflow solve harmonic-oscillator --omega 100 --out orbit.npz
 
       sympflow solve pendulum --method rk45:rtol=1e-8 --y0 1.5,0
     """
@@ -47,6 +51,8 @@ def solve(
         chosen = chosen[1] if isinstance(chosen, tuple) else chosen
         span = interval(scene, t_end)
         times = None if n_outputs is None else np.linspace(*span, n_outputs + 1)
+        if to is not None:
+            ready_file(to)
         options: dict[str, Any] = {} if dt is None else {"dt": dt}
         sol = solve_system(scene.system, chosen, span, state(y0), t_eval=times, backend=backend, **options)
         if to is not None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from sympflow.commands.arguments import one_scene, widths
-from sympflow.commands.output import out, print_table, reporting
+from sympflow.commands.output import out, print_table, ready_file, reporting
 
 
 def train(
@@ -53,7 +53,7 @@ def train(
         to = to or Path(f"{scene.key}-{kind}.safetensors")
         if to.suffix != ".safetensors":
             raise ValueError(f"`--out` must end in .safetensors; got {str(to)!r}.")
-        to.parent.mkdir(parents=True, exist_ok=True)
+        ready_file(to)
         flow = train_flow(
             scene.system,
             dt,
