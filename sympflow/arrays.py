@@ -71,3 +71,12 @@ def all_finite(y: Array) -> Array:
 
         return torch.isfinite(y).all(-1)
     return np.isfinite(y).all(-1)
+
+
+def full_of_nan(y: Array) -> Array:
+    """NaN in the shape, dtype and library of `y`, and in no graph."""
+    if is_tensor(y):
+        import torch
+
+        return torch.full_like(y, np.nan, requires_grad=False)
+    return np.full_like(y, np.nan)

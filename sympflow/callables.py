@@ -108,7 +108,9 @@ def _jacobian(f: Callable[[Array], Array], x: Array) -> Array:
     """Jacobian of a batched vector field by forward mode, one direction at a time: (..., k, k)."""
     import torch
 
-    return torch.stack([torch.func.jvp(f, (x,), (e,))[1] for e in _basis(x)], dim=-1)
+    from sympflow.forward_mode import jvp
+
+    return torch.stack([jvp(f, x, e)[1] for e in _basis(x)], dim=-1)
 
 
 def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...]) -> Array:

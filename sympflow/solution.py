@@ -43,8 +43,8 @@ class Solution:
         The problem that was solved and the method that did it: metrics execute the run again from these.
     """
 
-    t: np.ndarray
-    y: Array
+    t: np.ndarray = field(repr=False)
+    y: Array = field(repr=False)
     status: int | np.ndarray
     message: str
     stats: dict[str, Any]

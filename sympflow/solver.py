@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
 from sympflow.domain import EnergySublevel
 from sympflow.events import EventSearch, parse
 from sympflow.integrators.base import Integrator, Outcome, Problem
@@ -70,7 +70,7 @@ def solve(
         everything else with array operations. What ran is in `stats["backend"]`.
     on_domain_exit : "warn", "stop" or "ignore", optional
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
-        statistics, "stop" ends there with status −1. The default is "warn" for trained flows, whose figures hold in Ω,
+        statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The default is "warn" for trained flows, whose figures hold in Ω,
         and "ignore" for classical methods.
     **options
         Options of the method: `dt` for fixed steps (default `system.dt`, or the flow's Δt), `rtol` and `atol` for
@@ -252,16 +252,34 @@ def _check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianS
     if domain is None or not len(outcome.t):
         return
     slack = float(getattr(flow, "figures", {}).get("energy_error_max") or 0.0)
-    inside = domain.contains(outcome.y, slack=slack).reshape(len(outcome.t), -1).all(1)
+    inside = domain.contains(outcome.y, slack=slack)  # (n, ...)
+    with np.errstate(invalid="ignore"):
+        inside = inside | ~to_numpy(all_finite(outcome.y))  # what has become non-finite is reported as that
     if inside.all():
         return
-    first = int(np.argmin(inside))
+    first = int(np.argmin(inside.reshape(len(inside), -1).all(1)))
     t = float(outcome.t[first])
     outcome.stats["domain_exit"] = t
-    note = f"The state left the domain at t = {t:.17g}"
+    which = ""
+    if inside.ndim > 1:
+        index = tuple(np.argwhere(~inside[first])[0].tolist())
+        count = int((~inside).any(0).sum())
+        which = f" (trajectory {', '.join(map(str, index))}, the first of {count})"
+    note = f"The state left the domain at t = {t:.17g}{which}"
     if action == "warn":
         outcome.message += f" {note}: the figures of a trained flow do not hold there."
-    else:
+        return
+    outcome.message = f"{note}. Start inside the domain, or pass on_domain_exit='warn'."
+    if inside.ndim == 1:
         outcome.t, outcome.y = outcome.t[: first + 1], outcome.y[: first + 1]
-        outcome.status = np.full(np.shape(outcome.status), -1) if np.ndim(outcome.status) else -1
-        outcome.message = f"{note}. Start inside the domain, or pass on_domain_exit='warn'."
+        outcome.status = -1
+        return
+    outside = np.logical_or.accumulate(~inside, axis=0)
+    after = np.concatenate([np.zeros_like(outside[:1]), outside[:-1]])  # the exit itself is kept
+    outcome.status = np.where(outside[-1], -1, outcome.status)
+    if is_tensor(outcome.y):
+        import torch
+
+        outcome.y = outcome.y.masked_fill(torch.as_tensor(after, device=outcome.y.device)[..., None], math.nan)
+    else:
+        outcome.y = np.where(after[..., None], np.nan, outcome.y).astype(outcome.y.dtype)

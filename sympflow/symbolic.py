@@ -8,6 +8,7 @@ from functools import cached_property, reduce
 from typing import Any
 
 import sympy as sp
+from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from sympflow.arrays import Array, assemble, concatenate, is_tensor
 
@@ -134,12 +135,28 @@ class SymbolicHamiltonian:
             library = "torch" if is_tensor(x) else "numpy"
             if library not in generated:
                 code = [printable(f) for f in expressions(getattr(self, key[0]), variables)]
-                generated[library] = sp.lambdify(variables, code, modules=_modules(library, code), cse=True)
+                try:
+                    generated[library] = sp.lambdify(variables, code, modules=_modules(library, code), cse=True)
+                except (PrintMethodNotImplementedError, ValueError) as error:
+                    raise TypeError(
+                        f"`expression` has no derivative that {library} could evaluate: write it with smooth functions."
+                    ) from error
             columns = [x[..., i] for i in range(n)]
-            return collect(generated[library](*columns), columns[0], n)
+            try:
+                values = generated[library](*columns)
+            except (NameError, AttributeError, TypeError) as error:
+                raise TypeError(
+                    f"`expression` cannot be evaluated with {library} ({error}): write it with functions that "
+                    f"{library} has."
+                ) from error
+            return collect(values, columns[0], n)
 
         self._functions[key] = function
         return function
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the generated functions, which cannot be pickled and are generated again."""
+        return {name: value for name, value in vars(self).items() if name != "_functions"}
 
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:
@@ -148,9 +165,11 @@ class SymbolicHamiltonian:
 
 def _parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
     names = {name: sp.Symbol(name, real=True) for name in params}
+    _check_params(params)
     if isinstance(expression, str):
         words = set(re.findall(r"[A-Za-z_]\w*", expression))
         local = {w: sp.Symbol(w, real=True) for w in words if w not in vars(sp) or _is_coordinate(w) or w in params}
+        local |= {w: f for w, f in (("abs", sp.Abs), ("max", sp.Max), ("min", sp.Min)) if w in words - params.keys()}
         try:
             H = sp.sympify(expression, locals=local)
         except (sp.SympifyError, SyntaxError, TypeError, AttributeError) as error:
@@ -159,6 +178,8 @@ def _parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
         H = sp.sympify(expression)
     if not isinstance(H, sp.Expr):
         raise ValueError(f"`expression` must be a scalar expression; got {type(H).__name__}.")
+    if H.has(sp.I):
+        raise ValueError("`expression` is complex: a Hamiltonian must be real, so leave the imaginary unit I out.")
     H = H.xreplace({s: sp.Symbol(s.name, real=True) for s in H.free_symbols})
     for name, value in params.items():
         if names[name] not in H.free_symbols:
@@ -170,6 +191,14 @@ def _parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
     if unknown:
         raise ValueError(f"`expression` holds {', '.join(unknown)} without a value: give it in `params`.")
     return H
+
+
+def _check_params(params: Mapping[str, float]) -> None:
+    for name, value in params.items():
+        if not isinstance(name, str) or _is_coordinate(name) or name == "t":
+            raise ValueError(f"`params` gives a value to {name!r}, which is a coordinate: rename the parameter.")
+        if isinstance(value, str) or not sp.sympify(value).is_number or not sp.sympify(value).is_finite:
+            raise ValueError(f"`params` has {name} = {value!r}: give a finite number.")
 
 
 def _is_coordinate(name: str) -> bool:

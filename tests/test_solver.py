@@ -1,5 +1,6 @@
 """The solver's contract, for every classical method: outputs, dense output, directions, batches, order, failure."""
 
+import pickle
 import tracemalloc
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 import sympflow
-from sympflow import HamiltonianSystem, get, solve, systems
+from sympflow import Box, HamiltonianSystem, get, solve, systems
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.schemes import SCHEMES
 
@@ -257,6 +258,51 @@ def test_leaving_the_domain():
     stopped = solve(HH, "verlet", on_domain_exit="stop", **outside)
     assert stopped.status == -1
     assert len(stopped.t) == 1
+
+
+def test_leaving_the_domain_concerns_one_trajectory_of_a_batch():
+    box = HamiltonianSystem.from_sympy("p**2/2 + q**2/2", domain=Box([-1, -1], [1, 1]))
+    y0 = np.array([[0.3, 0.0], [0.9, 0.9], [0.2, 0.2]])
+    sol = solve(box, "verlet", (0, 10), y0=y0, on_domain_exit="stop")
+    assert sol.status.tolist() == [0, -1, 0]
+    assert np.isfinite(sol.y[[0, 2]]).all()
+    assert "trajectory 1, the first of 1" in sol.message
+    inside = np.isfinite(sol.y[1]).all(0)
+    assert 0 < inside.sum() < len(sol.t)
+    assert not box.domain.contains(sol.y[1].T[inside][-1])  # the exit itself is kept
+    tensors = solve(box, "verlet", (0, 10), y0=torch.tensor(y0), on_domain_exit="stop")
+    np.testing.assert_allclose(tensors.y.numpy(), sol.y, atol=1e-13)
+
+
+def test_a_batch_of_dopri5_with_one_blow_up_goes_on_one_by_one():
+    y0 = torch.tensor([ESCAPE["y0"], [0.1] * 4], dtype=torch.float64, requires_grad=True)
+    sol = solve(HH, "dopri5", (0, 20), y0=y0, t_eval=[0.0, 3.0, 20.0])
+    assert sol.status.tolist() == [-1, 0]
+    assert torch.isfinite(sol.y).all(1).tolist() == [[True, True, False], [True] * 3]
+    assert torch.isfinite(torch.autograd.grad(sol.y[1].sum(), y0)[0]).all()
+
+
+@pytest.mark.parametrize("method", ["verlet", "rk45", "dopri5", "rk4", "sympflow"])
+def test_solutions_can_be_pickled(method):
+    sol = solve(HH, method, (0, 2))
+    copy = pickle.loads(pickle.dumps(sol))
+    np.testing.assert_array_equal(copy.y, sol.y)
+    np.testing.assert_array_equal(copy.energy(), sol.energy())
+    assert len(repr(sol)) < 1000
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments"),
+    [
+        ("rk45", {"t_span": (0, 1e300), "t_eval": [1e300]}),
+        ("rk45", {"t_span": (0, 1), "max_step": 1e-300}),
+        ("dopri5", {"t_span": (0, 1e300), "t_eval": [1e300]}),
+    ],
+)
+def test_a_run_that_would_never_end_says_so(method, arguments):
+    sol = solve(PENDULUM, method, **arguments)
+    assert sol.status == -1
+    assert "at this pace the end needs about" in sol.message
 
 
 # the Solution -------------------------------------------------------------------------------------

@@ -103,6 +103,14 @@ def test_hessian_from_hessian_vector_products():
         (lambda: HamiltonianSystem.from_sympy("p1**2 + q + q2"), ValueError, "^`expression` mixes q, p"),
         (lambda: HamiltonianSystem.from_sympy("3"), ValueError, "^`expression` must depend on q1"),
         (lambda: HamiltonianSystem.from_sympy("p**2 + q", params={"k": 1}), ValueError, "^`params` has 'k'"),
+        (
+            lambda: HamiltonianSystem.from_sympy("p**2 + q", params={"q": 1}),
+            ValueError,
+            "^`params` gives a value to 'q'",
+        ),
+        (lambda: HamiltonianSystem.from_sympy("p**2 + k*q", params={"k": np.inf}), ValueError, "k = inf"),
+        (lambda: HamiltonianSystem.from_sympy("p**2 + k*q", params={"k": "a"}), ValueError, "^`params` has k = 'a'"),
+        (lambda: HamiltonianSystem.from_sympy("p**2 + I*q"), ValueError, "^`expression` is complex"),
         (lambda: HamiltonianSystem.from_sympy("p**2 + q", y0=[1, 2, 3]), ValueError, r"^`y0` must have shape \(2,\)"),
         (lambda: HamiltonianSystem.from_sympy("p**2 + q", dt=0), ValueError, "^`dt` must be positive"),
         (lambda: HamiltonianSystem.from_sympy("p**2 + q", domain=Ball([0.0] * 4, 1)), ValueError, "^`domain` must be"),
@@ -138,7 +146,7 @@ def test_functions_of_the_wrong_kind_are_explained(potential, error, message):
 @pytest.mark.parametrize(
     ("expression", "slope"),
     [
-        ("Max(q, 0)**2 + Abs(q)", lambda q: 2 * max(q, 0) + np.sign(q)),
+        ("max(q, 0)**2 + abs(q)", lambda q: 2 * max(q, 0) + np.sign(q)),
         ("sign(q)*q", np.sign),
         ("Heaviside(q)*q**2", lambda q: 2 * q * (q > 0)),
         ("Min(q**2, 1, q**4)", lambda q: 4 * q**3),

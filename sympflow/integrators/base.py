@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arrays import Array, all_finite, is_tensor, stack, to_numpy
+from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
 from sympflow.integrators.grid import Grid
 from sympflow.system import HamiltonianSystem
 
@@ -93,6 +93,8 @@ class Integrator:
         """The step from y (..., 2d) and its Jacobian A (..., 2d, 2d), by forward-mode differentiation of `step`."""
         import torch
 
+        from sympflow.forward_mode import jvp
+
         def step(x: torch.Tensor) -> torch.Tensor:
             return self.step(system, t, x, torch.as_tensor(h, dtype=x.dtype))
 
@@ -101,7 +103,7 @@ class Integrator:
         for i in range(x.shape[-1]):
             direction = torch.zeros_like(x)
             direction[..., i] = 1
-            y_next, column = torch.func.jvp(step, (x,), (direction,))[:2]
+            y_next, column = jvp(step, x, direction)
             columns.append(column)
         return to_numpy(y_next), to_numpy(torch.stack(columns, dim=-1))
 
@@ -139,7 +141,7 @@ class FixedStep(Integrator):
         return float(self.dt if self.dt is not None else system.dt)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Force and force-gradient evaluations of `n_steps` steps on the grid and `n_extra` shorter ones."""
+        """Force and force-gradient evaluations of n_steps steps, n_saved saved states, n_extra shorter steps."""
         return {"force_evaluations": 0, "hessian_evaluations": 0}
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
@@ -167,30 +169,39 @@ class FixedStep(Integrator):
         y = saved[np.searchsorted(save, count)]
         extra = np.flatnonzero(remainder)
         if extra.size:
-            y = self._shorter_steps(system, y, extra, remainder[extra])
+            y = self._shorter_steps(system, y, extra, remainder[extra], backend)
         n_steps = int(min(last, finite.max() + 1))
+        n_saved = int(np.count_nonzero((save > 0) & (save <= n_steps)))
+        at_end = int(bool(extra.size) and t[-1] == grid.t1)
         stats = {
             "dt": abs(grid.h),
-            "n_steps": n_steps,
-            **self.evaluations(n_steps, len(save), int(extra.size), backend),
+            "n_steps": n_steps + at_end,
+            **self.evaluations(n_steps, n_saved, int(extra.size), backend),
             "backend": backend,
         }
         outcome = Outcome(t, y, 0, FINISHED, stats)
         if problem.dense_output:
-            outcome.sol = GridSolution(self, system, grid, saved)
+            outcome.sol = GridSolution(self, system, grid, saved, backend)
         _report_failures(outcome, grid, finite, last)
         return outcome
 
-    def _shorter_steps(self, system: HamiltonianSystem, y: Array, extra: np.ndarray, h: np.ndarray) -> Array:
+    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
+        """`step` on the backend of the run that it belongs to."""
+        return self.step(system, 0.0, y, h)
+
+    def _shorter_steps(
+        self, system: HamiltonianSystem, y: Array, extra: np.ndarray, h: np.ndarray, backend: str
+    ) -> Array:
         """Replace the states y[extra] by those a step h later."""
         lengths = np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), y[extra].shape[:-1]).copy()
         if not is_tensor(y):
             with np.errstate(all="ignore"):
-                y[extra] = self.step(system, 0.0, y[extra], lengths.astype(y.dtype))
+                y[extra] = self.substep(system, y[extra], lengths.astype(y.dtype), backend)
             return y
         import torch
 
-        advanced = self.step(system, 0.0, y[extra], torch.as_tensor(lengths, dtype=y.dtype, device=y.device))
+        h_extra = torch.as_tensor(lengths, dtype=y.dtype, device=y.device)
+        advanced = self.substep(system, y[extra], h_extra, backend)
         return y.index_copy(0, torch.as_tensor(extra, device=y.device), advanced)
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
@@ -223,8 +234,11 @@ class GridSolution:
     Call it with a time or an array of times (n,); the result has shape (..., 2d) or (..., 2d, n).
     """
 
-    def __init__(self, integrator: FixedStep, system: HamiltonianSystem, grid: Grid, states: Array) -> None:
-        self.integrator, self.system, self.grid, self.states = integrator, system, grid, states
+    def __init__(
+        self, integrator: FixedStep, system: HamiltonianSystem, grid: Grid, states: Array, backend: str
+    ) -> None:
+        self.integrator, self.system, self.grid = integrator, system, grid
+        self.states, self.backend = states, backend
         self.t_min, self.t_max = sorted((grid.t0, grid.t1))
 
     def __call__(self, t: float | np.ndarray) -> Array:
@@ -233,7 +247,7 @@ class GridSolution:
         y = self.states[count]
         extra = np.flatnonzero(remainder)
         if extra.size:
-            y = self.integrator._shorter_steps(self.system, y, extra, remainder[extra])
+            y = self.integrator._shorter_steps(self.system, y, extra, remainder[extra], self.backend)
         y = y.movedim(0, -1) if is_tensor(y) else np.moveaxis(y, 0, -1)
         return y[..., 0] if np.ndim(t) == 0 else y
 
@@ -275,7 +289,7 @@ def rollout(
                     first = failed & (finite == n_steps) & ~to_numpy(all_finite(z))
                     finite = np.where(first, j, finite)
     if tensor:
-        out += [y * math.nan] * (len(wanted) - len(out))
+        out += [full_of_nan(y)] * (len(wanted) - len(out))
         out = stack(out, axis=0) if out else y[None][:0]
     return out, np.asarray(finite)
 

@@ -28,6 +28,9 @@ class Grid:
         quotient = (self.t1 - self.t0) / self.h
         if quotient > 2**53:
             raise ValueError(f"`dt` {dt:g} needs {quotient:.3g} steps from {t0:g} to {t1:g}: increase it.")
+        far = max(abs(self.t0), abs(self.t1))
+        if self.t0 != self.t1 and far + abs(self.h) == far:
+            raise ValueError(f"`dt` {dt:g} is below the spacing of floating-point numbers at t = {far:g}: increase it.")
         count, remainder = self.locate(np.array([self.t1]), bounded=False)
         self.n_steps, self.remainder = int(count[0]), float(remainder[0])
 

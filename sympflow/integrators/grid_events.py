@@ -31,16 +31,16 @@ def run_with_events(integrator: FixedStep, problem: Problem, search: EventSearch
         failed = good < n
         last = k + n == grid.n_steps or failed
 
-        taken, ended = _search(integrator, problem, search, grid, k, states[: good + 1])
+        taken, ended = _search(integrator, problem, search, grid, k, states[: good + 1], backend)
         if not ended and last and not failed and grid.remainder:
-            ended = _search_remainder(integrator, problem, search, grid, states[good])
+            ended = _search_remainder(integrator, problem, search, grid, states[good], backend)
 
         # outputs before the end of this chunk; a state at its end belongs to the next, unless there is none
         due = delivered + int(np.searchsorted(count[delivered:], k + good, "right" if last else "left"))
         chosen = slice(delivered, due)
         y_due, extra = states[count[chosen] - k], np.flatnonzero(remainder[chosen])
         if extra.size:
-            y_due = integrator._shorter_steps(system, y_due, extra, remainder[chosen][extra])
+            y_due = integrator._shorter_steps(system, y_due, extra, remainder[chosen][extra], backend)
         outputs.append(y_due)
         delivered = due
         if problem.dense_output:
@@ -64,7 +64,7 @@ def run_with_events(integrator: FixedStep, problem: Problem, search: EventSearch
     stats = {
         "dt": abs(grid.h),
         "n_steps": k,
-        **integrator.evaluations(k, k + 1, n_extra, backend),
+        **integrator.evaluations(k, k, n_extra, backend),
         "backend": backend,
     }
     outcome = Outcome(t, y_out, int(search.end is not None), ENDED if search.end else FINISHED, stats)
@@ -75,32 +75,38 @@ def run_with_events(integrator: FixedStep, problem: Problem, search: EventSearch
             "end `t_span` earlier."
         )
     if problem.dense_output:
-        outcome.sol = GridSolution(integrator, system, Grid(grid.t0, t_end, abs(grid.h)), _join(kept))
+        outcome.sol = GridSolution(integrator, system, Grid(grid.t0, t_end, abs(grid.h)), _join(kept), backend)
     return outcome
 
 
 def _search(
-    integrator: FixedStep, problem: Problem, search: EventSearch, grid: Grid, k: int, states: Array
+    integrator: FixedStep, problem: Problem, search: EventSearch, grid: Grid, k: int, states: Array, backend: str
 ) -> tuple[int, bool]:
     """Search the steps between `states`, which begin at grid point k: the number searched, and whether the run ends."""
     for j in range(len(states) - 1):
         t, y = grid.time(k + j), states[j]
 
         def dense(s: float, t: float = t, y: Array = y) -> Array:
-            return integrator.step(problem.system, t, y, s - t)
+            return integrator.substep(problem.system, y, s - t, backend)
 
         if search.step(t, y, grid.time(k + j + 1), states[j + 1], dense):
             return j + 1, True
     return len(states) - 1, False
 
 
-def _search_remainder(integrator: FixedStep, problem: Problem, search: EventSearch, grid: Grid, y: Array) -> bool:
+def _search_remainder(
+    integrator: FixedStep, problem: Problem, search: EventSearch, grid: Grid, y: Array, backend: str
+) -> bool:
     """Search the last, shorter step of an interval that dt does not divide."""
     t = grid.time(grid.n_steps)
-    y_end = integrator.step(problem.system, t, y, grid.remainder)
+
+    def dense(s: float) -> Array:
+        return integrator.substep(problem.system, y, s - t, backend)
+
+    y_end = dense(grid.t1)
     if not to_numpy(all_finite(y_end)):
         return False
-    return bool(search.step(t, y, grid.t1, y_end, lambda s: integrator.step(problem.system, t, y, s - t)))
+    return bool(search.step(t, y, grid.t1, y_end, dense))
 
 
 def _join(parts: Sequence[Array]) -> Array:

@@ -68,3 +68,17 @@ class RungeKutta(ExplicitStep):
 
 def _weighted(weights: Any, K: list[Array]) -> Array:
     return sum((float(w) * k for w, k in zip(weights, K, strict=False) if w), 0.0 * K[0])
+
+
+def hopeless(n_steps: int, t0: float, t: float, t1: float) -> str | None:
+    """Why a run that has taken `n_steps` to t will not reach t1 within a lifetime of patience, or None.
+
+    Looked at every ten thousand steps: an interval of 1e300, or steps too short to move t, would never end otherwise.
+    """
+    if n_steps % 10_000 or n_steps * abs(t1 - t) <= 1e10 * abs(t - t0):
+        return None
+    pace = n_steps * abs(t1 - t) / abs(t - t0) if t != t0 else math.inf
+    return (
+        f"After {n_steps} steps t = {t:.17g} is reached, and at this pace the end needs about {pace:.1g} more. End "
+        "`t_span` earlier, or raise `max_step` or the tolerances."
+    )

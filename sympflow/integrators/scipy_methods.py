@@ -16,7 +16,7 @@ from sympflow.arrays import Array, is_tensor
 from sympflow.events import ENDED
 from sympflow.integrators.base import FINISHED, Outcome, Problem, Steps
 from sympflow.integrators.grid import Grid
-from sympflow.integrators.runge_kutta import RungeKutta
+from sympflow.integrators.runge_kutta import RungeKutta, hopeless
 from sympflow.system import HamiltonianSystem
 
 
@@ -112,11 +112,16 @@ class _Scipy(RungeKutta):
                     failure = f"The solution became non-finite after t = {solver.t_old:.17g}. End `t_span` earlier."
                     break
                 stats["n_steps"] += 1
+                failure = hopeless(stats["n_steps"], t0, solver.t, t1)
+                if failure:
+                    break
                 t, y, interpolant = solver.t, solver.y, None
                 if search is not None:
                     interpolant = _Lazily(solver.dense_output)
                     t, y = search.step(solver.t_old, y_old, t, y, interpolant) or (t, y)
-                due = [s for s in wanted[len(outputs) :] if (t - s) * solver.direction >= 0]
+                due: list[float] = []
+                while (n := len(outputs) + len(due)) < len(wanted) and (t - wanted[n]) * solver.direction >= 0:
+                    due.append(wanted[n])
                 if problem.dense_output or due:
                     interpolant = solver.dense_output() if interpolant is None else interpolant.output
                     outputs += [y if s == t else interpolant(s) for s in due]
@@ -147,7 +152,7 @@ class _Scipy(RungeKutta):
         starts = np.asarray(y0, dtype=float).reshape(-1, y0.shape[-1])
         solvers = [self._start(system, *t_span, y) if t_span[0] != t_span[1] else None for y in starts]
         t = np.full(len(starts), t_span[0], dtype=float)
-        y = starts.copy()
+        y, n_steps = starts.copy(), 0
         while any(solver is not None and solver.status == "running" for solver in solvers):
             h, y_next = np.zeros(len(starts)), y.copy()
             for i, solver in enumerate(solvers):
@@ -155,12 +160,13 @@ class _Scipy(RungeKutta):
                     continue
                 with np.errstate(all="ignore"):
                     solver.step()
-                if solver.status == "failed" or not np.isfinite(solver.y).all():
+                stuck = hopeless(n_steps + 1, t_span[0], solver.t, t_span[1])
+                if solver.status == "failed" or not np.isfinite(solver.y).all() or stuck:
                     solvers[i] = None
                 else:
                     h[i], y_next[i] = solver.t - t[i], solver.y
             yield t.reshape(1, *batch).copy(), y.reshape(1, *y0.shape), h.reshape(1, *batch)
-            t, y = t + h, y_next
+            t, y, n_steps = t + h, y_next, n_steps + 1
 
 
 class _Lazily:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -97,6 +97,15 @@ class Splitting(FixedStep):
         states, finite = kernel.run_batch(self.scheme, h, rows, n_steps, save, self.compensated)
         return states.swapaxes(0, 1).reshape(len(save), *y0.shape), finite.reshape(y0.shape[:-1]), "compiled"
 
+    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
+        if backend != "compiled":
+            return self.step(system, 0.0, y, h)
+        from sympflow.kernels.splitting import splitting_kernel
+
+        rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
+        lengths = np.broadcast_to(h, y.shape[:-1]).reshape(-1)
+        return splitting_kernel(system).step(self.scheme, lengths, rows).reshape(y.shape)
+
     def _kernel(self, problem: Problem) -> SplittingKernel | None:
         """The compiled loops for the problem, or None where it needs, or asks for, array operations."""
         system, y0 = problem.system, problem.y0
@@ -134,10 +143,10 @@ def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int,
         return {"force_evaluations": n * len(kicks), "hessian_evaluations": n * sum(kicks)}
     # compiled, the last kick of a step is merged with the next step's first, except where a state is saved
     forces, hessians = scheme.force_evaluations, scheme.hessian_evaluations
-    opened = (n_saved + 1) if n_steps and len(kicks) > forces else 0
+    closed = n_saved if len(kicks) > forces else 0
     return {
-        "force_evaluations": n_steps * forces + opened + n_extra * len(kicks),
-        "hessian_evaluations": n_steps * hessians + opened * kicks[0] + n_extra * sum(kicks),
+        "force_evaluations": n_steps * forces + closed + n_extra * len(kicks),
+        "hessian_evaluations": n_steps * hessians + closed * kicks[-1] + n_extra * sum(kicks),
     }
 
 
@@ -148,6 +157,13 @@ def _kick(system: HamiltonianSystem, q: Array, c: float | Array, c3: float | Arr
         return c * force
     gradient = (system.potential_hessian(q) @ system.velocity(force)[..., None])[..., 0]
     return c * force - c3 * gradient
+
+
+def __getattr__(name: str) -> type[Splitting]:
+    """The integrator classes as attributes of the module, where pickle looks for them."""
+    if name in SCHEMES:
+        return splitting(name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 @cache

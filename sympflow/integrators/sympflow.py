@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -9,7 +10,7 @@ import numpy as np
 import torch
 
 from sympflow.arrays import Array, is_tensor
-from sympflow.integrators.base import FixedStep, Problem
+from sympflow.integrators.base import FixedStep, Outcome, Problem
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from sympflow.kernels.primed_flow import PrimedFlowKernel
 
 
-_SHIPPED: dict[tuple[str, tuple[float, ...]], Any] = {}  # read from their files once in a process
+_SHIPPED: dict[tuple[Any, ...], Any] = {}  # read from their files once in a process
 
 
 @dataclass(frozen=True)
@@ -75,24 +76,48 @@ class FlowIntegrator(FixedStep):
     def step_length(self, system: HamiltonianSystem) -> float:
         return float(self.dt if self.dt is not None else self.flow_for(system).dt)
 
+    def _flow_like(self, system: HamiltonianSystem, y: Array) -> Any:
+        """The flow for states such as y: a shipped one in their dtype and on their device, a given one as it is.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the given flow has another dtype or device.
+        """
+        flow = self.flow_for(system)
+        tensor = y if is_tensor(y) else torch.from_numpy(np.empty(0, y.dtype))
+        if tensor.dtype == flow.dtype and tensor.device == flow.device:
+            return flow
+        if self.flow is None:
+            key = (self.name, system.fingerprint, tensor.dtype, tensor.device)
+            if key not in _SHIPPED:
+                _SHIPPED[key] = copy.deepcopy(flow).to(dtype=tensor.dtype, device=tensor.device)
+            return _SHIPPED[key]
+        if tensor.dtype != flow.dtype:
+            raise TypeError(
+                f"`y0` is {tensor.dtype}, but the flow's weights are {flow.dtype}: pass flow.to({tensor.dtype}), or "
+                f"states in {flow.dtype}."
+            )
+        raise ValueError(f"`y0` is on {tensor.device}, but the flow is on {flow.device}: move one of them.")
+
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        return self._apply(self.flow_for(system), y, h)
+        return self.substep(system, y, h, "auto")
+
+    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
+        flow = self._flow_like(system, y)
+        kernel = _kernel(system, flow, y, "array" if backend == "torch" else backend)
+        if kernel is None:
+            return _apply(flow, y, h)
+        rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
+        lengths = np.broadcast_to(h, y.shape[:-1]).reshape(-1)
+        return kernel.step(lengths, rows).reshape(y.shape)
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        flow = self.flow_for(system)
-        return self._apply(flow.inverse, y, h)
+        return _apply(self._flow_like(system, y).inverse, y, h)
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         self.flow_for(system)  # files cannot be read inside a function transform
         return super().tangent(system, t, y, h)
-
-    def _apply(self, function: Any, y: Array, h: float | Array) -> Array:
-        """function(h, y) of tensors, for tensors or arrays."""
-        if is_tensor(y):
-            return function(h, y)
-        with torch.no_grad():
-            length = torch.from_numpy(np.array(h)) if np.ndim(h) else float(h)
-            return function(length, torch.from_numpy(np.ascontiguousarray(y))).numpy()
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         if not hasattr(self.flow, "scheme"):  # an MLP flow evaluates no forces
@@ -102,9 +127,9 @@ class FlowIntegrator(FixedStep):
         return scheme_evaluations(self.flow.scheme(self.dt), n_steps, n_saved, n_extra, backend)
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
-        y0, flow = problem.y0, self.flow_for(problem.system)
-        _check_match(y0, flow)
-        kernel = _kernel(problem, flow)
+        y0 = problem.y0
+        flow = self._flow_like(problem.system, y0)
+        kernel = _kernel(problem.system, flow, y0, problem.backend)
         if kernel is not None:
             rows = y0.reshape(-1, y0.shape[-1])
             states, finite = kernel.run_batch(h, rows, n_steps, save)
@@ -118,39 +143,35 @@ class FlowIntegrator(FixedStep):
         return states.numpy(), finite, "torch"
 
 
-def _kernel(problem: Problem, flow: Any) -> MLPFlowKernel | PrimedFlowKernel | None:
+def _apply(function: Any, y: Array, h: float | Array) -> Array:
+    """function(h, y) of tensors, for tensors or arrays."""
+    if is_tensor(y):
+        return function(h, y)
+    with torch.no_grad():
+        length = torch.from_numpy(np.array(h)) if np.ndim(h) else float(h)
+        return function(length, torch.from_numpy(np.ascontiguousarray(y))).numpy()
+
+
+def _kernel(system: HamiltonianSystem, flow: Any, y: Array, backend: str) -> MLPFlowKernel | PrimedFlowKernel | None:
     """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
-    if problem.backend == "array":
+    if backend == "array":
         return None
     try:
-        if is_tensor(problem.y0):
+        if is_tensor(y):
             raise ValueError("`y0` is a tensor: pass a NumPy array, or use backend='array'.")
         if flow.kind != "sympflow":
             raise ValueError("`method` 'mlp' has no compiled form: use backend='array'.")
         if hasattr(flow, "scheme"):
             from sympflow.kernels.primed_flow import PrimedFlowKernel
 
-            return PrimedFlowKernel(flow, problem.system)
+            return PrimedFlowKernel(flow, system)
         from sympflow.kernels.mlp_flow import mlp_flow_kernel
 
         return mlp_flow_kernel(flow)
     except ValueError as reason:
-        if problem.backend == "compiled":
+        if backend == "compiled":
             raise ValueError(f"`backend` 'compiled' does not apply. {reason}") from None
         return None
-
-
-def _check_match(y0: Array, flow: Any) -> None:
-    """Raise unless the state has the dtype and device of the flow's weights."""
-    weight = next(flow.parameters())
-    dtype = y0.dtype if is_tensor(y0) else torch.from_numpy(np.empty(0, y0.dtype)).dtype
-    if dtype != weight.dtype:
-        raise TypeError(
-            f"`y0` is {dtype}, but the flow's weights are {weight.dtype}: convert one, e.g. flow.to({dtype})."
-        )
-    device = y0.device if is_tensor(y0) else torch.device("cpu")
-    if device != weight.device:
-        raise ValueError(f"`y0` is on {device}, but the flow is on {weight.device}: move one of them, e.g. y0.to(...).")
 
 
 @dataclass(frozen=True)
@@ -188,6 +209,13 @@ class MLPIntegrator(FlowIntegrator):
 
     name: ClassVar[str] = "mlp"
     symplectic: ClassVar[bool] = False
+
+    def run(self, problem: Problem) -> Outcome:
+        if problem.t1 < problem.t0:
+            raise ValueError(
+                "`t_span` runs backwards, but method 'mlp' has no inverse: use a symplectic method for backward time."
+            )
+        return super().run(problem)
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         raise TypeError("`method` 'mlp' has no exact inverse: use a symplectic method.")

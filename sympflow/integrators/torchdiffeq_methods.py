@@ -9,11 +9,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
+from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
 from sympflow.events import ENDED, EventSearch
 from sympflow.integrators.base import FINISHED, FixedStep, Integrator, Outcome, Problem, Steps, check_dt
 from sympflow.integrators.grid import Grid
-from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta
+from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, Tableau
 from sympflow.system import HamiltonianSystem
 
@@ -42,7 +42,19 @@ def torchdiffeq_method(name: str) -> type[Integrator]:
 
 def _named(name: str, base: type[Integrator], namespace: dict[str, Any]) -> type[Integrator]:
     namespace |= {"name": name, "__module__": __name__}
-    return dataclass(frozen=True)(type(name.title().replace("_", ""), (base,), namespace))
+    return dataclass(frozen=True)(type(_class_name(name), (base,), namespace))
+
+
+def _class_name(method: str) -> str:
+    return method.title().replace("_", "")
+
+
+def __getattr__(name: str) -> type[Integrator]:
+    """The integrator classes as attributes of the module, where pickle looks for them."""
+    for method in (*ADAPTIVE, *FIXED, *MULTISTEP):
+        if name == _class_name(method):
+            return torchdiffeq_method(method)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 # step-size control --------------------------------------------------------------------------------
@@ -52,9 +64,9 @@ def _named(name: str, base: type[Integrator], namespace: dict[str, Any]) -> type
 class Adaptive(RungeKutta):
     """An adaptive Runge–Kutta method of torchdiffeq.
 
-    The trajectories of a batch share their steps, so they also fail together. Without `t_eval` the states are reported
-    every `system.dt`; the dense output integrates again up to the times that it is asked for. Events are located on a
-    shorter step of the method from the beginning of the step that they fall into.
+    The trajectories of a batch share their steps; if that fails, each is integrated by itself. Without `t_eval` the
+    states are reported every `system.dt`; the dense output integrates again up to the times that it is asked for.
+    Events are located on a shorter step of the method from the beginning of the step that they fall into.
 
     Parameters
     ----------
@@ -89,19 +101,42 @@ class Adaptive(RungeKutta):
                 t_eval = t_eval[(t_eval - search.end[0]) * (1 if problem.t1 >= problem.t0 else -1) <= 0]
         y, record, stopped = self._integrate(problem.system, problem.t0, t_eval, problem.y0)
         failure = failure or stopped
+        if failure and problem.y0.ndim > 1:
+            return self._one_by_one(problem, t_eval, stats)
         stats |= {
             "n_steps": record.n_steps,
             "force_evaluations": record.evaluations + cost,
             "hessian_evaluations": 0,
             "backend": "torchdiffeq",
         }
-        status = np.full(problem.y0.shape[:-1], -int(bool(failure))) if problem.y0.ndim > 1 else -int(bool(failure))
+        status = np.zeros(problem.y0.shape[:-1], dtype=int) if problem.y0.ndim > 1 else -int(bool(failure))
         outcome = Outcome(t_eval[: len(y)], y, status, failure or FINISHED, stats)
         if search is not None and search.end is not None:
             outcome.status, outcome.message = 1, ENDED
             if problem.t_eval is None and not (len(t_eval) and t_eval[-1] == search.end[0]):
                 outcome.t = np.append(t_eval, search.end[0])
                 outcome.y = _append(y, search.end[1])
+        if problem.dense_output:
+            outcome.sol = _Again(self, problem)
+        return outcome
+
+    def _one_by_one(self, problem: Problem, t_eval: np.ndarray, stats: dict[str, Any]) -> Outcome:
+        """A batch, some of whose trajectories fail: each by itself, with NaN after its last finite state."""
+        batch = problem.y0.shape[:-1]
+        stats |= {"n_steps": 0, "force_evaluations": 0, "hessian_evaluations": 0, "backend": "torchdiffeq"}
+        rows, status, message = [], np.zeros(batch, dtype=int), FINISHED
+        for index in np.ndindex(batch):
+            start = problem.y0[index]
+            y, record, failure = self._integrate(problem.system, problem.t0, t_eval, start)
+            stats["n_steps"] += record.n_steps
+            stats["force_evaluations"] += record.evaluations
+            if failure:
+                status[index] = -1
+                message = message if message != FINISHED else f"Trajectory {', '.join(map(str, index))}: {failure}"
+            missing = [full_of_nan(start)] * (len(t_eval) - len(y))
+            rows.append(stack([*y, *missing], axis=0))
+        y = stack(rows, axis=1).reshape(len(t_eval), *problem.y0.shape)
+        outcome = Outcome(t_eval, y, status, message, stats)
         if problem.dense_output:
             outcome.sol = _Again(self, problem)
         return outcome
@@ -142,7 +177,7 @@ class Adaptive(RungeKutta):
         sign = 1 if times.size == 0 or times[-1] >= t0 else -1
         distinct, position = np.unique(sign * np.append(t0, times), return_inverse=True)
         distinct = sign * distinct
-        record, failure = _Record(system, keep, visit, tensor), None
+        record, failure = _Record(system, keep, visit, tensor, (t0, float(times[-1]) if times.size else t0)), None
         with torch.set_grad_enabled(tensor and torch.is_grad_enabled()):
             while True:
                 if len(distinct) == 1:
@@ -162,7 +197,7 @@ class Adaptive(RungeKutta):
                     if visit is not None:
                         return y_start[None], record, failure
                     distinct = distinct[(distinct - reached) * sign <= 0][: len(distinct) - 1]
-                    record = _Record(system, keep)
+                    record = _Record(system, keep, span=(t0, float(distinct[-1])))
         kept = position[1:][position[1:] < len(distinct)]
         y = y[torch.as_tensor(kept)]
         return (y if tensor else y.numpy()), record, failure
@@ -185,7 +220,15 @@ class _Record:
     torchdiffeq announces a step by its beginning and length; its end is the beginning of the next.
     """
 
-    def __init__(self, system: HamiltonianSystem, keep: bool = False, visit: Any = None, tensor: bool = True) -> None:
+    def __init__(
+        self,
+        system: HamiltonianSystem,
+        keep: bool = False,
+        visit: Any = None,
+        tensor: bool = True,
+        span: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self.span = span
         self.system, self.keep, self.visit, self.tensor = system, keep, visit, tensor
         self.evaluations = self.n_steps = 0
         self.reached: float | None = None
@@ -199,6 +242,8 @@ class _Record:
     def callback_accept_step(self, t: Any, y: Any, dt: Any) -> None:
         self.n_steps += 1
         self.reached = float(t.detach())
+        if stuck := hopeless(self.n_steps, self.span[0], self.reached, self.span[1]):
+            raise AssertionError(stuck)
         if self.keep:
             self.steps.append((self.reached, to_numpy(y), abs(float(dt.detach()))))
         if self.visit is not None:
