@@ -70,8 +70,8 @@ def solve(
         everything else with array operations. What ran is in `stats["backend"]`.
     on_domain_exit : "warn", "stop" or "ignore", optional
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
-        statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The default is "warn" for trained flows, whose figures hold in Ω,
-        and "ignore" for classical methods.
+        statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The
+        default is "warn" for trained flows, whose figures hold in Ω, and "ignore" for classical methods.
     **options
         Options of the method: `dt` for fixed steps (default `system.dt`, or the flow's Δt), `rtol` and `atol` for
         adaptive ones, `flow` for "sympflow" and "mlp".
