@@ -35,6 +35,22 @@ def _vector(name: str, value: ArrayLike) -> tuple[float, ...]:
     return tuple(array.tolist())
 
 
+def _states(x: ArrayLike, width: int) -> np.ndarray:
+    """`x`, checked to be numbers of shape (..., width)."""
+    try:
+        array = to_numpy(x)
+    except ValueError:  # rows of different lengths
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"`x` must be states of real numbers; got {x!r}: pass an array of shape (..., {width}).")
+    if array.ndim == 0 or array.shape[-1] != width:
+        raise ValueError(
+            f"`x` must have shape (..., {width}), states [q, p] of the domain; got {array.shape}: "
+            "put them on the last axis."
+        )
+    return array
+
+
 def _sample_count(n: int) -> int:
     if n < 1 or int(n) != n:
         raise ValueError(f"`n` must be a positive integer; got {n!r}.")
@@ -67,7 +83,8 @@ class Ball:
         return center + self.radius * direction * rng.random((n, 1)) ** (1 / center.size)
 
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
-        return np.linalg.norm(to_numpy(x) - np.asarray(self.center), axis=-1) <= self.radius
+        center = np.asarray(self.center)
+        return np.linalg.norm(_states(x, center.size) - center, axis=-1) <= self.radius
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": "Ball", **asdict(self)}
@@ -99,8 +116,9 @@ class Box:
         return rng.uniform(low, high, (_sample_count(n), low.size))
 
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
-        x = to_numpy(x)
-        return ((x >= np.asarray(self.low)) & (x <= np.asarray(self.high))).all(-1)
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        x = _states(x, low.size)
+        return ((x >= low) & (x <= high)).all(-1)
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": "Box", **asdict(self)}
@@ -165,7 +183,7 @@ class EnergySublevel:
         return np.concatenate(accepted)[:n]
 
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
-        x = to_numpy(x)
+        x = _states(x, np.size(self.box.low))
         with np.errstate(all="ignore"):
             below = self._energy(x) < self.energy + slack
         return below & (self.box.contains(x) if slack == 0 else self._widened(slack).contains(x))
@@ -192,11 +210,23 @@ def domain_from_dict(description: dict[str, Any]) -> Domain:
         fields = {k: v for k, v in description.items() if k != "kind"}
         match description["kind"]:
             case "Ball":
-                return Ball(**fields)
+                return Ball(**_numbers(fields))
             case "Box":
-                return Box(**fields)
+                return Box(**_numbers(fields))
             case "EnergySublevel":
-                return EnergySublevel(float(fields["energy"]), Box(fields["box"]["low"], fields["box"]["high"]))
+                box = domain_from_dict(fields.pop("box"))
+                if not isinstance(box, Box):
+                    raise ValueError(f"the box of an EnergySublevel is a {type(box).__name__}")
+                return EnergySublevel(box=box, **_numbers(fields))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"`description` is not a domain: {error}.") from error
     raise ValueError(f"`description` is of an unknown kind of domain: {description['kind']!r}.")
+
+
+def _numbers(fields: dict[str, Any]) -> dict[str, Any]:
+    """`fields`, checked to be numbers and lists of numbers."""
+    for name, value in fields.items():
+        for v in value if isinstance(value, list | tuple) else (value,):
+            if isinstance(v, bool) or not isinstance(v, int | float):
+                raise TypeError(f"{name} {value!r} is not made of numbers")
+    return fields

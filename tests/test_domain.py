@@ -59,6 +59,18 @@ def test_energy_slack_widens_an_energy_domain():
     assert domain.contains(just_outside, slack=2e-3 * domain.energy)
 
 
+@pytest.mark.parametrize("domain", DOMAINS, ids=lambda d: type(d).__name__)
+def test_what_are_not_states_of_the_domain_is_refused(domain):
+    width = domain.sample(1).shape[-1]
+    assert domain.contains(domain.sample(1)[0].tolist())
+    for x in ([1, 2, 3], 0.5, np.zeros((2, width + 1))):
+        with pytest.raises(ValueError, match=rf"^`x` must have shape \(\.\.\., {width}\).*last axis"):
+            domain.contains(x)
+    for x in ("here", None, [[1.0], [1.0, 2.0]], np.zeros(width, dtype=complex)):
+        with pytest.raises(TypeError, match=r"^`x` must be states of real numbers.*pass an array"):
+            domain.contains(x)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -367,6 +367,33 @@ def test_bad_arguments_are_refused(arguments, message):
         train(harmonic_oscillator(), **arguments)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"domain": 3}, TypeError, r"^`domain` must be a domain of phase space; got 3: use sympflow\.Box"),
+        ({"device": "foo"}, ValueError, "^`device` 'foo' is not to be had here"),
+        ({"device": "cuda:4096"}, ValueError, "^`device` 'cuda:4096' is not to be had here"),
+        ({"dtype": torch.int32}, TypeError, "^`dtype` must be float32 or float64"),
+        (
+            {"kind": "mlp", "pairs": 1, "hidden": (2,)},
+            ValueError,
+            "^`hidden` and `pairs` describe .* 16 parameters.*: give wider layers",
+        ),
+    ],
+)
+def test_bad_arguments_are_named(arguments, error, message):
+    with pytest.raises(error, match=message):
+        train(harmonic_oscillator(), **arguments)
+
+
+def test_a_small_baseline():
+    system, options = harmonic_oscillator(), {**MORE, "pairs": 2, "hidden": (6,), "activation": "sin", "steps": 2}
+    flow, baseline = (train(system, kind=kind, **options, dtype=np.float32) for kind in ("sympflow", "mlp"))
+    assert abs(baseline.n_parameters - flow.n_parameters) <= 0.02 * flow.n_parameters
+    assert baseline.activation == "sin"
+    assert baseline.dtype == torch.float32
+
+
 def test_a_flow_of_another_system_is_refused():
     flow = train(harmonic_oscillator(), steps=2, **QUICK)
     with pytest.raises(ValueError, match="`system`"):

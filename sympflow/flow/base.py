@@ -16,6 +16,8 @@ from sympflow.flow.steps import whole_steps, whole_steps_of_each
 if TYPE_CHECKING:
     from sympflow.system import HamiltonianSystem
 
+MIN_DT, MAX_DT = 1e-18, 1e18  # were they seconds, from an attosecond to more than the age of the universe
+
 
 class FlowMap(nn.Module):
     """A learned map ψ̄_t, t ∈ [0, Δt], of states [q, p], and its extension ψ_t to every t.
@@ -48,8 +50,12 @@ class FlowMap(nn.Module):
         super().__init__()
         if isinstance(ndof, bool) or not isinstance(ndof, int) or ndof < 1:
             raise ValueError(f"`ndof` must be a positive integer, the degrees of freedom; got {ndof!r}.")
-        if not (isinstance(dt, (int, float)) and 0 < dt < math.inf):
+        if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf:
             raise ValueError(f"`dt` must be a positive finite number, the Δt of the flow; got {dt!r}.")
+        if not MIN_DT <= dt <= MAX_DT:
+            raise ValueError(
+                f"`dt` must lie between {MIN_DT:g} and {MAX_DT:g}; got {dt!r}: choose another unit of time."
+            )
         self.ndof, self.dt = ndof, float(dt)
         self.domain: Domain | None = None
         self.fingerprint: tuple[float, ...] | None = None

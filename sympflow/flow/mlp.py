@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -10,8 +11,12 @@ from torch import Tensor, nn
 
 from sympflow.flow.activations import activation as activation_named
 from sympflow.flow.base import FlowMap
+from sympflow.flow.placement import checked_device, checked_dtype
 from sympflow.flow.potentials import hidden_widths, outer
 from sympflow.flow.scaling import Scaling
+from sympflow.flow.sympflow import SympFlow
+
+MAX_DIFFERENCE = 6  # between the widths of two layers that are about the same
 
 
 class MLPFlow(FlowMap):
@@ -21,8 +26,9 @@ class MLPFlow(FlowMap):
     ----------
     ndof, dt, dtype, device, seed, scale
         As for `SympFlow`.
-    hidden : sequence of int
-        Widths of the hidden layers. `MLPFlow.matching` picks them to have as many parameters as a SympFlow.
+    hidden : sequence of int, optional
+        Widths of the hidden layers; the default gives as many parameters as the default SympFlow has, within 2 %.
+        `MLPFlow.matching` picks them to match any other SympFlow.
     activation : str
     """
 
@@ -35,7 +41,7 @@ class MLPFlow(FlowMap):
     def __init__(
         self,
         ndof: int,
-        hidden: Sequence[int] = (25, 25),
+        hidden: Sequence[int] | None = None,
         activation: str = "tanh",
         dt: float = 1.0,
         dtype: torch.dtype = torch.float64,
@@ -44,6 +50,9 @@ class MLPFlow(FlowMap):
         scale: Scaling | None = None,
     ) -> None:
         super().__init__(ndof, dt)
+        dtype, device = checked_dtype(dtype), checked_device(device)
+        if hidden is None:
+            hidden = _default_widths(ndof)
         self.hidden, self.activation = hidden_widths(hidden), activation
         self._sigma = activation_named(activation)
         scale = Scaling.unit(ndof, dt) if scale is None else scale
@@ -69,20 +78,15 @@ class MLPFlow(FlowMap):
         self.register_buffer("tau", constant(scale.t))
 
     @classmethod
-    def matching(cls, flow: FlowMap, seed: int = 0, scale: Scaling | None = None) -> MLPFlow:
-        """An MLPFlow of two hidden layers whose parameters number those of `flow`, within 2 %."""
-        d, target = flow.ndof, flow.n_parameters
-        counts = {
-            (m, n): (2 * d + 2) * m + (m + 1) * n + (n + 1) * 2 * d
-            for m in range(1, 2 * int(target**0.5) + 2)
-            for n in range(max(1, m - 6), m + 7)
-        }
-        m, n = min(counts, key=lambda widths: (abs(counts[widths] - target), abs(widths[0] - widths[1])))
-        if abs(counts[m, n] - target) > 0.02 * target:
+    def matching(cls, flow: FlowMap, seed: int = 0, scale: Scaling | None = None, activation: str = "tanh") -> MLPFlow:
+        """An MLPFlow whose parameters number those of `flow`, within 2 %."""
+        widths = matching_widths(flow.ndof, flow.n_parameters)
+        if widths is None:
             raise ValueError(
-                f"`flow` has only {target} parameters, which no MLPFlow matches within 2 %: use a larger flow."
+                f"`flow` has only {flow.n_parameters} parameters, which no MLPFlow matches within 2 %: "
+                "use a larger flow."
             )
-        return cls(d, (m, n), dt=flow.dt, dtype=flow.dtype, device=flow.device, seed=seed, scale=scale)
+        return cls(flow.ndof, widths, activation, flow.dt, flow.dtype, flow.device, seed, scale)
 
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.ndof, "hidden": list(self.hidden), "activation": self.activation}
@@ -124,3 +128,40 @@ class MLPFlow(FlowMap):
         ramp = torch.tanh(tau_t)
         dN = (1 - ramp * ramp) * N + ramp * (self.weights[-1] @ dh)
         return y + s * (ramp * N), s / self.tau * dN
+
+
+def matching_widths(ndof: int, target: int) -> tuple[int, ...] | None:
+    """Widths of the hidden layers of an MLPFlow of `target` parameters within 2 %, None if there are none.
+
+    Two layers of about the same width if there are such, else any two, else one.
+    """
+    d = ndof
+
+    def count(widths: tuple[int, ...]) -> int:
+        return (2 * d + 2) * widths[0] + sum((m + 1) * n for m, n in pairwise((*widths, 2 * d)))
+
+    def fits(widths: tuple[int, ...]) -> bool:
+        return abs(count(widths) - target) <= 0.02 * target
+
+    alike = [
+        (m, n)
+        for m in range(1, 2 * int(target**0.5) + 2)
+        for n in range(max(1, m - MAX_DIFFERENCE), m + MAX_DIFFERENCE + 1)
+    ]
+    best: tuple[int, ...] = min(alike, key=lambda widths: (abs(count(widths) - target), abs(widths[0] - widths[1])))
+    if fits(best):
+        return best
+    # For each first width the second that comes closest.
+    first = range(1, target // (2 * d + 2) + 1)
+    two = [(m, max(1, round((target - (2 * d + 2) * m - 2 * d) / (m + 1 + 2 * d)))) for m in first]
+    one = [(max(1, round((target - 2 * d) / (4 * d + 2))),)]
+    candidates: list[tuple[int, ...]] = [*filter(fits, two), *filter(fits, one)]
+    return min(candidates, key=lambda widths: (-len(widths), abs(widths[0] - widths[-1])), default=None)
+
+
+def _default_widths(ndof: int) -> tuple[int, ...]:
+    target = SympFlow(ndof, device="meta").n_parameters
+    widths = matching_widths(ndof, target)
+    if widths is None:
+        raise ValueError(f"`hidden` has no default for {ndof} degrees of freedom: give the widths, as by (30, 30).")
+    return widths

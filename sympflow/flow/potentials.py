@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.flow.activations import activation as activation_named
+from sympflow.flow.placement import checked_device, checked_dtype
 
 Time = float | Tensor
 
@@ -101,7 +102,7 @@ class MLPPotential(Potential):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        hidden = hidden_widths(hidden)
+        hidden, dtype, device = hidden_widths(hidden), checked_dtype(dtype), checked_device(device)
         self.ndof, self.hidden, self.activation = int(ndof), hidden, activation
         self._sigma = activation_named(activation)
 

@@ -16,6 +16,7 @@ import torch
 from sympflow.flow.base import FlowMap
 from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.layers import Drift, Kick
+from sympflow.flow.placement import checked_device, checked_dtype
 from sympflow.flow.primed_potentials import FORCE_GRADIENT, KINETIC, POTENTIAL, Binding, PrimedPotential, Term
 from sympflow.flow.sympflow import SympFlow
 from sympflow.integrators.schemes import SCHEMES, Scheme, compose
@@ -80,7 +81,7 @@ class PrimedFlow(SympFlow):
         self.sequence: tuple[Kind, ...] = tuple(first if i % 2 == 0 else other for i in range(maps))
         self.degree, self.palindromic = degree, palindromic
         exponents = tuple(range(0, degree, 2 if palindromic else 1))
-        like: dict[str, Any] = {"dtype": dtype, "device": device}
+        like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
         n_kicks, n_drifts = self.sequence.count("kick"), self.sequence.count("drift")
         self.kicks = Coefficients(n_kicks, exponents, self.dt, 1, palindromic, 1.0, **like)
         self.drifts = Coefficients(n_drifts, exponents, self.dt, 1, palindromic, 1.0, **like)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.potentials import Potential, Time
+from sympflow.forward_mode import jvp
 
 if TYPE_CHECKING:
     from sympflow.system import HamiltonianSystem
@@ -65,6 +67,10 @@ FORCE_GRADIENT = Term(_force_gradient_value, _force_gradient)
 KINETIC = Term(lambda system, p: system.kinetic(p), lambda system, p: system.velocity(p))
 
 
+def _gradient_columns(U: Term, system: HamiltonianSystem, x: Tensor) -> Tensor:
+    return U.gradient(system, x.T).T
+
+
 class PrimedPotential(Potential):
     """V(t, x) = Σ_j c_j(t) U_j(x), with U_j functions of the system and c_j(0) = 0.
 
@@ -94,7 +100,7 @@ class PrimedPotential(Potential):
         system = self.binding.system
         impulse = tangent = torch.zeros_like(x)
         for U, c, i in self._terms:
-            gradient, change = torch.func.jvp(lambda y, U=U: U.gradient(system, y.T).T, (x,), (dx,))[:2]
+            gradient, change = jvp(partial(_gradient_columns, U, system), x, dx)
             impulse = impulse + c.value(i, t) * gradient
             tangent = tangent + c.rate(i, t) * gradient + c.value(i, t) * change
         return impulse, tangent

@@ -12,7 +12,7 @@ import torch
 
 from sympflow.domain import Domain, EnergySublevel
 from sympflow.flow.base import FlowMap
-from sympflow.flow.mlp import MLPFlow
+from sympflow.flow.mlp import MLPFlow, matching_widths
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
@@ -72,7 +72,8 @@ def train(
     dt : float, optional
         Δt, the longest time of the map; the default is 1, or that of `flow`.
     kind : {"sympflow", "mlp"}, optional
-        The architecture: a SympFlow (the default) or the unconstrained baseline with as many parameters.
+        The architecture: a SympFlow (the default) or the unconstrained baseline with as many parameters as the
+        SympFlow that `pairs` and `hidden` describe.
     pairs, hidden, activation, dtype, device
         Of a new flow, see `SympFlow`; the defaults are 3, (10, 10), "tanh" and float64 on the CPU.
     flow : FlowMap, optional
@@ -181,7 +182,12 @@ def train(
             scaling,
         )
         if kind == "mlp":
-            flow = MLPFlow.matching(flow, seed, scaling)
+            if matching_widths(flow.ndof, flow.n_parameters) is None:
+                raise ValueError(
+                    f"`hidden` and `pairs` describe a SympFlow of only {flow.n_parameters} parameters, which no "
+                    "MLPFlow matches within 2 %: give wider layers or more pairs."
+                )
+            flow = MLPFlow.matching(flow, seed, scaling, "tanh" if activation is None else activation)
     run = Run.start(copy.deepcopy(flow).requires_grad_(True), system, domain, scaling, config)
     if resume is not None:
         run.load(resume)
@@ -220,6 +226,11 @@ def _domain(system: HamiltonianSystem, domain: Domain | None) -> Domain:
         raise ValueError(
             f"`domain` is not known for the system {system.name!r}: pass the states to train on, as by "
             "domain=sympflow.Box(low, high), sympflow.Ball(center, radius) or sympflow.EnergySublevel(energy, box)."
+        )
+    if not isinstance(domain, Domain):
+        raise TypeError(
+            f"`domain` must be a domain of phase space; got {domain!r}: use sympflow.Box(low, high), "
+            "sympflow.Ball(center, radius) or sympflow.EnergySublevel(energy, box)."
         )
     if isinstance(domain, EnergySublevel):
         domain = domain.attach(system.hamiltonian)
