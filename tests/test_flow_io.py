@@ -13,6 +13,7 @@ from sympflow.flow.io import KEY, load, save
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.record import checksum
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.systems import harmonic_oscillator, henon_heiles
@@ -43,10 +44,12 @@ def record(path):
     return json.loads(json.loads(content[8 : 8 + length])["__metadata__"][KEY])
 
 
-def tampered(path, change_record=lambda record: None, change_tensors=lambda tensors: None):
+def tampered(path, change_record=lambda record: None, change_tensors=lambda tensors: None, rechecked=True):
     notes, tensors = record(path), load_file(path)
     change_record(notes)
     change_tensors(tensors)
+    if "checksum" in notes:
+        notes["checksum"] = checksum(tensors) if rechecked else notes["checksum"]
     save_file(tensors, path, {KEY: notes if isinstance(notes, str) else json.dumps(notes)})
     return path
 
@@ -69,6 +72,10 @@ def test_round_trip(make, tmp_path):
 
 def test_a_file_with_no_domain_or_system_loads(tmp_path):
     SympFlow(1).save(tmp_path / "bare.safetensors")
+    assert (record(tmp_path / "bare.safetensors")["system"], record(tmp_path / "bare.safetensors")["fingerprint"]) == (
+        None,
+        None,
+    )
     flow = load(tmp_path / "bare.safetensors")
     assert flow.domain is None
     flow.check_system(harmonic_oscillator())
@@ -126,6 +133,10 @@ def test_a_hostile_file_is_refused(tmp_path, content):
         load(path)
 
 
+def remove(key):
+    return lambda record: record.pop(key)
+
+
 def change(*keys, value):
     def apply(record):
         for key in keys[:-1]:
@@ -140,10 +151,14 @@ def change(*keys, value):
     [
         (change("format", value=99), "format 99 is later"),
         (change("format", value="1"), "no format number"),
+        (change("format", value=0), "format 0 is not"),
+        (change("format", value=-1), "format -1 is not"),
         (change("kind", value="pickle"), "kind 'pickle' is unknown"),
         (change("dt", value=-1.0), "dt -1.0"),
         (change("dt", value="1"), "dt '1'"),
         (change("dt", value=math.nan), "not valid JSON"),
+        (change("dt", value=1e-300), "dt 1e-300 is not a number between"),
+        (change("dt", value=1e300), "dt 1e\\+300 is not a number between"),
         (change("architecture", value=None), "architecture is missing"),
         (change("architecture", "ndof", value=10**12), "ndof 1000000000000"),
         (change("architecture", "ndof", value=True), "ndof True"),
@@ -161,10 +176,34 @@ def change(*keys, value):
         (change("domain", value={"kind": "Klein bottle"}), "domain"),
         (change("domain", value=[1]), "domain"),
         (change("domain", value={"kind": "Ball", "center": [0.0, 0.0], "radius": 1.0}), "states of length 2, not 4"),
-        (change("dt", value=10**400), "too large"),
+        (change("domain", value={"kind": "Ball", "center": ["0"] * 4, "radius": 1.0}), "not made of numbers"),
+        (change("domain", "energy", value="0.1"), "energy '0.1' is not made of numbers"),
+        (change("domain", "box", "kind", value="Ball"), "domain is not admissible"),
+        (change("domain", "box", "kind", value="Torus"), "unknown kind of domain: 'Torus'"),
+        (change("domain", "box", "colour", value=1), "domain is not admissible"),
+        (change("dt", value=10**400), "is not a number between"),
         (change("fingerprint", value=[10**400] * 8), "too large"),
         (change("architecture", "layers", 0, "kind", value=["kick"]), "layer of unknown kind"),
-        (change("fingerprint", value=["a"]), "fingerprint"),
+        (change("fingerprint", value=["a"] * 8), "fingerprint is not a list of numbers"),
+        (change("fingerprint", value=[0.1] * 7), "fingerprint is not a list of 8 numbers"),
+        (change("fingerprint", value=None), "fingerprint of the system 'henon_heiles' is missing"),
+        (remove("fingerprint"), "record has no fingerprint"),
+        (remove("system"), "record has no system"),
+        (remove("domain"), "record has no domain"),
+        (remove("figures"), "record has no figures"),
+        (remove("checksum"), "no checksum"),
+        (change("version", value=1), "version is not a string"),
+        (change("figures", value={"energy_error_max": "x"}), "energy_error_max that is neither a number nor None: 'x'"),
+        (change("figures", value={"error_1": [1.0]}), "error_1 that is neither"),
+        (change("figures", value={"error_1": True}), "error_1 that is neither"),
+        (change("recipe", value={"stages": 3}), "stages that are not a list"),
+        (change("recipe", value={"stages": [{"steps": "many"}]}), "steps 'many'"),
+        (change("recipe", value={"stages": [{"optimizer": None}]}), "optimizer None"),
+        (change("recipe", value={"stages": [{"points": [1]}]}), r"points \[1\]"),
+        (change("recipe", value={"torch": 2}), "torch that is not a string"),
+        (change("recipe", value={"scaling": {"q": [1.0]}}), "scaling"),
+        (change("recipe", value={"scaling": Scaling.unit(1).to_dict()}), "not of 2 degrees of freedom"),
+        (change("recipe", value={"scaling": {**Scaling.unit(2).to_dict(), "t": "1"}}), "scaling"),
         (change("recipe", value=None), "recipe"),
         (change("figures", value=3), "figures"),
         (change("system", value=3), "system is not a name"),
@@ -198,6 +237,48 @@ def collapse(tensors):
 def test_false_tensors_are_refused(file, edit, message):
     with pytest.raises(ValueError, match=message):
         load(tampered(file, change_tensors=edit))
+
+
+@pytest.mark.parametrize("place", [0.1, 0.5, 0.999])
+def test_one_flipped_bit_of_the_weights_is_refused(file, place):
+    content = bytearray(file.read_bytes())
+    begin = 8 + struct.unpack("<Q", content[:8])[0]
+    content[begin + int(place * (len(content) - begin)) // 8 * 8] ^= 1  # the lowest bit of a number: it stays finite
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=r"`path` .* not those that were saved: their checksum differs"):
+        load(file)
+
+
+def test_tensors_that_changed_places_are_refused(file):
+    def swap(tensors):
+        a, b = (f"layers.{i}.potential.weight_out" for i in (0, 1))
+        tensors[a], tensors[b] = tensors[b], tensors[a]
+
+    with pytest.raises(ValueError, match="checksum differs"):
+        load(tampered(file, change_tensors=swap, rechecked=False))
+
+
+def test_what_load_would_refuse_is_not_saved(tmp_path):
+    flow, path = SympFlow(1), tmp_path / "flow.safetensors"
+    flow.figures = {"error_1": "small"}
+    with pytest.raises(ValueError, match="`flow` cannot be saved as it is: its figures have a error_1"):
+        flow.save(path)
+    flow.figures, flow.system_name = {}, "pendulum"
+    with pytest.raises(ValueError, match=r"`flow` .* fingerprint of the system 'pendulum' is missing"):
+        flow.save(path)
+    assert not path.exists()
+
+
+def test_what_is_not_a_path_is_refused():
+    for call in (load, SympFlow(1).save):
+        with pytest.raises(TypeError, match=r"`path` must be the path of a file; got 3: pass"):
+            call(3)
+
+
+def test_a_device_to_load_to_must_be_there(file):
+    with pytest.raises(ValueError, match=r"^`device` 'foo' is not to be had here .*: use device='cpu'"):
+        load(file, device="foo")
+    assert load(file, device="cpu").device == torch.device("cpu")
 
 
 def test_what_is_not_a_file_is_refused(tmp_path):

@@ -1,7 +1,8 @@
 """Files of flows: safetensors with a JSON record, never pickle; and the flows that ship with the package.
 
 The metadata entry "sympflow" is a JSON object: format, version (of the package), kind, architecture, dt, domain,
-system, fingerprint, recipe, figures. A file is taken for hostile until every part of it has been checked.
+system, fingerprint, recipe, figures, checksum (of the tensors). A file is taken for hostile until every part of it has
+been checked.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from safetensors.torch import save as save_tensors
 
 import sympflow
 from sympflow.flow.base import FlowMap, same_system
-from sympflow.flow.record import Refused, build, describe, dtype_of, fill, parse
+from sympflow.flow.description import check, describe
+from sympflow.flow.placement import checked_device
+from sympflow.flow.record import Refused, build, checksum, dtype_of, fill, parse
 
 if TYPE_CHECKING:
     from sympflow.system import HamiltonianSystem
@@ -35,11 +38,16 @@ MAX_FILE = 2**28
 def save(flow: FlowMap, path: str | os.PathLike[str]) -> None:
     """Write a flow to a safetensors file, atomically.
 
+    A flow without a system (one that was never trained) is recorded as such, and fits any when it is loaded.
+
     Raises
     ------
+    TypeError
+        If `path` is not a path.
     ValueError
-        If a weight is not finite.
+        If a weight is not finite, or the flow's record is one that `load` would refuse.
     """
+    path = _path(path)
     tensors = {name: value.detach().cpu().contiguous() for name, value in flow.state_dict().items()}
     for name, value in tensors.items():
         if not torch.isfinite(value).all():
@@ -55,9 +63,14 @@ def save(flow: FlowMap, path: str | os.PathLike[str]) -> None:
         "fingerprint": flow.fingerprint,
         "recipe": flow.recipe,
         "figures": flow.figures,
+        "checksum": checksum(tensors),
     }
-    content = save_tensors(tensors, {KEY: json.dumps(_finite(record), allow_nan=False, separators=(",", ":"))})
-    path = Path(path)
+    record = _finite(record)
+    try:
+        check(record, flow.ndof)
+    except Refused as reason:
+        raise ValueError(f"`flow` cannot be saved as it is: {reason}. Set it right first.") from None
+    content = save_tensors(tensors, {KEY: json.dumps(record, allow_nan=False, separators=(",", ":"))})
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -83,7 +96,7 @@ def load(
     system : HamiltonianSystem, optional
         The system of the flow, which is checked. A primed flow needs its V and T: given here, or later by
         `flow.bind(system)`; `solve` gives them as well.
-    device : optional
+    device : torch.device or str, optional
 
     Returns
     -------
@@ -94,13 +107,16 @@ def load(
     ------
     ValueError
         If the file is missing, truncated, of another or a later format, or anything in it is not as it should be:
-        tensors of the wrong name, shape or dtype, weights that are not finite, an absurd architecture. Or if `system`
-        is not the one that the flow was made for.
+        tensors of the wrong name, shape or dtype, weights that are not finite or not those that were saved, an absurd
+        architecture. Or if `system` is not the one that the flow was made for, or `device` is not to be had.
+    TypeError
+        If `path` is not a path, or `device` not a device.
     """
+    path, device = _path(path), checked_device(device)
     content, header, record = _read(path)
     try:
         flow = build(record, dtype_of(header))
-        fill(flow, content, header)
+        fill(flow, content, header, record)
         describe(flow, record)
     except Refused as reason:
         raise _refusal(path, str(reason)) from None
@@ -140,13 +156,19 @@ def _catalogue() -> tuple[tuple[Path, dict[str, Any]], ...]:
 # reading, with suspicion -----------------------------------------------------------------------------------
 
 
+def _path(path: Any) -> Path:
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"`path` must be the path of a file; got {path!r}: pass a string or a pathlib.Path.")
+    return Path(path)
+
+
 def _refusal(path: str | os.PathLike[str], reason: str) -> ValueError:
     return ValueError(f"`path` {str(path)!r} is not a usable flow: {reason}. Save it again with flow.save(path).")
 
 
 def _read(path: str | os.PathLike[str]) -> tuple[bytes, dict[str, Any], dict[str, Any]]:
     """The bytes of the file, its safetensors header, and the record in it."""
-    path = Path(path)
+    path = _path(path)
     if not path.is_file():
         raise ValueError(f"`path` {str(path)!r} is not a file: pass the path of a flow saved with flow.save(path).")
     try:
@@ -169,6 +191,8 @@ def _read(path: str | os.PathLike[str]) -> tuple[bytes, dict[str, Any], dict[str
         format_ = record.get("format")
         if isinstance(format_, bool) or not isinstance(format_, int):
             raise Refused("its record has no format number")
+        if format_ < 1:
+            raise Refused(f"its format {format_} is not one there has been")
         if format_ > FORMAT:
             raise Refused(
                 f"its format {format_} is later than {FORMAT}, which this version of sympflow reads: update it"

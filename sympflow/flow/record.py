@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-import math
 from typing import Any
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 
-from sympflow.domain import domain_from_dict
-from sympflow.flow.base import FlowMap
+from sympflow.flow.base import MAX_DT, MIN_DT, FlowMap
 from sympflow.flow.layers import LAYERS
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.potentials import MLPPotential
@@ -54,8 +53,8 @@ def build(record: dict[str, Any], dtype: torch.dtype) -> FlowMap:
     plan, dt = record.get("architecture"), record.get("dt")
     if not isinstance(plan, dict):
         raise Refused("its architecture is missing")
-    if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf:
-        raise Refused(f"its dt {dt!r} is not a positive number")
+    if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not MIN_DT <= dt <= MAX_DT:
+        raise Refused(f"its dt {dt!r} is not a number between {MIN_DT:g} and {MAX_DT:g}")
     ndof = _integer(plan.get("ndof"), "ndof", MAX_WIDTH)
     try:
         if record["kind"] == "mlp":
@@ -123,7 +122,17 @@ def _integer(value: Any, what: str, largest: int) -> int:
     return value
 
 
-def fill(flow: FlowMap, content: bytes, header: dict[str, Any]) -> None:
+def checksum(tensors: dict[str, torch.Tensor]) -> str:
+    """SHA-256 of the tensors by name: their names, dtypes, shapes and little-endian bytes."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        array = tensors[name].detach().cpu().numpy()
+        digest.update(json.dumps([name, str(array.dtype), array.shape]).encode())
+        digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
+    return digest.hexdigest()
+
+
+def fill(flow: FlowMap, content: bytes, header: dict[str, Any], record: dict[str, Any]) -> None:
     """Put the file's tensors into the flow."""
     expected = flow.state_dict()
     if set(header) != set(expected):
@@ -141,35 +150,9 @@ def fill(flow: FlowMap, content: bytes, header: dict[str, Any]) -> None:
             raise Refused(f"its tensor {name} is not finite")
         if name.split(".")[-1] in ("scale", "tau", "gain") and not (value > 0).all():
             raise Refused(f"its unit {name} is not positive")
+    if not isinstance(record.get("checksum"), str):
+        raise Refused("its record has no checksum of the weights")
+    if record["checksum"] != checksum(tensors):
+        raise Refused("its weights are not those that were saved: their checksum differs, the file is damaged")
     flow.load_state_dict(tensors)
     flow.requires_grad_(False)
-
-
-def describe(flow: FlowMap, record: dict[str, Any]) -> None:
-    """Give the flow the record of its file."""
-    if record.get("domain") is not None:
-        try:
-            flow.domain = domain_from_dict(record["domain"])
-        except (ValueError, TypeError, AttributeError) as error:
-            raise Refused(f"its domain is not admissible ({error})") from None
-        if _width(flow.domain) != 2 * flow.ndof:
-            raise Refused(f"its domain has states of length {_width(flow.domain)}, not {2 * flow.ndof}")
-    fingerprint = record.get("fingerprint")
-    if fingerprint is not None:
-        if not isinstance(fingerprint, list) or not all(
-            v is None or (isinstance(v, (int, float)) and not isinstance(v, bool)) for v in fingerprint
-        ):
-            raise Refused("its fingerprint is not a list of numbers")
-        flow.fingerprint = tuple(math.nan if v is None else float(v) for v in fingerprint)
-    for name, kind in (("recipe", dict), ("figures", dict)):
-        if not isinstance(record.get(name), kind):
-            raise Refused(f"its {name} is missing")
-    if not isinstance(record.get("system"), str | None):
-        raise Refused("its system is not a name")
-    flow.system_name, flow.recipe, flow.figures = record["system"], record["recipe"], record["figures"]
-
-
-def _width(domain: Any) -> int:
-    """The length of a domain's states."""
-    corners = getattr(domain, "box", domain)
-    return len(getattr(corners, "low", None) or corners.center)
