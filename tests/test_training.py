@@ -374,6 +374,9 @@ def test_bad_arguments_are_refused(arguments, message):
         ({"device": "foo"}, ValueError, "^`device` 'foo' is not to be had here"),
         ({"device": "cuda:4096"}, ValueError, "^`device` 'cuda:4096' is not to be had here"),
         ({"dtype": torch.int32}, TypeError, "^`dtype` must be float32 or float64"),
+        ({"optimizer": "gauss-newton", "device": "foo"}, ValueError, "^`device` 'foo' is not to be had here"),
+        ({"optimizer": "gauss-newton", "dtype": torch.float32}, TypeError, "^`optimizer` .* in float64"),
+        ({"flow": 3}, TypeError, "^`flow` must be a SympFlow or an MLPFlow; got 3"),
         (
             {"kind": "mlp", "pairs": 1, "hidden": (2,)},
             ValueError,

@@ -119,6 +119,8 @@ def train(
         raise ValueError(f"`time_budget` must be a positive number of seconds; got {time_budget!r}.")
     new = {"kind": kind, "pairs": pairs, "hidden": hidden, "activation": activation, "dtype": dtype, "device": device}
     if flow is not None:
+        if not isinstance(flow, FlowMap):
+            raise TypeError(f"`flow` must be a SympFlow or an MLPFlow; got {flow!r}: leave it out for a new one.")
         for name, value in new.items():
             if value is not None:
                 raise ValueError(f"`{name}` describes a new flow, but `flow` is given: leave out one of them.")
@@ -137,7 +139,8 @@ def train(
         choices: dict[str, Any] = {"points": points, "steps": steps, **of_labels}
         choices = {name: value for name, value in choices.items() if value is not None}
         labelled = GaussNewtonConfig(seed=seed, reference_states=reference_states, **choices)
-        flow = SympFlow.primed(system, dt=float(dt)) if flow is None else flow
+        if flow is None:
+            flow = SympFlow.primed(system, dt=float(dt), dtype=torch.float64 if dtype is None else dtype, device=device)
         if not isinstance(flow, PrimedFlow) or flow.dtype != torch.float64:
             raise TypeError(
                 "`optimizer` 'gauss-newton' fits primed flows in float64: pass flow=SympFlow.primed(system, dt=...)."
