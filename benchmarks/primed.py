@@ -88,8 +88,11 @@ def fewest_steps(error: Callable[[int], float], target: float, guess: int) -> in
     return high
 
 
-def measure(system: HamiltonianSystem, stages: int, dt: float, degree: int, repeats: int) -> Row:
-    flow = train(system, flow=SympFlow.primed(system, stages, dt=dt, degree=degree), optimizer="gauss-newton")
+def measure(
+    system: HamiltonianSystem, stages: int, dt: float, degree: int, repeats: int, force_gradient: bool = True
+) -> Row:
+    start = SympFlow.primed(system, stages, dt=dt, degree=degree, force_gradient=force_gradient)
+    flow = train(system, flow=start, optimizer="gauss-newton")
     kernel, n = splitting_kernel(system), round(T_END / dt)
     errors = energy_errors(system, kernel, flow.scheme(), n)
     target = float(np.median(errors))
@@ -156,13 +159,15 @@ def main() -> None:
     parser.add_argument("--dt", type=float, default=1.0)
     parser.add_argument("--stages", default="4,6,8", help="numbers of kicks, separated by commas")
     parser.add_argument("--degree", type=int, default=7)
+    parser.add_argument("--no-force-gradient", action="store_true")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", type=Path, help="file for the rows")
     options = parser.parse_args()
     system = getattr(systems, options.system)()
     rows = []
     for stages in map(int, options.stages.split(",")):
-        rows.append(measure(system, stages, options.dt, options.degree, options.repeats))
+        gradient = not options.no_force_gradient
+        rows.append(measure(system, stages, options.dt, options.degree, options.repeats, gradient))
         print(table(rows[-1:]).splitlines()[-1], flush=True)
     print("\n" + table(rows))
     if options.json:

@@ -231,6 +231,13 @@ def test_a_free_flow_is_no_worse_than_a_palindrome():
     assert full < 1.05 * half
 
 
+def test_without_force_gradients_the_search_finds_negative_coefficients():
+    """With positive ones, to which equal leapfrog steps lead, no order above 2 is possible."""
+    flow = train(HH, flow=SympFlow.primed(HH, 7, dt=0.5, force_gradient=False), **{**QUICK, "restarts": 12})
+    assert flow.figures["one_step_error"] < 1e-6
+    assert min(*flow.scheme().kicks, *flow.scheme().drifts) < 0
+
+
 def test_the_weight_at_dt_counts():
     def errors(weight):
         flow = SympFlow.primed(HH, 2, degree=1)  # one table for all t: a compromise

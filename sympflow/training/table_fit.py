@@ -15,6 +15,7 @@ from sympflow.training.levenberg_marquardt import Minimum, levenberg_marquardt
 from sympflow.training.table_jacobian import TableStep
 
 SPREAD = 0.25  # of random coefficients about those of equal steps
+WIDE_SPREAD = 2.0  # without force gradients, where an order above 2 needs negative ones
 STIFFNESS = 1e-3  # how reluctantly a table is made to vary with t where that is not called for
 
 
@@ -127,13 +128,14 @@ class Table:
             c.free.copy_(torch.as_tensor(part))
 
     def random(self, rng: np.random.Generator) -> np.ndarray:
-        """A frozen table near that of equal steps, with or without the force gradients of Takahashi and Imada."""
-        n_kicks, n_drifts = len(self.columns[0][1]), len(self.columns[1][1])
-        b = np.abs(rng.normal(1, SPREAD, n_kicks)) / n_kicks
-        a = np.abs(rng.normal(1, SPREAD, n_drifts)) / n_drifts
-        g = rng.choice([0.0, 1 / 12]) * b**3
+        """A frozen table about that of equal steps, with or without the force gradients of Takahashi and Imada."""
+        spread = SPREAD if self.flow.gradients is not None else WIDE_SPREAD
         table = np.zeros(self.n)
-        for values, (c, rows) in zip((b, a, g), self.columns, strict=False):
-            table[rows] = (values + values[::-1]) / 2 if self.flow.palindromic else values
-            table[rows] *= self.dt**c.power
+        for _, rows in self.columns[:2]:
+            values = rng.normal(1, spread, len(rows))
+            values = values + values[::-1] if self.flow.palindromic else values
+            table[rows] = self.dt * values / values.sum()
+        for c, rows in self.columns[2:]:
+            kicks = table[self.columns[0][1]]
+            table[rows] = rng.choice([0.0, 1 / 12]) * np.abs(kicks) ** c.power
         return table
