@@ -67,6 +67,11 @@ class CallableHamiltonian:
         assert self._potential is not None
         return _with_torch(_gradient_of(self._potential, "potential"), q, "potential", (self.ndof,))
 
+    @property
+    def hessian_vector(self) -> Callable[..., Array] | None:
+        """The user's ∇²V(q)·v, if given."""
+        return self._hessian_vector
+
     def potential_hessian(self, q: Array) -> Array:
         if self._hessian_vector is not None:
             return stack([self._hessian_vector(q, e) for e in _basis(q)])

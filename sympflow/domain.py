@@ -186,13 +186,10 @@ class EnergySublevel:
         x = _states(x, np.size(self.box.low))
         with np.errstate(all="ignore"):
             below = self._energy(x) < self.energy + slack
-        return below & (self.box.contains(x) if slack == 0 else self._widened(slack).contains(x))
-
-    def _widened(self, slack: float) -> Box:
-        """The box grown by the relative size of the slack, so that a state on its face does not leave by rounding."""
         low, high = np.asarray(self.box.low), np.asarray(self.box.high)
+        # the box grows by the relative size of the slack, so that a state on its face does not leave by rounding
         margin = (high - low) * slack / max(abs(self.energy), 1e-300)
-        return Box(low - margin, high + margin)
+        return below & ((x >= low - margin) & (x <= high + margin)).all(-1)
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": "EnergySublevel", "energy": self.energy, "box": self.box.to_dict()}

@@ -63,6 +63,10 @@ def break_even(points: list[Point], length: float) -> list[Point]:
         if point in done and point.training_time is not None and untrained:
             labels = {p.label for p in untrained}
             rival = min(cost_at([p for p in untrained if p.label == n], point.energy_error or 0.0) for n in labels)
+            if math.isinf(rival):  # no untrained point is as accurate: nothing to compare with
+                reason = "No break-even: no untrained method was run at a step that reaches this energy error."
+                filled.append(replace(point, reason=f"{point.reason} {reason}".strip()))
+                continue
             saved = (rival - (point.run_time or 0.0)) / length
             point = replace(point, break_even=point.training_time / saved if saved > 0 else math.inf)  # noqa: PLW2901
         filled.append(point)

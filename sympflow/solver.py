@@ -103,6 +103,8 @@ def solve(
     every = _check_save_every(save_every, times)
     if backend not in BACKENDS:
         raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
+    if backend == "compiled" and not integrator.compiles:
+        raise ValueError(f"`backend` 'compiled' does not apply to method {integrator.name!r}: use 'auto'.")
     if not isinstance(dense_output, bool | np.bool_):
         raise TypeError(f"`dense_output` must be True or False; got {dense_output!r}.")
     action = on_domain_exit or ("warn" if integrator.trained else "ignore")
@@ -248,7 +250,7 @@ def _check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianS
     flow = getattr(integrator, "flow_for", lambda system: None)(system)
     domain = getattr(flow, "domain", None) or system.domain
     if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
-        domain = domain.attach(system.hamiltonian)
+        domain = system.domain if domain == system.domain else domain.attach(system.hamiltonian)
     if domain is None or not len(outcome.t):
         return
     slack = float(getattr(flow, "figures", {}).get("energy_error_max") or 0.0)

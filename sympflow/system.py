@@ -220,6 +220,11 @@ class HamiltonianSystem:
         """∇²V(q): (..., d) to (..., d, d)."""
         return self._separable()._definition.potential_hessian(q)
 
+    def hessian_vector(self, q: Array, v: Array) -> Array:
+        """∇²V(q)·v, by the function given for it if there is one: (..., d), (..., d) to (..., d)."""
+        product = getattr(self._separable()._definition, "hessian_vector", None)
+        return (self.potential_hessian(q) @ v[..., None])[..., 0] if product is None else product(q, v)
+
     def kinetic(self, p: Array) -> Array:
         """T(p): (..., d) to (...)."""
         if self._separable().quadratic_kinetic:

@@ -67,6 +67,7 @@ def test_auto_chooses_what_applies(system, arguments, backend):
 @pytest.mark.parametrize(
     ("system", "arguments", "message"),
     [
+        (HH, {"backend": "compiled", "method": "rk45"}, r"^`backend` 'compiled' does not apply to method 'rk45'"),
         (HH, {"backend": "compiled", "dtype": "float32"}, r"^`backend` 'compiled' does not apply. `y0` is float32"),
         (HH, {"backend": "compiled", "y0": torch.tensor(HH.y0)}, r"^`backend` 'compiled' .* `y0` is a tensor"),
         (PLAIN, {"backend": "compiled"}, r"^`backend` 'compiled' .* given by plain functions"),
@@ -77,7 +78,20 @@ def test_auto_chooses_what_applies(system, arguments, backend):
 )
 def test_a_backend_that_does_not_apply_says_why(system, arguments, message):
     with pytest.raises(ValueError, match=message):
-        solve(system, "verlet", (0.0, 1.0), **arguments)
+        solve(system, **{"method": "verlet", "t_span": (0.0, 1.0), **arguments})
+
+
+@pytest.mark.parametrize("q", [1e12, 1e16, 1e18, 1e21, 1e100, 1e300])
+def test_sines_of_far_states_stay_bounded(q):
+    sol = solve(systems.pendulum(), "verlet", (0.0, 0.01), y0=[q, 0.0], dt=0.01)
+    assert sol.status == 0
+    assert abs(sol.p[0, -1]) <= 0.01 * (1 + 1e-15)  # |force| <= 1
+
+
+def test_steps_are_counted_once():
+    sol = solve(HH, "verlet", (0.0, 10.0), dt=0.1, t_eval=[0.05, 10.0])
+    assert sol.stats["n_steps"] == 100
+    assert solve(HH, "verlet", (0.0, 10.03), dt=0.1).stats["n_steps"] == 101
 
 
 def test_numba_functions_run_compiled():

@@ -71,6 +71,7 @@ class Integrator:
     order: ClassVar[int | None]
     symplectic: ClassVar[bool]
     trained: ClassVar[bool] = False
+    compiles: ClassVar[bool] = False
     finds_events: ClassVar[bool] = False
 
     @classmethod
@@ -172,7 +173,7 @@ class FixedStep(Integrator):
             y = self._shorter_steps(system, y, extra, remainder[extra], backend)
         n_steps = int(min(last, finite.max() + 1))
         n_saved = int(np.count_nonzero((save > 0) & (save <= n_steps)))
-        at_end = int(bool(extra.size) and t[-1] == grid.t1)
+        at_end = int(bool(extra.size) and extra[-1] == len(t) - 1 and t[-1] == grid.t1)
         stats = {
             "dt": abs(grid.h),
             "n_steps": n_steps + at_end,

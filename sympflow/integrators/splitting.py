@@ -33,6 +33,7 @@ class Splitting(FixedStep):
 
     scheme: ClassVar[Scheme]
     symplectic: ClassVar[bool] = True
+    compiles: ClassVar[bool] = True
 
     def check(self, system: HamiltonianSystem) -> None:
         if not system.separable:
@@ -155,8 +156,7 @@ def _kick(system: HamiltonianSystem, q: Array, c: float | Array, c3: float | Arr
     force = system.force(q)
     if isinstance(c3, float) and c3 == 0.0:
         return c * force
-    gradient = (system.potential_hessian(q) @ system.velocity(force)[..., None])[..., 0]
-    return c * force - c3 * gradient
+    return c * force - c3 * system.hessian_vector(q, system.velocity(force))
 
 
 def __getattr__(name: str) -> type[Splitting]:

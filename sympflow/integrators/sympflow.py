@@ -39,6 +39,7 @@ class FlowIntegrator(FixedStep):
 
     order: ClassVar[int | None] = None
     trained: ClassVar[bool] = True
+    compiles: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -16,6 +16,8 @@ ONE_BITS = 0x3FF0000000000000
 LN2 = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # log 2, the first part with 21 zero bits
 HALF_PI = 1.5707963267948966, 6.123233995736766e-17, -1.4973849048591698e-33  # π/2 to 160 bits
 
+QUARTER_PI = 0.78539816339745  # a bit above π/4, for the rounding of n
+
 
 @intrinsic
 def float_to_bits(typing_context, x):
@@ -75,13 +77,17 @@ def fast_tanh(x):
 def reduced(x):
     """r and n with x = n π/2 + r, |r| ≤ π/4, n as the low bits of an integer.
 
-    For |x| < 1e12 the first of the three fused multiply-adds is exact: n π/2 cancels against x.
+    For |x| < 1e12 the first of the three fused multiply-adds is exact: n π/2 cancels against x. Far beyond, r is what
+    rounding leaves, kept within ±π/4 so that sine and cosine stay within ±1; NaN and ±∞ become NaN.
     """
     shifted = x * (2.0 / math.pi) + ROUND
     n = shifted - ROUND
     r = fused_multiply_add(-n, HALF_PI[0], x)
     r = fused_multiply_add(-n, HALF_PI[1], r)
-    return fused_multiply_add(-n, HALF_PI[2], r), float_to_bits(shifted)
+    r = fused_multiply_add(-n, HALF_PI[2], r)
+    r = QUARTER_PI if r > QUARTER_PI else r
+    r = -QUARTER_PI if r < -QUARTER_PI else r
+    return r, float_to_bits(shifted)
 
 
 @njit(**OPTIONS)
@@ -110,7 +116,7 @@ def sin_of_quadrant(r, n):
 
 @njit(**OPTIONS)
 def fast_sin(x):
-    """sin x to a unit in the last place for |x| < 1e12, where a double is still a direction; NaN for ±∞ and NaN."""
+    """sin x to 2 units in the last place for |x| < 1e12; where doubles are far apart, a number in [−1, 1]."""
     r, n = reduced(x)
     return sin_of_quadrant(r, n)
 
