@@ -76,3 +76,42 @@ def test_what_is_not_hamiltonian_is_refused():
         from_hamiltonian(lambda t, q, p: q, 2)
     with pytest.raises(ValueError, match=r"^`ndof` must be a positive integer"):
         from_module(Field(), 0)
+
+
+def test_terms_linear_in_p_are_kept():
+    system = from_hamiltonian(lambda q, p: (p**2).sum(-1) / 2 + p.sum(-1) + (q**4).sum(-1), 1)
+    np.testing.assert_allclose(system.vector_field(np.array([1.0, 2.0])), [3.0, -4.0])
+    system = from_module(lambda t, y: torch.cat([y[..., 1:] + 1, -y[..., :1]], -1), 1)
+    np.testing.assert_allclose(system.vector_field(np.array([1.0, 2.0])), [3.0, -1.0])
+
+
+def test_a_periodic_field_is_not_autonomous():
+    def field(t, y):
+        return torch.cat([y[..., 1:], -y[..., :1] * (1 + torch.sin(2 * torch.pi * t))], -1)
+
+    with pytest.raises(ValueError, match=r"^`module` depends on t"):
+        from_module(field, 1)
+
+
+def test_a_singularity_between_the_origin_and_the_states_is_refused():
+    def kepler(t, y):
+        q, p = y.chunk(2, -1)
+        return torch.cat([p, -q / (q**2).sum(-1, keepdim=True) ** 1.5], -1)
+
+    with pytest.raises(ValueError, match=r"^`module` is not smooth on the straight lines"):
+        from_module(kepler, 2, y0=[1.0, 0.0, 0.0, 1.0])
+
+
+def test_a_module_in_single_precision_says_what_to_do():
+    torch.manual_seed(0)
+    with pytest.raises(TypeError, match=r"^`module` failed on float64 states .*double\(\) first"):
+        from_module(FloatModule(), 1)
+
+
+class FloatModule(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(2, 2)
+
+    def forward(self, t, y):
+        return self.layer(y)

@@ -14,13 +14,14 @@ from sympflow.system import HamiltonianSystem
 
 N_NODES = 16  # Gauss–Legendre nodes of the line integral: exact for fields of degree 31
 TOLERANCE = 1e-8
+TIMES = (0.0, 0.3719, 1.0, 3.14159265)  # at which a field must be the same to count as autonomous
 
 
 def from_hamiltonian(H: Callable[[Tensor, Tensor], Tensor], ndof: int, **scene: Any) -> HamiltonianSystem:
     """The system of a callable H(q, p), written with torch functions on (..., d).
 
-    Where H turns out to be T(p) + V(q) with T quadratic, at random states, it is made a separable system, to which
-    the splitting methods apply.
+    Where H turns out to be ½ pᵀM⁻¹p + V(q), as far as eight random states near y0 can tell, it is made a separable
+    system, to which the splitting methods apply.
 
     Parameters
     ----------
@@ -43,13 +44,16 @@ def from_hamiltonian(H: Callable[[Tensor, Tensor], Tensor], ndof: int, **scene: 
         raise TypeError(
             f"`H` must be a function H(q, p); calling it failed: {error}. An H(t, q, p) is not supported."
         ) from error
+    except RuntimeError as error:
+        raise TypeError(f"`H` failed on float64 states ({error}): if it is a module, call its .double().") from error
     if not (isinstance(values, Tensor) and values.shape == probes.shape[:-1]):
         raise ValueError(
             f"`H` must map q, p of shape (..., {ndof}) to (...), with torch functions; for (8, {ndof}) it gave "
             f"{tuple(getattr(values, 'shape', ()))}. Sum over the last axis."
         )
     hessian = torch.func.vmap(torch.func.hessian(lambda y: H(y[:ndof], y[ndof:])))(probes)
-    M_inverse = _inverse_mass(hessian[:, :ndof, ndof:], hessian[:, ndof:, ndof:])
+    velocity = torch.func.grad(lambda p: H(probes[:, :ndof], p).sum())(probes[:, ndof:])
+    M_inverse = _inverse_mass(hessian[:, :ndof, ndof:], hessian[:, ndof:, ndof:], probes[:, ndof:], velocity)
     if M_inverse is None:
         return HamiltonianSystem(hamiltonian=H, ndof=ndof, **scene)
     return HamiltonianSystem(lambda q: H(q, torch.zeros_like(q)), ndof=ndof, mass=np.linalg.inv(M_inverse), **scene)
@@ -76,11 +80,14 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
         If the field is not Hamiltonian, depends on t, or has another shape.
     """
     probes = _probes(ndof, scene.get("y0"))
-    with torch.no_grad():
-        f, later = (module(torch.tensor(t, dtype=probes.dtype), probes) for t in (0.0, 1.0))
+    try:
+        with torch.no_grad():
+            f, *later = (module(torch.tensor(t, dtype=probes.dtype), probes) for t in TIMES)
+    except RuntimeError as error:
+        raise TypeError(f"`module` failed on float64 states ({error}): call module.double() first.") from error
     if f.shape != probes.shape:
         raise ValueError(f"`module` must map (..., {2 * ndof}) to the same shape, [q', p']; got {tuple(f.shape)}.")
-    if not torch.allclose(f, later, rtol=1e-10, atol=1e-12):
+    if not all(torch.allclose(f, g, rtol=1e-10, atol=1e-12) for g in later):
         raise ValueError("`module` depends on t, which is not supported: freeze the time, or extend the phase space.")
 
     zero = torch.zeros((), dtype=probes.dtype)
@@ -104,7 +111,13 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
         w = torch.as_tensor(weights / 2, dtype=y.dtype, device=y.device).reshape(-1, *[1] * (y.ndim - 1))
         return (w * (minus_J_f(s * y) * y).sum(-1)).sum(0)
 
-    M_inverse = _inverse_mass(jacobian[:, :ndof, ndof:], jacobian[:, ndof:, ndof:])
+    slope = torch.func.grad(lambda y: H(y[:, :ndof], y[:, ndof:]).sum())(probes)
+    if not torch.allclose(slope, minus_J_f(probes).detach(), rtol=TOLERANCE, atol=TOLERANCE):
+        raise ValueError(
+            "`module` is not smooth on the straight lines from the origin to the states, along which H is integrated "
+            "(a singularity lies on them): give H itself, with from_hamiltonian or HamiltonianSystem."
+        )
+    M_inverse = _inverse_mass(jacobian[:, :ndof, ndof:], jacobian[:, ndof:, ndof:], probes[:, ndof:], f[:, :ndof])
     if M_inverse is None:
         return HamiltonianSystem(hamiltonian=H, ndof=ndof, **scene)
 
@@ -138,8 +151,8 @@ def _probes(ndof: int, y0: ArrayLike | None) -> Tensor:
     return torch.from_numpy(center + spread * noise)
 
 
-def _inverse_mass(mixed: Tensor, kinetic: Tensor) -> np.ndarray | None:
-    """M⁻¹ if ∂²H/∂q∂p vanishes and ∂²H/∂p² is one positive definite matrix at all probes."""
+def _inverse_mass(mixed: Tensor, kinetic: Tensor, p: Tensor, velocity: Tensor) -> np.ndarray | None:
+    """M⁻¹ if ∂²H/∂q∂p vanishes, ∂²H/∂p² is one positive definite matrix and ∂H/∂p = M⁻¹p at all probes."""
     scale = float(kinetic.abs().max().detach())
     constant = float((kinetic - kinetic[0]).abs().max().detach())
     if scale == 0 or max(float(mixed.abs().max().detach()), constant) > TOLERANCE * scale:
@@ -148,4 +161,5 @@ def _inverse_mass(mixed: Tensor, kinetic: Tensor) -> np.ndarray | None:
     M = (M + M.T) / 2
     M[np.abs(M) < TOLERANCE * scale] = 0.0
     rounded = np.round(M, 12)
-    return rounded if np.linalg.eigvalsh(rounded)[0] > 0 else None
+    linear = np.allclose(velocity.detach().numpy(), p.numpy() @ rounded, rtol=TOLERANCE, atol=TOLERANCE * scale)
+    return rounded if linear and np.linalg.eigvalsh(rounded)[0] > 0 else None

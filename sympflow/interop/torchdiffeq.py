@@ -23,7 +23,7 @@ from sympflow.interop.path import Path
 from sympflow.system import HamiltonianSystem
 
 State = Tensor | tuple[Tensor, ...]
-_THEIRS = {*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams"}
+_THEIRS = {*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver"}
 _RTOL, _ATOL = 1e-7, 1e-9
 
 
@@ -153,6 +153,8 @@ def _build(func: Any, method: Any, options: dict[str, Any] | None) -> tuple[Fixe
     options = dict(options or {})
     options.pop("norm", None)  # torchdiffeq adds its own
     system = options.pop("system", func if isinstance(func, HamiltonianSystem) else None)
+    if "step_size" in options and "dt" in options:
+        raise TypeError("`options` has both 'step_size' and 'dt', two names of the step length: give one of them.")
     if "step_size" in options:
         options["dt"] = float(options.pop("step_size"))
     integrator = fixed_step(method, options, "torchdiffeq")
