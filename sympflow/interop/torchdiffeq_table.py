@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sympflow.interop.path import Path
-from sympflow.interop.torchdiffeq import _build, _check_state, _joined
+from sympflow.interop.torchdiffeq import _build, _check_state, _joined, _no_adjoint
 
 
 def add(method: str) -> None:
@@ -19,12 +20,24 @@ def add(method: str) -> None:
     table[method] = type(f"{method.title()}Solver", (_Solver,), {"method": method})
 
 
+def _within_adjoint() -> bool:
+    """Whether torchdiffeq's `odeint_adjoint` is among the callers: it hands its solvers no other sign of itself."""
+    frame = sys._getframe()
+    while frame is not None:
+        if frame.f_globals.get("__name__") == "torchdiffeq._impl.adjoint":
+            return True
+        frame = frame.f_back  # type: ignore[assignment]
+    return False
+
+
 class _Solver:
     """What torchdiffeq asks of a solver: times come increasing, states flat; `func` knows what they were."""
 
     method: str
 
     def __init__(self, func: Any, y0: Tensor, rtol: Any, atol: Any, **options: Any) -> None:
+        if _within_adjoint():
+            raise _no_adjoint(self.method)
         self.direction, shapes = 1, None
         while type(func).__module__.startswith("torchdiffeq"):
             self.direction = -1 if type(func).__name__ == "_ReverseFunc" else self.direction
