@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
-from sympflow.arrays import Array, stack, to_numpy
+from sympflow.arrays import Array, is_tensor, stack, to_numpy
 
 EventFunction = Callable[[float, Array], Any]
 Dense = Callable[[float], Array]
@@ -152,6 +152,7 @@ class EventSearch:
                 zeros.append((self._locate(event, a, b, before[i], after[i], inside), i))
         for t, i in sorted(zeros, key=lambda zero: zero[0] if b >= a else -zero[0]):
             y = inside(t)
+            y = y.detach() if is_tensor(y) else y  # the time depends on y0 as well: a gradient through y alone is wrong
             self.found[i].append((t, y))
             if len(self.found[i]) >= self.events[i].limit:
                 self.end = (t, y)
@@ -176,5 +177,5 @@ class EventSearch:
         return [np.array([t for t, _ in zeros], dtype=float) for zeros in self.found]
 
     def states(self, y0: Array) -> list[Array]:
-        """`y_events` of the solution: an array (n, 2d) for each event, like `y0`."""
+        """`y_events` of the solution: an array (n, 2d) for each event, like `y0`; tensors without gradient."""
         return [stack([y for _, y in zeros], axis=0) if zeros else y0[None][:0] for zeros in self.found]

@@ -30,7 +30,8 @@ class Solution:
     sol : callable or None
         Dense output: sol(t) has shape (..., 2d) for a number t, (..., 2d, n) for an array.
     t_events, y_events : list of ndarray or None
-        For each event its times (n,) and states (n, 2d); None if no events were asked for.
+        For each event its times (n,) and states (n, 2d), without gradient (`interop.torchdiffeq.odeint_event` gives
+        that); None if no events were asked for.
     nfev : int
         Force (right-hand side) evaluations.
     status : int, or ndarray of the batch's shape
