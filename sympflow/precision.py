@@ -64,7 +64,8 @@ def work_precision(
     tolerances : sequence of float
         rtol of adaptive methods, with atol = rtol/1000, the ratio of SciPy's defaults.
     n_outputs : int
-        Number of instants.
+        Number of instants. Reaching one between two steps costs a method a shorter step, in run time and in
+        evaluations: with steps as long as the time between instants it is the outputs that are measured.
     repeats : int
         Timed runs of each point, interleaved over all points of one batch size.
     budget : float
