@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import sympflow
-from sympflow import HamiltonianSystem, get, solve, systems
+from sympflow import HamiltonianSystem, poincare_section, solve, systems
 
 LABELS = {"sympflow": "SympFlow", "mlp": "MLP", "rk45": "ODE45", "kahan_li8": "reference (Kahan–Li 8)"}
 TITLES = {"harmonic_oscillator": "Harmonic oscillator", "henon_heiles": "Hénon–Heiles"}
@@ -57,20 +57,6 @@ def trajectory_figure(system: HamiltonianSystem, t_end: float) -> Figure:
     return figure
 
 
-def section(system: HamiltonianSystem, method: str, y0: np.ndarray, t_end: float, **options: float) -> np.ndarray:
-    """The states (n, 4) where the orbits of y0 cross q₁ = 0 with p₁ > 0, by bisection on the step length."""
-    integrator = get(method)(**options)
-    sol = solve(system, integrator, (0.0, t_end), y0=y0)
-    before, after = sol.states[..., :-1, :], sol.states[..., 1:, :]
-    start = before[(before[..., 0] < 0) & (after[..., 0] >= 0)]
-    low, high = np.zeros(len(start)), np.full(len(start), sol.stats["dt"])
-    for _ in range(50):
-        middle = (low + high) / 2
-        crossed = integrator.step(system, 0.0, start, middle)[:, 0] >= 0
-        low, high = np.where(crossed, low, middle), np.where(crossed, middle, high)
-    return integrator.step(system, 0.0, start, high)
-
-
 def section_figure(t_end: float, energy: float = 0.1) -> Figure:
     """The section q₁ = 0, p₁ > 0 of Hénon–Heiles."""
     system = systems.henon_heiles()
@@ -82,7 +68,7 @@ def section_figure(t_end: float, energy: float = 0.1) -> Figure:
     figure = Figure(figsize=(8.0, 4.9), layout="constrained")
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     for ax, method, options in zip(axes, ("sympflow", "kahan_li8"), ({}, {"dt": 0.1}), strict=True):
-        points = section(system, method, y0, t_end, **options)
+        points = poincare_section(system, method, (0.0, t_end), y0, sample=1.0, **options).states
         ax.plot(points[:, 1], points[:, 3], ".", ms=1.2, color=COLOURS[method])
         ax.set(xlabel="$q_2$", ylabel="$p_2$", title=LABELS[method], aspect="equal")
     figure.suptitle(f"Hénon–Heiles, E = {energy:g}: section $q_1 = 0$, $p_1 > 0$ to t = {t_end:g}", fontsize=11)
