@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
-from sympflow.domain import EnergySublevel
+from sympflow.domain import Domain, EnergySublevel
 from sympflow.events import EventSearch, parse
 from sympflow.integrators.base import Integrator, Outcome, Problem
 from sympflow.integrators.registry import build
@@ -245,16 +245,24 @@ def _check_memory(integrator: Integrator, problem: Problem) -> None:
         )
 
 
+def domain_of(flow: Any, system: HamiltonianSystem) -> Domain | None:
+    """Ω of a flow, or else of its system, ready to be asked for states."""
+    domain = getattr(flow, "domain", None) or system.domain
+    if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
+        return system.domain if domain == system.domain else domain.attach(system.hamiltonian)
+    return domain
+
+
 def _check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:
     """Note the first output outside the domain, or end the run there."""
     flow = getattr(integrator, "flow_for", lambda system: None)(system)
-    domain = getattr(flow, "domain", None) or system.domain
-    if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
-        domain = system.domain if domain == system.domain else domain.attach(system.hamiltonian)
+    domain = domain_of(flow, system)
     if domain is None or not len(outcome.t):
         return
     slack = float(getattr(flow, "figures", {}).get("energy_error_max") or 0.0)
     inside = domain.contains(outcome.y, slack=slack)  # (n, ...)
+    if inside.all():
+        return
     with np.errstate(invalid="ignore"):
         inside = inside | ~to_numpy(all_finite(outcome.y))  # what has become non-finite is reported as that
     if inside.all():
@@ -269,7 +277,8 @@ def _check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianS
         which = f" (trajectory {', '.join(map(str, index))}, the first of {count})"
     note = f"The state left the domain at t = {t:.17g}{which}"
     if action == "warn":
-        outcome.message += f" {note}: the figures of a trained flow do not hold there."
+        held = "the figures" if getattr(flow, "certified", None) is None else "the figures and the certificate"
+        outcome.message += f" {note}: {held} of a trained flow do not hold there."
         return
     outcome.message = f"{note}. Start inside the domain, or pass on_domain_exit='warn'."
     if inside.ndim == 1:

@@ -7,6 +7,7 @@ from typing import Any
 
 from sympflow.domain import Domain, domain_from_dict
 from sympflow.flow.base import FlowMap
+from sympflow.flow.certificate import Certificate
 from sympflow.flow.record import Refused
 from sympflow.flow.scaling import Scaling
 
@@ -28,6 +29,7 @@ def describe(flow: FlowMap, record: dict[str, Any]) -> None:
     if record["fingerprint"] is not None:
         flow.fingerprint = tuple(math.nan if v is None else float(v) for v in record["fingerprint"])
     flow.system_name, flow.recipe, flow.figures = record["system"], record["recipe"], record["figures"]
+    flow.certified = _certificate(record)
 
 
 def check(record: dict[str, Any], ndof: int) -> Domain | None:
@@ -49,7 +51,21 @@ def check(record: dict[str, Any], ndof: int) -> Domain | None:
     for name, value in record["figures"].items():
         if value is not None and not _is_number(value):
             raise Refused(f"its figures have a {name} that is neither a number nor None: {value!r}")
+    _certificate(record)
     return None if record["domain"] is None else _domain(record["domain"], ndof)
+
+
+def _certificate(record: dict[str, Any]) -> Certificate | None:
+    """The certificate in the record, if there is one; it must be of the weights that the file holds."""
+    if record.get("certificate") is None:
+        return None
+    try:
+        certificate = Certificate.from_dict(record["certificate"])
+    except ValueError as error:
+        raise Refused(f"its certificate is not admissible ({error})") from None
+    if certificate.weights != record.get("checksum"):
+        raise Refused("its certificate is one of other weights")
+    return certificate
 
 
 def _check_system(name: Any, fingerprint: Any) -> None:

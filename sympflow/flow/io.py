@@ -1,8 +1,8 @@
 """Files of flows: safetensors with a JSON record, never pickle; and the flows that ship with the package.
 
 The metadata entry "sympflow" is a JSON object: format, version (of the package), kind, architecture, dt, domain,
-system, fingerprint, recipe, figures, checksum (of the tensors). A file is taken for hostile until every part of it has
-been checked.
+system, fingerprint, recipe, figures, checksum (of the tensors), and certificate, if one was computed. A file is taken
+for hostile until every part of it has been checked.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ def save(flow: FlowMap, path: str | os.PathLike[str]) -> None:
     TypeError
         If `path` is not a path.
     ValueError
-        If a weight is not finite, or the flow's record is one that `load` would refuse.
+        If a weight is not finite, the flow's certificate is one of other weights, or its record is one that `load`
+        would refuse.
     """
     path = _path(path)
     tensors = {name: value.detach().cpu().contiguous() for name, value in flow.state_dict().items()}
@@ -65,6 +66,12 @@ def save(flow: FlowMap, path: str | os.PathLike[str]) -> None:
         "figures": flow.figures,
         "checksum": checksum(tensors),
     }
+    if flow.certified is not None:
+        if flow.certified.weights != record["checksum"]:
+            raise ValueError(
+                "`flow` was changed after its certificate was computed: compute it again by flow.certificate(system)."
+            )
+        record["certificate"] = flow.certified.to_dict()
     record = _finite(record)
     try:
         check(record, flow.ndof)

@@ -146,6 +146,7 @@ def train(
                 "`optimizer` 'gauss-newton' fits primed flows in float64: pass flow=SympFlow.primed(system, dt=...)."
             )
         flow = copy.deepcopy(flow).bound(system)
+        flow.certified = None
         scaling = Scaling.of_samples(states(domain, SCALING_SAMPLES, seed, Stream.SCALING), flow.dt)
         search = GaussNewtonRun.start(flow, system, domain, scaling, labelled)
         if resume is not None:
@@ -191,7 +192,9 @@ def train(
                     "MLPFlow matches within 2 %: give wider layers or more pairs."
                 )
             flow = MLPFlow.matching(flow, seed, scaling, "tanh" if activation is None else activation)
-    run = Run.start(copy.deepcopy(flow).requires_grad_(True), system, domain, scaling, config)
+    flow = copy.deepcopy(flow).requires_grad_(True)
+    flow.certified = None  # of the weights as they were
+    run = Run.start(flow, system, domain, scaling, config)
     if resume is not None:
         run.load(resume)
     return run.finish(run.go(checkpoint, time_budget, progress, callback))

@@ -1,0 +1,277 @@
+"""What is known of a flow a posteriori: because its Hamiltonian 𝓗 is known, its energy error has a bound.
+
+    |H(ψ_kΔt(x)) − H(x)| ≤ k δ,    δ = ∫₀^Δt sup_x |∇Hᵀ J ∇(𝓗 − H)|(ψ̄_t(x)) dt,
+
+as long as the orbit is in Ω at every step: d/dt H(ψ̄_t(x)) = ∇Hᵀ J ∇𝓗, of which ∇Hᵀ J ∇H = 0 is no part.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from sympflow.domain import Domain
+
+if TYPE_CHECKING:
+    from sympflow.flow.base import FlowMap
+    from sympflow.flow.sympflow import SympFlow
+    from sympflow.system import HamiltonianSystem
+
+SAVED_VALUES = 1_000_000  # of a piece of the measured runs, which are never held whole
+
+
+@dataclass(frozen=True)
+class Quantiles:
+    """Of |values| over a sample: median, 95 % and largest."""
+
+    median: float
+    q95: float
+    largest: float
+
+    @classmethod
+    def of(cls, values: np.ndarray) -> Quantiles:
+        """What is not finite counts as infinite."""
+        values = np.abs(values)
+        values = np.where(np.isnan(values), math.inf, values)
+        # never interpolated, which would make NaN of infinities
+        return cls(*(float(np.quantile(values, level, method="higher")) for level in (0.5, 0.95, 1.0)))
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What was estimated of a flow on Ω × [0, Δt], and measured on held-out orbits; an estimate, not a proof.
+
+    Attributes
+    ----------
+    system : str
+    dt : float
+        Δt.
+    states, times, seed : int
+        The sample: seeded states of Ω, equidistant times in [0, Δt].
+    defect : Quantiles
+        ‖d/dt ψ̄_t(x) − J∇H(ψ̄_t(x))‖ over the sample.
+    hamiltonian_error : Quantiles
+        |𝓗(t, x) − H(x) − c(t)| over the sample, c(t) the mean over Ω; the largest estimates the supremum.
+    delta : Quantiles
+        ∫₀^Δt |∇Hᵀ J ∇(𝓗 − H)| dt by the trapezoidal rule, at each time the quantile over the states; the largest is δ.
+    held_out : int
+        Number of held-out states, of another seed.
+    t_end : float
+        T, to which their orbits were followed.
+    one_step_error : Quantiles
+        ‖ψ̄_Δt(x) − φ_H,Δt(x)‖ at the held-out states, φ by DOP853 at 1e-12.
+    energy_error, relative_energy_error : Quantiles
+        Over the held-out states, the largest |H(ψ_t x) − H(x)| at the steps up to T, or up to where the orbit leaves Ω;
+        relative to the system's `energy_scale`, else to |H(x)|.
+    left : int
+        Number of orbits that left Ω before T.
+    weights : str
+        Checksum of the weights that this holds for.
+    """
+
+    system: str
+    dt: float
+    states: int
+    times: int
+    seed: int
+    defect: Quantiles
+    hamiltonian_error: Quantiles
+    delta: Quantiles
+    held_out: int
+    t_end: float
+    one_step_error: Quantiles
+    energy_error: Quantiles
+    relative_energy_error: Quantiles
+    left: int
+    weights: str
+
+    def bound(self, t: float) -> float:
+        """kδ, k = ⌈|t|/Δt⌉: the most by which H changes over a time t while the orbit stays in Ω."""
+        return math.ceil(abs(t) / self.dt * (1 - 1e-12)) * self.delta.largest
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, description: dict[str, Any]) -> Certificate:
+        """The certificate that `to_dict` described; None stands for what was not finite.
+
+        Raises
+        ------
+        ValueError
+            If the description is not one of a certificate.
+        """
+        names = {f.name for f in fields(cls)}
+        if not isinstance(description, dict) or set(description) != names:
+            raise ValueError("`description` is not one of a certificate: compute it again by flow.certificate(system).")
+        values: dict[str, Any] = {}
+        for f in fields(cls):
+            value, kind = description[f.name], str(f.type)
+            if kind == "Quantiles":
+                if not isinstance(value, dict) or set(value) != {q.name for q in fields(Quantiles)}:
+                    raise ValueError(f"`description` has a {f.name} that is not made of quantiles: {value!r}.")
+                value = Quantiles(**{q: _number(q, math.inf if v is None else v) for q, v in value.items()})
+            elif kind == "float":
+                value = _number(f.name, value)
+            elif type(value).__name__ != kind:
+                raise ValueError(f"`description` has a {f.name} that is no {kind}: {value!r}.")
+            values[f.name] = value
+        return cls(**values)
+
+    def __str__(self) -> str:
+        rows = (
+            ("defect ‖dψ̄/dt − J∇H‖", self.defect),
+            ("|𝓗 − H − c(t)|", self.hamiltonian_error),
+            ("energy gained in a step, at most", self.delta),
+            (f"one-step error at Δt = {self.dt:g}", self.one_step_error),
+            (f"|H − H₀| up to T = {self.t_end:g}", self.energy_error),
+            ("the same, relative", self.relative_energy_error),
+        )
+        table = [f"{'':36}{'median':>10}{'95 %':>10}{'largest':>10}"]
+        table += [f"{name:36}{q.median:10.1e}{q.q95:10.1e}{q.largest:10.1e}" for name, q in rows]
+        left = f"; {self.left} of them left Ω" if self.left else ""
+        return "\n".join(
+            (
+                f"Certificate of a flow of {self.system}: estimates, no proof",
+                f"upper half: {self.states} states of Ω at {self.times} times in [0, {self.dt:g}] (seed {self.seed}); "
+                f"lower half: {self.held_out} held-out states{left}",
+                *table,
+                f"bound on |H − H₀| at T, while in Ω: {self.bound(self.t_end):.1e}",
+            )
+        )
+
+
+def certificate(
+    flow: FlowMap,
+    system: HamiltonianSystem,
+    *,
+    states: int = 2000,
+    times: int = 33,
+    held_out: int = 100,
+    t_end: float = 1000.0,
+    seed: int = 0,
+) -> Certificate:
+    """`FlowMap.certificate`."""
+    from sympflow.flow.record import checksum
+    from sympflow.flow.sympflow import SympFlow
+    from sympflow.solver import domain_of
+
+    if not isinstance(flow, SympFlow):
+        raise TypeError(
+            "`flow` is an unconstrained network, which is the flow of no Hamiltonian, so nothing bounds its energy "
+            "error: use a SympFlow for a certificate."
+        )
+    for name, value, least in (
+        ("states", states, 1),
+        ("times", times, 2),
+        ("held_out", held_out, 1),
+        ("seed", seed, 0),
+    ):
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ValueError(f"`{name}` must be an integer and at least {least}; got {value!r}.")
+    if not flow.dt <= t_end < math.inf:
+        raise ValueError(f"`t_end` must be finite and at least Δt = {flow.dt:g}; got {t_end!r}.")
+    flow.check_system(system)
+    flow = flow.bound(system)  # type: ignore[assignment]
+    domain = domain_of(flow, system)
+    if domain is None:
+        raise ValueError("`flow` has no domain and neither has its system: give the system a `domain`, say a Box.")
+    x, unseen = (domain.sample(n, _seed(seed, i)) for i, n in enumerate((states, held_out)))
+    energy, relative, left = _energy_errors(flow, system, domain, unseen, t_end)
+    return Certificate(
+        system.name,
+        flow.dt,
+        states,
+        times,
+        seed,
+        *_over_sample(flow, system, x, times),
+        held_out,
+        float(t_end),
+        _one_step_error(flow, system, unseen),
+        energy,
+        relative,
+        left,
+        checksum(flow.state_dict()),
+    )
+
+
+@torch.no_grad()
+def _over_sample(
+    flow: SympFlow, system: HamiltonianSystem, x: np.ndarray, times: int
+) -> tuple[Quantiles, Quantiles, Quantiles]:
+    """The defect, the error of 𝓗 and δ, over states x (n, 2d)."""
+    points = torch.as_tensor(x, dtype=flow.dtype, device=flow.device)
+    H = system.hamiltonian(points)
+    defects, mismatches, gains = [], [], []
+    for t in np.linspace(0.0, flow.dt, times).tolist():
+        y, velocity = flow.psi_and_velocity(t, points)
+        defect = velocity - system.vector_field(y)
+        # ∇H·J∇H = 0, so that ∇H·J∇𝓗 may lose that part, and with it the rounding
+        gains.append((system.gradient(y) * defect).sum(-1))
+        defects.append(torch.linalg.vector_norm(defect, dim=-1))
+        difference = flow.hamiltonian_unchecked(t, points) - H
+        mismatches.append(difference - difference.mean())
+    defects, mismatches, gains = (torch.stack(rows).cpu().double().numpy() for rows in (defects, mismatches, gains))
+    rates = np.array([list(asdict(Quantiles.of(row)).values()) for row in gains])  # (times, 3)
+    delta = Quantiles(*(float(np.trapezoid(column, dx=flow.dt / (times - 1))) for column in rates.T))
+    return Quantiles.of(defects), Quantiles.of(mismatches), delta
+
+
+def _one_step_error(flow: SympFlow, system: HamiltonianSystem, x: np.ndarray) -> Quantiles:
+    from sympflow.training.validation import reference_step
+
+    with torch.no_grad():
+        y = flow.psi(flow.dt, torch.as_tensor(x, dtype=flow.dtype, device=flow.device)).cpu().double().numpy()
+    return Quantiles.of(np.linalg.norm(y - reference_step(system, x, flow.dt), axis=-1))
+
+
+def _energy_errors(
+    flow: SympFlow, system: HamiltonianSystem, domain: Domain, x: np.ndarray, t_end: float
+) -> tuple[Quantiles, Quantiles, int]:
+    """The largest |H − H0| of each orbit at the steps in Ω up to t_end, the same relative, how many left Ω."""
+    from sympflow.solver import solve
+
+    steps = int(t_end / flow.dt * (1 + 1e-12))
+    piece = max(1, min(steps, SAVED_VALUES // x.size))
+    y = x.astype(str(flow.dtype).removeprefix("torch."))
+    H0 = system.hamiltonian(y).astype(float)
+    largest, inside, done = np.zeros(len(x)), np.full(len(x), True), 0
+    while done < steps and inside.any():
+        n = min(piece, steps - done)
+        state = torch.as_tensor(y, device=flow.device) if flow.device.type != "cpu" else y
+        with torch.no_grad(), np.errstate(all="ignore"):
+            run = solve(
+                system,
+                flow,
+                (0.0, n * flow.dt),
+                state,
+                **({"dtype": str(y.dtype)} if state is y else {}),
+                on_domain_exit="ignore",
+            )
+            orbit = np.moveaxis(torch.as_tensor(run.y).cpu().numpy(), -1, 0)  # (n + 1, N, 2d)
+            error = np.abs(system.hamiltonian(orbit) - H0)
+            stays = np.logical_and.accumulate(domain.contains(orbit), axis=0) & inside
+        # a step taken in Ω counts, even if it ends outside
+        counted = np.concatenate([inside[None], stays[:-1]])
+        error = np.where(np.isnan(error), math.inf, error)
+        largest = np.maximum(largest, np.where(counted, error, 0.0).max(0))
+        inside = stays[-1]
+        y, done = np.where(inside[:, None], orbit[-1], y), done + n
+    scale = np.abs(H0) if system.energy_scale is None else np.full_like(H0, system.energy_scale)
+    relative = largest / np.where(scale > 0, scale, 1.0)
+    return Quantiles.of(largest), Quantiles.of(relative), int((~inside).sum())
+
+
+def _seed(seed: int, stream: int) -> int:
+    return int(np.random.SeedSequence([seed, 20_261, stream]).generate_state(1)[0])
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not value >= 0:
+        raise ValueError(f"`description` has a {name} that is no number: {value!r}.")
+    return float(value)

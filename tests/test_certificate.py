@@ -1,0 +1,228 @@
+"""Certificates: the bound holds, the exact flow has none to speak of, and files keep them."""
+
+import json
+import math
+import struct
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+import sympflow
+from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, solve, systems
+from sympflow.flow.certificate import Certificate, Quantiles
+from sympflow.flow.io import KEY, shipped
+
+HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
+QUICK = {"states": 300, "times": 9, "held_out": 20, "t_end": 100.0}
+EPS = np.finfo(float).eps
+
+
+def primed(system=HH, **options):
+    """Untrained: three leapfrog steps."""
+    return SympFlow.primed(system, 3, dt=0.5, **options).requires_grad_(False)
+
+
+FLOWS = {
+    "network": (lambda: shipped(HH), HH),
+    "primed": (primed, HH),
+    "pendulum": (lambda: primed(PENDULUM), PENDULUM),
+    "layers": (lambda: SympFlow.from_layers(list(shipped(HH).layers), 1.0), HH),
+}
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_the_bound_holds_along_orbits(name):
+    """|H(ψ_kΔt x) − H(x)| ≤ kδ at every step until the orbit leaves Ω, for states of another seed."""
+    make, system = FLOWS[name]
+    flow = make()
+    found = flow.certificate(system, **{**QUICK, "states": 2000})
+    x = system.domain.sample(200, 987)
+    orbit = np.moveaxis(solve(system, flow, (0.0, 100.0), y0=x, on_domain_exit="ignore").y, -1, 0)
+    error = np.abs(system.hamiltonian(orbit) - system.hamiltonian(x))
+    inside = np.logical_and.accumulate(system.domain.contains(orbit), axis=0)
+    assert inside[-1].mean() > 0.5
+    bound = np.array([found.bound(flow.dt * k) for k in range(len(orbit))])[:, None]
+    assert (error[1:][inside[:-1]] <= np.broadcast_to(bound[1:], error[1:].shape)[inside[:-1]]).all()
+    assert found.energy_error.largest <= found.bound(100.0)
+    assert found.bound(100.0) < 1e4 * found.energy_error.largest  # pessimistic, but it says something
+
+
+def test_the_bound_counts_steps():
+    found = primed().certificate(HH, **QUICK)
+    delta = found.delta.largest
+    assert [found.bound(t) / delta for t in (0.0, 0.1, 0.5, 0.6, 100.0, -1.0)] == pytest.approx([0, 1, 1, 2, 200, 2])
+
+
+def test_delta_is_the_integral_of_the_rate():
+    """Against H itself: the mean over x of d/dt H(ψ̄_t(x)), integrated, is what H gained."""
+    flow = primed()
+    found = flow.certificate(HH, **{**QUICK, "states": 1, "times": 2001})
+    # one state alone: the integral of |rate| is at least what H gained, and the variation of H along the step
+    t = torch.linspace(0, flow.dt, 2001, dtype=torch.float64)
+    x = HH.domain.sample(1, int(np.random.SeedSequence([0, 20_261, 0]).generate_state(1)[0]))
+    H = HH.hamiltonian(flow.psi(t, torch.tensor(x))).numpy()
+    assert found.delta.largest == pytest.approx(np.abs(np.diff(H)).sum(), rel=1e-4)
+    assert found.delta.median == found.delta.largest
+
+
+def test_the_error_of_the_hamiltonian_against_its_definition():
+    flow = shipped(HH)
+    found = flow.certificate(HH, **{**QUICK, "times": 2})
+    x = torch.tensor(HH.domain.sample(300, int(np.random.SeedSequence([0, 20_261, 0]).generate_state(1)[0])))
+    differences = [flow.hamiltonian(t, x) - HH.hamiltonian(x) for t in (0.0, flow.dt)]
+    values = torch.cat([(d - d.mean()).abs() for d in differences])
+    assert found.hamiltonian_error.largest == pytest.approx(float(values.max()), rel=1e-12)
+    assert found.hamiltonian_error.q95 == pytest.approx(float(values.quantile(0.95)), rel=1e-2)
+
+
+def test_an_exact_flow_is_found_exact(rotation):
+    found = rotation.certificate(OSCILLATOR, **QUICK)
+    for q in (found.defect, found.hamiltonian_error, found.delta):
+        assert q.largest < 8 * EPS
+    assert found.energy_error.largest < 100 * 8 * EPS
+    assert found.bound(100.0) < 100 * 8 * EPS
+
+
+def test_the_measured_errors_are_those_of_solve():
+    flow = primed()
+    found = flow.certificate(HH, **QUICK)
+    x = HH.domain.sample(20, int(np.random.SeedSequence([0, 20_261, 1]).generate_state(1)[0]))
+    runs = [solve(HH, flow, (0.0, 100.0), y0=y, on_domain_exit="stop") for y in x]
+    errors = [np.abs(run.energy() - run.energy()[0]).max() for run in runs]
+    assert found.left == sum(run.status != 0 for run in runs)
+    assert found.energy_error.largest == pytest.approx(max(errors), rel=1e-9)
+    relative = [e / abs(run.energy()[0]) for e, run in zip(errors, runs, strict=True)]
+    assert found.relative_energy_error.largest == pytest.approx(max(relative), rel=1e-9)
+
+
+def test_long_runs_go_piece_by_piece(monkeypatch):
+    whole = primed().certificate(HH, **QUICK)
+    monkeypatch.setattr("sympflow.flow.certificate.SAVED_VALUES", 20 * 4 * 7)
+    pieces = primed().certificate(HH, **QUICK)
+    assert pieces.left == whole.left
+    # the rounding of a chaotic orbit differs where a piece begins
+    assert pieces.energy_error.largest == pytest.approx(whole.energy_error.largest, rel=1e-6)
+
+
+def test_orbits_that_blow_up_are_infinite_errors():
+    big = HamiltonianSystem.from_sympy("p**2/2 + q**3/3", domain=Box([-3.0, -3.0], [3.0, 3.0]))
+    found = SympFlow.primed(big, 1, dt=4.0).requires_grad_(False).certificate(big, **{**QUICK, "t_end": 40.0})
+    assert found.left > 0
+    assert Quantiles.of(np.array([1.0, math.nan, -2.0])).largest == math.inf
+    assert Quantiles.of(np.array([-3.0, 1.0, 2.0])) == Quantiles(2.0, 3.0, 3.0)
+
+
+def test_the_same_seed_gives_the_same_certificate():
+    one, same, other = (primed().certificate(HH, **QUICK, seed=s) for s in (0, 0, 1))
+    assert one == same
+    assert one.delta != other.delta
+
+
+def test_single_precision():
+    found = primed(dtype=torch.float32).certificate(HH, **QUICK)
+    assert found.delta.largest == pytest.approx(primed().certificate(HH, **QUICK).delta.largest, rel=1e-3)
+
+
+def test_it_reads_well():
+    text = str(primed().certificate(HH, **QUICK))
+    assert "no proof" in text
+    assert "300 states of Ω at 9 times in [0, 0.5]" in text
+    assert "20 held-out states" in text
+    assert "bound on |H − H₀| at T" in text
+
+
+# files -----------------------------------------------------------------------------------------------------------
+
+
+def test_files_keep_certificates(tmp_path):
+    flow, path = primed(), tmp_path / "flow.safetensors"
+    flow.save(path)
+    assert sympflow.load(path).certified is None
+    found = flow.certificate(HH, **QUICK)
+    assert flow.certified is found
+    flow.save(path)
+    assert sympflow.load(path, system=HH).certified == found
+    assert Certificate.from_dict(json.loads(json.dumps(found.to_dict()))) == found
+
+
+def test_a_certificate_is_of_the_weights_it_was_made_of(tmp_path):
+    flow = primed()
+    flow.certificate(HH, **QUICK)
+    with torch.no_grad():
+        flow.kicks.free[0] += 1e-6
+    with pytest.raises(ValueError, match=r"^`flow` was changed after its certificate .* flow\.certificate\(system\)"):
+        flow.save(tmp_path / "flow.safetensors")
+    trained = sympflow.train(
+        HH, flow=flow, optimizer="adam", steps=1, points=40, validation_points=40, progress=False, matching_weight=0.0
+    )
+    assert trained.certified is None
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda c: c.pop("delta"), "not one of a certificate"),
+        (lambda c: c.update(delta=3.0), "delta that is not made of quantiles"),
+        (lambda c: c["delta"].update(median="0"), "median that is no number"),
+        (lambda c: c["delta"].update(median=-1.0), "median that is no number"),
+        (lambda c: c.update(states=True), "states that is no int"),
+        (lambda c: c.update(weights="0"), "certificate is one of other weights"),
+    ],
+)
+def test_a_certificate_that_was_tampered_with_is_refused(tmp_path, edit, message):
+    flow, path = primed(), tmp_path / "flow.safetensors"
+    flow.certificate(HH, **QUICK)
+    flow.save(path)
+    content = path.read_bytes()
+    (length,) = struct.unpack("<Q", content[:8])
+    record = json.loads(json.loads(content[8 : 8 + length])["__metadata__"][KEY])
+    edit(record["certificate"])
+    save_file(load_file(path), path, {KEY: json.dumps(record)})
+    with pytest.raises(ValueError, match=rf"^`path` .*{message}"):
+        sympflow.load(path)
+
+
+# solve -----------------------------------------------------------------------------------------------------------
+
+
+def test_solve_says_that_the_certificate_does_not_hold_outside():
+    flow = primed()
+    flow.domain = HH.domain
+    outside = np.array([0.0, 0.0, 0.7, 0.0])
+    assert "left the domain at t = 0: the figures of" in solve(HH, flow, (0.0, 1.0), y0=outside).message
+    flow.certificate(HH, **QUICK)
+    assert "the figures and the certificate of" in solve(HH, flow, (0.0, 1.0), y0=outside).message
+
+
+# bad arguments -----------------------------------------------------------------------------------------------------
+
+
+def test_a_network_without_a_hamiltonian_has_no_certificate():
+    with pytest.raises(TypeError, match=r"^`flow` is an unconstrained network.*use a SympFlow"):
+        MLPFlow(2).certificate(HH)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"states": 0}, "^`states` must be an integer and at least 1"),
+        ({"times": 1}, "^`times` must be an integer and at least 2"),
+        ({"held_out": 2.0}, "^`held_out`"),
+        ({"seed": -1}, "^`seed`"),
+        ({"t_end": 0.1}, "^`t_end` must be finite and at least Δt"),
+        ({"t_end": math.inf}, "^`t_end`"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        primed().certificate(HH, **arguments)
+
+
+def test_the_wrong_system_and_no_domain_are_refused():
+    with pytest.raises(ValueError, match=r"^`system`"):
+        primed().certificate(PENDULUM)
+    free = HamiltonianSystem.from_sympy("p**2/2 + q**4")
+    with pytest.raises(ValueError, match=r"^`flow` has no domain"):
+        SympFlow(1).certificate(free)
