@@ -15,6 +15,7 @@ from sympflow.domain import Domain, EnergySublevel
 if TYPE_CHECKING:
     import sympy
 
+    from sympflow.linear_part import LinearPart
     from sympflow.symbolic import SymbolicHamiltonian
 
 
@@ -37,6 +38,9 @@ class HamiltonianSystem:
         ∇V(q), (..., d) to (..., d); as a Numba function: gradient(q, out).
     hessian_vector : callable, optional
         ∇²V(q)·v, (..., d), (..., d) to (..., d); as a Numba function: hessian_vector(q, v, out).
+    stiffness_matrix : array_like of shape (d, d), optional
+        A symmetric K, part ½ qᵀKq of the potential, that methods with an exact linear flow take as their `linear_part`.
+        Only with `potential`; of a symbolic system it is read off.
     name : str
     domain : Domain, optional
         Ω, where flows are trained. Classical methods never need one.
@@ -76,6 +80,7 @@ class HamiltonianSystem:
         mass: float | ArrayLike | None = None,
         gradient: Callable[..., Any] | None = None,
         hessian_vector: Callable[..., Any] | None = None,
+        stiffness_matrix: ArrayLike | None = None,
         name: str = "custom",
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
@@ -94,6 +99,7 @@ class HamiltonianSystem:
             raise TypeError("`mass` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         else:
             self._set(definition, None, False)
+        self.stiffness_matrix = _stiffness_matrix(stiffness_matrix, definition)
         self._set_scene(name, {}, domain, y0, t_span, dt, energy_scale)
 
     @classmethod
@@ -140,6 +146,7 @@ class HamiltonianSystem:
     def _set(self, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
         self._definition = definition
         self.symbols: SymbolicHamiltonian | None = None
+        self.stiffness_matrix: np.ndarray | None = None
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
         self.inverse_mass = inverse_mass
@@ -260,6 +267,21 @@ class HamiltonianSystem:
         """(potential, gradient, hessian_vector) if the system was given by Numba functions, else None."""
         return getattr(self._definition, "numba_functions", None)
 
+    # structure --------------------------------------------------------------------------------------
+
+    @cached_property
+    def linear_part(self) -> LinearPart:
+        """The quadratic part of H, with K, its frequencies, what remains (U) and the `stiffness`.
+
+        Raises
+        ------
+        ValueError
+            If there is none, or its stiff direction turns, with the reason.
+        """
+        from sympflow.linear_part import linear_part
+
+        return linear_part(self)
+
     # identity -------------------------------------------------------------------------------------
 
     @cached_property
@@ -299,6 +321,20 @@ def _inverse_mass(mass: float | ArrayLike | None, ndof: int) -> np.ndarray | Non
     if not (np.isfinite(full).all() and np.allclose(full, full.T) and np.linalg.eigvalsh(full)[0] > 0):
         raise ValueError("`mass` must be finite, symmetric and positive definite.")
     return _simplest_mass(np.diag(1 / M) if M.ndim == 1 else np.linalg.inv(full))
+
+
+def _stiffness_matrix(matrix: ArrayLike | None, definition: Any) -> np.ndarray | None:
+    if matrix is None:
+        return None
+    if not definition.separable:
+        raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
+    K = np.asarray(matrix, dtype=float)
+    if K.shape != (definition.ndof, definition.ndof) or not np.isfinite(K).all() or not np.allclose(K, K.T):
+        raise ValueError(
+            f"`stiffness_matrix` must be finite, symmetric and of shape ({definition.ndof}, {definition.ndof}); got "
+            f"shape {K.shape}."
+        )
+    return (K + K.T) / 2
 
 
 def _simplest_mass(inverse: np.ndarray) -> np.ndarray | None:

@@ -1,0 +1,304 @@
+"""The quadratic part of a Hamiltonian, whose flow is known exactly, and its normal modes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import sympy as sp
+
+    from sympflow.system import HamiltonianSystem
+
+ZERO = 1e-12  # of the largest squared frequency: what is below is a free drift
+SAME = 1e-9  # relative difference below which two frequencies are one
+DRAWN, SAMPLES = 4096, 64  # states drawn, and those of lowest potential at which Hessians are compared
+GAP = 10.0  # between the curvatures of a stiff direction and of the others
+TURN = 0.1  # radians by which a stiff direction may turn and still count as constant
+
+
+@dataclass(frozen=True)
+class LinearPart:
+    """½ pᵀBp + ½ (q − c)ᵀK(q − c), a quadratic Hamiltonian, in its normal modes.
+
+    With q = c + C X and p = C⁻ᵀY it is Σ_j Ω_j (Y_j² + σ_j X_j²)/2, where σ_j = 1 for an *oscillator*, −1 for a
+    *hyperbolic* mode (K negative along it), and Y_j²/2 for a *free* one; coordinates that B leaves out are *idle*.
+    In these variables, in which a state moves on a circle, the exact flow needs no number that depends on the scales
+    of q and p, and does not drift by rounding.
+
+    Attributes
+    ----------
+    inverse_mass : (d, d)
+        B, symmetric positive semidefinite: M⁻¹ where the kinetic energy is ½ pᵀM⁻¹p.
+    stiffness_matrix : (d, d)
+        K, symmetric.
+    center : (d,)
+        c.
+    potential : sympy.Expr or None
+        U(q), what the potential has beside the quadratic part, if the system is symbolic.
+    interval : float
+        Length of the system's default interval.
+    """
+
+    inverse_mass: np.ndarray
+    stiffness_matrix: np.ndarray
+    center: np.ndarray
+    potential: sp.Expr | None = None
+    interval: float = 0.0
+
+    @property
+    def ndof(self) -> int:
+        return len(self.center)
+
+    @cached_property
+    def _spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """λ (d,), C (d, d), C⁻¹ (d, d)."""
+        B, K, d = self.inverse_mass, self.stiffness_matrix, self.ndof
+        active = np.flatnonzero(np.diag(B) > 0)
+        if np.delete(np.delete(B, active, 0), active, 1).any() or np.delete(K, active, 0).any():
+            raise ValueError("`stiffness_matrix` acts on coordinates without a kinetic energy: leave them out of it.")
+        block = np.ix_(active, active)
+        L = np.linalg.cholesky(B[block])
+        S = L.T @ K[block] @ L
+        if np.count_nonzero(S - np.diag(np.diag(S))):
+            eigenvalues, W = np.linalg.eigh((S + S.T) / 2)
+        else:  # eigh would only reorder the modes
+            eigenvalues, W = np.diag(S).copy(), np.eye(len(S))
+        eigenvalues[np.abs(eigenvalues) <= ZERO * np.abs(eigenvalues).max(initial=0.0)] = 0.0
+        unit = np.where(eigenvalues != 0, np.abs(eigenvalues) ** 0.25, 1.0)  # √Ω
+        squares, C, inverse = np.full(d, np.nan), np.eye(d), np.eye(d)
+        squares[active] = eigenvalues
+        C[block] = L @ W / unit
+        inverse[block] = unit[:, None] * (W.T @ np.linalg.inv(L))
+        return squares, C, inverse
+
+    @property
+    def squared_frequencies(self) -> np.ndarray:
+        """The eigenvalues of BK, one for each mode, (d,): negative for a hyperbolic mode, NaN for an idle one."""
+        return self._spectrum[0]
+
+    @property
+    def frequencies(self) -> np.ndarray:
+        """ω of each mode, (d,): 0 where nothing oscillates."""
+        return np.sqrt(np.maximum(np.nan_to_num(self.squared_frequencies), 0.0))
+
+    @property
+    def modes(self) -> np.ndarray:
+        """C: (d, d)."""
+        return self._spectrum[1]
+
+    @property
+    def inverse_modes(self) -> np.ndarray:
+        """C⁻¹: (d, d)."""
+        return self._spectrum[2]
+
+    @cached_property
+    def kinds(self) -> tuple[str, ...]:
+        """Of each mode: "oscillator", "hyperbolic", "free" or "idle"."""
+        names = {1.0: "oscillator", -1.0: "hyperbolic", 0.0: "free"}
+        return tuple("idle" if np.isnan(s) else names[float(np.sign(s))] for s in self.squared_frequencies)
+
+    @cached_property
+    def rates(self) -> np.ndarray:
+        """Ω of each mode, (d,): ω, the hyperbolic rate, 1 for a free mode and 0 for an idle one."""
+        squares = np.nan_to_num(self.squared_frequencies)
+        return np.where(squares != 0, np.sqrt(np.abs(squares)), [float(kind == "free") for kind in self.kinds])
+
+    @cached_property
+    def classes(self) -> np.ndarray:
+        """To which of the distinct frequencies a mode belongs: (d,) int."""
+        found: list[tuple[str, float]] = []
+        labels = []
+        for kind, rate in zip(self.kinds, self.rates, strict=True):
+            same = [i for i, (k, r) in enumerate(found) if k == kind and abs(r - rate) <= SAME * abs(rate)]
+            labels.append(same[0] if same else len(found))
+            if not same:
+                found.append((kind, float(rate)))
+        return np.array(labels)
+
+    @cached_property
+    def n_classes(self) -> int:
+        return int(self.classes.max()) + 1
+
+    @cached_property
+    def representatives(self) -> np.ndarray:
+        """The first mode of each class: (n_classes,)."""
+        return np.array([int(np.argmax(self.classes == f)) for f in range(self.n_classes)])
+
+    @property
+    def stiffness(self) -> float:
+        """Largest frequency × length of the default interval: the radians that the fastest mode turns in it.
+
+        A method that meets the fast oscillation by forces, as every explicit one does, needs at least half as many
+        force evaluations to be stable.
+        """
+        return float(self.frequencies.max(initial=0.0) * self.interval)
+
+
+def linear_part(system: HamiltonianSystem) -> LinearPart:
+    """The quadratic part of a system, read off its symbols or made from its `stiffness_matrix`.
+
+    Of H = T(p) + V(q) or of any other H the terms ½ pᵀBp + ½ qᵀKq + linear ones are taken, where B belongs to
+    coordinates whose kinetic energy is quadratic. What remains is U.
+
+    Raises
+    ------
+    ValueError
+        If there is none; or if it is stiff in a direction that turns over the domain, which no constant K follows.
+    """
+    if system.stiffness_matrix is not None:
+        K = system.stiffness_matrix
+        part = LinearPart(_inverse_mass(system), K, np.zeros(system.ndof), None, _interval(system))
+    elif system.symbols is not None:
+        part = _read_off(system)
+    else:
+        raise ValueError(
+            f"`system` {system.name!r} is given by functions, from which no linear part can be read: pass "
+            "stiffness_matrix=K to HamiltonianSystem."
+        )
+    if system.quadratic_kinetic and (reason := _turns(system, part)):
+        raise ValueError(f"`system` {system.name!r} has no linear part that would help: {reason}.")
+    if part is None:
+        raise ValueError(
+            f"`system` {system.name!r} has no linear part: its potential has no quadratic terms. Use another splitting "
+            "method, such as 'srkn11b', or pass a system with `stiffness_matrix`."
+        )
+    return part
+
+
+def _inverse_mass(system: HamiltonianSystem) -> np.ndarray:
+    if not system.quadratic_kinetic:
+        raise ValueError("`stiffness_matrix` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
+    return np.asarray(system.kinetic_hessian(np.zeros(system.ndof)), dtype=float)
+
+
+def _interval(system: HamiltonianSystem) -> float:
+    return abs(system.t_span[1] - system.t_span[0])
+
+
+def _read_off(system: HamiltonianSystem) -> LinearPart | None:
+    """The quadratic terms of a symbolic H, or None if its potential has none."""
+    import sympy as sp
+
+    symbols = system.symbols
+    assert symbols is not None
+    q, p, d = symbols.q, symbols.p, system.ndof
+    quadratic, rest = quadratic_terms(symbols.H, (*q, *p))
+    B, K = sp.hessian(quadratic, p), sp.hessian(quadratic, q)
+    # a coordinate takes part if its momentum enters H by the quadratic terms alone
+    active = [i for i in range(d) if B[i, i] != 0 and not rest.has(p[i])]
+    idle = [i for i in range(d) if i not in active]
+    B_array, K_array = (np.array(A.tolist(), dtype=float) for A in (B, K))
+    for A in (B_array, K_array):
+        A[idle, :] = A[:, idle] = 0.0
+    if not K_array.any():
+        return None
+    at_zero = dict.fromkeys((*q, *p), sp.S.Zero)
+    slope = np.array([float(sp.diff(quadratic, s).xreplace(at_zero)) for s in q])
+    center = np.where(K_array.any(0), -np.linalg.pinv(K_array) @ slope, 0.0)
+    X = sp.Matrix([s - _number(c) for s, c in zip(q, center, strict=True)])
+    P, Ks, Bs = sp.Matrix(p), *(sp.Matrix(d, d, [_number(v) for v in A.ravel()]) for A in (K_array, B_array))
+    removed = sp.expand(quadratic - (X.T * Ks * X)[0] / 2 - (P.T * Bs * P)[0] / 2)
+    negligible = 1e-12 * (1 + np.abs(slope).max())
+    kept = [t for t in sp.Add.make_args(removed) if abs(t.as_coeff_Mul()[0]) > negligible and t.free_symbols]
+    return LinearPart(B_array, K_array, center, rest + sp.Add(*kept), _interval(system))
+
+
+def _number(value: float) -> Any:
+    import sympy as sp
+
+    return sp.Integer(int(value)) if float(value).is_integer() else sp.Float(value)
+
+
+def quadratic_terms(H: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[sp.Expr, sp.Expr]:
+    """H as polynomial terms of degree 2 or less and the rest; a term that has none of them is left as it is written.
+
+    Mixed products q_i p_j stay in the rest.
+    """
+    import sympy as sp
+
+    half = len(variables) // 2
+    first = set(variables[:half])
+    quadratic, rest = [], []
+    for term in sp.Add.make_args(H):
+        expanded = sp.Add.make_args(sp.expand(term))
+        low = [t for t in expanded if _degree(t, variables) <= 2 and not (t.has(*first) and t.has(*variables[half:]))]
+        if any(_degree(t, variables) == 2 for t in low) or len(low) == len(expanded):
+            quadratic += low
+            rest += [t for t in expanded if t not in low]
+        else:
+            rest.append(term)
+    return sp.Add(*quadratic), sp.Add(*rest)
+
+
+def _degree(term: sp.Expr, variables: tuple[sp.Symbol, ...]) -> float:
+    """Total degree of a monomial; infinite for what is no monomial."""
+    if not term.free_symbols:
+        return 0
+    powers = term.as_powers_dict()
+    degree = 0
+    for base, exponent in powers.items():
+        if base in variables and exponent.is_Integer and exponent > 0:
+            degree += int(exponent)
+        elif base.free_symbols:
+            return np.inf
+    return degree
+
+
+def _turns(system: HamiltonianSystem, part: LinearPart | None) -> str | None:
+    """Why a constant K does not follow the stiff directions of V, or None.
+
+    ∇²V is taken at states of low potential, in the domain or about y0: in the valleys where orbits are. It is stiff if
+    at the median state a gap divides its curvatures; then the stiff directions must be those of K at all of them, or,
+    where there is no K, those at the first.
+    """
+    q = _positions(system)
+    if q is None or system.ndof < 2:
+        return None
+    try:
+        with np.errstate(all="ignore"):
+            hessians = np.asarray(system.potential_hessian(q))
+    except (TypeError, ValueError):  # a callable that has no Hessian: nothing can be compared
+        return None
+    hessians = hessians[np.isfinite(hessians).all((-1, -2))]
+    if len(hessians) < 2:
+        return None
+    L = np.linalg.cholesky(_inverse_mass(system))
+    curvature, directions = np.linalg.eigh(L.T @ hessians @ L)
+    order = np.argsort(-np.abs(curvature), axis=-1)
+    typical = np.median(np.abs(np.take_along_axis(curvature, order, -1)), axis=0)
+    ratios = typical[:-1] / np.maximum(typical[1:], 1e-12 * typical[0])
+    m = int(np.argmax(ratios)) + 1
+    if not ratios[m - 1] > GAP:
+        return None
+    stiff = np.take_along_axis(directions, order[:, None, :m], -1)
+    if part is None:
+        reference, whose = stiff[0], "at another state of the domain"
+    else:
+        eigenvalues, W = np.linalg.eigh(L.T @ part.stiffness_matrix @ L)
+        reference, whose = W[:, np.argsort(-np.abs(eigenvalues))[:m]], "in the quadratic terms"
+    cosines = np.linalg.svd(reference.T @ stiff, compute_uv=False)[:, -1]
+    angle = float(np.arccos(np.clip(np.quantile(cosines, 0.1), 0.0, 1.0)))
+    if angle <= TURN:
+        return None
+    return (
+        f"its stiff directions turn, by {np.degrees(angle):.0f}° from those {whose}, so no constant matrix K follows "
+        "them. Write it in coordinates in which they do not turn, such as polar ones"
+    )
+
+
+def _positions(system: HamiltonianSystem) -> np.ndarray | None:
+    if system.domain is not None:
+        q = system.domain.sample(DRAWN, 0)[:, : system.ndof]
+    elif system.y0 is not None:
+        center = system.y0[: system.ndof]
+        spread = 0.5 * max(float(np.linalg.norm(center)), 1e-3) / np.sqrt(system.ndof)
+        q = center + spread * np.random.default_rng(0).standard_normal((DRAWN, system.ndof))
+    else:
+        return None
+    with np.errstate(all="ignore"):
+        V = np.asarray(system.potential(q))
+    return q[np.argsort(np.where(np.isfinite(V), V, np.inf))[:SAMPLES]]
