@@ -13,6 +13,7 @@ _HOME = {
     "Ball": "domain",
     "Box": "domain",
     "EnergySublevel": "domain",
+    "Tube": "tube",
     "solve": "solver",
     "Solution": "solution",
     "get": "integrators.registry",
@@ -65,6 +66,7 @@ if TYPE_CHECKING:
     from sympflow.solver import solve as solve
     from sympflow.system import HamiltonianSystem as HamiltonianSystem
     from sympflow.training.trainer import train as train
+    from sympflow.tube import Tube as Tube
 
 
 def __getattr__(name: str) -> Any:

@@ -128,7 +128,9 @@ class Box:
 class EnergySublevel:
     """The states of a box whose energy is below a bound: {x ∈ box : H(x) < energy}.
 
-    The box picks the component: inside its box, the Hénon–Heiles set H < 1/6 is the bounded well only.
+    The box picks the component: inside its box, the Hénon–Heiles set H < 1/6 is the bounded well only. Two more bounds
+    make it a shell that the exact flow does not leave: a lower bound of the energy, and, for motion in a plane under a
+    central force, bounds of the angular momentum.
 
     Parameters
     ----------
@@ -138,29 +140,57 @@ class EnergySublevel:
         Must contain the component that is meant.
     hamiltonian : callable, optional
         H(x), x of shape (..., 2d). A `HamiltonianSystem` fills it in with its own.
+    above : float, optional
+        Lower bound of the energy.
+    angular_momentum : (float, float), optional
+        Bounds of |q₁p₂ − q₂p₁|; only for d = 2.
     """
 
     energy: float
     box: Box
     hamiltonian: Callable[[Array], Array] | None = field(default=None, repr=False, compare=False)
+    above: float | None = None
+    angular_momentum: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.energy):
             raise ValueError(f"`energy` must be finite; got {self.energy!r}.")
         if not isinstance(self.box, Box):
             raise TypeError(f"`box` must be a Box; got {type(self.box).__name__}.")
+        if self.above is not None and not self.above < self.energy:
+            raise ValueError(f"`above` must be below `energy`; got {self.above!r} and {self.energy!r}.")
+        if self.angular_momentum is None:
+            return
+        if np.size(self.box.low) != 4:
+            raise ValueError("`angular_momentum` only bounds motion in a plane, d = 2: leave it out.")
+        try:
+            low, high = (float(bound) for bound in self.angular_momentum)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"`angular_momentum` must be two numbers; got {self.angular_momentum!r}.") from error
+        if not 0 <= low < high:
+            raise ValueError(f"`angular_momentum` must be 0 ≤ low < high; got {self.angular_momentum!r}.")
+        object.__setattr__(self, "angular_momentum", (low, high))
 
     def attach(self, hamiltonian: Callable[[Array], Array]) -> EnergySublevel:
         """The same domain with the H of a system."""
         return replace(self, hamiltonian=hamiltonian)
 
-    def _energy(self, x: np.ndarray) -> np.ndarray:
+    def _within(self, x: np.ndarray, slack: float) -> np.ndarray:
+        """Whether the energy, and the angular momentum if it is bounded, are within their bounds."""
         if self.hamiltonian is None:
             raise ValueError(
                 "`hamiltonian` is not known to this EnergySublevel: pass the domain to a HamiltonianSystem, "
                 "or give it hamiltonian=."
             )
-        return to_numpy(self.hamiltonian(x))
+        H = to_numpy(self.hamiltonian(x))
+        inside = self.energy + slack > H
+        if self.above is not None:
+            inside = inside & (self.above - slack < H)
+        if self.angular_momentum is not None:
+            low, high = self.angular_momentum
+            L = abs(x[..., 0] * x[..., 3] - x[..., 1] * x[..., 2])
+            inside = inside & (low <= L) & (high >= L)
+        return inside
 
     def sample(self, n: int, seed: int = 0) -> np.ndarray:
         _sample_count(n)
@@ -171,7 +201,7 @@ class EnergySublevel:
         while found < n:
             x = rng.uniform(low, high, (max(4 * n, 1024), low.size))
             with np.errstate(all="ignore"):
-                x = x[self._energy(x) < self.energy]
+                x = x[self._within(x, 0.0)]
             accepted.append(x)
             found += len(x)
             drawn += max(4 * n, 1024)
@@ -185,14 +215,16 @@ class EnergySublevel:
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
         x = _states(x, np.size(self.box.low))
         with np.errstate(all="ignore"):
-            below = self._energy(x) < self.energy + slack
+            within = self._within(x, slack)
         low, high = np.asarray(self.box.low), np.asarray(self.box.high)
         # the box grows by the relative size of the slack, so that a state on its face does not leave by rounding
         margin = (high - low) * slack / max(abs(self.energy), 1e-300)
-        return below & ((x >= low - margin) & (x <= high + margin)).all(-1)
+        return within & ((x >= low - margin) & (x <= high + margin)).all(-1)
 
     def to_dict(self) -> dict[str, Any]:
-        return {"kind": "EnergySublevel", "energy": self.energy, "box": self.box.to_dict()}
+        description = {"kind": "EnergySublevel", "energy": self.energy, "box": self.box.to_dict()}
+        more = {"above": self.above, "angular_momentum": self.angular_momentum}
+        return description | {name: bound for name, bound in more.items() if bound is not None}
 
 
 def domain_from_dict(description: dict[str, Any]) -> Domain:
@@ -215,15 +247,20 @@ def domain_from_dict(description: dict[str, Any]) -> Domain:
                 if not isinstance(box, Box):
                     raise ValueError(f"the box of an EnergySublevel is a {type(box).__name__}")
                 return EnergySublevel(box=box, **_numbers(fields))
+            case "Tube":
+                from sympflow.tube import Tube
+
+                return Tube(**_numbers(fields))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"`description` is not a domain: {error}.") from error
     raise ValueError(f"`description` is of an unknown kind of domain: {description['kind']!r}.")
 
 
 def _numbers(fields: dict[str, Any]) -> dict[str, Any]:
-    """`fields`, checked to be numbers and lists of numbers."""
+    """`fields`, checked to be numbers, lists of numbers, and lists of such lists."""
     for name, value in fields.items():
-        for v in value if isinstance(value, list | tuple) else (value,):
+        rows = value if isinstance(value, list | tuple) else (value,)
+        for v in (v for row in rows for v in (row if isinstance(row, list | tuple) else (row,))):
             if isinstance(v, bool) or not isinstance(v, int | float):
                 raise TypeError(f"{name} {value!r} is not made of numbers")
     return fields

@@ -1,17 +1,23 @@
 """Domains: seeded uniform samples inside, and membership."""
 
+import json
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sympflow import Ball, Box, EnergySublevel, systems
+from sympflow import Ball, Box, EnergySublevel, HamiltonianSystem, Tube, systems
 from sympflow.domain import domain_from_dict
 
 
 def kinetic_plus_square(x):
     return (x**2).sum(-1) / 2
 
+
+angle = np.linspace(0, 2 * np.pi, 65)
+CIRCLE = np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 DOMAINS = [
     Ball([0.5, -1.0, 0, 0], 2.0),
@@ -20,6 +26,10 @@ DOMAINS = [
     systems.henon_heiles().domain,
     systems.pendulum().domain,
     systems.harmonic_oscillator(100).domain,
+    systems.kepler().domain,
+    systems.kepler(0.999).domain,
+    Tube(CIRCLE, 0.1),
+    Tube(np.hstack([CIRCLE, 100 * CIRCLE]), [0.1, 0.2, 30.0, 10.0], groups=[[0, 2], [1, 3]]),
 ]
 
 
@@ -34,7 +44,10 @@ def test_samples_lie_inside_and_depend_on_the_seed_only(domain, seed, n):
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=lambda d: type(d).__name__)
 def test_description_round_trip(domain):
-    assert domain_from_dict(domain.to_dict()) == domain
+    """Through JSON, in which a flow's file keeps it."""
+    same = domain_from_dict(json.loads(json.dumps(domain.to_dict())))
+    assert same == domain
+    assert hash(same) == hash(domain)
 
 
 def test_ball_samples_are_uniform_in_radius():
@@ -50,6 +63,67 @@ def test_henon_heiles_well_is_the_bounded_component():
     assert (q2 > -0.5).all()
     assert (np.sqrt(3) * np.abs(q1) < 1 - q2).all()
     assert not domain.contains(np.array([0.0, 1.5, 0.0, 0.0]))  # H < 1/6 there too, but outside the well
+
+
+def test_the_tube_around_a_circle_is_an_annulus():
+    tube = Tube(CIRCLE, 0.1)
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1.3, 1.3, (5000, 2))
+    distance = abs(np.linalg.norm(x, axis=1) - 1)
+    sagitta = 1 - np.cos(np.pi / 64)  # how far the broken line is from the circle
+    assert tube.contains(x[distance < 0.1 - sagitta]).all()
+    assert not tube.contains(x[distance > 0.1 + sagitta]).any()
+    assert tube.contains(x.reshape(50, 100, 2)).shape == (50, 100)
+    assert not tube.contains([np.nan, 0.0])
+
+
+def test_a_tube_has_its_radius_in_each_coordinate():
+    tube = Tube([[0.0, 0.0], [1.0, 0.0]], [0.5, 2.0])
+    assert tube.contains([[-0.49, 0.0], [0.5, 1.99], [1.49, 0.0]]).all()
+    assert not tube.contains([[-0.51, 0.0], [0.5, 2.01], [1.51, 0.0]]).any()
+
+
+def test_the_groups_of_a_tube_have_times_of_their_own():
+    """Two bodies on the circle in step; in groups, at any two places of it."""
+    orbit = np.hstack([CIRCLE, CIRCLE])
+    opposite = np.array([1.0, 0.0, -1.0, 0.0])
+    assert not Tube(orbit, 0.1).contains(opposite)
+    groups = Tube(orbit, 0.1, groups=[[0, 1], [2, 3]])
+    assert groups.contains(opposite)
+    x = groups.sample(4000, 0)
+    phase = np.arctan2(x[:, [1, 3]], x[:, [0, 2]])
+    # independent and uniform: cos of the difference has mean 0 and variance 1/2
+    assert abs(np.cos(phase[:, 0] - phase[:, 1]).mean()) < 5 / math.sqrt(2 * 4000)
+
+
+def test_tube_samples_are_uniform_about_the_orbit():
+    """About a segment, far from its ends: uniform in the disc of the section times the segment."""
+    x = Tube([[0.0, 0.0], [1000.0, 0.0]], 1.0).sample(20_000, 0)
+    assert abs(x[:, 0].mean() - 500) < 5 * 1000 / math.sqrt(12 * 20_000)
+    assert abs((x[:, 1] ** 2).mean() - 1 / 4) < 5 / math.sqrt(20_000)  # of a disc: E y² = 1/4
+
+
+def test_a_tube_takes_a_solution_and_serves_a_system():
+    from sympflow import solve
+
+    sol = solve(systems.henon_heiles(), "verlet", (0, 10))
+    tube = Tube(sol.states, 0.01)
+    system = HamiltonianSystem.from_sympy(systems.henon_heiles().symbols.H, domain=tube)
+    assert system.domain.contains(sol.states).all()
+    assert "201 states" in repr(tube)
+
+
+def test_a_shell_is_what_its_bounds_say():
+    shell = systems.kepler().domain
+    q, p = np.split(shell.sample(500, 3), 2, axis=1)
+    E = (p**2).sum(1) / 2 - 1 / np.linalg.norm(q, axis=1)
+    L = abs(q[:, 0] * p[:, 1] - q[:, 1] * p[:, 0])
+    a, e = -1 / (2 * E), np.sqrt(1 + 2 * E * L**2)
+    assert 0.95 < a.min() < a.max() < 1.05
+    assert 0.45 < e.min() < e.max() < 0.67
+    angle = np.arctan2(q[:, 1], q[:, 0])
+    assert abs(np.exp(1j * angle).mean()) < 5 / math.sqrt(2 * 500)
+    assert not shell.contains([1.0, 0.0, 0.0, 1.0])  # a circle: too much angular momentum
 
 
 def test_energy_slack_widens_an_energy_domain():
@@ -86,6 +160,20 @@ def test_what_are_not_states_of_the_domain_is_refused(domain):
             lambda: EnergySublevel(-1.0, Box([0.0, 0.0], [1.0, 1.0]), kinetic_plus_square).sample(1),
             "^`box` holds almost no state",
         ),
+        (lambda: EnergySublevel(1.0, Box([0.0] * 4, [1.0] * 4), above=2.0), "^`above` must be below `energy`"),
+        (lambda: EnergySublevel(1.0, Box([0.0, 0.0], [1.0, 1.0]), angular_momentum=(0, 1)), "^`angular_momentum` only"),
+        (
+            lambda: EnergySublevel(1.0, Box([0.0] * 4, [1.0] * 4), angular_momentum=(2, 1)),
+            "^`angular_momentum` must be",
+        ),
+        (lambda: EnergySublevel(1.0, Box([0.0] * 4, [1.0] * 4), angular_momentum=3), "^`angular_momentum` must be two"),
+        (lambda: Tube([[0.0, 1.0]], 1.0), r"^`orbit` must have shape \(n, 2d\)"),
+        (lambda: Tube([0.0, 1.0], 1.0), r"^`orbit` must have shape"),
+        (lambda: Tube([[0.0, 1.0], [0.0, np.nan]], 1.0), "^`orbit` must be finite"),
+        (lambda: Tube(CIRCLE, [1.0] * 3), "^`radius` must be a number or have shape"),
+        (lambda: Tube(CIRCLE, [1.0, 0.0]), "^`radius` must be positive"),
+        (lambda: Tube(CIRCLE, 1.0, groups=[[0], [0, 1]]), "^`groups` must hold each"),
+        (lambda: domain_from_dict({"kind": "Tube", "orbit": "a", "radius": 1}), "^`description` is not a domain"),
         (lambda: domain_from_dict({"kind": "Torus"}), "^`description` is of an unknown kind"),
         (lambda: domain_from_dict({"kind": "Ball", "radius": 1}), "^`description` is not a domain"),
     ],

@@ -61,6 +61,11 @@ def scenes(words: Sequence[str]) -> list[Scene]:
     return found
 
 
+def shown(value: Any) -> str:
+    """A parameter's value as it is written on a command line."""
+    return value if isinstance(value, str) else f"{value:g}"
+
+
 def one_scene(words: Sequence[str]) -> Scene:
     """The scene of a command that takes one system."""
     found = scenes(words)
@@ -75,10 +80,10 @@ def interval(scene: Scene, t_end: float | None) -> tuple[float, float]:
     return start, scene.t_end if scene.t_end is not None else t_end if t_end is not None else end
 
 
-def _split(words: Sequence[str]) -> tuple[list[str], dict[str, float]]:
+def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
     """Names, and the parameters given as --name value or --name=value."""
     names: list[str] = []
-    shared: dict[str, float] = {}
+    shared: dict[str, str] = {}
     rest = list(words)
     while rest:
         word = rest.pop(0)
@@ -90,7 +95,7 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, float]]:
             if not rest:
                 raise ValueError(f"`--{name}` is no option, or lacks its value: see --help.")
             value = rest.pop(0)
-        shared[name] = _float(f"--{name}", value)
+        shared[name] = value
     return names, shared
 
 
@@ -99,22 +104,25 @@ def _key(word: str) -> str:
     return word.partition(":")[0].replace("_", "-")
 
 
-def _scene(word: str, shared: dict[str, float]) -> Scene:
+def _scene(word: str, shared: dict[str, str]) -> Scene:
     _, *pairs = word.split(":")
     name = _key(word)
     if name not in SCENES:
         close = difflib.get_close_matches(name, SCENES, n=1)
         hint = f"Did you mean {close[0]!r}? " if close else ""
         raise ValueError(f"`system` {name!r} is unknown. {hint}Choose from {', '.join(SCENES)}.")
-    own = {key: _float(key, value) for key, value in _pairs(pairs)}
-    t_end = own.pop("t_end", None)
-    unknown = [key for key in own if key not in parameters(name)]
+    own = dict(_pairs(pairs))
+    t_end = _float("t_end", own.pop("t_end")) if "t_end" in own else None
+    known = parameters(name)
+    unknown = [key for key in own if key not in known]
     if unknown:
-        raise ValueError(
-            f"`{unknown[0]}` is not a parameter of {name}, which takes {', '.join((*parameters(name), 't_end'))}."
-        )
-    params = {**{key: value for key, value in shared.items() if key in parameters(name)}, **own}
-    key = "-".join([name, *(f"{k}={v:g}" for k, v in params.items())])
+        raise ValueError(f"`{unknown[0]}` is not a parameter of {name}, which takes {', '.join((*known, 't_end'))}.")
+    asked = {f"--{key}": value for key, value in shared.items() if key in known and key not in own} | own
+    params = {
+        key.lstrip("-"): value if isinstance(known[key.lstrip("-")], str) else _float(key, value)
+        for key, value in asked.items()
+    }
+    key = "-".join([name, *(f"{k}={shown(v)}" for k, v in params.items())])
     return Scene(key, SCENES[name](**params), t_end)
 
 

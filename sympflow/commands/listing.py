@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import textwrap
 
-from sympflow.commands.arguments import SCENES, parameters
+from sympflow.commands.arguments import SCENES, parameters, shown
 from sympflow.commands.output import print_table, reporting
 
 
@@ -23,8 +24,8 @@ def systems() -> None:
             rows.append(
                 (
                     name,
-                    str(system.symbols.H) if system.symbols else "",
-                    ", ".join(f"{k} = {v:g}" for k, v in parameters(name).items()) or "–",
+                    textwrap.shorten(str(system.symbols.H), 72, placeholder=" …") if system.symbols else "",
+                    ", ".join(f"{k} = {shown(v)}" for k, v in parameters(name).items()) or "–",
                     f"{system.t_span[0]:g} … {system.t_span[1]:g}",
                     f"{system.dt:g}",
                     ", ".join(flows) or "–",
