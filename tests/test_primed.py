@@ -46,6 +46,9 @@ FLOWS = {
     "from a force-gradient scheme": lambda: random_flow(MASSES, scheme="omelyan4"),
     "without force gradient": lambda: random_flow(MASSES, scheme="blanes_moan4", force_gradient=False),
     "kinetic energy not quadratic": lambda: random_flow(RELATIVISTIC, scheme="mclachlan4", palindromic=False),
+    "processed": lambda: random_flow(HH, stages=2, processor=2, degree=4),
+    "processed, kick first": lambda: random_flow(MASSES, scheme="verlet", processor=1, palindromic=False),
+    "processed, no gradients": lambda: random_flow(RELATIVISTIC, scheme="mclachlan4", palindromic=False, processor=3),
     "another dt": lambda: random_flow(HH, stages=2, dt=0.3, degree=1),
 }
 
@@ -53,6 +56,10 @@ FLOWS = {
 @pytest.fixture(params=FLOWS.values(), ids=FLOWS.keys())
 def flow(request):
     return request.param()
+
+
+def processed(stages=2, processor=2, **options):
+    return random_flow(HH, stages=stages, processor=processor, **options)
 
 
 @pytest.mark.parametrize("name", SCHEMES)
@@ -122,6 +129,91 @@ def test_palindromes_halve_the_parameters():
     full, half = SympFlow.primed(HH, 6, degree=5, palindromic=False), SympFlow.primed(HH, 6, degree=5)
     assert full.n_parameters == 5 * (6 + 7 + 6) - 2
     assert half.n_parameters == 3 * (3 + 4 + 3) - 2
+
+
+# processed ----------------------------------------------------------------------------------------------------
+
+
+def test_a_processed_flow_is_its_kernel_in_other_coordinates():
+    flow, x = processed(), states(HH)
+    t = torch.linspace(0.0, 1.0, len(x), dtype=torch.float64)
+    y = flow.finish(t, flow.kernel_step(t, flow.prepare(t, x)))
+    torch.testing.assert_close(flow.psi(t, x), y, rtol=0, atol=16 * EPS)
+    torch.testing.assert_close(flow.prepare(t, flow.finish(t, x)), x, rtol=0, atol=64 * EPS)
+    back = flow.finish(t, flow.kernel_step(t, flow.prepare(t, y), back=True))
+    torch.testing.assert_close(back, x, rtol=0, atol=256 * EPS)
+
+
+def test_a_processor_begins_with_the_square_of_t():
+    """χ_t = identity + O(t²), so that 𝓗 at t = 0 is the system's, and for a palindrome χ is even in t."""
+    flow, x = processed(size=0.2), states(HH)
+    small, half = ((flow.finish(t, x) - x).norm() for t in (1e-4, 5e-5))
+    assert small / half == pytest.approx(4.0, rel=1e-2)
+    torch.testing.assert_close(flow.finish(-0.5, x), flow.finish(0.5, x), rtol=0, atol=16 * EPS)
+    torch.testing.assert_close(flow.psi(-0.5, flow.psi(0.5, x)), x, rtol=0, atol=256 * EPS)
+
+
+def test_untrained_the_processor_is_the_identity():
+    x = states(HH)
+    with_it, without = SympFlow.primed(HH, 3, processor=4), SympFlow.primed(HH, 3)
+    assert torch.equal(with_it(1.0, x), without(1.0, x))
+    assert with_it.n_parameters == without.n_parameters + (4 + 5 + 4) * 3
+
+
+def test_tables_of_a_processed_flow():
+    flow, y = processed(), HH.domain.sample(3, 0)
+    kernel, chi = flow.kernel_scheme(0.7), flow.processor_scheme(0.7)
+    assert (kernel.force_evaluations, chi.force_evaluations, flow.scheme(0.7).force_evaluations) == (2, 2, 6)
+    assert kernel.symmetric
+    from sympflow.kernels.splitting import splitting_kernel
+
+    loops, out = splitting_kernel(HH), y
+    for scheme in (chi.inverse(), kernel, chi):
+        out = loops.step(scheme, 0.7, out)
+    np.testing.assert_allclose(loops.step(flow.scheme(0.7), 0.7, y), out, atol=64 * EPS)
+    with pytest.raises(ValueError, match="^`flow` has no processor"):
+        SympFlow.primed(HH, 2).processor_scheme()
+
+
+@pytest.mark.parametrize("backend", ["compiled", "array"])
+def test_a_run_executes_the_processor_once_for_each_output(backend):
+    """10 steps of 2 kicks, 2 kicks for χ⁻¹ at the start and 2 for χ at each output, 6 for a fractional step."""
+    flow = processed()
+    for outputs, expected in (([10.0], 24), ([5.0, 10.0], 26), ([0.0, 0.5, 10.0], 30)):
+        stats = solve(HH, flow, (0.0, 10.0), t_eval=outputs, backend=backend).stats
+        assert (stats["force_evaluations"], stats["hessian_evaluations"]) == (expected, expected)
+
+
+def test_outputs_of_a_processed_flow_change_nothing():
+    flow, span = processed(), (0.0, 40.0)
+    few, many = (solve(HH, flow, span, t_eval=t).y[:, -1] for t in ([40.0], np.linspace(*span, 81)))
+    np.testing.assert_array_equal(few, many)
+    every = solve(HH, flow, span)
+    np.testing.assert_array_equal(every.y[:, 0], HH.y0)
+    np.testing.assert_allclose(every.y[:, -1], few, atol=1e-13)
+
+
+@pytest.mark.parametrize("backend", ["compiled", "array"])
+def test_events_and_dense_output_of_a_processed_flow(backend):
+    flow = processed(size=0.01)
+
+    def crossing(t, y):
+        return y[0]
+
+    sol = solve(HH, flow, (0.0, 20.0), events=crossing, dense_output=True, backend=backend)
+    assert len(sol.t_events[0]) > 3
+    for t, y in zip(sol.t_events[0], sol.y_events[0], strict=True):
+        np.testing.assert_allclose(flow(float(t), torch.tensor(HH.y0)).numpy(), y, atol=1e-11)
+        np.testing.assert_allclose(sol.sol(t), y, atol=1e-11)
+        assert abs(y[0]) < 1e-9
+
+
+def test_gradients_flow_through_a_processed_run():
+    flow = processed(size=0.02)
+    y0 = torch.tensor(HH.y0, requires_grad=True)
+    solve(HH, flow, (0.0, 3.5), y0=y0, t_eval=[3.5]).y.sum().backward()
+    expected = torch.func.grad(lambda y: flow(3.5, y).sum())(torch.tensor(HH.y0))
+    torch.testing.assert_close(y0.grad, expected, rtol=0, atol=1e-11)
 
 
 # frozen, it is a scheme: the compiled loops ---------------------------------------------------------------------
@@ -203,6 +295,9 @@ def test_another_system_is_refused(tmp_path):
     [
         {"maps": 10**9},
         {"maps": 4},
+        {"processor": -1},
+        {"processor": True},
+        {"processor": 1},
         {"degree": 10**6},
         {"degree": True},
         {"first": "jump"},
@@ -262,6 +357,8 @@ def test_it_trains_like_any_sympflow():
         ({"degree": 0}, r"^`degree` must be a positive integer"),
         ({"scheme": "chin4a", "force_gradient": False}, r"^`force_gradient` is False but 'chin4a'"),
         ({"dt": -1.0}, r"^`dt` must be a positive"),
+        ({"processor": -1}, r"^`processor` must be a non-negative integer"),
+        ({"processor": 2, "degree": 1}, r"^`degree` must be at least 2"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):

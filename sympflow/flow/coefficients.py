@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ class Coefficients(nn.Module):
     ----------
     n : int
     exponents : tuple of int
-        e_k ≥ 0, the first of them 0.
+        e_k ≥ 0, the first of them 0 where there is a `total`.
     dt : float
         Δt.
     power : int
@@ -81,9 +82,10 @@ class Coefficients(nn.Module):
         """Take the free c_ik from a table (n, K)."""
         self.free.copy_(torch.as_tensor([float(table[i, k]) for i, k in self._free]))
 
-    def at(self, tau: float) -> np.ndarray:
-        """c_i(τ): (n,)."""
-        return self.table.detach().cpu().double().numpy() @ tau ** np.array(self.exponents, dtype=float)
+    def at(self, tau: float | np.ndarray) -> np.ndarray:
+        """c_i(τ): (n,), or (n, N) for N values of τ."""
+        exponents = np.array(self.exponents, dtype=float).reshape(-1, *[1] * np.ndim(tau))
+        return self.table.detach().cpu().double().numpy() @ np.asarray(tau) ** exponents
 
     def value(self, i: int, t: Time) -> Time:
         """t^m c_i(t/Δt)."""
@@ -96,3 +98,19 @@ class Coefficients(nn.Module):
         c = self.offset[i] + self.basis[i] @ self.free
         tau, m = t / self.dt, self.power
         return t ** (m - 1) * sum((m + e) * c_k * tau**e for c_k, e in zip(c, self.exponents, strict=True))
+
+
+@dataclass(frozen=True)
+class Entry:
+    """± t^m c_i(t/Δt): the place of one c_i in a flow, with its sign."""
+
+    column: Coefficients
+    row: int
+    sign: int = 1
+
+    def value(self, t: Time) -> Time:
+        return self.sign * self.column.value(self.row, t)
+
+    def rate(self, t: Time) -> Time:
+        """Its time derivative."""
+        return self.sign * self.column.rate(self.row, t)

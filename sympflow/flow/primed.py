@@ -4,17 +4,24 @@
 
 Frozen at any t such a flow is a splitting scheme, kicks b, force gradients γ and drifts a in the convention of
 `sympflow.integrators.schemes`: a SympFlow of this kind is a table of numbers that varies smoothly with t.
+
+With a processor it is ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹, the kernel K and the processor χ being such tables: over many steps
+of Δt only K is executed, as the χ between two steps cancel.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from sympflow.flow.base import FlowMap
-from sympflow.flow.coefficients import Coefficients
+from sympflow.flow.coefficients import Coefficients, Entry
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.placement import checked_device, checked_dtype
 from sympflow.flow.primed_potentials import FORCE_GRADIENT, KINETIC, POTENTIAL, Binding, PrimedPotential, Term
@@ -22,24 +29,34 @@ from sympflow.flow.sympflow import SympFlow
 from sympflow.integrators.schemes import SCHEMES, Scheme, compose
 
 if TYPE_CHECKING:
+    from sympflow.flow.potentials import Time
     from sympflow.system import HamiltonianSystem
 
 Kind = Literal["kick", "drift"]
 
 
+@dataclass(frozen=True)
+class Substep:
+    """A kick or a drift of the flow: its coefficient, and for a kick that of its force gradient."""
+
+    kind: Kind
+    weight: Entry
+    gradient: Entry | None = None
+
+
 class PrimedFlow(SympFlow):
     """A SympFlow of kicks and drifts, in turn, that are primed with V and T; made by `SympFlow.primed`.
 
-    A palindromic one has even polynomials b, γ, a and reads the same backwards, so that it is time-reversible:
-    continued to negative t by its formulas, ψ̄_{−t} = (ψ̄_t)⁻¹.
+    A palindromic one has a kernel of even polynomials b, γ, a that reads the same backwards, and a processor χ that is
+    even in t: continued to negative t by its formulas, ψ̄_{−t} = (ψ̄_t)⁻¹. Without a processor it is time-reversible.
 
     Parameters
     ----------
     ndof : int
     first : {"kick", "drift"}
-        The map that comes first.
+        The map that comes first, in the kernel and in the processor.
     maps : int
-        How many kicks and drifts there are together.
+        How many kicks and drifts the kernel has.
     degree : int
         Degree in t of t b(t/Δt) and t a(t/Δt).
     palindromic, force_gradient : bool
@@ -47,15 +64,21 @@ class PrimedFlow(SympFlow):
         Δt.
     system : HamiltonianSystem, optional
         Without it the flow has a `scheme`, but no values.
+    processor : int
+        Number C of pairs of χ, 2C + 1 maps; 0 for none.
     dtype, device
         Of the parameters.
 
     Attributes
     ----------
     kicks, drifts : Coefficients
-        b and a.
+        b and a of the kernel.
     gradients : Coefficients or None
         γ, one for each kick.
+    processor_kicks, processor_drifts, processor_gradients : Coefficients or None
+        Those of χ.
+    substeps : tuple of Substep
+        What is executed, in this order: χ⁻¹, K, χ.
     """
 
     def __init__(
@@ -68,36 +91,65 @@ class PrimedFlow(SympFlow):
         force_gradient: bool,
         dt: float = 1.0,
         system: HamiltonianSystem | None = None,
+        processor: int = 0,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
         FlowMap.__init__(self, ndof, dt)
-        for name, value in (("maps", maps), ("degree", degree)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
+        for name, value, least in (("maps", maps, 1), ("degree", degree, 1), ("processor", processor, 0)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                kind = "positive" if least else "non-negative"
+                raise ValueError(f"`{name}` must be a {kind} integer; got {value!r}.")
         if maps < 2 or (palindromic and maps % 2 == 0):
             raise ValueError(f"`maps` must be at least 2, and odd for a palindrome; got {maps}: add a kick or a drift.")
-        other: Kind = "drift" if first == "kick" else "kick"
-        self.sequence: tuple[Kind, ...] = tuple(first if i % 2 == 0 else other for i in range(maps))
-        self.degree, self.palindromic = degree, palindromic
-        exponents = tuple(range(0, degree, 2 if palindromic else 1))
+        if processor and degree < 2:
+            raise ValueError(
+                f"`degree` must be at least 2 with a processor, whose lowest power of t is t²; got {degree}."
+            )
+        self.degree, self.palindromic, self.processor = degree, palindromic, processor
+        stride = 2 if palindromic else 1
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
-        n_kicks, n_drifts = self.sequence.count("kick"), self.sequence.count("drift")
-        self.kicks = Coefficients(n_kicks, exponents, self.dt, 1, palindromic, 1.0, **like)
-        self.drifts = Coefficients(n_drifts, exponents, self.dt, 1, palindromic, 1.0, **like)
-        self.gradients = Coefficients(n_kicks, exponents, self.dt, 3, palindromic, **like) if force_gradient else None
+        kernel, chi = _alternating(first, maps), _alternating(first, 2 * processor + 1 if processor else 0)
+
+        def columns(sequence: Sequence[Kind], start: int, mirrored: bool, total: float | None) -> list[Any]:
+            exponents = tuple(range(start, degree, stride))
+            n = [sequence.count(kind) for kind in ("kick", "drift", "kick")]
+            made: list[Any] = [
+                Coefficients(n[i], exponents, self.dt, power, mirrored, total if power == 1 else None, **like)
+                for i, power in enumerate((1, 1, 3))
+            ]
+            return made if force_gradient else [*made[:2], None]
+
+        self.kicks, self.drifts, self.gradients = columns(kernel, 0, palindromic, 1.0)
+        none = (None, None, None)
+        # From t² on: what is of first order in t would have to vanish at small t, and even powers keep the symmetry.
+        self.processor_kicks, self.processor_drifts, self.processor_gradients = (
+            columns(chi, 1, False, None) if processor else none
+        )
+        inner = _substeps(kernel, self.kicks, self.drifts, self.gradients, 1)
+        outer = {
+            sign: _substeps(chi, self.processor_kicks, self.processor_drifts, self.processor_gradients, sign)
+            for sign in (1, -1)
+        }
+        self.substeps: tuple[Substep, ...] = (*reversed(outer[-1]), *inner, *outer[1])
+        self._n_outer = len(chi)
         self._binding = Binding(system)
-        # A tuple, not a ModuleList: the layers own no parameters, they share the three columns.
-        self.layers = tuple(self._layer(kind, i // 2) for i, kind in enumerate(self.sequence))  # type: ignore[assignment]
+        # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
+        self.layers = tuple(self._layer(substep) for substep in self.substeps)  # type: ignore[assignment]
         if system is not None:
             self.fingerprint, self.system_name = system.fingerprint, system.name
 
-    def _layer(self, kind: Kind, i: int) -> Kick | Drift:
-        if kind == "drift":
-            return Drift(PrimedPotential(self.ndof, self._binding, [(KINETIC, self.drifts, i)]))
-        terms: list[tuple[Term, Coefficients, int]] = [(POTENTIAL, self.kicks, i)]
-        if self.gradients is not None:
-            terms.append((FORCE_GRADIENT, self.gradients, i))
+    @cached_property
+    def sequence(self) -> tuple[Kind, ...]:
+        """The kinds of the substeps."""
+        return tuple(substep.kind for substep in self.substeps)
+
+    def _layer(self, substep: Substep) -> Kick | Drift:
+        if substep.kind == "drift":
+            return Drift(PrimedPotential(self.ndof, self._binding, [(KINETIC, substep.weight)]))
+        terms: list[tuple[Term, Entry]] = [(POTENTIAL, substep.weight)]
+        if substep.gradient is not None:
+            terms.append((FORCE_GRADIENT, substep.gradient))
         return Kick(PrimedPotential(self.ndof, self._binding, terms))
 
     @classmethod
@@ -109,17 +161,19 @@ class PrimedFlow(SympFlow):
         degree: int,
         palindromic: bool,
         force_gradient: bool,
+        processor: int = 0,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> PrimedFlow:
-        """The flow that is, at every t, the given scheme."""
+        """The flow that is, at every t, the given scheme; its processor is the identity."""
         if palindromic and not scheme.symmetric:
             raise ValueError(f"`scheme` {scheme.name!r} is not symmetric: take another, or palindromic=False.")
         if any(scheme.gradients) and not force_gradient:
             raise ValueError(f"`force_gradient` is False but {scheme.name!r} has force gradients: leave it out.")
         substeps = scheme.substeps
         first: Kind = "kick" if substeps[0][0] == "kick" else "drift"
-        flow = cls(system.ndof, first, len(substeps), degree, palindromic, force_gradient, dt, system, dtype, device)
+        shape = (degree, palindromic, force_gradient, dt, system, processor, dtype, device)
+        flow = cls(system.ndof, first, len(substeps), *shape)
         for column, kind, entry in ((flow.kicks, "kick", 1), (flow.drifts, "drift", 1), (flow.gradients, "kick", 2)):
             if column is not None:
                 table = np.zeros(tuple(column.offset.shape))
@@ -127,25 +181,71 @@ class PrimedFlow(SympFlow):
                 column.set(table)
         return flow
 
-    # the frozen table ---------------------------------------------------------------------------------------
+    # the frozen tables --------------------------------------------------------------------------------------
 
     def scheme(self, t: float | None = None) -> Scheme:
         """ψ̄_t as a splitting scheme of step t, for t ∈ (0, Δt]; the default is Δt.
 
         Its coefficients depend on t, and so it has no classical order.
         """
+        return self._frozen("primed", self.substeps, t)
+
+    def kernel_scheme(self, t: float | None = None) -> Scheme:
+        """K_t, likewise: ψ̄_t where there is no processor."""
+        return self._frozen("primed kernel", self.substeps[self._n_outer : len(self.substeps) - self._n_outer], t)
+
+    def processor_scheme(self, t: float | None = None) -> Scheme:
+        """χ_t, likewise."""
+        if not self.processor:
+            raise ValueError("`flow` has no processor: see its `scheme`.")
+        return self._frozen("primed processor", self.substeps[-self._n_outer :], t)
+
+    def _frozen(self, name: str, substeps: Iterable[Substep], t: float | None) -> Scheme:
         t = self.dt if t is None else float(t)
         if not 0 < t <= self.dt * (1 + 1e-12):
             raise ValueError(f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t!r}.")
-        tau = t / self.dt
-        kicks, drifts = self.kicks.at(tau).tolist(), self.drifts.at(tau).tolist()
-        gradients = [0.0] * len(kicks) if self.gradients is None else self.gradients.at(tau).tolist()
-        if self.sequence[0] == "drift":
-            kicks, gradients = [0.0, *kicks], [0.0, *gradients]
-        if self.sequence[-1] == "kick":
-            drifts = [*drifts, 0.0]
+        stages: list[list[float]] = []
+        before = "drift"
+        for kind, c, g in self._values(substeps, t / self.dt):
+            if kind == "drift" and stages:
+                stages[-1][2] += c
+            elif kind == "kick" and before == "kick" and stages:
+                stages[-1][0] += c
+                stages[-1][1] += g
+            else:
+                stages.append([c, g, 0.0] if kind == "kick" else [0.0, 0.0, c])
+            before = kind
+        kicks, gradients, drifts = zip(*stages, strict=True)
         source = f"a SympFlow primed with {self.system_name}, Δt = {self.dt:g}, frozen at t = {t:g}"
-        return Scheme("primed", None, tuple(kicks), tuple(drifts), tuple(gradients), source, self.gradients is not None)
+        return Scheme(name, None, kicks, drifts, gradients, source, self.gradients is not None)
+
+    def _values(self, substeps: Iterable[Substep], tau: float) -> Iterable[tuple[Kind, float, float]]:
+        values = {id(column): column.at(tau) for column in self.children() if isinstance(column, Coefficients)}
+        for s in substeps:
+            w, g = s.weight, s.gradient
+            gradient = 0.0 if g is None else g.sign * float(values[id(g.column)][g.row])
+            yield s.kind, w.sign * float(values[id(w.column)][w.row]), gradient
+
+    # kernel and processor as maps ---------------------------------------------------------------------------
+
+    def prepare(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """χ_t⁻¹(x), unchecked: where a run of kernel steps starts."""
+        return self._partly(t, x, slice(0, self._n_outer))
+
+    def finish(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """χ_t(x), unchecked: what such a run gives as its output."""
+        return self._partly(t, x, slice(len(self.substeps) - self._n_outer, None))
+
+    def kernel_step(self, t: float | Tensor, x: Tensor, back: bool = False) -> Tensor:
+        """K_t(x), or its inverse, unchecked."""
+        return self._partly(t, x, slice(self._n_outer, len(self.substeps) - self._n_outer), back)
+
+    def _partly(self, t: Time, x: Tensor, part: slice, back: bool = False) -> Tensor:
+        t, y, batch = self._columns(t, x)
+        q, p = y.chunk(2)
+        for layer in reversed(self.layers[part]) if back else self.layers[part]:
+            q, p = layer.inverse(t, q, p) if back else layer(t, q, p)  # type: ignore[operator]
+        return self._states(torch.cat([q, p]), batch)
 
     # its system ---------------------------------------------------------------------------------------------
 
@@ -175,12 +275,34 @@ class PrimedFlow(SympFlow):
             "ndof": self.ndof,
             "primed": {
                 "first": self.sequence[0],
-                "maps": len(self.sequence),
+                "maps": len(self.sequence) - 2 * self._n_outer,
                 "degree": self.degree,
                 "palindromic": self.palindromic,
                 "force_gradient": self.gradients is not None,
+                "processor": self.processor,
             },
         }
+
+
+def _alternating(first: Kind, n: int) -> tuple[Kind, ...]:
+    other: Kind = "drift" if first == "kick" else "kick"
+    return tuple(first if i % 2 == 0 else other for i in range(n))
+
+
+def _substeps(
+    sequence: Sequence[Kind],
+    kicks: Coefficients | None,
+    drifts: Coefficients | None,
+    gradients: Coefficients | None,
+    sign: int,
+) -> list[Substep]:
+    made = []
+    for i, kind in enumerate(sequence):
+        column = kicks if kind == "kick" else drifts
+        assert column is not None
+        gradient = Entry(gradients, i // 2, sign) if kind == "kick" and gradients is not None else None
+        made.append(Substep(kind, Entry(column, i // 2, sign), gradient))
+    return made
 
 
 def primed(
@@ -191,6 +313,7 @@ def primed(
     scheme: Scheme | str | None,
     degree: int,
     force_gradient: bool | None,
+    processor: int,
     dtype: torch.dtype,
     device: torch.device | str | None,
 ) -> PrimedFlow:
@@ -214,4 +337,4 @@ def primed(
         scheme = SCHEMES[scheme]
     if (scheme.nystrom or any(scheme.gradients)) and not system.quadratic_kinetic:
         raise ValueError(f"`scheme` {scheme.name!r} needs a kinetic energy ½ pᵀM⁻¹p: take 'kahan_li8', for instance.")
-    return PrimedFlow.from_scheme(system, scheme, dt, degree, palindromic, force_gradient, dtype, device)
+    return PrimedFlow.from_scheme(system, scheme, dt, degree, palindromic, force_gradient, processor, dtype, device)

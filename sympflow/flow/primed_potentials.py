@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from sympflow.flow.coefficients import Coefficients
+from sympflow.flow.coefficients import Entry
 from sympflow.flow.potentials import Potential, Time
 from sympflow.forward_mode import jvp
 
@@ -78,31 +78,31 @@ class PrimedPotential(Potential):
     ----------
     ndof : int
     binding : Binding
-    terms : sequence of (Term, Coefficients, int)
-        U_j, and c_j as the column and row of a table.
+    terms : sequence of (Term, Entry)
+        U_j, and c_j as an entry of a table.
     """
 
-    def __init__(self, ndof: int, binding: Binding, terms: list[tuple[Term, Coefficients, int]]) -> None:
+    def __init__(self, ndof: int, binding: Binding, terms: list[tuple[Term, Entry]]) -> None:
         super().__init__()
         self.ndof, self.binding = ndof, binding
         self._terms = terms
 
     def impulse(self, t: Time, x: Tensor) -> Tensor:
         system = self.binding.system
-        return sum(c.value(i, t) * U.gradient(system, x.T).T for U, c, i in self._terms)  # type: ignore[return-value]
+        return sum(c.value(t) * U.gradient(system, x.T).T for U, c in self._terms)  # type: ignore[return-value]
 
     def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
         system = self.binding.system
-        rate = sum(c.rate(i, t) * U.value(system, x.T) for U, c, i in self._terms)
+        rate = sum(c.rate(t) * U.value(system, x.T) for U, c in self._terms)
         return self.impulse(t, x), rate  # type: ignore[return-value]
 
     def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
         system = self.binding.system
         impulse = tangent = torch.zeros_like(x)
-        for U, c, i in self._terms:
+        for U, c in self._terms:
             gradient, change = jvp(partial(_gradient_columns, U, system), x, dx)
-            impulse = impulse + c.value(i, t) * gradient
-            tangent = tangent + c.rate(i, t) * gradient + c.value(i, t) * change
+            impulse = impulse + c.value(t) * gradient
+            tangent = tangent + c.rate(t) * gradient + c.value(t) * change
         return impulse, tangent
 
     def to_dict(self) -> dict[str, Any]:

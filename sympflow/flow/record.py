@@ -90,7 +90,11 @@ def _primed(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> PrimedFlow:
             raise Refused(f"its {name} is neither true nor false")
     maps = _integer(plan.get("maps"), "number of maps", MAX_LAYERS)
     degree = _integer(plan.get("degree"), "degree", MAX_DEGREE)
-    return PrimedFlow(ndof, plan["first"], maps, degree, plan["palindromic"], plan["force_gradient"], dt, dtype=dtype)
+    processor = plan.get("processor", 0)  # files of the first release have none
+    if processor != 0 or isinstance(processor, bool):
+        processor = _integer(processor, "processor", MAX_LAYERS)
+    shape = (plan["first"], maps, degree, plan["palindromic"], plan["force_gradient"])
+    return PrimedFlow(ndof, *shape, dt, processor=processor, dtype=dtype)
 
 
 def _potential(layer: Any) -> dict[str, Any]:

@@ -124,6 +124,7 @@ class SympFlow(FlowMap):
         scheme: Scheme | str | None = None,
         degree: int = 7,
         force_gradient: bool | None = None,
+        processor: int = 0,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> PrimedFlow:
@@ -148,6 +149,9 @@ class SympFlow(FlowMap):
             Of the polynomials that multiply V and T.
         force_gradient : bool, optional
             Whether the kicks have a term in ½|∇V|²_{M⁻¹}; by default they do where T is quadratic.
+        processor : int
+            Number of kicks of χ in ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹, 0 for none. A run executes χ⁻¹ once, the kernel K of
+            `stages` kicks in every step, and χ for every output.
         dtype, device
             Of the parameters.
 
@@ -158,7 +162,7 @@ class SympFlow(FlowMap):
         """
         from sympflow.flow.primed import primed
 
-        return primed(system, stages, dt, palindromic, scheme, degree, force_gradient, dtype, device)
+        return primed(system, stages, dt, palindromic, scheme, degree, force_gradient, processor, dtype, device)
 
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.ndof, "layers": [layer.to_dict() for layer in self.layers]}  # type: ignore[operator]

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 
 from sympflow.arrays import Array, is_tensor
-from sympflow.integrators.base import FixedStep, Outcome, Problem
+from sympflow.integrators.base import FixedStep, Outcome, Problem, rollout
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from sympflow.flow.mlp import MLPFlow
+    from sympflow.flow.primed import PrimedFlow
     from sympflow.flow.sympflow import SympFlow
     from sympflow.kernels.mlp_flow import MLPFlowKernel
     from sympflow.kernels.primed_flow import PrimedFlowKernel
@@ -120,12 +121,23 @@ class FlowIntegrator(FixedStep):
         self.flow_for(system)  # files cannot be read inside a function transform
         return super().tangent(system, t, y, h)
 
+    def run(self, problem: Problem) -> Outcome:
+        if self.flow is None:  # the shipped one, from here on
+            return replace(self, flow=self._flow_like(problem.system, problem.y0)).run(problem)
+        return super().run(problem)
+
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        if not hasattr(self.flow, "scheme"):  # an MLP flow evaluates no forces
+        if not hasattr(self.flow, "kernel_scheme"):  # an MLP flow evaluates no forces
             return super().evaluations(n_steps, n_saved, n_extra, backend)
         from sympflow.integrators.splitting import scheme_evaluations
 
-        return scheme_evaluations(self.flow.scheme(self.dt), n_steps, n_saved, n_extra, backend)
+        flow = self.flow
+        counts = [scheme_evaluations(flow.kernel_scheme(self.dt), n_steps, n_saved, 0, backend)]
+        counts.append(scheme_evaluations(flow.scheme(self.dt), 0, 0, n_extra, backend))
+        if flow.processor:  # once at the start, and for each output
+            n = n_saved + (n_steps > 0)
+            counts.append(scheme_evaluations(flow.processor_scheme(self.dt), 0, 0, n, backend))
+        return {name: sum(count[name] for count in counts) for name in counts[0]}
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         y0 = problem.y0
@@ -136,12 +148,26 @@ class FlowIntegrator(FixedStep):
             states, finite = kernel.run_batch(h, rows, n_steps, save)
             states = states.swapaxes(0, 1).reshape(len(save), *y0.shape)
             return states, np.asarray(finite).reshape(y0.shape[:-1]), "compiled"
+        if is_tensor(y0) and getattr(flow, "processor", 0):
+            states, finite = _processed_rollout(flow, h, y0, n_steps, save)
+            return states, finite, "torch"
         if is_tensor(y0):
             return super().rollout(problem, h, n_steps, save)
         with torch.no_grad():
             tensors = Problem(problem.system, problem.t0, problem.t1, torch.from_numpy(np.ascontiguousarray(y0)))
-            states, finite, _ = super().rollout(tensors, h, n_steps, save)
+            states, finite, _ = self.rollout(tensors, h, n_steps, save)
         return states.numpy(), finite, "torch"
+
+
+def _processed_rollout(
+    flow: PrimedFlow, h: float, y0: torch.Tensor, n_steps: int, save: np.ndarray
+) -> tuple[torch.Tensor, np.ndarray]:
+    """A run of ψ̄ = χ ∘ K ∘ χ⁻¹ in which the χ between two steps cancel."""
+    t = abs(h)
+    states, finite = rollout(lambda k, y: flow.kernel_step(t, y, h < 0), flow.prepare(t, y0), n_steps, save)
+    states = flow.finish(t, states)
+    start = int(np.count_nonzero(save == 0))  # `save` is sorted
+    return torch.cat([y0.expand(start, *y0.shape), states[start:]]), finite
 
 
 def _apply(function: Any, y: Array, h: float | Array) -> Array:

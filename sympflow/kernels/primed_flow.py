@@ -1,4 +1,4 @@
-"""The kernel of a primed SympFlow: the splitting kernel of its system, run with the flow's table."""
+"""The kernel of a primed SympFlow: the splitting kernel of its system, run with the flow's tables."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ __all__ = ["PrimedFlowKernel"]
 class PrimedFlowKernel:
     """Compiled loops of a primed flow on its system; states are [q, p], float64.
 
+    A flow with a processor, ψ̄ = χ ∘ K ∘ χ⁻¹, starts a run by χ⁻¹, makes its steps by K, and applies χ to each output.
+
     Parameters
     ----------
     flow : PrimedFlow
@@ -33,14 +35,11 @@ class PrimedFlowKernel:
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
         self.flow, self._splitting = flow, splitting_kernel(system)
 
-    def _table(self, h: float) -> Scheme:
-        """ψ̄_h as a scheme of step |h|, and for h < 0 the inverse of ψ̄_|h|."""
-        scheme = self.flow.scheme(abs(h))
-        return scheme if h > 0 else scheme.inverse()
-
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` times ψ̄_h, or for h < 0 the inverse of ψ̄_|h|: see `SplittingKernel.run`."""
-        return self._splitting.run(self._table(h), abs(h), y0, n_steps, save)
+        start = self._prepared(abs(h), y0[None])[0]
+        Y, n_finite = self._splitting.run(_signed(self.flow.kernel_scheme(abs(h)), h), abs(h), start, n_steps, save)
+        return self._finished(abs(h), y0[None], Y[None], save)[0], n_finite
 
     def run_batch(
         self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None
@@ -49,7 +48,10 @@ class PrimedFlowKernel:
         if len(y0) == 1:
             Y, n_finite = self.run(h, y0[0], n_steps, save)
             return Y[None], np.array([n_finite])
-        return self._splitting.run_batch(self._table(h), abs(h), y0, n_steps, save, threads=threads)
+        start = self._prepared(abs(h), y0)
+        scheme = _signed(self.flow.kernel_scheme(abs(h)), h)
+        Y, finite = self._splitting.run_batch(scheme, abs(h), start, n_steps, save, threads=threads)
+        return self._finished(abs(h), y0, Y, save), finite
 
     def step(self, h: ArrayLike, y: np.ndarray) -> np.ndarray:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,): every distinct h is a table of its own."""
@@ -57,5 +59,27 @@ class PrimedFlowKernel:
         out = np.array(y, dtype=np.float64)
         for value in np.unique(h[h != 0]):
             rows = h == value
-            out[rows] = self._splitting.step(self._table(value), abs(value), y[rows])
+            out[rows] = self._splitting.step(_signed(self.flow.scheme(abs(value)), value), abs(value), y[rows])
         return out
+
+    def _prepared(self, t: float, y: np.ndarray) -> np.ndarray:
+        """χ_t⁻¹ of the rows of y."""
+        return self._splitting.step(self.flow.processor_scheme(t).inverse(), t, y) if self.flow.processor else y
+
+    def _finished(self, t: float, y0: np.ndarray, Y: np.ndarray, save: np.ndarray) -> np.ndarray:
+        """χ_t of the outputs Y (N, n, 2d); what is saved before the first step are the initial states themselves."""
+        if not self.flow.processor:
+            return Y
+        rows = Y.reshape(-1, Y.shape[-1])
+        out = np.empty_like(rows)
+        chi = self.flow.processor_scheme(t)
+        if len(rows):
+            out = self._splitting.run_batch(chi, t, rows, 1, np.array([1]), threads=1)[0][:, 0]
+        out = out.reshape(Y.shape)
+        out[:, np.asarray(save) == 0] = y0[:, None]
+        return out
+
+
+def _signed(scheme: Scheme, h: float) -> Scheme:
+    """The scheme, or for h < 0 its inverse: in either case one of step |h|."""
+    return scheme if h > 0 else scheme.inverse()

@@ -16,6 +16,7 @@ from sympflow.training.table_jacobian import TableStep
 
 SPREAD = 0.25  # of random coefficients about those of equal steps
 WIDE_SPREAD = 2.0  # without force gradients, where an order above 2 needs negative ones
+PROCESSOR_SPREAD = 0.1
 STIFFNESS = 1e-3  # how reluctantly a table is made to vary with t where that is not called for
 
 
@@ -76,66 +77,93 @@ class TableFit:
 
 
 class Table:
-    """The three columns of a primed flow as one vector of coefficients, in the order of `TableStep`."""
+    """A primed flow's parameters θ as one vector, and its table at any t as an affine function of them.
+
+    The coefficients are those of `TableStep`: of each map in order, then the force gradients of the kicks. One of the
+    processor stands in two places, χ and with the opposite sign χ⁻¹.
+    """
 
     def __init__(self, flow: PrimedFlow) -> None:
-        kicks = [i for i, kind in enumerate(flow.sequence) if kind == "kick"]
-        drifts = [i for i, kind in enumerate(flow.sequence) if kind == "drift"]
-        n, self.columns = len(flow.sequence), [(flow.kicks, kicks), (flow.drifts, drifts)]
-        if flow.gradients is not None:
-            self.columns.append((flow.gradients, [n + j for j in range(len(kicks))]))
-        self.n = max(max(rows) for _, rows in self.columns) + 1
         self.dt, self.flow = flow.dt, flow
+        kicks = [i for i, kind in enumerate(flow.sequence) if kind == "kick"]
+        n = len(flow.sequence)
+        self.n = n + (len(kicks) if flow.gradients is not None else 0)
+        named = (flow.kicks, flow.drifts, flow.gradients)
+        processor = (flow.processor_kicks, flow.processor_drifts, flow.processor_gradients)
+        self.columns = [c for c in (*named, *processor) if c is not None]
+        self._kernel = len([c for c in named if c is not None])
+        self._places = [np.zeros((self.n, c.offset.shape[0])) for c in self.columns]
+        index = {id(c): place for c, place in zip(self.columns, self._places, strict=True)}
+        for i, substep in enumerate(flow.substeps):
+            index[id(substep.weight.column)][i, substep.weight.row] = substep.weight.sign
+            if substep.gradient is not None:
+                row = n + kicks.index(i)
+                index[id(substep.gradient.column)][row, substep.gradient.row] = substep.gradient.sign
 
     def polynomial(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Offset (J, n) and design (J, n, f) of the coefficients at the times t by the flow's parameters."""
-        return self._assembled([c for c, _ in self.columns], t)
+        return self._assembled(self.columns, t)
 
     def frozen(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """The same for a table at one time that is bound by nothing but the palindrome."""
-        columns = [Coefficients(len(rows), (0,), self.dt, c.power, self.flow.palindromic) for c, rows in self.columns]
+        columns = [
+            Coefficients(c.offset.shape[0], (0,), self.dt, c.power, self.flow.palindromic and j < self._kernel)
+            for j, c in enumerate(self.columns)
+        ]
         return self._assembled(columns, np.array([t]))
 
     def _assembled(self, columns: list[Coefficients], t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         offset, blocks = np.zeros((len(t), self.n)), []
-        for c, (_, rows) in zip(columns, self.columns, strict=True):
+        for c, place in zip(columns, self._places, strict=True):
             powers = t[:, None] ** c.power * (t[:, None] / self.dt) ** np.array(c.exponents)
-            block = np.zeros((len(t), self.n, c.free.numel()))
-            block[:, rows] = np.einsum("nkf,jk->jnf", c.basis.cpu().double().numpy(), powers)
-            offset[:, rows] = powers @ c.offset.cpu().double().numpy().T
-            blocks.append(block)
+            blocks.append(np.einsum("mn,nkf,jk->jmf", place, _array(c.basis), powers, optimize=True))
+            offset += powers @ _array(c.offset).T @ place.T
         return offset, np.concatenate(blocks, axis=-1)
 
     def continued(self, coefficients: np.ndarray) -> np.ndarray:
         """The parameters for which the table at Δt is the given one (n,), and varies with t as little as may be."""
         parts = []
-        for c, rows in self.columns:
-            basis, offset = (a.cpu().double().numpy() for a in (c.basis, c.offset))
+        for c, place in zip(self.columns, self._places, strict=True):
+            basis, offset = _array(c.basis), _array(c.offset)
             A = np.concatenate([basis.sum(1), *np.moveaxis(STIFFNESS * basis[:, 1:], 1, 0)])
             b = np.zeros(len(A))
-            b[: len(rows)] = coefficients[rows] / self.dt**c.power - offset.sum(1)
+            b[: len(offset)] = self._column(coefficients, place) / self.dt**c.power - offset.sum(1)
             parts.append(np.linalg.lstsq(A, b, rcond=None)[0])
         return np.concatenate(parts)
 
+    @staticmethod
+    def _column(coefficients: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """The entries of a column in a table."""
+        return place.T @ coefficients / np.abs(place).sum(0)
+
     def parameters(self) -> np.ndarray:
-        return np.concatenate([c.free.detach().cpu().double().numpy() for c, _ in self.columns])
+        return np.concatenate([_array(c.free) for c in self.columns])
 
     @torch.no_grad()
     def assign(self, theta: np.ndarray) -> None:
         """Put the parameters into the flow."""
-        for c, _ in self.columns:
+        for c in self.columns:
             part, theta = theta[: c.free.numel()], theta[c.free.numel() :]
             c.free.copy_(torch.as_tensor(part))
 
     def random(self, rng: np.random.Generator) -> np.ndarray:
         """A frozen table about that of equal steps, with or without the force gradients of Takahashi and Imada."""
-        spread = SPREAD if self.flow.gradients is not None else WIDE_SPREAD
-        table = np.zeros(self.n)
-        for _, rows in self.columns[:2]:
-            values = rng.normal(1, spread, len(rows))
-            values = values + values[::-1] if self.flow.palindromic else values
-            table[rows] = self.dt * values / values.sum()
-        for c, rows in self.columns[2:]:
-            kicks = table[self.columns[0][1]]
-            table[rows] = rng.choice([0.0, 1 / 12]) * np.abs(kicks) ** c.power
+        flow = self.flow
+        spread = SPREAD if flow.gradients is not None else WIDE_SPREAD
+        table, kicks = np.zeros(self.n), np.zeros(0)
+        for c, place in zip(self.columns[:2], self._places[:2], strict=True):
+            values = rng.normal(1, spread, c.offset.shape[0])
+            values = values + values[::-1] if flow.palindromic else values
+            values = self.dt * values / values.sum()
+            kicks = values if c is flow.kicks else kicks
+            table += place @ values
+        if flow.gradients is not None:
+            table += self._places[2] @ (rng.choice([0.0, 1 / 12]) * np.abs(kicks) ** 3)
+        for c, place in zip(self.columns[self._kernel :], self._places[self._kernel :], strict=True):
+            if c.power == 1:
+                table += place @ rng.normal(0, PROCESSOR_SPREAD * self.dt, c.offset.shape[0])
         return table
+
+
+def _array(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().cpu().double().numpy()
