@@ -25,8 +25,8 @@ class ExplicitStep(Integrator):
         h = per_state(h, y)
         K: list[Array] = []
         for row in self.A[: len(self.B)]:
-            K.append(system.vector_field(y + h * _weighted(row, K) if K else y))
-        return y + h * _weighted(self.B, K)
+            K.append(system.vector_field(y + h * weighted(row, K) if K else y))
+        return y + h * weighted(self.B, K)
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         """The step and its Jacobian, the step length held fixed: each stage differentiated as it is executed."""
@@ -36,12 +36,12 @@ class ExplicitStep(Integrator):
         K: list[np.ndarray] = []
         dK: list[np.ndarray] = []
         for row in self.A[: len(self.B)]:
-            Y = y + h * _weighted(row, K) if K else y
-            dY = identity + h[..., None] * _weighted(row, dK) if K else identity
+            Y = y + h * weighted(row, K) if K else y
+            dY = identity + h[..., None] * weighted(row, dK) if K else identity
             K.append(system.vector_field(Y))
             hessian = system.hessian(Y)
             dK.append(np.concatenate([hessian[..., d:, :], -hessian[..., :d, :]], axis=-2) @ dY)
-        return y + h * _weighted(self.B, K), identity + h[..., None] * _weighted(self.B, dK)
+        return y + h * weighted(self.B, K), identity + h[..., None] * weighted(self.B, dK)
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,8 @@ class RungeKutta(ExplicitStep):
             raise ValueError("`rtol` and `atol` are both 0, which no step can meet: make one of them positive.")
 
 
-def _weighted(weights: Any, K: list[Array]) -> Array:
+def weighted(weights: Any, K: list[Array]) -> Array:
+    """Σ_i weights_i K_i, for as many weights as there are."""
     return sum((float(w) * k for w, k in zip(weights, K, strict=False) if w), 0.0 * K[0])
 
 

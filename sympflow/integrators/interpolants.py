@@ -1,0 +1,124 @@
+"""Dense output by interpolation: a polynomial for each step, of methods whose shorter steps are not their own path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from sympflow.arrays import Array, is_tensor, stack
+
+Time = Any
+"""A number, or a tensor that carries a gradient."""
+
+
+class Interpolant:
+    """One step from t0 to t1: the polynomial Σ_j c_j x^j in x = (t − t0)/(t1 − t0).
+
+    Parameters
+    ----------
+    begin, end : float or tensor
+        t0 and t1: tensors where the length of the step carries a gradient.
+    coefficients : sequence of arrays or tensors (..., 2d)
+        The first is the state at t0.
+    """
+
+    def __init__(self, begin: Time, end: Time, coefficients: Sequence[Array]) -> None:
+        self.begin, self.end, self.coefficients = begin, end, coefficients
+        self.t0, self.t1 = (float(t.detach()) if is_tensor(t) else t for t in (begin, end))
+
+    @property
+    def y0(self) -> Array:
+        """The state at the beginning."""
+        return self.coefficients[0]
+
+    def __call__(self, t: float) -> Array:
+        return _horner(self.coefficients, (float(t) - self.begin) / (self.end - self.begin))
+
+
+def quartic(t0: Time, t1: Time, y0: Array, y1: Array, middle: Array, f0: Array, f1: Array) -> Interpolant:
+    """The polynomial of degree 4 with these states at the beginning, end and middle, and slopes at both ends."""
+    h = t1 - t0
+    return Interpolant(
+        t0,
+        t1,
+        [
+            y0,
+            h * f0,
+            h * (f1 - 4 * f0) - 11 * y0 - 5 * y1 + 16 * middle,
+            h * (5 * f0 - 3 * f1) + 18 * y0 + 14 * y1 - 32 * middle,
+            2 * h * (f1 - f0) - 8 * (y0 + y1) + 16 * middle,
+        ],
+    )
+
+
+def hermite(t0: Time, t1: Time, y0: Array, y1: Array, f0: Array, f1: Array) -> Interpolant:
+    """The cubic with these states and slopes at both ends."""
+    h, rise = t1 - t0, y1 - y0
+    return Interpolant(t0, t1, [y0, h * f0, 3 * rise - h * (2 * f0 + f1), h * (f0 + f1) - 2 * rise])
+
+
+class Piecewise:
+    """Dense output: the interpolants of consecutive steps, up to t_end.
+
+    Call it with a time or an array of times (n,); the result has shape (..., 2d) or (..., 2d, n).
+    """
+
+    def __init__(self, steps: Sequence[Interpolant], y0: Array, t0: float, t_end: float) -> None:
+        self.steps, self.y0 = steps, y0
+        self.sign = 1 if t_end >= t0 else -1
+        self.t_min, self.t_max = sorted((t0, t_end))
+
+    @cached_property
+    def _ends(self) -> np.ndarray:
+        return np.array([step.t1 for step in self.steps])
+
+    @cached_property
+    def _stacked(self) -> tuple[Any, Any, list[Array]]:
+        """Beginnings, lengths and coefficients of each power of all steps: (m,), (m,), each (m, ..., 2d)."""
+        begin, length = zip(*((step.begin, step.end - step.begin) for step in self.steps), strict=True)
+        coefficients = [stack(c, axis=0) for c in zip(*(step.coefficients for step in self.steps), strict=True)]
+        if is_tensor(begin[0]):
+            return stack(begin, axis=0), stack(length, axis=0), coefficients
+        return np.array(begin), np.array(length), coefficients
+
+    def __call__(self, t: float | np.ndarray) -> Array:
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        if times.size and not (times.min() >= self.t_min and times.max() <= self.t_max):
+            raise ValueError(f"`t` must lie in [{self.t_min:g}, {self.t_max:g}], the interval that was solved.")
+        if not self.steps:
+            y = stack([self.y0] * len(times)) if times.size else self.y0[..., None][..., :0]
+            return y[..., 0] if np.ndim(t) == 0 else y
+        begin, length, coefficients = self._stacked
+        k: Any = np.minimum(np.searchsorted(self.sign * self._ends, self.sign * times), len(self.steps) - 1)
+        x: Any
+        if is_tensor(self.y0):
+            import torch
+
+            k = torch.as_tensor(k, device=self.y0.device)
+            x = ((torch.as_tensor(times) - torch.as_tensor(begin)[k]) / torch.as_tensor(length)[k]).to(self.y0)
+        else:
+            x = ((times - begin[k]) / length[k]).astype(self.y0.dtype)
+        y = _horner([c[k] for c in coefficients], x.reshape(-1, *[1] * self.y0.ndim))
+        y = y.movedim(0, -1) if is_tensor(y) else np.moveaxis(y, 0, -1)
+        return y[..., 0] if np.ndim(t) == 0 else y
+
+
+class Batch:
+    """The dense outputs of the trajectories of a batch, each by itself, as one: (..., 2d) or (..., 2d, n)."""
+
+    def __init__(self, solutions: Sequence[Callable[[Any], Array]], batch: tuple[int, ...]) -> None:
+        self.solutions, self.batch = solutions, batch
+
+    def __call__(self, t: Any) -> Array:
+        y = stack([sol(t) for sol in self.solutions], axis=0)
+        return y.reshape(*self.batch, *y.shape[1:])
+
+
+def _horner(coefficients: Sequence[Array], x: Any) -> Array:
+    y = coefficients[-1]
+    for c in coefficients[-2::-1]:
+        y = y * x + c
+    return y
