@@ -133,6 +133,8 @@ class FixedStep(Integrator):
     dt: float | None = None
 
     finds_events: ClassVar[bool] = True
+    breakdown: ClassVar[tuple[str, str]] = ("The solution became non-finite", "Reduce `dt`")
+    """What it means when the run cannot go on, and the remedy: for the message of status −1."""
 
     def __post_init__(self) -> None:
         check_dt(self.dt)
@@ -183,7 +185,7 @@ class FixedStep(Integrator):
         outcome = Outcome(t, y, 0, FINISHED, stats)
         if problem.dense_output:
             outcome.sol = GridSolution(self, system, grid, saved, backend)
-        _report_failures(outcome, grid, finite, last)
+        _report_failures(outcome, grid, finite, last, self.breakdown)
         return outcome
 
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
@@ -295,25 +297,33 @@ def rollout(
     return out, np.asarray(finite)
 
 
-def _report_failures(outcome: Outcome, grid: Grid, finite: np.ndarray, n_run: int) -> None:
-    """Set status −1 and the message where a trajectory became non-finite; cut a single trajectory there."""
+def _report_failures(outcome: Outcome, grid: Grid, finite: np.ndarray, n_run: int, breakdown: tuple[str, str]) -> None:
+    """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there.
+
+    `stats["failed_at"]` is the time of the last finite state on the grid, in a batch an array with NaN for those that
+    reached their end.
+    """
+    what, remedy = breakdown
     ok = to_numpy(all_finite(outcome.y))  # (n, ...): shorter steps may overflow too
     if finite.ndim:
         outcome.status = np.where((finite < n_run) | ~ok.all(0), -1, 0)
         failed = np.argwhere(outcome.status)
         if failed.size:
             i = tuple(failed[0].tolist())
+            times = grid.t0 + np.minimum(finite, grid.n_steps) * grid.h
+            outcome.stats["failed_at"] = np.where(outcome.status < 0, times, np.nan)
             outcome.message = (
-                f"{len(failed)} of {finite.size} trajectories became non-finite, the first of them (index "
-                f"{', '.join(map(str, i))}) after t = {grid.time(int(finite[i])):.17g}. Reduce `dt`."
+                f"{len(failed)} of {finite.size} trajectories failed, the first of them (index "
+                f"{', '.join(map(str, i))}) after t = {grid.time(int(finite[i])):.17g}. {what}. {remedy}."
             )
         return
     if finite < n_run or not ok.all():
         last = int(finite) if finite < n_run else int(grid.locate(outcome.t[~ok][:1])[0][0])
         outcome.status = -1
+        outcome.stats["failed_at"] = grid.time(last)
         outcome.message = (
-            f"The solution became non-finite after t = {grid.time(last):.17g} (step {last + 1} of {grid.n_steps}). "
-            "Reduce `dt`, or end `t_span` earlier."
+            f"{what} after t = {grid.time(last):.17g} (step {last + 1} of {grid.n_steps}). "
+            f"{remedy}, or end `t_span` earlier."
         )
         keep = int(np.argmin(ok)) if not ok.all() else len(ok)
         outcome.t, outcome.y = outcome.t[:keep], outcome.y[:keep]

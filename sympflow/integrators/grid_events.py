@@ -70,9 +70,10 @@ def run_with_events(integrator: FixedStep, problem: Problem, search: EventSearch
     outcome = Outcome(t, y_out, int(search.end is not None), ENDED if search.end else FINISHED, stats)
     if failed and not search.end:
         outcome.status = -1
+        what, remedy = integrator.breakdown
+        outcome.stats["failed_at"] = t_end
         outcome.message = (
-            f"The solution became non-finite after t = {t_end:.17g} (step {k + 1} of {grid.n_steps}). Reduce `dt`, or "
-            "end `t_span` earlier."
+            f"{what} after t = {t_end:.17g} (step {k + 1} of {grid.n_steps}). {remedy}, or end `t_span` earlier."
         )
     if problem.dense_output:
         outcome.sol = GridSolution(integrator, system, Grid(grid.t0, t_end, abs(grid.h)), _join(kept), backend)

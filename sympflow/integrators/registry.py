@@ -21,6 +21,8 @@ _BUILT_IN = {
     "dop853": "scipy_methods:DOP853",
     "sympflow": "sympflow:SympFlowIntegrator",
     "mlp": "sympflow:MLPIntegrator",
+    "implicit_midpoint": "implicit:ImplicitMidpoint",
+    "gauss_legendre4": "implicit:GaussLegendre4",
 }
 _TORCHDIFFEQ = (*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams")
 _NAMES = frozenset((*SCHEMES, *_BUILT_IN, *_TORCHDIFFEQ))

@@ -1,0 +1,266 @@
+"""Implicit midpoint and Gauss–Legendre of order 4: symplectic for any Hamiltonian, separable or not."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from math import sqrt
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
+from sympflow.integrators.base import FixedStep, Outcome, Problem
+from sympflow.system import HamiltonianSystem
+
+if TYPE_CHECKING:
+    from sympflow.kernels.implicit import ImplicitKernel, Tableau
+
+MOST_ITERATIONS = 50
+
+
+@dataclass(frozen=True)
+class Gauss(FixedStep):
+    """A Gauss method: K_i = h f(y + Σ_j a_ij K_j), y + Σ_i b_i K_i, solved by Newton's method with the Hessian of H.
+
+    The iteration runs until the increments are rounding, so that a step is symplectic and reversible to rounding; an
+    iteration that stops at a tolerance would make the energy drift [2]_. A step that has no solution, or whose
+    iteration does not find it, ends the solution with status −1.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Step length; the default is `system.dt`.
+    compensated : bool
+        Whether to sum with Kahan's compensation [1]_, which slows the growth of round-off. Compiled only.
+
+    References
+    ----------
+    .. [1] E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, 2nd ed. (Springer 2006): II.1.3 (the
+       methods), VI.4 (symplecticity), VIII.5 (compensated sums), VIII.6 (Newton's iteration).
+    .. [2] E. Hairer, R. I. McLachlan, A. Razakarivony, "Achieving Brouwer's law with implicit Runge–Kutta methods", BIT
+       48 (2008) 231–243.
+    """
+
+    compensated: bool = False
+
+    symplectic: ClassVar[bool] = True
+    compiles: ClassVar[bool] = True
+    breakdown: ClassVar[tuple[str, str]] = (
+        "The implicit step could not be solved: Newton's iteration did not converge",
+        "Reduce `dt`",
+    )
+    tableau: ClassVar[Tableau]
+
+    def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        K, _ = self._stages(system, y, per_state(h, y))
+        return self._advanced(y, K)
+
+    def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        return self.step(system, t, y, -h)  # the methods are symmetric
+
+    def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
+        """The step and its Jacobian, by differentiating the equations that the K of the step solve."""
+        y = to_numpy(y)
+        h = np.asarray(h, dtype=y.dtype)[..., None]
+        K, _ = self._stages(system, y, h)
+        A, b = (np.array(c, dtype=y.dtype) for c in self.tableau)
+        M, D = _newton_matrix(system, y[..., None, :] + A @ K, h, A)
+        s, n = K.shape[-2:]
+        dK = _solved(M, (h[..., None, None] * D).reshape(*y.shape[:-1], s * n, n)).reshape(*y.shape[:-1], s, n, n)
+        return self._advanced(y, K), np.eye(n, dtype=y.dtype) + np.einsum("i,...ijk->...jk", b, dK)
+
+    def run(self, problem: Problem) -> Outcome:
+        counting = copy.copy(self)  # Newton's iterations are counted in a copy: an integrator has no state
+        object.__setattr__(counting, "_iterations", [0])
+        outcome = super(Gauss, counting).run(problem)
+        iterations = counting._iterations[0]  # type: ignore[attr-defined]
+        evaluations = iterations * len(self.tableau[1])
+        outcome.stats |= {
+            "newton_iterations": iterations,
+            "force_evaluations": evaluations,
+            "hessian_evaluations": evaluations,
+        }
+        return outcome
+
+    def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
+        kernel = self._kernel(problem)
+        if kernel is None:
+            return super().rollout(problem, h, n_steps, save)
+        y0 = problem.y0
+        rows = y0.reshape(-1, y0.shape[-1])
+        states, finite, iterations = kernel.run_batch(h, rows, n_steps, save, self.compensated)
+        self._count(iterations)
+        states = states.swapaxes(0, 1).reshape(len(save), *y0.shape)
+        return states, finite.reshape(y0.shape[:-1]), "compiled"
+
+    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
+        if backend != "compiled":
+            return self.step(system, 0.0, y, h)
+        from sympflow.kernels.implicit import implicit_kernel
+
+        rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
+        out, iterations = implicit_kernel(system, self.tableau).step(np.broadcast_to(h, y.shape[:-1]).reshape(-1), rows)
+        self._count(iterations)
+        return out.reshape(y.shape)
+
+    def _kernel(self, problem: Problem) -> ImplicitKernel | None:
+        """The compiled loops for the problem, or None where it needs, or asks for, array operations."""
+        y0, reason = problem.y0, None
+        if problem.backend == "array":
+            reason = "`backend` is 'array': choose 'auto'."
+        elif is_tensor(y0):
+            reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
+        elif y0.dtype != np.float64:
+            reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
+        if reason is None:
+            from sympflow.kernels.implicit import implicit_kernel
+
+            try:
+                return implicit_kernel(problem.system, self.tableau)
+            except ValueError as error:
+                reason = str(error)
+        if problem.backend == "compiled":
+            raise ValueError(f"`backend` 'compiled' does not apply. {reason}")
+        if self.compensated:
+            raise ValueError(f"`compensated` sums need compiled loops. {reason}")
+        return None
+
+    def _count(self, iterations: int) -> None:
+        counter = getattr(self, "_iterations", None)
+        if counter is not None:
+            counter[0] += iterations
+
+    def _advanced(self, y: Array, K: Array) -> Array:
+        return y + sum(b * K[..., i, :] for i, b in enumerate(self.tableau[1]))
+
+    def _stages(self, system: HamiltonianSystem, y: Array, h: Any) -> tuple[Array, int]:
+        """The K (..., s, 2d) of a step, NaN for states whose step was not solved; and the iterations taken."""
+        if is_tensor(y):
+            return self._tensor_stages(system, y, h)
+        A = np.array(self.tableau[0], dtype=y.dtype)
+        eps = float(np.finfo(y.dtype).eps)
+        K = np.zeros((*y.shape[:-1], len(A), y.shape[-1]), dtype=y.dtype)
+        done = np.zeros(y.shape[:-1], dtype=bool)
+        before = np.full(y.shape[:-1], np.inf)
+        iteration = 0
+        with np.errstate(all="ignore"):
+            while not done.all() and iteration < MOST_ITERATIONS:
+                iteration += 1
+                M, residual = _equations(system, y, K, h, A)
+                change = _solved(M, residual[..., None])[..., 0].reshape(K.shape)
+                K = np.where(done[..., None, None], K, K - change)
+                size = _relative_size(change, y, K, system.ndof)
+                small = (size <= eps**0.7) | ((size <= eps**0.57) & (size >= before / 2))
+                lost = ~(size < np.inf) & ~done
+                K[lost] = np.nan
+                done, before = done | small | lost, size
+        K[~done] = np.nan
+        self._count(iteration * done.size)
+        return K, iteration
+
+    def _tensor_stages(self, system: HamiltonianSystem, y: Array, h: Any) -> tuple[Array, int]:
+        """`_stages` of tensors: solved without a graph, then two more iterations in it, which give it derivatives.
+
+        At the solution each differentiable iteration of Newton's method doubles the order of the derivatives that are
+        right, so first and second ones are.
+        """
+        import torch
+
+        constant = h.detach() if is_tensor(h) else h
+        with torch.no_grad():
+            flat = to_numpy(y.detach())
+            K0, iteration = self._stages(system, flat, to_numpy(constant) if is_tensor(h) else h)
+        K = torch.as_tensor(K0, dtype=y.dtype, device=y.device)
+        A = torch.as_tensor(self.tableau[0], dtype=y.dtype, device=y.device)
+        for _ in range(2):
+            M, residual = _equations(system, y, K, h, A)
+            K = K - torch.linalg.solve_ex(M, residual[..., None])[0][..., 0].reshape(K.shape)
+        return K, iteration + 2
+
+
+def _equations(system: HamiltonianSystem, y: Array, K: Array, h: Any, A: Array) -> tuple[Array, Array]:
+    """Newton's matrix (..., s·2d, s·2d) and the residuals K_i − h f(Y_i), (..., s·2d)."""
+    Y = y[..., None, :] + A @ K
+    M, _ = _newton_matrix(system, Y, h, A)
+    outer = h[..., None] if getattr(h, "ndim", 0) else h
+    residual = K - outer * system.vector_field(Y)
+    return M, residual.reshape(*residual.shape[:-2], -1)
+
+
+def _newton_matrix(system: HamiltonianSystem, Y: Array, h: Any, A: Array) -> tuple[Array, Array]:
+    """M = I − h (a_ij f'(Y_i)), (..., s·2d, s·2d), and f'(Y), (..., s, 2d, 2d)."""
+    d, (s, n) = system.ndof, Y.shape[-2:]
+    S = system.hessian(Y)
+    D = concatenate([S[..., d:, :].swapaxes(-1, -2), -S[..., :d, :].swapaxes(-1, -2)]).swapaxes(-1, -2)
+    outer = h[..., None, None, None] if getattr(h, "ndim", 0) else h
+    blocks = outer * A[:, None, :, None] * D[..., :, :, None, :]
+    M = -blocks.reshape(*Y.shape[:-2], s * n, s * n)
+    if is_tensor(M):
+        import torch
+
+        return M + torch.eye(s * n, dtype=M.dtype, device=M.device), D
+    return M + np.eye(s * n, dtype=M.dtype), D
+
+
+def _solved(M: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """M⁻¹x, NaN where M is singular."""
+    try:
+        return np.linalg.solve(M, x)
+    except np.linalg.LinAlgError:
+        out = np.full(x.shape, np.nan, dtype=x.dtype)
+        for i in np.ndindex(M.shape[:-2]):
+            if np.isfinite(M[i]).all() and np.linalg.matrix_rank(M[i]) == len(M[i]):
+                out[i] = np.linalg.solve(M[i], x[i])
+        return out
+
+
+def _relative_size(change: np.ndarray, y: np.ndarray, K: np.ndarray, d: int) -> np.ndarray:
+    """The larger of ‖ΔK_q‖/(‖q‖ + ‖K_q‖) and ‖ΔK_p‖/(‖p‖ + ‖K_p‖), (...)."""
+    ratios = []
+    for part in (slice(0, d), slice(d, None)):
+        top = np.abs(change[..., part]).max((-2, -1))
+        scale = (np.abs(y[..., part]) + np.abs(K[..., part]).max(-2)).max(-1)
+        ratios.append(np.where(top == 0, 0.0, top / np.where(scale == 0, 1, scale)))
+    return np.maximum(*ratios)
+
+
+@dataclass(frozen=True)
+class ImplicitMidpoint(Gauss):
+    """The implicit midpoint rule, y₁ = y + h f((y + y₁)/2): order 2, symplectic, symmetric, A-stable.
+
+    Parameters
+    ----------
+    dt, compensated
+        As for `Gauss`.
+
+    References
+    ----------
+    .. [1] E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, 2nd ed. (Springer 2006), (I.1.7), VI.4.
+    """
+
+    name: ClassVar[str] = "implicit_midpoint"
+    order: ClassVar[int | None] = 2
+    tableau: ClassVar[Tableau] = (((0.5,),), (1.0,))
+
+
+_A21 = 0.25 + sqrt(3) / 6  # a12 is 1/2 − a21 without rounding: b_i a_ij + b_j a_ji = b_i b_j holds exactly
+
+
+@dataclass(frozen=True)
+class GaussLegendre4(Gauss):
+    """The Gauss–Legendre method of two stages: order 4, symplectic, symmetric, A-stable.
+
+    Parameters
+    ----------
+    dt, compensated
+        As for `Gauss`.
+
+    References
+    ----------
+    .. [1] E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, 2nd ed. (Springer 2006), II.1.3, VI.4.
+    """
+
+    name: ClassVar[str] = "gauss_legendre4"
+    order: ClassVar[int | None] = 4
+    tableau: ClassVar[Tableau] = (((0.25, 0.5 - _A21), (_A21, 0.25)), (0.5, 0.5))

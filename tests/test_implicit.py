@@ -1,0 +1,116 @@
+"""Implicit midpoint and Gauss–Legendre 4: any H, quadratic invariants, failure of Newton's iteration."""
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import HamiltonianSystem, get, max_energy_error, solve, systems
+from sympflow.integrators.checks import check_integrator
+
+METHODS = ("implicit_midpoint", "gauss_legendre4")
+EPS = np.finfo(float).eps
+
+# the second system is not separable, and turns: q₁p₂ − q₂p₁ is conserved
+PRODUCT = HamiltonianSystem.from_sympy("(p**2 + 1)*(q**2 + 1)/2", y0=[0.0, 1.0], dt=0.05)
+TURNING = HamiltonianSystem.from_sympy(
+    "(p1**2 + p2**2)*(1 + q1**2 + q2**2)/2 + (q1**2 + q2**2)**2/4", y0=[0.6, 0.1, -0.2, 0.5], dt=0.05
+)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("system", [PRODUCT, TURNING], ids=["product", "turning"])
+def test_the_contract_holds_where_h_does_not_split(method, system):
+    names = check_integrator(get(method), system)
+    assert {"the_order_is_the_slope", "symplecticity_as_declared", "the_inverse_undoes_the_step"} <= set(names)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_quadratic_invariants_are_conserved_to_rounding(method):
+    n = 2000
+    sol = solve(TURNING, method, (0.0, 0.1 * n), dt=0.1)
+    q1, q2, p1, p2 = sol.y
+    momentum = q1 * p2 - q2 * p1  # HLW, theorem IV.2.1
+    assert np.abs(momentum - momentum[0]).max() < EPS * n
+    assert max_energy_error(sol) > 1e3 * EPS * n  # H itself is none
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("z", [20.0, 1e3])
+def test_no_step_is_too_long_for_an_oscillator(method, z):
+    omega, n = 1e6, 10_000
+    sol = solve(systems.harmonic_oscillator(omega), method, (0.0, n * z / omega), dt=z / omega)
+    assert max_energy_error(sol) < 100 * EPS * np.sqrt(n)
+    assert sol.stats["newton_iterations"] == 2 * n  # a linear system is solved at once; the second finds nothing left
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_compiled_and_array_agree_to_rounding(method):
+    y0 = np.array([[0.6, 0.1, -0.2, 0.5], [0.1, 0.2, 0.3, 0.4]])
+    times = [0.0, 1.23, 5.0]
+    compiled = solve(TURNING, method, (0.0, 5.0), y0=y0, t_eval=times)
+    array = solve(TURNING, method, (0.0, 5.0), y0=y0, t_eval=times, backend="array")
+    assert (compiled.stats["backend"], array.stats["backend"]) == ("compiled", "numpy")
+    np.testing.assert_allclose(compiled.y, array.y, rtol=0, atol=100 * 50 * EPS)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("backend", ["auto", "array"])
+def test_newtons_failure_is_status_minus_one_with_the_time(method, backend):
+    hh = systems.henon_heiles()
+    sol = solve(hh, method, (0.0, 10.0), y0=[0.0, 0.0, 0.0, 0.7], dt=0.05, backend=backend)
+    assert sol.status == -1
+    assert sol.message.startswith("The implicit step could not be solved: Newton's iteration did not converge after t")
+    assert np.isfinite(sol.y).all()
+    assert sol.t[-1] == sol.stats["failed_at"]
+    assert abs(sol.t[-1] - 5.450984210235402) < 5 * 0.05  # the solution is singular there
+    batch = solve(hh, method, (0.0, 10.0), y0=[hh.y0, [0.0, 0.0, 0.0, 0.7]], dt=0.05, backend=backend)
+    assert batch.status.tolist() == [0, -1]
+    assert np.isnan(batch.stats["failed_at"][0])
+    assert batch.stats["failed_at"][1] == sol.t[-1]
+    np.testing.assert_allclose(batch.y[1, :, : len(sol.t)], sol.y, rtol=1e-9)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_first_and_second_derivatives_pass_through_a_step(method):
+    integrator = get(method)()
+
+    def step(y):
+        return integrator.step(TURNING, 0.0, y, 0.2)
+
+    y = torch.tensor(TURNING.y0, requires_grad=True)
+    assert torch.autograd.gradcheck(step, y)
+    assert torch.autograd.gradgradcheck(step, y)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_events_and_failure_beside_them(method):
+    sol = solve(PRODUCT, method, (0.0, 20.0), events=lambda t, y: y[0])
+    zeros = sol.t_events[0]
+    assert len(zeros) > 4
+    half_periods = np.diff(zeros)
+    assert np.ptp(half_periods) < 1e-3 * half_periods[0]
+    hh = systems.henon_heiles()
+    sol = solve(hh, method, (0.0, 10.0), y0=[0.0, 0.0, 0.0, 0.7], dt=0.05, events=lambda t, y: y[0] - 9)
+    assert sol.status == -1
+    assert "Newton's iteration did not converge after t = 5" in sol.message
+
+
+def test_compensated_sums_need_compiled_loops_and_lower_the_rounding():
+    pendulum = systems.pendulum()
+    rms = []
+    for compensated in (False, True):
+        sol = solve(pendulum, "gauss_legendre4", (0.0, 200.0), dt=0.001, compensated=compensated, save_every=20)
+        error = sol.energy_error()
+        rms.append(np.sqrt(np.mean(error[len(error) // 2 :] ** 2)))
+    assert rms[1] < 0.5 * rms[0]
+    with pytest.raises(ValueError, match=r"^`compensated` sums need compiled loops"):
+        solve(pendulum, "gauss_legendre4", (0.0, 1.0), compensated=True, backend="array")
+
+
+def test_systems_of_plain_functions_run_with_arrays():
+    system = HamiltonianSystem(hamiltonian=lambda q, p: ((p**2 + 1) * (q**2 + 1)).sum(-1) / 2, ndof=1)
+    sol = solve(system, "gauss_legendre4", (0.0, 2.0), y0=PRODUCT.y0)
+    reference = solve(PRODUCT, "gauss_legendre4", (0.0, 2.0))
+    np.testing.assert_allclose(sol.y, reference.y, rtol=0, atol=1e-13)
+    with pytest.raises(ValueError, match=r"^`backend` 'compiled' does not apply"):
+        solve(system, "gauss_legendre4", (0.0, 2.0), y0=PRODUCT.y0, backend="compiled")
