@@ -171,7 +171,7 @@ def test_tables_of_a_processed_flow():
     for scheme in (chi.inverse(), kernel, chi):
         out = loops.step(scheme, 0.7, out)
     np.testing.assert_allclose(loops.step(flow.scheme(0.7), 0.7, y), out, atol=64 * EPS)
-    with pytest.raises(ValueError, match="^`flow` has no processor"):
+    with pytest.raises(ValueError, match=r"^`flow` has no processor"):
         SympFlow.primed(HH, 2).processor_scheme()
 
 

@@ -121,11 +121,9 @@ class PrimedFlow(SympFlow):
             return made if force_gradient else [*made[:2], None]
 
         self.kicks, self.drifts, self.gradients = columns(kernel, 0, palindromic, 1.0)
-        none = (None, None, None)
-        # From t² on: what is of first order in t would have to vanish at small t, and even powers keep the symmetry.
-        self.processor_kicks, self.processor_drifts, self.processor_gradients = (
-            columns(chi, 1, False, None) if processor else none
-        )
+        # The processor begins with t², and for a palindrome has even powers alone, which keep the symmetry in t.
+        outside: list[Any] = columns(chi, 1, False, None) if processor else [None, None, None]
+        self.processor_kicks, self.processor_drifts, self.processor_gradients = outside
         inner = _substeps(kernel, self.kicks, self.drifts, self.gradients, 1)
         outer = {
             sign: _substeps(chi, self.processor_kicks, self.processor_drifts, self.processor_gradients, sign)

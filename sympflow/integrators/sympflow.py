@@ -148,9 +148,8 @@ class FlowIntegrator(FixedStep):
             states, finite = kernel.run_batch(h, rows, n_steps, save)
             states = states.swapaxes(0, 1).reshape(len(save), *y0.shape)
             return states, np.asarray(finite).reshape(y0.shape[:-1]), "compiled"
-        if is_tensor(y0) and getattr(flow, "processor", 0):
-            states, finite = _processed_rollout(flow, h, y0, n_steps, save)
-            return states, finite, "torch"
+        if isinstance(y0, torch.Tensor) and hasattr(flow, "processor") and flow.processor:
+            return *_processed_rollout(flow, h, y0, n_steps, save), "torch"
         if is_tensor(y0):
             return super().rollout(problem, h, n_steps, save)
         with torch.no_grad():

@@ -64,6 +64,9 @@ def workspace():
     return np.empty(NDOF), np.empty(NDOF), np.empty(NDOF)
 
 
+COUPLED = True
+
+
 @njit(**OPTIONS)
 def kick(q, b, work):
     slope = work[0]

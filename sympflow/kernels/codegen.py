@@ -10,12 +10,12 @@ from sympy.printing.pycode import PythonCodePrinter
 
 from sympflow.symbolic import SymbolicHamiltonian, printable
 
-__all__ = ["algebra_source", "gradient_kick_source"]
+__all__ = ["KernelPrinter", "algebra_source", "gradient_kick_source", "tuple_algebra"]
 
 _MAX_POWER = 16  # integer powers up to this are written as products
 
 
-class _KernelPrinter(PythonCodePrinter):
+class KernelPrinter(PythonCodePrinter):
     """Python for Numba: float literals, and products and square roots in place of small powers."""
 
     def _print_Integer(self, expr: sp.Integer) -> str:
@@ -75,7 +75,7 @@ def algebra_source(symbols: SymbolicHamiltonian) -> str:
     slope = [sp.diff(symbols.V, s) for s in q]
     parts = [
         f"NDOF = {d}",
-        _tuple_algebra(d),
+        tuple_algebra(d),
         _function("kick", "q, b, work", q, [-s for s in slope], [f"b*{{{i}}}" for i in range(d)]),
         _function("drift", "p, a, work", p, velocity, [f"a*{{{i}}}" for i in range(d)]),
     ]
@@ -83,7 +83,10 @@ def algebra_source(symbols: SymbolicHamiltonian) -> str:
 
 
 def gradient_kick_source(symbols: SymbolicHamiltonian) -> str:
-    """−b∇V and g ∇²V M⁻¹∇V: the Hessian's upper triangle is computed, the products are taken with numbers.
+    """−b∇V + g ∇²V M⁻¹∇V in two parts, those of the Hessian's diagonal and of what is beside it.
+
+    The Hessian's upper triangle is computed, the products are taken with numbers: g times its entries does not wait
+    for ∇V, so that of what follows ∇V two fused operations are left.
 
     Raises
     ------
@@ -99,22 +102,28 @@ def gradient_kick_source(symbols: SymbolicHamiltonian) -> str:
 
     def velocity(j: int) -> str:
         terms = [f"{float(M[j, k])!r}*{{{k}}}" if M[j, k] != 1 else f"{{{k}}}" for k in range(d) if M[j, k] != 0]
-        return f"({' + '.join(terms)})"
+        return terms[0] if len(terms) == 1 else f"({' + '.join(terms)})"
 
-    plain, gradient = [f"-b*{{{i}}}" for i in range(d)], []
+    own, other = [], []
     for i in range(d):
-        row = [(position.get((min(i, j), max(i, j))), velocity(j)) for j in range(d)]
-        product = " + ".join(f"{{{n}}}*{v}" for n, v in row if n is not None)
-        gradient.append(f"g*({product})" if product else "0.0")
-    results = [f"({', '.join(change)},)" for change in (plain, gradient)]
-    return _function("gradient_kick", "q, b, g, work", q, [*slope, *entries], results) + "\n"
+        row = {j: n for j in range(d) if (n := position.get((min(i, j), max(i, j)))) is not None}
+        if i not in row:
+            own.append(f"-b*{{{i}}}")
+        elif M[i, i] == 1 and velocity(i) == f"{{{i}}}":
+            own.append(f"(g*{{{row[i]}}} - b)*{{{i}}}")
+        else:
+            own.append(f"(g*{{{row[i]}}}*{velocity(i)} - b*{{{i}}})")
+        other.append(" + ".join(f"(g*{{{n}}})*{velocity(j)}" for j, n in row.items() if j != i) or "0.0")
+    results = [f"({', '.join(change)},)" for change in (own, other)]
+    coupled = f"COUPLED = {any(term != '0.0' for term in other)}"
+    return f"{coupled}\n\n\n" + _function("gradient_kick", "q, b, g, work", q, [*slope, *entries], results) + "\n"
 
 
 def _function(
     name: str, arguments: str, variables: Sequence[sp.Symbol], expressions: list[sp.Expr], results: list[str]
 ) -> str:
     """A jitted function that returns the tuple `results`, ``{n}`` in them standing for the n-th expression."""
-    printer = _KernelPrinter({"fully_qualified_modules": True, "human": True})
+    printer = KernelPrinter({"fully_qualified_modules": True, "human": True})
     expressions = [printable(f) for f in expressions]
     shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("s_", real=True), list=True)
     values = [sp.Symbol(f"v_{n}", real=True) for n in range(len(reduced))]
@@ -133,7 +142,7 @@ def _function(
     return "\n".join(lines)
 
 
-def _tuple_algebra(d: int) -> str:
+def tuple_algebra(d: int) -> str:
     """Componentwise operations on tuples of length d, written out."""
 
     def each(pattern: str) -> str:

@@ -20,15 +20,27 @@ def empty_lanes():
 
 @njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
 def stage_lanes(Y, error, width, b, g, a):
-    for lane in range(width):
-        q, p = unpack_lane(Y, lane)
-        if COMPENSATED:
-            q_error, p_error = unpack_lane(error, lane)
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, a, None)
-            pack_lane(q_error, p_error, error, lane)
-        else:
-            q, p, _, _ = stage(q, p, None, None, b, g, a, None)
-        pack_lane(q, p, Y, lane)
+    # Asked outside the loops: a loop with a branch in it, once it is long, is no longer made of vector instructions.
+    if FORCE_GRADIENTS and g != 0.0:
+        for lane in range(width):
+            q, p = unpack_lane(Y, lane)
+            if COMPENSATED:
+                q_error, p_error = unpack_lane(error, lane)
+                q, p, q_error, p_error = gradient_stage(q, p, q_error, p_error, b, g, a, None)
+                pack_lane(q_error, p_error, error, lane)
+            else:
+                q, p, _, _ = gradient_stage(q, p, None, None, b, g, a, None)
+            pack_lane(q, p, Y, lane)
+    else:
+        for lane in range(width):
+            q, p = unpack_lane(Y, lane)
+            if COMPENSATED:
+                q_error, p_error = unpack_lane(error, lane)
+                q, p, q_error, p_error = plain_stage(q, p, q_error, p_error, b, a, None)
+                pack_lane(q_error, p_error, error, lane)
+            else:
+                q, p, _, _ = plain_stage(q, p, None, None, b, a, None)
+            pack_lane(q, p, Y, lane)
 
 
 @njit(**OPTIONS)

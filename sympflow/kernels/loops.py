@@ -2,7 +2,8 @@
 
 The algebra that comes before says what a state is: q and p are tuples held in registers (a symbolic system) or
 arrays changed in place (Numba functions). It defines ``unpack``, ``pack``, ``copy``, ``is_finite``, ``move``,
-``no_error``, ``kick``, ``gradient_kick``, ``drift`` and ``workspace``.
+``no_error``, ``kick``, ``gradient_kick``, ``drift`` and ``workspace``. A ``gradient_kick`` has two parts, which are
+added one after the other, the second only where `COUPLED`.
 
 A run executes the table [opening, inner …, link, closing] of stages (kick, then drift). A step is the link (the
 first step, the opening) and the inner stages; consecutive steps share their common kick or drift in the link, and
@@ -21,11 +22,24 @@ CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where noth
 def stage(q, p, q_error, p_error, b, g, a, work):
     """Kick by b (and g), then drift by a."""
     if FORCE_GRADIENTS and g != 0.0:
-        plain, gradient = gradient_kick(q, b, g, work)
-        p, p_error = move(p, p_error, plain)  # first, for it is known sooner
-        p, p_error = move(p, p_error, gradient)
-    else:
-        p, p_error = move(p, p_error, kick(q, b, work))
+        return gradient_stage(q, p, q_error, p_error, b, g, a, work)
+    return plain_stage(q, p, q_error, p_error, b, a, work)
+
+
+@njit(**OPTIONS)
+def plain_stage(q, p, q_error, p_error, b, a, work):
+    p, p_error = move(p, p_error, kick(q, b, work))
+    q, q_error = move(q, q_error, drift(p, a, work))
+    return q, p, q_error, p_error
+
+
+@njit(**OPTIONS)
+def gradient_stage(q, p, q_error, p_error, b, g, a, work):
+    if FORCE_GRADIENTS:
+        first, second = gradient_kick(q, b, g, work)
+        p, p_error = move(p, p_error, first)
+        if COUPLED:
+            p, p_error = move(p, p_error, second)
     q, q_error = move(q, q_error, drift(p, a, work))
     return q, p, q_error, p_error
 
