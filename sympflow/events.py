@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import brentq
 
 from sympflow.arrays import Array, is_tensor, stack, to_numpy
+
+if TYPE_CHECKING:
+    from sympflow.integrators.base import Integrator, Outcome, Problem
 
 EventFunction = Callable[[float, Array], Any]
 Dense = Callable[[float], Array]
@@ -100,8 +103,9 @@ class EventSearch:
     Parameters
     ----------
     events : tuple of Event
-    max_interval : float
+    max_interval : float, optional
         Longest time between two samples of the event functions: longer steps are sampled in between, at equal parts.
+        The default is the integrator's choice.
 
     Attributes
     ----------
@@ -111,15 +115,24 @@ class EventSearch:
         Evaluations of the dense output.
     """
 
-    def __init__(self, events: tuple[Event, ...], max_interval: float = math.inf) -> None:
+    def __init__(self, events: tuple[Event, ...], max_interval: float | None = None) -> None:
         self.events, self.max_interval = events, max_interval
         self.found: list[list[tuple[float, Array]]] = [[] for _ in events]
         self.values: list[float] | None = None
         self.end: tuple[float, Array] | None = None
         self.n_dense = 0
 
-    def step(self, t_old: float, y_old: Array, t: float, y: Array, dense: Dense) -> tuple[float, Array] | None:
-        """Search one step from (t_old, y_old) to (t, y): where the run ends in it, if it does."""
+    def parts(self, h: float, default: float = math.inf) -> int:
+        """The number of equal parts at whose ends a step of length h is sampled; `default` is the interval if unset."""
+        return max(1, math.ceil(abs(h) / (self.max_interval or default) * (1 - 4 * _EPS)))
+
+    def step(
+        self, t_old: float, y_old: Array, t: float, y: Array, dense: Dense, inner: Sequence[Array] | None = None
+    ) -> tuple[float, Array] | None:
+        """Search one step from (t_old, y_old) to (t, y): where the run ends in it, if it does.
+
+        `inner` are the states that divide the step into equal parts, if they are known already.
+        """
         first = self.values is None
         if first:
             self.values = [event.value(t_old, y_old) for event in self.events]
@@ -130,17 +143,14 @@ class EventSearch:
             self.n_dense += 1
             return dense(s)
 
-        for a, b in self._parts(t_old, t):
-            y_b = inside(b)
+        n = self.parts(t - t_old) if inner is None else len(inner) + 1
+        ends = [t_old + (t - t_old) * i / n for i in range(n)] + [t]
+        for i, (a, b) in enumerate(itertools.pairwise(ends)):
+            y_b = inside(b) if inner is None or i == n - 1 else inner[i]
             if self._part(a, b, y_b, inside, first):
                 return self.end
             first = False
         return None
-
-    def _parts(self, t_old: float, t: float) -> Iterator[tuple[float, float]]:
-        n = max(1, math.ceil(abs(t - t_old) / self.max_interval * (1 - 4 * _EPS)))
-        ends = [t_old + (t - t_old) * i / n for i in range(n)] + [t]
-        return itertools.pairwise(ends)
 
     def _part(self, a: float, b: float, y_b: Array, inside: Dense, first: bool) -> bool:
         before = self.values
@@ -179,3 +189,39 @@ class EventSearch:
     def states(self, y0: Array) -> list[Array]:
         """`y_events` of the solution: an array (n, 2d) for each event, like `y0`; tensors without gradient."""
         return [stack([y for _, y in zeros], axis=0) if zeros else y0[None][:0] for zeros in self.found]
+
+
+def run_and_search(integrator: Integrator, problem: Problem, search: EventSearch) -> Outcome:
+    """A run of an integrator that does not look for events itself: they are sought on its dense output afterwards.
+
+    Raises
+    ------
+    ValueError
+        If the integrator has no dense output.
+    """
+    full = integrator.run(replace(problem, t_eval=None, save_every=1, dense_output=True, events=None))
+    if full.sol is None:
+        raise ValueError(
+            f"`events` are located on the dense output, which method {integrator.name!r} does not give: use another "
+            "method."
+        )
+    sign = 1 if problem.t1 >= problem.t0 else -1
+    search.max_interval = search.max_interval or problem.system.dt
+    if len(full.t) == 1:
+        search.step(full.t[0], full.y[0], full.t[0], full.y[0], full.sol)
+    for k in range(len(full.t) - 1):
+        if search.step(float(full.t[k]), full.y[k], float(full.t[k + 1]), full.y[k + 1], full.sol):
+            break
+    t_end = search.end[0] if search.end else float(full.t[-1]) if full.status else problem.t1
+    if problem.t_eval is not None:
+        t = problem.t_eval[(problem.t_eval - t_end) * sign <= 0]
+        y = stack([full.sol(s) for s in t.tolist()], axis=0) if t.size else problem.y0[None][:0]
+    else:
+        keep = np.unique([*range(0, len(full.t), problem.save_every), len(full.t) - 1])
+        keep = keep[(full.t[keep] - t_end) * sign <= 0]
+        t, y = full.t[keep], full.y[keep]
+        if search.end and t[-1] != t_end:
+            t, y = np.append(t, t_end), stack([*y, search.end[1]], axis=0)
+    if search.end:
+        full.status, full.message = 1, ENDED
+    return replace(full, t=t, y=y, sol=full.sol if problem.dense_output else None)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
 from sympflow.domain import Domain, EnergySublevel
-from sympflow.events import EventSearch, parse
+from sympflow.events import EventSearch, parse, run_and_search
 from sympflow.integrators.base import Integrator, Outcome, Problem
 from sympflow.integrators.registry import build
 from sympflow.solution import Solution
@@ -60,11 +60,12 @@ def solve(
     events : callable or list of callables, optional
         Functions g(t, y) of one state whose zeros are sought, as in SciPy: with the attribute `terminal` True, or a
         count, the solution ends at the zero of that number; with `direction` positive (negative) only zeros where g
-        increases (decreases) count. They are located on the dense output, while the run streams by: no state is stored
-        for them. For single trajectories; `poincare_section` takes batches.
+        increases (decreases) count. They are located by Brent's method on the dense output, while the run streams by:
+        no state is stored for them. For single trajectories; `poincare_section` takes batches.
     event_step : float, optional
-        Longest time between two samples of the event functions. The default is every step, which misses two zeros
-        within one; smaller values sample within steps, without changing the run.
+        Longest time between two samples of the event functions; two zeros of one between two samples are missed. It
+        never changes the run: longer steps are sampled within, by the dense output, as `max_step` does inside
+        `solve_ivp`. The default is `system.dt` for fixed steps, which may be long, and every step for adaptive methods.
     backend : "auto", "compiled" or "array"
         "auto" runs splitting methods on symbolic systems (and on Numba functions) and float64 NumPy states compiled,
         everything else with array operations. What ran is in `stats["backend"]`.
@@ -110,12 +111,16 @@ def solve(
     action = on_domain_exit or ("warn" if integrator.trained else "ignore")
     if action not in ("warn", "stop", "ignore"):
         raise ValueError(f"`on_domain_exit` must be 'warn', 'stop' or 'ignore'; got {on_domain_exit!r}.")
-    search = _check_events(integrator, y_start, events, event_step)
+    search = _check_events(y_start, events, event_step)
     problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend, search)
     _check_memory(integrator, problem)
 
     start = time.perf_counter()
-    outcome = integrator.run(problem)
+    outcome = (
+        integrator.run(problem)
+        if search is None or integrator.finds_events
+        else run_and_search(integrator, problem, search)
+    )
     outcome.stats["wall_time"] = time.perf_counter() - start
     if action != "ignore":
         _check_domain(outcome, integrator, system, action)
@@ -209,7 +214,7 @@ def _check_save_every(save_every: Any, times: np.ndarray | None) -> int:
     return int(save_every)
 
 
-def _check_events(integrator: Integrator, y0: Array, events: Any, event_step: Any) -> EventSearch | None:
+def _check_events(y0: Array, events: Any, event_step: Any) -> EventSearch | None:
     parsed = parse(events)
     if not parsed:
         if event_step is not None:
@@ -220,8 +225,6 @@ def _check_events(integrator: Integrator, y0: Array, events: Any, event_step: An
             f"`events` are found along one trajectory, but `y0` is a batch of shape {tuple(y0.shape)}: solve one state "
             "at a time, or use poincare_section, which takes batches."
         )
-    if not integrator.finds_events:
-        raise ValueError(f"`events` are not found by method {integrator.name!r}: use another method.")
     if event_step is None:
         return EventSearch(parsed)
     if not (isinstance(event_step, int | float | np.number) and event_step > 0):

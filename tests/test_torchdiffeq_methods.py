@@ -76,6 +76,46 @@ def test_fixed_methods_are_torchdiffeqs(method):
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
+@pytest.mark.parametrize("t_end", [3.0, -3.0])
+def test_the_interpolation_is_torchdiffeqs(method, t_end):
+    """Between the steps, which are long here, to rounding: at output times, and by the dense output."""
+    times = np.linspace(0, t_end, 20)
+    loose = {"rtol": 1e-3, "atol": 1e-5}
+    theirs = odeint(HH, torch.tensor(HH.y0), torch.as_tensor(times), method=method, **loose).numpy().T
+    sol = solve(HH, method, (0, t_end), t_eval=times, dense_output=True, **loose)
+    np.testing.assert_allclose(sol.y, theirs, rtol=0, atol=256 * EPS)
+    np.testing.assert_allclose(sol.sol(times), theirs, rtol=0, atol=256 * EPS)
+    np.testing.assert_allclose(sol.sol(times[7]), theirs[:, 7], rtol=0, atol=256 * EPS)
+    batch = solve(HH, method, (0, t_end), np.stack([HH.y0, HH.y0]), dense_output=True, **loose)
+    np.testing.assert_allclose(batch.sol(times), [theirs, theirs], rtol=0, atol=256 * EPS)
+    assert batch.sol(times[3]).shape == (2, 4)
+    with pytest.raises(ValueError, match=r"^`t` must lie in"):
+        sol.sol(1.1 * t_end)
+
+
+def test_gradients_flow_through_the_dense_output():
+    y0 = torch.tensor([1.0, 0.2], dtype=torch.float64)
+    for method in ("dopri5", "explicit_adams"):
+
+        def state(y, method=method):
+            return solve(PENDULUM, method, (0, 2), y, dense_output=True).sol(1.234)
+
+        exact = torch.autograd.functional.jacobian(
+            lambda y: solve(PENDULUM, "kahan_li8", (0, 2), y, t_eval=[1.234]).y[:, 0], y0
+        )
+        torch.testing.assert_close(torch.autograd.functional.jacobian(state, y0), exact, atol=1e-3, rtol=0)
+
+
+def test_a_batch_of_which_one_fails_keeps_the_dense_output_of_the_others():
+    y0 = np.array([HH.y0, [0, 0, 0, 0.7]])
+    sol = solve(HH, "dopri5", (0, 8), y0, t_eval=[4.0, 7.0], rtol=1e-4, dense_output=True)
+    assert sol.status.tolist() == [0, -1]
+    assert "Trajectory 1: torchdiffeq stopped after t = 5.4" in sol.message
+    np.testing.assert_allclose(sol.sol(4.0), sol.y[..., 0], atol=64 * EPS)
+    assert np.isnan(sol.y[1, :, 1]).all()
+
+
+@pytest.mark.parametrize("method", ADAPTIVE)
 def test_one_step_of_the_tableau_is_torchdiffeqs(method):
     """Against an accepted first step of prescribed length."""
     h, loose = 0.3, {"rtol": 1e3, "atol": 1e3}
@@ -103,6 +143,16 @@ def test_multistep_methods_are_torchdiffeqs_and_have_no_step(method):
     np.testing.assert_allclose(solve(HH, method, (0, 1), dt=0.02).y[:, -1], theirs[-1].numpy(), atol=1e-9)
     with pytest.raises(TypeError, match=r"^`method` .* has no bare step"):
         get(method)().step(HH, 0.0, HH.y0, 0.1)
+
+
+@pytest.mark.parametrize("method", MULTISTEP)
+def test_order_of_multistep_methods_by_slope(method):
+    """With `max_order` 4 Adams–Bashforth uses three slopes, Adams–Moulton four."""
+    exact = solve(PENDULUM, "dop853", (0, 4), [1.0, 0.2], t_eval=[4.0], rtol=1e-13, atol=1e-14).y
+    errors = [
+        np.abs(solve(PENDULUM, method, (0, 4), [1.0, 0.2], t_eval=[4.0], dt=dt).y - exact).max() for dt in (0.1, 0.05)
+    ]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(get(method).order, abs=0.3)
 
 
 def test_methods_that_carry_a_slope_have_no_volume_to_measure():

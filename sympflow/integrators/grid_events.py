@@ -10,8 +10,10 @@ from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
 from sympflow.events import ENDED, EventSearch
 from sympflow.integrators.base import FINISHED, FixedStep, GridSolution, Outcome, Problem
 from sympflow.integrators.grid import Grid
+from sympflow.system import HamiltonianSystem
 
 FIRST_CHUNK, LAST_CHUNK = 8, 1024
+MOST_SAMPLES = 65536  # in a chunk
 
 
 def run_with_events(integrator: FixedStep, problem: Problem, search: EventSearch) -> Outcome:
@@ -22,9 +24,10 @@ def run_with_events(integrator: FixedStep, problem: Problem, search: EventSearch
     outputs: list[Array] = [y[None][:0]]
     kept: list[Array] = []
     chunk, k, delivered, failed, backend = FIRST_CHUNK, 0, 0, False, ""
+    largest = max(1, min(LAST_CHUNK, MOST_SAMPLES // search.parts(grid.h, system.dt)))
 
     while True:
-        n = min(chunk, grid.n_steps - k)
+        n = min(chunk, largest, grid.n_steps - k)
         piece = Problem(system, grid.time(k), grid.time(k + n), y, backend=problem.backend)
         states, finite, backend = integrator.rollout(piece, grid.h, n, np.arange(n + 1))
         good = min(n, int(finite))
@@ -48,7 +51,7 @@ def run_with_events(integrator: FixedStep, problem: Problem, search: EventSearch
         if ended or last:
             k += taken if ended else good
             break
-        y, k, chunk = states[n], k + n, min(2 * chunk, LAST_CHUNK)
+        y, k, chunk = states[n], k + n, 2 * chunk
 
     t, y_out = times[:delivered], _join(outputs)
     finite_outputs = to_numpy(all_finite(y_out))  # a shorter step may overflow too
@@ -84,15 +87,36 @@ def _search(
     integrator: FixedStep, problem: Problem, search: EventSearch, grid: Grid, k: int, states: Array, backend: str
 ) -> tuple[int, bool]:
     """Search the steps between `states`, which begin at grid point k: the number searched, and whether the run ends."""
+    inner = _samples(integrator, problem.system, search, states[:-1], grid.h, backend)
     for j in range(len(states) - 1):
         t, y = grid.time(k + j), states[j]
 
         def dense(s: float, t: float = t, y: Array = y) -> Array:
             return integrator.substep(problem.system, y, s - t, backend)
 
-        if search.step(t, y, grid.time(k + j + 1), states[j + 1], dense):
+        if search.step(t, y, grid.time(k + j + 1), states[j + 1], dense, inner[j]):
             return j + 1, True
     return len(states) - 1, False
+
+
+def _samples(
+    integrator: FixedStep, system: HamiltonianSystem, search: EventSearch, states: Array, h: float, backend: str
+) -> Array:
+    """States (n, parts − 1, 2d) that divide the steps of length h from `states` (n, 2d), all computed at once."""
+    parts = search.parts(h, system.dt)
+    search.n_dense += len(states) * (parts - 1)
+    lengths = h * np.arange(1, parts) / parts * np.ones((len(states), 1))
+    if parts == 1 or not len(states):
+        return states[:, None][:, :0]
+    if is_tensor(states):
+        import torch
+
+        with torch.no_grad():
+            repeated = states[:, None].expand(-1, parts - 1, -1)
+            return integrator.substep(system, repeated, torch.as_tensor(lengths).to(repeated), backend)
+    with np.errstate(all="ignore"):
+        repeated = np.repeat(states[:, None], parts - 1, axis=1)
+        return integrator.substep(system, repeated, lengths.astype(states.dtype), backend)
 
 
 def _search_remainder(
@@ -107,7 +131,8 @@ def _search_remainder(
     y_end = dense(grid.t1)
     if not to_numpy(all_finite(y_end)):
         return False
-    return bool(search.step(t, y, grid.t1, y_end, dense))
+    inner = _samples(integrator, problem.system, search, y[None], grid.remainder, backend)
+    return bool(search.step(t, y, grid.t1, y_end, dense, inner[0]))
 
 
 def _join(parts: Sequence[Array]) -> Array:

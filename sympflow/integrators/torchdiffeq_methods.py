@@ -15,14 +15,15 @@ from sympflow.integrators.tableaux import ADAPTIVE, FIXED, Tableau
 from sympflow.integrators.torchdiffeq_adams import Adams
 from sympflow.integrators.torchdiffeq_adaptive import Adaptive
 
-MULTISTEP = ("explicit_adams", "implicit_adams")
+MULTISTEP = {"explicit_adams": 3, "implicit_adams": 4}
+"""Orders with `max_order` 4, the default: Adams–Bashforth then uses three slopes, Adams–Moulton four."""
 
 
 @cache
 def torchdiffeq_method(name: str) -> type[Integrator]:
     """The integrator class of torchdiffeq's solver of that name."""
     if name in MULTISTEP:
-        return _named(name, Adams, {"order": 4, "__doc__": f"torchdiffeq's `{name}`: {Adams.__doc__}"})
+        return _named(name, Adams, {"order": MULTISTEP[name], "__doc__": f"torchdiffeq's `{name}`: {Adams.__doc__}"})
     tableau = (ADAPTIVE | FIXED)[name]
     base: type[Integrator] = Adaptive if name in ADAPTIVE else FixedGrid
     return _named(
