@@ -1,19 +1,34 @@
 """The built-in scenes: each is what its docstring says, and the truths that are known of it hold."""
 
 import math
+from importlib import import_module
 
 import numpy as np
 import pytest
 import torch
 
 from sympflow import solve, systems
+from sympflow.commands.arguments import scenes
 from sympflow.domain import domain_from_dict
+from sympflow.systems import SYSTEMS
+
+outer = import_module("sympflow.systems.outer_solar_system")  # the package's attributes are the functions
+argon = import_module("sympflow.systems.lennard_jones")
 
 # a scene as it is built, and H(y0) worked out by hand
 SCENES = {
     "harmonic_oscillator": (lambda: systems.harmonic_oscillator(3.0), 4.5),
     "henon_heiles": (systems.henon_heiles, 0.45 * 0.3 - 0.027 + 0.009 + 0.5 * 0.0225 + 0.0),
     "pendulum": (systems.pendulum, 1 - math.cos(1.5)),
+    "henon_heiles_escape": (systems.henon_heiles_escape, 0.245),
+    "pendulum_separatrix": (systems.pendulum_separatrix, 2.0),
+    "double_well": (systems.double_well, 0.25),
+    "double_well below": (lambda: systems.double_well(0.1), 0.1),
+    "three_body": (systems.three_body, -769 / 60),
+    "toda_lattice": (systems.toda_lattice, 0.75),
+    "toda_lattice 2": (lambda: systems.toda_lattice(2), 1.0),
+    "toda_lattice 5": (lambda: systems.toda_lattice(5), 0.625),
+    "nonseparable": (systems.nonseparable, 5.0),
     "kepler": (systems.kepler, -0.5),
     "kepler 0.999": (lambda: systems.kepler(0.999), -0.5),
     "quartic": (systems.quartic, 0.419025),
@@ -26,6 +41,12 @@ SCENES = {
         0.5 - math.cos(1) * (1 + math.cos(1) / 2e6),
     ),
 }
+
+NUMBA_SCENES = {
+    "outer_solar_system": systems.outer_solar_system,
+    "lennard_jones": systems.lennard_jones,
+}
+ALL = {**{name: make for name, (make, _) in SCENES.items()}, **NUMBA_SCENES}
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -47,16 +68,31 @@ def test_derivatives_are_those_of_H(scene):
         np.testing.assert_allclose(system.hessian(array), hessian, rtol=1e-10, atol=1e-10 * float(abs(hessian).max()))
 
 
-@pytest.mark.parametrize("scene", SCENES)
-def test_the_scene_starts_inside_its_domain_and_can_be_described(scene):
-    system = SCENES[scene][0]()
-    assert system.domain.contains(system.y0)
+@pytest.mark.parametrize("scene", NUMBA_SCENES)
+def test_derivatives_of_numba_functions_are_those_of_H(scene):
+    """By central differences, of the potential and of its gradient."""
+    system = NUMBA_SCENES[scene]()
+    q, d = system.y0[: system.ndof], system.ndof
+    step = 1e-4 * np.abs(q).max() * np.eye(d)
+    slope = (system.potential(q + step) - system.potential(q - step)) / (2 * step.diagonal())
+    np.testing.assert_allclose(system.force(q), -slope, rtol=1e-5, atol=1e-6 * abs(slope).max())
+    hessian = (system.force(q - step) - system.force(q + step)) / (2 * step.diagonal()[:, None])
+    given = system.potential_hessian(q)
+    np.testing.assert_allclose(given, hessian, rtol=1e-4, atol=1e-5 * abs(hessian).max())
+    np.testing.assert_allclose(given, given.T, atol=1e-14 * abs(given).max())
+    np.testing.assert_allclose(system.hessian_vector(q, q), given @ q, rtol=1e-9, atol=1e-14 * abs(given).max())
+
+
+@pytest.mark.parametrize("scene", ALL)
+def test_the_scene_can_be_described_and_starts_inside_its_domain(scene):
+    system = ALL[scene]()
+    assert bool(system.domain.contains(system.y0)) is (scene != "henon_heiles_escape")  # which is above its energy
     same = domain_from_dict(system.domain.to_dict())
     assert same == system.domain
     assert system.t_span[1] > system.t_span[0]
 
 
-@pytest.mark.parametrize("scene", sorted(SCENES.keys() - {"kepler 0.999", "spring pendulum, polar"}))
+@pytest.mark.parametrize("scene", sorted(SCENES.keys() - {"kepler 0.999", "spring pendulum, polar", "nonseparable"}))
 def test_the_default_step_is_sensible(scene):
     """A method of order 8 at the default step keeps the energy to 1e-9 for 500 steps.
 
@@ -65,6 +101,22 @@ def test_the_default_step_is_sensible(scene):
     system = SCENES[scene][0]()
     sol = solve(system, "kahan_li8", (0, 500 * system.dt), backend="array", save_every=50)
     assert sol.energy_error().max() < 1e-9
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_every_scene_is_on_the_command_line(name):
+    (scene,) = scenes([name])
+    assert scene.system.name == SYSTEMS[name].__name__
+    assert scene.system.y0 is not None
+    assert scene.system.domain is not None
+
+
+def test_parameters_of_a_scene_on_the_command_line():
+    (scene,) = scenes(["spring-pendulum", "--k", "1e4", "--coordinates=polar"])
+    assert not scene.system.separable
+    assert scene.system.params["k"] == 1e4
+    assert scene.key == "spring-pendulum-k=10000-coordinates=polar"
+    assert scenes(["fput:omega=10:m=2"])[0].system.ndof == 4
 
 
 def test_kepler_comes_back_after_every_period():
@@ -130,12 +182,184 @@ def test_the_spring_pendulum_starts_on_its_slow_manifold():
     np.testing.assert_allclose(fast_energy[0.5], 0.5, rtol=0.05)
 
 
+def test_on_the_separatrix_of_the_double_well():
+    system = systems.double_well()
+    t = np.linspace(0, 8, 33)
+    sol = solve(system, "dop853", (0, 8), t_eval=t, rtol=1e-13, atol=1e-14)
+    exact = math.sqrt(2) / np.cosh(t) * np.array([np.ones(33), -np.tanh(t)])
+    np.testing.assert_allclose(sol.y, exact, atol=1e-14 * math.exp(8) * 10)  # errors grow with exp(t)
+    right = solve(systems.double_well(0.2), "verlet", (0, 50))
+    assert right.y[0].min() > 0
+
+
+def test_on_the_separatrix_of_the_pendulum():
+    t = np.linspace(0, 8, 33)
+    sol = solve(systems.pendulum_separatrix(), "dop853", (0, 8), t_eval=t, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(
+        sol.y, [4 * np.arctan(np.exp(t)) - math.pi, 2 / np.cosh(t)], atol=1e-14 * math.exp(8) * 10
+    )
+    below, above = (solve(systems.pendulum_separatrix(E), "kahan_li8", (0, 50)).y[0] for E in (1.99, 2.01))
+    assert abs(below).max() < math.pi
+    assert above[-1] > 4 * math.pi
+
+
+def test_the_separatrices_agree_with_the_same_pendulum():
+    """One H: a flow for the one is a flow for the other."""
+    assert systems.pendulum_separatrix().fingerprint == systems.pendulum().fingerprint
+    assert systems.henon_heiles_escape().fingerprint == systems.henon_heiles().fingerprint
+
+
+def test_henon_heiles_ends_in_finite_time_above_the_escape_energy():
+    from scipy.integrate import quad
+
+    p, E = 0.7, 0.245
+    # q = tan²(s) maps [0, π/2) to [0, ∞) and makes the integrand smooth
+    t_star, _ = quad(
+        lambda s: 2 * math.tan(s) / math.cos(s) ** 2 / math.sqrt(2 * E - math.tan(s) ** 4 + 2 * math.tan(s) ** 6 / 3),
+        0,
+        math.pi / 2 - 1e-9,
+        epsabs=1e-13,
+        epsrel=1e-13,
+        limit=200,
+    )
+    assert t_star == pytest.approx(5.450984210235402, abs=1e-8)
+    system = systems.henon_heiles_escape(E)
+    np.testing.assert_array_equal(system.y0, [0, 0, 0, p])
+    late = t_star - 0.01
+    sol = solve(system, "dop853", (0, late), rtol=1e-13, atol=1e-13)
+    assert sol.y[1, -1] == pytest.approx(6 / 0.01**2, rel=1e-3)
+    beyond = solve(system, "dop853", (0, 10), rtol=1e-12, atol=1e-12)
+    assert beyond.status == -1
+    assert beyond.t[-1] == pytest.approx(t_star, abs=1e-6)
+
+
+def test_henon_heiles_stays_in_the_well_below_the_escape_energy():
+    system = systems.henon_heiles_escape(0.16567)
+    sol = solve(system, "kahan_li8", (0, 1000), dt=0.1)
+    assert system.domain.contains(sol.states, slack=1e-9).all()
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_the_toda_lattice_keeps_the_eigenvalues_of_laxs_matrix(n):
+    system = systems.toda_lattice(n)
+    sol = solve(system, "kahan_li8", (0, 50))
+    eigenvalues = systems.lax_eigenvalues(sol.states)
+    assert np.ptp(sol.y[:n], axis=1).min() > 0.5  # it moves
+    np.testing.assert_allclose(eigenvalues, np.broadcast_to(eigenvalues[0], eigenvalues.shape), atol=1e-11)
+    np.testing.assert_allclose(eigenvalues.sum(-1), 0, atol=1e-12)
+    if n > 2:
+        np.testing.assert_allclose((eigenvalues**2).sum(-1), (system.hamiltonian(system.y0) + n) / 2, rtol=1e-11)
+    assert system.domain.contains(sol.states).all()
+
+
+def test_the_toda_lattice_of_three_is_henon_heiles_to_third_order():
+    """With differences (2q₂ + 2√3q₁, 2q₂ − 2√3q₁, −4q₂) of neighbours, V/24 is the potential of Hénon and Heiles."""
+    toda, hh = systems.toda_lattice(3), systems.henon_heiles()
+    x = np.random.default_rng(0).uniform(-1, 1, (50, 2))
+    worst = []
+    for size in (2e-2, 1e-2):
+        q1, q2 = size * x.T
+        second = 2 * q2 - 2 * math.sqrt(3) * q1  # with the third particle at 0
+        particles = np.stack([second + 2 * q2 + 2 * math.sqrt(3) * q1, second, 0 * q1], axis=-1)
+        worst.append(abs(toda.potential(particles) / 24 - hh.potential(size * x)).max())
+    assert worst[0] / worst[1] == pytest.approx(16, rel=0.2)  # what is left is of fourth order
+
+
+def test_the_pythagorean_bodies_meet_as_they_should():
+    """The closest approach, at t = 15.8299."""
+    sol = solve(systems.three_body(), "dop853", (0, 16), rtol=1e-13, atol=1e-14)
+    bodies = sol.states[:, :6].reshape(-1, 3, 2)
+    distance = np.min(
+        [np.linalg.norm(bodies[:, i] - bodies[:, j], axis=1) for i, j in ((0, 1), (0, 2), (1, 2))], axis=0
+    )
+    assert distance.min() == pytest.approx(4.14e-4, rel=0.01)
+    assert sol.t[distance.argmin()] == pytest.approx(15.8299, abs=2e-4)
+
+
+def test_bodies_keep_their_momenta():
+    for system, dimension, mass in (
+        (systems.three_body(), 2, np.array([3.0, 4, 5])),
+        (systems.outer_solar_system(), 3, outer.MASSES),
+        (systems.lennard_jones(), 2, np.full(7, argon.MASS)),
+    ):
+        sol = solve(system, "kahan_li8", (0, 400 * system.dt), save_every=20)
+        q, p = (x.reshape(len(sol.t), -1, dimension) for x in np.split(sol.states, 2, axis=-1))
+        scale = abs(p).max()
+        np.testing.assert_allclose(p.sum(1), p[:1].sum(1) + np.zeros((len(sol.t), 1)), atol=1e-12 * scale)
+        assert abs(p[0].sum(0)).max() < 1e-14 * scale
+        angular = np.cross(q, p).sum(1) if dimension == 3 else (q[..., 0] * p[..., 1] - q[..., 1] * p[..., 0]).sum(1)
+        np.testing.assert_allclose(angular, angular[:1] + np.zeros_like(angular), atol=1e-11 * scale * abs(q).max())
+        np.testing.assert_allclose(system.velocity(p.reshape(len(p), -1)), (p / mass[:, None]).reshape(len(p), -1))
+
+
+def test_the_outer_solar_system_is_that_of_the_book():
+    system = systems.outer_solar_system()
+    m, G = outer.MASSES, outer.G
+    q, p = (x.reshape(6, 3) for x in np.split(system.y0, 2))
+    v = p / m[:, None]
+    np.testing.assert_allclose(q - q[0], outer.POSITIONS, atol=1e-14)
+    np.testing.assert_allclose(v - v[0], outer.VELOCITIES, atol=1e-17)
+    # osculating elements about the Sun: semi-major axes in AU, periods in days
+    r, speed2 = np.linalg.norm(q[1:] - q[0], axis=1), ((v[1:] - v[0]) ** 2).sum(1)
+    mu = G * (m[0] + m[1:])
+    a = 1 / (2 / r - speed2 / mu)
+    period = 2 * math.pi * np.sqrt(a**3 / mu)
+    np.testing.assert_allclose(a, [5.20, 9.58, 19.2, 30.1, 39.5], rtol=0.02)
+    assert period[0] == pytest.approx(4332, rel=2e-3)
+    # Kepler's third law with the year: k = 0.01720209895, G = k² in solar masses
+    assert math.sqrt(G) == pytest.approx(0.01720209895, rel=1e-9)
+
+
+def test_jupiter_returns_after_4332_days():
+    """Its mean period over 16 revolutions, from the angle swept in the plane of its orbit."""
+    system = systems.outer_solar_system()
+    sol = solve(system, "kahan_li8", (0, 16 * 4332.0), dt=50.0)
+    assert sol.energy_error().max() < 1e-13
+    assert sol.stats["backend"] == "compiled"
+    q = (sol.states[:, 3:6] - sol.states[:, :3]).T
+    pole = np.cross(q[:, 0], q[:, 20])
+    pole /= np.linalg.norm(pole)
+    x = q[:, 0] / np.linalg.norm(q[:, 0])
+    angle = np.unwrap(np.arctan2(np.cross(pole, x) @ q, x @ q))
+    assert 2 * math.pi * sol.t[-1] / angle[-1] == pytest.approx(4332, rel=2e-3)
+    assert system.domain.contains(sol.states).all()
+
+
+def test_the_argon_crystal_is_that_of_the_book():
+    system = systems.lennard_jones()
+    assert system.hamiltonian(system.y0) == pytest.approx(-1260.2, abs=0.05)
+    sol = solve(system, "verlet", (0, 0.02))
+    assert sol.energy_error().max() * 1260.2 < 10  # figure I.4.1 of the book: a few kelvin
+    assert sol.stats["backend"] == "compiled"
+
+
+@pytest.mark.parametrize("amplitude", [0.5, 3.0])
+def test_the_nonseparable_system_is_solved_by_elliptic_functions(amplitude):
+    from scipy.special import ellipj, ellipk
+
+    system = systems.nonseparable(amplitude)
+    rate, m = math.sqrt(1 + amplitude**2), amplitude**2 / (1 + amplitude**2)
+    t = np.linspace(0, 4 * ellipk(m) / rate, 41)
+    sol = solve(system, "dop853", (0, t[-1]), t_eval=t, rtol=1e-13, atol=1e-14)
+    sn, cn, dn, _ = ellipj(rate * t, m)
+    q = -amplitude * cn
+    p = amplitude * rate * sn * dn / (1 + q**2)
+    np.testing.assert_allclose(sol.y, [q, p], atol=1e-10 * amplitude)
+    assert system.domain.contains(sol.states).all()
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: systems.kepler(1.0), "^`e` must be an eccentricity"),
         (lambda: systems.kepler(-0.1), "^`e` must be"),
         (lambda: systems.kepler("0.6"), "^`e` must be"),
+        (lambda: systems.henon_heiles_escape(0), "^`energy` must be positive"),
+        (lambda: systems.double_well(math.nan), "^`energy` must be positive"),
+        (lambda: systems.pendulum_separatrix(-1), "^`energy` must be positive"),
+        (lambda: systems.toda_lattice(1), "^`n` must be an integer"),
+        (lambda: systems.toda_lattice("3"), "^`n` must be an integer"),
+        (lambda: systems.nonseparable(0), "^`amplitude` must be positive"),
         (lambda: systems.fput(0), "^`omega` must be positive"),
         (lambda: systems.fput(m=0), "^`m` must be a positive integer"),
         (lambda: systems.fput(m=1.5), "^`m` must be a positive integer"),
