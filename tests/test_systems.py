@@ -2,6 +2,7 @@
 
 import math
 from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -109,6 +110,15 @@ def test_every_scene_is_on_the_command_line(name):
     assert scene.system.name == SYSTEMS[name].__name__
     assert scene.system.y0 is not None
     assert scene.system.domain is not None
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_every_scene_is_documented(name):
+    docs = Path(__file__).parent.parent / "docs"
+    assert f"| `{name}` |" in (docs / "systems.md").read_text(encoding="utf-8")
+    assert f"::: sympflow.systems.{SYSTEMS[name].__name__}\n" in (docs / "reference" / "systems.md").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_parameters_of_a_scene_on_the_command_line():
