@@ -149,11 +149,12 @@ def linear_part(system: HamiltonianSystem) -> LinearPart:
     ValueError
         If there is none; or if it is stiff in a direction that turns over the domain, which no constant K follows.
     """
+    part: LinearPart | None
     if system.stiffness_matrix is not None:
         K = system.stiffness_matrix
         part = LinearPart(_inverse_mass(system), K, np.zeros(system.ndof), None, _interval(system))
     elif system.symbols is not None:
-        part = _read_off(system)
+        part = read_off(system.symbols.H, system.symbols.q, system.symbols.p, _interval(system))
     else:
         raise ValueError(
             f"`system` {system.name!r} is given by functions, from which no linear part can be read: pass "
@@ -179,14 +180,14 @@ def _interval(system: HamiltonianSystem) -> float:
     return abs(system.t_span[1] - system.t_span[0])
 
 
-def _read_off(system: HamiltonianSystem) -> LinearPart | None:
+def read_off(
+    H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...], interval: float = 0.0
+) -> LinearPart | None:
     """The quadratic terms of a symbolic H, or None if its potential has none."""
     import sympy as sp
 
-    symbols = system.symbols
-    assert symbols is not None
-    q, p, d = symbols.q, symbols.p, system.ndof
-    quadratic, rest = quadratic_terms(symbols.H, (*q, *p))
+    d = len(q)
+    quadratic, rest = quadratic_terms(H, (*q, *p))
     B, K = sp.hessian(quadratic, p), sp.hessian(quadratic, q)
     # a coordinate takes part if its momentum enters H by the quadratic terms alone
     active = [i for i in range(d) if B[i, i] != 0 and not rest.has(p[i])]
@@ -204,7 +205,7 @@ def _read_off(system: HamiltonianSystem) -> LinearPart | None:
     removed = sp.expand(quadratic - (X.T * Ks * X)[0] / 2 - (P.T * Bs * P)[0] / 2)
     negligible = 1e-12 * (1 + np.abs(slope).max())
     kept = [t for t in sp.Add.make_args(removed) if abs(t.as_coeff_Mul()[0]) > negligible and t.free_symbols]
-    return LinearPart(B_array, K_array, center, rest + sp.Add(*kept), _interval(system))
+    return LinearPart(B_array, K_array, center, rest + sp.Add(*kept), interval)
 
 
 def _number(value: float) -> Any:

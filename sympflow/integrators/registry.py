@@ -23,9 +23,17 @@ _BUILT_IN = {
     "mlp": "sympflow:MLPIntegrator",
     "implicit_midpoint": "implicit:ImplicitMidpoint",
     "gauss_legendre4": "implicit:GaussLegendre4",
+    "log_leapfrog": "logarithmic:log_leapfrog",
+    "log_blanes_moan4": "logarithmic:log_blanes_moan4",
+    "log_kahan_li8": "logarithmic:log_kahan_li8",
 }
+_WITH_PARTS = (
+    *("impulse", "mollified_impulse", "implicit_explicit"),
+    *("linear_srkn6b", "linear_srkn11b", "linear_srkn14a", "linear_omelyan4"),
+    *("strang_parts", "suzuki4_parts", "kahan_li6_parts", "kahan_li8_parts"),
+)
 _TORCHDIFFEQ = (*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams")
-_NAMES = frozenset((*SCHEMES, *_BUILT_IN, *_TORCHDIFFEQ))
+_NAMES = frozenset((*SCHEMES, *_BUILT_IN, *_WITH_PARTS, *_TORCHDIFFEQ))
 _registered: dict[str, type[Integrator]] = {}
 
 
@@ -56,6 +64,10 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
         from sympflow.integrators.splitting import splitting
 
         return splitting(method)
+    if method in _WITH_PARTS:
+        from sympflow.integrators.linear_splitting import maps_stepper
+
+        return maps_stepper(method)
     if method in _TORCHDIFFEQ:
         from sympflow.integrators.torchdiffeq_methods import torchdiffeq_method
 

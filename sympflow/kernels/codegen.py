@@ -10,12 +10,12 @@ from sympy.printing.pycode import PythonCodePrinter
 
 from sympflow.symbolic import SymbolicHamiltonian, printable
 
-__all__ = ["KernelPrinter", "algebra_source", "gradient_kick_source", "tuple_algebra"]
+__all__ = ["algebra_source", "gradient_kick_source", "tuple_algebra"]
 
 _MAX_POWER = 16  # integer powers up to this are written as products
 
 
-class KernelPrinter(PythonCodePrinter):
+class _KernelPrinter(PythonCodePrinter):
     """Python for Numba: float literals, and products and square roots in place of small powers."""
 
     def _print_Integer(self, expr: sp.Integer) -> str:
@@ -123,7 +123,7 @@ def _function(
     name: str, arguments: str, variables: Sequence[sp.Symbol], expressions: list[sp.Expr], results: list[str]
 ) -> str:
     """A jitted function that returns the tuple `results`, ``{n}`` in them standing for the n-th expression."""
-    printer = KernelPrinter({"fully_qualified_modules": True, "human": True})
+    printer = _KernelPrinter({"fully_qualified_modules": True, "human": True})
     expressions = [printable(f) for f in expressions]
     shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("s_", real=True), list=True)
     values = [sp.Symbol(f"v_{n}", real=True) for n in range(len(reduced))]

@@ -1,0 +1,178 @@
+"""The kernel of splittings into exactly solvable parts, in the normal modes of the linear one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sympflow.kernels.modules import OPTIONS, load_module, run_rows, template
+from sympflow.kernels.parts_codegen import IDLE, WITH_GRADIENT, parts_source, row_width
+from sympflow.parts import LINEAR, ExactParts, Map, PartFunctions
+
+__all__ = ["PartsKernel"]
+
+Maps = Callable[[np.ndarray], Sequence[Map]]
+"""The maps of a step of length h (...), their entries of that batch shape."""
+
+
+@dataclass(frozen=True)
+class _Loops:
+    """The compiled functions of one variant (with or without filters and force gradients)."""
+
+    rollout: Callable[..., int]
+    rollout_batch: Callable[..., None]
+    step_each: Callable[..., None]
+
+
+class PartsKernel:
+    """Compiled loops over the maps of any splitting of one system; states are [q, p], float64.
+
+    Rounding cannot make the linear part drift: its modes rotate by three shears, each with determinant 1 whatever its
+    number, by at most an eighth of a turn, after an exact number of quarter turns; the run stays in the modes.
+
+    Parameters
+    ----------
+    parts : ExactParts
+        Of a symbolic system.
+    """
+
+    def __init__(self, parts: ExactParts) -> None:
+        if not all(isinstance(part, PartFunctions) for part in parts.rest):
+            raise ValueError("`system` is given by plain functions: define it with from_sympy, or use backend='array'.")
+        self.parts = parts
+        self._variants: dict[tuple[bool, bool], _Loops] = {}
+        self._plain: str | None = None
+
+    def run(self, maps: Maps, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
+        """`n_steps` steps of length h from y0 (2d,), as `SplittingKernel.run`."""
+        sequence = maps(np.asarray(h, dtype=float))
+        loops, save = self._loops(sequence), np.ascontiguousarray(save, dtype=np.int64)
+        out = np.empty((len(save), 2 * self.parts.ndof))
+        codes, table = self._run_table(sequence)
+        n_finite = loops.rollout(codes, table, self._modes(y0), n_steps, save, out)
+        return self._states(out, save, y0), n_finite
+
+    def run_batch(
+        self, maps: Maps, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`run` for every row of y0 (N, 2d), in vector lanes and, where it pays, on several threads."""
+        sequence = maps(np.asarray(h, dtype=float))
+        loops, save = self._loops(sequence), np.ascontiguousarray(save, dtype=np.int64)
+        codes, table = self._run_table(sequence)
+        modes = self._modes(y0)
+        out = np.empty((len(y0), len(save), 2 * self.parts.ndof))
+        n_finite = np.empty(len(y0), dtype=np.int64)
+
+        def rows(i: slice) -> None:
+            loops.rollout_batch(codes, table, modes[i], n_steps, save, out[i], n_finite[i])
+
+        run_rows(rows, len(y0), n_steps * len(codes), threads)
+        return self._states(out, save, y0[:, None]), n_finite
+
+    def step(self, maps: Maps, h: Any, y: np.ndarray) -> np.ndarray:
+        """One step from each row of y (N, 2d), each of its own length h (N,)."""
+        sequence = maps(np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1]))
+        out = np.empty(y.shape)
+        codes, tables = self._table(sequence, len(y))
+        self._loops(sequence).step_each(codes, tables, self._modes(y), out)
+        return self._states(out)
+
+    def source(self) -> str:
+        """The generated flows of the parts, without filters and force gradients.
+
+        Raises
+        ------
+        ValueError
+            If H holds a function that has no compiled form.
+        """
+        if self._plain is None:
+            self._plain = parts_source(self.parts, False, False)
+        return self._plain
+
+    def _modes(self, y: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.concatenate(self.parts.to_modes(np.asarray(y, dtype=np.float64)), axis=-1))
+
+    def _states(self, modes: np.ndarray, save: np.ndarray | None = None, y0: np.ndarray | None = None) -> np.ndarray:
+        d = self.parts.ndof
+        states = self.parts.from_modes(modes[..., :d], modes[..., d:])
+        if save is not None:
+            states[..., save <= 0, :] = y0
+        return states
+
+    def _loops(self, sequence: Sequence[Map]) -> _Loops:
+        filters, gradients = any(m.filters is not None for m in sequence), any(map(has_gradient, sequence))
+        if gradients and not self.parts.has_force_gradient:
+            raise ValueError("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
+        if (filters, gradients) not in self._variants:
+            options = f"OPTIONS = {OPTIONS | {'cache': True}}\nCOMPENSATED = False"
+            header = f"import math\n\nfrom numba import njit\n\n{options}"
+            algebra = parts_source(self.parts, filters, gradients)
+            before = ["elementary"] if "fast_" in algebra else []
+            texts = [header, *map(template, before), algebra, *map(template, ["aligned", "parts_loops"])]
+            module = load_module("\n\n\n".join(texts))
+            self._variants[filters, gradients] = _Loops(module.rollout, module.rollout_lanes, module.step_each)
+        return self._variants[filters, gradients]
+
+    def _table(self, sequence: Sequence[Map], n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Codes (m,) and coefficients (n, m, W)."""
+        codes, tables = np.empty(len(sequence), dtype=np.int64), np.zeros((n, len(sequence), row_width(self.parts)))
+        F = self.parts.n_classes
+        for j, m in enumerate(sequence):
+            codes[j] = m.part + WITH_GRADIENT * has_gradient(m)
+            if m.part == LINEAR:
+                tables[:, j, : 4 * F] = self._turns(np.asarray(m.length)).reshape(-1, 4 * F)
+                continue
+            tables[:, j, 0], tables[:, j, 1] = m.length, m.gradient
+            tables[:, j, 2 : 2 + F] = 1.0 if m.filters is None else m.filters
+        return codes, tables
+
+    def _turns(self, s: np.ndarray) -> np.ndarray:
+        """What turns each frequency by Ω s, (..., F, 4): tan(r/2), sin r, and the quarter turn's cosine and sine."""
+        linear = self.parts.linear
+        assert linear is not None
+        out = np.zeros((*s.shape, 4))
+        for f, j in enumerate(linear.representatives):
+            kind, theta = linear.kinds[j], linear.rates[j] * s[..., f]
+            if kind == "oscillator":
+                angle = np.arctan2(np.sin(theta), np.cos(theta))  # exact reduction, of angles of any size
+                quarters = np.rint(angle / (np.pi / 2))
+                r = angle - quarters * (np.pi / 2)
+                q = quarters.astype(int) % 4
+                cosine = np.array([1.0, 0.0, -1.0, 0.0])
+                values = np.tan(r / 2), np.sin(r), cosine[q], cosine[q - 1]
+            elif kind == "hyperbolic":
+                values = np.tanh(theta / 2), -np.sinh(theta), 1.0, 0.0
+            else:
+                values = theta, 0.0, 1.0, 0.0
+            for i, value in enumerate(values):
+                out[..., f, i] = value
+        return out
+
+    def _run_table(self, sequence: Sequence[Map]) -> tuple[np.ndarray, np.ndarray]:
+        """Codes and rows of [opening, inner …, link, closing]: see `parts_loops`."""
+        idle = Map(IDLE, 0.0)
+        first, last = sequence[0], sequence[-1]
+        merged = merge(last, first) if len(sequence) > 1 else None
+        rows = [idle, *sequence, idle, idle] if merged is None else [first, *sequence[1:-1], merged, last]
+        codes, table = self._table(rows, 1)
+        return codes, np.ascontiguousarray(table[0])
+
+
+def has_gradient(m: Map) -> bool:
+    return bool(np.any(m.gradient))
+
+
+def merge(one: Map, other: Map) -> Map | None:
+    """The map that is `other` after `one`, if it is one map."""
+    if one.part != other.part:
+        return None
+    if one.part != LINEAR and not _same(one.filters, other.filters):
+        return None
+    return Map(one.part, one.length + other.length, one.gradient + other.gradient, one.filters)
+
+
+def _same(a: Any, b: Any) -> bool:
+    return (a is None and b is None) or (a is not None and b is not None and np.array_equal(a, b))

@@ -1,0 +1,131 @@
+"""The loops of a splitting into exactly solvable parts. Source text, pasted after the algebra of a system.
+
+The algebra that comes before defines tuples of normal modes x, y (``unpack``, ``pack``, …), ``apply_map`` and
+``apply_map_lanes``. A step is a list of maps, a code and a row of coefficients each. A run executes the rows
+[opening, inner …, link, closing]: a step is the link (the first step, the opening) and the inner maps, so that
+consecutive steps share their common map; an output is the closing map applied to a copy.
+"""
+# ruff: noqa: F821
+# mypy: ignore-errors
+
+import numpy as np
+from numba import njit
+
+CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where nothing is saved
+LANES = 64
+VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
+
+
+@njit(**OPTIONS)
+def one_step(x, y, codes, table, first, link):
+    x, y = apply_map(x, y, codes[first], table, first)
+    for j in range(1, link):
+        x, y = apply_map(x, y, codes[j], table, j)
+    return x, y
+
+
+@njit(**OPTIONS)
+def first_non_finite(x, y, codes, table, first, n_steps):
+    """The first of `n_steps` steps from a running state whose end is not finite; `n_steps` if none is."""
+    link = len(codes) - 2
+    for n in range(1, n_steps):
+        x, y = one_step(x, y, codes, table, first, link)
+        first = link
+        end_x, end_y = apply_map(x, y, codes[link + 1], table, link + 1)
+        if not is_finite(end_x, end_y):
+            return n
+    return n_steps
+
+
+@njit(**OPTIONS)
+def rollout(codes, table, z0, n_steps, save, out):
+    """`n_steps` steps from the modes `z0` (2d,), those after ``save[i]`` steps into ``out[i]``.
+
+    Returns the index of the last step that ends in a finite state; rows of later steps are NaN.
+    """
+    link = len(codes) - 2
+    x, y = unpack(z0)
+    n = saved = first = 0
+    while saved < len(save) and save[saved] <= 0:
+        pack(x, y, out[saved])
+        saved += 1
+    while n < n_steps:
+        block = min(CHECK_EVERY, n_steps - n)
+        if saved < len(save):
+            block = min(block, save[saved] - n)
+        start_x, start_y, start = x, y, first
+        for _ in range(block):
+            x, y = one_step(x, y, codes, table, first, link)
+            first = link
+        end_x, end_y = apply_map(x, y, codes[link + 1], table, link + 1)
+        if not is_finite(end_x, end_y):
+            out[saved:] = np.nan
+            return n - 1 + first_non_finite(start_x, start_y, codes, table, start, block)
+        n += block
+        while saved < len(save) and save[saved] == n:
+            pack(end_x, end_y, out[saved])
+            saved += 1
+    return n_steps
+
+
+@njit(**OPTIONS)
+def step_each(codes, tables, z, out):
+    """One step from every row of `z` (N, 2d) by the maps `codes`, each row with its own table (N, n, W)."""
+    for i in range(z.shape[0]):
+        x, y = unpack(z[i])
+        for j in range(len(codes)):
+            x, y = apply_map(x, y, codes[j], tables[i], j)
+        pack(x, y, out[i])
+
+
+@njit(**OPTIONS)
+def rollout_lanes(codes, table, z0, n_steps, save, out, n_finite):
+    """`rollout` of every row of `z0` (N, 2d), `LANES` at a time."""
+    link = len(codes) - 2
+    Z = aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
+    start = aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
+    for block_start in range(0, z0.shape[0], LANES):
+        count = min(LANES, z0.shape[0] - block_start)
+        width = (count + VECTOR - 1) // VECTOR * VECTOR
+        for lane in range(width):
+            i = block_start + min(lane, count - 1)
+            x, y = unpack(z0[i])
+            pack_lane(x, y, Z, lane)
+            n_finite[i] = n_steps
+            for row in range(len(save)):
+                if save[row] > 0:
+                    break
+                pack(x, y, out[i, row])
+        n = saved = first = 0
+        while saved < len(save) and save[saved] <= 0:
+            saved += 1
+        n_alive = count
+        while n < n_steps and n_alive > 0:
+            start[:] = Z
+            begin = first
+            block = min(CHECK_EVERY, n_steps - n)
+            if saved < len(save):
+                block = min(block, save[saved] - n)
+            for _ in range(block):
+                for k in range(link):
+                    j = first if k == 0 else k
+                    apply_map_lanes(Z, width, codes[j], table, j)
+                first = link
+            next_saved = saved
+            while next_saved < len(save) and save[next_saved] == n + block:
+                next_saved += 1
+            for lane in range(count):
+                i = block_start + lane
+                if n_finite[i] < n_steps:
+                    continue
+                x, y = unpack_lane(Z, lane)
+                x, y = apply_map(x, y, codes[link + 1], table, link + 1)
+                if not is_finite(x, y):
+                    x, y = unpack_lane(start, lane)
+                    n_finite[i] = n - 1 + first_non_finite(x, y, codes, table, begin, block)
+                    n_alive -= 1
+                    out[i, saved:] = np.nan
+                else:
+                    for row in range(saved, next_saved):
+                        pack(x, y, out[i, row])
+            n, saved = n + block, next_saved
