@@ -14,6 +14,7 @@ _HOME = {
     "Box": "domain",
     "EnergySublevel": "domain",
     "Tube": "tube",
+    "time_transformed": "time_transformation",
     "solve": "solver",
     "Solution": "solution",
     "get": "integrators.registry",
@@ -65,6 +66,7 @@ if TYPE_CHECKING:
     from sympflow.solution import Solution as Solution
     from sympflow.solver import solve as solve
     from sympflow.system import HamiltonianSystem as HamiltonianSystem
+    from sympflow.time_transformation import time_transformed as time_transformed
     from sympflow.training.trainer import train as train
     from sympflow.tube import Tube as Tube
 

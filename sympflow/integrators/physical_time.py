@@ -1,0 +1,267 @@
+"""A run whose steps are equal in another time: its outputs at physical times, by root-finding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sympflow.integrators.base import FINISHED, Outcome, Problem
+from sympflow.integrators.grid import Grid
+from sympflow.time_transformation import lifted, projected
+
+if TYPE_CHECKING:
+    from sympflow.integrators.logarithmic import Logarithmic
+
+LARGEST_CHUNK = 2**20  # numbers in one chunk of states
+MOST_KEPT = 100_000_000  # numbers that a run may store where every step is an output
+
+
+def reach(
+    step: Callable[[np.ndarray], np.ndarray],
+    start: np.ndarray,
+    longest: np.ndarray,
+    target: np.ndarray,
+    guess: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The states step(σ), σ from 0 to `longest`, whose time is `target`, and σ: Newton's method within brackets.
+
+    The slope dt/ds = 1/(T + B) is that of the exact flow at the end of the step, so a few iterations reach rounding.
+    """
+    d = start.shape[1] // 2 - 1
+    eps = float(np.finfo(start.dtype).eps)
+    tolerance = 2 * eps * np.maximum(np.abs(target), np.abs(start[:, d]))
+    low, high = np.zeros_like(longest), longest.copy()
+    sign = np.sign(longest)
+    sigma = np.where((guess - low) * sign < 0, low, np.where((guess - high) * sign > 0, high, guess))
+    best, best_sigma, best_residual = start.copy(), np.zeros_like(sigma), np.abs(start[:, d] - target)
+    for _ in range(80):
+        x = step(sigma)
+        residual = x[:, d] - target
+        better = np.abs(residual) < best_residual
+        best[better], best_sigma[better], best_residual[better] = x[better], sigma[better], np.abs(residual)[better]
+        if not (best_residual > tolerance).any():
+            break
+        beyond = ~(residual * sign < 0)  # NaN counts as too far
+        high, low = np.where(beyond, sigma, high), np.where(beyond, low, sigma)
+        # dt/ds by the chord of the step so far: exact enough, and needs nothing but the step
+        slope = (x[:, d] - start[:, d]) / sigma
+        rate = np.where(np.isfinite(slope) & (slope > 0), slope, np.inf)
+        newton = sigma - residual / rate
+        inside = ((newton - low) * sign > 0) & ((high - newton) * sign > 0)
+        sigma = np.where(inside & np.isfinite(newton), newton, (low + high) / 2)
+    best[best_residual > np.maximum(1e-3 * np.abs(target - start[:, d]), 100 * tolerance)] = np.nan  # no such σ
+    return best, best_sigma
+
+
+class PhysicalRun:
+    """One run: chunks of steps, equal in s, until the physical end is passed."""
+
+    def __init__(self, integrator: Logarithmic, problem: Problem) -> None:
+        self.integrator, self.problem = integrator, problem
+        self.system = problem.system
+        self.transformed = integrator.transformed(self.system)
+        self.inner = integrator.inner(self.system)
+        self.d, c = self.system.ndof, self.transformed.params["shift"]
+        rows = problem.y0.reshape(-1, problem.y0.shape[-1])
+        with np.errstate(all="ignore"):
+            gap = np.asarray(c - self.system.potential(rows[:, : self.d]))
+            self.start = lifted(self.system, rows, c)
+        if (gap <= 0).any():
+            i = int(np.argmax(gap <= 0))
+            raise ValueError(
+                f"`shift` {c:g} does not exceed the potential at `y0`, {c - gap[i]:g}: give one above the energy "
+                f"{float(self.system.hamiltonian(rows[i])):g}, so that c − V stays positive."
+            )
+        self.length = abs(problem.t1 - problem.t0)
+        self.sign = 1.0 if problem.t1 >= problem.t0 else -1.0
+        self.h = self.sign * integrator.new_step(self.system)
+        self.most_steps = 100_000 + 1000 * self.length / integrator.step_length(self.system)
+        self.n_steps = np.zeros(len(rows), dtype=int)
+        self.n_extra, self.backend = 0, ""
+        self.failed_at = np.full(len(rows), np.nan)
+        self.stalled = False
+
+    def chunks(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Chunks of states (N, n + 1, 2d + 2) and for each trajectory the steps (N,) of it that belong to the run.
+
+        The last step of a trajectory is the one that reaches or passes the end.
+        """
+        x, n, total = self.start, 16, 0
+        running = np.full(len(x), self.length > 0)
+        while running.any():
+            piece = Problem(self.transformed, 0.0, self.h * n, x[running], backend=self.problem.backend)
+            found, finite, self.backend = self.inner.rollout(piece, self.h, n, np.arange(n + 1))
+            states = np.repeat(x[:, None], n + 1, axis=1)
+            states[running] = np.moveaxis(np.asarray(found), 0, 1)
+            good = np.zeros(len(x), dtype=int)
+            good[running] = np.minimum(finite, n)
+            t = self.sign * states[..., self.d]
+            forward = np.isfinite(t) & (np.maximum.accumulate(np.where(np.isfinite(t), t, np.inf), axis=1) <= t)
+            good = np.minimum(good, np.where(forward.all(1), n, np.argmin(forward, axis=1) - 1))  # time must not turn
+            passed = (t >= self.length) & (np.arange(n + 1) <= good[:, None])
+            last = np.where(passed.any(1), passed.argmax(1), good)
+            last[~running] = 0
+            self.n_steps += last
+            total += n
+            lost = running & ~passed.any(1) & (good < n)
+            rows = np.arange(len(x))
+            self.stalled = total > self.most_steps
+            if self.stalled:
+                lost |= running & ~passed.any(1)
+            self.failed_at[lost] = self.problem.t0 + self.sign * t[rows, last][lost]
+            yield states, last
+            pace = np.nanmin(np.where(running, (t[rows, last] - t[:, 0]) / np.maximum(last, 1), np.nan))
+            running = running & ~passed.any(1) & ~lost
+            x = states[rows, last]
+            most = max(16, LARGEST_CHUNK // (len(x) * x.shape[1]))
+            left = (self.length - t[rows, last][running]).max(initial=0.0)
+            n = int(min(max(16, 1.02 * left / pace + 2 if pace > 0 else 2 * n), 4 * n, most))
+
+    def reach(self, before: np.ndarray, after: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """States [q, t, p, B] at the elapsed times `target`, within the steps from `before` to `after`."""
+
+        def step(sigma: np.ndarray) -> np.ndarray:
+            self.n_extra += len(sigma)
+            return np.asarray(self.inner.substep(self.transformed, before, sigma, self.backend))
+
+        with np.errstate(all="ignore"):
+            advance = after[:, self.d] - before[:, self.d]
+            h = np.full(len(before), self.h, dtype=before.dtype)
+            guess = h * (target - before[:, self.d]) / np.where(advance == 0, 1, advance)
+            x, _ = reach(step, before, h, target, guess)
+        at_end = after[:, self.d] == target
+        x[at_end] = after[at_end]
+        return x
+
+    def outcome(self) -> Outcome:
+        problem = self.problem
+        single = problem.y0.ndim == 1
+        times = problem.t_eval
+        if times is None and not single:  # the trajectories take different steps: report on a common grid
+            times = Grid(problem.t0, problem.t1, self.integrator.step_length(self.system)).outputs(
+                None, problem.save_every
+            )[0]
+        N = len(self.start)
+        wanted = np.empty(0) if times is None else (times - problem.t0).astype(self.start.dtype)
+        out = np.full((len(wanted), N, 2 * self.d), np.nan, dtype=self.start.dtype)
+        at_start = wanted == 0
+        out[at_start] = projected(self.start)
+        delivered = np.full(N, int(at_start.sum()))
+        kept: list[tuple[np.ndarray, np.ndarray]] = []
+        for states, last in self.chunks():
+            if problem.dense_output or times is None:
+                kept.append((states, last))
+                self._check_memory(kept)
+            if times is not None:
+                self._deliver(states, last, wanted, delivered, out)
+                if not problem.dense_output and (delivered == len(wanted)).all():
+                    break
+        path = _Path(self, kept) if kept or problem.dense_output else None
+        if times is None:
+            times, out = self._every_step(path)
+        elif single:
+            keep = int(delivered[0])
+            times, out = times[:keep], out[:keep]
+        y = out.reshape(len(times), *problem.y0.shape)
+        failed = np.isfinite(self.failed_at)
+        n_steps = int(self.n_steps.max(initial=0))
+        stats: dict[str, Any] = {
+            "dt": self.integrator.step_length(self.system),
+            "n_steps": n_steps,
+            **self.inner.evaluations(n_steps, n_steps, self.n_extra, self.backend),
+            "backend": self.backend or "numpy",
+        }
+        outcome = Outcome(times, y, 0 if single else np.where(failed, -1, 0).reshape(y.shape[1:-1]), FINISHED, stats)
+        if failed.any():
+            if single:
+                outcome.status = -1
+            stats["failed_at"] = float(self.failed_at[0]) if single else self.failed_at.reshape(y.shape[1:-1])
+            outcome.message = self._failure(int(np.argmax(failed)), int(failed.sum()))
+        if problem.dense_output:
+            outcome.sol = path
+        return outcome
+
+    @staticmethod
+    def _check_memory(kept: list[tuple[np.ndarray, np.ndarray]]) -> None:
+        if sum(states.size for states, _ in kept) > MOST_KEPT:
+            raise ValueError(
+                f"`t_eval` is not given, and the steps are so short that more than {MOST_KEPT:.0e} values would be "
+                "stored: choose the times with `t_eval`, leave dense_output out, or raise `dt`."
+            )
+
+    def _failure(self, i: int, count: int) -> str:
+        what, remedy = self.integrator.breakdown
+        if self.stalled:
+            what = f"After {self.n_steps[i]} steps time hardly advances any more, as before a collision"
+            remedy = "End `t_span` earlier, or raise `dt`"
+        which = (
+            "" if len(self.start) == 1 else f"{count} of {len(self.start)} trajectories failed, the first (index {i}): "
+        )
+        return f"{which}{what}, after t = {self.failed_at[i]:.17g}. {remedy}."
+
+    def _deliver(
+        self, states: np.ndarray, last: np.ndarray, wanted: np.ndarray, delivered: np.ndarray, out: np.ndarray
+    ) -> None:
+        """The outputs that fall into a chunk."""
+        due: list[tuple[int, np.ndarray, np.ndarray]] = []
+        for i in np.flatnonzero(last).tolist():
+            t = self.sign * states[i, : last[i] + 1, self.d]
+            end = int(np.searchsorted(self.sign * wanted, t[-1], side="right"))
+            if end > delivered[i]:
+                chosen = np.arange(delivered[i], end)
+                due.append((i, chosen, np.searchsorted(t, self.sign * wanted[chosen], side="left").clip(1) - 1))
+                delivered[i] = end
+        if due:
+            row = np.concatenate([np.full(len(chosen), i) for i, chosen, _ in due])
+            output = np.concatenate([chosen for _, chosen, _ in due])
+            k = np.concatenate([steps for _, _, steps in due])
+            out[output, row] = projected(self.reach(states[row, k], states[row, k + 1], wanted[output]))
+
+    def _every_step(self, path: _Path | None) -> tuple[np.ndarray, np.ndarray]:
+        """Times and states (n, 1, 2d) of every `save_every`-th step of a single trajectory, and of the end."""
+        if path is None:
+            return np.array([self.problem.t0]), projected(self.start)[None]
+        x = path.states[0]
+        inside = self.sign * x[:, self.d] < self.length
+        count = int(np.count_nonzero(inside))
+        keep = np.arange(0, count, self.problem.save_every)
+        t = self.problem.t0 + x[keep, self.d].astype(float)
+        y = projected(x[keep])
+        if np.isnan(self.failed_at[0]):
+            t = np.append(t, self.problem.t1)
+            y = np.concatenate([y, path(self.problem.t1).reshape(1, -1)])
+        elif keep[-1] != count - 1:
+            t, y = np.append(t, self.problem.t0 + x[count - 1, self.d]), np.concatenate([y, projected(x[[count - 1]])])
+        return t, y[:, None]
+
+
+class _Path:
+    """Dense output in the physical time: sol(t) has shape (..., 2d) or (..., 2d, n)."""
+
+    def __init__(self, run: PhysicalRun, kept: list[tuple[np.ndarray, np.ndarray]]) -> None:
+        self.run = run
+        self.states = [
+            np.concatenate([run.start[i : i + 1], *(states[i, 1 : last[i] + 1] for states, last in kept)])
+            for i in range(len(run.start))
+        ]
+        self.t_min, self.t_max = sorted((run.problem.t0, run.problem.t1))
+
+    def __call__(self, t: Any) -> np.ndarray:
+        run, times = self.run, np.atleast_1d(np.asarray(t, dtype=float))
+        if times.size and not (times.min() >= self.t_min and times.max() <= self.t_max):
+            raise ValueError(f"`t` must lie in [{self.t_min:g}, {self.t_max:g}], the interval that was solved.")
+        target = (times - run.problem.t0).astype(run.start.dtype)
+        rows = []
+        for x in self.states:
+            if len(x) == 1:
+                rows.append(np.repeat(projected(x), len(times), axis=0))
+                continue
+            k = np.searchsorted(run.sign * x[:, run.d], run.sign * target, side="left").clip(1, len(x) - 1) - 1
+            found = projected(run.reach(x[k], x[k + 1], target))
+            found[target == 0] = projected(x[:1])
+            found[run.sign * target > run.sign * x[-1, run.d]] = np.nan
+            rows.append(found)
+        y = np.stack(rows).swapaxes(-1, -2).reshape(*run.problem.y0.shape, len(times))
+        return y[..., 0] if np.ndim(t) == 0 else y

@@ -1,0 +1,181 @@
+"""The logarithmic Hamiltonian: a system in a new time that runs with the strength of its forces."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from sympflow.arrays import Array, concatenate, is_tensor
+from sympflow.domain import Domain
+from sympflow.system import HamiltonianSystem
+
+
+def time_transformed(
+    system: HamiltonianSystem, shift: float | None = None, domain: Domain | None = None
+) -> HamiltonianSystem:
+    """The logarithmic Hamiltonian of a separable system, with the physical time t as one more coordinate.
+
+    Λ(q, t, p, B) = log(T(p) + B) − log(c − V(q)), in a new time s. B, conjugate to t, is constant; from a state with
+    B = c − H(q, p), Λ is 0 and its flow runs along the solutions of the system with dt/ds = 1/(c − V(q)): slowly where
+    the force is strong. Λ is separable, so splitting methods apply to it, and the leapfrog follows a Kepler ellipse
+    exactly, with an error in the time alone.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        Separable.
+    shift : float, optional
+        c, above V wherever the motion goes; every number above the energy is. The default is `default_shift(system)`.
+    domain : Domain, optional
+        Ω of the new system, for `train`: a set of states [q, t, p, B], such as ``Tube(sol.states, radius)`` around a
+        solution of the new system.
+
+    Returns
+    -------
+    HamiltonianSystem
+        Of d + 1 degrees of freedom and states [q, t, p, B], to be solved, trained and compared like any other; its
+        independent variable is s, and ``sol.y[d]`` is the physical time. Its y0, t_span and dt correspond to the
+        system's. The methods "log_leapfrog", "log_blanes_moan4" and "log_kahan_li8" solve it in the physical time.
+
+    Raises
+    ------
+    ValueError
+        If the system is not separable, or `shift` is not finite, or does not exceed V at the system's y0.
+
+    References
+    ----------
+    .. [1] S. Mikkola, K. Tanikawa, "Explicit symplectic algorithms for time-transformed Hamiltonians", Celest. Mech.
+       Dyn. Astron. 74 (1999) 287–295.
+    .. [2] M. Preto, S. Tremaine, "A class of symplectic integrators with adaptive time step for separable Hamiltonian
+       systems", Astron. J. 118 (1999) 2532–2541.
+    .. [3] E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, 2nd ed. (Springer 2006), VIII.2.
+
+    Examples
+    --------
+    >>> import sympflow
+    >>> stretched = time_transformed(sympflow.systems.kepler(0.9))
+    >>> sol = sympflow.solve(stretched, "leapfrog")
+    >>> bool(sol.y[2, -1] > 600)  # the physical time
+    True
+    """
+    if not system.separable:
+        raise ValueError(
+            f"`system` {system.name!r} is not separable, so its logarithmic Hamiltonian is not either: use an implicit "
+            "method such as 'gauss_legendre4'."
+        )
+    c = default_shift(system) if shift is None else checked_shift(shift)
+    if system.symbols is not None:
+        transformed = HamiltonianSystem.from_sympy(_expression(system, c), name=f"log_{system.name}", energy_scale=1.0)
+    else:
+        transformed = HamiltonianSystem.__new__(HamiltonianSystem)
+        transformed._set(_Logarithmic(system, c), None, False)
+        transformed._set_scene(f"log_{system.name}", {}, None, None, (0.0, 100.0), 0.05, 1.0)
+    transformed.params = {**system.params, "shift": c}
+    transformed.domain = domain
+    if system.y0 is not None:
+        transformed.y0 = lifted(system, system.y0, c)
+        scale = time_scale(system, c)
+        transformed.dt = system.dt * scale
+        transformed.t_span = (0.0, (system.t_span[1] - system.t_span[0]) * scale)
+    return transformed
+
+
+def default_shift(system: HamiltonianSystem) -> float:
+    """c = E + |E| with the energy E of the system's y0: 0 for a bound system whose V vanishes far out, else 2E."""
+    E = 0.0 if system.y0 is None else float(system.hamiltonian(system.y0))
+    return E + abs(E) if math.isfinite(E) else 0.0
+
+
+def checked_shift(shift: Any) -> float:
+    if isinstance(shift, bool) or not isinstance(shift, int | float | np.number) or not math.isfinite(shift):
+        raise ValueError(f"`shift` must be a finite number, above the energy; got {shift!r}.")
+    return float(shift)
+
+
+def time_scale(system: HamiltonianSystem, c: float) -> float:
+    """ds/dt where the kinetic energy equals B = c − E, at the energy E of the system's y0: 2B.
+
+    For Newtonian attraction and c = 0 that is the mean along the orbit, by the virial theorem. Where B is not positive
+    it is c − V at y0.
+    """
+    if system.y0 is None:
+        return 1.0
+    B = c - float(system.hamiltonian(system.y0))
+    scale = 2 * B if B > 0 else c - float(system.potential(system.y0[: system.ndof]))
+    if not scale > 0:
+        raise ValueError(
+            f"`shift` {c:g} does not exceed the potential at y0 of {system.name!r}: give one above the energy."
+        )
+    return scale
+
+
+def lifted(system: HamiltonianSystem, y: Array, c: float, B: Array | None = None) -> Array:
+    """States [q, t, p, B] (..., 2d + 2) of states [q, p] (..., 2d), with t = 0 and B = c − H unless it is given."""
+    d = system.ndof
+    B = c - system.hamiltonian(y) if B is None else B
+    return concatenate([y[..., :d], 0 * y[..., :1], y[..., d:], B[..., None]])
+
+
+def projected(x: Array) -> Array:
+    """[q, p] of states [q, t, p, B]."""
+    d = x.shape[-1] // 2 - 1
+    return concatenate([x[..., :d], x[..., d + 1 : -1]])
+
+
+def _expression(system: HamiltonianSystem, c: float) -> Any:
+    import sympy as sp
+
+    symbols = system.symbols
+    assert symbols is not None
+    B = sp.Symbol(f"p{symbols.ndof + 1}", real=True)
+    numbered = sp.nsimplify(c) if c.is_integer() else sp.Float(c)
+    return sp.log(symbols.T + B) - sp.log(numbered - symbols.V)
+
+
+class _Logarithmic:
+    """log(T(p) + B) and −log(c − V(q)), with derivatives, for a system that is given by functions."""
+
+    separable = True
+
+    def __init__(self, system: HamiltonianSystem, c: float) -> None:
+        self.ndof, self._system, self._c = system.ndof + 1, system, c
+
+    def kinetic(self, P: Array) -> Array:
+        return _log(self._system.kinetic(P[..., :-1]) + P[..., -1])
+
+    def kinetic_gradient(self, P: Array) -> Array:
+        p, B = P[..., :-1], P[..., -1:]
+        weight = 1 / (self._system.kinetic(p)[..., None] + B)
+        return concatenate([weight * self._system.velocity(p), weight])
+
+    def kinetic_hessian(self, P: Array) -> Array:
+        p = P[..., :-1]
+        weight = (1 / (self._system.kinetic(p) + P[..., -1]))[..., None, None]
+        g = self.kinetic_gradient(P)
+        return _bordered(weight * (self._system.kinetic_hessian(p) + 0 * weight)) - g[..., :, None] * g[..., None, :]
+
+    def potential(self, Q: Array) -> Array:
+        return -_log(self._c - self._system.potential(Q[..., :-1]))
+
+    def potential_gradient(self, Q: Array) -> Array:
+        q = Q[..., :-1]
+        slope = -self._system.force(q) / (self._c - self._system.potential(q))[..., None]
+        return concatenate([slope, 0 * Q[..., -1:]])
+
+    def potential_hessian(self, Q: Array) -> Array:
+        q = Q[..., :-1]
+        weight = (1 / (self._c - self._system.potential(q)))[..., None, None]
+        g = self.potential_gradient(Q)
+        return _bordered(weight * self._system.potential_hessian(q)) + g[..., :, None] * g[..., None, :]
+
+
+def _log(x: Array) -> Array:
+    return x.log() if is_tensor(x) else np.log(x)
+
+
+def _bordered(S: Array) -> Array:
+    """S (..., d, d) with a row and a column of zeros added."""
+    wide = concatenate([S, 0 * S[..., :1]])
+    return concatenate([wide.swapaxes(-1, -2), 0 * wide.swapaxes(-1, -2)[..., :1]]).swapaxes(-1, -2)

@@ -1,0 +1,168 @@
+"""The logarithmic Hamiltonian: Kepler ellipses followed exactly, outputs at physical times, close encounters."""
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import HamiltonianSystem, SympFlow, get, max_energy_error, solve, systems, time_transformed
+from sympflow.integrators.checks import check_integrator
+from sympflow.integrators.logarithmic import LogSympFlow
+from sympflow.systems.kepler import kepler_ellipse
+
+METHODS = ("log_leapfrog", "log_blanes_moan4", "log_kahan_li8")
+EPS = np.finfo(float).eps
+
+MASSES, PLACES = (3, 4, 5), ((1, 3), (-2, -1), (1, -1))
+PYTHAGOREAN = HamiltonianSystem.from_sympy(
+    "+".join(f"(p{2 * i + 1}**2 + p{2 * i + 2}**2)/{2 * MASSES[i]}" for i in range(3))
+    + "".join(
+        f" - {MASSES[i] * MASSES[j]}/sqrt((q{2 * i + 1} - q{2 * j + 1})**2 + (q{2 * i + 2} - q{2 * j + 2})**2)"
+        for i in range(3)
+        for j in range(i + 1, 3)
+    ),
+    y0=[*np.ravel(PLACES), *[0.0] * 6],
+    t_span=(0.0, 70.0),
+    dt=1e-3,
+)
+
+
+@pytest.mark.parametrize("method", METHODS[:2])
+def test_the_contract_holds_for_the_kepler_problem(method):
+    names = check_integrator(get(method), systems.kepler(0.6))
+    assert {"the_order_is_the_slope", "symplecticity_as_declared", "the_inverse_undoes_the_step"} <= set(names)
+
+
+@pytest.mark.parametrize("e", [0.9, 0.99, 0.999])
+def test_the_leapfrog_stays_on_the_ellipse(e):
+    kepler = systems.kepler(e)
+    sol = solve(kepler, "log_leapfrog")  # 100 periods, 1000 steps each
+    assert max_energy_error(sol) < 1e-9
+    assert abs(sol.stats["n_steps"] - 100_000) < 100
+    q1, q2 = sol.q
+    r = np.hypot(q1, q2)
+    # r = a(1 − e²)/(1 + e cos φ): on the ellipse, though late or early; rounding at the pericentre is 1/(1 − e) larger
+    assert np.abs(r + e * q1 - (1 - e * e)).max() < 1e-9
+
+
+@pytest.mark.parametrize(("method", "order"), [("log_leapfrog", 2), ("log_blanes_moan4", 4)])
+def test_outputs_are_at_physical_times(method, order):
+    e, kepler, period = 0.9, systems.kepler(0.9), 2 * np.pi
+    anomaly = np.linspace(0, 2 * np.pi, 9)
+    times = anomaly - e * np.sin(anomaly)
+    errors = [
+        np.abs(
+            solve(systems.kepler(e), method, (0, period), dt=period / n, t_eval=times).y.T - kepler_ellipse(e, anomaly)
+        )
+        for n in (400, 800)
+    ]
+    assert errors[1].max() < errors[0].max() / 2 ** (order - 0.3)
+
+
+def test_the_time_of_an_output_is_met_to_rounding():
+    # where the ellipse is followed exactly, the state tells the time that the leapfrog has for it
+    kepler = systems.kepler(0.9)
+    transformed = time_transformed(kepler)
+    run = solve(transformed, "leapfrog", (0.0, 2.0), dt=0.01)
+    t, y = run.y[2], run.y[[0, 1, 3, 4]]
+    sol = solve(kepler, "log_leapfrog", (0.0, float(t[-1])), dt=0.01, t_eval=t)  # ds = dt·2|E| = dt
+    speed = np.abs(np.diff(y) / np.diff(t)).max()
+    assert np.abs(sol.y - y).max() < 1e-12 * speed
+    assert np.array_equal(sol.t, t)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_close_binary_and_its_escape(method):
+    limits = {"log_leapfrog": (1e-3, None), "log_blanes_moan4": (1e-5, 0.1), "log_kahan_li8": (1e-9, 1e-2)}
+    energy, state = limits[method]
+    sol = solve(PYTHAGOREAN, method, t_eval=[15.83, 35.0, 70.0])
+    assert max_energy_error(sol) < energy
+    reference = [6.933464, 20.261804, -2.003006, -6.872463, -2.557673, -6.659112]  # 128-bit arithmetic
+    if state is not None:
+        assert np.abs(sol.q[:, -1] - reference).max() < state
+
+
+def test_time_runs_backwards_and_by_steps_of_any_kind():
+    kepler = systems.kepler(0.9)
+    there = solve(kepler, "log_kahan_li8", (0.0, 20.0))
+    back = solve(kepler, "log_kahan_li8", (20.0, 0.0), y0=there.y[:, -1])
+    np.testing.assert_allclose(back.y[:, -1], kepler.y0, rtol=0, atol=1e-9)
+    assert (np.diff(back.t) < 0).all()
+    thinned = solve(kepler, "log_kahan_li8", (0.0, 20.0), save_every=7)
+    np.testing.assert_array_equal(thinned.t[:-1], there.t[:-1][::7][: len(thinned.t) - 1])
+    assert thinned.t[-1] == 20.0
+
+
+def test_events_are_found_in_physical_time():
+    sol = solve(systems.kepler(0.9), "log_kahan_li8", (0.0, 20.0), events=lambda t, y: y[1])
+    np.testing.assert_allclose(sol.t_events[0], np.pi * np.arange(7), atol=1e-9)
+
+
+def test_float32_and_functions_run_with_arrays():
+    kepler = systems.kepler(0.6)
+    functions = HamiltonianSystem(
+        potential=lambda q: -1 / (q**2).sum(-1).sqrt(), ndof=2, y0=kepler.y0, dt=kepler.dt, name="functions"
+    )
+    times = [0.0, 1.0, 7.0]
+    reference = solve(kepler, "log_leapfrog", (0.0, 7.0), dt=0.02, t_eval=times)
+    sol = solve(functions, "log_leapfrog", (0.0, 7.0), dt=0.02, t_eval=times)
+    np.testing.assert_allclose(sol.y, reference.y, rtol=0, atol=1e-11)
+    single = solve(kepler, "log_leapfrog", (0.0, 7.0), dt=0.02, t_eval=times, dtype="float32")
+    assert single.y.dtype == np.float32
+    np.testing.assert_allclose(single.y, reference.y, rtol=0, atol=1e-3)
+
+
+def test_the_transformed_functions_are_the_derivatives_of_each_other():
+    functions = HamiltonianSystem(
+        potential=lambda q: -1 / (q**2).sum(-1).sqrt(), ndof=2, y0=systems.kepler(0.6).y0, name="functions"
+    )
+    symbolic, plain = time_transformed(systems.kepler(0.6)), time_transformed(functions)
+    x = np.array([[0.3, 0.4, 1.0, -0.2, 0.9, 0.7], [1.0, 0.2, -3.0, 0.1, 0.4, 0.5]])
+    for name in ("hamiltonian", "gradient", "hessian"):
+        np.testing.assert_allclose(getattr(plain, name)(x), getattr(symbolic, name)(x), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(symbolic.hamiltonian(symbolic.y0), 0.0, atol=1e-14)
+
+
+def test_a_collision_ends_the_run_with_its_time():
+    kepler = systems.kepler(0.9)
+    sol = solve(kepler, "log_leapfrog", (0.0, 10.0), y0=[1.0, 0.0, 0.0, 0.0])  # falls into the centre
+    assert sol.status in (0, -1)
+    assert np.isfinite(sol.y).all()
+    escape = solve(systems.henon_heiles(), "log_leapfrog", (0.0, 10.0), y0=[0.0, 0.0, 0.0, 0.7], dt=0.2, shift=1.0)
+    assert escape.status == -1
+    assert "time hardly advances any more" in escape.message
+    assert escape.t[-1] <= escape.stats["failed_at"] < 5.450984210235402
+
+
+def test_bad_shifts_and_systems_are_refused():
+    with pytest.raises(
+        ValueError, match=r"^`shift` 0.1 does not exceed the potential at `y0`.*give one above the energy"
+    ):
+        solve(systems.henon_heiles(), "log_leapfrog", (0, 1), y0=[0.9, -0.4, 0, 0], shift=0.1)
+    with pytest.raises(ValueError, match=r"^`shift` must be a finite number"):
+        get("log_leapfrog")(shift=np.nan)
+    with pytest.raises(ValueError, match=r"is not separable, so its logarithmic Hamiltonian is not either"):
+        solve(HamiltonianSystem.from_sympy("(p**2+1)*(q**2+1)", y0=[0, 1]), "log_leapfrog")
+    with pytest.raises(TypeError, match=r"^`y0` is a tensor"):
+        solve(systems.kepler(), "log_leapfrog", (0, 1), y0=torch.tensor(systems.kepler().y0))
+
+
+def test_a_batch_has_a_status_for_each_trajectory():
+    kepler = systems.kepler(0.6)
+    sol = solve(kepler, "log_leapfrog", (0.0, 5.0), y0=[kepler.y0, 1e150 * np.ones(4)], t_eval=[1.0, 5.0])
+    assert sol.status.tolist() == [0, -1]
+    assert np.isfinite(sol.y[0]).all()
+    assert np.isnan(sol.stats["failed_at"][0])
+
+
+def test_a_sympflow_on_the_transformed_system_runs_in_physical_time():
+    kepler = systems.kepler(0.9)
+    transformed = time_transformed(kepler)
+    flow = SympFlow.primed(transformed, scheme="blanes_moan4", dt=0.02)  # untrained: the scheme itself
+    times = np.linspace(0.0, 20.0, 11)
+    sol = solve(kepler, LogSympFlow(flow=flow), (0.0, 20.0), t_eval=times)
+    scheme = solve(kepler, "log_blanes_moan4", (0.0, 20.0), dt=0.02, t_eval=times)
+    np.testing.assert_allclose(sol.y, scheme.y, rtol=0, atol=1e-9)
+    with pytest.raises(ValueError, match=r"^`dt` must be at most 0.02"):
+        solve(kepler, LogSympFlow(flow=flow, dt=0.03), (0.0, 1.0))
+    with pytest.raises(ValueError, match=r"^`flow` is needed"):
+        solve(kepler, LogSympFlow(), (0.0, 1.0))
