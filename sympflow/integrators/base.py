@@ -9,7 +9,8 @@ An integrator is a frozen dataclass whose fields are its options (`dt`, `rtol`, 
 5. `steps(system, t_span, y0)` executes the same run again as a stream of the steps that it takes, and
 6. `tangent(system, t, y, h)` differentiates such a step, so that metrics judge the map that was really executed.
 7. `inverse(system, t, y, h)` undoes `step(system, t, y, h)` exactly, or raises a TypeError.
-8. `finds_events` is False, or `run` hands every step to `problem.events`, if there are any, and ends where that says.
+8. `finds_events` is False, and `solve` seeks events on the dense output afterwards; or `run` hands every step to
+   `problem.events`, if there are any, and ends where that says.
 
 `FixedStep` does 4, 5, 6 and 8 for any integrator that has a step: a new one needs duties 1 to 3 only.
 """
@@ -73,6 +74,8 @@ class Integrator:
     trained: ClassVar[bool] = False
     compiles: ClassVar[bool] = False
     finds_events: ClassVar[bool] = False
+    tangent_holds: ClassVar[str] = ""
+    """What `tangent` holds fixed though a step from a neighbouring state would change it; "" for nothing."""
 
     @classmethod
     def options(cls) -> tuple[str, ...]:
