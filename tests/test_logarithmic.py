@@ -50,9 +50,7 @@ def test_outputs_are_at_physical_times(method, order):
     anomaly = np.linspace(0, 2 * np.pi, 9)
     times = anomaly - e * np.sin(anomaly)
     errors = [
-        np.abs(
-            solve(systems.kepler(e), method, (0, period), dt=period / n, t_eval=times).y.T - kepler_ellipse(e, anomaly)
-        )
+        np.abs(solve(kepler, method, (0, period), dt=period / n, t_eval=times).y.T - kepler_ellipse(e, anomaly))
         for n in (400, 800)
     ]
     assert errors[1].max() < errors[0].max() / 2 ** (order - 0.3)
