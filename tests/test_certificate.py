@@ -58,12 +58,12 @@ def test_the_bound_counts_steps():
 def test_delta_is_the_integral_of_the_rate():
     """Against H itself: the mean over x of d/dt H(ψ̄_t(x)), integrated, is what H gained."""
     flow = primed()
-    found = flow.certificate(HH, **{**QUICK, "states": 1, "times": 2001})
+    found = flow.certificate(HH, **{**QUICK, "states": 1, "times": 401})
     # one state alone: the integral of |rate| is at least what H gained, and the variation of H along the step
-    t = torch.linspace(0, flow.dt, 2001, dtype=torch.float64)
+    t = torch.linspace(0, flow.dt, 401, dtype=torch.float64)
     x = HH.domain.sample(1, int(np.random.SeedSequence([0, 20_261, 0]).generate_state(1)[0]))
     H = HH.hamiltonian(flow.psi(t, torch.tensor(x))).numpy()
-    assert found.delta.largest == pytest.approx(np.abs(np.diff(H)).sum(), rel=1e-4)
+    assert found.delta.largest == pytest.approx(np.abs(np.diff(H)).sum(), rel=2e-3)
     assert found.delta.median == found.delta.largest
 
 
@@ -107,8 +107,8 @@ def test_long_runs_go_piece_by_piece(monkeypatch):
 
 
 def test_orbits_that_blow_up_are_infinite_errors():
-    big = HamiltonianSystem.from_sympy("p**2/2 + q**3/3", domain=Box([-3.0, -3.0], [3.0, 3.0]))
-    found = SympFlow.primed(big, 1, dt=4.0).requires_grad_(False).certificate(big, **{**QUICK, "t_end": 40.0})
+    big = HamiltonianSystem.from_sympy(str(HH.symbols.H), domain=Box([-3.0] * 4, [3.0] * 4))
+    found = primed(big).certificate(big, **{**QUICK, "t_end": 40.0})
     assert found.left > 0
     assert Quantiles.of(np.array([1.0, math.nan, -2.0])).largest == math.inf
     assert Quantiles.of(np.array([-3.0, 1.0, 2.0])) == Quantiles(2.0, 3.0, 3.0)

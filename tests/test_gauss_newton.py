@@ -330,7 +330,7 @@ def test_progress(capsys):
         ({"frozen_weight": math.nan}, ValueError, r"^`frozen_weight` must be positive"),
         ({"label_times": 2.0}, ValueError, r"^`label_times` must be"),
         ({"seed": -1}, ValueError, r"^`seed` must be"),
-        ({"flow": SympFlow(2)}, TypeError, r"^`optimizer` 'gauss-newton' fits primed flows"),
+        ({"flow": SympFlow(2)}, TypeError, r"^`restarts` is not an option of the .* of kind 'sympflow'"),
         ({"flow": SympFlow.primed(PENDULUM)}, ValueError, r"^`system` .* degrees of freedom"),
     ],
 )

@@ -108,7 +108,7 @@ class MLPFlow(FlowMap):
         tau_t = t / self.tau
         h = torch.addmm(self.biases[0][:, None], self.weights[0], (y - self.center[:, None]) / s)
         h = self._sigma.value(h + outer(self.weight_t, tau_t))
-        for W, b in zip(self.weights[1:-1], self.biases[1:-1], strict=True):
+        for W, b in zip(list(self.weights)[1:-1], list(self.biases)[1:-1], strict=True):
             h = self._sigma.value(torch.addmm(b[:, None], W, h))
         return y + s * (torch.tanh(tau_t) * torch.addmm(self.biases[-1][:, None], self.weights[-1], h))
 
@@ -121,7 +121,7 @@ class MLPFlow(FlowMap):
         a = torch.addmm(self.biases[0][:, None], self.weights[0], (y - self.center[:, None]) / s)
         h, slope = self._sigma.slope(a + outer(k, tau_t))
         dh = slope * k[:, None]
-        for W, b in zip(self.weights[1:-1], self.biases[1:-1], strict=True):
+        for W, b in zip(list(self.weights)[1:-1], list(self.biases)[1:-1], strict=True):
             h, slope = self._sigma.slope(torch.addmm(b[:, None], W, h))
             dh = slope * (W @ dh)
         N = torch.addmm(self.biases[-1][:, None], self.weights[-1], h)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ class Stream(IntEnum):
     REFERENCE = 3
     SCALING = 4
     RESTARTS = 5
+    LABELS = 6
 
 
 @dataclass(frozen=True)
@@ -35,12 +37,15 @@ class Points:
         Of the residual loss L1.
     matching_t, matching_x : (m, 1), (m, n, 2d)
         Of the matching loss L2: few times with many states each.
+    labels : (n,), (n, 2d), (n, 2d), or None
+        Times, states and where the exact flow takes them, of the loss L3.
     """
 
     t: Tensor
     x: Tensor
     matching_t: Tensor
     matching_x: Tensor
+    labels: tuple[Tensor, Tensor, Tensor] | None = None
 
 
 def stream_seed(seed: int, stream: Stream, block: int = 0) -> int:
@@ -67,11 +72,13 @@ class PointSource:
         device: torch.device,
         streams: tuple[Stream, Stream] = (Stream.RESIDUAL, Stream.MATCHING),
         block: int = BLOCK,
+        labels: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> None:
         self.domain, self.dt, self.seed, self.streams = domain, dt, seed, streams
         self.points, self.times = points, matching_times
         self.block_length = block
         self._like = {"dtype": dtype, "device": device}
+        self._labels = None if labels is None else tuple(torch.as_tensor(a, **self._like) for a in labels)  # type: ignore[arg-type]
         self._block = -1
         self._arrays: tuple[Tensor, ...] = ()
 
@@ -81,7 +88,15 @@ class PointSource:
         if block != self._block:
             self._draw(block)
         t, x, matching_t, matching_x = self._arrays
-        return Points(t[i], x[i], matching_t[i], matching_x[i])
+        return Points(t[i], x[i], matching_t[i], matching_x[i], self._labelled(index))
+
+    def _labelled(self, index: int) -> Any:
+        """All labels, or as many as there are points, drawn anew for each index."""
+        if self._labels is None or len(self._labels[0]) <= self.points:
+            return self._labels
+        rng = np.random.default_rng([stream_seed(self.seed, Stream.LABELS), index])
+        rows = torch.as_tensor(rng.permutation(len(self._labels[0]))[: self.points], device=self._labels[0].device)
+        return tuple(a[rows] for a in self._labels)
 
     def _draw(self, block: int) -> None:
         m, k = self.times, self.block_length

@@ -9,6 +9,8 @@ from typing import Any
 DEFAULTS: dict[str, dict[str, Any]] = {
     "adam": {"steps": 20_000, "points": 700, "refresh": 1, "validate_every": 500, "checkpoint_every": 1000},
     "bfgs": {"steps": 200, "points": 4000, "refresh": None, "validate_every": 5, "checkpoint_every": 5},
+    "lbfgs": {"steps": 500, "points": 4000, "refresh": None, "validate_every": 5, "checkpoint_every": 5},
+    "gauss-newton": {"steps": 200, "points": 1500, "refresh": None, "validate_every": 5, "checkpoint_every": 10},
 }
 """What each optimizer does if not told otherwise."""
 
@@ -23,16 +25,22 @@ class TrainingConfig:
     Parameters
     ----------
     optimizer : str
-        "adam", one gradient step on fresh points at a time, or "bfgs", whose steps are 20 quasi-Newton iterations
-        on points that stay for `refresh` steps: slower a step, and far better for the last digits.
+        "adam", one gradient step on fresh points at a time; "gauss-newton", whose steps are Gauss–Newton steps on the
+        residuals of points that stay for `refresh` steps, each far dearer and far better, and which stops by itself;
+        "bfgs" and "lbfgs", whose steps are 20 quasi-Newton iterations on such points.
     steps : int
         Length of the run.
     points : int
         Collocation points of each of the two losses, per step.
-    residual_weight, matching_weight : float
-        Weights of L1 and L2; 0 leaves the loss out.
+    residual_weight, matching_weight, label_weight : float
+        Weights of L1, L2 and L3; 0 leaves the loss out.
     matching_times : int
         Number of distinct times in L2, each with points / matching_times states (to remove 𝓗's free c(t)).
+    label_times : int
+        Number of equidistant times in (0, Δt] at which as many states as there are points are labelled for L3; each
+        step takes `points` of these labels.
+    data : str or None
+        Checksum of the labels that were handed in instead.
     learning_rate : float
         The largest of the schedule.
     schedule : str
@@ -54,7 +62,10 @@ class TrainingConfig:
     points: int = 700
     residual_weight: float = 1.0
     matching_weight: float = 1.0
+    label_weight: float = 0.0
     matching_times: int = 10
+    label_times: int = 8
+    data: str | None = None
     learning_rate: float = 5e-3
     schedule: str = "one-cycle"
     clip: float | None = 1.0
@@ -76,6 +87,7 @@ class TrainingConfig:
             "steps",
             "points",
             "matching_times",
+            "label_times",
             "validate_every",
             "validation_points",
             "reference_states",
@@ -86,11 +98,13 @@ class TrainingConfig:
             _positive_integer("refresh", self.refresh)
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise ValueError(f"`seed` must be a non-negative integer; got {self.seed!r}.")
-        for name in ("residual_weight", "matching_weight"):
+        for name in ("residual_weight", "matching_weight", "label_weight"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"`{name}` must be finite and at least 0; got {getattr(self, name)!r}.")
-        if self.residual_weight == self.matching_weight == 0:
-            raise ValueError("`residual_weight` and `matching_weight` are both 0: give one of them a positive value.")
+        if self.residual_weight == self.matching_weight == self.label_weight == 0:
+            raise ValueError(
+                "`residual_weight`, `matching_weight` and `label_weight` are all 0: give one of them a positive value."
+            )
         for name in ("learning_rate", "clip"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:

@@ -1,11 +1,12 @@
-"""The two losses of the paper, in units in which every well-posed problem looks alike."""
+"""The two losses of the paper, in units in which every well-posed problem looks alike; and a third, of labels."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from sympflow.flow.base import FlowMap
 from sympflow.flow.scaling import Scaling
@@ -13,21 +14,23 @@ from sympflow.flow.sympflow import SympFlow
 from sympflow.system import HamiltonianSystem
 from sympflow.training.collocation import Points
 
+Terms = tuple[Tensor | None, Tensor | None, Tensor | None]
+
 
 @dataclass(frozen=True)
 class Loss:
-    """L = w_1 L1 + w_2 L2, without data.
+    """L = w_1 L1 + w_2 L2 + w_3 L3; the first two need no data.
 
     L1 = mean ‖d/dt ψ̄_t(x) − J∇H(ψ̄_t(x))‖², the residual of the flow; L2 = mean (𝓗(ψ̄)(t, x) − H(x))², Hamiltonian
-    matching, less its mean over x at each t, as 𝓗 is defined up to a function of t. Both are divided by the units of
-    the scaling: x by its spread over Ω, t by Δt, H by action / Δt.
+    matching, less its mean over x at each t, as 𝓗 is defined up to a function of t; L3 = mean ‖ψ̄_t(x) − φ_H,t(x)‖² at
+    labelled points. All are divided by the units of the scaling: x by its spread over Ω, t by Δt, H by action / Δt.
 
     Parameters
     ----------
     system : HamiltonianSystem
     scaling : Scaling
-    residual_weight, matching_weight : float
-        w_1, w_2; a loss of weight 0 is not evaluated.
+    residual_weight, matching_weight, label_weight : float
+        w_1, w_2, w_3; a loss of weight 0 is not evaluated.
 
     References
     ----------
@@ -39,34 +42,135 @@ class Loss:
     scaling: Scaling
     residual_weight: float = 1.0
     matching_weight: float = 1.0
+    label_weight: float = 0.0
 
-    def residual(self, flow: FlowMap, points: Points) -> Tensor:
-        """(d/dt ψ̄_t(x) − J∇H(ψ̄_t(x))) Δt/s: (N, 2d)."""
-        y, velocity = flow.psi_and_velocity(points.t, points.x)
+    def residual(self, flow: FlowMap, t: Tensor, x: Tensor) -> Tensor:
+        """(d/dt ψ̄_t(x) − J∇H(ψ̄_t(x))) Δt/s: (..., 2d)."""
+        y, velocity = flow.psi_and_velocity(t, x)
         unit = torch.tensor(self.scaling.x, dtype=y.dtype, device=y.device) / self.scaling.t
         return (velocity - self.system.vector_field(y)) / unit
 
-    def mismatch(self, flow: SympFlow, points: Points) -> Tensor:
-        """(𝓗(ψ̄)(t, x) − H(x) − c(t)) Δt/action: (m, n)."""
-        H = flow.hamiltonian_unchecked(points.matching_t, points.matching_x)
-        difference = (H - self.system.hamiltonian(points.matching_x)) * (self.scaling.t / self.scaling.action)
-        return difference - difference.mean(-1, keepdim=True)
+    def mismatch(self, flow: SympFlow, t: Tensor, x: Tensor) -> Tensor:
+        """(𝓗(ψ̄)(t, x) − H(x)) Δt/action, not yet less c(t): (...)."""
+        H = flow.hamiltonian_unchecked(t, x)
+        return (H - self.system.hamiltonian(x)) * (self.scaling.t / self.scaling.action)
 
-    def terms(self, flow: FlowMap, points: Points) -> tuple[Tensor | None, Tensor | None]:
-        """L1 and L2, None where the weight is 0."""
-        L1 = self.residual(flow, points).square().sum(-1).mean() if self.residual_weight else None
-        L2 = None
+    def label_error(self, flow: FlowMap, t: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """(ψ̄_t(x) − y)/s: (..., 2d)."""
+        unit = torch.tensor(self.scaling.x, dtype=y.dtype, device=y.device)
+        return (flow.psi(t, x) - y) / unit
+
+    def terms(self, flow: FlowMap, points: Points) -> Terms:
+        """L1, L2 and L3, None where the weight is 0."""
+        L1 = L2 = L3 = None
+        if self.residual_weight:
+            L1 = self.residual(flow, points.t, points.x).square().sum(-1).mean()
         if self.matching_weight:
             assert isinstance(flow, SympFlow)  # train refuses a matching weight for any other
-            L2 = self.mismatch(flow, points).square().mean()
-        return L1, L2
+            L2 = _less_mean(self.mismatch(flow, points.matching_t, points.matching_x)).square().mean()
+        if self.label_weight:
+            assert points.labels is not None
+            L3 = self.label_error(flow, *points.labels).square().sum(-1).mean()
+        return L1, L2, L3
 
-    def total(self, terms: tuple[Tensor | None, Tensor | None]) -> Tensor:
-        """w_1 L1 + w_2 L2."""
-        L1, L2 = terms
-        weighted = [w * L for w, L in ((self.residual_weight, L1), (self.matching_weight, L2)) if L is not None]
-        return weighted[0] if len(weighted) == 1 else weighted[0] + weighted[1]
+    def total(self, terms: Terms) -> Tensor:
+        """w_1 L1 + w_2 L2 + w_3 L3."""
+        weights = (self.residual_weight, self.matching_weight, self.label_weight)
+        weighted = [w * L for w, L in zip(weights, terms, strict=True) if L is not None]
+        return weighted[0] if len(weighted) == 1 else torch.stack(weighted).sum()
 
     def __call__(self, flow: FlowMap, points: Points) -> Tensor:
         """L at the points."""
         return self.total(self.terms(flow, points))
+
+
+@dataclass(frozen=True)
+class Objective:
+    """A loss of a flow at given points, as a number, or as the residuals whose sum of squares it is.
+
+    Parameters
+    ----------
+    loss : Loss
+    flow : FlowMap
+    points : Points
+    draw : int
+        Which points of the run these are.
+    """
+
+    loss: Loss
+    flow: FlowMap
+    points: Points
+    draw: int = 0
+
+    def __call__(self) -> Tensor:
+        return self.loss(self.flow, self.points)
+
+    @torch.no_grad()
+    def residuals(self) -> Tensor:
+        """The residuals (m,)."""
+        return torch.cat([self._reduced(name, f(self.flow, *arguments)) for name, f, arguments in self._blocks()])
+
+    def linearized(self) -> tuple[Tensor, Tensor]:
+        """The residuals (m,) and their Jacobian (m, n) by the parameters, in the order of `flow.parameters()`."""
+        rows = []
+        for name, function, arguments in self._blocks():
+            r, J = jacobian(self.flow, function, arguments)
+            rows.append((self._reduced(name, r), self._reduced(name, J.movedim(-1, 0), 1).T))
+        return torch.cat([r for r, _ in rows]), torch.cat([J for _, J in rows])
+
+    def _blocks(self) -> list[tuple[str, Callable[..., Tensor], tuple[Tensor, ...]]]:
+        """Of each loss that counts its name, its function and its points, one a row."""
+        loss, points = self.loss, self.points
+        blocks: list[tuple[str, Callable[..., Tensor], tuple[Tensor, ...]]] = []
+        if loss.residual_weight:
+            blocks.append(("residual", loss.residual, (points.t, points.x)))
+        if loss.matching_weight:
+            t = points.matching_t.expand(points.matching_x.shape[:2]).reshape(-1)
+            blocks.append(("matching", loss.mismatch, (t, points.matching_x.flatten(0, 1))))
+        if loss.label_weight:
+            assert points.labels is not None
+            blocks.append(("label", loss.label_error, points.labels))
+        return blocks
+
+    def _reduced(self, name: str, values: Tensor, leading: int = 0) -> Tensor:
+        """(..., N, ...) after `leading` axes as (..., m), so weighted that the sum of squares is the loss."""
+        weight = (getattr(self.loss, f"{name}_weight") / values.shape[leading]) ** 0.5
+        if name == "matching":
+            grid = values.unflatten(leading, self.points.matching_x.shape[:2])
+            values = _less_mean(grid)
+        return weight * values.flatten(leading)
+
+
+class _Evaluation(nn.Module):
+    """`function(flow, *arguments)` as a module, whose parameters may be replaced."""
+
+    def __init__(self, flow: FlowMap, function: Callable[..., Tensor]) -> None:
+        super().__init__()
+        self.flow, self.function = flow, function
+
+    def forward(self, *arguments: Tensor) -> Tensor:
+        return self.function(self.flow, *arguments)
+
+
+def jacobian(flow: FlowMap, function: Callable[..., Tensor], arguments: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    """function(flow, *arguments) of N points, (N, ...), and its derivatives by the n parameters, (N, ..., n).
+
+    By reverse mode for each point, a sweep for each of its values; where these are more than the parameters, by
+    forward mode.
+    """
+    evaluation = _Evaluation(flow, function)
+    parameters = {name: w.detach() for name, w in evaluation.named_parameters()}
+
+    def value(parameters: dict[str, Tensor], *point: Tensor) -> tuple[Tensor, Tensor]:
+        result = torch.func.functional_call(evaluation, parameters, point)
+        return result, result
+
+    each = (None, *(0 for _ in arguments))
+    outputs = torch.func.vmap(value, each)(parameters, *arguments)[0][0].numel()
+    derivative = torch.func.jacrev if outputs <= flow.n_parameters else torch.func.jacfwd
+    J, values = torch.func.vmap(derivative(value, has_aux=True), each)(parameters, *arguments)
+    return values, torch.cat([J[name].flatten(values.ndim) for name in parameters], -1)
+
+
+def _less_mean(values: Tensor) -> Tensor:
+    return values - values.mean(-1, keepdim=True)

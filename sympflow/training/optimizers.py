@@ -10,7 +10,8 @@ from torch import Tensor
 
 from sympflow.flow.base import FlowMap
 from sympflow.training.config import TrainingConfig
-from sympflow.training.quasi_newton import BFGS
+from sympflow.training.marquardt import GaussNewton
+from sympflow.training.quasi_newton import BFGS, LBFGS
 
 
 class Adam:
@@ -41,4 +42,5 @@ class Adam:
 
 def optimizer(flow: FlowMap, config: TrainingConfig) -> Any:
     """The optimizer that the configuration names."""
-    return {"adam": Adam, "bfgs": BFGS}[config.optimizer](flow, config)
+    named = {"adam": Adam, "bfgs": BFGS, "lbfgs": LBFGS, "gauss-newton": GaussNewton}
+    return named[config.optimizer](flow, config)

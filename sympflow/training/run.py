@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,14 +20,19 @@ from sympflow.flow.base import FlowMap
 from sympflow.flow.scaling import Scaling
 from sympflow.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
-from sympflow.training.collocation import PointSource, Stream, states
+from sympflow.training.collocation import PointSource, Stream, states, stream_seed
 from sympflow.training.config import TrainingConfig
-from sympflow.training.losses import Loss
+from sympflow.training.labels import Labels
+from sympflow.training.losses import Loss, Objective
 from sympflow.training.optimizers import optimizer as make_optimizer
 from sympflow.training.progress import progress as make_progress
 from sympflow.training.validation import Validation
 
 Path = str | os.PathLike[str]
+Labelled = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Times (n,), states (n, 2d), and where the flow takes them (n, 2d)."""
+
+HELD_OUT_SHARE = 0.1  # of the labels that are handed in
 
 
 @dataclass
@@ -55,10 +61,14 @@ class Run:
         domain: Domain,
         scaling: Scaling,
         config: TrainingConfig,
+        data: Labelled | None = None,
     ) -> Run:
-        loss = Loss(system, scaling, config.residual_weight, config.matching_weight)
+        loss = Loss(system, scaling, config.residual_weight, config.matching_weight, config.label_weight)
+        labels = unseen = None
+        if config.label_weight:
+            labels, unseen = _labels(system, domain, flow.dt, config) if data is None else _parted(data, config.seed)
         common = (flow.dt, config.points, config.matching_times, config.seed, flow.dtype, flow.device)
-        source = PointSource(domain, *common, block=1 if config.refresh is None else 32)
+        source = PointSource(domain, *common, block=1 if config.refresh is None else 32, labels=labels)
         held_out = PointSource(
             domain,
             flow.dt,
@@ -66,6 +76,7 @@ class Run:
             *common[2:],
             streams=(Stream.VALIDATION, Stream.VALIDATION),
             block=1,
+            labels=unseen,
         )
         x = states(domain, config.reference_states, config.seed, Stream.REFERENCE)
         validation = Validation(system, loss, held_out(0), x, flow.dt, flow)
@@ -92,14 +103,13 @@ class Run:
             with make_progress(progress, config.steps, f"{self.system.name} {flow.kind}", self.step) as bar:
                 while self.step < config.steps:
                     index = 0 if config.refresh is None else self.step // config.refresh
-                    points = self.source(index)
-                    value = self.optimizer.step(self.step, lambda points=points: self.loss(flow, points))
+                    value = self.optimizer.step(self.step, Objective(self.loss, flow, self.source(index), index))
                     self.step += 1
                     self.seconds = before + time.perf_counter() - begin
                     if not math.isfinite(value):
                         return f"the loss was not finite at step {self.step}: lower `learning_rate`"
                     bar.advance(self.step, value)
-                    last = self.step == config.steps
+                    last = self.step == config.steps or (config.refresh is None and self._finished() is not None)
                     spent = time_budget is not None and self.seconds - before > time_budget
                     if last or spent or self.step % config.validate_every == 0:
                         figures = self._validate()
@@ -108,11 +118,17 @@ class Run:
                             callback(self.step, dict(figures))
                     if checkpoint is not None and (last or spent or self.step % config.checkpoint_every == 0):
                         self.save(checkpoint)
-                    if spent and not last:
+                    if last:
+                        break
+                    if spent:
                         return "the time budget was used up"
         except KeyboardInterrupt:
             return "it was interrupted"
         return None
+
+    def _finished(self) -> str | None:
+        """Why the optimizer wants no more steps, if it does not."""
+        return getattr(self.optimizer, "finished", None)
 
     def _validate(self) -> dict[str, float]:
         figures = {"step": self.step, **self.validation(self.flow)}
@@ -148,6 +164,7 @@ class Run:
             **self.config.to_dict(),
             "steps_taken": self.step,
             "ended_early": reason,
+            "finished": self._finished(),
             "best_step": best["step"],
         }
         flow.recipe = {
@@ -198,3 +215,26 @@ class Run:
         except (RuntimeError, KeyError, ValueError) as error:
             raise ValueError(f"`resume` {str(path)!r} does not fit the flow: start afresh.") from error
         self.step, self.seconds, self.history = state["step"], state["seconds"], state["history"]
+
+
+def _labels(system: HamiltonianSystem, domain: Domain, dt: float, config: TrainingConfig) -> tuple[Labelled, Labelled]:
+    """Labels to train on, and held-out ones, at equidistant times."""
+    t = dt * np.arange(1, config.label_times + 1) / config.label_times
+    unseen = max(1, config.validation_points // config.label_times)
+    sets = []
+    for n, stream in ((config.points, Stream.LABELS), (unseen, Stream.VALIDATION)):
+        labels = Labels.of(system, states(domain, n, config.seed, stream), t)
+        if not len(labels.x):
+            raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
+        x = np.broadcast_to(labels.x, labels.y.shape).reshape(-1, labels.x.shape[1])
+        sets.append((np.repeat(t, len(labels.x)), x, labels.y.reshape(x.shape)))
+    return sets[0], sets[1]
+
+
+def _parted(data: Labelled, seed: int) -> tuple[Labelled, Labelled]:
+    """Labels that were handed in: those to train on, and the held-out ones."""
+    order = np.random.default_rng([stream_seed(seed, Stream.LABELS), 0]).permutation(len(data[0]))
+    first = math.ceil(HELD_OUT_SHARE * len(order))
+    t, x, y = data
+    held, rest = order[:first], order[first:]
+    return (t[rest], x[rest], y[rest]), (t[held], x[held], y[held])

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import inspect
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
+from sympflow.arrays import to_numpy
 from sympflow.domain import Domain, EnergySublevel
 from sympflow.flow.base import FlowMap
 from sympflow.flow.mlp import MLPFlow, matching_widths
@@ -20,7 +24,7 @@ from sympflow.system import HamiltonianSystem
 from sympflow.training.collocation import Stream, states
 from sympflow.training.config import TrainingConfig
 from sympflow.training.gauss_newton import GaussNewtonConfig, GaussNewtonRun
-from sympflow.training.run import Path, Run
+from sympflow.training.run import Labelled, Path, Run
 
 SCALING_SAMPLES = 4096
 
@@ -37,11 +41,15 @@ def train(
     activation: str | None = None,
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
-    optimizer: str = "adam",
+    stages: int | None = None,
+    processor: int | None = None,
+    optimizer: str | None = None,
     steps: int | None = None,
     points: int | None = None,
     residual_weight: float = 1.0,
     matching_weight: float | None = None,
+    label_weight: float | None = None,
+    data: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
     matching_times: int = 10,
     learning_rate: float = 5e-3,
     schedule: str = "one-cycle",
@@ -61,32 +69,42 @@ def train(
     progress: bool | None = None,
     callback: Callable[[int, dict[str, float]], None] | None = None,
 ) -> Any:
-    """Train a flow map of `system` on [0, dt] by its residual and by Hamiltonian matching, or by labels.
+    """Train a flow map of `system` on [0, dt]: with nothing else given, the best that is known for it.
 
-    Any system will do, separable or not: a SympFlow with MLP potentials is symplectic all the same. For a separable
-    symbolic one, optimizer="gauss-newton" fits a primed flow (`SympFlow.primed`) to the exact flow in seconds.
+    For a separable symbolic system with T = ½ pᵀM⁻¹p that is a primed flow (`SympFlow.primed`), whose few numbers are
+    fitted to the exact flow in seconds. For any other it is a SympFlow with MLP potentials, symplectic for every H,
+    trained by Adam on its residual and by Hamiltonian matching, without data.
 
     Parameters
     ----------
     system : HamiltonianSystem
     dt : float, optional
         Δt, the longest time of the map; the default is 1, or that of `flow`.
-    kind : {"sympflow", "mlp"}, optional
-        The architecture: a SympFlow (the default) or the unconstrained baseline with as many parameters as the
-        SympFlow that `pairs` and `hidden` describe.
-    pairs, hidden, activation, dtype, device
-        Of a new flow, see `SympFlow`; the defaults are 3, (10, 10), "tanh" and float64 on the CPU.
+    kind : {"primed", "sympflow", "mlp"}, optional
+        The architecture: a SympFlow primed with the system's V and T; one with MLP potentials; or the unconstrained
+        baseline with as many parameters as the SympFlow that `pairs` and `hidden` describe. The default is "primed"
+        for the systems above, unless an option says that it is to be a network.
     flow : FlowMap, optional
         Train a copy of this flow further (a second stage, say, with another optimizer) in place of a new one.
     domain : Domain, optional
         Ω; the default is that of the system.
-    optimizer, steps, points, residual_weight, matching_weight, matching_times, learning_rate, schedule, clip, refresh,
-    seed, validate_every, validation_points, reference_states, checkpoint_every
+    stages, processor
+        Of a new primed flow, see `SympFlow.primed`.
+    pairs, hidden, activation, dtype, device
+        Of a new network, see `SympFlow`; the defaults are 3, (10, 10), "tanh" and float64 on the CPU.
+    optimizer : {"gauss-newton", "adam", "bfgs", "lbfgs"}, optional
+        The default is "gauss-newton" for primed flows, "adam" for networks, which "gauss-newton" trains far better.
+    steps, points, residual_weight, matching_weight, label_weight, matching_times, learning_rate, schedule, clip,
+    refresh, seed, validate_every, validation_points, reference_states, checkpoint_every
         See `TrainingConfig`. What is left out gets the optimizer's own default: 20,000 steps on 700 fresh points
-        for Adam, 200 on 4000 fixed points for BFGS. A baseline has no Hamiltonian, so its matching weight is 0.
+        for Adam, at most 200 on 1500 fixed points for Gauss–Newton. A baseline has no Hamiltonian, so its matching
+        weight is 0; Gauss–Newton leaves matching out as well, unless it is given a weight.
+    data : (array (n,), array (n, 2d), array (n, 2d)), optional
+        Labels of a network: times in [0, dt], states, and where the exact flow takes them; a tenth is held out.
+        `label_weight` is then 1. Without data, labels are made where `label_weight` is given.
     restarts, label_times, frozen_weight
-        Only for "gauss-newton", which takes of those above `steps`, `points`, `seed` and `reference_states`: see
-        `GaussNewtonConfig`.
+        Of "gauss-newton" on a primed flow, which takes of those above `steps`, `points`, `seed` and
+        `reference_states`: see `GaussNewtonConfig`. `label_times` counts for a network's `label_weight` too.
     checkpoint : path, optional
         Write the state of the run there every `checkpoint_every` steps, atomically.
     resume : path, optional
@@ -110,6 +128,8 @@ def train(
     ------
     ValueError
         If the system has no domain and none is given, or an argument is not admissible.
+    TypeError
+        If an option is not one of the optimizer's.
     FloatingPointError
         If the loss is not finite from the start.
     """
@@ -117,7 +137,16 @@ def train(
     domain = _domain(system, domain)
     if time_budget is not None and not 0 < time_budget < math.inf:
         raise ValueError(f"`time_budget` must be a positive number of seconds; got {time_budget!r}.")
-    new = {"kind": kind, "pairs": pairs, "hidden": hidden, "activation": activation, "dtype": dtype, "device": device}
+    new = {
+        "kind": kind,
+        "stages": stages,
+        "processor": processor,
+        "pairs": pairs,
+        "hidden": hidden,
+        "activation": activation,
+        "dtype": dtype,
+        "device": device,
+    }
     if flow is not None:
         if not isinstance(flow, FlowMap):
             raise TypeError(f"`flow` must be a SympFlow or an MLPFlow; got {flow!r}: leave it out for a new one.")
@@ -126,35 +155,58 @@ def train(
                 raise ValueError(f"`{name}` describes a new flow, but `flow` is given: leave out one of them.")
         if dt is not None and dt != flow.dt:
             raise ValueError(f"`dt` is {dt!r} but the flow has {flow.dt!r}: leave `dt` out to train it further.")
-        dt, kind = flow.dt, flow.kind
+        dt, kind = flow.dt, "primed" if isinstance(flow, PrimedFlow) else flow.kind
         flow.check_system(system)
-    dt, kind = 1.0 if dt is None else dt, "sympflow" if kind is None else kind
+    dt = 1.0 if dt is None else dt
     if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf:
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}.")
-    if kind not in ("sympflow", "mlp"):
-        raise ValueError(f"`kind` {kind!r} is unknown: choose sympflow or mlp.")
-    of_labels = {"restarts": restarts, "label_times": label_times, "frozen_weight": frozen_weight}
-    if optimizer == "gauss-newton":
-        _refuse_options(given, _NOT_GAUSS_NEWTON, optimizer)
-        choices: dict[str, Any] = {"points": points, "steps": steps, **of_labels}
+    kind = _kind(system, given) if kind is None else kind
+    if kind not in KINDS:
+        raise ValueError(f"`kind` {kind!r} is unknown: choose one of {', '.join(KINDS)}.")
+    if flow is None:
+        for name in _OF_NETWORKS if kind == "primed" else ("stages", "processor"):
+            if new[name] is not None:
+                raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
+    optimizer = ("gauss-newton" if kind == "primed" else "adam") if optimizer is None else optimizer
+    if flow is None and kind == "primed":
+        flow = SympFlow.primed(
+            system,
+            stages,
+            dt=float(dt),
+            dtype=torch.float64 if dtype is None else dtype,
+            device=device,
+            processor=0 if processor is None else processor,
+        )
+    single = dtype not in (None, torch.float64) or (flow is not None and flow.dtype != torch.float64)
+    if optimizer == "gauss-newton" and single:
+        raise TypeError("`optimizer` 'gauss-newton' fits flows in float64: leave out `dtype`, or use 'adam'.")
+    if optimizer == "gauss-newton" and kind == "primed":
+        _refuse_options(given, _NOT_OF_TABLES, f"optimizer {optimizer!r} for primed flows")
+        choices: dict[str, Any] = {
+            "points": points,
+            "steps": steps,
+            "restarts": restarts,
+            "label_times": label_times,
+            "frozen_weight": frozen_weight,
+        }
         choices = {name: value for name, value in choices.items() if value is not None}
         labelled = GaussNewtonConfig(seed=seed, reference_states=reference_states, **choices)
-        if flow is None:
-            flow = SympFlow.primed(system, dt=float(dt), dtype=torch.float64 if dtype is None else dtype, device=device)
-        if not isinstance(flow, PrimedFlow) or flow.dtype != torch.float64:
-            raise TypeError(
-                "`optimizer` 'gauss-newton' fits primed flows in float64: pass flow=SympFlow.primed(system, dt=...)."
-            )
+        assert isinstance(flow, PrimedFlow)
         flow = copy.deepcopy(flow).bound(system)
-        flow.certified = None
+        flow.certified = None  # of the numbers as they were
         scaling = Scaling.of_samples(states(domain, SCALING_SAMPLES, seed, Stream.SCALING), flow.dt)
         search = GaussNewtonRun.start(flow, system, domain, scaling, labelled)
         if resume is not None:
             search.load(resume)
         return search.finish(search.go(checkpoint, time_budget, progress, callback))
-    _refuse_options(given, tuple(of_labels), optimizer)
+    _refuse_options(given, _OF_TABLES, f"optimizer {optimizer!r} for flows of kind {kind!r}")
+    if optimizer != "adam":
+        _refuse_options(given, ("learning_rate", "schedule", "clip"), f"optimizer {optimizer!r}")
     if kind == "mlp" and matching_weight:
         raise ValueError("`matching_weight` needs a Hamiltonian, which an MLP flow has not: leave it out.")
+    labels = None if data is None else _labels(data, system, float(dt))
+    if matching_weight is None:
+        matching_weight = 0.0 if kind == "mlp" or optimizer == "gauss-newton" else 1.0
     config = TrainingConfig.of(
         optimizer,
         steps=steps,
@@ -163,8 +215,11 @@ def train(
         validate_every=validate_every,
         checkpoint_every=checkpoint_every,
         residual_weight=residual_weight,
-        matching_weight=matching_weight if matching_weight is not None else 0.0 if kind == "mlp" else 1.0,
+        matching_weight=matching_weight,
+        label_weight=(0.0 if data is None else 1.0) if label_weight is None else label_weight,
         matching_times=matching_times,
+        label_times=8 if label_times is None else label_times,
+        data=None if labels is None else _digest(labels),
         learning_rate=learning_rate,
         schedule=schedule,
         clip=clip,
@@ -192,21 +247,22 @@ def train(
                     "MLPFlow matches within 2 %: give wider layers or more pairs."
                 )
             flow = MLPFlow.matching(flow, seed, scaling, "tanh" if activation is None else activation)
-    flow = copy.deepcopy(flow).requires_grad_(True)
+    flow = copy.deepcopy(flow).bound(system).requires_grad_(True)
     flow.certified = None  # of the weights as they were
-    run = Run.start(flow, system, domain, scaling, config)
+    run = Run.start(flow, system, domain, scaling, config, labels)
     if resume is not None:
         run.load(resume)
     return run.finish(run.go(checkpoint, time_budget, progress, callback))
 
 
-_NOT_GAUSS_NEWTON = (
-    "kind",
-    "pairs",
-    "hidden",
-    "activation",
+KINDS = ("primed", "sympflow", "mlp")
+_OF_NETWORKS = ("pairs", "hidden", "activation")
+_OF_TABLES = ("restarts", "frozen_weight")
+_NOT_OF_TABLES = (
     "residual_weight",
     "matching_weight",
+    "label_weight",
+    "data",
     "matching_times",
     "learning_rate",
     "schedule",
@@ -218,12 +274,59 @@ _NOT_GAUSS_NEWTON = (
 )
 
 
-def _refuse_options(given: dict[str, Any], names: Sequence[str], optimizer: str) -> None:
-    """Raise if one of the named arguments of `train` has another value than its default."""
+def _kind(system: HamiltonianSystem, given: dict[str, Any]) -> str:
+    """The architecture that is meant where none is named."""
+    if _given(given, ("stages", "processor", *_OF_TABLES)):
+        return "primed"
+    fits = system.separable and system.quadratic_kinetic and system.symbols is not None
+    wants_network = given["optimizer"] not in (None, "gauss-newton") or _given(given, (*_OF_NETWORKS, *_NOT_OF_TABLES))
+    return "primed" if fits and not wants_network else "sympflow"
+
+
+def _given(given: dict[str, Any], names: Sequence[str]) -> list[str]:
+    """Those of the named arguments of `train` that have another value than their default."""
     defaults = inspect.signature(train).parameters
-    for name in names:
-        if given[name] != defaults[name].default:
-            raise TypeError(f"`{name}` is not an option of the optimizer {optimizer!r}: leave it out.")
+    return [
+        name for name in names if given[name] is not defaults[name].default and given[name] != defaults[name].default
+    ]
+
+
+def _differs(value: Any, default: Any) -> bool:
+    return value is not default and (default is None or value != default)
+
+
+def _refuse_options(given: dict[str, Any], names: Sequence[str], what: str) -> None:
+    for name in _given(given, names):
+        raise TypeError(f"`{name}` is not an option of the {what}: leave it out.")
+
+
+def _labels(data: Any, system: HamiltonianSystem, dt: float) -> Labelled:
+    """The labels that were handed in, as float64 arrays."""
+    if not isinstance(data, tuple | list) or len(data) != 3:
+        raise TypeError(
+            "`data` must be three arrays, times (n,), states (n, 2d) and where they go (n, 2d): pass a tuple."
+        )
+    t, x, y = (np.asarray(to_numpy(a), dtype=float) for a in data)
+    width = 2 * system.ndof
+    if t.ndim != 1 or x.shape != (len(t), width) or y.shape != x.shape or len(t) < 2:
+        raise ValueError(
+            f"`data` must have shapes (n,), (n, {width}) and (n, {width}), n ≥ 2; got {t.shape}, {x.shape} and "
+            f"{y.shape}: give one row for each label."
+        )
+    if not (np.isfinite(t).all() and np.isfinite(x).all() and np.isfinite(y).all()):
+        raise ValueError("`data` must be finite: remove the labels with NaN or infinity.")
+    if t.min() < 0 or t.max() > dt * (1 + 1e-12):
+        raise ValueError(
+            f"`data` has times from {t.min():g} to {t.max():g}, beyond [0, dt] = [0, {dt:g}]: change `dt`."
+        )
+    return t, x, y
+
+
+def _digest(labels: Labelled) -> str:
+    digest = hashlib.sha256()
+    for array in labels:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def _domain(system: HamiltonianSystem, domain: Domain | None) -> Domain:

@@ -55,7 +55,7 @@ class Validation:
         """Losses on the held-out points; mean and largest ‖ψ̄_Δt(x) − φ_H,Δt(x)‖ over the held-out states."""
         terms = self.loss.terms(flow, self.points)
         figures = {"loss": float(self.loss.total(terms))}
-        for name, term in zip(("residual_loss", "matching_loss"), terms, strict=True):
+        for name, term in zip(("residual_loss", "matching_loss", "label_loss"), terms, strict=True):
             if term is not None:
                 figures[name] = float(term)
         if len(self.x):

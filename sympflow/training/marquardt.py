@@ -1,0 +1,142 @@
+"""Gauss–Newton steps on the residuals of a flow, damped as by Levenberg and Marquardt: what trains networks best."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sympflow.flow.base import FlowMap
+from sympflow.training.config import TrainingConfig
+from sympflow.training.losses import Objective
+
+MAX_PARAMETERS = 8000
+MAX_REJECTED = 20
+FIRST_DAMPING = 1e-3
+LEAST_DAMPING = 1e-16
+WELL_CONDITIONED = 1e-8  # damping above which (JᵀJ + λD²)s = −Jᵀr loses no more than half the digits
+PATIENCE = 20
+GAIN = 1e-2
+PROBE = 0.1  # share of a step over which the curvature of the residuals is measured
+CURVED = 0.75  # largest ratio of the second-order correction to the step
+
+
+class GaussNewton:
+    """Levenberg–Marquardt, one accepted step at a time.
+
+    A step s minimizes ‖J s + r‖² + λ‖D s‖², D the largest norms that the columns of J have had, so that λ bounds
+    the condition number: by the normal equations where it is large, else by a QR factorization of J. λ follows the
+    gain ratio, actual over predicted decrease, as in [2]_. The steps end where `PATIENCE` of them on the same points
+    lower the loss by less than 1 %, or none does.
+
+    Attributes
+    ----------
+    finished : str or None
+        Why no more steps are worth while.
+
+    References
+    ----------
+    .. [1] J. J. Moré, The Levenberg–Marquardt algorithm: implementation and theory, Lect. Notes Math. 630 (1978).
+    .. [2] H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05 (1999).
+    .. [3] M. K. Transtrum, J. P. Sethna, Improvements to the Levenberg–Marquardt algorithm for nonlinear least-squares
+       minimization, arXiv:1201.5885 (2012).
+    """
+
+    def __init__(self, flow: FlowMap, config: TrainingConfig) -> None:
+        if flow.n_parameters > MAX_PARAMETERS:
+            raise ValueError(
+                f"`optimizer` 'gauss-newton' keeps a dense Jacobian and takes at most {MAX_PARAMETERS} parameters; the "
+                f"flow has {flow.n_parameters}: use 'lbfgs' or 'adam'."
+            )
+        self.parameters = list(flow.parameters())
+        self.damping, self.growth = FIRST_DAMPING, 2.0
+        self.scale: Tensor | None = None  # D²
+        self.costs: list[float] = []
+        self.draw: int | None = None
+        self.finished: str | None = None
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "damping": self.damping,
+            "growth": self.growth,
+            "scale": self.scale,
+            "costs": self.costs,
+            "draw": self.draw,
+            "finished": self.finished,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        n, scale = sum(w.numel() for w in self.parameters), state["scale"]
+        if scale is not None and scale.shape != (n,):
+            raise ValueError(f"`state` has a scale of shape {tuple(scale.shape)}, not {(n,)}: start afresh.")
+        self.scale = None if scale is None else scale.to(self.parameters[0])
+        self.damping, self.growth, self.costs = state["damping"], state["growth"], list(state["costs"])
+        self.draw, self.finished = state["draw"], state["finished"]
+
+    def step(self, index: int, objective: Objective) -> float:
+        """Take a step; the loss before it."""
+        r, J = objective.linearized()
+        cost = float(r @ r)
+        if not math.isfinite(cost):
+            return cost
+        if objective.draw != self.draw:
+            self.draw, self.costs = objective.draw, []
+        G, g = J.T @ J, J.T @ r
+        squares = G.diagonal()
+        self.scale = squares.clone() if self.scale is None else torch.maximum(self.scale, squares)
+        D = torch.where(self.scale > 0, self.scale, 1.0).sqrt()
+        x = torch.cat([w.detach().reshape(-1) for w in self.parameters])
+        for _ in range(MAX_REJECTED):
+            solve = self._damped(J, G, D)
+            s = -solve(g)
+            predicted = -float(s @ (G @ s + 2 * g))
+            s = s + self._bend(objective, solve, x, s, r, J, D)
+            self._put(x + s)
+            with torch.no_grad():
+                after = float(objective())
+            gain = (cost - after) / predicted if predicted > 0 and math.isfinite(after) else -1.0
+            if gain > 0:
+                shrink = max(1 / 5, 1 - (2 * min(gain, 1.0) - 1) ** 3)
+                self.damping, self.growth = max(self.damping * shrink, LEAST_DAMPING), 2.0
+                self.costs = [*self.costs[-PATIENCE:], after]
+                if len(self.costs) > PATIENCE and after > (1 - GAIN) * self.costs[0]:
+                    self.finished = "it has converged"
+                return cost
+            self.damping, self.growth = self.damping * self.growth, self.growth * 2
+        self._put(x)
+        self.damping, self.growth, self.finished = FIRST_DAMPING, 2.0, "no step lowers the loss"
+        return cost
+
+    def _damped(self, J: Tensor, G: Tensor, D: Tensor) -> Callable[[Tensor], Tensor]:
+        """v → (JᵀJ + λD²)⁻¹ v."""
+        identity = torch.eye(len(D), dtype=D.dtype, device=D.device)
+        if self.damping > WELL_CONDITIONED:
+            R, failed = torch.linalg.cholesky_ex(G / torch.outer(D, D) + self.damping * identity, upper=True)
+        if self.damping <= WELL_CONDITIONED or failed:
+            R = torch.linalg.qr(torch.cat([J / D, self.damping**0.5 * identity]), mode="r")[1]
+        return lambda v: torch.cholesky_solve((v / D)[:, None], R, upper=True)[:, 0] / D
+
+    def _bend(
+        self,
+        objective: Objective,
+        solve: Callable[[Tensor], Tensor],
+        x: Tensor,
+        s: Tensor,
+        r: Tensor,
+        J: Tensor,
+        D: Tensor,
+    ) -> Tensor:
+        """The geodesic acceleration of [3]_, by which a step follows a curved valley; 0 where it would lead astray."""
+        self._put(x + PROBE * s)
+        curvature = (objective.residuals() - r - PROBE * (J @ s)) / PROBE**2
+        bend = -solve(J.T @ curvature)
+        small = 2 * torch.linalg.vector_norm(D * bend) <= CURVED * torch.linalg.vector_norm(D * s)
+        return bend if small else torch.zeros_like(s)  # NaN is not small
+
+    @torch.no_grad()
+    def _put(self, x: Tensor) -> None:
+        for w, part in zip(self.parameters, x.split([w.numel() for w in self.parameters]), strict=True):
+            w.copy_(part.view_as(w))
