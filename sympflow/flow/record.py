@@ -15,12 +15,14 @@ from sympflow.flow.layers import LAYERS
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.primed import PrimedFlow
+from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
 
 MAX_LAYERS = 1000
 MAX_WIDTH = 4096
 MAX_DEGREE = 64
 MAX_PARAMETERS = 10_000_000
+KINDS_OF_MODES = ("oscillator", "hyperbolic", "free", "idle")
 DTYPES = {"F32": torch.float32, "F64": torch.float64}
 
 
@@ -60,6 +62,8 @@ def build(record: dict[str, Any], dtype: torch.dtype) -> FlowMap:
         if record["kind"] == "mlp":
             hidden = _widths(plan.get("hidden"), 2 * ndof)
             return MLPFlow(ndof, hidden, str(plan.get("activation")), dt, dtype)
+        if "split" in plan:
+            return _split(ndof, plan["split"], dt, dtype)
         if "primed" in plan:
             return _primed(ndof, plan["primed"], dt, dtype)
         layers = plan.get("layers")
@@ -95,6 +99,31 @@ def _primed(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> PrimedFlow:
         processor = _integer(processor, "processor", MAX_LAYERS)
     shape = (plan["first"], maps, degree, plan["palindromic"], plan["force_gradient"])
     return PrimedFlow(ndof, *shape, dt, processor=processor, dtype=dtype)
+
+
+def _split(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> SplitFlow:
+    """A flow of the parts of a system, which `bind` will give it."""
+    if not isinstance(plan, dict):
+        raise Refused("its plan of a split flow is missing")
+    for name in ("filters", "force_gradient"):
+        if not isinstance(plan.get(name), bool):
+            raise Refused(f"its {name} is neither true nor false")
+    for name, admissible in (("kinds", ("kick", "shear")), ("classes", KINDS_OF_MODES)):
+        value = plan.get(name)
+        if not isinstance(value, list) or len(value) > MAX_LAYERS or not all(entry in admissible for entry in value):
+            raise Refused(f"its {name} are not a list of {', '.join(admissible)}")
+    sequence, expressions = plan.get("sequence"), plan.get("expressions")
+    if not isinstance(sequence, list) or not 1 <= len(sequence) <= MAX_LAYERS:
+        raise Refused("its sequence of maps is missing or absurdly long")
+    if not all(isinstance(k, int) and not isinstance(k, bool) and 0 <= k <= len(plan["kinds"]) for k in sequence):
+        raise Refused("its sequence of maps does not consist of numbers of parts")
+    if expressions is not None and not (isinstance(expressions, list) and all(isinstance(e, str) for e in expressions)):
+        raise Refused("its parts are not a list of expressions")
+    terms = _integer(plan.get("terms"), "number of terms", MAX_DEGREE)
+    if len(sequence) * terms * (len(plan["classes"]) + 2) > MAX_PARAMETERS // 100:
+        raise Refused("its architecture is absurdly large")
+    shape = (sequence, plan["kinds"], plan["classes"], terms, plan["filters"], plan["force_gradient"])
+    return SplitFlow(ndof, *shape, dt, expressions, dtype=dtype)
 
 
 def _potential(layer: Any) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from sympflow.flow.scaling import Scaling
 
 if TYPE_CHECKING:
     from sympflow.flow.primed import PrimedFlow
+    from sympflow.flow.split import SplitFlow
     from sympflow.integrators.schemes import Scheme
     from sympflow.system import HamiltonianSystem
 
@@ -163,6 +164,54 @@ class SympFlow(FlowMap):
         from sympflow.flow.primed import primed
 
         return primed(system, stages, dt, palindromic, scheme, degree, force_gradient, processor, dtype, device)
+
+    @staticmethod
+    def split(
+        system: HamiltonianSystem,
+        stages: int = 4,
+        *,
+        dt: float = 1.0,
+        terms: int = 8,
+        filters: bool = True,
+        force_gradient: bool | None = None,
+        parts: Sequence[str] | None = None,
+        linear_outside: bool = True,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> SplitFlow:
+        """A SympFlow of exact flows of the parts of H, the linear one among them, for stiff systems.
+
+        Untrained it is so many equal Strang steps; `training.split_fit.fit_split` fits it to the system and its domain.
+
+        Parameters
+        ----------
+        system : HamiltonianSystem
+            One with parts that are solved exactly: `sympflow.parts.exact_parts`.
+        stages : int
+            Number of Strang steps, palindromic throughout.
+        dt : float
+            Δt.
+        terms : int
+            Number of even polynomials in t of each coefficient.
+        filters : bool
+            Whether the parts see the fast modes through trained filters.
+        force_gradient : bool, optional
+            Whether kicks have a term in ½|∇U|²_{M⁻¹}; by default they do where H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q).
+        parts : sequence of str, optional
+            The parts, as for the method "strang_parts".
+        linear_outside : bool
+            Whether the linear part begins and ends the flow; else it is innermost in each Strang step.
+        dtype, device
+            Of the parameters.
+
+        Raises
+        ------
+        ValueError
+            If the system has no such parts, or an argument is not admissible.
+        """
+        from sympflow.flow.split import split
+
+        return split(system, stages, dt, terms, filters, force_gradient, parts, linear_outside, dtype, device)
 
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.ndof, "layers": [layer.to_dict() for layer in self.layers]}  # type: ignore[operator]

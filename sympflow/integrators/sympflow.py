@@ -127,6 +127,8 @@ class FlowIntegrator(FixedStep):
         return super().run(problem)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        if hasattr(self.flow, "kernel_for"):
+            return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
         if not hasattr(self.flow, "kernel_scheme"):  # an MLP flow evaluates no forces
             return super().evaluations(n_steps, n_saved, n_extra, backend)
         from sympflow.integrators.splitting import scheme_evaluations
@@ -187,6 +189,8 @@ def _kernel(system: HamiltonianSystem, flow: Any, y: Array, backend: str) -> MLP
             raise ValueError("`y0` is a tensor: pass a NumPy array, or use backend='array'.")
         if flow.kind != "sympflow":
             raise ValueError("`method` 'mlp' has no compiled form: use backend='array'.")
+        if hasattr(flow, "kernel_for"):
+            return flow.kernel_for(system)
         if hasattr(flow, "scheme"):
             from sympflow.kernels.primed_flow import PrimedFlowKernel
 

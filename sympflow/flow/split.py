@@ -1,0 +1,364 @@
+"""SympFlows of exact flows: of a system's linear part, and of the other parts of H with trained weights and filters.
+
+    linear    Σ_f s_f(t) E_f(x), E_f the energy of the modes of frequency ω_f, turned by the exact flow
+    kick      V(t, q) = w(t) U(A(t) q) − γ(t) ½|∇_q U(A(t) q)|²_{M⁻¹},  A(t) = C φ(t) C⁻¹ a filter of the normal modes
+    shear     the same for a part H_k(q, p) of which no two variables are conjugate, without γ
+
+in the notation of `sympflow.linear_part` and `sympflow.parts`; s, w, γ and φ are even polynomials in t, times t, t,
+t³ and 1. The impulse method (φ = 1), the mollified impulse (φ = sinc) and Nyström splittings with the exact linear flow are
+the untrained cases. Frozen at any t the flow is a list of maps, and runs in the compiled loops of these methods.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sympflow.flow.base import FlowMap
+from sympflow.flow.columns import Column
+from sympflow.flow.layers import Layer
+from sympflow.flow.placement import checked_device, checked_dtype
+from sympflow.flow.potentials import Time
+from sympflow.flow.sympflow import SympFlow
+from sympflow.forward_mode import jvp
+from sympflow.parts import LINEAR, ExactParts, Map, exact_parts
+
+if TYPE_CHECKING:
+    from sympflow.kernels.split_flow import SplitFlowKernel
+    from sympflow.system import HamiltonianSystem
+
+FILTERED = ("oscillator", "hyperbolic")
+"""The kinds of modes that filters act on; others pass."""
+
+
+class PartsBinding:
+    """The system whose parts a flow is made of; shared by copies of the flow, stored in no file."""
+
+    def __init__(self, system: HamiltonianSystem | None, expressions: Sequence[str] | None) -> None:
+        self.expressions = None if expressions is None else tuple(expressions)
+        self.system, self._parts = system, None if system is None else exact_parts(system, expressions)
+
+    @property
+    def parts(self) -> ExactParts:
+        if self._parts is None:
+            raise ValueError(
+                "`flow` is made of the parts of a system, which its file does not hold: give it by "
+                "sympflow.load(path, system=system) or flow.bind(system)."
+            )
+        return self._parts
+
+    def bind(self, system: HamiltonianSystem, parts: ExactParts) -> None:
+        self.system, self._parts = system, parts
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> PartsBinding:
+        copied = PartsBinding(None, self.expressions)
+        copied.system, copied._parts = self.system, self._parts
+        return copied
+
+
+class SplitLayer(Layer):
+    """The exact flow of a part of H, times functions of t; `index` is its place in the flow."""
+
+    def __init__(self, flow: SplitFlow, index: int) -> None:
+        super().__init__()
+        self.ndof, self.index = flow.ndof, index
+        self.part = flow.sequence[index]
+        self.kind = "linear" if self.part == LINEAR else flow.kinds[self.part - 1]  # type: ignore[misc]
+        self._of = (flow,)  # in a tuple: a layer does not own its flow
+
+    @property
+    def flow(self) -> SplitFlow:
+        return self._of[0]
+
+    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self._apply_map(self.flow.maps(t)[self.index], q, p)
+
+    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self._apply_map(self.flow.maps(t)[self.index].inverse(), q, p)
+
+    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        def along(s: Tensor) -> Tensor:
+            return torch.cat(self(t + s, q + s * dq, p + s * dp))
+
+        x, dx = jvp(along, q.new_zeros(()), q.new_ones(()))
+        return (*x.chunk(2), *dx.chunk(2))  # type: ignore[return-value]
+
+    def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        q, p = self.inverse(t, q, p)
+        parts = self.flow.parts
+        X, Y = parts.to_modes(torch.cat([q, p]).T)
+
+        def generator(s: Tensor) -> Tensor:
+            m = self.flow.maps(t + s)[self.index]
+            if m.part == LINEAR:
+                return (m.length * parts.linear_energies(X, Y)).sum(-1)
+            V = m.length * parts.value(m.part, X, Y, m.filters)
+            if isinstance(m.gradient, Tensor):
+                slope, _ = parts.slopes(m.part, X, Y, m.filters)
+                V = V - m.gradient * (slope * parts.inverse_masses(X) * slope).sum(-1) / 2
+            return V
+
+        return q, p, jvp(generator, q.new_zeros(()), q.new_ones(()))[1]
+
+    def _apply_map(self, m: Map, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        parts = self.flow.parts
+        y = parts.from_modes(*parts.apply([m], *parts.to_modes(torch.cat([q, p]).T))).T
+        return y.chunk(2)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": self.kind, "part": self.part}
+
+
+class SplitFlow(SympFlow):
+    """A palindromic SympFlow of the exact flows of a system's parts; made by `SympFlow.split`.
+
+    Time-reversible: continued to negative t by its formulas, ψ̄_{−t} = (ψ̄_t)⁻¹.
+
+    Parameters
+    ----------
+    ndof : int
+    sequence : sequence of int
+        The part that each map is of, 0 for the linear one; it must read the same backwards.
+    kinds : sequence of str
+        Of the parts 1, 2, …: "kick" for a potential, else "shear".
+    classes : sequence of str
+        What the distinct frequencies are, see `LinearPart.kinds`.
+    terms : int
+        Basis functions of each coefficient.
+    filters, force_gradient : bool
+    dt : float
+        Δt.
+    expressions : sequence of str, optional
+        The parts, where they are not those that are detected.
+    system : HamiltonianSystem, optional
+        Without it the flow has maps, but no values.
+    dtype, device
+        Of the parameters.
+
+    Attributes
+    ----------
+    linear : ModuleList of Column
+        s_f, for each frequency, of the linear maps.
+    weights, filters, gradients : ModuleList of Column
+        w, φ (for each frequency) and γ of the other parts, part by part.
+    """
+
+    def __init__(
+        self,
+        ndof: int,
+        sequence: Sequence[int],
+        kinds: Sequence[str],
+        classes: Sequence[str],
+        terms: int,
+        filters: bool,
+        force_gradient: bool,
+        dt: float = 1.0,
+        expressions: Sequence[str] | None = None,
+        system: HamiltonianSystem | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> None:
+        FlowMap.__init__(self, ndof, dt)
+        self.sequence, self.kinds, self.classes = tuple(sequence), tuple(kinds), tuple(classes)
+        if not self.sequence or self.sequence != self.sequence[::-1]:
+            raise ValueError("`sequence` must read the same backwards: make it a palindrome.")
+        if set(self.sequence) - set(range(len(self.kinds) + 1)):
+            raise ValueError(f"`sequence` names parts beyond the {len(self.kinds)} there are: check `kinds`.")
+        if isinstance(terms, bool) or not isinstance(terms, int) or terms < 1:
+            raise ValueError(f"`terms` must be a positive integer; got {terms!r}.")
+        self.terms, self.filtered = terms, bool(filters)
+        self.force_gradient = bool(force_gradient)
+        like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
+
+        def column(part: int, power: int, total: str | None) -> Column:
+            n = self.sequence.count(part)
+            return Column(n, terms, self.dt, power, total, **like)
+
+        modules = torch.nn.ModuleList
+        rest = [k for k in range(1, len(self.kinds) + 1) if k in self.sequence]
+        turning = [f for f, kind in enumerate(self.classes) if kind in FILTERED]
+        linear = range(len(self.classes)) if LINEAR in self.sequence else ()
+        self.linear = modules(column(LINEAR, 1, "always") for _ in linear)
+        self.weights = modules(column(k, 1, "start") for k in rest)
+        self.filters = modules(column(k, 0, None) for k in rest for _ in turning if filters)
+        with_gradient = [k for k in rest if self.kinds[k - 1] == "kick" and force_gradient]
+        self.gradients = modules(column(k, 3, None) for k in with_gradient)
+        self._slot = {k: i for i, k in enumerate(rest)}
+        self._gradient_slot = {k: i for i, k in enumerate(with_gradient)}
+        self._turning = turning
+        for c in self.columns():  # equal steps, φ = 1
+            if c.power < 3:
+                c.set(np.eye(1, terms).repeat(c.n, 0) / (c.n if c.power else 1))
+        self._binding = PartsBinding(system, expressions)
+        # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
+        self.layers = tuple(SplitLayer(self, i) for i in range(len(self.sequence)))  # type: ignore[assignment]
+        if system is not None:
+            self._check_parts(self._binding.parts)
+            self.fingerprint, self.system_name = system.fingerprint, system.name
+
+    def columns(self) -> list[Column]:
+        """All coefficients: s, w, φ, γ."""
+        groups = (self.linear, self.weights, self.filters, self.gradients)
+        return [column for group in groups for column in group if isinstance(column, Column)]
+
+    # the maps -----------------------------------------------------------------------------------------------
+
+    def maps(self, t: Time) -> list[Map]:
+        """ψ̄_t as maps of the parts, their entries tensors of the shape of t."""
+        if isinstance(t, Tensor) and t.dtype != self.dtype:
+            t = t.to(self.dtype)
+        return self._assemble(lambda column: column.values(t), lambda entries: torch.stack(entries, dim=-1))
+
+    def numpy_maps(self, t: np.ndarray) -> list[Map]:
+        """The same of an array of times, for the compiled loops; for t < 0 the inverse of ψ̄_|t| (one sign for all)."""
+        t = np.asarray(t, dtype=float)
+        maps = self._assemble(
+            lambda column: np.moveaxis(column.at(np.abs(t)), -1, 0), lambda entries: np.stack(entries, axis=-1)
+        )
+        return [m.inverse() for m in reversed(maps)] if (t < 0).any() else maps
+
+    def _assemble(self, values: Any, stack: Any) -> list[Map]:
+        linear = [values(column) for column in self.linear]
+        weights, filters, gradients = (
+            [values(c) for c in group] for group in (self.weights, self.filters, self.gradients)
+        )
+        seen: dict[int, int] = {}
+        maps = []
+        for part in self.sequence:
+            i = seen[part] = seen.get(part, -1) + 1
+            if part == LINEAR:
+                maps.append(Map(LINEAR, stack([column[i] for column in linear])))
+                continue
+            slot = self._slot[part]
+            phi = None
+            if filters:
+                n, one = len(self._turning), 1 + 0 * weights[slot][i]
+                own = dict(zip(self._turning, filters[slot * n : (slot + 1) * n], strict=True))
+                phi = stack([own[f][i] if f in own else one for f in range(len(self.classes))])
+            gradient = gradients[self._gradient_slot[part]][i] if part in self._gradient_slot else 0.0
+            maps.append(Map(part, weights[slot][i], gradient, phi))
+        return maps
+
+    def _map(self, t: float | Tensor, y: Tensor) -> Tensor:
+        return self._run(self.maps(t), y)
+
+    def _map_inverse(self, t: float | Tensor, y: Tensor) -> Tensor:
+        return self._run([m.inverse() for m in reversed(self.maps(t))], y)
+
+    def _map_tangent(self, t: float | Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        return jvp(lambda s: self._map(t + s, y), y.new_zeros(()), y.new_ones(()))
+
+    def _run(self, maps: Sequence[Map], y: Tensor) -> Tensor:
+        parts = self.parts
+        return parts.from_modes(*parts.apply(maps, *parts.to_modes(y.T))).T
+
+    def kernel_for(self, system: HamiltonianSystem) -> SplitFlowKernel:
+        """The compiled loops of this flow."""
+        from sympflow.kernels.split_flow import SplitFlowKernel
+
+        return SplitFlowKernel(self.bound(system))
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Evaluations of the slopes of parts, and of force gradients, as `FixedStep.evaluations`."""
+        from sympflow.integrators.linear_splitting import map_evaluations
+
+        return map_evaluations(self.numpy_maps(np.array(self.dt)), n_steps, n_saved, n_extra, backend)
+
+    # its system ---------------------------------------------------------------------------------------------
+
+    @property
+    def parts(self) -> ExactParts:
+        return self._binding.parts
+
+    @property
+    def system(self) -> HamiltonianSystem | None:
+        """The system whose parts the flow uses, None for one loaded without it."""
+        return self._binding.system
+
+    def bind(self, system: HamiltonianSystem) -> SplitFlow:
+        """Give a flow that was loaded from a file the parts of its system; itself.
+
+        Raises
+        ------
+        ValueError
+            If it is not the system that the flow was made for.
+        """
+        self.check_system(system)
+        parts = exact_parts(system, self._binding.expressions)
+        self._check_parts(parts)
+        self._binding.bind(system, parts)
+        return self
+
+    def bound(self, system: HamiltonianSystem) -> SplitFlow:
+        """This flow, bound to `system` if it was loaded without one."""
+        return self if self._binding.system is not None else self.bind(system)
+
+    def _check_parts(self, parts: ExactParts) -> None:
+        if part_kinds(parts) != self.kinds or class_kinds(parts) != self.classes:
+            raise ValueError(
+                f"`system` has the parts {part_kinds(parts)} and frequencies {class_kinds(parts)}, but the flow is made "
+                f"for {self.kinds} and {self.classes}: pass the system of the flow."
+            )
+        if self.filtered:
+            for k in self._slot:
+                parts.check_filters(k)
+        if self.force_gradient and not parts.has_force_gradient:
+            raise ValueError("`force_gradient` needs H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q): leave it out.")
+
+    def architecture(self) -> dict[str, Any]:
+        expressions = self._binding.expressions
+        return {
+            "ndof": self.ndof,
+            "split": {
+                "sequence": list(self.sequence),
+                "kinds": list(self.kinds),
+                "classes": list(self.classes),
+                "terms": self.terms,
+                "filters": self.filtered,
+                "force_gradient": self.force_gradient,
+                "expressions": None if expressions is None else list(expressions),
+            },
+        }
+
+
+def part_kinds(parts: ExactParts) -> tuple[str, ...]:
+    """ "kick" for a potential, else "shear", of the parts 1, 2, …"""
+    return tuple("kick" if part.of_positions else "shear" for part in parts.rest)
+
+
+def class_kinds(parts: ExactParts) -> tuple[str, ...]:
+    """What each of the distinct frequencies is."""
+    if parts.linear is None:
+        return ()
+    return tuple(parts.linear.kinds[j] for j in parts.linear.representatives)
+
+
+def split(
+    system: HamiltonianSystem,
+    stages: int,
+    dt: float,
+    terms: int,
+    filters: bool,
+    force_gradient: bool | None,
+    expressions: Sequence[str] | None,
+    linear_outside: bool,
+    dtype: torch.dtype,
+    device: torch.device | str | None,
+) -> SplitFlow:
+    """`SympFlow.split`."""
+    if isinstance(stages, bool) or not isinstance(stages, int) or stages < 1:
+        raise ValueError(f"`stages` must be a positive integer; got {stages!r}.")
+    parts = exact_parts(system, expressions)
+    if force_gradient is None:
+        force_gradient = parts.has_force_gradient
+    order = parts.sequence
+    if linear_outside and order[-1] == LINEAR:
+        order = (LINEAR, *order[:-1])
+    one = (*order, *order[-2::-1])
+    sequence = one + (stages - 1) * one[1:]
+    shape = (sequence, part_kinds(parts), class_kinds(parts), terms, filters, force_gradient)
+    return SplitFlow(system.ndof, *shape, dt, expressions, system, dtype, device)

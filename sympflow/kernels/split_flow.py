@@ -1,0 +1,55 @@
+"""The kernel of a SympFlow made of exact flows of parts: the loops of its parts, run with the flow's maps."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.integrators.linear_splitting import kernel_of
+from sympflow.kernels.parts import PartsKernel
+
+if TYPE_CHECKING:
+    from sympflow.flow.split import SplitFlow
+
+__all__ = ["SplitFlowKernel"]
+
+
+class SplitFlowKernel:
+    """Compiled loops of a split flow on its system; states are [q, p], float64.
+
+    Parameters
+    ----------
+    flow : SplitFlow
+        Bound to a system that can be compiled, in float64 on the CPU.
+    """
+
+    def __init__(self, flow: SplitFlow) -> None:
+        if str(flow.dtype) != "torch.float64" or flow.device.type != "cpu":
+            raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
+        self.flow = flow
+        self._kernel: PartsKernel = kernel_of(flow.parts, PartsKernel)
+        self._kernel.source()
+
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
+        """`n_steps` times ψ̄_h, or for h < 0 the inverse of ψ̄_|h|: see `PartsKernel.run`."""
+        return self._kernel.run(self.flow.numpy_maps, h, y0, n_steps, save)
+
+    def run_batch(
+        self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`run` for every row of `y0` (N, 2d): see `PartsKernel.run_batch`."""
+        if len(y0) == 1:
+            Y, n_finite = self.run(h, y0[0], n_steps, save)
+            return Y[None], np.array([n_finite])
+        return self._kernel.run_batch(self.flow.numpy_maps, h, y0, n_steps, save, threads=threads)
+
+    def step(self, h: ArrayLike, y: np.ndarray) -> np.ndarray:
+        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
+        h = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
+        out = np.array(y, dtype=np.float64)
+        for rows in (h > 0, h < 0):
+            if rows.any():
+                out[rows] = self._kernel.step(self.flow.numpy_maps, h[rows], y[rows])
+        return out
