@@ -5,8 +5,8 @@
     shear     the same for a part H_k(q, p) of which no two variables are conjugate, without γ
 
 in the notation of `sympflow.linear_part` and `sympflow.parts`; s, w, γ and φ are even polynomials in t, times t, t,
-t³ and 1. The impulse method (φ = 1), the mollified impulse (φ = sinc) and Nyström splittings with the exact linear flow are
-the untrained cases. Frozen at any t the flow is a list of maps, and runs in the compiled loops of these methods.
+t³ and 1. The impulse method (φ = 1), the mollified impulse (φ = sinc) and Nyström splittings with the exact linear flow
+are the untrained cases. Frozen at any t the flow is a list of maps, and runs in the compiled loops of these methods.
 """
 
 from __future__ import annotations
@@ -300,8 +300,8 @@ class SplitFlow(SympFlow):
     def _check_parts(self, parts: ExactParts) -> None:
         if part_kinds(parts) != self.kinds or class_kinds(parts) != self.classes:
             raise ValueError(
-                f"`system` has the parts {part_kinds(parts)} and frequencies {class_kinds(parts)}, but the flow is made "
-                f"for {self.kinds} and {self.classes}: pass the system of the flow."
+                f"`system` has the parts {part_kinds(parts)} and frequencies {class_kinds(parts)}, but the flow is for "
+                f" {self.kinds} and {self.classes}: pass the system of the flow."
             )
         if self.filtered:
             for k in self._slot:
