@@ -15,7 +15,6 @@ from sympflow.integrators.checks import CHECKS, check_integrator, parametrize_wi
 from sympflow.integrators.tableaux import ADAPTIVE
 from sympflow.integrators.torchdiffeq_methods import MULTISTEP
 
-
 NO_STEP = {check.__name__ for check in checks_of_steps.ALL} - {"the_order_is_the_slope"}
 
 
