@@ -177,7 +177,7 @@ def certificate(
     if not flow.dt <= t_end < math.inf:
         raise ValueError(f"`t_end` must be finite and at least Δt = {flow.dt:g}; got {t_end!r}.")
     flow.check_system(system)
-    flow = flow.bound(system)  # type: ignore[assignment]
+    flow.bound(system)
     domain = domain_of(flow, system)
     if domain is None:
         raise ValueError("`flow` has no domain and neither has its system: give the system a `domain`, say a Box.")
@@ -216,10 +216,13 @@ def _over_sample(
         defects.append(torch.linalg.vector_norm(defect, dim=-1))
         difference = flow.hamiltonian_unchecked(t, points) - H
         mismatches.append(difference - difference.mean())
-    defects, mismatches, gains = (torch.stack(rows).cpu().double().numpy() for rows in (defects, mismatches, gains))
-    rates = np.array([list(asdict(Quantiles.of(row)).values()) for row in gains])  # (times, 3)
+    rates = np.array([list(asdict(Quantiles.of(_array(row))).values()) for row in gains])  # (times, 3)
     delta = Quantiles(*(float(np.trapezoid(column, dx=flow.dt / (times - 1))) for column in rates.T))
-    return Quantiles.of(defects), Quantiles.of(mismatches), delta
+    return Quantiles.of(_array(torch.stack(defects))), Quantiles.of(_array(torch.stack(mismatches))), delta
+
+
+def _array(values: torch.Tensor) -> np.ndarray:
+    return values.detach().cpu().double().numpy()
 
 
 def _one_step_error(flow: SympFlow, system: HamiltonianSystem, x: np.ndarray) -> Quantiles:
@@ -239,20 +242,14 @@ def _energy_errors(
     steps = int(t_end / flow.dt * (1 + 1e-12))
     piece = max(1, min(steps, SAVED_VALUES // x.size))
     y = x.astype(str(flow.dtype).removeprefix("torch."))
+    precision: dict[str, Any] = {"dtype": str(y.dtype)} if flow.device.type == "cpu" else {}
     H0 = system.hamiltonian(y).astype(float)
     largest, inside, done = np.zeros(len(x)), np.full(len(x), True), 0
     while done < steps and inside.any():
         n = min(piece, steps - done)
         state = torch.as_tensor(y, device=flow.device) if flow.device.type != "cpu" else y
         with torch.no_grad(), np.errstate(all="ignore"):
-            run = solve(
-                system,
-                flow,
-                (0.0, n * flow.dt),
-                state,
-                **({"dtype": str(y.dtype)} if state is y else {}),
-                on_domain_exit="ignore",
-            )
+            run = solve(system, flow, (0.0, n * flow.dt), state, on_domain_exit="ignore", **precision)
             orbit = np.moveaxis(torch.as_tensor(run.y).cpu().numpy(), -1, 0)  # (n + 1, N, 2d)
             error = np.abs(system.hamiltonian(orbit) - H0)
             stays = np.logical_and.accumulate(domain.contains(orbit), axis=0) & inside
