@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arrays import Array, is_tensor, stack
+from sympflow.numba_functions import NumbaFunctions
 
 
 class CallableHamiltonian:
@@ -37,8 +38,9 @@ class CallableHamiltonian:
         self.numba_functions: tuple[Any, Any, Any] | None = None
         if gradient is not None and hasattr(gradient, "py_func"):
             self.numba_functions = (potential, gradient, hessian_vector)
-            potential, gradient = _each_state(potential), _each_state_out(gradient)
-            hessian_vector = None if hessian_vector is None else _each_state_out(hessian_vector)
+            arrays = NumbaFunctions(potential, gradient, hessian_vector)
+            potential, gradient = arrays.potential, arrays.gradient
+            hessian_vector = None if hessian_vector is None else arrays.hessian_vector
         self._potential, self._hamiltonian = potential, hamiltonian
         self._gradient, self._hessian_vector = gradient, hessian_vector
 
@@ -142,26 +144,3 @@ def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
             f"{tuple(getattr(value, 'shape', ()))}. Reduce over the last axis only."
         )
     return value
-
-
-def _each_state(f: Callable[..., Any] | None) -> Callable[[Array], Array]:
-    def function(q: np.ndarray) -> np.ndarray:
-        assert f is not None
-        flat = np.ascontiguousarray(q, dtype=float).reshape(-1, q.shape[-1])
-        return np.array([f(row) for row in flat]).reshape(q.shape[:-1])
-
-    return function
-
-
-def _each_state_out(f: Callable[..., Any]) -> Callable[..., Array]:
-    """An array function from a Numba function f(q, …, out) of one state."""
-
-    def function(*arguments: np.ndarray) -> np.ndarray:
-        shape = np.broadcast_shapes(*(a.shape for a in arguments))
-        flat = [np.ascontiguousarray(np.broadcast_to(a, shape), dtype=float).reshape(-1, shape[-1]) for a in arguments]
-        out = np.empty_like(flat[0])
-        for i, row in enumerate(out):
-            f(*(a[i] for a in flat), row)
-        return out.reshape(shape)
-
-    return function

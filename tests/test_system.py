@@ -1,10 +1,13 @@
 """HamiltonianSystem: symbolic and callable definitions agree with each other and with automatic differentiation."""
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
+from numba import njit
 
-from sympflow import Ball, HamiltonianSystem, solve, systems
+from sympflow import Ball, HamiltonianSystem, solve, systems, volume_error
 
 SYSTEMS = {
     "harmonic": systems.harmonic_oscillator(3.0),
@@ -92,6 +95,93 @@ def test_hessian_from_hessian_vector_products():
     )
     q = np.array([[0.5, 2.0], [1.0, 3.0]])
     np.testing.assert_array_equal(system.potential_hessian(q), [np.diag([3.0, 12.0]), np.diag([6.0, 18.0])])
+
+
+def numba_pendulum(with_hessian=True):
+    @njit
+    def potential(q):
+        return 1 - np.cos(q[0]) + q[0] * q[1] ** 2
+
+    @njit
+    def gradient(q, out):
+        out[0], out[1] = np.sin(q[0]) + q[1] ** 2, 2 * q[0] * q[1]
+
+    @njit
+    def hessian_vector(q, v, out):
+        out[0] = np.cos(q[0]) * v[0] + 2 * q[1] * v[1]
+        out[1] = 2 * q[1] * v[0] + 2 * q[0] * v[1]
+
+    return HamiltonianSystem(
+        potential, gradient=gradient, hessian_vector=hessian_vector if with_hessian else None, ndof=2, mass=[1.0, 2.0]
+    )
+
+
+class TestNumbaFunctions:
+    """They serve tensors too, with the derivatives that they are themselves."""
+
+    system = numba_pendulum()
+    symbolic = HamiltonianSystem.from_sympy("p1**2/2 + p2**2/4 + 1 - cos(q1) + q1*q2**2")
+
+    @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_agree_with_the_symbolic_system_on_arrays_and_tensors(self, batch, dtype):
+        y = torch.tensor(states(self.system, *batch), dtype=dtype)
+        eps = 64 * torch.finfo(dtype).eps
+        for method in ("hamiltonian", "gradient", "vector_field", "hessian"):
+            expected = getattr(self.symbolic, method)(y)
+            on_tensor, on_array = (getattr(self.system, method)(x) for x in (y, y.numpy()))
+            assert on_tensor.dtype == dtype
+            assert on_array.dtype == y.numpy().dtype
+            torch.testing.assert_close(on_tensor, expected, rtol=eps, atol=eps)
+            np.testing.assert_allclose(on_array, expected.numpy(), rtol=eps, atol=eps)
+
+    def test_derivatives_flow_in_both_modes(self):
+        q = torch.tensor(states(self.system, 3)[:, :2], requires_grad=True)
+        v = torch.randn(3, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
+        assert torch.autograd.gradcheck(self.system.potential, q, check_forward_ad=True)
+        assert torch.autograd.gradcheck(self.system.force, q, check_forward_ad=True)
+        assert torch.autograd.gradgradcheck(self.system.potential, q)
+        fixed = q.detach()
+        assert torch.autograd.gradcheck(lambda w: self.system.hessian_vector(fixed, w), v, check_forward_ad=True)
+
+    def test_in_vmap(self):
+        y = torch.tensor(states(self.system, 4))
+        gradient = torch.func.vmap(torch.func.grad(self.system.hamiltonian))(y)
+        torch.testing.assert_close(gradient, self.system.gradient(y))
+        jacobian = torch.func.vmap(torch.func.jacfwd(self.system.force))(y[:, :2])
+        torch.testing.assert_close(jacobian, -self.system.potential_hessian(y[:, :2]))
+
+    @pytest.mark.parametrize("method", ["verlet", "dopri5", "rk45", "omelyan4"])
+    def test_every_kind_of_method_runs(self, method):
+        y0 = np.array([0.3, 0.2, 0.1, -0.2])
+        sols = [solve(system, method, (0, 0.5), y0=y0) for system in (self.system, self.symbolic)]
+        np.testing.assert_allclose(sols[0].y[:, -1], sols[1].y[:, -1], atol=1e-12)
+
+    def test_gradients_flow_through_solve(self):
+        def end(y0):
+            return solve(self.system, "verlet", (0, 0.2), y0=y0, dt=0.1).y[:, -1]
+
+        y0 = torch.tensor([0.3, 0.2, 0.1, -0.2], dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(end, y0)
+
+    def test_third_derivatives_are_refused(self):
+        q = torch.tensor([0.3, 0.2], dtype=torch.float64, requires_grad=True)
+        with pytest.raises(ValueError, match=r"^`hessian_vector` would have to be differentiated.*from_sympy\.$"):
+            self.system.hessian_vector(q, torch.ones(2, dtype=torch.float64)).sum().backward()
+        sol = solve(self.system, "omelyan4", (0, 0.2), y0=[0.3, 0.2, 0.1, -0.2])
+        with pytest.raises(ValueError, match=r"^`hessian_vector` would have to be differentiated"):
+            volume_error(sol)
+
+    def test_without_hessian_vector(self):
+        system = numba_pendulum(with_hessian=False)
+        for q in (np.zeros(2), torch.zeros(2)):
+            with pytest.raises(ValueError, match=r"^`hessian_vector` is needed here"):
+                system.potential_hessian(q)
+
+    def test_can_be_copied(self):
+        self.system.force(torch.zeros(2))
+        same = pickle.loads(pickle.dumps(self.system))
+        torch.testing.assert_close(same.force(torch.ones(2)), self.system.force(torch.ones(2)))
 
 
 @pytest.mark.parametrize(
