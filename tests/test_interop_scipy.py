@@ -1,5 +1,6 @@
 """Our methods inside `solve_ivp`: the same numbers as `solve`, and all that SciPy's driver asks of a solver."""
 
+import math
 import warnings
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from sympflow import MLPFlow, SympFlow, get, solve, systems
+from sympflow import HamiltonianSystem, MLPFlow, SympFlow, get, solve, systems
+from sympflow.arrays import stack
 from sympflow.interop.scipy import as_scipy
 
 HH, OSCILLATOR = systems.henon_heiles(), systems.harmonic_oscillator()
@@ -81,12 +83,49 @@ class TestEveryMethod:
         assert sol.t_events[0].size
 
 
-def test_evaluations_are_counted():
-    """`fun` once, for the check; then what the method evaluates: Verlet one force a step and one at each opening."""
-    assert solve_ivp(HH, (0, 50), HH.y0, method=as_scipy("sympflow", HH)).nfev == 1
-    nfev = solve_ivp(HH, (0, 10), HH.y0, method=as_scipy("rk4", HH, dt=0.1)).nfev
-    assert nfev == 1 + 4 * 100
-    assert 100 < solve_ivp(HH, (0, 10), HH.y0, method=as_scipy("verlet", HH, dt=0.1)).nfev <= 1 + 2 * 100 + 16
+@pytest.fixture
+def counting():
+    """Hénon–Heiles by functions that count the forces that are evaluated."""
+    evaluated = []
+
+    def gradient(q):
+        evaluated.append(math.prod(q.shape) // 2)
+        return stack([q[..., 0] + 2 * q[..., 0] * q[..., 1], q[..., 1] + q[..., 0] ** 2 - q[..., 1] ** 2])
+
+    system = HamiltonianSystem(lambda q: 0 * q[..., 0], ndof=2, gradient=gradient, y0=HH.y0)
+    return system, lambda: sum(evaluated)
+
+
+def terminal(t, y):
+    return y[0] - 0.2
+
+
+terminal.terminal = 3
+
+
+@pytest.mark.parametrize("method", ["verlet", "kahan_li8", "rk4"])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {},
+        {"t_eval": np.linspace(0, 9.99, 77)},
+        {"dense_output": True, "max_step": 0.04},
+        {"events": [terminal, lambda t, y: y[1]]},
+    ],
+)
+def test_every_evaluation_of_a_force_is_counted(method, arguments, counting):
+    """Steps, those computed ahead, outputs and events between them, `fun`, and its comparison with the method."""
+    system, evaluated = counting
+    sol = solve_ivp(system, (0, 9.99), HH.y0, method=as_scipy(method, system, dt=0.1), **arguments)
+    assert sol.nfev == evaluated()
+    before = evaluated()
+    other = solve_ivp(HH, (0, 9.99), HH.y0, method=as_scipy(method, system, dt=0.1), **arguments)
+    assert other.nfev == evaluated() - before + 1  # `fun` is HH now, evaluated once
+
+
+def test_a_flow_of_networks_evaluates_no_force():
+    arguments = {"method": as_scipy("sympflow", HH), "events": lambda t, y: y[0]}
+    assert solve_ivp(HH, (0, 50), HH.y0, **arguments).nfev == 1
 
 
 def test_the_exact_flow_finds_all_zeros(rotation):

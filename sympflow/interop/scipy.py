@@ -69,6 +69,12 @@ class FlowSolver(OdeSolver):
         As for every `OdeSolver`. `fun` is evaluated once, to warn if it is not the system of the method.
     max_step : float
         Longest time between two reported states; they are samples of the flow within its steps.
+
+    Attributes
+    ----------
+    nfev : int
+        Evaluations of `fun` and of the forces: those of the steps, of outputs and events within steps, and of the
+        comparison of `fun` with the method's own velocity.
     """
 
     integrator: ClassVar[FixedStep]
@@ -96,6 +102,7 @@ class FlowSolver(OdeSolver):
             raise ValueError(f"`max_step` must be positive; got {max_step!r}.")
         if not (math.isfinite(t0) and math.isfinite(t_bound)):
             raise ValueError(f"`t_span` must be finite; got ({t0}, {t_bound}). Choose an end that can be reached.")
+        self._evaluations = _Count()
         super().__init__(fun, t0, y0, t_bound, vectorized)
         self._check(fun)
         system = self._solved
@@ -129,8 +136,22 @@ class FlowSolver(OdeSolver):
             slope = np.asarray(self.fun(self.t, self.y), dtype=float)
         if slope.shape != self.y.shape:
             raise ValueError(f"`fun` must return shape {self.y.shape}, as `y0`; got {slope.shape}.")
-        if np.isfinite(slope).all():
+        known = fun is self._solved and not integrator.trained
+        if np.isfinite(slope).all() and not known:
+            self.nfev += self._forces(1) if integrator.trained else 1
             warn_of_another_system(integrator, self._solved, self.y, slope, stacklevel=5)
+
+    @property
+    def nfev(self) -> int:
+        return self._evaluations.total
+
+    @nfev.setter
+    def nfev(self, value: int) -> None:
+        self._evaluations.total = value
+
+    def _forces(self, n: int) -> int:
+        """Force evaluations of n steps by array operations."""
+        return self.integrator.evaluations(0, 0, n, "array")["force_evaluations"]
 
     def _flow(self) -> Any:
         """The flow, or None if it cannot be known without a system."""
@@ -172,12 +193,19 @@ class FlowSolver(OdeSolver):
         return self._ahead.popleft()
 
     def _shorter(self, h: float) -> np.ndarray:
-        self.nfev += self.integrator.evaluations(0, 0, 1, "array")["force_evaluations"]
+        self.nfev += self._forces(1)
         with np.errstate(all="ignore"):
             return self.integrator.step(self._solved, self._t_anchor, self._anchor, h)
 
     def _dense_output_impl(self) -> DenseOutput:
         return FlowOutput(self, self._t_anchor, self._anchor)
+
+
+class _Count:
+    """Evaluations so far; the dense outputs of a solver count into it too, while the solver runs."""
+
+    def __init__(self) -> None:
+        self.total = 0
 
 
 class FlowOutput(DenseOutput):
@@ -187,6 +215,7 @@ class FlowOutput(DenseOutput):
         super().__init__(solver.t_old, solver.t)
         self._integrator, self._system = solver.integrator, solver._solved
         self._t_anchor, self._anchor, self._y = t_anchor, anchor, solver.y
+        self._evaluations, self._forces = solver._evaluations, solver._forces(1)
 
     def _call_impl(self, t: np.ndarray) -> np.ndarray:
         times = np.atleast_1d(t).astype(float)
@@ -195,6 +224,7 @@ class FlowOutput(DenseOutput):
         moving = (h != 0) & (times != self.t)
         states[times == self.t] = self._y
         if moving.any():
+            self._evaluations.total += self._forces * int(np.count_nonzero(moving))
             with np.errstate(all="ignore"):
                 states[moving] = self._integrator.step(self._system, self._t_anchor, states[moving], h[moving])
         return states.T if t.ndim else states[0]
