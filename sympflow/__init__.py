@@ -23,9 +23,11 @@ _HOME = {
     "SympFlow": "flow.sympflow",
     "MLPFlow": "flow.mlp",
     "load": "flow.io",
+    "shipped_flows": "flow.shipped",
     "train": "training.trainer",
     "compare": "comparison",
     "work_precision": "precision",
+    "stability": "step_stability",
     "poincare_section": "poincare",
     "energy_error": "metrics.energy",
     "max_energy_error": "metrics.energy",
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
     from sympflow.domain import EnergySublevel as EnergySublevel
     from sympflow.flow.io import load as load
     from sympflow.flow.mlp import MLPFlow as MLPFlow
+    from sympflow.flow.shipped import shipped_flows as shipped_flows
     from sympflow.flow.sympflow import SympFlow as SympFlow
     from sympflow.integrators.registry import available as available
     from sympflow.integrators.registry import get as get
@@ -65,6 +68,7 @@ if TYPE_CHECKING:
     from sympflow.precision import work_precision as work_precision
     from sympflow.solution import Solution as Solution
     from sympflow.solver import solve as solve
+    from sympflow.step_stability import stability as stability
     from sympflow.system import HamiltonianSystem as HamiltonianSystem
     from sympflow.time_transformation import time_transformed as time_transformed
     from sympflow.training.trainer import train as train

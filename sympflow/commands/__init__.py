@@ -16,6 +16,7 @@ PARAMETERS = {"allow_extra_args": True, "ignore_unknown_options": True}
 app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
 app.command()(listing.systems)
 app.command()(listing.methods)
+app.command(context_settings=PARAMETERS)(listing.flows)
 app.command(context_settings=PARAMETERS)(solving.solve)
 app.command(context_settings=PARAMETERS)(comparing.compare)
 app.command(context_settings=PARAMETERS)(comparing.bench)

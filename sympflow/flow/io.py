@@ -12,8 +12,6 @@ import math
 import os
 import struct
 import tempfile
-from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +19,11 @@ import torch
 from safetensors.torch import save as save_tensors
 
 import sympflow
-from sympflow.flow.base import FlowMap, same_system
+from sympflow.flow.base import FlowMap
 from sympflow.flow.description import check, describe
 from sympflow.flow.placement import checked_device
 from sympflow.flow.record import Refused, build, checksum, dtype_of, fill, parse
+from sympflow.flow.shipped import choose
 
 if TYPE_CHECKING:
     from sympflow.system import HamiltonianSystem
@@ -135,29 +134,15 @@ def load(
     return flow.to(device) if device is not None else flow
 
 
-def shipped(system: HamiltonianSystem, kind: str = "sympflow") -> Any:
-    """The flow that the package ships for `system`, recognised by its fingerprint.
+def shipped(system: HamiltonianSystem, kind: str = "sympflow", tol: float | None = None) -> Any:
+    """The flow that the package ships for `system`, recognised by its fingerprint: see `flow.shipped.choose`.
 
     Raises
     ------
     ValueError
-        If there is none; the message lists those there are.
+        If there is none, or none that meets `tol`; the message lists those there are.
     """
-    for path, record in _catalogue():
-        fingerprint = tuple(math.nan if v is None else v for v in record.get("fingerprint") or ())
-        if record["kind"] == kind and same_system(fingerprint, system.fingerprint):
-            return load(path, system=system)
-    there = ", ".join(path.stem for path, record in _catalogue() if record["kind"] == kind)
-    raise ValueError(
-        f"`system` {system.name!r} has no shipped {kind} flow (there are: {there or 'none'}): train one by "
-        f"flow = sympflow.train(system{', kind=' + repr(kind) if kind != 'sympflow' else ''}) and pass flow=flow."
-    )
-
-
-@cache
-def _catalogue() -> tuple[tuple[Path, dict[str, Any]], ...]:
-    folder = Path(str(resources.files("sympflow"))) / "pretrained"
-    return tuple((path, _read(path)[2]) for path in sorted(folder.glob("*.safetensors")))
+    return choose(system, kind, tol).load(system)
 
 
 # reading, with suspicion -----------------------------------------------------------------------------------

@@ -63,12 +63,17 @@ class FlowIntegrator(FixedStep):
         """The flow that is used for a system: the one given, else the one shipped."""
         if self.flow is not None:
             return self.flow.bound(system)
-        key = (self.name, system.fingerprint)
+        key = (self.name, system.fingerprint, self._tolerance)
         if key not in _SHIPPED:
             from sympflow.flow.io import shipped
 
-            _SHIPPED[key] = shipped(system, self.name)
+            _SHIPPED[key] = shipped(system, self.name, self._tolerance)
         return _SHIPPED[key]
+
+    @property
+    def _tolerance(self) -> float | None:
+        """The energy error by which the shipped flow is chosen, where there is a choice."""
+        return getattr(self, "tol", None)
 
     def check(self, system: HamiltonianSystem) -> None:
         if self.flow is not None:
@@ -91,7 +96,7 @@ class FlowIntegrator(FixedStep):
         if tensor.dtype == flow.dtype and tensor.device == flow.device:
             return flow
         if self.flow is None:
-            key = (self.name, system.fingerprint, tensor.dtype, tensor.device)
+            key = (self.name, system.fingerprint, self._tolerance, tensor.dtype, tensor.device)
             if key not in _SHIPPED:
                 _SHIPPED[key] = copy.deepcopy(flow).to(dtype=tensor.dtype, device=tensor.device)
             return _SHIPPED[key]
@@ -123,7 +128,8 @@ class FlowIntegrator(FixedStep):
 
     def run(self, problem: Problem) -> Outcome:
         if self.flow is None:  # the shipped one, from here on
-            return replace(self, flow=self._flow_like(problem.system, problem.y0)).run(problem)
+            chosen: dict[str, Any] = {"flow": self._flow_like(problem.system, problem.y0)}
+            return replace(self, **chosen, **({} if self._tolerance is None else {"tol": None})).run(problem)
         return super().run(problem)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
@@ -214,6 +220,9 @@ class SympFlowIntegrator(FlowIntegrator):
         Step length, at most the flow's Δt, which is the default. A smaller one composes ψ̄_dt, which is another map.
     flow : SympFlow, optional
         The default is the flow shipped for the system.
+    tol : float, optional
+        Take the cheapest shipped flow whose relative energy error up to T = 1000, the 95 % quantile over held-out
+        states, is at most this; `sympflow.shipped_flows(system)` lists them. It says nothing of a smaller `dt`.
 
     References
     ----------
@@ -221,8 +230,18 @@ class SympFlowIntegrator(FlowIntegrator):
        neural integrators" (2024).
     """
 
+    tol: float | None = None
+
     name: ClassVar[str] = "sympflow"
     symplectic: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.tol is None:
+            return
+        for name in ("flow", "dt"):
+            if getattr(self, name) is not None:
+                raise ValueError(f"`tol` chooses the flow and its Δt, but `{name}` is given: leave out one of them.")
 
 
 @dataclass(frozen=True)

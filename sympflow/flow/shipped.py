@@ -1,0 +1,229 @@
+"""The flows that ship with the package: what there is, and which of them a system, and an accuracy, calls for.
+
+Only the headers of the files are read, once in a process: a flow's weights when it is wanted.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sympflow.system import HamiltonianSystem
+
+DEFAULT_TOL = 1e-6
+"""What the default flow of a system reaches if it has no network, and one of its primed flows does."""
+
+
+@dataclass(frozen=True)
+class ShippedFlow:
+    """A file in the package, and what is told in it.
+
+    Attributes
+    ----------
+    name : str
+        Of the file, without its ending.
+    kind : {"sympflow", "mlp"}
+    system : str
+    dt : float
+        Δt.
+    stages : int or None
+        Number of kicks of a primed flow, None for a network.
+    processor : int
+        Number of pairs of its processor.
+    cost : float or None
+        Time for a unit of time, in force evaluations of the compiled splitting kernel; outputs are not counted.
+    energy_error : float or None
+        Largest relative energy error up to `t_end`, the 95 % quantile over held-out states.
+    t_end : float or None
+    one_step_error, fractional_error : float or None
+        Means over held-out states: at Δt, and over 50 times before it.
+    training_seconds : float or None
+    path : Path
+    """
+
+    name: str
+    kind: str
+    system: str
+    dt: float
+    stages: int | None
+    processor: int
+    cost: float | None
+    energy_error: float | None
+    t_end: float | None
+    one_step_error: float | None
+    fractional_error: float | None
+    training_seconds: float | None
+    path: Path = field(repr=False)
+    fingerprint: tuple[float, ...] = field(repr=False)
+
+    @classmethod
+    def of(cls, path: Path) -> ShippedFlow:
+        """What the header of a file tells."""
+        record = _record(path)
+        figures, plan = record["figures"], record["architecture"].get("primed")
+        return cls(
+            name=path.stem,
+            kind=record["kind"],
+            system=record["system"],
+            dt=record["dt"],
+            stages=None if plan is None else (plan["maps"] + (plan["first"] == "kick")) // 2,
+            processor=0 if plan is None else plan.get("processor", 0),
+            cost=figures.get("cost"),
+            energy_error=figures.get("energy_error_95"),
+            t_end=figures.get("t_end"),
+            one_step_error=figures.get("one_step_error"),
+            fractional_error=figures.get("fractional_error"),
+            training_seconds=figures.get("training_seconds"),
+            path=path,
+            fingerprint=tuple(math.nan if v is None else v for v in record["fingerprint"]),
+        )
+
+    def load(self, system: HamiltonianSystem | None = None) -> Any:
+        """The flow itself; see `sympflow.load`."""
+        from sympflow.flow.io import load
+
+        return load(self.path, system=system)
+
+
+class ShippedFlows(Sequence[ShippedFlow]):
+    """Some of the flows that ship, which print as a table."""
+
+    def __init__(self, flows: Sequence[ShippedFlow]) -> None:
+        self._flows = tuple(flows)
+
+    def __len__(self) -> int:
+        return len(self._flows)
+
+    def __getitem__(self, index: Any) -> Any:
+        return ShippedFlows(self._flows[index]) if isinstance(index, slice) else self._flows[index]
+
+    def rows(self) -> Iterator[tuple[str, ...]]:
+        """A row of text for each: see `HEADINGS`."""
+        for f in self._flows:
+            architecture = f.kind if f.stages is None else f"primed, {f.stages} kicks"
+            architecture += f", processor {f.processor}" if f.processor else ""
+            until = "" if f.t_end is None else f" (T = {f.t_end:g})"
+            yield (
+                f.name,
+                f.system,
+                architecture,
+                f"{f.dt:g}",
+                *(_brief(v) for v in (f.cost, f.one_step_error, f.fractional_error)),
+                _brief(f.energy_error) + until,
+                "–" if f.training_seconds is None else f"{f.training_seconds:.3g} s",
+            )
+
+    def table(self) -> str:
+        """A Markdown table."""
+        lines = [HEADINGS, tuple("---" for _ in HEADINGS), *self.rows()]
+        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+    def __repr__(self) -> str:
+        return self.table()
+
+
+HEADINGS = (
+    "flow",
+    "system",
+    "architecture",
+    "Δt",
+    "cost",
+    "one-step error",
+    "fractional t",
+    "energy error, 95 %",
+    "training",
+)
+
+
+def shipped_flows(system: HamiltonianSystem | None = None, kind: str | None = None) -> ShippedFlows:
+    """The flows that ship, the cheapest first: all, or those of a system, which is recognised by its H.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem, optional
+    kind : {"sympflow", "mlp"}, optional
+
+    Returns
+    -------
+    ShippedFlows
+        A sequence that prints as a table. `flow.load(system)` reads one of them.
+
+    Examples
+    --------
+    >>> sympflow.shipped_flows(sympflow.systems.pendulum())
+    """
+    from sympflow.system import HamiltonianSystem
+
+    if system is not None and not isinstance(system, HamiltonianSystem):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {system!r}: leave it out for all flows.")
+    if kind not in (None, "sympflow", "mlp"):
+        raise ValueError(f"`kind` {kind!r} is unknown: choose 'sympflow' or 'mlp', or leave it out.")
+    found = [f for f in _catalogue() if kind in (None, f.kind)]
+    if system is not None:
+        from sympflow.flow.base import same_system
+
+        found = [f for f in found if same_system(f.fingerprint, system.fingerprint)]
+    return ShippedFlows(sorted(found, key=lambda f: (f.system, math.inf if f.cost is None else f.cost)))
+
+
+def choose(system: HamiltonianSystem, kind: str = "sympflow", tol: float | None = None) -> ShippedFlow:
+    """The flow that `solve` takes: with `tol` the cheapest whose energy error is at most that.
+
+    Without `tol` it is the network that ships for the system, or else the cheapest of its primed flows that reaches
+    1e-6, or else the most accurate of them.
+
+    Raises
+    ------
+    ValueError
+        If there is none; the message lists those there are.
+    """
+    if tol is not None and not (isinstance(tol, int | float) and not isinstance(tol, bool) and 0 < tol < math.inf):
+        raise ValueError(f"`tol` must be a positive number, a relative energy error; got {tol!r}.")
+    own = shipped_flows(system, kind)
+    if not own:
+        there = ", ".join(f.name for f in shipped_flows(kind=kind))
+        raise ValueError(
+            f"`system` {system.name!r} has no shipped {kind} flow (there are: {there or 'none'}): train one by "
+            f"flow = sympflow.train(system{', kind=' + repr(kind) if kind != 'sympflow' else ''}) and pass flow=flow."
+        )
+    if tol is None:
+        networks = [f for f in own if f.stages is None]
+        able = [f for f in own if _error(f) <= DEFAULT_TOL]
+        return networks[0] if networks else able[0] if able else min(own, key=_error)
+    able = [f for f in own if _error(f) <= tol]
+    if not able:
+        there = ", ".join(f"{f.name} {_brief(f.energy_error)}" for f in own)
+        raise ValueError(
+            f"`tol` {tol:g} is met by no flow that ships for {system.name!r} (relative energy errors: {there}): raise "
+            "it, or train a flow and pass flow=flow."
+        )
+    return able[0]
+
+
+def _error(flow: ShippedFlow) -> float:
+    return math.inf if flow.energy_error is None else flow.energy_error
+
+
+def _brief(value: float | None) -> str:
+    return "–" if value is None else f"{value:.1e}" if abs(value) < 0.01 or abs(value) >= 1e5 else f"{value:.3g}"
+
+
+@cache
+def _catalogue() -> tuple[ShippedFlow, ...]:
+    folder = Path(str(resources.files("sympflow"))) / "pretrained"
+    return tuple(ShippedFlow.of(path) for path in sorted(folder.glob("*.safetensors")))
+
+
+def _record(path: Path) -> dict[str, Any]:
+    """The record in the header of a file of our own; `flow.io` reads others, with suspicion."""
+    with path.open("rb") as file:
+        (length,) = struct.unpack("<Q", file.read(8))
+        return json.loads(json.loads(file.read(length))["__metadata__"]["sympflow"])
