@@ -211,6 +211,11 @@ class HamiltonianSystem:
 
     def __call__(self, t: float, y: Array) -> Array:
         """The right-hand side fun(t, y) of `scipy.integrate.solve_ivp` and `torchdiffeq.odeint`."""
+        if y.shape[-1:] != (2 * self.ndof,):
+            raise ValueError(
+                f"`y` must have shape (..., {2 * self.ndof}), [q, p] on the last axis; got {tuple(y.shape)}. In "
+                "solve_ivp leave `vectorized` out, which asks for states in columns."
+            )
         return self.vector_field(y)
 
     # separable systems: V(q) and T(p) -------------------------------------------------------------

@@ -25,6 +25,30 @@ class SymplecticEuler(FixedStep):
         return np.concatenate([y[..., :d] + np.asarray(h)[..., None] * system.velocity(p), p], -1)
 
 
+@dataclass(frozen=True)
+class Failing(SymplecticEuler):
+    def __post_init__(self):
+        raise SystemExit(3)
+
+
+@dataclass(frozen=True)
+class Refusing(SymplecticEuler):
+    def __post_init__(self):
+        raise ValueError("`dt` is not to my taste.")
+
+
+class Optionless(SymplecticEuler):
+    @classmethod
+    def options(cls):
+        raise KeyError("options")
+
+
+def __getattr__(name):
+    if name == "leaving_on_import":
+        raise SystemExit("I leave")
+    raise AttributeError(name)
+
+
 @pytest.fixture
 def plugins(monkeypatch):
     """Entry points as if installed: one that works, one that breaks, one with a built-in name, one that is none."""
@@ -33,6 +57,10 @@ def plugins(monkeypatch):
         EntryPoint("broken", "a_module_that_does_not_exist:Thing", registry.GROUP),
         EntryPoint("verlet", f"{__name__}:SymplecticEuler", registry.GROUP),
         EntryPoint("nothing", "math:pi", registry.GROUP),
+        EntryPoint("leaving", f"{__name__}:leaving_on_import", registry.GROUP),
+        EntryPoint("failing", f"{__name__}:Failing", registry.GROUP),
+        EntryPoint("refusing", f"{__name__}:Refusing", registry.GROUP),
+        EntryPoint("optionless", f"{__name__}:Optionless", registry.GROUP),
     ]
     monkeypatch.setattr(registry, "entry_points", lambda group: points)
     registry._plugins.cache_clear()
@@ -79,3 +107,26 @@ def test_plugins_break_on_use_and_not_before(plugins):
         get("broken")
     with pytest.raises(ImportError, match=r"^`method` 'nothing' of the plug-in .* is no Integrator class"):
         get("nothing")
+
+
+@pytest.mark.filterwarnings("ignore:The integrator 'verlet' of")
+@pytest.mark.parametrize(
+    ("method", "error", "message"),
+    [
+        ("leaving", ImportError, r"^`method` 'leaving' of the plug-in .* cannot be loaded \(SystemExit: I leave\)"),
+        ("failing", RuntimeError, r"^`method` 'failing' of the plug-in test_registry:Failing failed when it was made"),
+        ("refusing", ValueError, r"^`dt` is not to my taste. \(Raised by the plug-in test_registry:Refusing.\)"),
+        ("optionless", RuntimeError, r"^`method` 'optionless' of the plug-in test_registry:Optionless failed"),
+    ],
+)
+def test_a_plugin_that_fails_is_named(method, error, message, plugins):
+    with pytest.raises(error, match=message.replace("test_registry", __name__)):
+        solve(systems.pendulum(), method, (0, 1))
+    assert solve(systems.pendulum(), "verlet", (0, 1)).success
+
+
+def test_max_step_of_a_fixed_step_method_is_explained():
+    with pytest.raises(
+        TypeError, match=r"^`max_step` is not an option of method 'verlet'.*`event_step` samples events"
+    ):
+        solve(systems.pendulum(), "verlet", (0, 1), max_step=0.1)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import difflib
 import warnings
+from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, TypeVar
 
 from sympflow.integrators.base import Integrator
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED
+
+T = TypeVar("T")
 
 GROUP = "sympflow.integrators"
 """The entry-point group in which a distribution announces its integrators: `name = "package.module:Class"`."""
@@ -34,6 +37,7 @@ _WITH_PARTS = (
 )
 _TORCHDIFFEQ = (*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams")
 _NAMES = frozenset((*SCHEMES, *_BUILT_IN, *_WITH_PARTS, *_TORCHDIFFEQ))
+_INSTEAD = {"max_step": "`dt` is the step, and `event_step` samples events within it"}
 _registered: dict[str, type[Integrator]] = {}
 
 
@@ -108,6 +112,8 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
     ------
     TypeError
         If an option is not one of the method's.
+    RuntimeError
+        If the class of a plug-in fails, with the name of its distribution.
     """
     if isinstance(method, Integrator):
         if options:
@@ -119,13 +125,31 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
         options = {"flow": method, **options}
         method = method.kind
     cls = get(method)
-    unknown = [name for name in options if name not in cls.options()]
+    known = _made(method, cls.options)
+    unknown = [name for name in options if name not in known]
     if unknown:
         raise TypeError(
-            f"`{unknown[0]}` is not an option of method {cls.name!r}, which takes "
-            f"{', '.join(cls.options()) or 'none'}: remove it or choose another method."
+            f"`{unknown[0]}` is not an option of method {cls.name!r}, which takes {', '.join(known) or 'none'}: "
+            f"{_INSTEAD.get(unknown[0], 'remove it or choose another method')}."
         )
-    return cls(**options)
+    return _made(method, lambda: cls(**options))
+
+
+def _made(method: Any, make: Callable[[], T]) -> T:
+    """What `make` gives; if it fails in the code of a plug-in, with the name of its distribution."""
+    try:
+        return make()
+    except (Exception, SystemExit) as error:
+        if not isinstance(method, str) or method in _NAMES or method in _registered:
+            raise
+        plugin = f"the plug-in {_distribution(_plugins()[method])}"
+        if isinstance(error, TypeError | ValueError):  # what its options were given, most likely
+            kind = TypeError if isinstance(error, TypeError) else ValueError
+            raise kind(f"{error} (Raised by {plugin}.)") from error
+        raise RuntimeError(
+            f"`method` {method!r} of {plugin} failed when it was made ({type(error).__name__}: {error}): report it "
+            "there."
+        ) from error
 
 
 def _is_flow(method: Any) -> bool:
@@ -150,10 +174,10 @@ def _plugins() -> dict[str, EntryPoint]:
 def _load(point: EntryPoint) -> type[Integrator]:
     try:
         integrator = point.load()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ImportError(
-            f"`method` {point.name!r} of the plug-in {_distribution(point)} cannot be loaded ({error}): "
-            "reinstall or remove that distribution."
+            f"`method` {point.name!r} of the plug-in {_distribution(point)} cannot be loaded ({type(error).__name__}: "
+            f"{error}): reinstall or remove that distribution."
         ) from error
     if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
         raise ImportError(
