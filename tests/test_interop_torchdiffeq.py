@@ -154,6 +154,16 @@ def test_everything_else_is_handed_on():
     assert torch.equal(odeint_adjoint(lambda t, y: module(y), y0, t, adjoint_params=()), theirs)
 
 
+def test_a_name_that_neither_has_is_answered_with_both():
+    y0, t = torch.tensor(HH.y0), times(0.0, 1.0)
+    with pytest.raises(ValueError, match=r"^`method` 'verlett' is unknown. Did you mean 'verlet'\?"):
+        odeint_event(HH, y0, t[0], event_fn=lambda t, y: y[0], method="verlett")
+    with pytest.raises(ValueError, match=r"^`method` 'dopri55' is unknown. Did you mean 'dopri5'\?"):
+        odeint_adjoint(HH, y0, t, method="dopri55", adjoint_params=())
+    with pytest.raises(ValueError, match=r"^We require len\(t\) == 2"):
+        odeint(HH, y0, times(0.0, 1.0, 2.0), method="dopri5", event_fn=lambda t, y: y[0])  # their own errors pass
+
+
 def test_the_adjoint_is_refused():
     for method in ("sympflow", "verlet", flow()):
         with pytest.raises(ValueError, match=r"cannot be used with odeint_adjoint.*Use odeint"):
@@ -213,18 +223,42 @@ class TestRegistration:
         with pytest.raises(ValueError, match="is torchdiffeq's own already"):
             register("dopri5")
 
+    @pytest.mark.parametrize(
+        ("method", "error", "message"),
+        [
+            ("rk45", TypeError, r"^`method` 'rk45' is no fixed-step map"),
+            ("verlett", ValueError, r"^`method` 'verlett' is unknown. Did you mean 'verlet'\?"),
+            (3, TypeError, r"^`method` must be the name of a method"),
+        ],
+    )
+    def test_what_makes_no_sense_there_is_refused(self, method, error, message):
+        with pytest.raises(error, match=message):
+            register(method)
+        assert method not in import_module("torchdiffeq._impl.odeint").SOLVERS
+
 
 def test_a_warning_where_func_is_another_system(rotation):
     with pytest.warns(UserWarning, match="solves its own system, not this one"):
         odeint(lambda t, y: 9.0 * y, times(1.0, 0.5), times(0.0, 1.0), method=rotation)
     odeint(lambda t, y: torch.stack([y[1], -y[0]]), times(1.0, 0.5), times(0.0, 1.0), method=rotation)
+    with pytest.warns(UserWarning, match="solves its own system, not this one"):  # two systems in one call
+        odeint(PENDULUM, times(1.0, 0.5), times(0.0, 1.0), method="verlet", options={"system": OSCILLATOR})
+    with pytest.warns(UserWarning, match="solves its own system, not this one"):
+        odeint(PENDULUM, (times(1.0), times(0.5)), times(0.0, 1.0), method="verlet", options={"system": OSCILLATOR})
+    same = systems.pendulum()
+    odeint(PENDULUM, times(1.0, 0.5), times(0.0, 1.0), method="verlet", options={"system": same})
 
 
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
         ({"method": "rk45"}, TypeError, r"^`method` 'rk45' is no fixed-step map"),
-        ({"method": "nothing"}, ValueError, r"Invalid method"),
+        (
+            {"method": "nothing"},
+            ValueError,
+            r"^`method` 'nothing' is unknown. Choose one of .*dopri5.*scipy_solver.*verlet",
+        ),
+        ({"method": "verlett"}, ValueError, r"^`method` 'verlett' is unknown. Did you mean 'verlet'\?"),
         ({"options": {"norm": None, "interp": "cubic"}}, TypeError, r"^`interp` is not an option of method"),
         ({"t": times(0.0, 1.0, 0.5)}, ValueError, r"^`t` must be finite and strictly"),
         ({"t": times(0.0, np.nan)}, ValueError, r"^`t` must be finite and strictly"),

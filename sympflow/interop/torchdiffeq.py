@@ -6,8 +6,10 @@ options go into `options`: `flow`, `dt` (or `step_size`), and `system` where `fu
 
 from __future__ import annotations
 
+import difflib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -64,9 +66,10 @@ def odeint(
         event time by the implicit function theorem; they are those of the map that was executed.
     """
     if not _is_ours(method):
-        return torchdiffeq.odeint(
-            _of_pairs(func, y0), y0, t, rtol=rtol, atol=atol, method=method, options=options, event_fn=event_fn
-        )
+        with _names_of_both():
+            return torchdiffeq.odeint(
+                _of_pairs(func, y0), y0, t, rtol=rtol, atol=atol, method=method, options=options, event_fn=event_fn
+            )
     if (rtol, atol) != (_RTOL, _ATOL):
         warnings.warn(
             f"`rtol` and `atol` have no effect on the fixed-step method {_name(method)!r}: leave them out.",
@@ -77,7 +80,7 @@ def odeint(
     integrator, system = _build(func, method, options)
     y, pack = _joined(y0)
     _check_state(y, system, integrator)
-    if not isinstance(func, HamiltonianSystem):
+    if func is not system:
         _check_right_hand_side(func, y0, t, integrator, system)
     path = Path(integrator, system, y, -1 if len(t) > 1 and t[0] > t[1] else 1)
     if event_fn is None:
@@ -103,9 +106,9 @@ def odeint_event(
     """
     if not _is_ours(kwargs.get("method")):
         theirs = torchdiffeq.odeint if odeint_interface is odeint else odeint_interface
-        return torchdiffeq.odeint_event(
-            _of_pairs(func, y0), y0, t0, event_fn=event_fn, reverse_time=reverse_time, odeint_interface=theirs, **kwargs
-        )
+        arguments = {"event_fn": event_fn, "reverse_time": reverse_time, "odeint_interface": theirs, **kwargs}
+        with _names_of_both():
+            return torchdiffeq.odeint_event(_of_pairs(func, y0), y0, t0, **arguments)
     if odeint_interface is not odeint:
         raise _no_adjoint(kwargs["method"])
     start = t0.reshape(-1)
@@ -123,19 +126,43 @@ def odeint_adjoint(func: Any, y0: State, t: Tensor, *, method: Any = None, **kwa
     """
     if _is_ours(method):
         raise _no_adjoint(method)
-    return torchdiffeq.odeint_adjoint(func, y0, t, method=method, **kwargs)
+    with _names_of_both():
+        return torchdiffeq.odeint_adjoint(func, y0, t, method=method, **kwargs)
 
 
 def register(method: str) -> None:
     """Add one of our methods to torchdiffeq's own table, for code whose calls of `odeint` cannot be changed.
 
     That table is private to torchdiffeq, so this is never done unasked, and may break with a release of it.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If there is no such method, it is torchdiffeq's own, or it has no fixed steps.
     """
+    if not isinstance(method, str):
+        raise TypeError(f"`method` must be the name of a method, such as 'verlet'; got {type(method).__name__}.")
+    if method in _THEIRS:
+        raise ValueError(f"`method` {method!r} is torchdiffeq's own already: register one of ours, such as 'verlet'.")
+    fixed_step(method, {}, "torchdiffeq")
     from sympflow.interop.torchdiffeq_table import add
 
-    if not _is_ours(method) or not isinstance(method, str):
-        raise ValueError(f"`method` {method!r} is torchdiffeq's own already: register one of ours, such as 'verlet'.")
     add(method)
+
+
+@contextmanager
+def _names_of_both() -> Iterator[None]:
+    """torchdiffeq knows its own methods only: a name that neither has is answered with ours as well."""
+    try:
+        yield
+    except ValueError as error:
+        if not str(error).startswith("Invalid method"):
+            raise
+        name = str(error).split('"')[1]
+        known = sorted({*available(), *_THEIRS})
+        close = difflib.get_close_matches(name.lower(), known, n=1)
+        hint = f" Did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"`method` {name!r} is unknown.{hint} Choose one of {', '.join(known)}.") from None
 
 
 def _is_ours(method: Any) -> bool:
@@ -200,7 +227,7 @@ def _check_right_hand_side(
 ) -> None:
     """Warn if `func` at (t[0], y0) is not the velocity of the method's own motion."""
     with torch.no_grad():
-        slope = func(t[0], y0)
+        slope = _of_pairs(func, y0)(t[0], y0)
     slope = _joined(slope)[0]
     y = _joined(y0)[0]
     first = tuple(0 for _ in y.shape[:-1])
