@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, field, make_dataclass
 from functools import cached_property
@@ -51,7 +52,7 @@ def poincare_section(
         Index into [q, p], or a name such as "q1" or "p2".
     level : float
     direction : 1, -1 or 0
-        Only crossings upwards, only downwards, or both.
+        Only crossings upwards, only downwards, or both. A start on the plane counts, as it does for events.
     sample : float, optional
         Longest time between two samples; two crossings within it are missed. The default is `system.dt`, or the
         method's step where that is shorter.
@@ -87,10 +88,11 @@ def poincare_section(
     index = _check_coordinate(coordinate, system.ndof)
     if direction not in (-1, 0, 1):
         raise ValueError(f"`direction` must be 1 (upwards), -1 (downwards) or 0 (both); got {direction!r}.")
-    if sample is None:
-        sample = system.dt
-    if not sample > 0:
-        raise ValueError(f"`sample` must be a positive time; got {sample!r}.")
+    if not (_is_number(level) and math.isfinite(level)):
+        raise ValueError(f"`level` must be a finite number, the value of the coordinate on the plane; got {level!r}.")
+    sample = system.dt if sample is None else sample
+    if not (_is_number(sample) and sample > 0):
+        raise ValueError(f"`sample` must be a positive number, a time; got {sample!r}.")
     rows = start.reshape(-1, start.shape[-1])
     found = _Crossings(integrator, system, index, float(level), direction, float(sample))
     for t, y, h in integrator.steps(system, span, rows):
@@ -216,16 +218,21 @@ class _Crossings:
         self.integrator, self.system = integrator, system
         self.coordinate, self.level, self.direction, self.sample = coordinate, level, direction, sample
         self.found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self.at_start = True
 
     def search(self, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> None:
         """Steps (n,) of N trajectories: times (n,) or (n, N), states at their beginnings (n, N, 2d), lengths."""
         h, t = (np.broadcast_to(a.reshape(len(y), -1), y.shape[:-1]) for a in (h, t))
         parts = max(1, int(np.ceil(np.abs(h).max() / self.sample * (1 - 1e-12))))
         before = y[..., self.coordinate] - self.level
+        starts = np.zeros(before.shape, dtype=bool)
+        starts[:1] = self.at_start & (before[:1] == 0)  # a zero at the end of a step was counted in that step
+        self.at_start = False
         for part in range(parts):
             with np.errstate(all="ignore"):
                 after = self._step(y, h * ((part + 1) / parts))[..., self.coordinate] - self.level
-                up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
+                up, down = ((before < 0) | starts) & (after >= 0), ((before > 0) | starts) & (after <= 0)
+            starts = np.zeros_like(starts)
             crossed = {1: up, -1: down, 0: up | down}[self.direction] & (h != 0)
             if crossed.any():
                 self._locate(t, y, h, crossed, part / parts, (part + 1) / parts, before)
@@ -236,7 +243,7 @@ class _Crossings:
     ) -> None:
         """Bisect all crossings together, in the fraction of the step."""
         y, t, h, sign = y[crossed], t[crossed], h[crossed], np.sign(before[crossed])
-        low, high = np.full(len(y), a), np.full(len(y), b)
+        low, high = np.full(len(y), a), np.where(sign == 0, a, b)
         for _ in range(54):
             middle = (low + high) / 2
             g = self._step(y, h * middle)[:, self.coordinate] - self.level
@@ -257,6 +264,10 @@ class _Crossings:
 def names(ndof: int) -> list[str]:
     """q, p for one degree of freedom; q1 … qd, p1 … pd for more."""
     return [f"{x}{i + 1}" if ndof > 1 else x for x in "qp" for i in range(ndof)]
+
+
+def _is_number(x: object) -> bool:
+    return isinstance(x, int | float | np.number) and not isinstance(x, bool)
 
 
 def _check_coordinate(coordinate: int | str, ndof: int) -> int:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import to_numpy
+from sympflow.arrays import Array, to_numpy
 from sympflow.comparison_report import Comparison
-from sympflow.crossings import section_crossings
 from sympflow.figure_style import TEXT, dress, method_styles, new_figure
 from sympflow.integrators.registry import build
-from sympflow.solution import Solution
 from sympflow.solver import solve
-from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,8 +20,8 @@ if TYPE_CHECKING:
 def portrait(comparison: Comparison) -> Figure:
     """Phase space, a panel for each method with the reference behind in grey.
 
-    One degree of freedom: the orbit in the (q, p) plane. Two: the Poincaré section q₁ = 0, p₁ > 0, from a run with
-    outputs every `system.dt`. More: q₁ against q₂.
+    One degree of freedom: the orbit in the (q, p) plane. Two: the Poincaré section q₁ = 0, p₁ > 0, by events of each
+    method. More: q₁ against q₂.
     """
     system = comparison.system
     runs = [run for run in comparison.runs if run.sol is not None]
@@ -58,54 +54,38 @@ def portrait(comparison: Comparison) -> Figure:
     return figure
 
 
-def section_figure(sections: Sequence[tuple[str, Solution]], energy: float | None = None) -> Figure:
-    """Poincaré sections q₁ = 0, p₁ > 0 of two degrees of freedom, one panel for each (title, solution).
-
-    Parameters
-    ----------
-    sections : sequence of (str, Solution)
-        Single trajectories or batches, with outputs every fraction of the fastest oscillation.
-    energy : float, optional
-        Draws the boundary H(0, q₂, 0, p₂) = energy of what can be reached.
-    """
-    if not sections:
-        raise ValueError("`sections` is empty: give at least one (title, solution).")
-    figure = new_figure(0.5 + 3.4 * len(sections), 3.7)
-    axes = figure.subplots(1, len(sections), sharex=True, sharey=True, squeeze=False)[0]
-    for k, (ax, (title, sol)) in enumerate(zip(axes, sections, strict=True)):
-        if sol.system.ndof != 2:
-            raise ValueError(f"`sections` are of two degrees of freedom; {sol.system.name!r} has {sol.system.ndof}.")
-        points = section_crossings(sol)[:, [1, 3]]
-        ax.plot(*points.T, ".", color="#0072B2", ms=1.6, mew=0, rasterized=True)
-        if energy is not None:
-            _draw_boundary(ax, sol.system, energy, points)
-        ax.set_title(title, fontsize=10, color=TEXT)
-        dress(ax, "q₂", "p₂" if k == 0 else "")
-        ax.set_aspect("equal")
-    return figure
-
-
-def _draw_boundary(ax: Axes, system: HamiltonianSystem, energy: float, points: np.ndarray) -> None:
-    reach = 1.6 * np.abs(points).max(initial=0.1)
-    grid = np.linspace(-reach, reach, 400)
-    q2, p2 = np.meshgrid(grid, grid)
-    H = system.hamiltonian(np.stack([0 * q2, q2, 0 * q2, p2], axis=-1))
-    ax.contour(q2, p2, H, levels=[energy], colors="#999999", linewidths=0.8)
-
-
 def _phase_points(comparison: Comparison, integrator: Any) -> np.ndarray:
     """What a portrait shows of one run, (m, 2)."""
     system = comparison.system
-    if system.ndof != 2:
-        t = comparison.t
-        pair = [0, 1]
-    else:
-        t0, t1 = comparison.t_span
-        n = min(int(np.ceil(abs(t1 - t0) / system.dt)), 400_000)
-        t, pair = np.linspace(t0, t1, n + 1), [1, 3]
+    if system.ndof == 2:
+        return _section(comparison, integrator)
+    t = comparison.t
     sol = solve(system, integrator, comparison.t_span, comparison.y0, t_eval=t, on_domain_exit="ignore")
-    states = section_crossings(sol) if system.ndof == 2 else to_numpy(sol.states).reshape(-1, 2 * system.ndof)
-    return states[:, pair]
+    return to_numpy(sol.states).reshape(-1, 2 * system.ndof)[:, [0, 1]]
+
+
+def _section(comparison: Comparison, integrator: Any) -> np.ndarray:
+    """(q₂, p₂) where q₁ passes 0 upwards, (m, 2): events of each trajectory."""
+
+    def q1(t: float, y: Array) -> Array:
+        return y[0]
+
+    q1.direction = 1  # type: ignore[attr-defined]
+    points = []
+    for y0 in to_numpy(comparison.y0).reshape(-1, 4):
+        sol = solve(
+            comparison.system,
+            integrator,
+            comparison.t_span,
+            y0,
+            t_eval=[],
+            events=q1,
+            event_step=comparison.system.dt,
+            on_domain_exit="ignore",
+        )
+        assert sol.y_events is not None
+        points.append(sol.y_events[0])
+    return np.concatenate(points)[:, [1, 3]]
 
 
 def _reference_points(comparison: Comparison) -> np.ndarray:

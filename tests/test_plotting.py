@@ -6,10 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from sympflow import compare, get, solve, systems
-from sympflow.crossings import section_crossings
+from sympflow import compare, get, poincare_section, systems
 from sympflow.plotting import overview, save_comparison
-from sympflow.portraits import section_figure
 
 
 @pytest.fixture(scope="module")
@@ -63,30 +61,27 @@ def test_figures_of_what_was_not_measured_are_refused(report, tmp_path):
         report.plot(tmp_path / "figure.bmp")
 
 
-def test_section_lies_in_the_plane_and_on_the_energy_surface():
+@pytest.mark.parametrize("method", ["kahan_li8", "explicit_adams", "dopri5"])
+def test_portraits_of_two_degrees_of_freedom_are_sections(method):
+    """The points are those of `poincare_section`, for every method."""
     system = systems.henon_heiles()
-    sol = solve(system, "kahan_li8", (0, 300), t_eval=np.linspace(0, 300, 6001))
-    points = section_crossings(sol)
-    assert len(points) > 30
-    assert np.abs(points[:, 0]).max() < 1e-12
-    assert (points[:, 2] > 0).all()
-    energies = system.hamiltonian(points)
-    assert (
-        np.abs(energies - system.hamiltonian(system.y0)).max() < 1e-6
-    )  # Hermite interpolation at h = 0.05: h⁴ · 1/384
-    halved = section_crossings(solve(system, "kahan_li8", (0, 300), t_eval=np.linspace(0, 300, 12001)))
-    assert np.abs(points - halved).max() < 1e-6
+    options = {"rtol": 1e-7, "atol": 1e-9} if method == "dopri5" else {"dt": 0.01}
+    report = compare(system, [get(method)(**options)], ["energy"], t_span=(0, 30), n_outputs=40, repeats=1)
+    reference, points = report.figure("portrait").axes[0].lines
+    section = poincare_section(system, "kahan_li8", (0, 30), dt=0.01)
+    assert len(section) > 3
+    np.testing.assert_allclose(reference.get_xydata(), section.states[:, [1, 3]], atol=1e-9)
+    np.testing.assert_allclose(points.get_xydata(), section.states[:, [1, 3]], atol=1e-3)
 
 
-def test_section_of_a_batch_is_that_of_its_trajectories():
+def test_the_portrait_of_a_batch_holds_the_sections_of_its_trajectories():
     system = systems.henon_heiles()
-    y0, t = system.domain.sample(3, 1), np.linspace(0, 100, 2001)
-    together = section_crossings(solve(system, "verlet", (0, 100), y0, t_eval=t))
-    apart = np.concatenate([section_crossings(solve(system, "verlet", (0, 100), y, t_eval=t)) for y in y0])
-    np.testing.assert_allclose(np.sort(together, axis=0), np.sort(apart, axis=0), atol=1e-12)
-    assert section_figure([("verlet", solve(system, "verlet", (0, 100), y0, t_eval=t))], energy=0.1).axes
-    with pytest.raises(ValueError, match="`sections` are of two degrees of freedom"):
-        section_figure([("pendulum", solve(systems.pendulum(), "verlet", (0, 1)))])
+    y0 = system.domain.sample(2, 1)
+    report = compare(system, ["verlet"], ["energy"], t_span=(0, 30), y0=y0, n_outputs=40, repeats=1)
+    section = poincare_section(system, "verlet", (0, 30), y0)
+    np.testing.assert_allclose(
+        report.figure("portrait").axes[0].lines[1].get_xydata(), section.states[:, [1, 3]], atol=1e-10
+    )
 
 
 def test_pyplot_is_never_imported_and_comparing_needs_no_matplotlib():

@@ -34,6 +34,21 @@ def test_all_zeros_of_cos_t_upwards_and_downwards(rotation):
             np.testing.assert_allclose(np.abs(section.t), expected, rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("direction", [-1, 0, 1])
+@pytest.mark.parametrize("t_end", [20.0, -20.0])
+def test_a_start_on_the_plane_counts_as_it_does_for_events(direction, t_end):
+    def g(t, y):
+        return y[0]
+
+    g.direction = direction
+    y0 = np.array([[0.0, 1.0], [0.0, -1.0], [0.5, 0.1]])  # the first leaves upwards, the second downwards
+    section = poincare_section(OSCILLATOR, "kahan_li8", (0, t_end), y0, direction=direction)
+    for k in range(3):
+        sol = solve(OSCILLATOR, "kahan_li8", (0, t_end), y0[k], t_eval=[], events=g)
+        assert (0.0 in sol.t_events[0]) == (k < 2 and direction in (0, (-1) ** k * np.sign(t_end)))
+        np.testing.assert_allclose(section.t[section.trajectory == k], sol.t_events[0], atol=1e-12)
+
+
 def test_a_batch_is_the_loop():
     y0 = HH.domain.sample(5, 1)
     together = poincare_section(HH, "verlet", (0, 50), y0.reshape(5, 1, 4), coordinate="q2", level=0.1)
@@ -78,6 +93,10 @@ def test_no_crossing():
         ({"coordinate": 4}, ValueError, r"^`coordinate` must be one of"),
         ({"direction": 2}, ValueError, r"^`direction` must be 1"),
         ({"sample": 0}, ValueError, r"^`sample` must be a positive"),
+        ({"sample": "x"}, ValueError, r"^`sample` must be a positive number, a time; got 'x'"),
+        ({"sample": np.nan}, ValueError, r"^`sample` must be a positive"),
+        ({"level": np.nan}, ValueError, r"^`level` must be a finite number"),
+        ({"level": "a"}, ValueError, r"^`level` must be a finite number.* got 'a'"),
         ({"y0": torch.zeros(4)}, TypeError, r"^`y0` is a tensor"),
         ({"method": "explicit_adams"}, TypeError, r"no bare step|define steps"),
     ],
