@@ -2,13 +2,14 @@
 
 python -m sympflow.training.pretrained                                  all of them
 python -m sympflow.training.pretrained henon_heiles --kind sympflow     one
+python -m sympflow.training.pretrained kepler --stages 4                one rung of a ladder of primed flows
 python -m sympflow.training.pretrained --measure                        their figures, without training
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -22,6 +23,7 @@ from sympflow.flow.io import load
 from sympflow.system import HamiltonianSystem
 from sympflow.systems import harmonic_oscillator, henon_heiles, pendulum
 from sympflow.training.figures import measure
+from sympflow.training.ladder import certify, ladders
 from sympflow.training.trainer import train
 
 KINDS = ("sympflow", "mlp")
@@ -29,7 +31,7 @@ KINDS = ("sympflow", "mlp")
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a scene's flows are trained, the same for both architectures: Adam first, then BFGS.
+    """How a scene's networks are trained, the same for both architectures: by Gauss–Newton, in two stages.
 
     Parameters
     ----------
@@ -40,44 +42,26 @@ class Recipe:
         Δt.
     omega : float
         The frequency in whose units the figures are (see `measure`).
-    adam, bfgs : int
-        Steps of the two stages; one of BFGS is 20 iterations.
-    points : int
-        Collocation points of the second stage.
+    points, steps : (int, int)
+        Collocation points and steps of the stages.
     """
 
     system: HamiltonianSystem
     initial: Callable[[], np.ndarray]
     dt: float = 1.0
     omega: float = 1.0
-    adam: int = 3000
-    bfgs: int = 200
-    points: int = 2000
+    points: tuple[int, int] = (1000, 2500)
+    steps: tuple[int, int] = (150, 100)
 
     def train(self, kind: str, **options: Any) -> Any:
-        """The flow, with its figures."""
-        flow = train(
-            self.system,
-            self.dt,
-            kind=kind,
-            steps=self.adam,
-            learning_rate=1e-2,
-            matching_weight=0.0,
-            **options,
-        )
-        flow = train(
-            self.system,
-            flow=flow,
-            optimizer="bfgs",
-            steps=self.bfgs,
-            points=self.points,
-            refresh=50,
-            matching_weight=0.0,
-            validate_every=10,
-            seed=1,
-            **options,
-        )
+        """The flow, with its figures, and a certificate if it is symplectic."""
+        first, second = zip(self.points, self.steps, strict=True)
+        newton: dict[str, Any] = {"optimizer": "gauss-newton", **options}
+        flow = train(self.system, self.dt, kind=kind, points=first[0], steps=first[1], **newton)
+        flow = train(self.system, flow=flow, points=second[0], steps=second[1], seed=1, **newton)
         flow.figures |= self.measure(flow)
+        if kind == "sympflow":
+            certify(flow, self.system)
         return flow
 
     def measure(self, flow: Any, steps: int = 1000) -> dict[str, Any]:
@@ -102,7 +86,7 @@ def recipes() -> dict[str, Recipe]:
     swing = pendulum()
     assert swing.domain is not None
     return {
-        "henon_heiles": Recipe(henon_heiles(), lambda: _well(1 / 8), bfgs=400, points=4000),
+        "henon_heiles": Recipe(henon_heiles(), lambda: _well(1 / 8), points=(1000, 4000)),
         "harmonic_oscillator": Recipe(harmonic_oscillator(), lambda: _square(1.0)),
         "pendulum": Recipe(swing, lambda: swing.domain.sample(100, 0)),  # type: ignore[union-attr]
         "harmonic_oscillator_100": Recipe(harmonic_oscillator(100.0), lambda: _square(100.0), dt=0.01, omega=100.0),
@@ -110,9 +94,14 @@ def recipes() -> dict[str, Recipe]:
 
 
 def path(name: str, kind: str, folder: Path | None = None) -> Path:
-    """The file of a scene's flow, in the package if no folder is given."""
+    """The file of a scene's flow, in the package if no folder is given; a primed one's kind is primed-STAGES."""
     folder = Path(str(resources.files("sympflow"))) / "pretrained" if folder is None else folder
     return folder / f"{name}-{kind}.safetensors"
+
+
+def scenes() -> list[str]:
+    """The names of all that ships, networks and ladders."""
+    return list(dict.fromkeys([*recipes(), *ladders()]))
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -120,27 +109,47 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m sympflow.training.pretrained", description="Train the shipped flows."
     )
-    parser.add_argument("scenes", nargs="*", metavar="scene", help=f"of {', '.join(recipes())}; all if none is named")
-    parser.add_argument("--kind", choices=KINDS, help="one architecture only")
+    parser.add_argument("scenes", nargs="*", metavar="scene", help=f"of {', '.join(scenes())}; all if none is named")
+    parser.add_argument("--kind", choices=(*KINDS, "primed"), help="one architecture only")
+    parser.add_argument("--stages", type=int, help="one rung only of a ladder of primed flows")
     parser.add_argument("--out", type=Path, help="folder to write to (default: the package)")
     parser.add_argument("--measure", action="store_true", help="only measure the files that are there")
     options = parser.parse_args(arguments)
-    unknown = sorted(set(options.scenes) - set(recipes()))
+    unknown = sorted(set(options.scenes) - set(scenes()))
     if unknown:
-        parser.error(f"unknown scene {', '.join(unknown)}: choose from {', '.join(recipes())}")
+        parser.error(f"unknown scene {', '.join(unknown)}: choose from {', '.join(scenes())}")
     torch.set_num_threads(1)  # the arrays are small, and one thread is reproducible
-    for name in options.scenes or recipes():
-        recipe = recipes()[name]
-        for kind in (options.kind,) if options.kind else KINDS:
-            file = path(name, kind, options.out)
-            if options.measure:
-                figures = recipe.measure(load(file))
-            else:
-                flow = recipe.train(kind)
-                flow.save(file)
-                figures = flow.figures
-            values = "  ".join(f"{k} {'diverges' if v is None else f'{v:.2e}'}" for k, v in figures.items())
-            print(f"{name} {kind}: {values}", flush=True)
+    kinds = (options.kind,) if options.kind else ("primed",) if options.stages else (*KINDS, "primed")
+    for name in options.scenes or scenes():
+        for kind in kinds:
+            for file, figures in _made(name, kind, options):
+                values = "  ".join(f"{k} {'diverges' if v is None else f'{v:.2e}'}" for k, v in figures.items())
+                print(f"{file.stem}: {values}", flush=True)
+
+
+def _made(name: str, kind: str, options: argparse.Namespace) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """The files of a scene, as they are written or only measured, and their figures."""
+    if kind == "primed":
+        if name not in ladders():
+            return
+        ladder = ladders()[name]
+        if options.measure:
+            for rung in ladder.rungs:
+                file = path(name, f"primed-{rung.stages}", options.out)
+                if options.stages in (None, rung.stages):
+                    yield file, ladder.measure(load(file))
+            return
+        for rung, flow in ladder.flows(options.stages):
+            flow.save(file := path(name, f"primed-{rung.stages}", options.out))
+            yield file, flow.figures
+    elif name in recipes():
+        recipe, file = recipes()[name], path(name, kind, options.out)
+        if options.measure:
+            yield file, recipe.measure(load(file))
+        else:
+            flow = recipe.train(kind)
+            flow.save(file)
+            yield file, flow.figures
 
 
 if __name__ == "__main__":
