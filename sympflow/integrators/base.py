@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -136,6 +136,8 @@ class FixedStep(Integrator):
     dt: float | None = None
 
     finds_events: ClassVar[bool] = True
+    on_grid: ClassVar[bool] = True
+    """Whether the steps are those of the grid t0 + k·dt, as a peer that drives them presumes."""
     breakdown: ClassVar[tuple[str, str]] = ("The solution became non-finite", "Reduce `dt`")
     """What it means when the run cannot go on, and the remedy: for the message of status −1."""
 
@@ -145,6 +147,10 @@ class FixedStep(Integrator):
     def step_length(self, system: HamiltonianSystem) -> float:
         """The step that is used for a system."""
         return float(self.dt if self.dt is not None else system.dt)
+
+    def counting(self, system: HamiltonianSystem) -> Self:
+        """The integrator whose `evaluations` hold for one run on the system: a copy, where it must keep count."""
+        return self
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Force and force-gradient evaluations of n_steps steps, n_saved saved states, n_extra shorter steps."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 from math import sqrt
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -71,17 +71,22 @@ class Gauss(FixedStep):
         return self._advanced(y, K), np.eye(n, dtype=y.dtype) + np.einsum("i,...ijk->...jk", b, dK)
 
     def run(self, problem: Problem) -> Outcome:
-        counting = copy.copy(self)  # Newton's iterations are counted in a copy: an integrator has no state
-        object.__setattr__(counting, "_iterations", [0])
+        counting = self.counting(problem.system)
         outcome = super(Gauss, counting).run(problem)
-        iterations = counting._iterations[0]  # type: ignore[attr-defined]
-        evaluations = iterations * len(self.tableau[1])
-        outcome.stats |= {
-            "newton_iterations": iterations,
-            "force_evaluations": evaluations,
-            "hessian_evaluations": evaluations,
-        }
+        outcome.stats["newton_iterations"] = counting._iterations[0]  # type: ignore[attr-defined]
         return outcome
+
+    def counting(self, system: HamiltonianSystem) -> Self:
+        counting = copy.copy(self)  # Newton's iterations are counted in a copy: an integrator has no state
+        object.__setattr__(counting, "_iterations", [0, 0])  # all, and those that `evaluations` has told
+        return counting
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Those since it was last asked."""
+        total, told = self._iterations  # type: ignore[attr-defined]
+        self._iterations[1] = total  # type: ignore[attr-defined]
+        n = (total - told) * len(self.tableau[1])
+        return {"force_evaluations": n, "hessian_evaluations": n}
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         kernel = self._kernel(problem)

@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -40,9 +40,12 @@ class MapsStepper(FixedStep):
         self.parts_of(system)
 
     def run(self, problem: Problem) -> Outcome:
+        return super(MapsStepper, self.counting(problem.system)).run(problem)
+
+    def counting(self, system: HamiltonianSystem) -> Self:
         counted = copy.copy(self)  # one that knows the maps whose evaluations it counts
-        object.__setattr__(counted, "counted_maps", self.maps(self.parts_of(problem.system), 1.0))
-        return super(MapsStepper, counted).run(problem)
+        object.__setattr__(counted, "counted_maps", self.maps(self.parts_of(system), 1.0))
+        return counted
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return map_evaluations(self.counted_maps, n_steps, n_saved, n_extra, backend)

@@ -48,6 +48,7 @@ class Logarithmic(FixedStep):
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
     finds_events: ClassVar[bool] = False  # they are sought on the dense output
+    on_grid: ClassVar[bool] = False
     tangent_holds: ClassVar[str] = "the realised step in s, and B,"
     breakdown: ClassVar[tuple[str, str]] = (
         "T + B or c − V ceased to be positive and finite",

@@ -49,7 +49,7 @@ def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
     Raises
     ------
     TypeError
-        If the method chooses its own steps: the peer has such methods itself.
+        If the method chooses its own steps: the peer has such methods itself; or if its steps are not on a grid.
     """
     from sympflow.integrators.registry import build
 
@@ -58,6 +58,11 @@ def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
         raise TypeError(
             f"`method` {integrator.name!r} is no fixed-step map, which is what can be handed to {peer}: use a "
             f"splitting method or a trained flow, or {peer}'s own method."
+        )
+    if not integrator.on_grid:
+        raise TypeError(
+            f"`method` {integrator.name!r} takes steps that are not equal in t, which {peer} cannot drive: use "
+            "solve(), or another method."
         )
     return integrator
 

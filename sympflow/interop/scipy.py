@@ -106,6 +106,7 @@ class FlowSolver(OdeSolver):
         super().__init__(fun, t0, y0, t_bound, vectorized)
         self._check(fun)
         system = self._solved
+        self._counting = self.integrator if system is None else self.integrator.counting(system)
         self._grid = Grid(t0, t_bound, self.integrator.step_length(system))
         self._parts = max(1, math.ceil(abs(self._grid.h) / max_step * (1 - 1e-12)))
         self._k, self._part = 0, 0  # the grid point before the state, and the sample after it
@@ -138,7 +139,7 @@ class FlowSolver(OdeSolver):
             raise ValueError(f"`fun` must return shape {self.y.shape}, as `y0`; got {slope.shape}.")
         known = fun is self._solved and not integrator.trained
         if np.isfinite(slope).all() and not known:
-            self.nfev += self._forces(1) if integrator.trained else 1
+            self.nfev += integrator.evaluations(0, 0, 1, "array")["force_evaluations"] if integrator.trained else 1
             warn_of_another_system(integrator, self._solved, self.y, slope, stacklevel=5)
 
     @property
@@ -148,10 +149,6 @@ class FlowSolver(OdeSolver):
     @nfev.setter
     def nfev(self, value: int) -> None:
         self._evaluations.total = value
-
-    def _forces(self, n: int) -> int:
-        """Force evaluations of n steps by array operations."""
-        return self.integrator.evaluations(0, 0, n, "array")["force_evaluations"]
 
     def _flow(self) -> Any:
         """The flow, or None if it cannot be known without a system."""
@@ -187,15 +184,16 @@ class FlowSolver(OdeSolver):
             n = min(self._block, self._grid.n_steps - self._k)
             self._block = min(2 * self._block, LOOK_AHEAD)
             piece = Problem(self._solved, self._t_anchor, self._t_anchor + n * self._grid.h, self._anchor)
-            states, _, backend = self.integrator.rollout(piece, self._grid.h, n, np.arange(1, n + 1))
+            states, _, backend = self._counting.rollout(piece, self._grid.h, n, np.arange(1, n + 1))
             self._ahead.extend(states)
-            self.nfev += self.integrator.evaluations(n, n, 0, backend)["force_evaluations"]
+            self.nfev += self._counting.evaluations(n, n, 0, backend)["force_evaluations"]
         return self._ahead.popleft()
 
     def _shorter(self, h: float) -> np.ndarray:
-        self.nfev += self._forces(1)
         with np.errstate(all="ignore"):
-            return self.integrator.step(self._solved, self._t_anchor, self._anchor, h)
+            y = self._counting.step(self._solved, self._t_anchor, self._anchor, h)
+        self.nfev += self._counting.evaluations(0, 0, 1, "array")["force_evaluations"]
+        return y
 
     def _dense_output_impl(self) -> DenseOutput:
         return FlowOutput(self, self._t_anchor, self._anchor)
@@ -213,9 +211,9 @@ class FlowOutput(DenseOutput):
 
     def __init__(self, solver: Any, t_anchor: float, anchor: np.ndarray) -> None:
         super().__init__(solver.t_old, solver.t)
-        self._integrator, self._system = solver.integrator, solver._solved
+        self._integrator, self._system = solver._counting, solver._solved
         self._t_anchor, self._anchor, self._y = t_anchor, anchor, solver.y
-        self._evaluations, self._forces = solver._evaluations, solver._forces(1)
+        self._evaluations = solver._evaluations
 
     def _call_impl(self, t: np.ndarray) -> np.ndarray:
         times = np.atleast_1d(t).astype(float)
@@ -224,7 +222,8 @@ class FlowOutput(DenseOutput):
         moving = (h != 0) & (times != self.t)
         states[times == self.t] = self._y
         if moving.any():
-            self._evaluations.total += self._forces * int(np.count_nonzero(moving))
             with np.errstate(all="ignore"):
                 states[moving] = self._integrator.step(self._system, self._t_anchor, states[moving], h[moving])
+            counts = self._integrator.evaluations(0, 0, int(np.count_nonzero(moving)), "array")
+            self._evaluations.total += counts["force_evaluations"]
         return states.T if t.ndim else states[0]
