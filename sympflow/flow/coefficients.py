@@ -22,7 +22,7 @@ class Coefficients(nn.Module):
     ----------
     n : int
     exponents : tuple of int
-        e_k ≥ 0, the first of them 0 where there is a `total`.
+        e_k ≥ 0, the first of them 0.
     dt : float
         Δt.
     power : int

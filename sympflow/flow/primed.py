@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 Kind = Literal["kick", "drift"]
 
+MOST_KEPT = 64  # frozen tables
+
 
 @dataclass(frozen=True)
 class Substep:
@@ -47,8 +49,8 @@ class Substep:
 class PrimedFlow(SympFlow):
     """A SympFlow of kicks and drifts, in turn, that are primed with V and T; made by `SympFlow.primed`.
 
-    A palindromic one has a kernel of even polynomials b, γ, a that reads the same backwards, and a processor χ that is
-    even in t: continued to negative t by its formulas, ψ̄_{−t} = (ψ̄_t)⁻¹. Without a processor it is time-reversible.
+    A palindromic one has even polynomials b, γ, a, and its kernel reads the same backwards, which makes K
+    time-reversible: continued to negative t by its formulas, K_{−t} = K_t⁻¹. With a processor ψ̄ is conjugate to it.
 
     Parameters
     ----------
@@ -111,8 +113,8 @@ class PrimedFlow(SympFlow):
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
         kernel, chi = _alternating(first, maps), _alternating(first, 2 * processor + 1 if processor else 0)
 
-        def columns(sequence: Sequence[Kind], start: int, mirrored: bool, total: float | None) -> list[Any]:
-            exponents = tuple(range(start, degree, stride))
+        def columns(sequence: Sequence[Kind], mirrored: bool, total: float | None) -> list[Any]:
+            exponents = tuple(range(0, degree, stride))
             n = [sequence.count(kind) for kind in ("kick", "drift", "kick")]
             made: list[Any] = [
                 Coefficients(n[i], exponents, self.dt, power, mirrored, total if power == 1 else None, **like)
@@ -120,9 +122,8 @@ class PrimedFlow(SympFlow):
             ]
             return made if force_gradient else [*made[:2], None]
 
-        self.kicks, self.drifts, self.gradients = columns(kernel, 0, palindromic, 1.0)
-        # The processor begins with t², and for a palindrome has even powers alone, which keep the symmetry in t.
-        outside: list[Any] = columns(chi, 1, False, None) if processor else [None, None, None]
+        self.kicks, self.drifts, self.gradients = columns(kernel, palindromic, 1.0)
+        outside: list[Any] = columns(chi, False, None) if processor else [None, None, None]
         self.processor_kicks, self.processor_drifts, self.processor_gradients = outside
         inner = _substeps(kernel, self.kicks, self.drifts, self.gradients, 1)
         outer = {
@@ -131,11 +132,25 @@ class PrimedFlow(SympFlow):
         }
         self.substeps: tuple[Substep, ...] = (*reversed(outer[-1]), *inner, *outer[1])
         self._n_outer = len(chi)
+        self._kept: dict[tuple[str, float], Scheme] = {}
+        self._kept_for: tuple[tuple[int, int], ...] = ()
         self._binding = Binding(system)
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(self._layer(substep) for substep in self.substeps)  # type: ignore[assignment]
         if system is not None:
             self.fingerprint, self.system_name = system.fingerprint, system.name
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.kicks.free.dtype
+
+    @property
+    def device(self) -> torch.device:
+        return self.kicks.free.device
+
+    @property
+    def _columns_in_use(self) -> list[Coefficients]:
+        return [column for column in self._modules.values() if isinstance(column, Coefficients)]
 
     @cached_property
     def sequence(self) -> tuple[Kind, ...]:
@@ -202,6 +217,15 @@ class PrimedFlow(SympFlow):
         t = self.dt if t is None else float(t)
         if not 0 < t <= self.dt * (1 + 1e-12):
             raise ValueError(f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t!r}.")
+        # Kept while no number changes: making a table takes longer than many a step.
+        numbers = tuple((column.free.data_ptr(), column.free._version) for column in self._columns_in_use)
+        if self._kept_for != numbers or len(self._kept) > MOST_KEPT:
+            self._kept, self._kept_for = {}, numbers
+        if (name, t) not in self._kept:
+            self._kept[name, t] = self._table(name, substeps, t)
+        return self._kept[name, t]
+
+    def _table(self, name: str, substeps: Iterable[Substep], t: float) -> Scheme:
         stages: list[list[float]] = []
         before = "drift"
         for kind, c, g in self._values(substeps, t / self.dt):
@@ -218,7 +242,7 @@ class PrimedFlow(SympFlow):
         return Scheme(name, None, kicks, drifts, gradients, source, self.gradients is not None)
 
     def _values(self, substeps: Iterable[Substep], tau: float) -> Iterable[tuple[Kind, float, float]]:
-        values = {id(column): column.at(tau) for column in self.children() if isinstance(column, Coefficients)}
+        values = {id(column): column.at(tau) for column in self._columns_in_use}
         for s in substeps:
             w, g = s.weight, s.gradient
             gradient = 0.0 if g is None else g.sign * float(values[id(g.column)][g.row])
@@ -309,7 +333,7 @@ def primed(
     dt: float,
     palindromic: bool,
     scheme: Scheme | str | None,
-    degree: int,
+    degree: int | None,
     force_gradient: bool | None,
     processor: int,
     dtype: torch.dtype,
@@ -322,6 +346,8 @@ def primed(
         force_gradient = system.quadratic_kinetic
     elif force_gradient and not system.quadratic_kinetic:
         raise ValueError("`force_gradient` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
+    if degree is None:
+        degree = 5 if processor else 7
     if scheme is None:
         stages = 6 if stages is None else stages
         if isinstance(stages, bool) or not isinstance(stages, int) or stages < 1:

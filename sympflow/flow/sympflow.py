@@ -123,7 +123,7 @@ class SympFlow(FlowMap):
         dt: float = 1.0,
         palindromic: bool = True,
         scheme: Scheme | str | None = None,
-        degree: int = 7,
+        degree: int | None = None,
         force_gradient: bool | None = None,
         processor: int = 0,
         dtype: torch.dtype = torch.float64,
@@ -146,8 +146,8 @@ class SympFlow(FlowMap):
             Whether it is time-reversible, with half the parameters.
         scheme : Scheme or str, optional
             A table, or its name in `sympflow.integrators.schemes.SCHEMES`, to start from in place of leapfrog.
-        degree : int
-            Of the polynomials that multiply V and T.
+        degree : int, optional
+            Of the polynomials that multiply V and T; 7 by default, 5 with a processor, which has more of them.
         force_gradient : bool, optional
             Whether the kicks have a term in ½|∇V|²_{M⁻¹}; by default they do where T is quadratic.
         processor : int

@@ -1,7 +1,8 @@
 """Gauss–Newton training of primed flows: the numbers of a splitting table, fitted to the exact flow of a system.
 
-In two stages. First the table frozen at Δt, a dozen numbers, from many random starts: the cost has many local minima.
-Then the polynomials in t, from the best of these tables, to labels at several times in (0, Δt].
+In three stages. First the table frozen at Δt, a dozen or two numbers, from many random starts, each followed for a
+few iterations: the cost has many local minima. Then the best of these to the end of their narrow valleys. Then the
+polynomials in t, from the best of these tables, to labels at several times in (0, Δt].
 """
 
 from __future__ import annotations
@@ -30,8 +31,10 @@ from sympflow.training.run import Path
 from sympflow.training.table_fit import Table, TableFit
 from sympflow.training.table_jacobian import TableStep
 
-FINALISTS = 3  # frozen tables from which the polynomials are fitted
-SEARCH_SHARE = 0.6  # of a time budget that the frozen search may use
+FINALISTS = 4  # tables of the search that are followed to the end
+FITTED = 2  # tables from which the polynomials are fitted
+SEARCH_STEPS = 60  # iterations from each start
+SEARCH_SHARE, FROZEN_SHARE = 0.4, 0.7  # of a time budget, that the search, and all work on frozen tables, may use
 FRACTIONAL_TIMES = 50
 
 
@@ -50,7 +53,7 @@ class GaussNewtonConfig:
     restarts : int
         Starts of the frozen search: the flow as it is, then random tables.
     steps : int
-        The most iterations from each start.
+        The most iterations of each of the final fits.
     seed : int
     reference_states : int
         Held-out states of the figures.
@@ -60,7 +63,7 @@ class GaussNewtonConfig:
     label_times: int = 8
     frozen_weight: float = 1.0
     restarts: int = 24
-    steps: int = 300
+    steps: int = 1000
     seed: int = 0
     reference_states: int = 100
 
@@ -137,11 +140,15 @@ class GaussNewtonRun:
         def search_is_spent() -> bool:
             return spent(SEARCH_SHARE)
 
+        def frozen_is_spent() -> bool:
+            return spent(FROZEN_SHARE)
+
         label = f"{self.system.name} {self.flow.kind}"
         try:
             with make_progress(progress, self.config.restarts, label, len(self.minima)) as bar:
                 while len(self.minima) < self.config.restarts and not search_is_spent():
-                    minimum = self.frozen.minimize(self._start(table, given), self.config.steps, search_is_spent)
+                    steps = min(SEARCH_STEPS, self.config.steps)
+                    minimum = self.frozen.minimize(self._start(table, given), steps, search_is_spent)
                     self.minima.append(minimum)
                     best = min(self.minima, key=lambda m: m.cost)
                     table.assign(table.continued(self.frozen.design[0] @ best.x))
@@ -157,9 +164,13 @@ class GaussNewtonRun:
         if len(self.minima) < self.config.restarts and reason is None:
             reason = "the time budget was used up"
 
-        tables = [self.frozen.design[0] @ m.x for m in _distinct(self.minima)[:FINALISTS]]
+        finalists = [
+            self.frozen.minimize(m.x, self.config.steps, frozen_is_spent, thorough=True)
+            for m in _distinct(self.minima)[:FINALISTS]
+        ]
+        tables = [self.frozen.design[0] @ m.x for m in _distinct(finalists)[:FITTED]]
         starts = [given, *(table.continued(t) for t in tables)]
-        fitted = [self.whole.minimize(theta, self.config.steps, spent) for theta in starts]
+        fitted = [self.whole.minimize(theta, self.config.steps, spent, thorough=True) for theta in starts]
         best = min(fitted, key=lambda m: m.cost)
         if not math.isfinite(best.cost):
             raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
