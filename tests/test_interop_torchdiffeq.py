@@ -105,6 +105,21 @@ class TestEvents:
         assert y.shape == (2, 2)
         assert abs(float(y[1, 0])) < 1e-14
 
+    @pytest.mark.parametrize("reverse", [False, True])
+    def test_the_first_of_two_zeros_within_a_step_is_seen(self, rotation, reverse):
+        """q grows from cos 0.45 to 1 and falls again: it passes 0.95 twice within Δt = 1."""
+        y0 = times(np.cos(0.45), (-1 if reverse else 1) * np.sin(0.45)).repeat(2, 1)
+        t, y = odeint_event(
+            OSCILLATOR,
+            y0,
+            times(0.0)[0],
+            event_fn=lambda t, y: 0.95 - y[..., 0].mean(),
+            reverse_time=reverse,
+            method=rotation,
+        )
+        assert abs(float(t)) == pytest.approx(0.45 - np.arccos(0.95), abs=1e-13)
+        torch.testing.assert_close(y[1, :, 0], times(0.95, 0.95))
+
     @pytest.mark.parametrize("as_tuple", [False, True])
     def test_as_torchdiffeq_finds_it(self, as_tuple):
         y0 = torch.tensor(HH.y0)

@@ -70,7 +70,9 @@ class Path:
         return torch.is_grad_enabled() and (self.y0.requires_grad or any(w.requires_grad for w in weights))
 
     def first_zero(self, g: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """The elapsed time s at which g(s, ψ_s(y0)), a number, first vanishes; g is tested at every step.
+        """The elapsed time s at which g(s, ψ_s(y0)), a number, first vanishes.
+
+        g is tested at every step, and every `system.dt` within longer ones, such as those of a flow.
 
         Its derivatives are those of the implicit function: ds = −dg / (dg/ds).
 
@@ -100,26 +102,48 @@ class Path:
         while k < MAX_EVENT_STEPS:
             ahead = Path(self.integrator, self.system, y, 1 if self.h > 0 else -1)
             states = ahead._rollout(np.arange(chunk + 1))
+            inner = self._samples(states[:-1])
+            parts = inner.shape[1] + 1
             for j in range(chunk):
-                after = value((k + j + 1) * self.h, states[j + 1])
-                if before * after <= 0:
-                    return self._locate(value, (k + j) * self.h, states[j], before, after)
-                if not math.isfinite(after):
-                    raise RuntimeError(
-                        f"`event_fn` found no zero: the solution became non-finite after an elapsed time of "
-                        f"{(k + j) * self.h:.6g}. Check y0, or use a smaller dt."
-                    )
-                before = after
+                a = start = (k + j) * self.h
+                for i in range(1, parts + 1):
+                    b, y_b = start + self.h * i / parts, inner[j, i - 1] if i < parts else states[j + 1]
+                    after = value(b, y_b)
+                    if before * after <= 0:
+                        return self._locate(value, start, states[j], (a, before), (b, after))
+                    if not math.isfinite(after):
+                        raise RuntimeError(
+                            f"`event_fn` found no zero: the solution became non-finite after an elapsed time of "
+                            f"{a:.6g}. Check y0, or use a smaller dt."
+                        )
+                    a, before = b, after
             k, y, chunk = k + chunk, states[-1], min(2 * chunk, 1024)
         raise RuntimeError(f"`event_fn` found no zero within {MAX_EVENT_STEPS:,} steps: check that there is one.")
 
-    def _locate(self, value: Callable[[float, Tensor], float], a: float, y: Tensor, g_a: float, g_b: float) -> float:
-        b = a + self.h
+    def _samples(self, states: Tensor) -> Tensor:
+        """States (n, parts − 1, ..., 2d) that divide the steps from `states` (n, ..., 2d) into equal parts."""
+        longest = abs(self.h) if self.system is None else self.system.dt
+        parts = max(1, math.ceil(abs(self.h) / longest * (1 - _EPS)))
+        repeated = states[:, None].expand(-1, parts - 1, *states.shape[1:])
+        fractions = torch.arange(1, parts, dtype=states.dtype, device=states.device) / parts
+        h = (self.h * fractions).reshape(-1, *[1] * (states.ndim - 2)).expand(repeated.shape[:-1])
+        return repeated if parts == 1 else self.integrator.step(self.system, 0.0, repeated, h)
+
+    def _locate(
+        self,
+        value: Callable[[float, Tensor], float],
+        start: float,
+        y: Tensor,
+        left: tuple[float, float],
+        right: tuple[float, float],
+    ) -> float:
+        """The zero between two (s, g), in the step from y at `start`."""
+        (a, g_a), (b, g_b) = left, right
         known = {a: g_a, b: g_b}
 
         def f(s: float) -> float:
             if s in known:
                 return known[s]
-            return value(s, self.integrator.step(self.system, 0.0, y, s - a))
+            return value(s, self.integrator.step(self.system, 0.0, y, s - start))
 
         return b if g_b == 0 else float(brentq(f, a, b, xtol=_EPS, rtol=_EPS))
