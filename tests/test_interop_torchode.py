@@ -6,7 +6,8 @@ import torch
 
 torchode = pytest.importorskip("torchode", reason="torchode is an optional peer: pip install torchode")
 
-from sympflow import SympFlow, get, solve, systems  # noqa: E402
+from sympflow import SympFlow, available, get, solve, systems  # noqa: E402
+from sympflow.integrators.base import FixedStep  # noqa: E402
 from sympflow.interop.torchode import register, step_method  # noqa: E402
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
@@ -25,7 +26,14 @@ def run(method, y0, t_eval, dt, **arguments):
     )
 
 
-@pytest.mark.parametrize(("name", "dt"), [("verlet", 0.1), ("kahan_li8", 0.25), ("sympflow", 1.0)])
+CLASSICAL = [
+    name
+    for name in available()
+    if issubclass(get(name), FixedStep) and get(name).on_grid and name not in ("sympflow", "mlp")
+]
+
+
+@pytest.mark.parametrize(("name", "dt"), [*((name, 0.1) for name in CLASSICAL), ("kahan_li8", 0.25), ("sympflow", 1.0)])
 def test_each_sample_has_its_own_times(name, dt):
     register(name, HH)
     y0 = torch.tensor(HH.domain.sample(3, 0))
