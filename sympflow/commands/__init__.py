@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from sympflow import __version__
-from sympflow.commands import comparing, listing, solving, training
+from sympflow.commands import comparing, limits, listing, solving, training
 from sympflow.commands.output import out
 
 PARAMETERS = {"allow_extra_args": True, "ignore_unknown_options": True}
@@ -20,6 +20,7 @@ app.command(context_settings=PARAMETERS)(listing.flows)
 app.command(context_settings=PARAMETERS)(solving.solve)
 app.command(context_settings=PARAMETERS)(comparing.compare)
 app.command(context_settings=PARAMETERS)(comparing.bench)
+app.command(context_settings=PARAMETERS)(limits.stability)
 app.command(context_settings=PARAMETERS)(training.train)
 
 

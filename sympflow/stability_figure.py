@@ -1,0 +1,119 @@
+"""Figures of stability: energy error against the step, and maps of step against stiffness."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sympflow.figure_style import TEXT, dress, method_styles, new_figure
+from sympflow.stability_report import StabilityReport, StabilityRow
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SMALLEST, LARGEST = 1e-15, 1e3
+UNSTABLE = "#5A1020"
+_GREEK = {"omega": "ω"}
+
+
+def stability_figure(report: StabilityReport, kind: str | None = None) -> Figure:
+    """The figure "map" or "steps" of a report.
+
+    Raises
+    ------
+    ValueError
+        For another kind, or a map of a single system.
+    """
+    kind = kind or ("map" if len(report.systems) > 1 else "steps")
+    if kind == "steps":
+        return _steps(report)
+    if kind != "map":
+        raise ValueError(f"`kind` must be 'steps' or 'map'; got {kind!r}.")
+    if len({row.value for row in report.rows}) < 2:
+        raise ValueError("`kind` 'map' needs several systems that differ in a parameter: pass a family to stability().")
+    return _map(report)
+
+
+def _steps(report: StabilityReport) -> Figure:
+    """A panel for each system: energy error against the step, unstable steps as crosses at the top."""
+    figure = new_figure(5.6 * len(report.systems), 4.2)
+    axes = figure.subplots(1, len(report.systems), squeeze=False)[0]
+    styles = method_styles(list(dict.fromkeys((r.label, r.method) for r in report.rows)))
+    names = list(dict.fromkeys(r.system for r in report.rows))
+    for ax, name in zip(axes, names, strict=False):
+        rows = [r for r in report.rows if r.system == name and r.energy_error is not None]
+        for label, dtype in dict.fromkeys((r.label, r.dtype) for r in rows):
+            own = [r for r in rows if (r.label, r.dtype) == (label, dtype)]
+            _curve(ax, own, styles[label], "" if dtype == "float64" else f" ({dtype})")
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        ax.set_ylim(SMALLEST / 3, 3 * LARGEST)
+        dress(ax, "step", "largest |energy error|, relative")
+        ax.set_title(name, loc="left", fontsize=10, color=TEXT)
+    handles = {h.get_label(): h for ax in axes for h in ax.lines if not str(h.get_label()).startswith("_")}
+    figure.legend(
+        handles=list(handles.values()),
+        loc="outside upper center",
+        ncols=min(len(handles), 6) or 1,
+        frameon=False,
+        fontsize=9,
+    )
+    return figure
+
+
+def _curve(ax: Axes, rows: list[StabilityRow], style: tuple[str, str], note: str) -> None:
+    colour, marker = style
+    fixed = [(r.dt, _shown(r)) for r in rows if r.dt is not None]
+    line: dict[str, Any] = {"color": colour, "lw": 1.2, "ls": "--" if note else "-", "mec": "white", "mew": 0.6}
+    if fixed:
+        ax.plot(*zip(*fixed, strict=True), marker=marker, ms=5.5, label=rows[0].label + note, **line)
+    elif rows:  # adaptive: no step
+        ax.axhline(_shown(rows[0]), color=colour, lw=1.0, ls=":", label=rows[0].label + note)
+    lost = [r.dt for r in rows if r.dt is not None and r.status == "unstable"]
+    if lost:
+        ax.plot(lost, [LARGEST] * len(lost), "x", color=colour, ms=7, mew=1.6)
+
+
+def _shown(row: StabilityRow) -> float:
+    error = row.energy_error
+    return LARGEST if error is None or not math.isfinite(error) else min(max(error, SMALLEST), LARGEST)
+
+
+def _map(report: StabilityReport) -> Figure:
+    """A panel for each method: step against stiffness, coloured by energy error; unstable cells dark."""
+    from matplotlib.colors import LogNorm
+
+    labels = list(dict.fromkeys(r.label for r in report.rows if r.energy_error is not None and r.dt is not None))
+    columns = min(3, len(labels)) or 1
+    lines = -(-len(labels) // columns) or 1
+    figure = new_figure(3.6 * columns + 1.0, 3.0 * lines + 0.4)
+    axes = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    norm, image = LogNorm(1e-10, 10), None
+    for ax, label in zip(axes, labels, strict=False):
+        rows = [r for r in report.rows if r.label == label and r.dt is not None and r.energy_error is not None]
+        x, y = np.array([r.dt for r in rows]), np.array([r.value for r in rows])
+        error = np.array([_shown(r) for r in rows])
+        bad = np.array([r.status == "unstable" for r in rows])
+        image = ax.scatter(
+            x[~bad], y[~bad], c=np.clip(error[~bad], norm.vmin, norm.vmax), norm=norm, cmap="viridis", marker="s", s=34
+        )
+        ax.scatter(x[bad], y[bad], c=UNSTABLE, marker="x", s=22, lw=1.0)
+        limits = [
+            (x.stable, x.value) for x in report.limits if x.label == label and x.stable is not None and x.unstable
+        ]
+        if limits:
+            ax.plot(*zip(*limits, strict=True), color="#D55E00", lw=1.4)
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        parameter = next((r.parameter for r in rows if r.parameter), "parameter")
+        dress(ax, "step", _GREEK.get(parameter, parameter))
+        ax.set_title(label, loc="left", fontsize=10, color=TEXT)
+    for ax in axes[len(labels) :]:
+        ax.set_visible(False)
+    if image is not None:
+        bar = figure.colorbar(image, ax=list(axes), shrink=0.9)
+        bar.set_label("largest |energy error|, relative (×: unstable)", fontsize=9, color=TEXT)
+    return figure

@@ -1,0 +1,165 @@
+"""stability(): the limits that are known, blow-ups told apart, and what is refused."""
+
+import csv
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import sympflow
+from sympflow import get, solve, stability, systems
+from sympflow.commands import app
+from sympflow.singularities import blow_up
+from sympflow.step_stability import initial_states
+
+SINGULARITY = 5.450984210235402  # of Hénon–Heiles from q = 0, p = (0, 0.7)
+
+
+@pytest.mark.parametrize("method", ["verlet", "leapfrog"])
+@pytest.mark.parametrize("omega", [1.0, 1e3, 1e6])
+def test_the_limit_of_an_oscillator_is_two_at_every_frequency(method, omega):
+    report = stability(systems.harmonic_oscillator(omega), [method], steps=[1 / omega, 3 / omega], metrics=("energy",))
+    (limit,) = report.limits
+    assert abs(limit.stable * omega - 2) < 0.02
+    assert abs(limit.unstable * omega - 2) < 0.02
+
+
+def test_two_is_unstable_though_one_state_does_not_show_it():
+    oscillator = systems.harmonic_oscillator()
+    alone = solve(oscillator, "verlet", (0.0, 2e3), dt=2.0)
+    assert sympflow.max_energy_error(alone) == 0
+    kinds = {}
+    for z in (1.98, 2.0, 2.02):
+        report = stability(oscillator, ["verlet"], steps=[z], metrics=("energy",), limits=False)
+        kinds[z] = report.rows[0].status
+    assert kinds == {1.98: "stable", 2.0: "unstable", 2.02: "unstable"}
+
+
+def test_an_overflow_is_never_a_small_error():
+    (row,) = stability(systems.harmonic_oscillator(), ["verlet"], steps=[2.5], limits=False).rows
+    assert row.status == "unstable"
+    assert row.energy_error == np.inf
+    assert not row.singular
+    assert "grows by a factor 4 a step" in row.reason  # z²/2 − 1 + √((z²/2 − 1)² − 1) at z = 2.5
+    assert row.blow_up == solve(systems.harmonic_oscillator(), "verlet", (0, 2500), dt=2.5).stats["failed_at"]
+
+
+@pytest.mark.parametrize("dt", [0.2, 0.1, 0.02])
+@pytest.mark.parametrize("method", ["verlet", "leapfrog", "kahan_li8", "implicit_midpoint", "gauss_legendre4", "rk4"])
+def test_a_singularity_is_found_within_a_step(method, dt):
+    system = systems.henon_heiles_escape()
+    sol = solve(system, method, (0.0, 10.0), dt=dt)
+    assert sol.status == -1
+    end = blow_up(system, get(method)(dt=dt), (0.0, 10.0), system.y0, sol.stats["failed_at"])
+    assert end.singular
+    assert abs(end.time - SINGULARITY) < dt
+
+
+def test_rows_of_a_singular_solution():
+    report = stability(systems.henon_heiles_escape(), ["kahan_li8", "rk45"], steps=[0.1], t_span=(0, 20))
+    fixed, adaptive = report.rows
+    assert fixed.status == adaptive.status == "unstable"
+    assert fixed.singular
+    assert abs(fixed.blow_up - SINGULARITY) < 0.1
+    assert abs(adaptive.blow_up - SINGULARITY) < 0.1
+    assert fixed.domain_exit < SINGULARITY
+    assert report.limits[0].stable is None
+    assert "singular" in report.limits[0].reached
+
+
+def test_initial_states_lie_on_one_orbit():
+    system = systems.kepler(0.9)
+    states = initial_states(system, None)
+    assert states.shape == (4, 4)
+    np.testing.assert_array_equal(states[0], system.y0)
+    np.testing.assert_allclose(system.hamiltonian(states), -0.5, rtol=1e-8)
+    given = np.ones((3, 4))
+    np.testing.assert_array_equal(initial_states(system, given), given)
+
+
+def test_both_precisions_and_every_metric(tmp_path):
+    report = stability(systems.pendulum(), ["verlet", "gauss_legendre4"], steps=[0.1], dtypes=["float64", "float32"])
+    double, single = report.rows[:2]
+    assert (double.dtype, single.dtype) == ("float64", "float32")
+    assert double.symplecticity_defect < 1e-14 < single.symplecticity_defect < 1e-5
+    assert double.volume_error < 1e-12 < single.volume_error < 1e-3
+    assert double.status == single.status == "stable"
+    assert abs(double.energy_drift) < 5 * double.energy_drift_error + 1e-9
+    path = report.to_csv(tmp_path / "rows.csv")
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["energy_error"]) for row in rows] == [row.energy_error for row in report.rows]
+    assert "longest stable step" in report.table()
+
+
+def test_a_flow_is_run_up_to_its_dt_and_refused_beyond():
+    report = stability(systems.pendulum(), ["sympflow"], metrics=("energy", "domain"))
+    dt = solve(systems.pendulum(), "sympflow", (0, 1)).stats["dt"]
+    assert [row.dt for row in report.rows] == [dt / 4, dt / 2, dt]
+    assert report.limits[0].stable == dt
+    assert report.limits[0].reached == "all up to the flow's Δt"
+    (row,) = stability(systems.pendulum(), ["sympflow"], steps=[2 * dt]).rows
+    assert row.status == "not applicable"
+    assert row.reason.startswith("`dt` must be at most the flow's Δt")
+
+
+def test_what_does_not_apply_is_a_row_with_its_reason():
+    report = stability(systems.nonseparable(), ["verlet", "implicit_midpoint"], steps=[0.05], metrics=("energy",))
+    assert [row.status for row in report.rows] == ["not applicable", "stable"]
+    assert "is not" in report.rows[0].reason
+    assert [limit.label for limit in report.limits] == ["implicit_midpoint"]
+
+
+def test_a_map_of_a_family(tmp_path):
+    pytest.importorskip("matplotlib")
+    family = [systems.harmonic_oscillator(omega) for omega in (1.0, 10.0)]
+    report = stability(family, ["verlet", "implicit_midpoint"], steps=[0.1, 1.0], metrics=("energy",), limits=False)
+    assert [(row.value, row.status) for row in report.rows if row.label == "verlet"] == [
+        (1, "stable"),
+        (1, "stable"),
+        (10, "stable"),
+        (10, "unstable"),
+    ]
+    for kind in ("map", "steps"):
+        report.plot(tmp_path / f"{kind}.png", kind)
+        assert (tmp_path / f"{kind}.png").stat().st_size > 5000
+    with pytest.raises(ValueError, match=r"^`kind` must be 'steps' or 'map'"):
+        report.figure("pie")
+    with pytest.raises(ValueError, match=r"^`kind` 'map' needs several systems"):
+        stability(family[0], ["verlet"], steps=[0.1], limits=False).figure("map")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"steps": [0.1, -1]}, r"^`steps` must be positive and finite"),
+        ({"steps": 0.1}, r"^`steps` must be a list"),
+        ({"metrics": "energy"}, r"^`metrics` must be a list"),
+        ({"metrics": ["speed"]}, r"^`metrics` must be a list of names from"),
+        ({"dtypes": ["float16"]}, r"^`dtypes` must be"),
+        ({"bound": np.nan}, r"^`bound` must be positive"),
+        ({"min_steps": 0}, r"^`min_steps` must be a positive integer"),
+        ({"t_span": (1, 1)}, r"^`t_span` has length zero"),
+        ({"y0": np.zeros((2, 2, 2))}, r"^`y0` must have shape"),
+    ],
+)
+def test_bad_arguments(arguments, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        stability(systems.pendulum(), ["verlet"], **arguments)
+    with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem or a sequence"):
+        stability([1], ["verlet"])
+
+
+def test_the_command(tmp_path):
+    pytest.importorskip("matplotlib")
+    words = ["stability", "harmonic-oscillator", "--vary", "omega=1,1000", "--methods", "verlet", "--metrics", "energy"]
+    result = CliRunner().invoke(app, [*words, "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    assert result.output.count("harmonic oscillator, ω = 1000  verlet") >= 1
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "harmonic-oscillator-stability.csv",
+        "harmonic-oscillator-stability.png",
+    }
+    result = CliRunner().invoke(app, ["stability", "pendulum", "--vary", "omega=1"])
+    assert result.exit_code == 2
+    assert "which is not a parameter of pendulum" in result.output
