@@ -113,7 +113,7 @@ class FlowSolver(OdeSolver):
         self._t_anchor, self._anchor = float(t0), self.y
         self._next_anchor = (self._t_anchor, self.y)
         self._ahead: deque[np.ndarray] = deque()
-        self._block = 1
+        self._block, self._backend = 1, "auto"
 
     def _check(self, fun: Callable[..., Any]) -> None:
         self._solved: Any = self.system
@@ -184,15 +184,15 @@ class FlowSolver(OdeSolver):
             n = min(self._block, self._grid.n_steps - self._k)
             self._block = min(2 * self._block, LOOK_AHEAD)
             piece = Problem(self._solved, self._t_anchor, self._t_anchor + n * self._grid.h, self._anchor)
-            states, _, backend = self._counting.rollout(piece, self._grid.h, n, np.arange(1, n + 1))
+            states, _, self._backend = self._counting.rollout(piece, self._grid.h, n, np.arange(1, n + 1))
             self._ahead.extend(states)
-            self.nfev += self._counting.evaluations(n, n, 0, backend)["force_evaluations"]
+            self.nfev += self._counting.evaluations(n, n, 0, self._backend)["force_evaluations"]
         return self._ahead.popleft()
 
     def _shorter(self, h: float) -> np.ndarray:
         with np.errstate(all="ignore"):
-            y = self._counting.step(self._solved, self._t_anchor, self._anchor, h)
-        self.nfev += self._counting.evaluations(0, 0, 1, "array")["force_evaluations"]
+            y = self._counting.substep(self._solved, self._anchor, h, self._backend)
+        self.nfev += self._counting.evaluations(0, 0, 1, self._backend)["force_evaluations"]
         return y
 
     def _dense_output_impl(self) -> DenseOutput:
@@ -211,7 +211,7 @@ class FlowOutput(DenseOutput):
 
     def __init__(self, solver: Any, t_anchor: float, anchor: np.ndarray) -> None:
         super().__init__(solver.t_old, solver.t)
-        self._integrator, self._system = solver._counting, solver._solved
+        self._integrator, self._system, self._backend = solver._counting, solver._solved, solver._backend
         self._t_anchor, self._anchor, self._y = t_anchor, anchor, solver.y
         self._evaluations = solver._evaluations
 
@@ -223,7 +223,7 @@ class FlowOutput(DenseOutput):
         states[times == self.t] = self._y
         if moving.any():
             with np.errstate(all="ignore"):
-                states[moving] = self._integrator.step(self._system, self._t_anchor, states[moving], h[moving])
-            counts = self._integrator.evaluations(0, 0, int(np.count_nonzero(moving)), "array")
+                states[moving] = self._integrator.substep(self._system, states[moving], h[moving], self._backend)
+            counts = self._integrator.evaluations(0, 0, int(np.count_nonzero(moving)), self._backend)
             self._evaluations.total += counts["force_evaluations"]
         return states.T if t.ndim else states[0]
