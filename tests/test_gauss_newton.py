@@ -23,7 +23,14 @@ MASSES = HamiltonianSystem.from_sympy(
     name="masses",
     domain=sympflow.Ball([0.0] * 6, 1.0),
 )
-QUICK = {"optimizer": "gauss-newton", "restarts": 3, "points": 60, "reference_states": 30, "progress": False}
+QUICK = {
+    "optimizer": "gauss-newton",
+    "restarts": 3,
+    "steps": 100,
+    "points": 60,
+    "reference_states": 30,
+    "progress": False,
+}
 
 
 def weights(flow):
@@ -135,6 +142,51 @@ def test_a_table_is_continued_to_all_times():
     np.testing.assert_allclose(offset[0] + design[0] @ theta, target, atol=1e-8)
     constant = table.parameters()
     np.testing.assert_allclose(table.continued(offset[0] + design[0] @ constant), constant, atol=1e-12)
+
+
+def without_symbols(kind):
+    """Hénon–Heiles by a torch function, or by Numba functions."""
+    numba = pytest.importorskip("numba")
+    if kind == "torch":
+        return HamiltonianSystem(
+            lambda q: (q * q).sum(-1) / 2 + q[..., 0] ** 2 * q[..., 1] - q[..., 1] ** 3 / 3, ndof=2, domain=HH.domain
+        )
+
+    @numba.njit
+    def potential(q):
+        return (q[0] ** 2 + q[1] ** 2) / 2 + q[0] ** 2 * q[1] - q[1] ** 3 / 3
+
+    @numba.njit
+    def slope(q, out):
+        out[0], out[1] = q[0] + 2 * q[0] * q[1], q[1] + q[0] ** 2 - q[1] ** 2
+
+    @numba.njit
+    def product(q, v, out):
+        out[0] = (1 + 2 * q[1]) * v[0] + 2 * q[0] * v[1]
+        out[1] = 2 * q[0] * v[0] + (1 - 2 * q[1]) * v[1]
+
+    return HamiltonianSystem(potential, gradient=slope, hessian_vector=product, ndof=2, domain=HH.domain)
+
+
+@pytest.mark.parametrize("kind", ["torch", "numba"])
+@pytest.mark.parametrize("force_gradient", [True, False])
+def test_derivatives_without_symbols(kind, force_gradient):
+    """Third derivatives by a difference of Hessians, exact for a cubic potential up to rounding."""
+    sequence = ["drift", "kick"] * 2
+    steps = [TableStep(system, sequence, force_gradient) for system in (HH, without_symbols(kind))]
+    c = np.random.default_rng(0).normal(0, 0.3, (steps[0].n_coefficients, 5))
+    y = HH.domain.sample(5, 0).T
+    for one, other in zip(*(step.with_jacobian(c, y) for step in steps), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-11)
+    np.testing.assert_allclose(steps[1](c, y), steps[0](c, y), atol=1e-14)
+
+
+def test_a_system_of_numba_functions_is_fitted_like_its_symbols():
+    system = without_symbols("numba")
+    short = {**QUICK, "steps": 30}
+    a, b = (train(s, flow=SympFlow.primed(s, 2), **short) for s in (HH, system))
+    assert b.figures["one_step_error"] == pytest.approx(a.figures["one_step_error"], rel=1e-2)
+    assert solve(system, b, (0.0, 5.0), y0=HH.y0).stats["backend"] == "compiled"
 
 
 # the search -----------------------------------------------------------------------------------------------------
@@ -340,9 +392,9 @@ def test_bad_arguments_are_named(arguments, error, message):
 
 
 def test_systems_it_does_not_apply_to():
-    with pytest.raises(ValueError, match=r"^`system` .* must be symbolic"):
-        plain = HamiltonianSystem(lambda q: q.square().sum(-1), ndof=1, domain=sympflow.Ball([0.0, 0.0], 1.0))
-        train(plain, **QUICK)
+    relativistic = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**2/2", domain=sympflow.Ball([0.0, 0.0], 1.0))
+    with pytest.raises(ValueError, match=r"^`system` .* must have a kinetic energy"):
+        train(relativistic, flow=SympFlow.primed(relativistic), **QUICK)
 
 
 def test_training_states_are_not_the_held_out_ones():

@@ -343,7 +343,8 @@ def primed(
     if not system.separable:
         raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
     if force_gradient is None:
-        force_gradient = system.quadratic_kinetic
+        functions = system.numba_functions
+        force_gradient = system.quadratic_kinetic and (functions is None or functions[2] is not None)
     elif force_gradient and not system.quadratic_kinetic:
         raise ValueError("`force_gradient` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
     if degree is None:

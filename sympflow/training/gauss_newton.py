@@ -36,6 +36,7 @@ FITTED = 2  # tables from which the polynomials are fitted
 SEARCH_STEPS = 60  # iterations from each start
 SEARCH_SHARE, FROZEN_SHARE = 0.4, 0.7  # of a time budget, that the search, and all work on frozen tables, may use
 FRACTIONAL_TIMES = 50
+FEWEST_POINTS, MOST_POINTS, COORDINATES = 40, 250, 1000
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ class GaussNewtonConfig:
 
     Parameters
     ----------
-    points : int
-        Number of labelled states, drawn from the domain.
+    points : int, optional
+        Number of labelled states, drawn from the domain: by default 250, and fewer for more than 4 degrees of freedom.
     label_times : int
         Number of equidistant times in (0, Δt] at which the states are labelled.
     frozen_weight : float
@@ -59,7 +60,7 @@ class GaussNewtonConfig:
         Held-out states of the figures.
     """
 
-    points: int = 250
+    points: int | None = None
     label_times: int = 8
     frozen_weight: float = 1.0
     restarts: int = 24
@@ -70,6 +71,8 @@ class GaussNewtonConfig:
     def __post_init__(self) -> None:
         for name in ("points", "label_times", "restarts", "steps", "reference_states"):
             value = getattr(self, name)
+            if name == "points" and value is None:
+                continue
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
@@ -107,7 +110,8 @@ class GaussNewtonRun:
         config: GaussNewtonConfig,
     ) -> GaussNewtonRun:
         step, table = TableStep(system, flow.sequence, flow.gradients is not None), Table(flow)
-        x = states(domain, config.points, config.seed, Stream.RESIDUAL)
+        points = config.points or min(MOST_POINTS, max(FEWEST_POINTS, COORDINATES // system.ndof))
+        x = states(domain, points, config.seed, Stream.RESIDUAL)
         t = flow.dt * np.arange(1, config.label_times + 1) / config.label_times
         labels = Labels.of(system, x, t)
         if len(labels.x) == 0:
@@ -194,7 +198,7 @@ class GaussNewtonRun:
             "step": len(self.minima),
             "loss": minimum.cost,
             "iterations": minimum.iterations,
-            **errors(self.flow, self.held_out),
+            **errors(self.flow, self.whole.step, self.held_out),
         }
         self.history.append(figures)
         return figures
@@ -281,12 +285,13 @@ def _distinct(minima: list[Minimum]) -> list[Minimum]:
     return kept
 
 
-@torch.no_grad()
-def errors(flow: PrimedFlow, labels: Labels) -> dict[str, float]:
+def errors(flow: PrimedFlow, step: TableStep, labels: Labels) -> dict[str, float]:
     """‖ψ̄_t(x) − φ_H,t(x)‖ at the labels: mean and largest at Δt, the last time; mean over the times before it."""
-    t = torch.as_tensor(labels.t, dtype=flow.dtype, device=flow.device)[:, None]
-    x = torch.as_tensor(labels.x, dtype=flow.dtype, device=flow.device)
-    error = np.linalg.norm(flow.psi(t, x).cpu().numpy() - labels.y, axis=-1)
+    table = Table(flow)
+    offset, design = table.polynomial(labels.t)
+    coefficients = offset + design @ table.parameters()
+    psi = np.stack([step(c[:, None], labels.x.T).T for c in coefficients])
+    error = np.linalg.norm(psi - labels.y, axis=-1)
     return {
         "one_step_error": float(error[-1].mean()),
         "one_step_error_max": float(error[-1].max()),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -74,8 +75,9 @@ class TableFit:
 
     def minimize(self, theta: np.ndarray, iterations: int, stop: Callable[[], bool], thorough: bool = False) -> Minimum:
         """Least squares from θ; a thorough one goes on where little is gained, as along a narrow curved valley."""
-        until = {"patience": 20, "gain": 1e-3} if thorough else {}
-        return levenberg_marquardt(self.residuals, self.linearized, theta, iterations=iterations, stop=stop, **until)
+        patience, gain = (20, 1e-3) if thorough else (10, 1e-2)
+        limits: dict[str, Any] = {"iterations": iterations, "patience": patience, "gain": gain, "stop": stop}
+        return levenberg_marquardt(self.residuals, self.linearized, theta, **limits)
 
 
 class Table:

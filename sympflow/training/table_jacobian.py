@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from sympflow.system import HamiltonianSystem
+from sympflow.training.table_forces import forces_of
 
 
 class TableStep:
-    """The map of alternating kicks p += w F(q) + g ∇²V M⁻¹∇V(q) and drifts q += a M⁻¹p of a symbolic system.
+    """The map of kicks p += w F(q) + g ∇²V M⁻¹∇V(q) and drifts q += a M⁻¹p of a system.
 
     Arrays are feature-major: states y (2d, P). A coefficient is a row of P numbers, one a state, so that states may
     be at different times: c (n, P), or (n, 1).
@@ -19,21 +19,21 @@ class TableStep:
     Parameters
     ----------
     system : HamiltonianSystem
-        Symbolic and separable, with T = ½ pᵀM⁻¹p.
+        Separable, with T = ½ pᵀM⁻¹p.
     sequence : sequence of "kick" or "drift"
     force_gradient : bool
         Whether the kicks have the term g.
     """
 
     def __init__(self, system: HamiltonianSystem, sequence: Sequence[str], force_gradient: bool) -> None:
-        if system.symbols is None or not system.quadratic_kinetic:
+        if not system.quadratic_kinetic:
             raise ValueError(
-                f"`system` {system.name!r} must be symbolic with a kinetic energy ½ pᵀM⁻¹p for Gauss–Newton training: "
-                "define it by HamiltonianSystem.from_sympy, or use optimizer='bfgs'."
+                f"`system` {system.name!r} must have a kinetic energy ½ pᵀM⁻¹p for its table to be fitted by "
+                "Gauss–Newton steps: use optimizer='bfgs'."
             )
         self.ndof, self.sequence, self.force_gradient = system.ndof, tuple(sequence), force_gradient
         self._inverse_mass = system.kinetic_hessian(np.zeros(system.ndof))
-        self._forces = _Forces(system.symbols, force_gradient)
+        self._forces = forces_of(system, force_gradient)
         n = len(sequence)
         kicks = [i for i in range(n) if sequence[i] == "kick"]
         self.n_coefficients = n + (len(kicks) if force_gradient else 0)
@@ -99,45 +99,3 @@ def _apply(A: np.ndarray, v: np.ndarray) -> np.ndarray:
     for k in range(1, len(v)):
         result += A[:, k] * v[k]
     return result
-
-
-class _Forces:
-    """F = −∇V, G = ∇²V M⁻¹∇V and their Jacobians, generated from the symbols: (d, P) and (d, d, P)."""
-
-    def __init__(self, symbols: Any, force_gradient: bool) -> None:
-        import sympy as sp
-
-        d = symbols.ndof
-        slope = sp.Matrix([sp.diff(symbols.V, s) for s in symbols.q])
-        G = sp.hessian(symbols.V, symbols.q) * symbols.inverse_mass * slope if force_gradient else sp.zeros(0, 1)
-        values = [*(-slope), *G]
-        jacobians = [*(-slope).jacobian(symbols.q), *(G.jacobian(symbols.q) if force_gradient else [])]
-        self._d, self._n = d, len(values)
-        self._values = _generated(symbols.q, values)
-        self._all = _generated(symbols.q, [*values, *jacobians])
-
-    def values(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rows = self._values(q)
-        return rows[: self._d], rows[self._d :]
-
-    def all(self, q: np.ndarray) -> tuple[np.ndarray, ...]:
-        d, n = self._d, self._n
-        rows = self._all(q)
-        jacobians = rows[n:].reshape(-1, d, q.shape[1])
-        return rows[:d], rows[d:n], jacobians[:d], jacobians[d:]
-
-
-def _generated(variables: Sequence[Any], expressions: list[Any]) -> Callable[[np.ndarray], np.ndarray]:
-    """The expressions as one function of (d, P), with common subexpressions shared: (n, P)."""
-    import sympy as sp
-
-    function = sp.lambdify(variables, expressions, modules="numpy", cse=True)
-
-    def evaluate(q: np.ndarray) -> np.ndarray:
-        values = function(*q)
-        out = np.empty((len(values), q.shape[1]))
-        for i, value in enumerate(values):
-            out[i] = value
-        return out
-
-    return evaluate
