@@ -151,6 +151,8 @@ class FlowIntegrator(FixedStep):
         y0 = problem.y0
         flow = self._flow_like(problem.system, y0)
         kernel = _kernel(problem.system, flow, y0, problem.backend)
+        if isinstance(self, SympFlowIntegrator) and self.compensated:
+            kernel = self._compensated_kernel(problem, flow)
         if kernel is not None:
             rows = y0.reshape(-1, y0.shape[-1])
             states, finite = kernel.run_batch(h, rows, n_steps, save)
@@ -223,6 +225,8 @@ class SympFlowIntegrator(FlowIntegrator):
     tol : float, optional
         Take the cheapest shipped flow whose relative energy error up to T = 1000, the 95 % quantile over held-out
         states, is at most this; `sympflow.shipped_flows(system)` lists them. It says nothing of a smaller `dt`.
+    compensated : bool
+        Whether to sum with Kahan's compensation, which slows the growth of round-off. Compiled primed flows only.
 
     References
     ----------
@@ -231,6 +235,7 @@ class SympFlowIntegrator(FlowIntegrator):
     """
 
     tol: float | None = None
+    compensated: bool = False
 
     name: ClassVar[str] = "sympflow"
     symplectic: ClassVar[bool] = True
@@ -242,6 +247,17 @@ class SympFlowIntegrator(FlowIntegrator):
         for name in ("flow", "dt"):
             if getattr(self, name) is not None:
                 raise ValueError(f"`tol` chooses the flow and its Δt, but `{name}` is given: leave out one of them.")
+
+    def _compensated_kernel(self, problem: Problem, flow: Any) -> PrimedFlowKernel:
+        kernel = _kernel(problem.system, flow, problem.y0, problem.backend)
+        if kernel is None or not hasattr(flow, "kernel_scheme"):
+            raise ValueError(
+                "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave it out, or "
+                "take a flow of SympFlow.primed."
+            )
+        from sympflow.kernels.primed_flow import PrimedFlowKernel
+
+        return PrimedFlowKernel(flow, problem.system, compensated=True)
 
 
 @dataclass(frozen=True)

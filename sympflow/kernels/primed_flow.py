@@ -28,17 +28,20 @@ class PrimedFlowKernel:
         In float64 on the CPU.
     system : HamiltonianSystem
         The flow's, one that can be compiled.
+    compensated : bool
+        Whether runs sum with Kahan's compensation.
     """
 
-    def __init__(self, flow: PrimedFlow, system: HamiltonianSystem) -> None:
+    def __init__(self, flow: PrimedFlow, system: HamiltonianSystem, compensated: bool = False) -> None:
         if str(flow.dtype) != "torch.float64" or flow.device.type != "cpu":
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
-        self.flow, self._splitting = flow, splitting_kernel(system)
+        self.flow, self._splitting, self._compensated = flow, splitting_kernel(system), compensated
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` times ψ̄_h, or for h < 0 the inverse of ψ̄_|h|: see `SplittingKernel.run`."""
         start = self._prepared(abs(h), y0[None])[0]
-        Y, n_finite = self._splitting.run(_signed(self.flow.kernel_scheme(abs(h)), h), abs(h), start, n_steps, save)
+        scheme = _signed(self.flow.kernel_scheme(abs(h)), h)
+        Y, n_finite = self._splitting.run(scheme, abs(h), start, n_steps, save, self._compensated)
         return self._finished(abs(h), y0[None], Y[None], save)[0], n_finite
 
     def run_batch(
@@ -50,7 +53,7 @@ class PrimedFlowKernel:
             return Y[None], np.array([n_finite])
         start = self._prepared(abs(h), y0)
         scheme = _signed(self.flow.kernel_scheme(abs(h)), h)
-        Y, finite = self._splitting.run_batch(scheme, abs(h), start, n_steps, save, threads=threads)
+        Y, finite = self._splitting.run_batch(scheme, abs(h), start, n_steps, save, self._compensated, threads)
         return self._finished(abs(h), y0, Y, save), finite
 
     def step(self, h: ArrayLike, y: np.ndarray) -> np.ndarray:
