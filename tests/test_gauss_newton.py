@@ -301,8 +301,9 @@ def test_the_weight_at_dt_counts():
 
 def test_by_default_it_makes_a_primed_flow():
     flow = train(PENDULUM, 0.5, **QUICK)
-    assert (flow.dt, len(flow.sequence), flow.system) == (0.5, 13, PENDULUM)
-    assert flow.figures["one_step_error"] < 1e-8
+    assert (flow.dt, flow.system) == (0.5, PENDULUM)
+    assert flow.processor
+    assert flow.figures["one_step_error"] < 1e-5
 
 
 def test_what_is_trained_is_a_copy_and_stages_are_recorded(tmp_path):

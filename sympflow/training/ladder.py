@@ -17,8 +17,8 @@ from sympflow.systems import SYSTEMS
 from sympflow.timing import interleaved
 from sympflow.training.trainer import train
 
-REPEATS = 21
-FORCES = 20_000  # that a timed run evaluates, or thereabouts
+REPEATS = 15
+FORCES = 200_000  # that a timed run evaluates, or thereabouts
 
 
 @dataclass(frozen=True)
@@ -27,21 +27,29 @@ class Rung:
 
     Parameters
     ----------
-    stages, processor, dt
+    stages, dt, processor
         See `SympFlow.primed`.
+    restarts : int
+        Starts of the search.
     options : dict
-        Of `train`.
+        Other options of `train`.
     """
 
     stages: int
     dt: float
-    processor: int = 0
+    processor: int = 6
+    restarts: int = 12
     options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Of its file, after that of the scene."""
+        return f"primed-{self.stages}-{self.dt:g}"
 
     def train(self, system: HamiltonianSystem, t_end: float, **options: Any) -> PrimedFlow:
         """The flow with its certificate and figures."""
         start = SympFlow.primed(system, self.stages, dt=self.dt, processor=self.processor)
-        flow = train(system, flow=start, **{**self.options, **options})
+        flow = train(system, flow=start, **{"restarts": self.restarts, **self.options, **options})
         certify(flow, system, t_end)
         return flow
 
@@ -63,12 +71,12 @@ class Ladder:
     rungs: tuple[Rung, ...]
     t_end: float = 1000.0
 
-    def flows(self, stages: int | None = None, **options: Any) -> Iterator[tuple[Rung, PrimedFlow]]:
-        """Each rung and its flow, as they are made; or one rung only."""
+    def flows(self, rung: str | None = None, **options: Any) -> Iterator[tuple[Rung, PrimedFlow]]:
+        """Each rung and its flow, as they are made; or one rung only, by its name."""
         system = self.make()
-        for rung in self.rungs:
-            if stages in (None, rung.stages):
-                yield rung, rung.train(system, self.t_end, **options)
+        for each in self.rungs:
+            if rung in (None, each.name):
+                yield each, each.train(system, self.t_end, **options)
 
     def measure(self, flow: PrimedFlow) -> dict[str, Any]:
         """The figures by which flows are chosen, measured again."""
@@ -98,7 +106,7 @@ def cost(flow: SympFlow, system: HamiltonianSystem) -> float:
     if y0 is None:
         assert system.domain is not None
         y0 = system.domain.sample(1, 0)[0]
-    per_step = flow.scheme().force_evaluations if isinstance(flow, PrimedFlow) else 100
+    per_step = flow.kernel_scheme().force_evaluations if isinstance(flow, PrimedFlow) else 100
     n = max(1, FORCES // per_step)
     h = system.dt / 10  # the length of a step does not matter, but the orbit must stay finite
     calls = [
@@ -114,8 +122,14 @@ def cost(flow: SympFlow, system: HamiltonianSystem) -> float:
 def ladders() -> dict[str, Ladder]:
     """The ladders, by the name of the scene."""
     return {
-        "henon_heiles": Ladder(SYSTEMS["henon-heiles"], tuple(Rung(s, 1.0) for s in (2, 3, 4, 6, 8))),
-        "pendulum": Ladder(SYSTEMS["pendulum"], tuple(Rung(s, 1.0) for s in (2, 3, 4, 6, 8))),
-        "quartic": Ladder(SYSTEMS["quartic"], tuple(Rung(s, 1.0) for s in (2, 3, 4, 6, 8))),
-        "kepler": Ladder(SYSTEMS["kepler"], tuple(Rung(s, 0.1) for s in (2, 3, 4, 6, 8))),
+        "henon_heiles": Ladder(
+            SYSTEMS["henon-heiles"], _rungs((2, 1.5), (2, 1.0), (3, 1.0), (4, 1.0), (3, 0.6), (3, 0.4))
+        ),
+        "pendulum": Ladder(SYSTEMS["pendulum"], _rungs((1, 1.0), (2, 1.5), (2, 1.0), (3, 1.0), (3, 0.75), (3, 0.5))),
+        "quartic": Ladder(SYSTEMS["quartic"], _rungs((2, 1.0), (2, 0.6), (3, 0.6), (4, 0.6), (3, 0.4), (3, 0.25))),
+        "kepler": Ladder(SYSTEMS["kepler"], _rungs((2, 0.2), (2, 0.12), (3, 0.12), (4, 0.12), (3, 0.08), (3, 0.05))),
     }
+
+
+def _rungs(*sizes: tuple[int, float]) -> tuple[Rung, ...]:
+    return tuple(Rung(stages, dt) for stages, dt in sizes)

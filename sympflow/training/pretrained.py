@@ -2,7 +2,7 @@
 
 python -m sympflow.training.pretrained                                  all of them
 python -m sympflow.training.pretrained henon_heiles --kind sympflow     one
-python -m sympflow.training.pretrained kepler --stages 4                one rung of a ladder of primed flows
+python -m sympflow.training.pretrained kepler --rung primed-3-0.08      one rung of a ladder of primed flows
 python -m sympflow.training.pretrained --measure                        their figures, without training
 """
 
@@ -94,7 +94,7 @@ def recipes() -> dict[str, Recipe]:
 
 
 def path(name: str, kind: str, folder: Path | None = None) -> Path:
-    """The file of a scene's flow, in the package if no folder is given; a primed one's kind is primed-STAGES."""
+    """The file of a scene's flow, in the package if no folder is given; a primed one's kind is primed-STAGES-DT."""
     folder = Path(str(resources.files("sympflow"))) / "pretrained" if folder is None else folder
     return folder / f"{name}-{kind}.safetensors"
 
@@ -111,7 +111,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("scenes", nargs="*", metavar="scene", help=f"of {', '.join(scenes())}; all if none is named")
     parser.add_argument("--kind", choices=(*KINDS, "primed"), help="one architecture only")
-    parser.add_argument("--stages", type=int, help="one rung only of a ladder of primed flows")
+    parser.add_argument("--rung", help="one rung only of a ladder of primed flows: primed-STAGES-DT")
     parser.add_argument("--out", type=Path, help="folder to write to (default: the package)")
     parser.add_argument("--measure", action="store_true", help="only measure the files that are there")
     options = parser.parse_args(arguments)
@@ -119,7 +119,7 @@ def main(arguments: list[str] | None = None) -> None:
     if unknown:
         parser.error(f"unknown scene {', '.join(unknown)}: choose from {', '.join(scenes())}")
     torch.set_num_threads(1)  # the arrays are small, and one thread is reproducible
-    kinds = (options.kind,) if options.kind else ("primed",) if options.stages else (*KINDS, "primed")
+    kinds = (options.kind,) if options.kind else ("primed",) if options.rung else (*KINDS, "primed")
     for name in options.scenes or scenes():
         for kind in kinds:
             for file, figures in _made(name, kind, options):
@@ -135,12 +135,12 @@ def _made(name: str, kind: str, options: argparse.Namespace) -> Iterator[tuple[P
         ladder = ladders()[name]
         if options.measure:
             for rung in ladder.rungs:
-                file = path(name, f"primed-{rung.stages}", options.out)
-                if options.stages in (None, rung.stages):
+                file = path(name, rung.name, options.out)
+                if options.rung in (None, rung.name):
                     yield file, ladder.measure(load(file))
             return
-        for rung, flow in ladder.flows(options.stages):
-            flow.save(file := path(name, f"primed-{rung.stages}", options.out))
+        for rung, flow in ladder.flows(options.rung):
+            flow.save(file := path(name, rung.name, options.out))
             yield file, flow.figures
     elif name in recipes():
         recipe, file = recipes()[name], path(name, kind, options.out)

@@ -24,6 +24,7 @@ from sympflow.system import HamiltonianSystem
 from sympflow.training.collocation import Stream, states
 from sympflow.training.config import TrainingConfig
 from sympflow.training.gauss_newton import GaussNewtonConfig, GaussNewtonRun
+from sympflow.training.recipes import default_recipe
 from sympflow.training.run import Labelled, Path, Run
 
 SCALING_SAMPLES = 4096
@@ -79,7 +80,8 @@ def train(
     ----------
     system : HamiltonianSystem
     dt : float, optional
-        Δt, the longest time of the map; the default is 1, or that of `flow`.
+        Δt, the longest time of the map; the default is that of `flow`, for a new primed flow what suits the system's
+        frequencies on Ω (see `sympflow.training.recipes`), else 1.
     kind : {"primed", "sympflow", "mlp"}, optional
         The architecture: a SympFlow primed with the system's V and T; one with MLP potentials; or the unconstrained
         baseline with as many parameters as the SympFlow that `pairs` and `hidden` describe. The default is "primed"
@@ -89,7 +91,8 @@ def train(
     domain : Domain, optional
         Ω; the default is that of the system.
     stages, processor
-        Of a new primed flow, see `SympFlow.primed`.
+        Of a new primed flow, see `SympFlow.primed`; the defaults are 3 kicks, or as many as a given `dt` needs, and a
+        processor of 6.
     pairs, hidden, activation, dtype, device
         Of a new network, see `SympFlow`; the defaults are 3, (10, 10), "tanh" and float64 on the CPU.
     optimizer : {"gauss-newton", "adam", "bfgs", "lbfgs"}, optional
@@ -157,8 +160,7 @@ def train(
             raise ValueError(f"`dt` is {dt!r} but the flow has {flow.dt!r}: leave `dt` out to train it further.")
         dt, kind = flow.dt, "primed" if isinstance(flow, PrimedFlow) else flow.kind
         flow.check_system(system)
-    dt = 1.0 if dt is None else dt
-    if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf:
+    if dt is not None and (isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}.")
     kind = _kind(system, given) if kind is None else kind
     if kind not in KINDS:
@@ -169,14 +171,8 @@ def train(
                 raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
     optimizer = ("gauss-newton" if kind == "primed" else "adam") if optimizer is None else optimizer
     if flow is None and kind == "primed":
-        flow = SympFlow.primed(
-            system,
-            stages,
-            dt=float(dt),
-            dtype=torch.float64 if dtype is None else dtype,
-            device=device,
-            processor=0 if processor is None else processor,
-        )
+        flow = _primed(system, domain, dt, stages, processor, dtype, device)
+    dt = flow.dt if flow is not None else 1.0 if dt is None else float(dt)
     single = dtype not in (None, torch.float64) or (flow is not None and flow.dtype != torch.float64)
     if optimizer == "gauss-newton" and single:
         raise TypeError("`optimizer` 'gauss-newton' fits flows in float64: leave out `dtype`, or use 'adam'.")
@@ -204,7 +200,7 @@ def train(
         _refuse_options(given, ("learning_rate", "schedule", "clip"), f"optimizer {optimizer!r}")
     if kind == "mlp" and matching_weight:
         raise ValueError("`matching_weight` needs a Hamiltonian, which an MLP flow has not: leave it out.")
-    labels = None if data is None else _labels(data, system, float(dt))
+    labels = None if data is None else _labels(data, system, dt)
     if matching_weight is None:
         matching_weight = 0.0 if kind == "mlp" or optimizer == "gauss-newton" else 1.0
     config = TrainingConfig.of(
@@ -227,14 +223,14 @@ def train(
         validation_points=validation_points,
         reference_states=reference_states,
     )
-    scaling = Scaling.of_samples(states(domain, SCALING_SAMPLES, seed, Stream.SCALING), float(dt))
+    scaling = Scaling.of_samples(states(domain, SCALING_SAMPLES, seed, Stream.SCALING), dt)
     if flow is None:
         flow = SympFlow(
             system.ndof,
             3 if pairs is None else pairs,
             (10, 10) if hidden is None else hidden,
             "tanh" if activation is None else activation,
-            float(dt),
+            dt,
             torch.float64 if dtype is None else dtype,
             device,
             seed,
@@ -281,6 +277,33 @@ def _kind(system: HamiltonianSystem, given: dict[str, Any]) -> str:
     fits = system.separable and system.quadratic_kinetic and system.symbols is not None
     wants_network = given["optimizer"] not in (None, "gauss-newton") or _given(given, (*_OF_NETWORKS, *_NOT_OF_TABLES))
     return "primed" if fits and not wants_network else "sympflow"
+
+
+def _primed(
+    system: HamiltonianSystem,
+    domain: Domain,
+    dt: float | None,
+    stages: int | None,
+    processor: int | None,
+    dtype: torch.dtype | None,
+    device: torch.device | str | None,
+) -> PrimedFlow:
+    """A new primed flow: what is not given is as `default_recipe` has it, Δt in proportion to the kicks."""
+    recipe = None
+    if system.separable and (dt is None or stages is None or processor is None):
+        recipe = default_recipe(system, domain, dt)
+        if dt is None:
+            dt = recipe.dt if stages is None else float(f"{recipe.dt * stages / recipe.stages:.3g}")
+        stages = recipe.stages if stages is None else stages
+        processor = recipe.processor if processor is None else processor
+    return SympFlow.primed(
+        system,
+        stages,
+        dt=1.0 if dt is None else float(dt),
+        processor=0 if processor is None else processor,
+        dtype=torch.float64 if dtype is None else dtype,
+        device=device,
+    )
 
 
 def _given(given: dict[str, Any], names: Sequence[str]) -> list[str]:
