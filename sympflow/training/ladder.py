@@ -121,15 +121,13 @@ def cost(flow: SympFlow, system: HamiltonianSystem) -> float:
 
 def ladders() -> dict[str, Ladder]:
     """The ladders, by the name of the scene."""
-    return {
-        "henon_heiles": Ladder(
-            SYSTEMS["henon-heiles"], _rungs((2, 1.5), (2, 1.0), (3, 1.0), (4, 1.0), (3, 0.6), (3, 0.4))
-        ),
-        "pendulum": Ladder(SYSTEMS["pendulum"], _rungs((1, 1.0), (2, 1.5), (2, 1.0), (3, 1.0), (3, 0.75), (3, 0.5))),
-        "quartic": Ladder(SYSTEMS["quartic"], _rungs((2, 1.0), (2, 0.6), (3, 0.6), (4, 0.6), (3, 0.4), (3, 0.25))),
-        "kepler": Ladder(SYSTEMS["kepler"], _rungs((2, 0.2), (2, 0.12), (3, 0.12), (4, 0.12), (3, 0.08), (3, 0.05))),
+    sizes = {  # kicks and Δt
+        "henon-heiles": ((2, 1.5), (2, 1.0), (3, 1.0), (3, 0.8), (3, 0.6), (3, 0.4)),
+        "pendulum": ((2, 2.0), (2, 1.5), (3, 1.5), (3, 1.0), (3, 0.75), (3, 0.6)),
+        "quartic": ((2, 1.0), (2, 0.75), (3, 0.75), (3, 0.6), (3, 0.5), (3, 0.3)),
+        "kepler": ((2, 0.25), (2, 0.15), (3, 0.2), (3, 0.15), (3, 0.1), (3, 0.06)),
     }
-
-
-def _rungs(*sizes: tuple[int, float]) -> tuple[Rung, ...]:
-    return tuple(Rung(stages, dt) for stages, dt in sizes)
+    return {
+        scene.replace("-", "_"): Ladder(SYSTEMS[scene], tuple(Rung(stages, dt) for stages, dt in rungs))
+        for scene, rungs in sizes.items()
+    }
