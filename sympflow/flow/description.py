@@ -18,7 +18,8 @@ STAGE: dict[str, Any] = {
     "loss": str,
     "schedule": str,
     "ended_early": (str, type(None)),
-    **dict.fromkeys(("steps", "steps_taken", "best_step", "points", "seed"), int),
+    "points": (int, type(None)),
+    **dict.fromkeys(("steps", "steps_taken", "best_step", "seed"), int),
 }
 """The types of what every stage of training may record; its other entries are numbers, strings, booleans or None."""
 
