@@ -212,3 +212,7 @@ def test_a_method_that_does_not_apply_to_the_system_is_refused():
 def test_what_makes_no_integrator_is_refused():
     with pytest.raises(TypeError, match=r"^`factory` must make an Integrator; it made int"):
         check_integrator(lambda: 3)
+    with pytest.raises(TypeError, match=r"^`factory` must be an integrator's class, .* got a str"):
+        check_integrator("verlet")
+    with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem; got str"):
+        check_integrator(get("verlet"), "henon_heiles")

@@ -214,6 +214,10 @@ class TestBadInput:
         verlet = as_scipy("verlet", HH)
         with pytest.warns(UserWarning, match="atol, rtol have no effect"):
             solve_ivp(HH, (0, 1), HH.y0, method=verlet, rtol=1e-3, atol=1e-6)
+        with pytest.warns(UserWarning, match=r"dt have no effect .*; dt is an option of as_scipy"):
+            solve_ivp(HH, (0, 1), HH.y0, method=verlet, dt=0.1)
+        with pytest.raises(ValueError, match=r"^`max_step` must be positive; got 'a'"):
+            solve_ivp(HH, (0, 1), HH.y0, method=verlet, max_step="a")
         with pytest.raises(ValueError, match=r"^`max_step` must be positive"):
             solve_ivp(HH, (0, 1), HH.y0, method=verlet, max_step=-1)
         with pytest.raises(ValueError, match=r"^`t_span` must be finite"):

@@ -115,3 +115,8 @@ class FloatModule(torch.nn.Module):
 
     def forward(self, t, y):
         return self.layer(y)
+
+
+def test_what_is_no_function_is_refused():
+    with pytest.raises(TypeError, match=r"^`module` must be a function module\(t, y\) or a torch module; got str"):
+        from_module("pendulum", ndof=1)

@@ -157,6 +157,10 @@ class TestEvents:
         )
         assert end
 
+    def test_the_time_must_be_a_tensor(self):
+        with pytest.raises(TypeError, match=r"^`t0` must be a floating-point tensor with one time"):
+            odeint_event(HH, torch.tensor(HH.y0), 0.0, event_fn=lambda t, y: y[0], method="verlet")
+
     def test_no_event_is_an_error(self):
         with pytest.raises(RuntimeError, match=r"^`event_fn` found no zero: the solution became non-finite"):
             odeint_event(
@@ -286,6 +290,14 @@ def test_a_warning_where_func_is_another_system(rotation):
         ({"t": times(0.0, np.nan)}, ValueError, r"^`t` must be finite and strictly"),
         ({"t": torch.tensor([0, 1])}, TypeError, r"^`t` must be a one-dimensional floating"),
         ({"t": [0.0, 1.0]}, TypeError, r"^`t` must be a one-dimensional floating"),
+        ({"options": [0.1]}, TypeError, r"^`options` must be a dict"),
+        (
+            {"options": {"system": "pendulum"}},
+            TypeError,
+            r"^`options` has a 'system' that is no HamiltonianSystem: str",
+        ),
+        ({"method": "log_leapfrog"}, TypeError, r"^`method` 'log_leapfrog' takes steps that are not equal in t"),
+        ({"y0": times(1.0, np.nan)}, ValueError, r"^`y0` must be finite"),
         ({"y0": times(1.0)}, ValueError, r"^`y0` must have shape \(\.\.\., 2\)"),
         ({"y0": torch.tensor([1, 0])}, TypeError, r"^`y0` must be real floating-point"),
         ({"y0": torch.zeros(2, dtype=torch.complex128)}, TypeError, r"^`y0` must be real floating-point"),

@@ -103,6 +103,8 @@ def check_integrator(factory: Factory, system: HamiltonianSystem | None = None) 
         If the method does not apply to the system.
     """
     integrator = _made(factory)
+    if not (system is None or isinstance(system, HamiltonianSystem)):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     integrator.check(default_system() if system is None else system)
     passed, skipped = [], {}
     for check in CHECKS:
@@ -141,6 +143,9 @@ def parametrize_with_checks(factories: Iterable[Factory], system: HamiltonianSys
 
 
 def _made(factory: Factory) -> Integrator:
+    if not callable(factory):
+        what = f"a {type(factory).__name__}"
+        raise TypeError(f"`factory` must be an integrator's class, or a function that makes one; got {what}.")
     integrator = factory()
     if not isinstance(integrator, Integrator):
         raise TypeError(f"`factory` must make an Integrator; it made {type(integrator).__name__}.")

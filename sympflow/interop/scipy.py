@@ -93,12 +93,14 @@ class FlowSolver(OdeSolver):
         **extraneous: Any,
     ) -> None:
         if extraneous:
+            own = sorted(set(extraneous) & set(self.integrator.options()))
+            remedy = f"leave them out; {', '.join(own)} is an option of as_scipy" if own else "leave them out"
             warnings.warn(
-                f"The options {', '.join(sorted(extraneous))} have no effect on a fixed-step method: leave them out.",
+                f"The options {', '.join(sorted(extraneous))} have no effect on a fixed-step method: {remedy}.",
                 UserWarning,
                 stacklevel=3,
             )
-        if not max_step > 0:
+        if not (isinstance(max_step, int | float | np.number) and max_step > 0):
             raise ValueError(f"`max_step` must be positive; got {max_step!r}.")
         if not (math.isfinite(t0) and math.isfinite(t_bound)):
             raise ValueError(f"`t_span` must be finite; got ({t0}, {t_bound}). Choose an end that can be reached.")

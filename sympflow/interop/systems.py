@@ -79,6 +79,8 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
     ValueError
         If the field is not Hamiltonian, depends on t, or has another shape.
     """
+    if not callable(module):
+        raise TypeError(f"`module` must be a function module(t, y) or a torch module; got {type(module).__name__}.")
     probes = _probes(ndof, scene.get("y0"))
     try:
         with torch.no_grad():

@@ -111,6 +111,8 @@ def odeint_event(
             return torchdiffeq.odeint_event(_of_pairs(func, y0), y0, t0, **arguments)
     if odeint_interface is not odeint:
         raise _no_adjoint(kwargs["method"])
+    if not (isinstance(t0, Tensor) and t0.numel() == 1 and t0.is_floating_point()):
+        raise TypeError("`t0` must be a floating-point tensor with one time: use torch.tensor(0.0).")
     start = t0.reshape(-1)
     t = torch.cat([start, start.detach() + (-1.0 if reverse_time else 1.0)])
     return odeint(func, y0, t, event_fn=event_fn, **kwargs)
@@ -177,9 +179,13 @@ def _name(method: Any) -> str:
 
 def _build(func: Any, method: Any, options: dict[str, Any] | None) -> tuple[FixedStep, HamiltonianSystem | None]:
     """The integrator and the system that a call means."""
+    if not (options is None or isinstance(options, dict)):
+        raise TypeError(f"`options` must be a dict, such as {{'dt': 0.1}}; got {type(options).__name__}.")
     options = dict(options or {})
     options.pop("norm", None)  # torchdiffeq adds its own
     system = options.pop("system", func if isinstance(func, HamiltonianSystem) else None)
+    if not (system is None or isinstance(system, HamiltonianSystem)):
+        raise TypeError(f"`options` has a 'system' that is no HamiltonianSystem: {type(system).__name__}. Pass one.")
     if "step_size" in options and "dt" in options:
         raise TypeError("`options` has both 'step_size' and 'dt', two names of the step length: give one of them.")
     if "step_size" in options:
@@ -220,6 +226,8 @@ def _check_state(y: Tensor, system: HamiltonianSystem | None, integrator: Integr
         raise TypeError(f"`y0` must be real floating-point; got {y.dtype}. Use y0.double().")
     if y.ndim == 0 or y.shape[-1] != size:
         raise ValueError(f"`y0` must have shape (..., {size}), [q, p]; got {tuple(y.shape)}.")
+    if not torch.isfinite(y).all():
+        raise ValueError("`y0` must be finite; it holds NaN or infinity. Remove these states.")
 
 
 def _check_right_hand_side(
