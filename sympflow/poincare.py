@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import is_tensor
-from sympflow.integrators.base import Integrator
+from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import build
-from sympflow.solver import _check_t_span, _check_y0
+from sympflow.solver import _check_t_span, _check_y0, solve
 from sympflow.system import HamiltonianSystem
 from sympflow.tables import Column, text_table, write_csv
 
@@ -37,8 +37,8 @@ def poincare_section(
 ) -> PoincareSection:
     """The states in which trajectories cross the plane y[coordinate] = level.
 
-    Each crossing is located to rounding on the dense output of the method, a shorter step of it. The run streams: only
-    the crossings are stored.
+    Each crossing is located to rounding on the dense output of the method, as an event is: of fixed steps that is a
+    shorter step. The run streams: only the crossings are stored.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def poincare_section(
     t_span : (float, float), optional
         The default is the system's.
     y0 : array_like of shape (..., 2d), optional
-        One state, or a batch of them: the trajectories advance together. The default is the system's.
+        One state, or a batch of them. With fixed steps the trajectories advance together. The default is the system's.
     coordinate : int or str
         Index into [q, p], or a name such as "q1" or "p2".
     level : float
@@ -94,10 +94,13 @@ def poincare_section(
     if not (_is_number(sample) and sample > 0):
         raise ValueError(f"`sample` must be a positive number, a time; got {sample!r}.")
     rows = start.reshape(-1, start.shape[-1])
-    found = _Crossings(integrator, system, index, float(level), direction, float(sample))
-    for t, y, h in integrator.steps(system, span, rows):
-        found.search(t, y, h)
-    trajectory, times, states = found.result(system.ndof, np.sign(span[1] - span[0]))
+    if isinstance(integrator, FixedStep) and integrator.on_grid:
+        found = _Crossings(integrator, system, index, float(level), direction, float(sample))
+        for t, y, h in integrator.steps(system, span, rows):
+            found.search(t, y, h)
+        trajectory, times, states = found.result(system.ndof, np.sign(span[1] - span[0]))
+    else:
+        trajectory, times, states = _events(integrator, system, span, rows, index, float(level), direction, sample)
     return PoincareSection(system, integrator, span, rows, index, float(level), direction, trajectory, times, states)
 
 
@@ -203,8 +206,32 @@ class PoincareSection:
         return figure
 
 
+def _events(
+    integrator: Integrator,
+    system: HamiltonianSystem,
+    t_span: tuple[float, float],
+    rows: np.ndarray,
+    coordinate: int,
+    level: float,
+    direction: int,
+    sample: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The crossings of trajectories that take steps of their own: events of each."""
+
+    def g(t: float, y: np.ndarray) -> float:
+        return float(y[coordinate] - level)
+
+    g.direction = direction  # type: ignore[attr-defined]
+    runs = [
+        solve(system, integrator, t_span, y, t_eval=[], events=g, event_step=sample, on_domain_exit="ignore")
+        for y in rows
+    ]
+    times, states = zip(*((run.t_events[0], run.y_events[0]) for run in runs), strict=True)  # type: ignore[index]
+    return np.repeat(np.arange(len(rows)), [len(t) for t in times]), np.concatenate(times), np.concatenate(states)
+
+
 class _Crossings:
-    """Finds the crossings in the steps of a run as they stream by."""
+    """Finds the crossings in the steps of a run, those of all trajectories at once, as they stream by."""
 
     def __init__(
         self,

@@ -5,24 +5,24 @@ import pytest
 import torch
 
 import sympflow
-from sympflow import poincare_section, solve, systems
+from sympflow import available, poincare_section, solve, systems
+from sympflow.integrators.tableaux import ADAPTIVE
 
 HH, OSCILLATOR = systems.henon_heiles(), systems.harmonic_oscillator()
-METHODS = [("kahan_li8", {"dt": 0.1}), ("verlet", {"dt": 0.05}), ("sympflow", {}), ("dop853", {"rtol": 1e-10})]
 
 
-@pytest.mark.parametrize(("method", "options"), METHODS)
-def test_the_crossings_are_those_that_events_find(method, options):
+@pytest.mark.parametrize("method", available())
+def test_the_crossings_are_those_that_events_find(method):
     def g(t, y):
         return y[0]
 
     g.direction = 1
-    section = poincare_section(HH, method, (0.0, 60.0), sample=0.1, **options)
-    sol = solve(HH, method, (0.0, 60.0), t_eval=[], events=g, event_step=0.1, on_domain_exit="ignore", **options)
-    assert len(section) == len(sol.t_events[0]) > 5
-    tolerance = 1e-5 if method == "dop853" else 1e-12  # a bare step there, the interpolant here
-    np.testing.assert_allclose(section.t, sol.t_events[0], atol=tolerance)
-    np.testing.assert_allclose(section.states, sol.y_events[0], atol=tolerance)
+    options = {"rtol": 1e-4, "atol": 1e-6} if method in ADAPTIVE else {}
+    section = poincare_section(HH, method, (0.0, 20.0), sample=0.1, **options)
+    sol = solve(HH, method, (0.0, 20.0), t_eval=[], events=g, event_step=0.1, on_domain_exit="ignore", **options)
+    assert len(section) == len(sol.t_events[0]) > 1
+    np.testing.assert_allclose(section.t, sol.t_events[0], atol=1e-12)
+    np.testing.assert_allclose(section.states, sol.y_events[0], atol=1e-12)
     assert np.abs(section.states[:, 0]).max() < 1e-13
 
 
@@ -36,15 +36,16 @@ def test_all_zeros_of_cos_t_upwards_and_downwards(rotation):
 
 @pytest.mark.parametrize("direction", [-1, 0, 1])
 @pytest.mark.parametrize("t_end", [20.0, -20.0])
-def test_a_start_on_the_plane_counts_as_it_does_for_events(direction, t_end):
+@pytest.mark.parametrize("method", ["kahan_li8", "dop853"])
+def test_a_start_on_the_plane_counts_as_it_does_for_events(method, direction, t_end):
     def g(t, y):
         return y[0]
 
     g.direction = direction
     y0 = np.array([[0.0, 1.0], [0.0, -1.0], [0.5, 0.1]])  # the first leaves upwards, the second downwards
-    section = poincare_section(OSCILLATOR, "kahan_li8", (0, t_end), y0, direction=direction)
+    section = poincare_section(OSCILLATOR, method, (0, t_end), y0, direction=direction)
     for k in range(3):
-        sol = solve(OSCILLATOR, "kahan_li8", (0, t_end), y0[k], t_eval=[], events=g)
+        sol = solve(OSCILLATOR, method, (0, t_end), y0[k], t_eval=[], events=g)
         assert (0.0 in sol.t_events[0]) == (k < 2 and direction in (0, (-1) ** k * np.sign(t_end)))
         np.testing.assert_allclose(section.t[section.trajectory == k], sol.t_events[0], atol=1e-12)
 
@@ -98,7 +99,7 @@ def test_no_crossing():
         ({"level": np.nan}, ValueError, r"^`level` must be a finite number"),
         ({"level": "a"}, ValueError, r"^`level` must be a finite number.* got 'a'"),
         ({"y0": torch.zeros(4)}, TypeError, r"^`y0` is a tensor"),
-        ({"method": "explicit_adams"}, TypeError, r"no bare step|define steps"),
+        ({"method": "mlp", "t_span": (1, 0)}, ValueError, r"has no exact inverse"),
     ],
 )
 def test_bad_arguments_are_named(arguments, error, message):
