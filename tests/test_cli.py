@@ -154,6 +154,26 @@ def test_wrong_usage_ends_with_a_remedy_and_not_with_a_traceback(words, message)
     assert "Traceback" not in result.output
 
 
+def test_train_makes_a_primed_flow_unless_told_otherwise(tmp_path):
+    path = tmp_path / "flow.safetensors"
+    small = ("--stages", 1, "--processor", 0, "--dt", 0.4, "--restarts", 1, "--steps", 3, "--points", 20)
+    result = run("train", "pendulum", *small, "--out", path)
+    assert result.exit_code == 0, result.stderr
+    assert "fractional error" in result.stdout
+    assert run("solve", "pendulum", "--method", path, "--t-end", 1).exit_code == 0
+    refused = run("train", "pendulum", *small, "--pairs", 2, "--out", path)
+    assert refused.exit_code == 2
+    assert "`pairs` is not an option of flows of kind 'primed'" in refused.stderr
+
+
+def test_flows_are_listed():
+    everything = run("flows").stdout
+    assert "henon_heiles-sympflow" in everything
+    own = run("flows", "harmonic-oscillator", "--omega", 100).stdout
+    assert "harmonic_oscillator_100-sympflow" in own
+    assert "henon_heiles" not in own
+
+
 def test_train_writes_a_flow_that_solve_takes(tmp_path):
     path = tmp_path / "flow.safetensors"
     small = ["--pairs", 1, "--hidden", "4", "--epochs", 3, "--points", 40, "--seed", 1, "--dt", 0.2]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -14,19 +14,32 @@ from sympflow.commands.output import out, print_table, ready_file, reporting
 def train(
     ctx: typer.Context,
     system: Annotated[str, typer.Argument(help="See `sympflow systems`; its parameters as --omega 100.")],
-    dt: Annotated[float, typer.Option(help="Δt, the longest time of the map.")] = 1.0,
-    kind: Annotated[str, typer.Option(help="sympflow, or mlp for the unconstrained baseline.")] = "sympflow",
-    pairs: Annotated[int, typer.Option(help="Pairs of kick and drift.")] = 3,
-    hidden: Annotated[str, typer.Option(help="Widths of the hidden layers of each potential.")] = "10,10",
-    activation: Annotated[str, typer.Option(help="Activation function.")] = "tanh",
-    optimizer: Annotated[str, typer.Option(help="adam or bfgs.")] = "adam",
+    dt: Annotated[float | None, typer.Option(help="Δt, the longest time of the map. Default: what suits it.")] = None,
+    kind: Annotated[
+        str | None,
+        typer.Option(help="primed (with V and T), sympflow (a network), or mlp (the baseline). Default: the best."),
+    ] = None,
+    stages: Annotated[int | None, typer.Option(help="Kicks of a primed flow.")] = None,
+    processor: Annotated[int | None, typer.Option(help="Kicks of a primed flow's processor; 0 for none.")] = None,
+    pairs: Annotated[int | None, typer.Option(help="Pairs of kick and drift of a network. Default: 3.")] = None,
+    hidden: Annotated[
+        str | None, typer.Option(help="Widths of the hidden layers of each potential of a network. Default: 10,10.")
+    ] = None,
+    activation: Annotated[str | None, typer.Option(help="Activation function of a network. Default: tanh.")] = None,
+    optimizer: Annotated[
+        str | None,
+        typer.Option(help="gauss-newton, adam, lbfgs or bfgs. Default: gauss-newton for primed flows, else adam."),
+    ] = None,
     steps: Annotated[
         int | None, typer.Option("--steps", "--epochs", help="Training steps. Default: the optimizer's.")
     ] = None,
     points: Annotated[int | None, typer.Option(help="Collocation points a step. Default: the optimizer's.")] = None,
-    learning_rate: Annotated[float, typer.Option(help="Largest learning rate.")] = 5e-3,
-    residual_weight: Annotated[float, typer.Option(help="Weight of the residual loss.")] = 1.0,
+    learning_rate: Annotated[float | None, typer.Option(help="Largest learning rate of adam. Default: 0.005.")] = None,
+    residual_weight: Annotated[float | None, typer.Option(help="Weight of the residual loss.")] = None,
     matching_weight: Annotated[float | None, typer.Option(help="Weight of Hamiltonian matching.")] = None,
+    label_weight: Annotated[float | None, typer.Option(help="Weight of labels, the exact flow of states.")] = None,
+    restarts: Annotated[int | None, typer.Option(help="Starts of the search for a primed flow.")] = None,
+    time_budget: Annotated[float | None, typer.Option(help="Stop after so many seconds.")] = None,
     seed: Annotated[int, typer.Option(help="Of points and initial weights.")] = 0,
     to: Annotated[
         Path | None, typer.Option("--out", help="File for the flow. Default: SYSTEM-KIND.safetensors.")
@@ -38,9 +51,14 @@ def train(
 ) -> None:
     """Train a flow for a system and save it.
 
+    With nothing else said, a system with separable H gets a flow primed with its own V and T, in less than a minute;
+    any other, or where an option is one of networks, a SympFlow with neural potentials.
+
     Examples:
 
       sympflow train henon-heiles --out mine.safetensors
+
+      sympflow train kepler --stages 4 --dt 0.2 --processor 0
 
       sympflow train pendulum --dt 0.5 --pairs 5 --epochs 50000 --checkpoint run.pt
 
@@ -50,34 +68,32 @@ def train(
         from sympflow.training.trainer import train as train_flow
 
         scene = one_scene([system, *ctx.args])
-        to = to or Path(f"{scene.key}-{kind}.safetensors")
+        chosen = {
+            "kind": kind,
+            "stages": stages,
+            "processor": processor,
+            "pairs": pairs,
+            "hidden": None if hidden is None else widths(hidden),
+            "activation": activation,
+            "optimizer": optimizer,
+            "steps": steps,
+            "points": points,
+            "learning_rate": learning_rate,
+            "residual_weight": residual_weight,
+            "matching_weight": matching_weight,
+            "label_weight": label_weight,
+            "restarts": restarts,
+            "time_budget": time_budget,
+        }
+        options: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None}
+        to = to or Path(f"{scene.key}-{kind or 'sympflow'}.safetensors")
         if to.suffix != ".safetensors":
             raise ValueError(f"`--out` must end in .safetensors; got {str(to)!r}.")
         ready_file(to)
-        flow = train_flow(
-            scene.system,
-            dt,
-            kind=kind,
-            pairs=pairs,
-            hidden=widths(hidden),
-            activation=activation,
-            optimizer=optimizer,
-            steps=steps,
-            points=points,
-            learning_rate=learning_rate,
-            residual_weight=residual_weight,
-            matching_weight=matching_weight,
-            seed=seed,
-            checkpoint=checkpoint,
-            resume=resume,
-        )
+        flow = train_flow(scene.system, dt, seed=seed, checkpoint=checkpoint, resume=resume, **options)
         flow.save(to)
         figures = [
             (k.replace("_", " "), f"{v:.3g}" if isinstance(v, float) else str(v)) for k, v in flow.figures.items()
         ]
         print_table(("figure", "value"), figures)
         out.print(f"Written: {to}. Use it with: sympflow compare {system} --methods {to},verlet")
-
-
-def _brief(value: object) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
