@@ -42,8 +42,8 @@ def flows(
 ) -> None:
     """List the flows that ship, the cheapest of a system first, with what each achieves.
 
-    The cost is the time for a unit of time, in compiled force evaluations; the energy error is relative, the largest up
-    to T, the 95 % quantile over held-out states: `solve(system, tol=1e-6)` takes the cheapest that meets it.
+    The cost is that of a unit of time in force evaluations; the energy error is relative, the largest up to T, the 95 %
+    quantile over held-out states: `solve(system, tol=1e-6)` takes the cheapest that meets it.
     """
     with reporting():
         from sympflow.flow.shipped import HEADINGS, shipped_flows

@@ -39,7 +39,7 @@ class ShippedFlow:
     processor : int
         Number of pairs of its processor.
     cost : float or None
-        Time for a unit of time, in force evaluations of the compiled splitting kernel; outputs are not counted.
+        Of a unit of time, in force evaluations: see `sympflow.training.ladder.cost`. Outputs are not counted.
     energy_error : float or None
         Largest relative energy error up to `t_end`, the 95 % quantile over held-out states.
     t_end : float or None
