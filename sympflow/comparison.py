@@ -21,9 +21,10 @@ from sympflow.metrics.energy import failed, max_energy_error
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
-from sympflow.solver import _check_t_span, _check_y0, solve
+from sympflow.solver import solve
 from sympflow.system import HamiltonianSystem
 from sympflow.timing import interleaved
+from sympflow.validation import check_t_span, check_y0
 
 METRICS = tuple(MEASURES)
 MATCHES = ("time", "evaluations", "energy_error")
@@ -100,10 +101,10 @@ def compare(
             raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
     if match is not None and match not in MATCHES:
         raise ValueError(f"`match` must be one of {', '.join(map(repr, MATCHES))}, or None; got {match!r}.")
-    t0, t1 = _check_t_span(system.t_span if t_span is None else t_span)
+    t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     if t0 == t1:
         raise ValueError("`t_span` has length zero, so there is nothing to compare: choose a later end.")
-    start = _check_y0(system, system.y0 if y0 is None else y0, None)
+    start = check_y0(system, system.y0 if y0 is None else y0, None)
     t = t0 + (t1 - t0) * np.arange(1, n_outputs + 1) / n_outputs
     given = None if reference is None else _given(reference, start, t)
     say = progress or (lambda text: None)

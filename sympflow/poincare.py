@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike
 from sympflow.arrays import is_tensor
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import build
-from sympflow.solver import _check_t_span, _check_y0, solve
+from sympflow.solver import solve
 from sympflow.system import HamiltonianSystem
 from sympflow.tables import Column, text_table, write_csv
+from sympflow.validation import check_t_span, check_y0
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,10 +82,10 @@ def poincare_section(
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     integrator = build(method, options)
     integrator.check(system)
-    span = _check_t_span(system.t_span if t_span is None else t_span)
+    span = check_t_span(system.t_span if t_span is None else t_span)
     if is_tensor(y0):
         raise TypeError("`y0` is a tensor, but crossings are located on NumPy arrays: pass y0.numpy().")
-    start = _check_y0(system, system.y0 if y0 is None else y0, None)
+    start = check_y0(system, system.y0 if y0 is None else y0, None)
     index = _check_coordinate(coordinate, system.ndof)
     if direction not in (-1, 0, 1):
         raise ValueError(f"`direction` must be 1 (upwards), -1 (downwards) or 0 (both); got {direction!r}.")

@@ -20,9 +20,10 @@ from sympflow.metrics.reference import reference as compute_reference
 from sympflow.precision_points import Point, break_even
 from sympflow.precision_report import WorkPrecision
 from sympflow.solution import Solution
-from sympflow.solver import _check_t_span, _check_y0, solve
+from sympflow.solver import solve
 from sympflow.system import HamiltonianSystem
 from sympflow.timing import interleaved
+from sympflow.validation import check_t_span, check_y0
 
 METHODS = ("verlet", "leapfrog", "blanes_moan4", "srkn11b", "kahan_li8", "rk45", "dop853", "sympflow", "mlp")
 TOLERANCES = tuple(10.0**-k for k in range(3, 13))
@@ -92,10 +93,10 @@ def work_precision(
     for name, value in (("n_outputs", n_outputs), ("repeats", repeats)):
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
-    t0, t1 = _check_t_span(system.t_span if t_span is None else t_span)
+    t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     if t0 == t1:
         raise ValueError("`t_span` has length zero, so there is nothing to measure: choose a later end.")
-    starts = [_check_y0(system, system.y0 if y0 is None else y0, None)]
+    starts = [check_y0(system, system.y0 if y0 is None else y0, None)]
     if starts[0].ndim != 1:
         raise ValueError("`y0` must be one state: give several as `batch`.")
     if batch is not None:
@@ -127,7 +128,7 @@ def _batch(system: HamiltonianSystem, batch: int | ArrayLike) -> np.ndarray:
         if system.domain is None:
             raise ValueError(f"`batch` cannot be drawn: {system.name!r} has no domain. Pass the states themselves.")
         return system.domain.sample(int(batch), 0)
-    states = _check_y0(system, batch, None)
+    states = check_y0(system, batch, None)
     if states.ndim != 2:
         raise ValueError(f"`batch` must be a number, or states of shape (n, {2 * system.ndof}); got {states.shape}.")
     return states

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
 from sympflow.domain import Domain, EnergySublevel
-from sympflow.events import EventSearch, parse, run_and_search
+from sympflow.events import run_and_search
 from sympflow.integrators.base import Integrator, Outcome, Problem
 from sympflow.integrators.registry import build
 from sympflow.solution import Solution
 from sympflow.system import HamiltonianSystem
+from sympflow.validation import check_events, check_memory, check_save_every, check_t_eval, check_t_span, check_y0
 
-MAX_SAVED_VALUES = 10_000_000
 BACKENDS = ("auto", "compiled", "array")
 
 
@@ -98,10 +98,10 @@ def solve(
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     integrator = build(method, options)
     integrator.check(system)
-    t0, t1 = _check_t_span(system.t_span if t_span is None else t_span)
-    y_start = _check_y0(system, system.y0 if y0 is None else y0, dtype)
-    times = None if t_eval is None else _check_t_eval(t_eval, t0, t1)
-    every = _check_save_every(save_every, times)
+    t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
+    y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
+    times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
+    every = check_save_every(save_every, times)
     if backend not in BACKENDS:
         raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
     if backend == "compiled" and not integrator.compiles:
@@ -111,9 +111,9 @@ def solve(
     action = on_domain_exit or ("warn" if integrator.trained else "ignore")
     if action not in ("warn", "stop", "ignore"):
         raise ValueError(f"`on_domain_exit` must be 'warn', 'stop' or 'ignore'; got {on_domain_exit!r}.")
-    search = _check_events(y_start, events, event_step)
+    search = check_events(y_start, events, event_step, abs(t1 - t0))
     problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend, search)
-    _check_memory(integrator, problem)
+    check_memory(integrator, problem)
 
     start = time.perf_counter()
     outcome = (
@@ -139,113 +139,6 @@ def solve(
         t_events=None if search is None else search.times(),
         y_events=None if search is None else search.states(y_start),
     )
-
-
-def _check_t_span(t_span: Any) -> tuple[float, float]:
-    try:
-        t0, t1 = (float(t) for t in t_span)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"`t_span` must be two numbers, start and end; got {t_span!r}.") from error
-    if not (math.isfinite(t0) and math.isfinite(t1)):
-        raise ValueError(f"`t_span` must be finite; got ({t0}, {t1}). Choose an end that can be reached.")
-    return t0, t1
-
-
-def _check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
-    if y0 is None:
-        raise ValueError(f"`y0` is needed: the system {system.name!r} has no default initial state.")
-    size = 2 * system.ndof
-    if is_tensor(y0):
-        if dtype is not None:
-            raise TypeError("`dtype` is for NumPy states: convert the tensor `y0` instead.")
-        if not y0.is_floating_point():
-            raise TypeError(f"`y0` must be a real floating-point tensor; got {y0.dtype}. Use y0.double().")
-    else:
-        try:
-            array = np.asarray(y0)
-            if array.dtype == object or not np.issubdtype(array.dtype, np.number):
-                raise TypeError(f"dtype {array.dtype}")
-        except (TypeError, ValueError) as error:
-            raise TypeError(f"`y0` must be an array of numbers; got {error}.") from error
-        if np.iscomplexobj(array):
-            raise TypeError("`y0` must be real; got complex numbers. Use y0.real if the imaginary part is zero.")
-        y0 = array.astype(_check_dtype(dtype))
-    if y0.ndim == 0 or y0.shape[-1] != size:
-        raise ValueError(
-            f"`y0` must have shape (..., {size}) for {system.name!r}, [q, p] with {system.ndof} each; got "
-            f"{tuple(y0.shape)}."
-        )
-    if math.prod(y0.shape) == 0:
-        raise ValueError(f"`y0` is an empty batch, of shape {tuple(y0.shape)}: pass at least one state.")
-    if not np.isfinite(to_numpy(y0)).all():
-        raise ValueError("`y0` must be finite; it holds NaN or infinity. Remove these states.")
-    return y0
-
-
-def _check_dtype(dtype: Any) -> np.dtype:
-    try:
-        chosen = np.dtype(np.float64 if dtype is None else dtype)
-    except TypeError:
-        chosen = np.dtype(object)
-    if chosen not in (np.float32, np.float64):
-        raise ValueError(f"`dtype` must be 'float32' or 'float64'; got {dtype!r}.")
-    return chosen
-
-
-def _check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
-    times = np.asarray(to_numpy(t_eval), dtype=float)
-    if times.ndim != 1:
-        raise ValueError(f"`t_eval` must be one-dimensional; got shape {times.shape}.")
-    low, high = min(t0, t1), max(t0, t1)
-    if times.size and not (times.min() >= low and times.max() <= high):
-        raise ValueError(f"`t_eval` must lie within `t_span`, [{low:g}, {high:g}]: extend `t_span` or drop times.")
-    if (np.diff(times) * (1 if t1 >= t0 else -1) < 0).any():
-        raise ValueError("`t_eval` must be ordered from the start of `t_span` to its end: sort it.")
-    return times
-
-
-def _check_save_every(save_every: Any, times: np.ndarray | None) -> int:
-    if save_every is None:
-        return 1
-    if times is not None:
-        raise ValueError("`save_every` and `t_eval` both choose the outputs: give one of them.")
-    if not isinstance(save_every, int | np.integer) or isinstance(save_every, bool) or save_every < 1:
-        raise ValueError(f"`save_every` must be a positive integer; got {save_every!r}.")
-    return int(save_every)
-
-
-def _check_events(y0: Array, events: Any, event_step: Any) -> EventSearch | None:
-    parsed = parse(events)
-    if not parsed:
-        if event_step is not None:
-            raise ValueError("`event_step` samples events, but there are none: pass `events`, or leave it out.")
-        return None if events is None else EventSearch(())
-    if y0.ndim != 1:
-        raise ValueError(
-            f"`events` are found along one trajectory, but `y0` is a batch of shape {tuple(y0.shape)}: solve one state "
-            "at a time, or use poincare_section, which takes batches."
-        )
-    if event_step is None:
-        return EventSearch(parsed)
-    if not (isinstance(event_step, int | float | np.number) and event_step > 0):
-        raise ValueError(f"`event_step` must be a positive number, a time; got {event_step!r}.")
-    return EventSearch(parsed, float(event_step))
-
-
-def _check_memory(integrator: Integrator, problem: Problem) -> None:
-    """Refuse runs whose outputs would fill the memory."""
-    length = getattr(integrator, "step_length", lambda system: None)(problem.system)
-    if length is None:
-        return
-    n_steps = abs(problem.t1 - problem.t0) / length
-    stored = n_steps if problem.dense_output else n_steps / problem.save_every if problem.t_eval is None else 0.0
-    values = (stored + 1) * math.prod(problem.y0.shape)
-    if values > MAX_SAVED_VALUES:
-        raise ValueError(
-            f"`t_eval` is not given, so {values:.3g} values ({values * 8 / 2**30:.1f} GiB) would be stored, more than "
-            f"{MAX_SAVED_VALUES:.0e}: choose the times with `t_eval`, or thin them with `save_every`"
-            f"{', or leave dense_output out' if problem.dense_output else ''}."
-        )
 
 
 def domain_of(flow: Any, system: HamiltonianSystem) -> Domain | None:

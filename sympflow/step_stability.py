@@ -18,9 +18,10 @@ from sympflow.metrics.energy import energy_drift, max_energy_error
 from sympflow.metrics.symplectic import symplecticity_defect, volume_error
 from sympflow.singularities import blow_up
 from sympflow.solution import Solution
-from sympflow.solver import MAX_SAVED_VALUES, _check_t_span, _check_y0, domain_of, solve
+from sympflow.solver import domain_of, solve
 from sympflow.stability_report import StabilityReport, StabilityRow, StepLimit
 from sympflow.system import HamiltonianSystem
+from sympflow.validation import MAX_SAVED_VALUES, check_t_span, check_y0
 
 DEFAULT = ("sympflow", "verlet", "leapfrog", "kahan_li8", "implicit_midpoint", "rk4", "rk45")
 METRICS = ("energy", "drift", "volume", "symplecticity", "domain")
@@ -109,7 +110,7 @@ def stability(
     rows: list[StabilityRow] = []
     found: list[StepLimit] = []
     for one in family:
-        span = _check_t_span(one.t_span if t_span is None else t_span)
+        span = check_t_span(one.t_span if t_span is None else t_span)
         if span[0] == span[1]:
             raise ValueError("`t_span` has length zero, so there is nothing to run: choose a later end.")
         starts = initial_states(one, y0)
@@ -126,7 +127,7 @@ def stability(
 
 def initial_states(system: HamiltonianSystem, y0: ArrayLike | None) -> np.ndarray:
     """The states (n, 2d) that runs start from: those given, or one and three more along its orbit."""
-    given = _check_y0(system, system.y0 if y0 is None else y0, None)
+    given = check_y0(system, system.y0 if y0 is None else y0, None)
     if given.ndim > 2:
         raise ValueError(f"`y0` must have shape (2d,) or (n, 2d); got {given.shape}.")
     if given.ndim == 2:
