@@ -248,6 +248,38 @@ def test_a_degenerate_direction_does_no_harm():
     assert found.x[2] == 0
 
 
+# processed flows --------------------------------------------------------------------------------------------------
+
+
+def test_the_fits_derivatives_with_a_processor():
+    flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=2, dt=0.8)
+    run = GaussNewtonRun.start(
+        flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), GaussNewtonConfig(points=5, label_times=3)
+    )
+    table = Table(flow)
+    theta = table.parameters() + np.random.default_rng(0).normal(0, 0.05, flow.n_parameters)
+    table.assign(theta)
+    r, J = run.whole.linearized(theta)
+    x, t = torch.as_tensor(run.whole._x[:, :5].T), torch.tensor([[0.8 / 3], [1.6 / 3], [0.8]], dtype=torch.float64)
+    predicted = flow.psi(t, x.expand(3, 5, 2)).detach().numpy().transpose(0, 2, 1)
+    labelled = run.whole._y.reshape(2, 3, 5).transpose(1, 0, 2)
+    np.testing.assert_allclose(r, ((predicted - labelled) / math.sqrt(15)).ravel(), atol=1e-14)
+    e = 1e-6
+    for i in range(len(theta)):
+        d = e * np.eye(len(theta))[i]
+        slope = (run.whole.residuals(theta + d) - run.whole.residuals(theta - d)) / (2 * e)
+        np.testing.assert_allclose(J[:, i], slope, atol=1e-9)
+
+
+def test_a_processor_pays():
+    """At every time, and at no cost over a long run."""
+    processed, plain = (
+        train(HH, flow=SympFlow.primed(HH, 2, processor=c), **{**QUICK, "steps": 40}).figures for c in (3, 0)
+    )
+    assert processed["one_step_error"] < plain["one_step_error"] / 5
+    assert processed["fractional_error"] < 10 * processed["one_step_error"]
+
+
 # training --------------------------------------------------------------------------------------------------------
 
 
@@ -274,6 +306,44 @@ def test_the_harmonic_oscillator_in_any_units():
         flow = train(system, flow=SympFlow.primed(system, 3, dt=1 / omega), **QUICK)
         errors.append(flow.figures["one_step_error"] / omega)
     assert max(errors) < 1e-5
+
+
+@pytest.mark.parametrize("loss", ["labels+matching", "labels+residual", "residual", "residual+matching"])
+def test_other_losses_train_too(loss):
+    start = SympFlow.primed(PENDULUM, 2)
+    flow = train(PENDULUM, flow=start, loss=loss, **{**QUICK, "restarts": 1, "steps": 8})
+    assert flow.recipe["stages"][0]["loss"] == "+".join(n for n in ("labels", "residual", "matching") if n in loss)
+    assert flow.figures["one_step_error"] < 3e-3  # of two leapfrog steps it is 2e-2, of labels alone 1e-3
+
+
+def test_residuals_of_a_loss_are_those_of_the_flow():
+    """Of the whole fit, against Loss: the sum of squares is the loss, and the Jacobian its derivative."""
+    flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=1)
+    config = GaussNewtonConfig(label_weight=0.0, residual_weight=2.0, matching_weight=3.0, loss_points=20)
+    run = GaussNewtonRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), config)
+    theta = Table(flow).parameters() + np.random.default_rng(0).normal(0, 0.02, flow.n_parameters)
+    r, J = run.whole.linearized(theta)
+    objective = run.whole.objective
+    assert r @ r == pytest.approx(float(objective.loss(flow, objective.points).detach()), rel=1e-12)
+    e = 1e-6
+    for i in range(len(theta)):
+        d = e * np.eye(len(theta))[i]
+        slope = (run.whole.residuals(theta + d) - run.whole.residuals(theta - d)) / (2 * e)
+        np.testing.assert_allclose(J[:, i], slope, atol=1e-8)
+
+
+def test_labels_may_be_handed_in():
+    """At any times; those at Δt serve the search of the frozen table. A flow of other labels is another flow."""
+    x, t = PENDULUM.domain.sample(40, 5), np.array([0.3, 0.7, 1.0])
+    labels = Labels.of(PENDULUM, x, t)
+    data = (np.repeat(t, 40), np.tile(x, (3, 1)), labels.y.reshape(-1, 2))
+    arguments = {name: value for name, value in QUICK.items() if name != "points"}
+    flow = train(PENDULUM, flow=SympFlow.primed(PENDULUM, 2), data=data, **arguments)
+    assert flow.figures["one_step_error"] < 3e-3
+    without_end = tuple(a[:80] for a in data)
+    other = train(PENDULUM, flow=SympFlow.primed(PENDULUM, 2), data=without_end, **{**arguments, "restarts": 1})
+    assert other.figures["fractional_error"] < 1e-3
+    assert other.recipe["stages"][0]["data"] != flow.recipe["stages"][0]["data"]
 
 
 def test_a_free_flow_is_no_worse_than_a_palindrome():
@@ -380,6 +450,8 @@ def test_progress(capsys):
         ({"pairs": 3}, TypeError, r"^`pairs` is not an option"),
         ({"optimizer": "adam"}, TypeError, r"^`restarts` is not an option of the optimizer 'adam'"),
         ({"restarts": 0}, ValueError, r"^`restarts` must be a positive integer"),
+        ({"loss": "energy"}, ValueError, r"^`loss` 'energy' is unknown"),
+        ({"residual_weight": 2.0}, TypeError, r"^`residual_weight` is not an option .* without a `loss`"),
         ({"frozen_weight": math.nan}, ValueError, r"^`frozen_weight` must be positive"),
         ({"label_times": 2.0}, ValueError, r"^`label_times` must be"),
         ({"seed": -1}, ValueError, r"^`seed` must be"),

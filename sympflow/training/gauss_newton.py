@@ -3,6 +3,9 @@
 In three stages. First the table frozen at Δt, a dozen or two numbers, from many random starts, each followed for a
 few iterations: the cost has many local minima. Then the best of these to the end of their narrow valleys. Then the
 polynomials in t, from the best of these tables, to labels at several times in (0, Δt].
+
+Other losses (the residual of the flow, Hamiltonian matching) join in the last stage. Without labels there is that stage
+alone, from each start.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,12 +26,13 @@ from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
-from sympflow.training.collocation import Stream, states, stream_seed
+from sympflow.training.collocation import PointSource, Stream, states, stream_seed
 from sympflow.training.labels import Labels
 from sympflow.training.levenberg_marquardt import Minimum
+from sympflow.training.losses import Loss, Objective
 from sympflow.training.progress import progress as make_progress
 from sympflow.training.run import Path
-from sympflow.training.table_fit import Table, TableFit
+from sympflow.training.table_fit import Fit, LossFit, StackedFit, Table, TableFit
 from sympflow.training.table_jacobian import TableStep
 
 FINALISTS = 4  # tables of the search that are followed to the end
@@ -37,6 +41,7 @@ SEARCH_STEPS = 60  # iterations from each start
 SEARCH_SHARE, FROZEN_SHARE = 0.4, 0.7  # of a time budget, that the search, and all work on frozen tables, may use
 FRACTIONAL_TIMES = 50
 FEWEST_POINTS, MOST_POINTS, COORDINATES = 40, 250, 1000
+FITTED_POINTS = 120  # that are enough for the polynomials: at each of several times
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,12 @@ class GaussNewtonConfig:
         Number of equidistant times in (0, Δt] at which the states are labelled.
     frozen_weight : float
         Weight of the residuals at t = Δt, which alone are composed over many steps; those at other times have 1.
+    label_weight, residual_weight, matching_weight : float
+        Weights of the labels, of ‖d/dt ψ̄_t(x) − J∇H‖² and of (𝓗 − H − c(t))²; 0 leaves a loss out.
+    loss_points, matching_times : int
+        Points of each of the last two, and the number of times in the last.
+    data : str, optional
+        Checksum of labels that were handed in.
     restarts : int
         Starts of the frozen search: the flow as it is, then random tables.
     steps : int
@@ -63,13 +74,20 @@ class GaussNewtonConfig:
     points: int | None = None
     label_times: int = 8
     frozen_weight: float = 1.0
+    label_weight: float = 1.0
+    residual_weight: float = 0.0
+    matching_weight: float = 0.0
+    loss_points: int = 300
+    matching_times: int = 10
+    data: str | None = None
     restarts: int = 24
     steps: int = 1000
     seed: int = 0
     reference_states: int = 100
 
     def __post_init__(self) -> None:
-        for name in ("points", "label_times", "restarts", "steps", "reference_states"):
+        positive = ("points", "label_times", "restarts", "steps", "reference_states", "loss_points", "matching_times")
+        for name in positive:
             value = getattr(self, name)
             if name == "points" and value is None:
                 continue
@@ -79,9 +97,18 @@ class GaussNewtonConfig:
             raise ValueError(f"`seed` must be a non-negative integer; got {self.seed!r}.")
         if not 0 < self.frozen_weight < math.inf:
             raise ValueError(f"`frozen_weight` must be positive and finite; got {self.frozen_weight!r}.")
+        weights = [getattr(self, f"{name}_weight") for name in ("label", "residual", "matching")]
+        if not (all(0 <= weight < math.inf for weight in weights) and any(weights)):
+            raise ValueError(
+                "`label_weight`, `residual_weight` and `matching_weight` must be finite and at least 0, one of them "
+                f"positive; got {weights}."
+            )
 
     def to_dict(self) -> dict[str, Any]:
-        return {"optimizer": "gauss-newton", "loss": "labels", **asdict(self)}
+        named = {"labels": self.label_weight, "residual": self.residual_weight, "matching": self.matching_weight}
+        loss = "+".join(name for name, weight in named.items() if weight)
+        record = {"optimizer": "gauss-newton", "loss": loss, **asdict(self)}
+        return {name: value for name, value in record.items() if value is not None}
 
 
 @dataclass
@@ -93,8 +120,9 @@ class GaussNewtonRun:
     domain: Domain
     scaling: Scaling
     config: GaussNewtonConfig
-    frozen: TableFit
-    whole: TableFit
+    step: TableStep
+    frozen: TableFit | None
+    whole: Fit
     held_out: Labels
     minima: list[Minimum] = field(default_factory=list)
     history: list[dict[str, float]] = field(default_factory=list)
@@ -108,22 +136,40 @@ class GaussNewtonRun:
         domain: Domain,
         scaling: Scaling,
         config: GaussNewtonConfig,
+        data: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> GaussNewtonRun:
+        """A run for labels made on the spot, or for `data`: times (n,), states and where they go, (n, 2d)."""
         step, table = TableStep(system, flow.sequence, flow.gradients is not None), Table(flow)
-        points = config.points or min(MOST_POINTS, max(FEWEST_POINTS, COORDINATES // system.ndof))
-        x = states(domain, points, config.seed, Stream.RESIDUAL)
-        t = flow.dt * np.arange(1, config.label_times + 1) / config.label_times
-        labels = Labels.of(system, x, t)
-        if len(labels.x) == 0:
-            raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
-        at_end = Labels(labels.t[-1:], labels.x, labels.y[-1:])
-        unit, weight = np.array(scaling.x), np.where(t < t[-1], 1.0, config.frozen_weight)
-        frozen = TableFit(step, at_end, *table.frozen(flow.dt), unit, np.ones(1))
-        whole = TableFit(step, labels, *table.polynomial(t), unit, weight)
+        unit = np.array(scaling.x)
+        parts: list[tuple[float, Fit]] = []
+        frozen = None
+        if config.label_weight and data is None:
+            points = config.points or min(MOST_POINTS, max(FEWEST_POINTS, COORDINATES // system.ndof))
+            x = states(domain, points, config.seed, Stream.RESIDUAL)
+            t = flow.dt * np.arange(1, config.label_times + 1) / config.label_times
+            labels = Labels.of(system, x, t)
+            if len(labels.x) == 0:
+                raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
+            frozen = TableFit(step, labels.at(-1), *table.frozen(flow.dt), unit, np.ones(1))
+            weight = np.where(t < t[-1], 1.0, config.frozen_weight)
+            labels = labels.first(FITTED_POINTS)
+            parts.append((config.label_weight, TableFit(step, labels, *table.polynomial(t), unit, weight)))
+        elif config.label_weight and data is not None:
+            at_end = np.abs(data[0] - flow.dt) <= 1e-9 * flow.dt
+            if 2 * system.ndof * at_end.sum() >= 2 * table.n:
+                labels = Labels(data[0][at_end][-1:], data[1][at_end], data[2][at_end][None])
+                frozen = TableFit(step, labels, *table.frozen(flow.dt), unit, np.ones(1))
+        if config.residual_weight or config.matching_weight or data is not None:
+            rest = config.label_weight if data is not None else 0.0
+            loss = Loss(system, scaling, config.residual_weight, config.matching_weight, rest)
+            shape = (flow.dt, config.loss_points, config.matching_times, config.seed, flow.dtype, flow.device)
+            points_at = replace(PointSource(domain, *shape, block=1)(0), labels=_tensors(data) if rest else None)
+            parts.append((1.0, LossFit(table, Objective(loss, flow, points_at))))
         x = states(domain, config.reference_states, config.seed, Stream.REFERENCE)
         t = flow.dt * (np.arange(FRACTIONAL_TIMES) + 0.5) / FRACTIONAL_TIMES
         held_out = Labels.of(system, x, np.append(t, flow.dt))
-        return cls(flow, system, domain, scaling, config, frozen, whole, held_out)
+        whole = parts[0][1] if len(parts) == 1 else StackedFit(*parts)  # one weight changes nothing
+        return cls(flow, system, domain, scaling, config, step, frozen, whole, held_out)
 
     def go(
         self,
@@ -152,10 +198,10 @@ class GaussNewtonRun:
             with make_progress(progress, self.config.restarts, label, len(self.minima)) as bar:
                 while len(self.minima) < self.config.restarts and not search_is_spent():
                     steps = min(SEARCH_STEPS, self.config.steps)
-                    minimum = self.frozen.minimize(self._start(table, given), steps, search_is_spent)
+                    start = self._start(table, given)
+                    minimum = (self.frozen or self.whole).minimize(start, steps, search_is_spent)
                     self.minima.append(minimum)
-                    best = min(self.minima, key=lambda m: m.cost)
-                    table.assign(table.continued(self.frozen.design[0] @ best.x))
+                    table.assign(self._continued(table, min(self.minima, key=lambda m: m.cost)))
                     figures = self._record(minimum)
                     bar.advance(len(self.minima), minimum.cost)
                     bar.validated(len(self.minima), figures)
@@ -168,12 +214,11 @@ class GaussNewtonRun:
         if len(self.minima) < self.config.restarts and reason is None:
             reason = "the time budget was used up"
 
-        finalists = [
-            self.frozen.minimize(m.x, self.config.steps, frozen_is_spent, thorough=True)
-            for m in _distinct(self.minima)[:FINALISTS]
-        ]
-        tables = [self.frozen.design[0] @ m.x for m in _distinct(finalists)[:FITTED]]
-        starts = [given, *(table.continued(t) for t in tables)]
+        finalists = _distinct(self.minima)[:FINALISTS]
+        if self.frozen is not None:
+            fit = self.frozen
+            finalists = [fit.minimize(m.x, self.config.steps, frozen_is_spent, thorough=True) for m in finalists]
+        starts = [given, *(self._continued(table, m) for m in _distinct(finalists)[:FITTED])]
         fitted = [self.whole.minimize(theta, self.config.steps, spent, thorough=True) for theta in starts]
         best = min(fitted, key=lambda m: m.cost)
         if not math.isfinite(best.cost):
@@ -186,19 +231,26 @@ class GaussNewtonRun:
     def _start(self, table: Table, given: np.ndarray) -> np.ndarray:
         """Where the next search begins: the flow as it was given, then random tables."""
         restart = len(self.minima)
-        coefficients = self.whole.offset[-1] + self.whole.design[-1] @ given
+        offset, design = table.polynomial(np.array([table.dt]))
+        coefficients = offset[0] + design[0] @ given
         if restart:
             coefficients = table.random(
                 np.random.default_rng([stream_seed(self.config.seed, Stream.RESTARTS), restart])
             )
+        if self.frozen is None:
+            return table.continued(coefficients) if restart else given
         return np.linalg.lstsq(self.frozen.design[0], coefficients, rcond=None)[0]
+
+    def _continued(self, table: Table, minimum: Minimum) -> np.ndarray:
+        """The parameters that a minimum of the search gives."""
+        return minimum.x if self.frozen is None else table.continued(self.frozen.design[0] @ minimum.x)
 
     def _record(self, minimum: Minimum) -> dict[str, float]:
         figures = {
             "step": len(self.minima),
             "loss": minimum.cost,
             "iterations": minimum.iterations,
-            **errors(self.flow, self.whole.step, self.held_out),
+            **errors(self.flow, self.step, self.held_out),
         }
         self.history.append(figures)
         return figures
@@ -283,6 +335,10 @@ def _distinct(minima: list[Minimum]) -> list[Minimum]:
         if not kept or m.cost > 1.01 * kept[-1].cost:
             kept.append(m)
     return kept
+
+
+def _tensors(data: tuple[np.ndarray, ...] | None) -> Any:
+    return None if data is None else tuple(torch.as_tensor(a, dtype=torch.float64) for a in data)
 
 
 def errors(flow: PrimedFlow, step: TableStep, labels: Labels) -> dict[str, float]:

@@ -39,3 +39,11 @@ class Labels:
             exists = np.isfinite(after).all(-1)
             y, reached = [states[exists] for states in (*y, after)], time
         return cls(np.asarray(t), y[0], np.stack(y[1:]))
+
+    def at(self, j: int) -> Labels:
+        """Those at the j-th time alone."""
+        return Labels(self.t[[j]], self.x, self.y[[j]])
+
+    def first(self, n: int) -> Labels:
+        """Those of the first n states."""
+        return Labels(self.t, self.x[:n], self.y[:, :n])

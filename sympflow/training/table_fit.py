@@ -13,6 +13,7 @@ from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
 from sympflow.training.labels import Labels
 from sympflow.training.levenberg_marquardt import Minimum, levenberg_marquardt
+from sympflow.training.losses import Objective
 from sympflow.training.table_jacobian import TableStep
 
 SPREAD = 0.25  # of random coefficients about those of equal steps
@@ -21,7 +22,55 @@ PROCESSOR_SPREAD = 0.1
 STIFFNESS = 1e-3  # how reluctantly a table is made to vary with t where that is not called for
 
 
-class TableFit:
+class Fit:
+    """Residuals of parameters θ whose sum of squares is to be small."""
+
+    def residuals(self, theta: np.ndarray) -> np.ndarray:
+        """(m,)."""
+        raise NotImplementedError
+
+    def linearized(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The residuals and their Jacobian, (m, f)."""
+        raise NotImplementedError
+
+    def minimize(self, theta: np.ndarray, iterations: int, stop: Callable[[], bool], thorough: bool = False) -> Minimum:
+        """Least squares from θ; a thorough one goes on where little is gained, as along a narrow curved valley."""
+        patience, gain = (20, 1e-3) if thorough else (10, 1e-2)
+        limits: dict[str, Any] = {"iterations": iterations, "patience": patience, "gain": gain, "stop": stop}
+        return levenberg_marquardt(self.residuals, self.linearized, theta, **limits)
+
+
+class StackedFit(Fit):
+    """Several fits of the same parameters, with a weight each."""
+
+    def __init__(self, *parts: tuple[float, Fit]) -> None:
+        self.parts = parts
+
+    def residuals(self, theta: np.ndarray) -> np.ndarray:
+        return np.concatenate([math.sqrt(weight) * fit.residuals(theta) for weight, fit in self.parts])
+
+    def linearized(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        pieces = [(math.sqrt(weight), *fit.linearized(theta)) for weight, fit in self.parts]
+        return np.concatenate([w * r for w, r, _ in pieces]), np.concatenate([w * J for w, _, J in pieces])
+
+
+class LossFit(Fit):
+    """The residuals of a `Loss` (the flow's residual, Hamiltonian matching, labels at any times) at given points."""
+
+    def __init__(self, table: Table, objective: Objective) -> None:
+        self.table, self.objective = table, objective
+
+    def residuals(self, theta: np.ndarray) -> np.ndarray:
+        self.table.assign(theta)
+        return self.objective.residuals().numpy()
+
+    def linearized(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        self.table.assign(theta)
+        r, J = self.objective.linearized()
+        return r.detach().numpy(), J.detach().numpy()
+
+
+class TableFit(Fit):
     """The labels' residuals as a function of parameters on which the table at each time depends affinely.
 
     Parameters

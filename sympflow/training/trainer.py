@@ -45,6 +45,7 @@ def train(
     stages: int | None = None,
     processor: int | None = None,
     optimizer: str | None = None,
+    loss: str | None = None,
     steps: int | None = None,
     points: int | None = None,
     residual_weight: float = 1.0,
@@ -105,6 +106,9 @@ def train(
     data : (array (n,), array (n, 2d), array (n, 2d)), optional
         Labels of a network: times in [0, dt], states, and where the exact flow takes them; a tenth is held out.
         `label_weight` is then 1. Without data, labels are made where `label_weight` is given.
+    loss : str, optional
+        Some of "residual", "matching" and "labels", joined by "+": those that are left out get the weight 0. The
+        default is "labels" for primed flows with optimizer="gauss-newton", else what the weights say.
     restarts, label_times, frozen_weight
         Of "gauss-newton" on a primed flow, which takes of those above `steps`, `points`, `seed` and
         `reference_states`: see `GaussNewtonConfig`. `label_times` counts for a network's `label_weight` too.
@@ -176,14 +180,25 @@ def train(
     single = dtype not in (None, torch.float64) or (flow is not None and flow.dtype != torch.float64)
     if optimizer == "gauss-newton" and single:
         raise TypeError("`optimizer` 'gauss-newton' fits flows in float64: leave out `dtype`, or use 'adam'.")
+    if loss is not None or (kind == "primed" and optimizer == "gauss-newton"):
+        weights = _weights("labels" if loss is None else loss, residual_weight, matching_weight, label_weight)
+        residual_weight, matching_weight, label_weight = weights
     if optimizer == "gauss-newton" and kind == "primed":
         _refuse_options(given, _NOT_OF_TABLES, f"optimizer {optimizer!r} for primed flows")
+        if loss is None:
+            _refuse_options(given, _OF_LOSSES, f"optimizer {optimizer!r} for primed flows without a `loss`")
+        handed = None if data is None else _labels(data, system, dt)
         choices: dict[str, Any] = {
             "points": points,
             "steps": steps,
             "restarts": restarts,
             "label_times": label_times,
             "frozen_weight": frozen_weight,
+            "residual_weight": residual_weight,
+            "matching_weight": matching_weight,
+            "label_weight": label_weight,
+            "matching_times": matching_times,
+            "data": None if handed is None else _digest(handed),
         }
         choices = {name: value for name, value in choices.items() if value is not None}
         labelled = GaussNewtonConfig(seed=seed, reference_states=reference_states, **choices)
@@ -191,7 +206,7 @@ def train(
         flow = copy.deepcopy(flow).bound(system)
         flow.certified = None  # of the numbers as they were
         scaling = Scaling.of_samples(states(domain, SCALING_SAMPLES, seed, Stream.SCALING), flow.dt)
-        search = GaussNewtonRun.start(flow, system, domain, scaling, labelled)
+        search = GaussNewtonRun.start(flow, system, domain, scaling, labelled, handed)
         if resume is not None:
             search.load(resume)
         return search.finish(search.go(checkpoint, time_budget, progress, callback))
@@ -254,12 +269,8 @@ def train(
 KINDS = ("primed", "sympflow", "mlp")
 _OF_NETWORKS = ("pairs", "hidden", "activation")
 _OF_TABLES = ("restarts", "frozen_weight")
+_OF_LOSSES = ("residual_weight", "matching_weight", "label_weight", "matching_times")
 _NOT_OF_TABLES = (
-    "residual_weight",
-    "matching_weight",
-    "label_weight",
-    "data",
-    "matching_times",
     "learning_rate",
     "schedule",
     "clip",
@@ -275,8 +286,25 @@ def _kind(system: HamiltonianSystem, given: dict[str, Any]) -> str:
     if _given(given, ("stages", "processor", *_OF_TABLES)):
         return "primed"
     fits = system.separable and system.quadratic_kinetic and system.symbols is not None
-    wants_network = given["optimizer"] not in (None, "gauss-newton") or _given(given, (*_OF_NETWORKS, *_NOT_OF_TABLES))
+    of_networks = (*_OF_NETWORKS, *_NOT_OF_TABLES, *((*_OF_LOSSES, "data") if given["loss"] is None else ()))
+    wants_network = given["optimizer"] not in (None, "gauss-newton") or _given(given, of_networks)
     return "primed" if fits and not wants_network else "sympflow"
+
+
+def _weights(
+    loss: str, residual_weight: float, matching_weight: float | None, label_weight: float | None
+) -> tuple[float, float, float]:
+    """Those of the residual, of matching and of the labels: 0 for what the loss does not name."""
+    names = loss.split("+") if isinstance(loss, str) else []
+    if not names or not set(names) <= {"residual", "matching", "labels"}:
+        raise ValueError(f"`loss` {loss!r} is unknown: join some of residual, matching and labels by +.")
+    chosen = {
+        "residual": residual_weight,
+        "matching": 1.0 if matching_weight is None else matching_weight,
+        "labels": 1.0 if label_weight is None else label_weight,
+    }
+    residual, matching, labels = (weight if name in names else 0.0 for name, weight in chosen.items())
+    return residual, matching, labels
 
 
 def _primed(
