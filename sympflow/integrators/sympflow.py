@@ -252,8 +252,8 @@ class SympFlowIntegrator(FlowIntegrator):
         kernel = _kernel(problem.system, flow, problem.y0, problem.backend)
         if kernel is None or not hasattr(flow, "kernel_scheme"):
             raise ValueError(
-                "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave it out, or "
-                "take a flow of SympFlow.primed."
+                "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave "
+                "it out, or take a flow of SympFlow.primed."
             )
         from sympflow.kernels.primed_flow import PrimedFlowKernel
 
