@@ -49,12 +49,15 @@ class Event:
     def value(self, t: float, y: Array) -> float:
         value = self.g(t, y)
         try:
-            return float(to_numpy(value))
+            number = float(to_numpy(value))
         except (TypeError, ValueError) as error:
             raise TypeError(
                 f"{self.label} must return one number for a time and a state of shape {tuple(y.shape)}; {error}. "
                 "Return a scalar, e.g. y[0]."
             ) from error
+        if math.isnan(number) and np.isfinite(to_numpy(y)).all():
+            raise ValueError(f"{self.label} returned NaN at t = {t:.17g}: return a number for every finite state.")
+        return number
 
     def crossed(self, before: float, after: float) -> bool:
         """Whether the sign changed in the direction that is asked for, from `before` to `after`."""

@@ -121,6 +121,7 @@ def solve(
         if search is None or integrator.finds_events
         else run_and_search(integrator, problem, search)
     )
+    _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
     if action != "ignore":
         _check_domain(outcome, integrator, system, action)
@@ -147,6 +148,29 @@ def domain_of(flow: Any, system: HamiltonianSystem) -> Domain | None:
     if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
         return system.domain if domain == system.domain else domain.attach(system.hamiltonian)
     return domain
+
+
+def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
+    """Refuse what is no answer (of a plug-in), and flag states that are not finite, whatever the method says."""
+    if not isinstance(outcome, Outcome) or tuple(np.shape(outcome.y)) != (len(outcome.t), *y0.shape):
+        what = f"y of shape {tuple(np.shape(outcome.y))}" if isinstance(outcome, Outcome) else type(outcome).__name__
+        raise TypeError(
+            f"`method` {integrator.name!r} must answer with an Outcome that has y of shape (n, *y0.shape); got {what}. "
+            "Mend its run(): check_integrator tests it."
+        )
+    finite = to_numpy(all_finite(outcome.y))
+    bad = ~finite.all(0) & (np.asarray(outcome.status) >= 0)
+    if not bad.any():
+        return
+    first = int(np.argmin(finite[(slice(None), *np.argwhere(bad)[0])] if bad.ndim else finite))
+    index = f" (trajectory {', '.join(map(str, np.argwhere(bad)[0].tolist()))})" if bad.ndim else ""
+    outcome.message = (
+        f"The solution became non-finite before t = {outcome.t[first]:.17g}{index}. Start from a smaller state, or end "
+        "`t_span` earlier."
+    )
+    outcome.status = np.where(bad, -1, outcome.status) if bad.ndim else -1
+    if not bad.ndim:
+        outcome.t, outcome.y = outcome.t[:first], outcome.y[:first]
 
 
 def _check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:

@@ -163,16 +163,22 @@ class HamiltonianSystem:
         energy_scale: float | None,
     ) -> None:
         self.name, self.params = name, params
-        if not 0 < dt < np.inf:
+        if not (isinstance(dt, int | float | np.number) and 0 < dt < np.inf):
             raise ValueError(f"`dt` must be positive and finite; got {dt!r}.")
-        self.t_span = (float(t_span[0]), float(t_span[1]))
+        try:
+            self.t_span = (float(t_span[0]), float(t_span[1]))
+        except (TypeError, ValueError, IndexError, KeyError) as error:
+            raise ValueError(f"`t_span` must be two numbers, start and end; got {t_span!r}.") from error
         self.dt = float(dt)
-        if energy_scale is not None and not 0 < energy_scale < np.inf:
+        scale = isinstance(energy_scale, int | float | np.number)
+        if energy_scale is not None and not (scale and 0 < energy_scale < np.inf):
             raise ValueError(f"`energy_scale` must be positive and finite; got {energy_scale!r}.")
         self.energy_scale = energy_scale
         self.y0 = None if y0 is None else np.array(y0, dtype=float)
         if self.y0 is not None and self.y0.shape != (2 * self.ndof,):
             raise ValueError(f"`y0` must have shape ({2 * self.ndof},), [q, p]; got {self.y0.shape}.")
+        if domain is not None and not isinstance(domain, Domain):
+            raise TypeError(f"`domain` must be a domain such as sympflow.Box(low, high); got {type(domain).__name__}.")
         self.domain = domain.attach(self.hamiltonian) if isinstance(domain, EnergySublevel) else domain
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")

@@ -17,7 +17,7 @@ An integrator is a frozen dataclass whose fields are its options (`dt`, `rtol`, 
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -236,8 +236,14 @@ class FixedStep(Integrator):
 def check_dt(dt: Any) -> None:
     """Raise unless `dt` is None or a step length."""
     number = isinstance(dt, int | float | np.number) and not isinstance(dt, bool)
-    if dt is not None and not (number and 0 < dt < math.inf):
+    if dt is not None and not (number and 0 < dt <= sys.float_info.max):
         raise ValueError(f"`dt` must be a positive and finite number; got {dt!r}.")
+
+
+def check_flag(name: str, value: Any) -> None:
+    """Raise unless the option `name` is True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"`{name}` must be True or False; got {value!r}.")
 
 
 class GridSolution:
@@ -285,7 +291,7 @@ def rollout(
         while k < n_steps and (finite == n_steps).any():
             start, y_start = k, y
             for k in range(start, min(start + block, n_steps)):
-                y = step(k, y)
+                y = step(k, y) if k else _first(step(k, y), y)
                 if position < len(wanted) and wanted[position] == k + 1:
                     if tensor:
                         out.append(y)
@@ -304,6 +310,17 @@ def rollout(
         out += [full_of_nan(y)] * (len(wanted) - len(out))
         out = stack(out, axis=0) if out else y[None][:0]
     return out, np.asarray(finite)
+
+
+def _first(y_next: Any, y: Array) -> Array:
+    """The first step's result, checked: a step may be that of a plug-in."""
+    if is_tensor(y_next) != is_tensor(y) or np.shape(y_next) != np.shape(y) or isinstance(y_next, list | tuple):
+        what = f"shape {tuple(y_next.shape)}" if hasattr(y_next, "shape") else "no array"
+        raise TypeError(
+            f"`step` must return states of the shape and library of those that it is given, {tuple(y.shape)}; got "
+            f"{type(y_next).__name__} of {what}. Mend the integrator: check_integrator tests it."
+        )
+    return y_next
 
 
 def _report_failures(outcome: Outcome, grid: Grid, finite: np.ndarray, n_run: int, breakdown: tuple[str, str]) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
-from sympflow.integrators.base import FixedStep, Outcome, Problem
+from sympflow.integrators.base import FixedStep, Outcome, Problem, check_flag
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
@@ -51,6 +51,10 @@ class Gauss(FixedStep):
         "Reduce `dt`",
     )
     tableau: ClassVar[Tableau]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_flag("compensated", self.compensated)
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         K, _ = self._stages(system, y, per_state(h, y))

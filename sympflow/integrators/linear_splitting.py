@@ -278,7 +278,8 @@ class PartsSplitting(MapsStepper):
         super().__post_init__()
         if self.parts is None:
             return
-        if isinstance(self.parts, str) or not all(isinstance(part, str) for part in self.parts) or not self.parts:
+        sequence = isinstance(self.parts, list | tuple)
+        if not sequence or not all(isinstance(part, str) for part in self.parts) or not self.parts:
             raise TypeError(f"`parts` must be a sequence of expressions; got {self.parts!r}: pass a list of strings.")
         object.__setattr__(self, "parts", tuple(self.parts))
 

@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arrays import Array, is_tensor, to_numpy
-from sympflow.integrators.base import FixedStep, Outcome, Problem, Steps
+from sympflow.integrators.base import FixedStep, Outcome, Problem, Steps, check_flag
 from sympflow.integrators.physical_time import PhysicalRun, reach
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.integrators.splitting import splitting
@@ -180,6 +180,10 @@ class LogSplitting(Logarithmic):
     compensated: bool = False
 
     scheme_name: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_flag("compensated", self.compensated)
 
     def inner(self, system: HamiltonianSystem) -> FixedStep:
         return splitting(self.scheme_name)(compensated=self.compensated)

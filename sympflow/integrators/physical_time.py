@@ -77,7 +77,7 @@ class PhysicalRun:
         self.length = abs(problem.t1 - problem.t0)
         self.sign = 1.0 if problem.t1 >= problem.t0 else -1.0
         self.h = self.sign * integrator.new_step(self.system)
-        self.most_steps = 100_000 + 1000 * self.length / integrator.step_length(self.system)
+        self.most_steps = 20_000 + 1000 * self.length / integrator.step_length(self.system)
         self.n_steps = np.zeros(len(rows), dtype=int)
         self.n_extra, self.backend = 0, ""
         self.failed_at = np.full(len(rows), np.nan)

@@ -42,9 +42,10 @@ class _Scipy(RungeKutta):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.max_step > 0:
+        if not (isinstance(self.max_step, int | float | np.number) and self.max_step > 0):
             raise ValueError(f"`max_step` must be positive; got {self.max_step!r}.")
-        if self.first_step is not None and not 0 < self.first_step < math.inf:
+        number = isinstance(self.first_step, int | float | np.number)
+        if self.first_step is not None and not (number and 0 < self.first_step < math.inf):
             raise ValueError(f"`first_step` must be positive and finite; got {self.first_step!r}.")
 
     def _start(self, system: HamiltonianSystem, t0: float, t1: float, y0: np.ndarray) -> Any:
@@ -95,7 +96,10 @@ class _Scipy(RungeKutta):
         solver = self._start(problem.system, t0, t1, y0.astype(float)) if t1 != t0 else None
         failure = None
         if t1 != t0 and solver is None:
-            failure = f"The vector field or the first step is not finite at t = {t0:.17g}. Check `y0` and its scale."
+            failure = (
+                f"The vector field or the first step is not finite at t = {t0:.17g}. Check `y0` and its scale, or raise "
+                "`atol`."
+            )
         wanted = [] if t_eval is None else t_eval.tolist()
         outputs: list[np.ndarray] = [y0 for t in wanted if t == t0]
         search = problem.events

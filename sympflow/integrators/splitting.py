@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
-from sympflow.integrators.base import FixedStep, Problem
+from sympflow.integrators.base import FixedStep, Problem, check_flag
 from sympflow.integrators.schemes import SCHEMES, Scheme
 from sympflow.system import HamiltonianSystem
 
@@ -34,6 +34,10 @@ class Splitting(FixedStep):
     scheme: ClassVar[Scheme]
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_flag("compensated", self.compensated)
 
     def check(self, system: HamiltonianSystem) -> None:
         if not system.separable:
