@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sympflow.domain import EnergySublevel
+from sympflow.domain import Box, EnergySublevel
 from sympflow.flow.io import load
 from sympflow.system import HamiltonianSystem
 from sympflow.systems import harmonic_oscillator, henon_heiles, pendulum
@@ -44,6 +44,9 @@ class Recipe:
         The frequency in whose units the figures are (see `measure`).
     points, steps : (int, int)
         Collocation points and steps of the stages.
+    margin : float
+        How much wider than the system's the domain is that is trained on, in energy: what a network does beyond its
+        domain is arbitrary, and orbits at the edge come there.
     """
 
     system: HamiltonianSystem
@@ -52,17 +55,28 @@ class Recipe:
     omega: float = 1.0
     points: tuple[int, int] = (1000, 2500)
     steps: tuple[int, int] = (150, 100)
+    margin: float = 1.0
 
     def train(self, kind: str, **options: Any) -> Any:
         """The flow, with its figures, and a certificate if it is symplectic."""
         first, second = zip(self.points, self.steps, strict=True)
-        newton: dict[str, Any] = {"optimizer": "gauss-newton", **options}
+        newton: dict[str, Any] = {"optimizer": "gauss-newton", "domain": self.domain, **options}
         flow = train(self.system, self.dt, kind=kind, points=first[0], steps=first[1], **newton)
         flow = train(self.system, flow=flow, points=second[0], steps=second[1], seed=1, **newton)
         flow.figures |= self.measure(flow)
         if kind == "sympflow":
             certify(flow, self.system)
         return flow
+
+    @property
+    def domain(self) -> EnergySublevel:
+        """The domain that is trained on."""
+        own = self.system.domain
+        assert isinstance(own, EnergySublevel)
+        low, high = np.array(own.box.low), np.array(own.box.high)
+        middle, half = (low + high) / 2, (high - low) / 2 * max(1.0, self.margin)
+        box = Box(middle - half, middle + half) if self.margin != 1.0 else own.box
+        return EnergySublevel(self.margin * own.energy, box).attach(self.system.hamiltonian)
 
     def measure(self, flow: Any, steps: int = 1000) -> dict[str, Any]:
         """`measure` from the initial states of the recipe."""
@@ -87,9 +101,11 @@ def recipes() -> dict[str, Recipe]:
     assert swing.domain is not None
     return {
         "henon_heiles": Recipe(henon_heiles(), lambda: _well(1 / 8), points=(1000, 4000)),
-        "harmonic_oscillator": Recipe(harmonic_oscillator(), lambda: _square(1.0)),
-        "pendulum": Recipe(swing, lambda: swing.domain.sample(100, 0)),  # type: ignore[union-attr]
-        "harmonic_oscillator_100": Recipe(harmonic_oscillator(100.0), lambda: _square(100.0), dt=0.01, omega=100.0),
+        "harmonic_oscillator": Recipe(harmonic_oscillator(), lambda: _square(1.0), margin=1.1),
+        "pendulum": Recipe(swing, lambda: swing.domain.sample(100, 0), margin=1.03),  # type: ignore[union-attr]
+        "harmonic_oscillator_100": Recipe(
+            harmonic_oscillator(100.0), lambda: _square(100.0), dt=0.01, omega=100.0, margin=1.1
+        ),
     }
 
 
