@@ -82,6 +82,22 @@ def test_gradients_of_a_flow_to_y0_t_and_weights(t):
     assert torch.autograd.gradcheck(states, (y0, times(*t).requires_grad_(True), *psi.parameters()))
 
 
+@pytest.mark.parametrize("make", [lambda: SympFlow.primed(PENDULUM), lambda: MLPFlow(1, hidden=(4,))])
+def test_gradients_of_other_flows(make):
+    """Through states and event times, to y0, t and all weights."""
+    psi = make().requires_grad_(True)
+    y0 = times(1.0, 0.2).requires_grad_(True)
+
+    def states(y, s, *weights):
+        return odeint(PENDULUM, y, s, method=psi)
+
+    def event_time(y, *weights):
+        return odeint_event(PENDULUM, y, times(0.0)[0], event_fn=lambda t, y: t + y[0] - 1.9, method=psi)[0]
+
+    assert torch.autograd.gradcheck(states, (y0, times(0.0, 0.25, 1.3).requires_grad_(True), *psi.parameters()))
+    assert torch.autograd.gradcheck(event_time, (y0, *psi.parameters()))
+
+
 def test_gradient_in_t_on_the_grid_is_the_velocity(rotation):
     t = times(0.0, 0.5, 2.0).requires_grad_(True)
     y = odeint(OSCILLATOR, times(1.0, 0.0), t, method=rotation)

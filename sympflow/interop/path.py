@@ -31,7 +31,7 @@ class Path:
     """
 
     def __init__(self, integrator: FixedStep, system: HamiltonianSystem | None, y0: Tensor, direction: int) -> None:
-        self.integrator, self.y0 = integrator, y0
+        self.integrator, self.y0, self.eager = integrator, y0, False
         self.system: HamiltonianSystem = system  # type: ignore[assignment]
         self.h = math.copysign(integrator.step_length(self.system), direction)
 
@@ -56,7 +56,7 @@ class Path:
         """The states after the steps `count`: compiled where nothing is to be differentiated."""
         save, n_steps = np.unique(count), int(count.max(initial=0))
         y0: Tensor | np.ndarray = self.y0
-        plain = not self._differentiable() and self.y0.device.type == "cpu"
+        plain = not (self.eager or self._differentiable()) and self.y0.device.type == "cpu"
         if plain:
             y0 = self.y0.detach().numpy()
         states, _, _ = self.integrator.rollout(Problem(self.system, 0.0, n_steps * self.h, y0), self.h, n_steps, save)
@@ -65,9 +65,12 @@ class Path:
         return states[torch.as_tensor(np.searchsorted(save, count), device=self.y0.device)]
 
     def _differentiable(self) -> bool:
+        return torch.is_grad_enabled() and (self.y0.requires_grad or self._learns())
+
+    def _learns(self) -> bool:
+        """Whether the flow has weights that require gradients."""
         flow = self.integrator.flow_for(self.system) if self.integrator.trained else None  # type: ignore[attr-defined]
-        weights = () if flow is None else flow.parameters()
-        return torch.is_grad_enabled() and (self.y0.requires_grad or any(w.requires_grad for w in weights))
+        return flow is not None and any(w.requires_grad for w in flow.parameters())
 
     def first_zero(self, g: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """The elapsed time s at which g(s, ψ_s(y0)), a number, first vanishes.
@@ -99,8 +102,10 @@ class Path:
         if before == 0:
             return 0.0
         k, chunk, y = 0, 8, self.y0.detach()
+        eager = self._learns()  # the map whose derivatives follow, not a compiled copy of its weights
         while k < MAX_EVENT_STEPS:
             ahead = Path(self.integrator, self.system, y, 1 if self.h > 0 else -1)
+            ahead.eager = eager
             states = ahead._rollout(np.arange(chunk + 1))
             inner = self._samples(states[:-1])
             parts = inner.shape[1] + 1
