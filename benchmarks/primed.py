@@ -1,13 +1,14 @@
-"""Primed SympFlows against every splitting scheme of the package, at equal energy error.
+"""Primed SympFlows against every splitting scheme of the package, and heyoka, at equal error.
 
-    python benchmarks/primed.py                                            Hénon–Heiles, Δt = 1, 4, 6 and 8 kicks
-    python benchmarks/primed.py --system pendulum --stages 3,6 --dt 1
+    python benchmarks/primed.py                        four scenes: energy error over T = 1000, state error at T = 100
+    python benchmarks/primed.py --system pendulum --flows folder      one scene; the flows are kept, and used again
+    python benchmarks/primed.py --ablation             what of a flow and its training pays, on Hénon–Heiles
+    python benchmarks/primed.py --quick                the same in miniature
 
-A flow is fitted (its time is stated), then run over T = 1000 from 20 held-out states; its energy error is the largest
-|H − H0|/|H0| over 1000 instants, the median over the states. Each scheme gets the fewest steps with which that median
-is as small. Then all run one trajectory, and 1000 of them, in the same compiled loops, in turn, on one thread; what is
-stated is how much longer than the flow the best scheme takes. The flow is one that holds for all t: its mean error
-over 50 fractional times stands beside that at Δt.
+Flows of a few sizes are fitted to each scene. For each target each of them, and each scheme, gets the fewest steps
+(for a flow, of at most its Δt) with which the median error over 20 held-out states is no larger; the flow that is then
+the fastest is the row. Everything runs in the same compiled loops, in turn, on one thread: one trajectory of which the
+end is kept; one of which 1000 outputs are kept, with the processor executed at each; and a batch of 1000.
 """
 
 # ruff: noqa: E402
@@ -15,163 +16,173 @@ over 50 fractional times stands beside that at Δt.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from contenders.environment import pin_to_one_thread
 
 pin_to_one_thread()
 
-import numpy as np
+from contenders import primed_race
+from contenders.primed_race import Measure, Row, Runner, fewest_steps, race, schemes
 
+import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, train
-from sympflow.integrators.schemes import SCHEMES, Scheme
-from sympflow.kernels.splitting import SplittingKernel, splitting_kernel
-from sympflow.timing import interleaved
+from sympflow.flow.primed import PrimedFlow
+from sympflow.training.recipes import PrimedRecipe
 
-T_END, INSTANTS = 1000.0, 1000
-HELD_OUT, HELD_OUT_SEED = 20, 20_261_121  # a seed that no training uses
-BATCH = 1000
-MOST_STEPS = 10_000_000
-CLOSENESS = 1.01  # of the fewest steps, as a ratio
-
-
-@dataclass(frozen=True)
-class Row:
-    """A flow and the scheme that comes nearest."""
-
-    system: str
-    dt: float
-    stages: int
-    parameters: int
-    fit_seconds: float
-    one_step_error: float
-    fractional_error: float
-    energy_error: float
-    energy_error_worst: float
-    kicks: int
-    rival: str
-    rival_kicks: int
-    evaluations_saved: float
-    times_faster: float
-    batch_rival: str
-    batch_times_faster: float
+TARGETS = (1e-4, 1e-6, 1e-8)
+MEASURES = {"energy": 1000.0, "state": 100.0}
+FLOWS = {
+    "henon_heiles": (
+        PrimedRecipe(1.1, 2), PrimedRecipe(0.65, 2), PrimedRecipe(0.9, 3), PrimedRecipe(0.55, 3, restarts=48),
+    ),
+    "pendulum": (
+        PrimedRecipe(0.8, 1), PrimedRecipe(1.2, 2, 4), PrimedRecipe(0.5, 2), PrimedRecipe(0.5, 3, restarts=48),
+    ),
+    "quartic": (PrimedRecipe(0.8, 2), PrimedRecipe(0.5, 3), PrimedRecipe(0.3, 3, restarts=48)),
+    "kepler": (PrimedRecipe(0.15, 2), PrimedRecipe(0.1, 3), PrimedRecipe(0.045, 3, restarts=48)),
+}  # fmt: skip
 
 
-def energy_errors(system: HamiltonianSystem, kernel: SplittingKernel, scheme: Scheme, n: int) -> np.ndarray:
-    """The largest relative energy error of each held-out state in n steps over T."""
-    assert system.domain is not None
-    y0 = system.domain.sample(HELD_OUT, HELD_OUT_SEED)
-    save = np.unique(np.linspace(0, n, INSTANTS + 1).round().astype(np.int64))
-    with np.errstate(all="ignore"):  # too few steps overflow
-        H = system.hamiltonian(kernel.run_batch(scheme, T_END / n, y0, n, save)[0])
-        error = np.abs(H - H[:, :1]).max(1) / np.abs(H[:, 0])
-    return np.where(np.isnan(error), np.inf, error)
+def fitted(system: HamiltonianSystem, recipe: PrimedRecipe, folder: Path | None, **options: Any) -> PrimedFlow:
+    """The flow of a recipe, from the folder if it is there."""
+    path = folder and folder / f"{system.name}-{recipe.dt:g}-{recipe.stages}-{recipe.processor}.safetensors"
+    if path is not None and path.exists():
+        return sympflow.load(path, system=system)
+    flow = train(system, flow=recipe.flow(system), progress=False, **(recipe.options() | options))
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        flow.save(path)
+    return flow
 
 
-def fewest_steps(error: Callable[[int], float], target: float, guess: int) -> int | None:
-    """The smallest n, to 1 %, with error(n) ≤ target, if there is one below `MOST_STEPS`."""
-    high = guess
-    while error(high) > target:
-        high *= 2
-        if high > MOST_STEPS:
-            return None
-    low = high // 2
-    while low > 1 and error(low) <= target:
-        low, high = low // 2, low
-    while high > CLOSENESS * low + 1:
-        middle = round((low * high) ** 0.5)
-        low, high = (low, middle) if error(middle) <= target else (middle, high)
-    return high
+def taylor_of(system: HamiltonianSystem) -> Any:
+    """heyoka's integrators of the system, None where it is not installed."""
+    if importlib.util.find_spec("heyoka") is None:
+        return None
+    from contenders.heyoka_systems import Taylor
 
-
-def measure(
-    system: HamiltonianSystem, stages: int, dt: float, degree: int, repeats: int, force_gradient: bool = True
-) -> Row:
-    start = SympFlow.primed(system, stages, dt=dt, degree=degree, force_gradient=force_gradient)
-    flow = train(system, flow=start, optimizer="gauss-newton")
-    kernel, n = splitting_kernel(system), round(T_END / dt)
-    errors = energy_errors(system, kernel, flow.scheme(), n)
-    target = float(np.median(errors))
-    contenders: dict[str, tuple[Scheme, int]] = {}
-    for name, scheme in SCHEMES.items():
-        if (scheme.nystrom or any(scheme.gradients)) and not system.quadratic_kinetic:
-            continue
-        guess = max(1, n * stages // scheme.force_evaluations)
-        steps = fewest_steps(lambda k, s=scheme: float(np.median(energy_errors(system, kernel, s, k))), target, guess)
-        if steps is not None:
-            contenders[name] = (scheme, steps)
-    everyone = {"the flow": (flow.scheme(), n), **contenders}
-    assert system.domain is not None
-    y0 = system.domain.sample(BATCH, 0)
-    one = [partial(kernel.run, s, T_END / k, y0[0], k, np.array([k])) for s, k in everyone.values()]
-    many = [partial(kernel.run_batch, s, T_END / k, y0, k, np.array([k]), threads=1) for s, k in everyone.values()]
-    times = {}
-    for label, calls, count in (("one", one, 5 * repeats), ("many", many, repeats)):
-        for call in calls:
-            call()
-        medians = [time.median for time in interleaved(calls, count)]
-        times[label] = dict(zip(everyone, medians, strict=True))
-    best = {label: min(contenders, key=lambda name, label=label: times[label][name]) for label in times}
-    rival, steps = contenders[best["one"]]
-    return Row(
-        system=system.name,
-        dt=dt,
-        stages=stages,
-        parameters=flow.n_parameters,
-        fit_seconds=flow.figures["training_seconds"],
-        one_step_error=flow.figures["one_step_error"],
-        fractional_error=flow.figures["fractional_error"],
-        energy_error=target,
-        energy_error_worst=float(errors.max()),
-        kicks=n * stages,
-        rival=best["one"],
-        rival_kicks=steps * rival.force_evaluations,
-        evaluations_saved=steps * rival.force_evaluations / (n * stages),
-        times_faster=times["one"][best["one"]] / times["one"]["the flow"],
-        batch_rival=best["many"],
-        batch_times_faster=times["many"][best["many"]] / times["many"]["the flow"],
-    )
+    return Taylor(system)
 
 
 def table(rows: list[Row]) -> str:
     lines = [
-        "| system, Δt, kicks | fit | one-step error at Δt / at fractional t | energy error, T = 1000: median (largest) "
-        "| best scheme, forces to forces | times faster | batch of 1000 |",
-        "|---|---|---|---|---|---|---|",
+        "| system, target | Δt, kicks + processor | fit | error at Δt / at fractional t | forces saved "
+        "| one trajectory | heyoka | with 1000 outputs | heyoka | batch of 1000 | heyoka |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
+        faster = {name: f"{value:.2f}" for name, value in r.faster.items()}
+        versus = [
+            f"{faster[kind]} ({r.rival[kind]}) | {faster.get(f'heyoka {kind}', '–')}"
+            for kind in ("one", "outputs", "batch")
+        ]
         lines.append(
-            f"| {r.system}, {r.dt:g}, {r.stages} | {r.fit_seconds:.1f} s, {r.parameters} numbers | "
-            f"{r.one_step_error:.1e} / {r.fractional_error:.1e} | {r.energy_error:.1e} ({r.energy_error_worst:.1e}) | "
-            f"{r.rival}, {r.evaluations_saved:.1f}× | {r.times_faster:.2f} | "
-            f"{r.batch_times_faster:.2f} ({r.batch_rival}) |"
+            f"| {r.system}, {r.measure} {r.target:.0e} | {r.flow} at {r.dt:.3g} | {r.fit_seconds:.0f} s | "
+            f"{r.one_step_error:.1e} / {r.fractional_error:.1e} | {r.evaluations_saved:.1f}× | {' | '.join(versus)} |"
         )
     return "\n".join(lines)
 
 
+# ablation ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A flow and its training that differ from the base in one thing."""
+
+    name: str
+    stages: int = 3
+    processor: int = 6
+    flow: tuple[tuple[str, Any], ...] = ()
+    training: tuple[tuple[str, Any], ...] = ()
+
+
+ABLATION = (
+    Variant("as recommended"),
+    Variant("no processor", processor=0),
+    Variant("a small processor", processor=3),
+    Variant("a large processor", processor=9),
+    Variant("not palindromic", flow=(("palindromic", False),)),
+    Variant("no force gradients", flow=(("force_gradient", False),)),
+    Variant("no force gradients, twice the kicks", stages=6, flow=(("force_gradient", False),)),
+    Variant("labels + matching", training=(("loss", "labels+matching"), ("restarts", 4), ("steps", 30))),
+    Variant("labels + residual", training=(("loss", "labels+residual"), ("restarts", 4), ("steps", 30))),
+    Variant("residual", training=(("loss", "residual"), ("restarts", 4), ("steps", 30))),
+    Variant("residual + matching", training=(("loss", "residual+matching"), ("restarts", 4), ("steps", 30))),
+    Variant("Δt alone weighted 10 times", training=(("frozen_weight", 10.0),)),
+)
+
+
+def ablation(system: HamiltonianSystem, dt: float, variants: tuple[Variant, ...], **options: Any) -> str:
+    """How near each variant comes with the same Δt, and how many forces it saves at its own energy error."""
+    lines = [
+        "| variant | numbers | fit | error at Δt / at fractional t | energy error, T = 1000 | forces saved |",
+        "|---|---|---|---|---|---|",
+    ]
+    measure = Measure(system, "energy", MEASURES["energy"])
+    for v in variants:
+        start = SympFlow.primed(system, v.stages, dt=dt, processor=v.processor, **dict(v.flow))
+        flow = train(system, flow=start, progress=False, **(options | dict(v.training)))
+        n, runner = round(measure.t_end / dt), Runner.of_flow(flow, system)
+        error = measure.of(runner, n)
+        needed = []
+        for rival in schemes(system):
+            most = primed_race.MOST_FORCES // rival.forces
+            steps = fewest_steps(partial(measure.of, rival), error, max(1, 3 * n // rival.forces), 1, most)
+            needed += [] if steps is None else [steps * rival.forces]
+        saved = f"{min(needed) / (n * runner.forces):.1f}×" if needed else "–"
+        f = flow.figures
+        lines.append(
+            f"| {v.name} | {flow.n_parameters} | {f['training_seconds']:.0f} s | {f['one_step_error']:.1e} / "
+            f"{f['fractional_error']:.1e} | {error:.1e} | {saved} |"
+        )
+        print(lines[-1], flush=True)
+    return "\n".join(lines)
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Primed SympFlows against splitting schemes at equal energy error.")
-    parser.add_argument("--system", default="henon_heiles", choices=[s.__name__ for s in systems.SYSTEMS.values()])
-    parser.add_argument("--dt", type=float, default=1.0)
-    parser.add_argument("--stages", default="4,6,8", help="numbers of kicks, separated by commas")
-    parser.add_argument("--degree", type=int, default=7)
-    parser.add_argument("--no-force-gradient", action="store_true")
-    parser.add_argument("--repeats", type=int, default=5)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--system", action="append", choices=list(FLOWS), help="all four if not given")
+    parser.add_argument("--ablation", action="store_true")
+    parser.add_argument("--quick", action="store_true", help="small fits, short intervals")
+    parser.add_argument("--flows", type=Path, help="folder where fitted flows are kept")
+    parser.add_argument("--fit-seconds", type=float, help="time budget of a fit")
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--batch", type=int, default=1000)
     parser.add_argument("--json", type=Path, help="file for the rows")
-    options = parser.parse_args()
-    system = getattr(systems, options.system)()
-    rows = []
-    for stages in map(int, options.stages.split(",")):
-        gradient = not options.no_force_gradient
-        rows.append(measure(system, stages, options.dt, options.degree, options.repeats, gradient))
-        print(table(rows[-1:]).splitlines()[-1], flush=True)
-    print("\n" + table(rows))
+    print(run(parser.parse_args()))
+
+
+def run(options: argparse.Namespace) -> str:
+    quick: dict[str, Any] = {"restarts": 2, "steps": 10, "points": 60, "reference_states": 20} if options.quick else {}
+    if options.fit_seconds:
+        quick["time_budget"] = options.fit_seconds
+    targets, measures = (TARGETS, MEASURES) if not options.quick else ((1e-2,), {"energy": 20.0, "state": 5.0})
+    if options.ablation:
+        system = getattr(systems, (options.system or ["henon_heiles"])[0])()
+        return ablation(system, 0.5, ABLATION[:3] if options.quick else ABLATION, **quick)
+    rows: list[Row] = []
+    for name in options.system or FLOWS:
+        system = getattr(systems, name)()
+        flows = [fitted(system, r, options.flows, **quick) for r in FLOWS[name][: 1 if options.quick else None]]
+        taylor = taylor_of(system)
+        for measure, t_end in measures.items():
+            for target in targets:
+                row = race(Measure(system, measure, t_end), target, flows, taylor, options.repeats, options.batch)
+                if row is None:
+                    print(f"{name}: no flow reaches {measure} {target:g}", flush=True)
+                    continue
+                rows.append(row)
+                print(table([row]).splitlines()[-1], flush=True)
     if options.json:
         options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
+    return "\n" + table(rows)
 
 
 if __name__ == "__main__":

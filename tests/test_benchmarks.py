@@ -1,6 +1,7 @@
 """The arithmetic of the comparison with other packages, and a tiny run of it. Nothing here judges a time."""
 # ruff: noqa: E402  (the benchmarks are no package that is installed)
 
+import argparse
 import importlib.util
 import json
 import math
@@ -17,7 +18,7 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import peers
 import primed
-from contenders import compiled_loops, interpreted_loops, ours, runge_kutta
+from contenders import compiled_loops, interpreted_loops, ours, primed_race, runge_kutta
 from contenders.calibration import Judged, largest_control
 from contenders.contender import Skipped, Work
 from contenders.goals import Goal, goals, worst_ratio
@@ -26,6 +27,7 @@ from contenders.page import duration, page, three
 from contenders.prose import power
 from contenders.scene import Scene
 
+from sympflow.integrators.schemes import SCHEMES
 from sympflow.systems import pendulum
 
 TINY = Scene(t_end=20.0, n_instants=20, trajectories=70)  # more than a block of the hand-written loops, and not two
@@ -208,12 +210,43 @@ def test_fewest_steps_are_the_fewest():
     assert primed.fewest_steps(lambda n: (100 / n) ** 4, 1.0, 13) in (100, 101)
     assert primed.fewest_steps(lambda n: (100 / n) ** 4, 1.0, 5000) in (100, 101)
     assert primed.fewest_steps(lambda n: 1.0, 0.5, 10) is None
+    assert primed.fewest_steps(lambda n: (100 / n) ** 4, 1.0, 1, least=400) == 400
 
 
-def test_a_tiny_comparison_of_a_primed_flow(monkeypatch):
-    monkeypatch.setattr(primed, "T_END", 20.0)
-    monkeypatch.setattr(primed, "INSTANTS", 20)
-    row = primed.measure(pendulum(), 2, 1.0, 3, 1)
-    assert row.energy_error > 0
-    assert row.rival_kicks > row.kicks
-    assert primed.table([row]).count("\n") == 2
+def arguments(**options):
+    given = {"system": ["pendulum"], "ablation": False, "quick": True, "flows": None, "json": None, "fit_seconds": None}
+    return argparse.Namespace(**{**given, "repeats": 1, "batch": 16, **options})
+
+
+def test_a_tiny_race_of_primed_flows(tmp_path, monkeypatch):
+    monkeypatch.setattr(primed_race, "TIMED_SPAN", 20.0)
+    text = primed.run(arguments(flows=tmp_path, json=tmp_path / "rows.json"))
+    assert text.count("| pendulum, ") == 2
+    for row in json.loads((tmp_path / "rows.json").read_text()):
+        assert 0 < row["error"] <= row["target"]
+        assert row["dt"] <= 0.8
+        assert row["rival"]["one"] in SCHEMES
+        assert all(value > 0 for value in row["faster"].values())
+    assert len(list(tmp_path.glob("*.safetensors"))) == 1
+    system = pendulum()
+    again = primed.fitted(system, primed.FLOWS["pendulum"][0], tmp_path)  # not fitted again, but read
+    assert again.recipe["stages"][0]["restarts"] == 2
+
+
+def test_a_tiny_ablation():
+    lines = primed.run(arguments(ablation=True)).splitlines()
+    assert [line.split(" | ")[0] for line in lines[2:]] == [f"| {v.name}" for v in primed.ABLATION[:3]]
+
+
+def test_heyoka_solves_any_symbolic_system():
+    pytest.importorskip("heyoka")
+    from contenders.heyoka_systems import Taylor
+
+    from sympflow.systems import quartic
+
+    system = quartic()
+    taylor, y0 = Taylor(system), system.domain.sample(5, 0)
+    expected = primed_race.reference(system, (0.0, 10.0), y0, np.array([10.0])).y[..., 0]
+    np.testing.assert_allclose(taylor.run_lanes(1e-9, y0, 10.0), expected, atol=1e-6)
+    np.testing.assert_allclose(taylor.run(1e-9, y0[0], 10.0), expected[0], atol=1e-6)
+    np.testing.assert_allclose(taylor.grid(1e-9, y0[0], np.array([0.0, 5.0, 10.0]))[-1], expected[0], atol=1e-6)

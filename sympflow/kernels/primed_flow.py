@@ -25,7 +25,7 @@ class PrimedFlowKernel:
     Parameters
     ----------
     flow : PrimedFlow
-        In float64 on the CPU.
+        In float64 on the CPU, with the numbers that it has when a table of it is first needed.
     system : HamiltonianSystem
         The flow's, one that can be compiled.
     compensated : bool
@@ -36,12 +36,12 @@ class PrimedFlowKernel:
         if str(flow.dtype) != "torch.float64" or flow.device.type != "cpu":
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
         self.flow, self._splitting, self._compensated = flow, splitting_kernel(system), compensated
+        self._tables: dict[float, tuple[Scheme, ...]] = {}
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` times ψ̄_h, or for h < 0 the inverse of ψ̄_|h|: see `SplittingKernel.run`."""
         start = self._prepared(abs(h), y0[None])[0]
-        scheme = _signed(self.flow.kernel_scheme(abs(h)), h)
-        Y, n_finite = self._splitting.run(scheme, abs(h), start, n_steps, save, self._compensated)
+        Y, n_finite = self._splitting.run(self._kernel(h), abs(h), start, n_steps, save, self._compensated)
         return self._finished(abs(h), y0[None], Y[None], save)[0], n_finite
 
     def run_batch(
@@ -52,7 +52,7 @@ class PrimedFlowKernel:
             Y, n_finite = self.run(h, y0[0], n_steps, save)
             return Y[None], np.array([n_finite])
         start = self._prepared(abs(h), y0)
-        scheme = _signed(self.flow.kernel_scheme(abs(h)), h)
+        scheme = self._kernel(h)
         Y, finite = self._splitting.run_batch(scheme, abs(h), start, n_steps, save, self._compensated, threads)
         return self._finished(abs(h), y0, Y, save), finite
 
@@ -65,9 +65,21 @@ class PrimedFlowKernel:
             out[rows] = self._splitting.step(_signed(self.flow.scheme(abs(value)), value), abs(value), y[rows])
         return out
 
+    def _kernel(self, h: float) -> Scheme:
+        """K_h, or for h < 0 its inverse."""
+        return self._schemes(abs(h))[0 if h > 0 else 1]
+
+    def _schemes(self, t: float) -> tuple[Scheme, ...]:
+        """K_t and its inverse, and with a processor χ_t and its inverse."""
+        if t not in self._tables:
+            made = [self.flow.kernel_scheme(t)]
+            made += [self.flow.processor_scheme(t)] if self.flow.processor else []
+            self._tables[t] = tuple(s for scheme in made for s in (scheme, scheme.inverse()))
+        return self._tables[t]
+
     def _prepared(self, t: float, y: np.ndarray) -> np.ndarray:
         """χ_t⁻¹ of the rows of y."""
-        return self._splitting.step(self.flow.processor_scheme(t).inverse(), t, y) if self.flow.processor else y
+        return self._splitting.step(self._schemes(t)[3], t, y) if self.flow.processor else y
 
     def _finished(self, t: float, y0: np.ndarray, Y: np.ndarray, save: np.ndarray) -> np.ndarray:
         """χ_t of the outputs Y (N, n, 2d); what is saved before the first step are the initial states themselves."""
@@ -75,7 +87,7 @@ class PrimedFlowKernel:
             return Y
         rows = Y.reshape(-1, Y.shape[-1])
         out = np.empty_like(rows)
-        chi = self.flow.processor_scheme(t)
+        chi = self._schemes(t)[2]
         if len(rows):
             out = self._splitting.run_batch(chi, t, rows, 1, np.array([1]), threads=1)[0][:, 0]
         out = out.reshape(Y.shape)

@@ -1,0 +1,236 @@
+"""Primed flows, splitting schemes and heyoka at equal error: how many steps each needs, and how long it takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+
+from sympflow import HamiltonianSystem
+from sympflow.flow.primed import PrimedFlow
+from sympflow.integrators.schemes import SCHEMES
+from sympflow.kernels.primed_flow import PrimedFlowKernel
+from sympflow.kernels.splitting import splitting_kernel
+from sympflow.metrics.reference import reference
+from sympflow.timing import interleaved
+
+INSTANTS = 1000
+HELD_OUT, HELD_OUT_SEED = 20, 20_261_121  # a seed that no training uses
+TIMED = 3  # states that are run one after the other for a time
+TIMED_SPAN = 10_000.0  # how far: 1000 units of time may take 20 µs, of which the call would be a good part
+MOST_FORCES = 3_000_000  # beyond which a scheme is out of the race
+CLOSENESS = 1.01  # of the fewest steps, as a ratio
+NEAR = 2.0  # schemes with so many times the fewest evaluations are not timed
+WORK = 20_000_000  # kicks of all trajectories together in a timed batch, which is a part of the interval
+
+
+@dataclass(frozen=True)
+class Runner:
+    """What takes steps: a flow or a scheme. `one` and `many` are its compiled loops: (h, y0, n, save) to states."""
+
+    name: str
+    forces: int
+    hessians: int
+    one: Callable[..., Any]
+    many: Callable[..., Any]
+    longest: float = np.inf
+
+    @classmethod
+    def of_flow(cls, flow: PrimedFlow, system: HamiltonianSystem) -> Runner:
+        kernel, scheme = PrimedFlowKernel(flow, system), flow.kernel_scheme()
+        name = f"Δt = {flow.dt:g}, {scheme.force_evaluations} + {flow.processor}"
+        many = partial(kernel.run_batch, threads=1)
+        return cls(name, scheme.force_evaluations, scheme.hessian_evaluations, kernel.run, many, flow.dt)
+
+    @classmethod
+    def of_scheme(cls, name: str, system: HamiltonianSystem) -> Runner:
+        kernel, scheme = splitting_kernel(system), SCHEMES[name]
+        one, many = partial(kernel.run, scheme), partial(kernel.run_batch, scheme, threads=1)
+        return cls(name, scheme.force_evaluations, scheme.hessian_evaluations, one, many)
+
+
+def schemes(system: HamiltonianSystem) -> list[Runner]:
+    """All of the package that apply."""
+    return [
+        Runner.of_scheme(name, system)
+        for name, scheme in SCHEMES.items()
+        if system.quadratic_kinetic or not (scheme.nystrom or any(scheme.gradients))
+    ]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """An error over [0, t_end], the median over held-out states: of the energy, or of the state at the end."""
+
+    system: HamiltonianSystem
+    name: str
+    t_end: float
+
+    @cached_property
+    def y0(self) -> np.ndarray:
+        assert self.system.domain is not None
+        return self.system.domain.sample(HELD_OUT, HELD_OUT_SEED)
+
+    @cached_property
+    def _end(self) -> np.ndarray:
+        return reference(self.system, (0.0, self.t_end), self.y0, np.array([self.t_end])).y[..., 0]
+
+    def of(self, runner: Runner, n: int) -> float:
+        """In n steps."""
+        save = np.unique(np.linspace(0, n, INSTANTS + 1).round().astype(np.int64))
+        with np.errstate(all="ignore"):  # too few steps overflow
+            Y = runner.many(self.t_end / n, self.y0, n, save if self.name == "energy" else np.array([0, n]))[0]
+            return self.of_states(Y)
+
+    def of_states(self, Y: np.ndarray) -> float:
+        """Of states (N, n, 2d), the first of which are the initial ones."""
+        if self.name == "energy":
+            H = self.system.hamiltonian(Y)
+            error = np.abs(H - H[:, :1]).max(1) / np.abs(H[:, 0])
+        else:
+            error = np.linalg.norm(Y[:, -1] - self._end, axis=-1)
+        return float(np.median(np.where(np.isnan(error), np.inf, error)))
+
+
+def fewest_steps(
+    error: Callable[[int], float], target: float, guess: int, least: int = 1, most: int = 10**7
+) -> int | None:
+    """The smallest n ≥ least, to 1 %, with error(n) ≤ target, if there is one up to `most`."""
+    high = max(guess, least)
+    while error(high) > target:
+        high *= 2
+        if high > most:
+            return None
+    low = max(high // 2, least)
+    while low > least and error(low) <= target:
+        low, high = max(low // 2, least), low
+    if error(low) <= target:
+        return low
+    while high > CLOSENESS * low + 1:
+        middle = round((low * high) ** 0.5)
+        low, high = (low, middle) if error(middle) <= target else (middle, high)
+    return high
+
+
+@dataclass
+class Row:
+    """A target, the flow that meets it in the shortest time, and how many times longer the best of the others takes."""
+
+    system: str
+    measure: str
+    target: float
+    flow: str
+    dt: float
+    kicks: int
+    error: float
+    fit_seconds: float
+    one_step_error: float
+    fractional_error: float
+    seconds: float
+    faster: dict[str, float] = field(default_factory=dict)
+    rival: dict[str, str] = field(default_factory=dict)
+    evaluations_saved: float = 0.0
+
+
+def race(
+    measure: Measure, target: float, flows: Sequence[PrimedFlow], taylor: Any, repeats: int, batch: int
+) -> Row | None:
+    """All at the error `target`, on one thread: one trajectory, one with 1000 outputs, and a batch."""
+    system, T = measure.system, measure.t_end
+    own = {Runner.of_flow(f, system): f for f in flows}
+    steps: dict[Runner, int] = {}
+    for runner in [*own, *schemes(system)]:
+        least = max(1, int(np.ceil(T / runner.longest * (1 - 1e-12))))
+        guess = max(least, round(2000 * T / 1000 / runner.forces))
+        found = fewest_steps(partial(measure.of, runner), target, guess, least, MOST_FORCES // runner.forces)
+        if found is not None:
+            steps[runner] = found
+    work = {r: n * (r.forces + r.hessians / 2) for r, n in steps.items()}
+    if not any(r in own for r in steps):
+        return None
+    ours, others = [{r for r in steps if (r in own) == mine} for mine in (True, False)]
+    near = [r for side in (ours, others) for r in side if work[r] <= NEAR * min(work[s] for s in side)]
+    tol = None if taylor is None else tolerance(measure, taylor, target)
+    times = {
+        "one": _single(near, steps, measure, taylor, tol, repeats, outputs=False),
+        "outputs": _single(near, steps, measure, taylor, tol, repeats, outputs=True),
+        "batch": _batch(near, steps, measure, taylor, tol, repeats, batch),
+    }
+    flow = min((r for r in near if r in own), key=lambda r: times["one"][r.name])
+    n, trained = steps[flow], own[flow]
+    row = Row(
+        system.name, measure.name, target, flow.name, T / n, n * flow.forces, measure.of(flow, n),
+        trained.figures["training_seconds"], trained.figures["one_step_error"], trained.figures["fractional_error"],
+        times["one"][flow.name],
+    )  # fmt: skip
+    for kind, of in times.items():
+        mine = min(of[r.name] for r in near if r in own) if kind == "batch" else of[flow.name]
+        rivals = {r.name: of[r.name] for r in near if r not in own}
+        row.rival[kind] = min(rivals, key=rivals.__getitem__)
+        row.faster[kind] = rivals[row.rival[kind]] / mine
+        if "heyoka" in of:
+            row.faster[f"heyoka {kind}"] = of["heyoka"] / mine
+    row.evaluations_saved = min(steps[r] * r.forces for r in others) / row.kicks
+    return row
+
+
+def tolerance(measure: Measure, taylor: Any, target: float) -> float:
+    """The largest tolerance of heyoka, to 10 %, that meets the target."""
+    times = np.linspace(0.0, measure.t_end, INSTANTS + 1 if measure.name == "energy" else 2)
+
+    def error(tol: float) -> float:
+        return measure.of_states(np.stack([taylor.grid(tol, y, times) for y in measure.y0]))
+
+    low, high = 1e-16, 1e-2
+    while high > 1.1 * low:
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if error(middle) <= target else (low, middle)
+    return low
+
+
+def _single(near, steps, measure, taylor, tol, repeats, outputs):  # type: ignore[no-untyped-def]
+    T, y0 = measure.t_end, measure.y0[:TIMED]
+    repeat = max(1, round(TIMED_SPAN / T))
+    times = np.linspace(0.0, repeat * T, repeat * INSTANTS + 1)
+    calls: dict[str, Callable[[], Any]] = {}
+    for runner in near:
+        n = repeat * steps[runner]
+        save = np.array([n])
+        if outputs:
+            save = np.unique(np.linspace(0, n, repeat * INSTANTS + 1).round().astype(np.int64))
+        calls[runner.name] = partial(_each, partial(runner.one, T / steps[runner]), y0, n, save)
+    if tol is not None:
+        run, until = (taylor.grid, times) if outputs else (taylor.run, repeat * T)
+        calls["heyoka"] = partial(_each, partial(run, tol), y0, until)
+    return {name: seconds / (repeat * TIMED) for name, seconds in _timed(calls, repeats).items()}
+
+
+def _each(run: Callable[..., Any], y0: np.ndarray, *arguments: Any) -> None:
+    for y in y0:
+        run(y, *arguments)
+
+
+def _batch(near, steps, measure, taylor, tol, repeats, batch):  # type: ignore[no-untyped-def]
+    T = measure.t_end
+    y0 = measure.system.domain.sample(batch, 0)
+    calls: dict[str, Callable[[], Any]] = {}
+    share = {}
+    for runner in near:
+        n = steps[runner]
+        part = max(1, min(n, WORK // (batch * runner.forces)))
+        share[runner.name] = n / part
+        calls[runner.name] = partial(runner.many, T / n, y0, part, np.array([part]))
+    if tol is not None:
+        part = min(T, T * WORK / (50 * batch * max(steps[r] * r.forces for r in near)))
+        share["heyoka"] = T / part
+        calls["heyoka"] = partial(taylor.run_lanes, tol, y0, part)
+    return {name: seconds * share[name] for name, seconds in _timed(calls, repeats).items()}
+
+
+def _timed(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    for call in calls.values():
+        call()
+    return {name: t.median for name, t in zip(calls, interleaved(list(calls.values()), repeats), strict=True)}
