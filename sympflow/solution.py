@@ -35,11 +35,14 @@ class Solution:
     nfev : int
         Force (right-hand side) evaluations.
     status : int, or ndarray of the batch's shape
-        0: the end was reached. −1: the solution became non-finite, or the step size underflowed. 1: an event ended it.
+        0: the end was reached. −1: the solution became non-finite, an implicit step could not be solved, or the step
+        size underflowed. 1: an event ended it.
     message : str
         In words, with the time and the remedy.
     stats : dict
-        n_steps, force_evaluations, hessian_evaluations, wall_time (seconds), backend, and dt for fixed steps.
+        n_steps, force_evaluations, hessian_evaluations, wall_time (seconds), backend, and dt for fixed steps; where
+        fixed steps failed, failed_at, the time of the last finite state (in a batch an array, NaN for the others);
+        newton_iterations of implicit methods.
     system, integrator, t_span, y0
         The problem that was solved and the method that did it: metrics execute the run again from these.
     """
