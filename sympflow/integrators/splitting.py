@@ -148,7 +148,9 @@ def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int,
         return {"force_evaluations": n * len(kicks), "hessian_evaluations": n * sum(kicks)}
     # compiled, the last kick of a step is merged with the next step's first, except where a state is saved
     forces, hessians = scheme.force_evaluations, scheme.hessian_evaluations
-    closed = n_saved if len(kicks) > max(forces, 0) else 0
+    if not kicks:
+        return {"force_evaluations": 0, "hessian_evaluations": 0}
+    closed = n_saved if len(kicks) > forces else 0
     return {
         "force_evaluations": n_steps * forces + closed + n_extra * len(kicks),
         "hessian_evaluations": n_steps * hessians + closed * kicks[-1] + n_extra * sum(kicks),

@@ -141,7 +141,8 @@ class FlowIntegrator(FixedStep):
 
         flow = self.flow
         counts = [scheme_evaluations(flow.kernel_scheme(self.dt), n_steps, n_saved, 0, backend)]
-        counts.append(scheme_evaluations(flow.scheme(self.dt), 0, 0, n_extra, backend))
+        if n_extra:
+            counts.append(scheme_evaluations(flow.scheme(self.dt), 0, 0, n_extra, backend))
         if flow.processor:  # once at the start, and for each output
             n = n_saved + (n_steps > 0)
             counts.append(scheme_evaluations(flow.processor_scheme(self.dt), 0, 0, n, backend))
