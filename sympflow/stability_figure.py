@@ -111,8 +111,9 @@ def _map(report: StabilityReport) -> Figure:
         parameter = next((r.parameter for r in rows if r.parameter), "parameter")
         dress(ax, "step", _GREEK.get(parameter, parameter))
         ax.set_title(label, loc="left", fontsize=10, color=TEXT)
-    for ax in axes[len(labels) :]:
-        ax.set_visible(False)
+    for i in range(len(labels), len(axes)):  # an empty place: the panel above it bears the labels
+        axes[i].set_visible(False)
+        axes[i - columns].tick_params(labelbottom=True)
     if image is not None:
         bar = figure.colorbar(image, ax=list(axes), shrink=0.9)
         bar.set_label("largest |energy error|, relative (×: unstable)", fontsize=9, color=TEXT)
