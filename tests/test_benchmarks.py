@@ -214,8 +214,8 @@ def test_fewest_steps_are_the_fewest():
 
 
 def arguments(**options):
-    given = {"system": ["pendulum"], "ablation": False, "quick": True, "flows": None, "json": None, "fit_seconds": None}
-    return argparse.Namespace(**{**given, "repeats": 1, "batch": 16, **options})
+    given = {"system": ["pendulum"], "ablation": False, "quick": True, "fit": True, "json": None}
+    return argparse.Namespace(**{**given, "fit_seconds": None, "repeats": 1, "batch": 16, **options})
 
 
 def test_a_tiny_race_of_primed_flows(tmp_path, monkeypatch):

@@ -385,3 +385,21 @@ def test_asymmetric_schemes_make_no_palindrome():
     for t in (0.0, -0.5, 1.5):
         with pytest.raises(ValueError, match=r"^`t` must lie in \(0, dt\]"):
             flow.scheme(t)
+
+
+# energy over long times -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("system", "stages", "processor"), [(PENDULUM, 2, 2), (HH, 3, 0), (HH, 2, 3)])
+def test_no_drift_over_a_million_steps(system, stages, processor):
+    """The slope of the energy error is within three standard errors of 0, or below what rounding adds at random."""
+    start = SympFlow.primed(system, stages, dt=0.5, processor=processor, degree=3)
+    options = {"restarts": 2, "steps": 40, "points": 60, "reference_states": 20, "progress": False}
+    flow = train(system, flow=start, **options)
+    n = 1_000_000
+    sol = solve(system, flow, (0.0, n * flow.dt), t_eval=np.linspace(0, n * flow.dt, 4001), y0=0.5 * system.y0)
+    drift, T = sympflow.energy_drift(sol), n * flow.dt
+    error = np.abs(sol.energy_error())
+    assert abs(drift.slope) * T <= max(3 * drift.standard_error * T, 10 * EPS * n**0.5)
+    assert error.max() < 2 * error[:400].max()
+    assert sol.stats["force_evaluations"] == n * stages + (4000 + 1) * processor
