@@ -80,7 +80,7 @@ class Coefficients(nn.Module):
     @torch.no_grad()
     def set(self, table: np.ndarray) -> None:
         """Take the free c_ik from a table (n, K)."""
-        self.free.copy_(torch.as_tensor([float(table[i, k]) for i, k in self._free]))
+        self.free.copy_(torch.tensor([float(table[i, k]) for i, k in self._free], dtype=torch.float64))
 
     def at(self, tau: float | np.ndarray) -> np.ndarray:
         """c_i(τ): (n,), or (n, N) for N values of τ."""

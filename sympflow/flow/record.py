@@ -105,9 +105,11 @@ def _split(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> SplitFlow:
     """A flow of the parts of a system, which `bind` will give it."""
     if not isinstance(plan, dict):
         raise Refused("its plan of a split flow is missing")
-    for name in ("filters", "force_gradient"):
-        if not isinstance(plan.get(name), bool):
-            raise Refused(f"its {name} is neither true nor false")
+    if not isinstance(plan.get("filters"), bool):
+        raise Refused("its filters are neither true nor false")
+    gradients = plan.get("gradients")
+    if not isinstance(gradients, list) or not all(isinstance(i, int) and 0 <= i < MAX_LAYERS for i in gradients):
+        raise Refused("its gradients are not a list of kicks")
     for name, admissible in (("kinds", ("kick", "shear")), ("classes", KINDS_OF_MODES)):
         value = plan.get(name)
         if not isinstance(value, list) or len(value) > MAX_LAYERS or not all(entry in admissible for entry in value):
@@ -122,7 +124,7 @@ def _split(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> SplitFlow:
     terms = _integer(plan.get("terms"), "number of terms", MAX_DEGREE)
     if len(sequence) * terms * (len(plan["classes"]) + 2) > MAX_PARAMETERS // 100:
         raise Refused("its architecture is absurdly large")
-    shape = (sequence, plan["kinds"], plan["classes"], terms, plan["filters"], plan["force_gradient"])
+    shape = (sequence, plan["kinds"], plan["classes"], terms, plan["filters"], gradients)
     return SplitFlow(ndof, *shape, dt, expressions, dtype=dtype)
 
 

@@ -129,7 +129,9 @@ class SplitFlow(SympFlow):
         What the distinct frequencies are, see `LinearPart.kinds`.
     terms : int
         Basis functions of each coefficient.
-    filters, force_gradient : bool
+    filters : bool
+    gradients : sequence of int
+        Which of the kicks carry a force gradient, counted from 0; the same from either end.
     dt : float
         Δt.
     expressions : sequence of str, optional
@@ -155,7 +157,7 @@ class SplitFlow(SympFlow):
         classes: Sequence[str],
         terms: int,
         filters: bool,
-        force_gradient: bool,
+        gradients: Sequence[int],
         dt: float = 1.0,
         expressions: Sequence[str] | None = None,
         system: HamiltonianSystem | None = None,
@@ -170,8 +172,12 @@ class SplitFlow(SympFlow):
             raise ValueError(f"`sequence` names parts beyond the {len(self.kinds)} there are: check `kinds`.")
         if isinstance(terms, bool) or not isinstance(terms, int) or terms < 1:
             raise ValueError(f"`terms` must be a positive integer; got {terms!r}.")
-        self.terms, self.filtered = terms, bool(filters)
-        self.force_gradient = bool(force_gradient)
+        self.terms, self.filtered, self.gradient_kicks = terms, bool(filters), tuple(sorted(set(gradients)))
+        n_kicks = self.sequence.count(1)
+        if self.gradient_kicks != tuple(sorted(n_kicks - 1 - i for i in self.gradient_kicks)):
+            raise ValueError(f"`force_gradient` {gradients!r} is not the same from either end of {n_kicks} kicks.")
+        if not set(self.gradient_kicks) <= set(range(n_kicks)) or (gradients and "shear" in self.kinds):
+            raise ValueError(f"`force_gradient` {gradients!r} names no kicks: count them from 0 to {n_kicks - 1}.")
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
 
         def column(part: int, power: int, total: str | None) -> Column:
@@ -185,15 +191,15 @@ class SplitFlow(SympFlow):
         self.linear = modules(column(LINEAR, 1, "always") for _ in linear)
         self.weights = modules(column(k, 1, "start") for k in rest)
         self.filters = modules(column(k, 0, None) for k in rest for _ in turning if filters)
-        with_gradient = [k for k in rest if self.kinds[k - 1] == "kick" and force_gradient]
-        self.gradients = modules(column(k, 3, None) for k in with_gradient)
+        n_gradients = len(self.gradient_kicks)
+        self.gradients = modules(Column(n_gradients, terms, self.dt, 3, **like) for _ in range(n_gradients > 0))
         self._slot = {k: i for i, k in enumerate(rest)}
-        self._gradient_slot = {k: i for i, k in enumerate(with_gradient)}
         self._turning = turning
         for c in self.columns():  # equal steps, φ = 1
             if c.power < 3:
                 c.set(np.eye(1, terms).repeat(c.n, 0) / (c.n if c.power else 1))
         self._binding = PartsBinding(system, expressions)
+        self._known: tuple[Any, list[Map]] | None = None
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(SplitLayer(self, i) for i in range(len(self.sequence)))  # type: ignore[assignment]
         if system is not None:
@@ -216,6 +222,14 @@ class SplitFlow(SympFlow):
     def numpy_maps(self, t: np.ndarray) -> list[Map]:
         """The same of an array of times, for the compiled loops; for t < 0 the inverse of ψ̄_|t| (one sign for all)."""
         t = np.asarray(t, dtype=float)
+        if t.ndim == 0:  # every step of every run with this step is made of these
+            key = (float(t), *((id(c.free), c.free._version) for c in self.columns()))
+            if self._known is None or self._known[0] != key:
+                self._known = key, self._numpy_maps(t)
+            return self._known[1]
+        return self._numpy_maps(t)
+
+    def _numpy_maps(self, t: np.ndarray) -> list[Map]:
         maps = self._assemble(
             lambda column: np.moveaxis(column.at(np.abs(t)), -1, 0), lambda entries: np.stack(entries, axis=-1)
         )
@@ -239,7 +253,7 @@ class SplitFlow(SympFlow):
                 n, one = len(self._turning), 1 + 0 * weights[slot][i]
                 own = dict(zip(self._turning, filters[slot * n : (slot + 1) * n], strict=True))
                 phi = stack([own[f][i] if f in own else one for f in range(len(self.classes))])
-            gradient = gradients[self._gradient_slot[part]][i] if part in self._gradient_slot else 0.0
+            gradient = gradients[0][self.gradient_kicks.index(i)] if i in self.gradient_kicks else 0.0
             maps.append(Map(part, weights[slot][i], gradient, phi))
         return maps
 
@@ -306,7 +320,7 @@ class SplitFlow(SympFlow):
         if self.filtered:
             for k in self._slot:
                 parts.check_filters(k)
-        if self.force_gradient and not parts.has_force_gradient:
+        if self.gradient_kicks and not parts.has_force_gradient:
             raise ValueError("`force_gradient` needs H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q): leave it out.")
 
     def architecture(self) -> dict[str, Any]:
@@ -319,7 +333,7 @@ class SplitFlow(SympFlow):
                 "classes": list(self.classes),
                 "terms": self.terms,
                 "filters": self.filtered,
-                "force_gradient": self.force_gradient,
+                "gradients": list(self.gradient_kicks),
                 "expressions": None if expressions is None else list(expressions),
             },
         }
@@ -343,7 +357,7 @@ def split(
     dt: float,
     terms: int,
     filters: bool,
-    force_gradient: bool | None,
+    force_gradient: bool | Sequence[int] | None,
     expressions: Sequence[str] | None,
     linear_outside: bool,
     dtype: torch.dtype,
@@ -360,5 +374,6 @@ def split(
         order = (LINEAR, *order[:-1])
     one = (*order, *order[-2::-1])
     sequence = one + (stages - 1) * one[1:]
-    shape = (sequence, part_kinds(parts), class_kinds(parts), terms, filters, force_gradient)
+    kicks: Sequence[int] = range(sequence.count(1)) if isinstance(force_gradient, bool) else force_gradient
+    shape = (sequence, part_kinds(parts), class_kinds(parts), terms, filters, () if force_gradient is False else kicks)
     return SplitFlow(system.ndof, *shape, dt, expressions, system, dtype, device)

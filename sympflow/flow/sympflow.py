@@ -173,7 +173,7 @@ class SympFlow(FlowMap):
         dt: float = 1.0,
         terms: int = 8,
         filters: bool = True,
-        force_gradient: bool | None = None,
+        force_gradient: bool | Sequence[int] | None = None,
         parts: Sequence[str] | None = None,
         linear_outside: bool = True,
         dtype: torch.dtype = torch.float64,
@@ -195,8 +195,9 @@ class SympFlow(FlowMap):
             Number of even polynomials in t of each coefficient.
         filters : bool
             Whether the parts see the fast modes through trained filters.
-        force_gradient : bool, optional
-            Whether kicks have a term in ½|∇U|²_{M⁻¹}; by default they do where H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q).
+        force_gradient : bool or sequence of int, optional
+            Whether kicks have a term in ½|∇U|²_{M⁻¹}, or which of them, counted from 0, the same from either end; by
+            default all do where H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q).
         parts : sequence of str, optional
             The parts, as for the method "strang_parts".
         linear_outside : bool

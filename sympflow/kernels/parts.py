@@ -80,6 +80,13 @@ class PartsKernel:
         self._loops(sequence).step_each(codes, tables, self._modes(y), out)
         return self._states(out)
 
+    def step_modes(self, sequence: Sequence[Map], modes: np.ndarray) -> np.ndarray:
+        """The maps applied once to every row [X, Y] of `modes` (N, 2d), which stay modes."""
+        loops = self._loops(sequence)
+        out, n_finite = np.empty((len(modes), 1, modes.shape[1])), np.empty(len(modes), dtype=np.int64)
+        loops.rollout_batch(*self._run_table(sequence), modes, 1, np.ones(1, dtype=np.int64), out, n_finite)
+        return out[:, 0]
+
     def source(self) -> str:
         """The generated flows of the parts, without filters and force gradients.
 

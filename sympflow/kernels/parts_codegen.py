@@ -103,15 +103,19 @@ def _part(parts: ExactParts, part: PartFunctions, name: str, filters: bool, grad
         if part.H.has(p[i]):
             lines.append(f"    {p[i]} = {_sum(parts.inverse_C[:, i], 'y_{}')}")
     by_q, by_p = ([sp.diff(part.H, s) for s in symbols] for symbols in (q, p))
-    hessian = {(i, j): sp.diff(by_q[i], q[j]) for i in range(d) for j in range(i, d)} if gradient else {}
-    hessian = {ij: entry for ij, entry in hessian.items() if entry != 0}
-    expressions = [*by_q, *by_p, *hessian.values()]
-    shared, reduced = sp.cse(
-        [printable(f) for f in expressions], symbols=sp.numbered_symbols("s_", real=True), list=True
-    )
-    names = [f"g_{i}" for i in range(d)] + [f"v_{i}" for i in range(d)] + [f"h_{i}_{j}" for i, j in hessian]
-    lines += _assignments([(s.name, f) for s, f in shared])
-    lines += _assignments([(n, f) for n, f in zip(names, reduced, strict=True) if f != 0])
+    z = sp.symbols(f"z_0:{d}", real=True)
+    products = _hessian_vector(part.H, q, z) if gradient else []
+    names = [f"{letter}_{i}" for letter in "gvm"[: 2 + gradient] for i in range(d)]
+    expressions = [printable(f) for f in (*by_q, *by_p, *products)]
+    shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("s_", real=True), list=True)
+    late, early_lines, late_lines = set(z), [], []  # late is what holds the direction z, known after the slopes
+    for target, f in [*((s.name, f) for s, f in shared), *zip(names, reduced, strict=True)]:
+        if f.free_symbols & late:
+            late.add(sp.Symbol(target, real=True))
+            late_lines.append((target, f))
+        elif f != 0 or target.startswith("m_"):
+            early_lines.append((target, f))
+    lines += _assignments(early_lines)
     moved = [i for i in range(d) if by_q[i] != 0]
     for j in range(d):
         slope = _sum([parts.C[i, j] if i in moved else 0.0 for i in range(d)], "g_{}")
@@ -121,14 +125,27 @@ def _part(parts: ExactParts, part: PartFunctions, name: str, filters: bool, grad
         velocity = _sum([parts.inverse_C[j, i] if by_p[i] != 0 else 0.0 for i in range(d)], "v_{}")
         if velocity:
             lines.append(f"    x_{j} += c[0] * ({velocity})")
-    if gradient and hessian:
-        lines += _force_gradient(parts, hessian, moved, phi)
+    if gradient:
+        lines += _direction(parts, moved, phi)
+        lines += _assignments(late_lines)
+        for j in range(d):
+            product = _sum([parts.C[i, j] if i in moved else 0.0 for i in range(d)], "m_{}")
+            if product:
+                factor = f" * {phi[j]}" if phi[j] else ""
+                lines.append(f"    y_{j} += c[1]{factor} * ({product})")
     return "\n".join([*lines, _returned(d)])
 
 
-def _force_gradient(
-    parts: ExactParts, hessian: dict[tuple[int, int], sp.Expr], moved: list[int], phi: list[str]
-) -> list[str]:
+def _hessian_vector(H: sp.Expr, q: Sequence[sp.Symbol], z: Sequence[sp.Symbol]) -> list[sp.Expr]:
+    """∇²H z, as the slope of the derivative of H along z: that keeps powers of sums together."""
+    eps = sp.Symbol("eps_", real=True)
+    moved = H.xreplace({x: x + eps * v for x, v in zip(q, z, strict=True) if H.has(x)})
+    along = sp.diff(moved, eps).subs(eps, 0)
+    return [sp.diff(along, x) for x in q]
+
+
+def _direction(parts: ExactParts, moved: list[int], phi: list[str]) -> list[str]:
+    """z = C φ M⁻¹ φ Cᵀ∇U, along which the Hessian acts."""
     assert parts.linear is not None
     d, w, lines = parts.ndof, parts.linear.rates, []
     reached = [j for j in range(d) if any(parts.C[i, j] for i in moved) and w[j]]
@@ -137,14 +154,6 @@ def _force_gradient(
         lines.append(f"    w_{j} = {factor}{_literal(w[j])} * G_{j}")
     for i in moved:
         lines.append(f"    z_{i} = {_sum([parts.C[i, j] if j in reached else 0.0 for j in range(d)], 'w_{}')}")
-    for i in moved:
-        terms = [f"h_{min(i, k)}_{max(i, k)} * z_{k}" for k in moved if (min(i, k), max(i, k)) in hessian]
-        lines.append(f"    m_{i} = {' + '.join(terms) or '0.0'}")
-    for j in range(d):
-        product = _sum([parts.C[i, j] if i in moved else 0.0 for i in range(d)], "m_{}")
-        if product:
-            factor = f" * {phi[j]}" if phi[j] else ""
-            lines.append(f"    y_{j} += c[1]{factor} * ({product})")
     return lines
 
 

@@ -1,0 +1,225 @@
+"""Stiff systems: the FPUT chain and the spring pendulum, by every method and by the shipped flows.
+
+    python benchmarks/stiff.py                        both frequencies of FPUT, the pendulum, the oscillator
+    python benchmarks/stiff.py --only fput --omega 50
+
+FPUT runs over T = 200 from y0; errors are the largest of 1000 instants. Of the splitting schemes with the exact linear
+flow (every table of the package, with the drift replaced) the cheapest is sought that has an error of at most 1e-4,
+and the cheapest that is as good as the flow; they are then timed against it in the same compiled loops, in turn, on
+one thread, the outputs included. Radau and DOP853 are SciPy's, over the interval stated.
+"""
+
+# ruff: noqa: E402
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from contenders.environment import pin_to_one_thread
+
+pin_to_one_thread()
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
+from sympflow.flow.io import shipped
+from sympflow.integrators.linear_splitting import LinearSplitting, kernel_of
+from sympflow.integrators.schemes import SCHEMES
+from sympflow.kernels.parts import PartsKernel
+from sympflow.systems.fput import oscillatory_energies
+from sympflow.timing import interleaved
+
+T_END, INSTANTS = 200.0, 1000
+GOAL = 1e-4
+IMPLICIT_TIME = {50.0: 200.0, 1000.0: 2.0}  # what SciPy's methods can be waited for
+
+
+@dataclass(frozen=True)
+class Run:
+    """A method with its step: its cost and its errors; `call` runs it once more."""
+
+    name: str
+    turn: float | None  # h ω
+    forces: int
+    hessians: int
+    energy_error: float
+    invariant_error: float
+    call: Callable[[], Any] | None = None
+    seconds: float = float("nan")
+    note: str = ""
+
+
+def errors(system: HamiltonianSystem, y: np.ndarray) -> tuple[float, float]:
+    """Of states (n, 2d): the largest relative energy error, and |I − 1|."""
+    with np.errstate(all="ignore"):
+        H = system.hamiltonian(y)
+        I = oscillatory_energies(system, y).sum(-1)  # noqa: E741
+        energy, invariant = np.abs(H / H[0] - 1).max(), np.abs(I - 1).max()
+    return tuple(float(v) if np.isfinite(v) else np.inf for v in (energy, invariant))  # type: ignore[return-value]
+
+
+def with_linear_flow(name: str, **changes: Any) -> LinearSplitting:
+    """The scheme with its drift replaced by the exact linear flow."""
+    namespace = {"name": name, "order": SCHEMES[name].order, "scheme": SCHEMES[name], **changes}
+    return dataclass(frozen=True)(type(name, (LinearSplitting,), namespace))()
+
+
+def run_scheme(system: HamiltonianSystem, method: LinearSplitting, n: int) -> Run:
+    """n steps over T, 1000 outputs on the grid."""
+    parts = method.parts_of(system)
+    kernel, save = kernel_of(parts, PartsKernel), np.linspace(0, n, INSTANTS + 1).round().astype(np.int64)
+    call = partial(kernel.run, lambda h: method.maps(parts, h), T_END / n, system.y0, n, save)
+    scheme = method.scheme
+    forces, hessians = n * scheme.force_evaluations, n * scheme.hessian_evaluations
+    turn = T_END / n * system.params["omega"]
+    return Run(method.name, turn, forces, hessians, *errors(system, call()[0]), call)
+
+
+def run_flow(system: HamiltonianSystem, flow: Any) -> Run:
+    n = round(T_END / flow.dt)
+    kernel, save = flow.kernel_for(system), np.linspace(0, n, INSTANTS + 1).round().astype(np.int64)
+    call = partial(kernel.run, flow.dt, system.y0, n, save)
+    counts = flow.evaluations(n, 0, 0, "compiled")
+    turn = flow.dt * system.params["omega"]
+    cost = counts["force_evaluations"], counts["hessian_evaluations"]
+    return Run(f"**SympFlow** ({cost[0] // n} stages)", turn, *cost, *errors(system, call()[0]), call)
+
+
+def candidates(system: HamiltonianSystem) -> list[Run]:
+    """Every scheme at many steps, and those that the goal or less needs."""
+    omega, runs = system.params["omega"], []
+    for name in SCHEMES:
+        method = with_linear_flow(name)
+        for turn in np.geomspace(1.2, 6.0, 15) if omega <= 50 else np.geomspace(1.5, 14.0, 18):
+            n = INSTANTS * max(1, round(T_END * omega / turn / INSTANTS))
+            runs.append(run_scheme(system, method, n))
+    return runs
+
+
+def cheapest(runs: list[Run], goal: float) -> Run | None:
+    """Of the runs that reach the goal the one that runs fastest: the few with least evaluations are timed."""
+    good = sorted((r for r in runs if r.energy_error <= goal), key=lambda r: r.forces + r.hessians)[:6]
+    if not good:
+        return None
+    times = interleaved([r.call for r in good], 7)  # type: ignore[misc]
+    return good[int(np.argmin([t.median for t in times]))]
+
+
+def adaptive(system: HamiltonianSystem, name: str, t_end: float) -> Run:
+    """SciPy's Radau and DOP853 at rtol = 1e-6."""
+    t = np.linspace(0, t_end, INSTANTS + 1)
+    begin = time.perf_counter()
+    sol = solve_ivp(system, (0.0, t_end), system.y0, name, t_eval=t, rtol=1e-6, atol=1e-9)
+    seconds = time.perf_counter() - begin
+    note = "" if t_end == T_END else f"T = {t_end:g}"
+    return Run(f"SciPy {name}", None, sol.nfev, 0, *errors(system, sol.y.T), None, seconds, note)
+
+
+def verlet(system: HamiltonianSystem, turn: float) -> Run:
+    h = turn / system.params["omega"]
+    n = INSTANTS * round(T_END / h / INSTANTS)
+    call = partial(solve, system, get("verlet")(dt=T_END / n), t_eval=np.linspace(0, T_END, INSTANTS + 1))
+    sol = call()
+    found = errors(system, sol.y.T) if len(sol.t) > INSTANTS else (np.inf, np.inf)
+    return Run("verlet", T_END / n * system.params["omega"], n, 0, *found, call)
+
+
+def fput_table(omega: float, repeats: int) -> None:
+    system = systems.fput(omega=omega)
+    flow = shipped(system)
+    ours = run_flow(system, flow)
+    n_flow = round(T_END / flow.dt)
+    tried = candidates(system)
+    rows = [adaptive(system, name, IMPLICIT_TIME.get(omega, 2.0)) for name in ("Radau", "DOP853")]
+    rows += [verlet(system, turn) for turn in (0.05, 1.0)]
+    plain, mollified = with_linear_flow("verlet"), with_linear_flow("verlet", mollified=True)
+    midpoint = with_linear_flow("verlet", midpoint=True)
+    same = [(plain, "impulse"), (mollified, "mollified_impulse"), (midpoint, "implicit_explicit")]
+    for name in ("srkn6b", "srkn11b", "srkn14a"):
+        same.append((with_linear_flow(name), f"linear_{name}"))
+    for method, label in same:
+        n = n_flow if omega > 50 else 2 * n_flow
+        run = run_scheme(system, method, n)
+        rows.append(Run(label, *list(vars(run).values())[1:]))
+    best = [(goal, cheapest(tried, goal)) for goal in (GOAL, max(ours.energy_error, 1e-12))]
+    labels = ("fastest untrained of all, to 1e-4", "fastest untrained of all, as good as the flow")
+    for label, (_, run) in zip(labels, best, strict=True):
+        if run is not None:
+            rows.append(Run(f"{label}: linear {run.name}", *list(vars(run).values())[1:]))
+    rows.append(ours)
+    timed = [r for r in rows if r.call is not None]
+    medians = [t.median for t in interleaved([r.call for r in timed], repeats)]  # type: ignore[misc]
+    seconds = {id(r): s for r, s in zip(timed, medians, strict=True)}
+    print(f"\n## FPUT, ω = {omega:g}, T = {T_END:g}\n")
+    print(
+        "| method | hω | forces | force gradients | run time, ms | over the flow's | energy error | largest \\|I − 1\\| |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    for r in rows:
+        spent = seconds.get(id(r), r.seconds)
+        turn = "adaptive" if r.turn is None else f"{r.turn:.3g}"
+        ratio = "" if r.note else f"{spent / seconds[id(ours)]:.3g}"
+        name = f"{r.name}, {r.note}" if r.note else r.name
+        print(
+            f"| {name} | {turn} | {r.forces:,} | {r.hessians:,} | {spent * 1e3:.3g} | {ratio} | "
+            f"{_error(r.energy_error)} | {_error(r.invariant_error)} |"
+        )
+
+
+def _error(value: float) -> str:
+    return f"{value:.2g}" if np.isfinite(value) else "not finite"
+
+
+def pendulum_table() -> None:
+    print("\n## Stiff spring pendulum, T = 20; energy error relative to |H(y0)|\n")
+    print("| method | coordinates | k | h√k | slow manifold | fast mode excited |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    cases: list[tuple[str, str, float, float]] = [("verlet", "cartesian", 1e6, 0.1)]
+    if "implicit_midpoint" in __import__("sympflow").available():
+        cases.append(("implicit_midpoint", "cartesian", 1e6, 10.0))
+    cases += [(m, "polar", 1e6, 10.0) for m in ("strang_parts", "suzuki4_parts", "kahan_li6_parts", "sympflow")]
+    for method, coordinates, k, turn in cases:
+        found = []
+        for radial in (0.0, 0.5):
+            system = systems.spring_pendulum(k, coordinates, radial_energy=radial)
+            sol = solve(system, method, (0.0, 20.0), dt=turn / np.sqrt(k), on_domain_exit="ignore")
+            H = sol.energy()
+            found.append(_error(float(np.abs(H / H[0] - 1).max())) if sol.success else f"status −1: {sol.message[:40]}")
+        print(f"| {method} | {coordinates} | {k:g} | {turn:g} | {found[0]} | {found[1]} |")
+
+
+def oscillator_table() -> None:
+    print("\n## Harmonic oscillator, 10⁶ steps of a SympFlow with a linear layer\n")
+    print("| ω | hω | largest relative energy error |")
+    print("| --- | --- | --- |")
+    for omega in (1.0, 1e3, 1e6):
+        for turn in (20.0, 1e3):
+            system = systems.harmonic_oscillator(omega)
+            flow = SympFlow.split(system, 1, dt=turn / omega)
+            sol = solve(system, flow, (0.0, 1e6 * flow.dt), save_every=100)
+            print(f"| {omega:g} | {turn:g} | {np.abs(sol.energy_error()).max():.1e} |")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Stiff systems")
+    parser.add_argument("--only", choices=("fput", "pendulum", "oscillator"))
+    parser.add_argument("--omega", type=float, action="append")
+    parser.add_argument("--repeats", type=int, default=15)
+    options = parser.parse_args()
+    if options.only in (None, "fput"):
+        for omega in options.omega or (50.0, 1000.0):
+            fput_table(omega, options.repeats)
+    if options.only in (None, "pendulum"):
+        pendulum_table()
+    if options.only in (None, "oscillator"):
+        oscillator_table()
+
+
+if __name__ == "__main__":
+    main()

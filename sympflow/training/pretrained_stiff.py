@@ -1,0 +1,160 @@
+"""The flows that ship for stiff systems, and the command that makes them again.
+
+python -m sympflow.training.pretrained_stiff                    all of them
+python -m sympflow.training.pretrained_stiff fput_50            one
+python -m sympflow.training.pretrained_stiff --measure          their figures, without training
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sympflow.domain import Box, Domain, EnergySublevel
+from sympflow.flow.io import load
+from sympflow.flow.split import SplitFlow
+from sympflow.flow.sympflow import SympFlow
+from sympflow.solver import solve
+from sympflow.system import HamiltonianSystem
+from sympflow.systems import fput, spring_pendulum
+from sympflow.training.split_fit import fit_split
+
+HELD_OUT, SEED = 20, 20_261_121  # states of the energy figure, from a seed that no training uses
+
+
+@dataclass(frozen=True)
+class StiffRecipe:
+    """How a flow for a stiff system is made.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    domain : Domain
+        Ω.
+    turn : float
+        Δt times the fastest frequency.
+    structure : dict
+        Arguments of `SympFlow.split`.
+    fit : dict
+        Arguments of `fit_split`.
+    """
+
+    system: HamiltonianSystem
+    domain: Domain
+    turn: float
+    structure: dict[str, Any]
+    fit: dict[str, Any] = field(default_factory=dict)
+
+    def train(self) -> SplitFlow:
+        """The flow, with its figures."""
+        dt = self.turn / float(self.system.linear_part.frequencies.max())
+        flow = SympFlow.split(self.system, dt=dt, **self.structure)
+        fit_split(flow, self.system, self.domain, **self.fit)
+        flow.figures |= self.measure(flow)
+        return flow
+
+    def measure(self, flow: SplitFlow) -> dict[str, float]:
+        """Largest relative energy errors over the system's interval.
+
+        `orbit_energy_error` from y0 at every step, `between_steps` at 1000 times that lie between steps;
+        `energy_error` and `energy_error_max` (in units of H) of held-out states of Ω at every step: the mean over the
+        states, and the largest.
+        """
+        system, flow = self.system, flow.bound(self.system)
+        on_grid = solve(system, flow, on_domain_exit="ignore")
+        t = np.linspace(*system.t_span, 1001)[1:] - 0.37 * flow.dt
+        between = solve(system, flow, on_domain_exit="ignore", t_eval=t)
+        x = self.domain_of(system).sample(HELD_OUT, SEED)
+        steps = np.arange(0.0, system.t_span[1] + flow.dt / 2, flow.dt)[::10]
+        many = solve(system, flow, y0=x, t_eval=steps[steps <= system.t_span[1]], on_domain_exit="ignore")
+        H = np.asarray(many.energy())
+        drift = np.abs(H - H[..., :1]).max(-1)
+        return {
+            "orbit_energy_error": float(np.abs(on_grid.energy_error()).max()),
+            "between_steps": float(np.abs(between.energy_error()).max()),
+            "energy_error": float(drift.mean()),
+            "energy_error_max": float(drift.max()),
+        }
+
+    def domain_of(self, system: HamiltonianSystem) -> Domain:
+        attached = isinstance(self.domain, EnergySublevel)
+        return self.domain.attach(system.hamiltonian) if attached else self.domain  # type: ignore[attr-defined]
+
+
+def low_energies(omega: float, energy: float = 2.5) -> EnergySublevel:
+    """The states of `fput` with H < 2.5 (y0 has 2.0012), in the smallest box that holds them."""
+    p, root = math.sqrt(2 * energy), energy**0.25
+    slow = [1.42 * root, 2 * root, 1.42 * root]  # where the four quartic springs alone have the energy
+    high = np.array([*slow, *[p / omega] * 3, *[p] * 6]) * 1.001
+    return EnergySublevel(energy, Box(-high, high))
+
+
+def recipes() -> dict[str, Callable[[], StiffRecipe]]:
+    """The recipes, by the name of the file."""
+    return {
+        "fput_50": lambda: StiffRecipe(
+            fput(omega=50.0),
+            low_energies(50.0),
+            10.0,
+            {"stages": 6, "terms": 10, "force_gradient": (0, 5)},
+            {"label_times": 20, "frozen_weight": 3.0},
+        ),
+        "fput_1000": lambda: StiffRecipe(
+            fput(omega=1000.0),
+            low_energies(1000.0),
+            20.0,
+            {"stages": 4, "terms": 16, "force_gradient": False},
+            {"label_times": 40, "frozen_weight": 3.0},
+        ),
+        "spring_pendulum_1e6": lambda: _spring_pendulum(1e6),
+    }
+
+
+def _spring_pendulum(k: float) -> StiffRecipe:
+    system = spring_pendulum(k, coordinates="polar")
+    assert system.domain is not None
+    structure = {"stages": 1, "terms": 8}
+    return StiffRecipe(system, system.domain, 10.0, structure, {"label_times": 20, "frozen_weight": 3.0})
+
+
+def path(name: str, folder: Path | None = None) -> Path:
+    """The file of a flow, in the package if no folder is given."""
+    folder = Path(str(resources.files("sympflow"))) / "pretrained" if folder is None else folder
+    return folder / f"{name}-sympflow.safetensors"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sympflow.training.pretrained_stiff", description="Train the shipped flows of stiff systems."
+    )
+    parser.add_argument("names", nargs="*", metavar="name", help=f"of {', '.join(recipes())}; all if none is named")
+    parser.add_argument("--out", type=Path, help="folder to write to (default: the package)")
+    parser.add_argument("--measure", action="store_true", help="only measure the files that are there")
+    options = parser.parse_args(arguments)
+    unknown = sorted(set(options.names) - set(recipes()))
+    if unknown:
+        parser.error(f"unknown name {', '.join(unknown)}: choose from {', '.join(recipes())}")
+    torch.set_num_threads(1)
+    for name in options.names or recipes():
+        recipe, file = recipes()[name](), path(name, options.out)
+        if options.measure:
+            figures: dict[str, Any] = recipe.measure(load(file))
+        else:
+            flow = recipe.train()
+            flow.save(file)
+            figures = flow.figures
+        print(name, json.dumps({k: float(f"{v:.3g}") for k, v in figures.items()}), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,376 @@
+"""Gauss–Newton training of split flows: their weights, filters and angles, fitted to the exact flow of a system.
+
+First the maps frozen at Δt, a dozen numbers, from many random starts. Then numbers are followed from equal steps at a
+small t up to Δt, each fit starting where the last ended (or down from the best at Δt, if those are much better);
+polynomials in t are put through them, and these are fitted to labels at all times together. Derivatives of a step by a
+number of its table are central differences of the compiled step, exact to 1e-10, which Gauss–Newton steps do not see.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from sympflow.domain import Domain, EnergySublevel
+from sympflow.flow.columns import Column
+from sympflow.flow.split import SplitFlow
+from sympflow.integrators.linear_splitting import kernel_of
+from sympflow.kernels.parts import PartsKernel
+from sympflow.parts import Map
+from sympflow.system import HamiltonianSystem
+from sympflow.training.collocation import Stream, states, stream_seed
+from sympflow.training.labels import Labels
+from sympflow.training.levenberg_marquardt import Minimum, levenberg_marquardt
+
+DIFFERENCE = 1e-5  # of a coefficient, relative to its unit
+SPREAD = 0.3  # of random weights about those of equal steps
+FOLLOWING = 40  # iterations at each time, on the way from one to the next
+WORSE = 30.0  # times the best error at Δt that numbers followed up from 0 may have there
+PULL = 0.3  # towards equal steps, as a share of the error: it chooses among coefficients that do as well
+ROUGHNESS = 1e-6  # how reluctantly polynomials are made to vary with t
+
+
+@dataclass(frozen=True)
+class SplitFitConfig:
+    """The choices of a fit; with the seed they determine the trained weights.
+
+    Parameters
+    ----------
+    points : int
+        Number of labelled states, drawn from the domain.
+    label_times : int
+        Number of equidistant times in (0, Δt] at which the states are labelled.
+    frozen_weight : float
+        Weight of the residuals at t = Δt, which alone are composed over many steps; those at other times have 1.
+    restarts : int
+        Starts of the frozen search.
+    steps : int
+        The most iterations from each start.
+    seed : int
+    reference_states : int
+        Held-out states of the figures.
+    """
+
+    points: int = 150
+    label_times: int = 16
+    frozen_weight: float = 30.0
+    restarts: int = 8
+    steps: int = 150
+    seed: int = 0
+    reference_states: int = 100
+
+    def __post_init__(self) -> None:
+        for name in ("points", "label_times", "restarts", "steps", "reference_states"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise ValueError(f"`seed` must be a non-negative integer; got {self.seed!r}.")
+        if not 0 < self.frozen_weight < math.inf:
+            raise ValueError(f"`frozen_weight` must be positive and finite; got {self.frozen_weight!r}.")
+
+
+def fit_split(
+    flow: SplitFlow,
+    system: HamiltonianSystem,
+    domain: Domain | None = None,
+    *,
+    time_budget: float | None = None,
+    **options: Any,
+) -> SplitFlow:
+    """Fit a flow made by `SympFlow.split` to the exact flow of its system, in place.
+
+    Parameters
+    ----------
+    flow : SplitFlow
+    system : HamiltonianSystem
+        Symbolic.
+    domain : Domain, optional
+        Ω, where labels are drawn; the default is the system's.
+    time_budget : float, optional
+        Seconds after which the best so far is taken, with a warning.
+    **options
+        Of `SplitFitConfig`.
+
+    Returns
+    -------
+    SplitFlow
+        The flow, with its domain, recipe, history and figures: mean and largest one-step error ‖ψ̄_Δt − φ_H,Δt‖ of
+        held-out states, each mode in its unit over Ω, and the mean over times in (0, Δt).
+
+    Raises
+    ------
+    ValueError
+        If the system is not the flow's, or cannot be compiled, or there is no domain.
+    """
+    config = SplitFitConfig(**options)
+    flow.bind(system)
+    domain = system.domain if domain is None else domain
+    if domain is None:
+        raise ValueError("`domain` is needed: the system has none. Pass domain=, a Box or an EnergySublevel around 0.")
+    if isinstance(domain, EnergySublevel):
+        domain = domain.attach(system.hamiltonian)
+    begin = time.perf_counter()
+
+    def spent() -> bool:
+        return time_budget is not None and time.perf_counter() - begin > time_budget
+
+    fit = _Fit(flow, system, domain, config)
+    minima = fit.search(spent)
+    best = min(minima, key=lambda m: m.cost)
+    if not math.isfinite(best.cost):
+        raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
+    whole = fit.whole(best.x, spent)
+    if spent():
+        warnings.warn("Training ended because the time budget was used up.", RuntimeWarning, stacklevel=2)
+    flow.domain = domain
+    stage = {
+        "optimizer": "gauss-newton",
+        "loss": "labels",
+        **asdict(config),
+        "restarts_taken": len(minima),
+        "iterations": sum(m.iterations for m in minima) + whole.iterations,
+        "ended_early": "the time budget was used up" if spent() else None,
+    }
+    flow.recipe = {"stages": [*flow.recipe.get("stages", []), stage], "torch": torch.__version__}
+    flow.history = [{"step": i, "loss": m.cost} for i, m in enumerate(minima, 1)]
+    flow.figures = {**fit.errors(), "training_seconds": round(time.perf_counter() - begin, 3)}
+    flow.requires_grad_(False)
+    return flow
+
+
+class _Fit:
+    """Labels in modes, and the flow's coefficients as numbers: those of the first half of the palindrome."""
+
+    def __init__(self, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, config: SplitFitConfig) -> None:
+        self.flow, self.config, self.parts = flow, config, flow.parts
+        self.kernel: PartsKernel = kernel_of(self.parts, PartsKernel)
+        self.kernel.source()
+        self.columns = flow.columns()
+        ends = np.cumsum([(c.n + 1) // 2 for c in self.columns])
+        self.slices = [slice(int(end) - (c.n + 1) // 2, int(end)) for c, end in zip(self.columns, ends, strict=True)]
+        self.n = int(ends[-1]) if len(ends) else 0
+        t = flow.dt * np.arange(1, config.label_times + 1) / config.label_times
+        x = states(domain, config.points, config.seed, Stream.RESIDUAL)
+        labels = Labels.of(system, x, t)
+        if len(labels.x) == 0:
+            raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
+        self.t, self.z, self.labels = t, self._modes(labels.x), [self._modes(y) for y in labels.y]
+        self.unit = self._unit(float(np.std(system.hamiltonian(labels.x))))
+        x = states(domain, config.reference_states, config.seed, Stream.REFERENCE)
+        self.held_out = Labels.of(
+            system, x, flow.dt * (np.arange(2 * config.label_times) + 1) / (2 * config.label_times)
+        )
+
+    def _modes(self, y: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.concatenate(self.parts.to_modes(y), axis=-1))
+
+    def _unit(self, energy: float) -> np.ndarray:
+        """What errors are measured in: the spread over Ω, but for an oscillator what changes its energy as H varies.
+
+        A fast mode that is hardly excited would else count as much as the slow ones that carry the energy.
+        """
+        spread = self.z.std(0)
+        unit = np.where(spread > 0, spread, 1.0)
+        linear, d = self.parts.linear, self.parts.ndof
+        for j in range(d if linear is not None else 0):
+            if linear.kinds[j] == "oscillator" and energy > 0:  # type: ignore[union-attr]
+                unit[[j, d + j]] = math.sqrt(energy / linear.rates[j])  # type: ignore[union-attr]
+        return unit
+
+    def units(self, t: float) -> np.ndarray:
+        """What the coefficients are measured in: t^m / n for weights and angles, 1 for filters."""
+        out = np.empty(self.n)
+        for c, part in zip(self.columns, self.slices, strict=True):
+            out[part] = t**c.power / (c.n**c.power if c.power else 1)
+        return out
+
+    def maps(self, u: np.ndarray) -> list[Map]:
+        """The maps with the numbers u of the first half."""
+        entries = {}
+        for c, part in zip(self.columns, self.slices, strict=True):
+            half = u[part]
+            entries[c] = np.concatenate([half, half[: c.n // 2][::-1]])
+        return self.flow._assemble(entries.__getitem__, lambda values: np.stack(values, axis=-1))
+
+    def residuals(self, u: np.ndarray, j: int) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            error = (self.kernel.step_modes(self.maps(u), self.z) - self.labels[j]) / self.unit
+        return error.ravel() / math.sqrt(len(self.z))
+
+    def jacobian(self, u: np.ndarray, j: int) -> np.ndarray:
+        steps, columns = DIFFERENCE * self.units(self.t[j]), []
+        for e, step in enumerate(steps):
+            change = np.zeros(self.n)
+            change[e] = step
+            columns.append((self.residuals(u + change, j) - self.residuals(u - change, j)) / (2 * step))
+        return np.stack(columns, axis=-1)
+
+    # frozen at one time -------------------------------------------------------------------------------------
+
+    def frozen(self, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Offset (n,) and design (n, f) of numbers that are bound by Σ s = t alone, in their units."""
+        offset, blocks = np.zeros(self.n), []
+        unit = self.units(t)
+        for c, part in zip(self.columns, self.slices, strict=True):
+            bare = Column(c.n, 1, t, c.power, c.total if c.total == "always" else None)
+            own, design = bare.affine(np.array([t]))
+            m = (c.n + 1) // 2
+            offset[part] = own[0, :m]
+            block = np.zeros((self.n, design.shape[-1]))
+            block[part] = design[0, :m] / t**c.power * unit[part][:, None]
+            blocks.append(block)
+        return offset, np.concatenate(blocks, axis=1)
+
+    def minimize(self, u: np.ndarray, j: int, iterations: int, stop: Callable[[], bool], pull: float = 0.0) -> Minimum:
+        """The numbers at the j-th time that fit the labels best, pulled towards equal steps."""
+        offset, design = self.frozen(self.t[j])
+        unit, equal = self.units(self.t[j]), self.equal(self.t[j])
+
+        def residuals(theta: np.ndarray) -> np.ndarray:
+            u = offset + design @ theta
+            return np.concatenate([self.residuals(u, j), pull * (u - equal) / unit])
+
+        def linearized(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            J = self.jacobian(offset + design @ theta, j) @ design
+            return residuals(theta), np.concatenate([J, pull * design / unit[:, None]])
+
+        theta = np.linalg.lstsq(design / unit[:, None], (u - offset) / unit, rcond=None)[0]
+        m = levenberg_marquardt(residuals, linearized, theta, iterations=iterations, stop=stop)
+        return Minimum(offset + design @ m.x, m.cost, m.iterations, m.reason)
+
+    def pull(self, u: np.ndarray, j: int) -> float:
+        """A pull that costs little beside the error there is."""
+        return PULL * float(np.linalg.norm(self.residuals(u, j))) / math.sqrt(self.n)
+
+    def equal(self, t: float) -> np.ndarray:
+        """The numbers of equal steps without filters and force gradients."""
+        u = self.units(t)
+        for c, part in zip(self.columns, self.slices, strict=True):
+            if c.power > 1:
+                u[part] = 0.0
+        return u
+
+    def search(self, stop: Callable[[], bool]) -> list[Minimum]:
+        """Minima at Δt, their x the numbers u, from the flow as it is and from random ones."""
+        last = len(self.t) - 1
+        minima: list[Minimum] = []
+        for restart in range(self.config.restarts):
+            if minima and stop():
+                break
+            u = self.random(restart) if restart else self.current(self.t[last])
+            minima.append(self.minimize(u, last, self.config.steps, stop))
+        return minima
+
+    def current(self, t: float) -> np.ndarray:
+        """The numbers of the flow as it is."""
+        u = np.empty(self.n)
+        for c, part in zip(self.columns, self.slices, strict=True):
+            u[part] = c.at(np.array(t))[: (c.n + 1) // 2]
+        return u
+
+    def random(self, restart: int) -> np.ndarray:
+        rng = np.random.default_rng([stream_seed(self.config.seed, Stream.RESTARTS), restart])
+        u, dt = np.empty(self.n), self.flow.dt
+        for c, part in zip(self.columns, self.slices, strict=True):
+            m = (c.n + 1) // 2
+            if c.power == 1:
+                w = rng.normal(1, SPREAD, m)
+                u[part] = dt * w / np.concatenate([w, w[: c.n // 2]]).sum()
+            elif c.power == 0:
+                u[part] = rng.uniform(0.2, 1.2, m)
+            else:
+                u[part] = rng.choice([0.0, 1 / 12]) * (dt / c.n) ** 3
+        return u
+
+    # all times ----------------------------------------------------------------------------------------------
+
+    def whole(self, u: np.ndarray, stop: Callable[[], bool]) -> Minimum:
+        """The polynomials, put through the numbers followed from the least time up, then fitted to all labels.
+
+        Where that path ends far from the best numbers at Δt, these are followed down instead.
+        """
+        last = len(self.t) - 1
+        followed = self.follow(self.equal(self.t[0]), range(last + 1), stop)
+        if np.linalg.norm(self.residuals(followed[last], last)) > WORSE * np.linalg.norm(self.residuals(u, last)):
+            followed = self.follow(u, range(last, -1, -1), stop)[::-1]
+        pulls = np.array([self.pull(v, j) for j, v in enumerate(followed)])
+        offsets, designs = self.polynomials()
+        scale = np.array([self.units(t) for t in self.t])
+        A = (designs / scale[:, :, None]).reshape(-1, designs.shape[-1])
+        b = ((np.array(followed) - offsets) / scale).ravel()
+        A = np.concatenate([A, ROUGHNESS * np.eye(A.shape[1])])
+        theta = np.linalg.lstsq(A, np.concatenate([b, np.zeros(A.shape[1])]), rcond=None)[0]
+        weight = np.where(np.arange(len(self.t)) == len(self.t) - 1, self.config.frozen_weight, 1.0)
+        weight /= math.sqrt(len(self.t))
+
+        equal, bend = np.array([self.equal(t) for t in self.t]), (weight * pulls)[:, None] / scale
+
+        def residuals(theta: np.ndarray) -> np.ndarray:
+            u = offsets + designs @ theta
+            data = [weight[j] * self.residuals(u[j], j) for j in range(len(self.t))]
+            return np.concatenate([*data, *(bend * (u - equal))])
+
+        def linearized(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            u = offsets + designs @ theta
+            data = [weight[j] * self.jacobian(u[j], j) @ designs[j] for j in range(len(self.t))]
+            return residuals(theta), np.concatenate([*data, *(bend[..., None] * designs)])
+
+        m = levenberg_marquardt(residuals, linearized, theta, iterations=self.config.steps, stop=stop)
+        self.assign(m.x)
+        return m
+
+    def follow(self, u: np.ndarray, order: range, stop: Callable[[], bool]) -> list[np.ndarray]:
+        """The numbers at the times in order, each from those at the time before, the first from u."""
+        followed: list[np.ndarray] = []
+        for j in order:
+            if followed:
+                before = j - order.step
+                u = followed[-1] * self.units(self.t[j]) / self.units(self.t[before])
+            for _ in range(2):  # the second time with the pull that suits the error reached
+                u = self.minimize(u, j, FOLLOWING, stop, self.pull(u, j)).x
+            followed.append(u)
+        return followed
+
+    def polynomials(self) -> tuple[np.ndarray, np.ndarray]:
+        """Offsets (J, n) and designs (J, n, f) of the numbers at the label times by the flow's parameters."""
+        offsets, blocks = np.zeros((len(self.t), self.n)), []
+        for c, part in zip(self.columns, self.slices, strict=True):
+            offset, design = c.affine(self.t)
+            m = (c.n + 1) // 2
+            offsets[:, part] = offset[:, :m]
+            block = np.zeros((len(self.t), self.n, design.shape[-1]))
+            block[:, part] = design[:, :m]
+            blocks.append(block)
+        return offsets, np.concatenate(blocks, axis=-1)
+
+    @torch.no_grad()
+    def assign(self, theta: np.ndarray) -> None:
+        """Put the parameters into the flow."""
+        for c in self.columns:
+            own, theta = theta[: c.free.numel()], theta[c.free.numel() :]
+            c.free.copy_(torch.as_tensor(own))
+
+    def errors(self) -> dict[str, float]:
+        """‖ψ̄_t(x) − φ_H,t(x)‖ of held-out states, in the units of the modes."""
+        t, z = self.held_out.t, self._modes(self.held_out.x)
+        error = np.array(
+            [
+                np.linalg.norm(
+                    (self.kernel.step_modes(self.flow.numpy_maps(np.array(s)), z) - self._modes(y)) / self.unit, axis=-1
+                )
+                for s, y in zip(t, self.held_out.y, strict=True)
+            ]
+        )
+        return {
+            "one_step_error": float(error[-1].mean()),
+            "one_step_error_max": float(error[-1].max()),
+            "fractional_error": float(error[:-1].mean()),
+        }

@@ -1,0 +1,111 @@
+"""Splittings with the exact linear flow, and into any number of exactly solvable parts."""
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import HamiltonianSystem, get, solve, symplecticity_defect
+from sympflow.integrators.linear_splitting import LINEAR_SPLITTINGS, PARTS_SPLITTINGS
+from sympflow.systems import fput, henon_heiles, spring_pendulum
+from sympflow.systems.fput import oscillatory_energies
+
+SOFT = fput(omega=2.0)  # where the order shows
+EXACT = solve(SOFT, "dop853", (0, 2), t_eval=[2.0], rtol=1e-13, atol=1e-14).y[:, -1]
+
+
+@pytest.mark.parametrize("name", [*LINEAR_SPLITTINGS, *PARTS_SPLITTINGS])
+def test_the_order_is_the_slope(name):
+    order = get(name).order
+    lengths = {2: (0.04, 0.02), 4: (0.1, 0.05), 6: (0.125, 0.0625), 8: (0.25, 0.125)}[order]
+    runs = [solve(SOFT, name, (0, 2), dt=h, t_eval=[2.0], backend="array") for h in lengths]
+    errors = [np.abs(run.y[:, -1] - EXACT).max() for run in runs]
+    assert -0.5 < np.log2(errors[0] / errors[1]) - order < 2
+
+
+@pytest.mark.parametrize("name", ["impulse", "mollified_impulse", "linear_omelyan4", "strang_parts"])
+def test_compiled_array_and_tensor_runs_agree(name):
+    system = henon_heiles()
+    y0 = system.y0 * np.linspace(0.7, 1.0, 3)[:, None]
+    t = np.array([0.0, 0.1, 0.37, 0.9])
+    runs = [solve(system, name, (0, 1), y0=y, dt=0.1, t_eval=t, backend=b).y for y, b in ((y0, "auto"), (y0, "array"))]
+    runs.append(solve(system, name, (0, 1), y0=torch.as_tensor(y0), dt=0.1, t_eval=t).y.numpy())
+    alone = solve(system, name, (0, 1), y0=y0[1], dt=0.1, t_eval=t).y
+    for run in runs[1:]:
+        assert np.abs(run - runs[0]).max() < 1e-12
+    assert np.abs(alone - runs[0][1]).max() < 1e-12
+
+
+def test_it_is_symplectic_and_goes_back():
+    system = fput(omega=50.0)
+    sol = solve(system, "linear_srkn11b", (0, 2), dt=0.1)
+    assert symplecticity_defect(sol) < 1e3 * np.finfo(float).eps
+    back = solve(system, "linear_srkn11b", (2, 0), dt=0.1, y0=sol.y[:, -1])
+    assert np.abs(back.y[:, -1] - system.y0).max() < 1e-12
+
+
+def test_fput_figures():
+    """The known figures at hω = 5, T = 200, and the adiabatic invariant."""
+    system = fput(omega=50.0)
+    known = {"impulse": 1.6e-1, "mollified_impulse": 1.1e-2, "implicit_explicit": 1.0e-2, "linear_srkn11b": 5.7e-5}
+    for name, figure in known.items():
+        backend = "array" if name == "mollified_impulse" else "auto"
+        sol = solve(system, name, dt=0.1, backend=backend)
+        assert np.abs(sol.energy_error()).max() == pytest.approx(figure, rel=0.05)
+    drift = np.abs(oscillatory_energies(system, sol.y.T).sum(-1) - 1).max()
+    assert drift < 0.08
+
+
+def test_evaluations_are_those_of_the_scheme():
+    system = fput(omega=50.0)
+    assert solve(system, "linear_srkn11b", (0, 10), dt=0.1, t_eval=[10.0]).stats["force_evaluations"] == 1101
+    assert solve(system, "impulse", (0, 10), dt=0.1, t_eval=[10.0], backend="array").stats["force_evaluations"] == 200
+
+
+def test_three_parts_of_the_polar_spring_pendulum():
+    system = spring_pendulum(1e6, coordinates="polar")
+    sol = solve(system, "strang_parts", (0, 20), dt=0.01)
+    H = sol.energy()
+    assert np.abs(H / H[0] - 1).max() < 1e-4
+    assert sol.stats["force_evaluations"] == pytest.approx(3 * 2000, abs=2001)
+
+
+def test_parts_given_by_the_user():
+    system = spring_pendulum(1e4, coordinates="polar")
+    parts = ("-g*q1*cos(q2)", "p2**2/(2*q1**2)", "p1**2/2 + k*(q1 - 1)**2/2")
+    detected = solve(system, "strang_parts", (0, 1), dt=0.05)
+    given = solve(system, "strang_parts", (0, 1), dt=0.05, parts=parts)
+    assert np.abs(given.y - detected.y).max() < 1e-13
+    other = solve(system, "strang_parts", (0, 1), dt=0.05, parts=parts[::-1])
+    assert np.abs(other.y - detected.y).max() > 1e-8
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (("p1**2/2 + k*(q1 - 1)**2/2", "p2**2/(2*q1**2)"), "do not add up to the Hamiltonian"),
+        (("p1**2/2 + k*(q1 - 1)**2/2 - g*q1*cos(q2)", "p2**2/(2*q1**2)"), "is not solved exactly"),
+    ],
+)
+def test_parts_that_will_not_do(parts, message):
+    with pytest.raises(ValueError, match=message):
+        solve(spring_pendulum(1e4, coordinates="polar"), "strang_parts", (0, 1), parts=parts)
+
+
+def test_a_term_with_a_conjugate_pair_is_refused():
+    system = HamiltonianSystem.from_sympy("(p**2 + 1)*(q**2 + 1)/2 + sin(q*p)", y0=[0.1, 0.2])
+    with pytest.raises(ValueError, match="does not split into parts"):
+        solve(system, "strang_parts", (0, 1), dt=0.1)
+
+
+def test_parts_that_are_no_sequence():
+    with pytest.raises(TypeError, match=r"^`parts` must be a sequence of expressions"):
+        get("strang_parts")(parts="q**2")
+
+
+def test_any_separable_system_splits_into_two():
+    """Without a linear part Strang's splitting is Verlet."""
+    from sympflow.systems import pendulum
+
+    one, other = (solve(pendulum(), name, (0, 5), dt=0.1).y for name in ("strang_parts", "verlet"))
+    assert np.abs(one - other).max() < 1e-13
+    assert np.abs(solve(henon_heiles(), "strang_parts", (0, 1), dt=0.1).y).max() < 1
