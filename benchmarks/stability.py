@@ -2,8 +2,9 @@
 
     python benchmarks/stability.py --out docs/stability.md
 
-Everything runs on one thread; ten minutes or so. With `--only kepler,round_off` the named sections alone are run and
-printed. The words around the tables are in benchmarks/stability_words.py.
+Everything runs on one thread; ten minutes or so. With `--results file.json` the tables are kept, and with `--only
+kepler,round_off` the named sections alone are measured again and the others taken from there. The words around the
+tables are in benchmarks/stability_words.py.
 """
 
 # ruff: noqa: E402
@@ -11,6 +12,7 @@ printed. The words around the tables are in benchmarks/stability_words.py.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -26,6 +28,7 @@ import stability_words as words
 
 import sympflow
 from sympflow import HamiltonianSystem, energy_growth, get, max_energy_error, solve, stability, systems
+from sympflow.integrators.logarithmic import LogSympFlow
 from sympflow.singularities import blow_up
 from sympflow.stability_report import StabilityReport, StabilityRow
 from sympflow.systems.fput import oscillatory_energies
@@ -40,19 +43,24 @@ SINGULARITY = 5.450984210235402
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("docs/stability.md"))
-    parser.add_argument("--only", default="", help="comma-separated sections, printed instead of written")
+    parser.add_argument("--results", type=Path, help="JSON file that keeps the tables")
+    parser.add_argument("--only", default="", help="comma-separated sections to measure; printed without --results")
     arguments = parser.parse_args()
     figures = arguments.out.parent / "figures"
     chosen = arguments.only.split(",") if arguments.only else list(SECTIONS)
-    parts = {}
+    parts: dict[str, str] = {}
+    if arguments.results and arguments.only:
+        parts = json.loads(arguments.results.read_text())
     for name in chosen:
         start = time.perf_counter()
         parts[name] = SECTIONS[name](figures)
         print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
-    if arguments.only:
+        if arguments.results:
+            arguments.results.write_text(json.dumps(parts, indent=1))
+    if set(parts) == set(SECTIONS):
+        arguments.out.write_text(words.page(parts))
+    else:
         print("\n\n".join(parts.values()))
-        return
-    arguments.out.write_text(words.page(parts))
 
 
 # tables ---------------------------------------------------------------------------------------------------
@@ -288,6 +296,30 @@ def _kepler_cells(system: HamiltonianSystem, method: Any, sol: Any) -> list[str]
     return [number(float(max_energy_error(sol))), state, ends]
 
 
+def log_flow(figures: Path) -> str:
+    """A flow trained on the logarithmic Hamiltonian, 50 steps a period, against schemes at as many forces."""
+    period = 2 * math.pi
+    system, ds = systems.kepler(0.9), period / 50
+    orbit = solve(sympflow.time_transformed(system), "kahan_li8", (0.0, period), dt=period / 400).states
+    tube = sympflow.Tube(orbit, 1e-3 * np.maximum(1e-3, np.abs(orbit).max(0)))
+    transformed = sympflow.time_transformed(system, domain=tube)
+    start = sympflow.SympFlow.primed(transformed, scheme="blanes_moan4", dt=ds)
+    points = {"points": 200, "validation_points": 200, "reference_states": 20}
+    trained = sympflow.train(transformed, flow=start, optimizer="bfgs", steps=12, seed=0, **points)
+    times = period * np.arange(100) + 0.01  # just after the pericentre
+    rows = []
+    for label, integrator in (
+        ("log_blanes_moan4, untrained", LogSympFlow(flow=start)),
+        ("log SympFlow, trained from it", LogSympFlow(flow=trained)),
+        ("log_kahan_li8", get("log_kahan_li8")(dt=period / 24)),
+        ("log_leapfrog", get("log_leapfrog")(dt=period / 400)),
+    ):
+        sol = solve(system, integrator, t_eval=times, on_domain_exit="ignore")
+        state = np.abs(sol.y - sol.y[:, :1]).max()
+        rows.append([label, f"{sol.nfev:,}", number(float(max_energy_error(sol))), number(float(state))])
+    return table(["method, e = 0.9", "force evaluations", "energy error", "state error"], rows)
+
+
 def three_body(figures: Path) -> str:
     system, rows = systems.three_body(), []
     cases = [
@@ -430,6 +462,7 @@ SECTIONS: dict[str, Callable[[Path], str]] = {
     "fput": fput,
     "spring": spring,
     "kepler": kepler,
+    "log_flow": log_flow,
     "three_body": three_body,
     "escape": escape,
     "henon_heiles": _scene(systems.henon_heiles, (*CLASSICAL, "rk4", *ADAPTIVE)),

@@ -110,6 +110,12 @@ from sympflow.integrators.logarithmic import LogSympFlow
 flow = SympFlow.primed(time_transformed(kepler), scheme="blanes_moan4", dt=0.02)  # untrained: the scheme itself
 sol = solve(kepler, LogSympFlow(flow=flow), (0.0, 20.0))
 ```
+
+Trained for a minute in a tube around one orbit (bfgs on the residual; the faster Gauss–Newton fit needs a kinetic energy quadratic in p, which Λ has not), 50 steps a period, outputs just after each pericentre:
+
+{log_flow}
+
+Training gains three digits at no cost in forces, but Kepler in the transformed time is so smooth that a scheme of order 8 gains more.
 """
 
 THREE_BODY = """## Close encounters: the Pythagorean three-body problem
@@ -188,9 +194,9 @@ Over 1e6 to 1e8 steps the truncation error of an accurate method is below its ro
 
 ![Growth of the rounding error](figures/stability_round_off.png)
 
-Independent rounding errors make the energy a random walk, rms|ΔH| ~ √n [Brouwer 1937]; a systematic error would grow like n. No drift is seen: the slope, its error taken from the scatter between the trajectories, is 0 within it.
+Independent rounding errors make the energy a random walk, rms|ΔH| ~ √n [Brouwer 1937]; a systematic error would grow like n. No drift is seen: the slope, its error taken from the scatter between the trajectories, is 0 within two of its standard errors.
 Compensated summation (`compensated=True`: splittings, Gauss methods, `log_…` and primed SympFlows, compiled) keeps the part of each update that is lost, and gains a factor of 20 to 50. Newton's iteration runs to
-rounding, not to a tolerance, and the Gauss coefficients satisfy the symplecticity condition exactly, else the Gauss methods would drift [Hairer, McLachlan, Razakarivony 2008]. A flow whose truncation error is above its rounding has exponent 0. To measure your own:
+rounding, not to a tolerance, and the Gauss coefficients satisfy the symplecticity condition exactly, else the Gauss methods would drift [Hairer, McLachlan, Razakarivony 2008]. Where the truncation error is above the rounding the exponent is 0, or, with MLP potentials (the last row), that of a slow diffusion on chaotic orbits: their Hamiltonian 𝓗 depends on t within a step, and H is not conserved by it. To measure your own:
 
 ```python
 system = systems.henon_heiles()
