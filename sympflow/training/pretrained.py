@@ -63,10 +63,15 @@ class Recipe:
         newton: dict[str, Any] = {"optimizer": "gauss-newton", "domain": self.domain, **options}
         flow = train(self.system, self.dt, kind=kind, points=first[0], steps=first[1], **newton)
         flow = train(self.system, flow=flow, points=second[0], steps=second[1], seed=1, **newton)
-        flow.figures |= self.measure(flow)
-        if kind == "sympflow":
-            certify(flow, self.system)
+        self.judge(flow)
         return flow
+
+    def judge(self, flow: Any) -> dict[str, Any]:
+        """Its figures, measured (again), with a certificate if it is symplectic."""
+        flow.figures |= self.measure(flow)
+        if flow.kind == "sympflow":
+            certify(flow, self.system)
+        return flow.figures
 
     @property
     def domain(self) -> EnergySublevel:
@@ -161,7 +166,7 @@ def _made(name: str, kind: str, options: argparse.Namespace) -> Iterator[tuple[P
     elif name in recipes():
         recipe, file = recipes()[name], path(name, kind, options.out)
         if options.measure:
-            yield file, recipe.measure(load(file))
+            yield file, recipe.judge(load(file))
         else:
             flow = recipe.train(kind)
             flow.save(file)
