@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 from weakref import WeakKeyDictionary
 
@@ -66,8 +66,8 @@ class MapsStepper(FixedStep):
             states, finite = rollout_in_modes(parts, self.maps(parts, h), y0, n_steps, save)
             return states, finite, "torch" if is_tensor(y0) else "numpy"
 
-        def maps(length: np.ndarray) -> list[Map]:
-            return self.maps(parts, length)
+        def maps(length: np.ndarray) -> Sequence[Map]:
+            return known_maps(self, parts, float(length))
 
         if y0.ndim == 1:
             states, last = kernel.run(maps, h, y0, n_steps, save)
@@ -86,6 +86,12 @@ class MapsStepper(FixedStep):
         lengths = np.broadcast_to(h, y.shape[:-1]).reshape(-1)
         kernel = kernel_of(parts, PartsKernel)
         return kernel.step(lambda length: self.maps(parts, length), lengths, rows).reshape(y.shape)
+
+
+@lru_cache(maxsize=64)
+def known_maps(method: MapsStepper, parts: ExactParts, h: float) -> Sequence[Map]:
+    """The maps of a step, the same object for the same step, whose table the kernel then knows."""
+    return method.maps(parts, h)
 
 
 _KERNELS: WeakKeyDictionary[ExactParts, Any] = WeakKeyDictionary()

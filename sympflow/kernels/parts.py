@@ -14,6 +14,8 @@ from sympflow.parts import LINEAR, ExactParts, Map, PartFunctions
 
 __all__ = ["PartsKernel"]
 
+KNOWN_TABLES = 64  # run tables that are kept: those of the steps in use
+
 Maps = Callable[[np.ndarray], Sequence[Map]]
 """The maps of a step of length h (...), their entries of that batch shape."""
 
@@ -31,7 +33,7 @@ class PartsKernel:
     """Compiled loops over the maps of any splitting of one system; states are [q, p], float64.
 
     Rounding cannot make the linear part drift: its modes rotate by three shears, each with determinant 1 whatever its
-    number, by at most an eighth of a turn, after an exact number of quarter turns; the run stays in the modes.
+    number, by at most a quarter turn, after an exact half turn where that is needed; the run stays in the modes.
 
     Parameters
     ----------
@@ -45,6 +47,7 @@ class PartsKernel:
         self.parts = parts
         self._variants: dict[tuple[bool, bool], _Loops] = {}
         self._plain: str | None = None
+        self._tables: dict[int, tuple[Sequence[Map], tuple[np.ndarray, np.ndarray]]] = {}
 
     def run(self, maps: Maps, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` steps of length h from y0 (2d,), as `SplittingKernel.run`."""
@@ -133,11 +136,13 @@ class PartsKernel:
                 tables[:, j, : 4 * F] = self._turns(np.asarray(m.length)).reshape(-1, 4 * F)
                 continue
             tables[:, j, 0], tables[:, j, 1] = m.length, m.gradient
-            tables[:, j, 2 : 2 + F] = 1.0 if m.filters is None else m.filters
+            if m.filters is not None:
+                scale = np.diag(self.parts.C) if self.parts.diagonal else 1.0
+                tables[:, j, 2 : 2 + self.parts.ndof] = self.parts.by_class(np.asarray(m.filters)) * scale
         return codes, tables
 
     def _turns(self, s: np.ndarray) -> np.ndarray:
-        """What turns each frequency by Ω s, (..., F, 4): tan(r/2), sin r, and the quarter turn's cosine and sine."""
+        """What turns each frequency by Ω s, (..., F, 4): tan(r/2), sin r, the sign s of a half turn, s tan(r/2)."""
         linear = self.parts.linear
         assert linear is not None
         out = np.zeros((*s.shape, 4))
@@ -145,13 +150,11 @@ class PartsKernel:
             kind, theta = linear.kinds[j], linear.rates[j] * s[..., f]
             if kind == "oscillator":
                 angle = np.arctan2(np.sin(theta), np.cos(theta))  # exact reduction, of angles of any size
-                quarters = np.rint(angle / (np.pi / 2))
-                r = angle - quarters * (np.pi / 2)
-                q = quarters.astype(int) % 4
-                cosine = np.array([1.0, 0.0, -1.0, 0.0])
-                values = np.tan(r / 2), np.sin(r), cosine[q], cosine[q - 1]
+                halves = np.rint(angle / np.pi)
+                r, sign = angle - halves * np.pi, np.where(halves == 0, 1.0, -1.0)
+                values: tuple[Any, ...] = np.tan(r / 2), np.sin(r), sign, sign * np.tan(r / 2)
             elif kind == "hyperbolic":
-                values = np.tanh(theta / 2), -np.sinh(theta), 1.0, 0.0
+                values = np.tanh(theta / 2), -np.sinh(theta), 1.0, np.tanh(theta / 2)
             else:
                 values = theta, 0.0, 1.0, 0.0
             for i, value in enumerate(values):
@@ -160,12 +163,18 @@ class PartsKernel:
 
     def _run_table(self, sequence: Sequence[Map]) -> tuple[np.ndarray, np.ndarray]:
         """Codes and rows of [opening, inner …, link, closing]: see `parts_loops`."""
+        known = self._tables.get(id(sequence))
+        if known is not None and known[0] is sequence:
+            return known[1]
         idle = Map(IDLE, 0.0)
         first, last = sequence[0], sequence[-1]
         merged = merge(last, first) if len(sequence) > 1 else None
         rows = [idle, *sequence, idle, idle] if merged is None else [first, *sequence[1:-1], merged, last]
         codes, table = self._table(rows, 1)
-        return codes, np.ascontiguousarray(table[0])
+        if len(self._tables) >= KNOWN_TABLES:
+            self._tables.clear()
+        self._tables[id(sequence)] = sequence, (codes, np.ascontiguousarray(table[0]))
+        return self._tables[id(sequence)][1]
 
 
 def has_gradient(m: Map) -> bool:

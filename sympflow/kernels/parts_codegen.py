@@ -19,8 +19,8 @@ WITH_GRADIENT = 100  # added to the code of a part that carries a force gradient
 
 
 def row_width(parts: ExactParts) -> int:
-    """Numbers that a map may need: four for each frequency, or a weight, a force gradient and the filters."""
-    return max(4 * parts.n_classes, 2 + parts.n_classes)
+    """Numbers that a map may need: four for each frequency, or a weight, a force gradient and the filters of modes."""
+    return max(4 * parts.n_classes, 2 + parts.ndof)
 
 
 def parts_source(parts: ExactParts, filters: bool, gradients: bool) -> str:
@@ -71,20 +71,20 @@ def _dispatch_lanes(calls: Sequence[tuple[int, str]], row: str) -> str:
 
 
 def _linear(parts: ExactParts) -> str:
-    """Rotations by three shears after a quarter turn, hyperbolic ones likewise, drifts."""
+    """Rotations by three shears after a half turn or none (a sign), hyperbolic ones likewise, drifts."""
     assert parts.linear is not None
     d = parts.ndof
     lines = ["@njit(**OPTIONS)", "def linear(x, y, c):", *_unpacked(d)]
     for j, (kind, f) in enumerate(zip(parts.linear.kinds, parts.linear.classes.tolist(), strict=True)):
-        t, s, cosine, sine = (f"c[{4 * f + i}]" for i in range(4))
+        t, s, sign, signed_t = (f"c[{4 * f + i}]" for i in range(4))
         if kind == "free":
             lines.append(f"    x_{j} += {t} * y_{j}")
         elif kind != "idle":
-            if kind == "oscillator":
-                turn = f"{cosine} * x_{j} + {sine} * y_{j}, {cosine} * y_{j} - {sine} * x_{j}"
-                lines.append(f"    x_{j}, y_{j} = {turn}")
-            shear = f"    x_{j} += {t} * y_{j}"
-            lines += [shear, f"    y_{j} -= {s} * x_{j}", shear]
+            lines += [
+                f"    x_{j} = {sign} * x_{j} + {signed_t} * y_{j}",
+                f"    y_{j} = {sign} * y_{j} - {s} * x_{j}",
+                f"    x_{j} += {t} * y_{j}",
+            ]
     return "\n".join([*lines, _returned(d)])
 
 
@@ -92,14 +92,15 @@ def _part(parts: ExactParts, part: PartFunctions, name: str, filters: bool, grad
     """x + b J∇H_k(x), and with a force gradient g ∇²U M⁻¹∇U added to y."""
     d, q, p = parts.ndof, part.q, part.p
     lines = ["@njit(**OPTIONS)", f"def {name}(x, y, c):", *_unpacked(d)]
-    phi = [f"c[{2 + f}]" if filters else "" for f in parts.classes.tolist()]
-    active = {int(j) for i in range(d) if part.H.has(q[i]) for j in np.flatnonzero(parts.C[i])}
+    phi = [f"c[{2 + j}]" if filters else "" for j in range(d)]
+    C = np.eye(d) if filters and parts.diagonal else parts.C  # diagonal ones are in the filters
+    active = {int(j) for i in range(d) if part.H.has(q[i]) for j in np.flatnonzero(C[i])}
     for j in sorted(active):
         lines.append(f"    u_{j} = {phi[j]} * x_{j}" if filters else f"    u_{j} = x_{j}")
     for i in range(d):
         if part.H.has(q[i]):
             offset = [_literal(parts.center[i])] if parts.center[i] else []
-            lines.append(f"    {q[i]} = {_sum(parts.C[i], 'u_{}', offset)}")
+            lines.append(f"    {q[i]} = {_sum(C[i], 'u_{}', offset)}")
         if part.H.has(p[i]):
             lines.append(f"    {p[i]} = {_sum(parts.inverse_C[:, i], 'y_{}')}")
     by_q, by_p = ([sp.diff(part.H, s) for s in symbols] for symbols in (q, p))
@@ -118,7 +119,7 @@ def _part(parts: ExactParts, part: PartFunctions, name: str, filters: bool, grad
     lines += _assignments(early_lines)
     moved = [i for i in range(d) if by_q[i] != 0]
     for j in range(d):
-        slope = _sum([parts.C[i, j] if i in moved else 0.0 for i in range(d)], "g_{}")
+        slope = _sum([C[i, j] if i in moved else 0.0 for i in range(d)], "g_{}")
         if slope:
             lines.append(f"    G_{j} = {phi[j]} * ({slope})" if filters else f"    G_{j} = {slope}")
             lines.append(f"    y_{j} -= c[0] * G_{j}")
@@ -126,10 +127,10 @@ def _part(parts: ExactParts, part: PartFunctions, name: str, filters: bool, grad
         if velocity:
             lines.append(f"    x_{j} += c[0] * ({velocity})")
     if gradient:
-        lines += _direction(parts, moved, phi)
+        lines += _direction(C, parts.linear.rates if parts.linear else C[0], moved, phi)
         lines += _assignments(late_lines)
         for j in range(d):
-            product = _sum([parts.C[i, j] if i in moved else 0.0 for i in range(d)], "m_{}")
+            product = _sum([C[i, j] if i in moved else 0.0 for i in range(d)], "m_{}")
             if product:
                 factor = f" * {phi[j]}" if phi[j] else ""
                 lines.append(f"    y_{j} += c[1]{factor} * ({product})")
@@ -144,16 +145,15 @@ def _hessian_vector(H: sp.Expr, q: Sequence[sp.Symbol], z: Sequence[sp.Symbol]) 
     return [sp.diff(along, x) for x in q]
 
 
-def _direction(parts: ExactParts, moved: list[int], phi: list[str]) -> list[str]:
-    """z = C φ M⁻¹ φ Cᵀ∇U, along which the Hessian acts."""
-    assert parts.linear is not None
-    d, w, lines = parts.ndof, parts.linear.rates, []
-    reached = [j for j in range(d) if any(parts.C[i, j] for i in moved) and w[j]]
+def _direction(C: np.ndarray, w: np.ndarray, moved: list[int], phi: list[str]) -> list[str]:
+    """z = C φ M⁻¹ φ Cᵀ∇U, along which the Hessian acts; w is the diagonal M⁻¹ of the modes."""
+    d, lines = len(C), []
+    reached = [j for j in range(d) if any(C[i, j] for i in moved) and w[j]]
     for j in reached:
         factor = f"{phi[j]} * " if phi[j] else ""
         lines.append(f"    w_{j} = {factor}{_literal(w[j])} * G_{j}")
     for i in moved:
-        lines.append(f"    z_{i} = {_sum([parts.C[i, j] if j in reached else 0.0 for j in range(d)], 'w_{}')}")
+        lines.append(f"    z_{i} = {_sum([C[i, j] if j in reached else 0.0 for j in range(d)], 'w_{}')}")
     return lines
 
 
