@@ -1,0 +1,269 @@
+"""One method on one system in one precision: its runs with a range of steps, what is measured, and its limit."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sympflow.candidates import Candidate
+from sympflow.comparison_report import title
+from sympflow.integrators.base import FixedStep, Integrator
+from sympflow.metrics.energy import energy_drift, max_energy_error
+from sympflow.metrics.symplectic import symplecticity_defect, volume_error
+from sympflow.singularities import blow_up
+from sympflow.solution import Solution
+from sympflow.solver import domain_of, solve
+from sympflow.stability_report import StabilityRow, StepLimit
+from sympflow.system import HamiltonianSystem
+from sympflow.validation import MAX_SAVED_VALUES
+
+STEPS = tuple(2.0**k for k in range(-1, 7))
+"""Default steps of classical methods, times the system's; those of a trained flow are fractions of its Δt."""
+FRACTIONS = (0.25, 0.5, 1.0)
+MOST_OUTPUTS, TANGENT_STEPS = 20_000, 256
+LIMIT_PRECISION = 1.002
+
+
+@dataclass(frozen=True)
+class Study:
+    """One method on one system in one precision."""
+
+    system: HamiltonianSystem
+    candidate: Candidate
+    dtype: str
+    t_span: tuple[float, float]
+    starts: np.ndarray
+    metrics: tuple[str, ...]
+    bound: float
+    min_steps: int
+    max_steps: int
+
+    @property
+    def has_steps(self) -> bool:
+        return isinstance(self.candidate.integrator, FixedStep)
+
+    def lengths(self, asked: list[float] | None) -> list[float | None]:
+        """The steps to run; None for an adaptive method."""
+        integrator = self.candidate.integrator
+        if not isinstance(integrator, FixedStep):
+            return [None]
+        if integrator.trained:
+            try:
+                longest = integrator.step_length(self.system)
+            except ValueError:  # there is no flow: the row says so
+                return [self.system.dt]
+            return [longest * fraction for fraction in FRACTIONS] if asked is None else [*asked]
+        return [integrator.step_length(self.system) * f for f in STEPS] if asked is None else [*asked]
+
+    def with_step(self, h: float | None) -> Integrator:
+        integrator = self.candidate.integrator
+        return integrator if h is None else replace(integrator, dt=h)
+
+    def span(self, h: float | None) -> tuple[float, float]:
+        """The interval, extended or shortened to between `min_steps` and `max_steps` steps."""
+        t0, t1 = self.t_span
+        if h is None:
+            return t0, t1
+        most = self.max_steps if self.dtype == "float64" else self.max_steps // 50  # array operations
+        length = min(max(abs(t1 - t0), h * self.min_steps), h * most)
+        return t0, t0 + math.copysign(length, t1 - t0)
+
+    def runs(self, integrator: Integrator, h: float | None, y0: np.ndarray) -> list[Solution]:
+        """Solutions that hold every step, or equally many of them, of each state."""
+        span = self.span(h)
+        together = isinstance(integrator, FixedStep) and integrator.finds_events  # steps on a common grid
+        width = y0.size if together else y0.shape[1]
+        most = min(MOST_OUTPUTS, MAX_SAVED_VALUES // (2 * width))
+        every = 1 if h is None else max(1, math.ceil(abs(span[1] - span[0]) / h / most))
+        batches = [y0] if together else list(y0)
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore", RuntimeWarning)
+            return [
+                solve(self.system, integrator, span, b, save_every=every, dtype=self.dtype, on_domain_exit="ignore")
+                for b in batches
+            ]
+
+    def stable(self, h: float) -> tuple[bool, float]:
+        """Whether all runs with this step stay below the bound, and their largest energy error."""
+        try:
+            error = _largest_error(self.runs(self.with_step(h), h, self.starts))
+        except (ValueError, ArithmeticError):  # such as a step above Δt
+            return False, math.inf
+        return error <= self.bound, error
+
+    def row(self, h: float | None) -> StabilityRow:
+        """Everything that is asked for at one step."""
+        c, span = self.candidate, self.span(h)
+        params = self.system.params
+        row = StabilityRow(
+            system=title(self.system),
+            parameter=next(iter(params), None),
+            value=next(iter(params.values()), None),
+            method=c.method,
+            label=c.label,
+            dtype=self.dtype,
+            dt=h,
+            t_end=span[1],
+        )
+        try:
+            if c.problem:
+                raise ImportError(c.problem)
+            integrator = self.with_step(h)
+            sols = self.runs(integrator, h, self.starts)
+        except (ValueError, TypeError, ImportError, NotImplementedError) as error:
+            return replace(row, status="not applicable", reason=str(error))
+        worst = _largest_error(sols)
+        row = replace(
+            row,
+            status="stable" if worst <= self.bound else "unstable",
+            n_steps=max(int(s.stats["n_steps"]) for s in sols),
+            energy_error=worst,
+            reason=next((s.message for s in sols if not s.success), ""),
+        )
+        row = self._blow_up(row, integrator, sols)
+        for metric in self.metrics:
+            with warnings.catch_warnings(), np.errstate(all="ignore"):
+                warnings.simplefilter("ignore", RuntimeWarning)
+                row = getattr(self, f"_{metric}")(row, integrator, sols)
+        return row
+
+    def _blow_up(self, row: StabilityRow, integrator: Integrator, sols: list[Solution]) -> StabilityRow:
+        """The time and manner of the first failure, of the first state that fails."""
+        times = np.concatenate([_failure_times(s) for s in sols])
+        if not np.isfinite(times).any():
+            return row
+        first = int(np.argmax(np.isfinite(times)))
+        end = blow_up(self.system, integrator, self.span(row.dt), self._typed(self.starts[first]), float(times[first]))
+        return replace(row, blow_up=end.time, singular=end.singular, reason=f"{row.reason} {end}".strip())
+
+    def _energy(self, row: StabilityRow, integrator: Integrator, sols: list[Solution]) -> StabilityRow:
+        return row
+
+    def _drift(self, row: StabilityRow, integrator: Integrator, sols: list[Solution]) -> StabilityRow:
+        if row.status != "stable" or len(sols[0].t) < 40:
+            return row
+        drifts = [energy_drift(s) for s in sols]
+        slope = np.concatenate([np.ravel(d.slope) for d in drifts])
+        error = np.concatenate([np.ravel(d.standard_error) for d in drifts])
+        middle = int(np.argsort(slope)[len(slope) // 2])
+        return replace(row, energy_drift=float(slope[middle]), energy_drift_error=float(error[middle]))
+
+    def _volume(self, row: StabilityRow, integrator: Integrator, sols: list[Solution]) -> StabilityRow:
+        return self._of_tangents(row, integrator, "volume_error", lambda sol: abs(float(volume_error(sol))))
+
+    def _symplecticity(self, row: StabilityRow, integrator: Integrator, sols: list[Solution]) -> StabilityRow:
+        return self._of_tangents(
+            row, integrator, "symplecticity_defect", lambda sol: float(symplecticity_defect(sol, relative=True))
+        )
+
+    def _of_tangents(
+        self, row: StabilityRow, integrator: Integrator, name: str, measure: Callable[[Solution], float]
+    ) -> StabilityRow:
+        """A metric of the first steps from the first state."""
+        t0, t1 = self.span(row.dt)
+        h = self.system.dt if row.dt is None else row.dt
+        t1 = t0 + math.copysign(min(abs(t1 - t0), TANGENT_STEPS * h), t1 - t0)
+        y0 = self._typed(self.starts[0])
+        try:
+            sol = solve(self.system, integrator, (t0, t1), y0, dtype=self.dtype, on_domain_exit="ignore")
+            measured: dict[str, Any] = {name: measure(sol)}
+            return replace(row, **measured)
+        except (TypeError, ValueError, np.linalg.LinAlgError) as error:
+            return replace(row, reason=f"{row.reason} No {name.replace('_', ' ')}: {error}".strip())
+
+    def _domain(self, row: StabilityRow, integrator: Integrator, sols: list[Solution]) -> StabilityRow:
+        """When the first trajectory leaves the domain of the flow, or of the system."""
+        flow = getattr(integrator, "flow_for", lambda system: None)(self.system)
+        domain = domain_of(flow, self.system)
+        if domain is None:
+            return row
+        slack = float(getattr(flow, "figures", {}).get("energy_error_max") or 0.0)
+        sol = sols[0]
+        thin = max(1, len(sol.t) // 2000)
+        states = sol.states[0] if sol.y.ndim == 3 else sol.states
+        outside = ~domain.contains(states[::thin], slack=slack) & np.isfinite(states[::thin]).all(-1)
+        if not outside.any():
+            return row
+        exit_time = float(sol.t[::thin][int(np.argmax(outside))])
+        return replace(row, domain_exit=exit_time)
+
+    def _typed(self, y: np.ndarray) -> np.ndarray:
+        return y.astype(self.dtype)
+
+    def limit(self, rows: list[StabilityRow]) -> StepLimit:
+        """The longest stable step, from the rows and by bisection below the first unstable one."""
+        tried = [row for row in rows if row.dt is not None and row.status != "not applicable"]
+        ran = [(row.dt, row.status == "stable") for row in tried if row.dt is not None]
+        first_bad = next((i for i, (_, good) in enumerate(ran) if not good), len(ran))
+        low = ran[first_bad - 1][0] if first_bad else None
+        high = ran[first_bad][0] if first_bad < len(ran) else None
+        reached = ""
+        if high is None and low is not None:
+            low, high, reached = self._longer(low)
+        elif low is None and any(row.singular for row in tried):
+            reached = "none: the solution is singular"  # no step helps
+        elif low is None and high is not None:
+            low, high = self._shorter(high)
+        error = None
+        while low is not None and high is not None and high / low > LIMIT_PRECISION:
+            middle = math.sqrt(low * high)
+            good, error_there = self.stable(middle)
+            low, high, error = (middle, high, error_there) if good else (low, middle, error)
+        if low is not None and error is None:
+            error = self.stable(low)[1]
+        c, params = self.candidate, self.system.params
+        return StepLimit(
+            title(self.system),
+            next(iter(params), None),
+            next(iter(params.values()), None),
+            c.method,
+            c.label,
+            self.dtype,
+            low,
+            high,
+            error,
+            reached,
+        )
+
+    def _longer(self, low: float) -> tuple[float, float | None, str]:
+        """Double a stable step until it is unstable, refused, or as long as the interval."""
+        longest = abs(self.t_span[1] - self.t_span[0])
+        if self.candidate.integrator.trained:
+            top = self.candidate.integrator.step_length(self.system)
+            if low >= top * (1 - 1e-12):
+                return low, None, "all up to the flow's Δt"
+            good, _ = self.stable(top)
+            return (top, None, "all up to the flow's Δt") if good else (low, top, "")
+        while low < longest:
+            if not self.stable(2 * low)[0]:
+                return low, 2 * low, ""
+            low = 2 * low
+        return low, None, "all up to the length of the interval"
+
+    def _shorter(self, high: float) -> tuple[float | None, float]:
+        for _ in range(12):
+            if self.stable(high / 2)[0]:
+                return high / 2, high
+            high = high / 2
+        return None, high
+
+
+def _largest_error(sols: list[Solution]) -> float:
+    """Over states and outputs, inf where a run failed or is not finite."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        worst = [float(np.max(max_energy_error(s))) for s in sols]
+    return math.inf if any(math.isnan(x) for x in worst) else max(worst)
+
+
+def _failure_times(sol: Solution) -> np.ndarray:
+    """For each trajectory the time after which it could not go on, NaN if it did not fail."""
+    status = np.atleast_1d(np.asarray(sol.status))
+    last = sol.t[-1] if len(sol.t) else sol.t_span[0]
+    times = np.broadcast_to(np.asarray(sol.stats.get("failed_at", last), dtype=float), status.shape)
+    return np.where(status < 0, times, np.nan)
