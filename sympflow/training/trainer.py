@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import inspect
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from sympflow.arrays import to_numpy
-from sympflow.domain import Domain, EnergySublevel
+from sympflow.domain import Domain
 from sympflow.flow.base import FlowMap
 from sympflow.flow.mlp import MLPFlow, matching_widths
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.system import HamiltonianSystem
+from sympflow.training.arguments import digest, domain_for, labels_of, weights_of
 from sympflow.training.collocation import Stream, states
 from sympflow.training.config import TrainingConfig
 from sympflow.training.gauss_newton import GaussNewtonConfig, GaussNewtonRun
 from sympflow.training.recipes import default_recipe
-from sympflow.training.run import Labelled, Path, Run
+from sympflow.training.run import Path, Run
 
 SCALING_SAMPLES = 4096
 
@@ -141,7 +139,7 @@ def train(
         If the loss is not finite from the start.
     """
     given = dict(locals())
-    domain = _domain(system, domain)
+    domain = domain_for(system, domain)
     if time_budget is not None and not 0 < time_budget < math.inf:
         raise ValueError(f"`time_budget` must be a positive number of seconds; got {time_budget!r}.")
     new = {
@@ -181,13 +179,13 @@ def train(
     if optimizer == "gauss-newton" and single:
         raise TypeError("`optimizer` 'gauss-newton' fits flows in float64: leave out `dtype`, or use 'adam'.")
     if loss is not None or (kind == "primed" and optimizer == "gauss-newton"):
-        weights = _weights("labels" if loss is None else loss, residual_weight, matching_weight, label_weight)
+        weights = weights_of("labels" if loss is None else loss, residual_weight, matching_weight, label_weight)
         residual_weight, matching_weight, label_weight = weights
     if optimizer == "gauss-newton" and kind == "primed":
         _refuse_options(given, _NOT_OF_TABLES, f"optimizer {optimizer!r} for primed flows")
         if loss is None:
             _refuse_options(given, _OF_LOSSES, f"optimizer {optimizer!r} for primed flows without a `loss`")
-        handed = None if data is None else _labels(data, system, dt)
+        handed = None if data is None else labels_of(data, system, dt)
         choices: dict[str, Any] = {
             "points": points,
             "steps": steps,
@@ -198,7 +196,7 @@ def train(
             "matching_weight": matching_weight,
             "label_weight": label_weight,
             "matching_times": matching_times,
-            "data": None if handed is None else _digest(handed),
+            "data": None if handed is None else digest(handed),
         }
         choices = {name: value for name, value in choices.items() if value is not None}
         labelled = GaussNewtonConfig(seed=seed, reference_states=reference_states, **choices)
@@ -215,7 +213,7 @@ def train(
         _refuse_options(given, ("learning_rate", "schedule", "clip"), f"optimizer {optimizer!r}")
     if kind == "mlp" and matching_weight:
         raise ValueError("`matching_weight` needs a Hamiltonian, which an MLP flow has not: leave it out.")
-    labels = None if data is None else _labels(data, system, dt)
+    labels = None if data is None else labels_of(data, system, dt)
     if matching_weight is None:
         matching_weight = 0.0 if kind == "mlp" or optimizer == "gauss-newton" else 1.0
     config = TrainingConfig.of(
@@ -230,7 +228,7 @@ def train(
         label_weight=(0.0 if data is None else 1.0) if label_weight is None else label_weight,
         matching_times=matching_times,
         label_times=8 if label_times is None else label_times,
-        data=None if labels is None else _digest(labels),
+        data=None if labels is None else digest(labels),
         learning_rate=learning_rate,
         schedule=schedule,
         clip=clip,
@@ -291,22 +289,6 @@ def _kind(system: HamiltonianSystem, given: dict[str, Any]) -> str:
     return "primed" if fits and not wants_network else "sympflow"
 
 
-def _weights(
-    loss: str, residual_weight: float, matching_weight: float | None, label_weight: float | None
-) -> tuple[float, float, float]:
-    """Those of the residual, of matching and of the labels: 0 for what the loss does not name."""
-    names = loss.split("+") if isinstance(loss, str) else []
-    if not names or not set(names) <= {"residual", "matching", "labels"}:
-        raise ValueError(f"`loss` {loss!r} is unknown: join some of residual, matching and labels by +.")
-    chosen = {
-        "residual": residual_weight,
-        "matching": 1.0 if matching_weight is None else matching_weight,
-        "labels": 1.0 if label_weight is None else label_weight,
-    }
-    residual, matching, labels = (weight if name in names else 0.0 for name, weight in chosen.items())
-    return residual, matching, labels
-
-
 def _primed(
     system: HamiltonianSystem,
     domain: Domain,
@@ -349,52 +331,3 @@ def _differs(value: Any, default: Any) -> bool:
 def _refuse_options(given: dict[str, Any], names: Sequence[str], what: str) -> None:
     for name in _given(given, names):
         raise TypeError(f"`{name}` is not an option of the {what}: leave it out.")
-
-
-def _labels(data: Any, system: HamiltonianSystem, dt: float) -> Labelled:
-    """The labels that were handed in, as float64 arrays."""
-    if not isinstance(data, tuple | list) or len(data) != 3:
-        raise TypeError(
-            "`data` must be three arrays, times (n,), states (n, 2d) and where they go (n, 2d): pass a tuple."
-        )
-    t, x, y = (np.asarray(to_numpy(a), dtype=float) for a in data)
-    width = 2 * system.ndof
-    if t.ndim != 1 or x.shape != (len(t), width) or y.shape != x.shape or len(t) < 2:
-        raise ValueError(
-            f"`data` must have shapes (n,), (n, {width}) and (n, {width}), n ≥ 2; got {t.shape}, {x.shape} and "
-            f"{y.shape}: give one row for each label."
-        )
-    if not (np.isfinite(t).all() and np.isfinite(x).all() and np.isfinite(y).all()):
-        raise ValueError("`data` must be finite: remove the labels with NaN or infinity.")
-    if t.min() < 0 or t.max() > dt * (1 + 1e-12):
-        raise ValueError(
-            f"`data` has times from {t.min():g} to {t.max():g}, beyond [0, dt] = [0, {dt:g}]: change `dt`."
-        )
-    return t, x, y
-
-
-def _digest(labels: Labelled) -> str:
-    digest = hashlib.sha256()
-    for array in labels:
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
-def _domain(system: HamiltonianSystem, domain: Domain | None) -> Domain:
-    domain = system.domain if domain is None else domain
-    if domain is None:
-        raise ValueError(
-            f"`domain` is not known for the system {system.name!r}: pass the states to train on, as by "
-            "domain=sympflow.Box(low, high), sympflow.Ball(center, radius) or sympflow.EnergySublevel(energy, box)."
-        )
-    if not isinstance(domain, Domain):
-        raise TypeError(
-            f"`domain` must be a domain of phase space; got {domain!r}: use sympflow.Box(low, high), "
-            "sympflow.Ball(center, radius) or sympflow.EnergySublevel(energy, box)."
-        )
-    if isinstance(domain, EnergySublevel):
-        domain = domain.attach(system.hamiltonian)
-    width = domain.sample(1, 0).shape[-1]
-    if width != 2 * system.ndof:
-        raise ValueError(f"`domain` has states of length {width}, the system {2 * system.ndof}: give [q, p].")
-    return domain

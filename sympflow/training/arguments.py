@@ -1,0 +1,80 @@
+"""The arguments of `train` that need more than a look: the domain, the losses by name, labels that are handed in."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+
+from sympflow.arrays import to_numpy
+from sympflow.domain import Domain, EnergySublevel
+from sympflow.system import HamiltonianSystem
+from sympflow.training.run import Labelled
+
+
+def domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
+    """Ω of a training: the domain that is given, else that of the system; checked."""
+    domain = system.domain if domain is None else domain
+    if domain is None:
+        raise ValueError(
+            f"`domain` is not known for the system {system.name!r}: pass the states to train on, as by "
+            "domain=sympflow.Box(low, high), sympflow.Ball(center, radius) or sympflow.EnergySublevel(energy, box)."
+        )
+    if not isinstance(domain, Domain):
+        raise TypeError(
+            f"`domain` must be a domain of phase space; got {domain!r}: use sympflow.Box(low, high), "
+            "sympflow.Ball(center, radius) or sympflow.EnergySublevel(energy, box)."
+        )
+    if isinstance(domain, EnergySublevel):
+        domain = domain.attach(system.hamiltonian)
+    width = domain.sample(1, 0).shape[-1]
+    if width != 2 * system.ndof:
+        raise ValueError(f"`domain` has states of length {width}, the system {2 * system.ndof}: give [q, p].")
+    return domain
+
+
+def weights_of(
+    loss: str, residual_weight: float, matching_weight: float | None, label_weight: float | None
+) -> tuple[float, float, float]:
+    """Those of the residual, of matching and of the labels: 0 for what the loss does not name."""
+    names = loss.split("+") if isinstance(loss, str) else []
+    if not names or not set(names) <= {"residual", "matching", "labels"}:
+        raise ValueError(f"`loss` {loss!r} is unknown: join some of residual, matching and labels by +.")
+    chosen = {
+        "residual": residual_weight,
+        "matching": 1.0 if matching_weight is None else matching_weight,
+        "labels": 1.0 if label_weight is None else label_weight,
+    }
+    residual, matching, labels = (weight if name in names else 0.0 for name, weight in chosen.items())
+    return residual, matching, labels
+
+
+def labels_of(data: Any, system: HamiltonianSystem, dt: float) -> Labelled:
+    """The labels that were handed in, as float64 arrays."""
+    if not isinstance(data, tuple | list) or len(data) != 3:
+        raise TypeError(
+            "`data` must be three arrays, times (n,), states (n, 2d) and where they go (n, 2d): pass a tuple."
+        )
+    t, x, y = (np.asarray(to_numpy(a), dtype=float) for a in data)
+    width = 2 * system.ndof
+    if t.ndim != 1 or x.shape != (len(t), width) or y.shape != x.shape or len(t) < 2:
+        raise ValueError(
+            f"`data` must have shapes (n,), (n, {width}) and (n, {width}), n ≥ 2; got {t.shape}, {x.shape} and "
+            f"{y.shape}: give one row for each label."
+        )
+    if not (np.isfinite(t).all() and np.isfinite(x).all() and np.isfinite(y).all()):
+        raise ValueError("`data` must be finite: remove the labels with NaN or infinity.")
+    if t.min() < 0 or t.max() > dt * (1 + 1e-12):
+        raise ValueError(
+            f"`data` has times from {t.min():g} to {t.max():g}, beyond [0, dt] = [0, {dt:g}]: change `dt`."
+        )
+    return t, x, y
+
+
+def digest(labels: Labelled) -> str:
+    """Their checksum."""
+    content = hashlib.sha256()
+    for array in labels:
+        content.update(np.ascontiguousarray(array).tobytes())
+    return content.hexdigest()
