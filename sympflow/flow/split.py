@@ -223,7 +223,7 @@ class SplitFlow(SympFlow):
         """The same of an array of times, for the compiled loops; for t < 0 the inverse of ψ̄_|t| (one sign for all)."""
         t = np.asarray(t, dtype=float)
         if t.ndim == 0:  # every step of every run with this step is made of these
-            key = (float(t), *((id(c.free), c.free._version) for c in self.columns()))
+            key = (float(t), *((id(w), w._version) for w in self.parameters()))
             if self._known is None or self._known[0] != key:
                 self._known = key, self._numpy_maps(t)
             return self._known[1]

@@ -47,6 +47,7 @@ class PartsKernel:
         self.parts = parts
         self._variants: dict[tuple[bool, bool], _Loops] = {}
         self._plain: str | None = None
+        self._scale = np.concatenate([np.diag(parts.C), np.diag(parts.inverse_C)])
         self._tables: dict[int, tuple[Sequence[Map], tuple[np.ndarray, np.ndarray]]] = {}
 
     def run(self, maps: Maps, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
@@ -106,10 +107,15 @@ class PartsKernel:
         return np.ascontiguousarray(np.concatenate(self.parts.to_modes(np.asarray(y, dtype=np.float64)), axis=-1))
 
     def _states(self, modes: np.ndarray, save: np.ndarray | None = None, y0: np.ndarray | None = None) -> np.ndarray:
-        d = self.parts.ndof
-        states = self.parts.from_modes(modes[..., :d], modes[..., d:])
-        if save is not None:
-            states[..., save <= 0, :] = y0
+        parts, d = self.parts, self.parts.ndof
+        if parts.diagonal:
+            modes *= self._scale
+            modes[..., :d] += parts.center
+            states = modes
+        else:
+            states = parts.from_modes(modes[..., :d], modes[..., d:])
+        if save is not None and len(save) and save[0] <= 0:
+            states[..., : np.count_nonzero(save <= 0), :] = y0
         return states
 
     def _loops(self, sequence: Sequence[Map]) -> _Loops:

@@ -1,0 +1,175 @@
+"""SympFlows of exact flows of parts: identity at 0, inverse, Hamiltonian, save and load, compiled, and fitted."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import Box, HamiltonianSystem, SympFlow, get, load, solve
+from sympflow.systems import fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum
+from sympflow.systems.fput import oscillatory_energies
+from sympflow.training.split_fit import fit_split
+
+CASES = {
+    "kicks": (henon_heiles, {"dt": 0.7, "stages": 3}),
+    "shears": (lambda: spring_pendulum(1e4, coordinates="polar"), {"dt": 0.05, "stages": 2}),
+    "no_filters": (henon_heiles, {"dt": 0.7, "stages": 2, "filters": False, "force_gradient": False}),
+    "inside": (henon_heiles, {"dt": 0.7, "stages": 3, "linear_outside": False, "force_gradient": (1, 2)}),
+}
+
+
+@pytest.fixture(params=CASES)
+def case(request):
+    """A flow with random parameters, its system, states and times."""
+    make, options = CASES[request.param]
+    system = make()
+    flow = SympFlow.split(system, terms=4, **options)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for w in flow.parameters():
+            w += 0.05 * torch.randn(w.shape, generator=generator, dtype=w.dtype)
+    flow.requires_grad_(False)
+    x = torch.as_tensor(system.domain.sample(7, 0))
+    return flow, system, x, flow.dt * torch.linspace(0.1, 1, 7, dtype=torch.float64)
+
+
+def test_it_is_the_identity_at_zero_and_has_an_inverse(case):
+    flow, _, x, t = case
+    assert torch.equal(flow(0.0, x), x)
+    assert (flow.inverse(t, flow(t, x)) - x).abs().max() < 1e-12
+    assert (flow.inverse(3.3 * flow.dt, flow(3.3 * flow.dt, x)) - x).abs().max() < 1e-11
+
+
+def test_its_hamiltonian_generates_it(case):
+    flow, system, x, t = case
+    y = flow(t, x).requires_grad_(True)
+    (g,) = torch.autograd.grad(flow.hamiltonian_unchecked(t, y).sum(), y)
+    field = torch.cat([g[:, system.ndof :], -g[:, : system.ndof]], -1)
+    velocity = flow.velocity(t, x)
+    assert (velocity - field).abs().max() < 1e-10 * velocity.abs().max()
+
+
+def test_it_is_symplectic(case):
+    flow, system, x, t = case
+    A = torch.func.vmap(torch.func.jacfwd(lambda z: flow.psi(flow.dt, z)))(x)
+    d = system.ndof
+    J = torch.zeros(2 * d, 2 * d, dtype=x.dtype)
+    J[:d, d:], J[d:, :d] = torch.eye(d), -torch.eye(d)
+    assert (A.mT @ J @ A - J).abs().max() < 1e-13 * A.abs().max() ** 2
+
+
+def test_the_layers_compose_to_it(case):
+    flow, _, x, t = case
+    q, p = x.T.chunk(2)
+    dq, dp = torch.zeros_like(q), torch.zeros_like(p)
+    for layer in flow.layers:
+        q, p, dq, dp = layer.tangent(t, q, p, dq, dp)
+    assert (torch.cat([q, p]).T - flow(t, x)).abs().max() < 1e-12
+    velocity = flow.velocity(t, x)
+    assert (torch.cat([dq, dp]).T - velocity).abs().max() < 1e-11 * velocity.abs().max()
+
+
+def test_it_is_reversible(case):
+    """A palindrome: ρ ψ̄_t ρ is its inverse, ρ turning the momenta."""
+    flow, system, x, _ = case
+    rho = torch.cat([torch.ones(system.ndof), -torch.ones(system.ndof)]).double()
+    assert (rho * flow(flow.dt, rho * flow(flow.dt, x)) - x).abs().max() < 1e-12
+
+
+def test_compiled_and_array_runs_agree_and_files_keep_it(case, tmp_path):
+    flow, system, x, t = case
+    times = np.linspace(0, 3.3 * flow.dt, 9)
+    runs = [
+        solve(system, flow, (0, times[-1]), y0=x.numpy(), t_eval=times, backend=backend, on_domain_exit="ignore")
+        for backend in ("compiled", "array")
+    ]
+    assert np.abs(runs[0].y - runs[1].y).max() < 1e-11
+    flow.save(tmp_path / "flow.safetensors")
+    again = load(tmp_path / "flow.safetensors", system=system)
+    assert torch.equal(again(t, x), flow(t, x))
+    assert torch.equal(copy.deepcopy(flow)(t, x), flow(t, x))
+
+
+def test_a_changed_parameter_changes_the_compiled_map():
+    system = henon_heiles()
+    flow = SympFlow.split(system, 2, dt=0.5, terms=2)
+    one = solve(system, flow, (0, 5), t_eval=[5.0]).y
+    with torch.no_grad():
+        flow.weights[0].free += 0.01
+    other = solve(system, flow, (0, 5), t_eval=[5.0]).y
+    array = solve(system, flow, (0, 5), t_eval=[5.0], backend="array").y
+    assert np.abs(one - other).max() > 1e-6
+    assert np.abs(other - array).max() < 1e-12
+
+
+def test_untrained_it_is_the_impulse_method():
+    system = fput(omega=50.0)
+    flow = SympFlow.split(system, 1, dt=0.1, terms=1, filters=False, force_gradient=False, linear_outside=False)
+    x = torch.as_tensor(system.y0)
+    y = get("impulse")(dt=0.1).step(system, 0.0, system.y0, 0.1)
+    assert np.abs(flow(0.1, x).numpy() - y).max() < 1e-14
+
+
+@pytest.mark.parametrize("turn", [20.0, 1e3])
+def test_the_oscillator_for_a_million_steps(turn):
+    system = harmonic_oscillator(100.0)
+    flow = SympFlow.split(system, 1, dt=turn / 100)
+    sol = solve(system, flow, (0, 1e6 * flow.dt), save_every=1000, on_domain_exit="ignore")
+    assert np.abs(sol.energy_error()).max() < 1e-11
+
+
+def test_a_fit_lowers_the_error_at_all_times():
+    system = HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 + 200*q2**2 + (q1 - q2)**4/4", domain=Box([-1, -0.05, -1, -1], [1, 0.05, 1, 1])
+    )
+    start = SympFlow.split(system, 2, dt=0.25, terms=4)
+    x = torch.as_tensor(system.domain.sample(50, 99))
+    t = torch.linspace(0.05, 0.25, 5, dtype=torch.float64)[:, None]
+    from sympflow.training.validation import reference_step
+
+    exact = np.stack([reference_step(system, x.numpy(), float(s)) for s in t[:, 0]])
+    before = np.linalg.norm(start(t, x).detach().numpy() - exact, axis=-1).mean(1)
+    flow = fit_split(copy.deepcopy(start), system, points=40, label_times=6, restarts=2, steps=40)
+    after = np.linalg.norm(flow(t, x).numpy() - exact, axis=-1).mean(1)
+    assert after[-1] < 0.1 * before[-1]
+    assert (after < before).all()
+    again = fit_split(copy.deepcopy(start), system, points=40, label_times=6, restarts=2, steps=40)
+    assert all(torch.equal(a, b) for a, b in zip(flow.parameters(), again.parameters(), strict=True))
+
+
+def test_the_shipped_flow_of_fput_reaches_its_figures():
+    system = fput(omega=50.0)
+    sol = solve(system, t_eval=np.linspace(0, 200, 1001))
+    assert sol.stats["dt"] * 50 >= 5
+    assert np.abs(sol.energy_error()).max() < 1e-4
+    assert np.abs(oscillatory_energies(system, sol.y.T).sum(-1) - 1).max() < 0.08
+    between = solve(system, t_eval=np.linspace(0, 200, 301)[1:] - 0.05)
+    assert np.abs(between.energy_error()).max() < 1e-4
+
+
+def test_the_shipped_flow_of_the_spring_pendulum_beats_its_parts():
+    system = spring_pendulum(1e6, coordinates="polar")
+    flow, parts = solve(system), solve(system, "strang_parts", dt=0.01)
+    assert flow.stats["dt"] == pytest.approx(0.01)
+    assert np.abs(flow.energy_error()).max() < np.abs(parts.energy_error()).max()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"stages": 0}, r"^`stages` must be a positive integer"),
+        ({"terms": 0}, r"^`terms` must be a positive integer"),
+        ({"force_gradient": (0,), "stages": 3}, r"^`force_gradient` .* not the same from either end"),
+        ({"force_gradient": (0, 7), "stages": 8, "parts": ("p2**2/2",)}, r"^`parts` do not add up"),
+    ],
+)
+def test_what_makes_no_flow_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        SympFlow.split(henon_heiles(), **options)
+
+
+def test_a_flow_of_another_system_is_refused():
+    flow = SympFlow.split(henon_heiles(), 2)
+    with pytest.raises(ValueError, match="is not the one|degrees of freedom"):
+        flow.bind(pendulum())
