@@ -194,9 +194,9 @@ Over 1e6 to 1e8 steps the truncation error of an accurate method is below its ro
 
 ![Growth of the rounding error](figures/stability_round_off.png)
 
-Independent rounding errors make the energy a random walk, rms|ΔH| ~ √n [Brouwer 1937]; a systematic error would grow like n. No drift is seen: the slope, its error taken from the scatter between the trajectories, is 0 within two of its standard errors.
+Independent rounding errors make the energy a random walk, rms|ΔH| ~ √n [Brouwer 1937]; a systematic error would grow like n. No drift is seen: the slope, its error taken from the scatter between the trajectories, is 0 within three of its standard errors.
 Compensated summation (`compensated=True`: splittings, Gauss methods, `log_…` and primed SympFlows, compiled) keeps the part of each update that is lost, and gains a factor of 20 to 50. Newton's iteration runs to
-rounding, not to a tolerance, and the Gauss coefficients satisfy the symplecticity condition exactly, else the Gauss methods would drift [Hairer, McLachlan, Razakarivony 2008]. Where the truncation error is above the rounding the exponent is 0, or, with MLP potentials (the last row), that of a slow diffusion on chaotic orbits: their Hamiltonian 𝓗 depends on t within a step, and H is not conserved by it. To measure your own:
+rounding, not to a tolerance, and the Gauss coefficients satisfy the symplecticity condition exactly, else the Gauss methods would drift [Hairer, McLachlan, Razakarivony 2008]. Where the truncation error is above the rounding the exponent is 0, or, with the long steps of trained flows (last rows), that of a slow diffusion on chaotic orbits: at such steps no nearby Hamiltonian is conserved to better than that. To measure your own:
 
 ```python
 system = systems.henon_heiles()
