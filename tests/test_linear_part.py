@@ -38,7 +38,7 @@ def test_terms_linear_in_q_move_the_center():
 
 def test_a_stiff_direction_that_turns_is_refused():
     for k in (1e2, 1e4, 1e6):
-        with pytest.raises(ValueError, match="its stiff directions turn, by .*such as polar"):
+        with pytest.raises(ValueError, match=r"its stiff directions turn, by .*such as polar"):
             _ = spring_pendulum(k).linear_part
     for method in ("impulse", "linear_srkn11b"):
         with pytest.raises(ValueError, match="stiff directions turn"):

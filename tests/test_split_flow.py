@@ -28,7 +28,7 @@ def case(request):
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for w in flow.parameters():
-            w += 0.05 * torch.randn(w.shape, generator=generator, dtype=w.dtype)
+            w.add_(torch.randn(w.shape, generator=generator, dtype=w.dtype), alpha=0.05)
     flow.requires_grad_(False)
     x = torch.as_tensor(system.domain.sample(7, 0))
     return flow, system, x, flow.dt * torch.linspace(0.1, 1, 7, dtype=torch.float64)
@@ -51,7 +51,7 @@ def test_its_hamiltonian_generates_it(case):
 
 
 def test_it_is_symplectic(case):
-    flow, system, x, t = case
+    flow, system, x, _ = case
     A = torch.func.vmap(torch.func.jacfwd(lambda z: flow.psi(flow.dt, z)))(x)
     d = system.ndof
     J = torch.zeros(2 * d, 2 * d, dtype=x.dtype)
@@ -108,7 +108,7 @@ def test_untrained_it_is_the_impulse_method():
     flow = SympFlow.split(system, 1, dt=0.1, terms=1, filters=False, force_gradient=False, linear_outside=False)
     x = torch.as_tensor(system.y0)
     y = get("impulse")(dt=0.1).step(system, 0.0, system.y0, 0.1)
-    assert np.abs(flow(0.1, x).numpy() - y).max() < 1e-14
+    assert np.abs(flow(0.1, x).detach().numpy() - y).max() < 1e-14
 
 
 @pytest.mark.parametrize("turn", [20.0, 1e3])
@@ -130,11 +130,11 @@ def test_a_fit_lowers_the_error_at_all_times():
 
     exact = np.stack([reference_step(system, x.numpy(), float(s)) for s in t[:, 0]])
     before = np.linalg.norm(start(t, x).detach().numpy() - exact, axis=-1).mean(1)
-    flow = fit_split(copy.deepcopy(start), system, points=40, label_times=6, restarts=2, steps=40)
+    flow = fit_split(copy.deepcopy(start), system, points=20, label_times=4, restarts=1, steps=20)
     after = np.linalg.norm(flow(t, x).numpy() - exact, axis=-1).mean(1)
     assert after[-1] < 0.1 * before[-1]
     assert (after < before).all()
-    again = fit_split(copy.deepcopy(start), system, points=40, label_times=6, restarts=2, steps=40)
+    again = fit_split(copy.deepcopy(start), system, points=20, label_times=4, restarts=1, steps=20)
     assert all(torch.equal(a, b) for a, b in zip(flow.parameters(), again.parameters(), strict=True))
 
 
@@ -171,5 +171,5 @@ def test_what_makes_no_flow_is_refused(options, message):
 
 def test_a_flow_of_another_system_is_refused():
     flow = SympFlow.split(henon_heiles(), 2)
-    with pytest.raises(ValueError, match="is not the one|degrees of freedom"):
+    with pytest.raises(ValueError, match=r"is not the one|degrees of freedom"):
         flow.bind(pendulum())
