@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -37,6 +38,7 @@ class CallableHamiltonian:
         self.separable = potential is not None
         self.numba_functions: tuple[Any, Any, Any] | None = None
         if gradient is not None and hasattr(gradient, "py_func"):
+            _check_numba(potential, gradient, hessian_vector)
             self.numba_functions = (potential, gradient, hessian_vector)
             arrays = NumbaFunctions(potential, gradient, hessian_vector)
             potential, gradient = arrays.potential, arrays.gradient
@@ -76,7 +78,8 @@ class CallableHamiltonian:
 
     def potential_hessian(self, q: Array) -> Array:
         if self._hessian_vector is not None:
-            return stack([self._hessian_vector(q, e) for e in _basis(q)])
+            columns = [self._hessian_vector(q, e) for e in _basis(q)]
+            return stack([_checked(column, q, "hessian_vector", (self.ndof,)) for column in columns])
         if self._gradient is not None and not is_tensor(q):
             raise ValueError(
                 "`hessian_vector` is needed here (force-gradient methods, volume and symplecticity metrics) and was "
@@ -86,6 +89,22 @@ class CallableHamiltonian:
             return _jacobian(self._gradient, q)
         assert self._potential is not None
         return _with_torch(_hessian_of(self._potential, "potential"), q, "potential", (self.ndof, self.ndof))
+
+
+def _check_numba(potential: Any, gradient: Any, hessian_vector: Any) -> None:
+    """Raise unless the functions given with a Numba `gradient` are Numba functions of the right arguments."""
+    for name, function, arguments in (
+        ("potential", potential, "q"),
+        ("gradient", gradient, "q, out"),
+        ("hessian_vector", hessian_vector, "q, v, out"),
+    ):
+        if function is None:
+            continue
+        if not hasattr(function, "py_func"):
+            raise TypeError(f"`{name}` must be a Numba function, as `gradient` is: decorate it with numba.njit.")
+        count = len(inspect.signature(function.py_func).parameters)
+        if count != len(arguments.split(",")):
+            raise TypeError(f"`{name}` must take ({arguments}) as a Numba function; it takes {count} arguments.")
 
 
 def _basis(x: Array) -> list[Array]:
@@ -128,6 +147,8 @@ def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[in
     try:
         value = f(tensor)
     except (TypeError, RuntimeError, AttributeError, IndexError) as error:
+        if isinstance(error, RecursionError) or str(error).startswith(f"`{name}` must"):
+            raise
         raise TypeError(
             f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({error}). Write it with torch functions of "
             "(..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
@@ -137,10 +158,26 @@ def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[in
 
 
 def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
+    """What the user's function returned for x: real numbers of the right shape, in the library and dtype of x."""
     expected = (*x.shape[:-1], *tail)
-    if tuple(getattr(value, "shape", ())) != expected:
+    if isinstance(value, int | float) and not is_tensor(x):
+        value = np.asarray(value)
+    shape = getattr(value, "shape", None)
+    if shape is None or tuple(shape) != expected:
         raise ValueError(
             f"`{name}` must return shape {expected} for a state part of shape {tuple(x.shape)}; got "
-            f"{tuple(getattr(value, 'shape', ()))}. Reduce over the last axis only."
+            f"{type(value).__name__ if shape is None else tuple(shape)}. Reduce over the last axis only."
         )
-    return value
+    if is_tensor(value) != is_tensor(x):
+        given, got = ("a torch tensor", "NumPy's") if is_tensor(x) else ("a NumPy array", "torch's")
+        raise TypeError(
+            f"`{name}` must return an array of the library that it is given, {given}; got one of {got}. Write it for "
+            "both, leave `gradient` out, or take a method that runs on the other, such as 'rk45' or 'dopri5'."
+        )
+    if is_tensor(value):
+        if value.is_complex():
+            raise TypeError(f"`{name}` must return real numbers; got {value.dtype}. Take the real part.")
+        return value.to(x.dtype)
+    if value.dtype.kind not in "fiub":
+        raise TypeError(f"`{name}` must return real numbers; got {value.dtype}. Take the real part.")
+    return value.astype(x.dtype, copy=False)

@@ -152,11 +152,17 @@ def domain_of(flow: Any, system: HamiltonianSystem) -> Domain | None:
 
 def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
     """Refuse what is no answer (of a plug-in), and flag states that are not finite, whatever the method says."""
-    if not isinstance(outcome, Outcome) or tuple(np.shape(outcome.y)) != (len(outcome.t), *y0.shape):
-        what = f"y of shape {tuple(np.shape(outcome.y))}" if isinstance(outcome, Outcome) else type(outcome).__name__
+    what = type(outcome).__name__
+    if isinstance(outcome, Outcome):
+        status, shapes = np.asarray(outcome.status), (np.shape(outcome.t), tuple(np.shape(outcome.y)))
+        if status.dtype.kind in "iu" and shapes == (shapes[0][:1], (*shapes[0][:1], *y0.shape)):
+            what = ""
+        else:
+            what = f"status {outcome.status!r}, t and y of shapes {shapes[0]} and {shapes[1]}"
+    if what:
         raise TypeError(
-            f"`method` {integrator.name!r} must answer with an Outcome that has y of shape (n, *y0.shape); got {what}. "
-            "Mend its run(): check_integrator tests it."
+            f"`method` {integrator.name!r} must answer with an Outcome that has an integer status, t of shape (n,) and "
+            f"y of shape (n, *y0.shape); got {what}. Mend its run(): check_integrator tests it."
         )
     finite = to_numpy(all_finite(outcome.y))
     bad = ~finite.all(0) & (np.asarray(outcome.status) >= 0)

@@ -314,11 +314,13 @@ def rollout(
 
 def _first(y_next: Any, y: Array) -> Array:
     """The first step's result, checked: a step may be that of a plug-in."""
-    if is_tensor(y_next) != is_tensor(y) or np.shape(y_next) != np.shape(y) or isinstance(y_next, list | tuple):
-        what = f"shape {tuple(y_next.shape)}" if hasattr(y_next, "shape") else "no array"
+    shape = getattr(y_next, "shape", None)
+    real = shape is not None and (y_next.is_floating_point() if is_tensor(y_next) else y_next.dtype.kind == "f")
+    if is_tensor(y_next) != is_tensor(y) or shape != y.shape or not real:
+        what = "" if shape is None else f" of {y_next.dtype} and shape {tuple(shape)}"
         raise TypeError(
-            f"`step` must return states of the shape and library of those that it is given, {tuple(y.shape)}; got "
-            f"{type(y_next).__name__} of {what}. Mend the integrator: check_integrator tests it."
+            f"`step` must return states as those that it is given, of {y.dtype} and shape {tuple(y.shape)}; got "
+            f"{type(y_next).__name__}{what}. Mend the integrator: check_integrator tests it."
         )
     return y_next
 

@@ -97,8 +97,8 @@ class _Scipy(RungeKutta):
         failure = None
         if t1 != t0 and solver is None:
             failure = (
-                f"The vector field or the first step is not finite at t = {t0:.17g}. Check `y0` and its scale, or raise "
-                "`atol`."
+                f"The vector field or the first step is not finite at t = {t0:.17g}. Check `y0` and its scale, or "
+                "raise `atol`."
             )
         wanted = [] if t_eval is None else t_eval.tolist()
         outputs: list[np.ndarray] = [y0 for t in wanted if t == t0]

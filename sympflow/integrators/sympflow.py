@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from sympflow.arrays import Array, is_tensor
-from sympflow.integrators.base import FixedStep, Outcome, Problem, rollout
+from sympflow.integrators.base import FixedStep, Outcome, Problem, check_flag, rollout
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
@@ -243,6 +243,7 @@ class SympFlowIntegrator(FlowIntegrator):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_flag("compensated", self.compensated)
         if self.tol is None:
             return
         for name in ("flow", "dt"):

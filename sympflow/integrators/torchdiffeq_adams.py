@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -62,7 +63,14 @@ class Adams(Watched):
         assert isinstance(trace, _Nodes)
         nodes = torch.as_tensor(np.abs(np.array(trace.times) - trace.times[0]), device=y.device)
         options = {"grid_constructor": lambda f, y0, t: nodes, "max_order": self.max_order}
-        states = odeint(trace, y, nodes[[0, -1]], method=self.name, rtol=1e-7, atol=1e-9, options=options)
+        with warnings.catch_warnings(record=True) as raised:
+            warnings.simplefilter("always")
+            states = odeint(trace, y, nodes[[0, -1]], method=self.name, rtol=1e-7, atol=1e-9, options=options)
+        for warning in raised:
+            if str(warning.message).startswith("Functional iteration did not converge"):
+                trace.note = " Its functional iteration did not converge in every step: reduce `dt`."
+            else:
+                warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
         trace.callback_step(None, None, None)
         trace(None, states[-1])
 

@@ -32,6 +32,7 @@ class Trace:
         self.tensor = is_tensor(y0)
         self.evaluations = self.n_steps = 0
         self.reached = t_span[0]
+        self.note = ""  # for the message, when the run ends
 
     def __call__(self, s: Any, y: Any) -> Any:
         self.evaluations += 1
@@ -136,7 +137,7 @@ class Watched(Integrator):
             times,
             stack(states, axis=0) if states else y0[None][:0],
             np.zeros(y0.shape[:-1], dtype=int) if y0.ndim > 1 else status,
-            ENDED if status == 1 else failure or FINISHED,
+            (ENDED if status == 1 else failure or FINISHED) + trace.note,
             stats,
         )
         if problem.dense_output:
