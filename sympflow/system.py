@@ -99,7 +99,7 @@ class HamiltonianSystem:
             raise TypeError("`mass` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         else:
             self._set(definition, None, False)
-        self.stiffness_matrix = _stiffness_matrix(stiffness_matrix, definition)
+        self.stiffness_matrix: np.ndarray | None = _stiffness_matrix(stiffness_matrix, definition)
         self._set_scene(name, {}, domain, y0, t_span, dt, energy_scale)
 
     @classmethod
@@ -139,14 +139,13 @@ class HamiltonianSystem:
         M = symbols.inverse_mass
         inverse_mass = None if M is None else _simplest_mass(np.array(M.tolist(), dtype=float))
         self._set(symbols, inverse_mass, M is not None)
-        self.symbols = symbols
+        self.symbols, self.stiffness_matrix = symbols, None
         self._set_scene(name, dict(params or {}), domain, y0, t_span, dt, energy_scale)
         return self
 
     def _set(self, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
         self._definition = definition
         self.symbols: SymbolicHamiltonian | None = None
-        self.stiffness_matrix: np.ndarray | None = None
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
         self.inverse_mass = inverse_mass
