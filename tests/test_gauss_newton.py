@@ -112,7 +112,7 @@ def test_the_fits_derivatives(palindromic):
     """Residuals and Jacobian by the flow's parameters, against the flow itself."""
     flow = SympFlow.primed(PENDULUM, 2, degree=3, palindromic=palindromic, dt=0.8).requires_grad_(False)
     run = GaussNewtonRun.start(
-        flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), GaussNewtonConfig(points=5, label_times=3)
+        flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), GaussNewtonConfig(points=5, label_times=3, frozen_weight=1.0)
     )
     table, labels_x = Table(flow), torch.as_tensor(run.whole._x[:, :5].T)
     theta = table.parameters() + 0.02 * np.random.default_rng(0).normal(size=flow.n_parameters)
@@ -254,7 +254,7 @@ def test_a_degenerate_direction_does_no_harm():
 def test_the_fits_derivatives_with_a_processor():
     flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=2, dt=0.8)
     run = GaussNewtonRun.start(
-        flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), GaussNewtonConfig(points=5, label_times=3)
+        flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), GaussNewtonConfig(points=5, label_times=3, frozen_weight=1.0)
     )
     table = Table(flow)
     theta = table.parameters() + np.random.default_rng(0).normal(0, 0.05, flow.n_parameters)
