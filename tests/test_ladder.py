@@ -1,0 +1,238 @@
+"""The flows that ship as ladders: chosen by accuracy and cost, listed, built by one command; and what they achieve."""
+
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+import torch
+
+import sympflow
+from sympflow import HamiltonianSystem, SympFlow, get, load, max_energy_error, shipped_flows, solve, systems
+from sympflow.flow import shipped as catalogue
+from sympflow.flow.shipped import ShippedFlow, choose
+from sympflow.integrators import sympflow as integrator
+from sympflow.training import ladder, pretrained
+from sympflow.training.ladder import Ladder, Rung, certify
+
+HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
+QUARTIC = HamiltonianSystem.from_sympy("p**2/2 + q**4/4", name="plain_quartic", domain=sympflow.Ball([0.0, 0.0], 1.0))
+QUICK = {"restarts": 2, "points": 40, "reference_states": 10, "steps": 20, "progress": False}
+LADDERS = ladder.ladders()
+FILES = [f for f in shipped_flows() if f.stages is not None]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Three rungs for the pendulum with figures made up, a network for it, and a rung for another system."""
+    folder = tmp_path_factory.mktemp("pretrained")
+    for stages, error, cost in ((2, 1e-3, 3.0), (4, 1e-5, 9.0), (6, 1e-7, 7.0)):
+        flow = SympFlow.primed(PENDULUM, stages, dt=0.5)
+        flow.figures = {"energy_error_95": error, "cost": cost, "t_end": 1000.0}
+        flow.domain = PENDULUM.domain
+        flow.save(folder / f"pendulum-primed-{stages}.safetensors")
+    network = SympFlow(1, dt=0.7)
+    network.fingerprint, network.system_name = OSCILLATOR.fingerprint, OSCILLATOR.name
+    network.save(folder / "oscillator-sympflow.safetensors")
+    SympFlow.primed(OSCILLATOR, 1, dt=0.3).save(folder / "oscillator-primed-1.safetensors")
+    return folder
+
+
+@pytest.fixture
+def three(folder, monkeypatch):
+    """They are what ships."""
+    files = tuple(ShippedFlow.of(path) for path in sorted(folder.glob("*.safetensors")))
+    monkeypatch.setattr(catalogue, "_catalogue", lambda: files)
+    monkeypatch.setattr(integrator, "_SHIPPED", {})
+    return files
+
+
+# choosing ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("tol", "stages"), [(1e-2, 2), (1e-3, 2), (9e-4, 6), (1e-5, 6), (1e-7, 6)])
+def test_the_cheapest_that_meets_the_tolerance_is_taken(three, tol, stages):
+    assert choose(PENDULUM, tol=tol).stages == stages
+    sol = solve(PENDULUM, "sympflow", (0.0, 2.0), tol=tol)
+    assert sol.stats["dt"] == 0.5
+    assert sol.stats["force_evaluations"] == 4 * stages
+    reference = solve(PENDULUM, SympFlow.primed(PENDULUM, stages, dt=0.5), (0.0, 2.0))
+    np.testing.assert_array_equal(sol.y, reference.y)
+
+
+def test_if_none_meets_it_those_there_are_are_listed(three):
+    message = (
+        r"^`tol` 1e-09 is met by no flow .*pendulum-primed-2 1.0e-03, pendulum-primed-6 1.0e-07.*: raise it, or train"
+    )
+    with pytest.raises(ValueError, match=message):
+        solve(PENDULUM, "sympflow", (0.0, 1.0), tol=1e-9)
+    with pytest.raises(ValueError, match=r"^`system` 'plain_quartic' has no shipped sympflow flow"):
+        solve(QUARTIC, "sympflow", (0.0, 1.0), tol=1e-3)
+
+
+def test_without_a_tolerance(three):
+    """The network, if there is one; else the cheapest rung that reaches 1e-6, else the most accurate."""
+    assert choose(OSCILLATOR).dt == 0.7
+    assert choose(PENDULUM).stages == 6
+    assert solve(PENDULUM, "sympflow", (0.0, 1.0)).stats["force_evaluations"] == 2 * 6
+    assert catalogue.DEFAULT_TOL == 1e-6
+
+
+def test_without_a_rung_that_reaches_the_default_the_most_accurate(three, monkeypatch):
+    monkeypatch.setattr(catalogue, "DEFAULT_TOL", 1e-12)
+    assert choose(PENDULUM).stages == 6
+
+
+def test_a_flow_without_figures_meets_no_tolerance(three):
+    with pytest.raises(ValueError, match=r"^`tol` 1 is met by no flow .*oscillator-sympflow –"):
+        choose(OSCILLATOR, tol=1.0)
+
+
+@pytest.mark.parametrize("tol", [0.0, -1.0, float("nan"), True, "1e-6"])
+def test_bad_tolerances_are_refused(tol):
+    with pytest.raises(ValueError, match=r"^`tol` must be a positive number"):
+        solve(PENDULUM, "sympflow", (0.0, 1.0), tol=tol)
+
+
+@pytest.mark.parametrize("other", [{"dt": 0.1}, {"flow": SympFlow(1)}])
+def test_a_tolerance_chooses_flow_and_step(other):
+    with pytest.raises(ValueError, match=r"^`tol` chooses the flow and its Δt"):
+        solve(PENDULUM, "sympflow", (0.0, 1.0), tol=1e-3, **other)
+    with pytest.raises(TypeError, match=r"^`tol` is not an option of method 'mlp'"):
+        solve(PENDULUM, "mlp", (0.0, 1.0), tol=1e-3)
+
+
+def test_a_configured_integrator_takes_a_tolerance(three):
+    method = get("sympflow")(tol=1e-5)
+    assert method.step_length(PENDULUM) == 0.5
+    assert solve(PENDULUM, method, (0.0, 2.0)).stats["force_evaluations"] == 4 * 6
+    y = torch.tensor([[0.3, 0.1]], dtype=torch.float64)
+    assert method.step(PENDULUM, 0.0, y, 0.5).shape == (1, 2)
+    assert solve(PENDULUM, method, (0.0, 1.0), y0=[0.3, 0.1], dtype="float32").y.dtype == np.float32
+
+
+def test_weights_are_read_only_of_the_flow_that_is_taken(three, monkeypatch):
+    read = []
+    original = ShippedFlow.load
+    monkeypatch.setattr(ShippedFlow, "load", lambda self, system=None: read.append(self.name) or original(self, system))
+    for _ in range(3):
+        solve(PENDULUM, "sympflow", (0.0, 1.0), tol=1e-3)
+    assert read == ["pendulum-primed-2"]
+
+
+# listing -------------------------------------------------------------------------------------------------------
+
+
+def test_the_list(three):
+    rows = shipped_flows(PENDULUM)
+    assert [f.stages for f in rows] == [2, 6, 4]  # by cost
+    assert [f.name for f in rows[:1]] == ["pendulum-primed-2"]
+    assert rows[0].load(PENDULUM).system is PENDULUM
+    assert len(shipped_flows(kind="sympflow")) == 5
+    assert len(shipped_flows(QUARTIC)) == 0
+    table = rows.table().splitlines()
+    assert len(table) == 5
+    assert "1.0e-03 (T = 1000)" in table[2]
+    assert repr(rows) == rows.table()
+    with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem"):
+        shipped_flows("pendulum")
+    with pytest.raises(ValueError, match=r"^`kind` 'gan' is unknown"):
+        shipped_flows(kind="gan")
+
+
+def test_listing_loads_no_weights():
+    code = "import sympflow; print(len(sympflow.shipped_flows())); import sys; assert 'torch' not in sys.modules"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert int(run.stdout) == len(shipped_flows())
+
+
+# building ------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_builds_a_ladder(tmp_path, monkeypatch, capsys):
+    rungs = tuple(Rung(s, 0.5, 0, options=QUICK) for s in (1, 2))
+    monkeypatch.setattr(pretrained, "ladders", lambda: {"pendulum": Ladder(systems.pendulum, rungs, t_end=50.0)})
+    pretrained.main(["pendulum", "--kind", "primed", "--out", str(tmp_path)])
+    assert capsys.readouterr().out.count("energy_error_95") == 2
+    one, two = (load(tmp_path / f"pendulum-primed-{s}-0.5.safetensors", system=PENDULUM) for s in (1, 2))
+    assert one.certified.t_end == two.figures["t_end"] == 50.0
+    assert two.figures["energy_error_95"] == two.certified.relative_energy_error.q95 < one.figures["energy_error_95"]
+    assert two.figures["cost"] > one.figures["cost"] > 0
+    assert two.recipe["stages"][0]["restarts"] == 2
+    listed = ShippedFlow.of(tmp_path / "pendulum-primed-2-0.5.safetensors")
+    assert (listed.stages, listed.dt, listed.cost) == (2, 0.5, two.figures["cost"])
+    pretrained.main(["pendulum", "--rung", "primed-2-0.5", "--out", str(tmp_path), "--measure"])
+    assert capsys.readouterr().out.startswith("pendulum-primed-2-0.5: one_step_error")
+
+
+def test_rebuilding_gives_the_same_weights():
+    rung = Rung(2, 0.5, 1, options=QUICK)
+    one, two = (rung.train(PENDULUM, 20.0).state_dict() for _ in range(2))
+    assert all(torch.equal(one[name], two[name]) for name in one)
+
+
+def test_the_figures_are_those_of_the_certificate():
+    flow = SympFlow.primed(HH, 2, dt=0.5).requires_grad_(False)
+    certify(flow, HH, 100.0)
+    sample = HH.domain.sample(400, 77)
+    errors = max_energy_error(solve(HH, flow, (0.0, 100.0), y0=sample, on_domain_exit="ignore"))
+    # another sample of states: quantiles agree to the noise of 100 draws
+    assert flow.figures["energy_error_median"] == pytest.approx(float(np.median(errors)), rel=0.5)
+    assert flow.figures["energy_error_95"] == pytest.approx(float(np.quantile(errors, 0.95)), rel=0.8)
+
+
+# what ships ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", LADDERS)
+def test_every_rung_ships(name):
+    names = {f.name for f in FILES}
+    assert {f"{name}-{rung.name}" for rung in LADDERS[name].rungs} <= names
+
+
+@pytest.mark.parametrize("flow", FILES, ids=lambda f: f.name)
+def test_shipped_flows_are_maps_for_all_times(flow):
+    """Not tables at Δt alone: the error at fractional times is at most ten times that at Δt; files stay small."""
+    assert flow.fractional_error <= 10 * flow.one_step_error
+    assert flow.path.stat().st_size < 200_000
+    assert flow.cost > 0
+    assert flow.energy_error < 0.1
+
+
+@pytest.mark.parametrize("name", LADDERS)
+def test_shipped_figures_hold(name):
+    """Measured again, on states of another seed, over a tenth of the time: no rung is worse than its file says."""
+    system = LADDERS[name].make()
+    t_end = LADDERS[name].t_end / 10
+    for listed in shipped_flows(system):
+        if listed.stages is None:
+            continue
+        flow = listed.load(system)
+        y0 = flow.domain.attach(system.hamiltonian).sample(40, 4321) if hasattr(flow.domain, "attach") else None
+        y0 = flow.domain.sample(40, 4321) if y0 is None else y0
+        t_eval = np.linspace(0.0, t_end, 201)
+        sol = solve(system, flow, (0.0, t_end), y0=y0, t_eval=t_eval, on_domain_exit="ignore")
+        errors = np.sort(max_energy_error(sol))
+        assert errors[len(errors) * 9 // 10] <= 3 * listed.energy_error
+        assert listed.energy_error < 100 * errors[-1] + 1e-9
+
+
+@pytest.mark.parametrize("name", LADDERS)
+def test_what_costs_more_is_more_accurate(name):
+    rungs = [f for f in shipped_flows(LADDERS[name].make()) if f.stages]
+    errors = [f.energy_error for f in rungs]  # the cheapest first
+    assert errors[-1] < 1e-3 * errors[0]
+    assert all(f.cost == pytest.approx(ladder.cost(f.load()), abs=1e-3) for f in rungs)
+
+
+def test_no_torch_to_choose_a_classical_method():
+    code = textwrap.dedent(
+        """
+        import sympflow, sys
+        sympflow.solve(sympflow.systems.pendulum(), "verlet", (0, 1), backend="array")
+        assert "torch" not in sys.modules and "sympflow.flow.shipped" not in sys.modules
+        """
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
