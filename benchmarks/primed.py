@@ -128,7 +128,7 @@ ABLATION = (
     Variant("labels + residual", training=(("loss", "labels+residual"), ("restarts", 4), ("steps", 30))),
     Variant("residual", training=(("loss", "residual"), ("restarts", 4), ("steps", 30))),
     Variant("residual + matching", training=(("loss", "residual+matching"), ("restarts", 4), ("steps", 30))),
-    Variant("Δt weighted like other times", training=(("frozen_weight", 1.0),)),
+    Variant("Δt weighted 10 times", training=(("frozen_weight", 10.0),)),
 )
 
 

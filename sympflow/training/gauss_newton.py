@@ -73,7 +73,7 @@ class GaussNewtonConfig:
 
     points: int | None = None
     label_times: int = 8
-    frozen_weight: float = 10.0
+    frozen_weight: float = 1.0
     label_weight: float = 1.0
     residual_weight: float = 0.0
     matching_weight: float = 0.0
