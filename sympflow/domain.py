@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, to_numpy
+
+if TYPE_CHECKING:
+    from sympflow.tube import Tube
+
+
+_MOST_SAMPLES = 100_000_000
 
 
 @runtime_checkable
@@ -52,8 +58,11 @@ def _states(x: ArrayLike, width: int) -> np.ndarray:
 
 
 def _sample_count(n: int) -> int:
-    if n < 1 or int(n) != n:
+    number = isinstance(n, int | float | np.number) and np.isfinite(n)
+    if not number or n < 1 or int(n) != n:
         raise ValueError(f"`n` must be a positive integer; got {n!r}.")
+    if n > _MOST_SAMPLES:
+        raise ValueError(f"`n` must be at most {_MOST_SAMPLES:.0e}; got {n:.3g}: draw in parts, with several seeds.")
     return int(n)
 
 
@@ -74,6 +83,10 @@ class Ball:
         object.__setattr__(self, "center", _vector("center", self.center))
         if not 0 < self.radius < np.inf:
             raise ValueError(f"`radius` must be positive and finite; got {self.radius!r}.")
+
+    @property
+    def width(self) -> int:
+        return np.size(self.center)
 
     def sample(self, n: int, seed: int = 0) -> np.ndarray:
         rng = np.random.default_rng(seed)
@@ -109,6 +122,10 @@ class Box:
             raise ValueError(f"`high` must have the length of `low`; got {np.size(self.high)} and {np.size(self.low)}.")
         if not np.all(np.less(self.low, self.high)):
             raise ValueError(f"`low` must be below `high` in every component; got {self.low!r}, {self.high!r}.")
+
+    @property
+    def width(self) -> int:
+        return np.size(self.low)
 
     def sample(self, n: int, seed: int = 0) -> np.ndarray:
         rng = np.random.default_rng(seed)
@@ -192,6 +209,10 @@ class EnergySublevel:
             inside = inside & (low <= L) & (high >= L)
         return inside
 
+    @property
+    def width(self) -> int:
+        return self.box.width
+
     def sample(self, n: int, seed: int = 0) -> np.ndarray:
         _sample_count(n)
         rng = np.random.default_rng(seed)
@@ -227,7 +248,7 @@ class EnergySublevel:
         return description | {name: bound for name, bound in more.items() if bound is not None}
 
 
-def domain_from_dict(description: dict[str, Any]) -> Domain:
+def domain_from_dict(description: dict[str, Any]) -> Ball | Box | EnergySublevel | Tube:
     """The domain that `to_dict` described.
 
     Raises

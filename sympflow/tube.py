@@ -54,7 +54,9 @@ class Tube:
             raise ValueError(f"`radius` must be a number or have shape ({width},); got {radius.shape}.")
         if not ((radius > 0) & (radius < np.inf)).all():
             raise ValueError(f"`radius` must be positive and finite; got {self.radius!r}.")
-        groups = [list(range(width))] if self.groups is None else [[int(i) for i in group] for group in self.groups]
+        groups = [list(range(width))] if self.groups is None else [[*group] for group in self.groups]
+        whole = all(isinstance(i, int | np.integer) and not isinstance(i, bool) for group in groups for i in group)
+        groups = [[int(i) for i in group] for group in groups] if whole else []
         if sorted(i for group in groups for i in group) != list(range(width)):
             raise ValueError(f"`groups` must hold each of 0 … {width - 1} once; got {self.groups!r}.")
         orbit.setflags(write=False)
@@ -79,6 +81,10 @@ class Tube:
         radius = np.broadcast_to(np.asarray(self.radius), orbit.shape[1:])
         assert self.groups is not None
         return [(list(group), orbit[:, list(group)], radius[list(group)]) for group in self.groups]
+
+    @property
+    def width(self) -> int:
+        return np.shape(self.orbit)[1]
 
     def sample(self, n: int, seed: int = 0) -> np.ndarray:
         rng = np.random.default_rng(seed)

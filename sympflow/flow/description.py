@@ -112,10 +112,8 @@ def _domain(description: Any, ndof: int) -> Domain:
         domain = domain_from_dict(description)
     except (ValueError, TypeError, AttributeError) as error:
         raise Refused(f"its domain is not admissible ({error})") from None
-    corners: Any = getattr(domain, "box", domain)
-    width = len(getattr(corners, "low", None) or corners.center)
-    if width != 2 * ndof:
-        raise Refused(f"its domain has states of length {width}, not {2 * ndof}")
+    if domain.width != 2 * ndof:
+        raise Refused(f"its domain has states of length {domain.width}, not {2 * ndof}")
     return domain
 
 

@@ -22,7 +22,7 @@ import sympflow
 from sympflow.flow.base import FlowMap
 from sympflow.flow.description import check, describe
 from sympflow.flow.placement import checked_device
-from sympflow.flow.record import Refused, build, checksum, dtype_of, fill, parse
+from sympflow.flow.record import Refused, build, checksum, dtype_of, fill, parse, tensor_bytes
 from sympflow.flow.shipped import choose
 
 if TYPE_CHECKING:
@@ -77,6 +77,11 @@ def save(flow: FlowMap, path: str | os.PathLike[str]) -> None:
     except Refused as reason:
         raise ValueError(f"`flow` cannot be saved as it is: {reason}. Set it right first.") from None
     content = save_tensors(tensors, {KEY: json.dumps(record, allow_nan=False, separators=(",", ":"))})
+    if (length := struct.unpack("<Q", content[:8])[0]) > MAX_HEADER:
+        raise ValueError(
+            f"`flow` cannot be saved as it is: its description takes {length:,} bytes, more than {MAX_HEADER:,}. "
+            "Describe its domain with fewer numbers, for instance a Tube around fewer states."
+        )
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -161,21 +166,30 @@ def _refusal(path: str | os.PathLike[str], reason: str) -> ValueError:
 def _read(path: str | os.PathLike[str]) -> tuple[bytes, dict[str, Any], dict[str, Any]]:
     """The bytes of the file, its safetensors header, and the record in it."""
     path = _path(path)
-    if not path.is_file():
+    try:
+        found = path.is_file()
+    except OSError:  # a name that no file can have
+        found = False
+    if not found:
         raise ValueError(f"`path` {str(path)!r} is not a file: pass the path of a flow saved with flow.save(path).")
     try:
         size = path.stat().st_size
         if size > MAX_FILE:
             raise Refused(f"it has {size:,} bytes, more than any flow")
-        content = path.read_bytes()
-        if len(content) < 8:
-            raise Refused("it is truncated")
-        (length,) = struct.unpack("<Q", content[:8])
-        if length > MAX_HEADER:
-            raise Refused(f"it is no safetensors file, or its header is oversized ({length:,} bytes)")
-        if len(content) < 8 + length:
-            raise Refused("it is truncated")
-        header = parse(content[8 : 8 + length], "header")
+        with path.open("rb") as file:
+            content = file.read(8)
+            if len(content) < 8:
+                raise Refused("it is truncated")
+            (length,) = struct.unpack("<Q", content)
+            if length > MAX_HEADER:
+                raise Refused(f"it is no safetensors file, or its header is oversized ({length:,} bytes)")
+            content += file.read(length)
+            if len(content) < 8 + length:
+                raise Refused("it is truncated")
+            header = parse(content[8:], "header")
+            if (expected := len(content) + tensor_bytes(header)) != size:
+                raise Refused(f"it is truncated or damaged: it has {size:,} bytes, by its header {expected:,}")
+            content += file.read()
         notes = header.pop("__metadata__", None)
         if not isinstance(notes, dict) or not isinstance(notes.get(KEY), str):
             raise Refused("it holds no record of a sympflow flow")

@@ -43,6 +43,16 @@ def parse(text: str | bytes, what: str) -> dict[str, Any]:
     return value
 
 
+def tensor_bytes(header: dict[str, Any]) -> int:
+    """How many bytes follow the header, by the offsets in it."""
+    try:
+        return max(
+            (int(entry["data_offsets"][1]) for name, entry in header.items() if name != "__metadata__"), default=0
+        )
+    except (KeyError, TypeError, ValueError, IndexError):
+        raise Refused("its header has a tensor without offsets") from None
+
+
 def dtype_of(header: dict[str, Any]) -> torch.dtype:
     names = {str(entry.get("dtype")) if isinstance(entry, dict) else "nothing" for entry in header.values()}
     if len(names) != 1 or not names <= set(DTYPES):
