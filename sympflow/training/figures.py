@@ -10,7 +10,10 @@ import torch
 
 from sympflow.flow.base import FlowMap
 from sympflow.system import HamiltonianSystem
+from sympflow.training.labels import Labels
 from sympflow.training.validation import reference_step
+
+FRACTIONAL_TIMES = 50
 
 
 @torch.no_grad()
@@ -58,3 +61,20 @@ def measure(
 def _mean(values: np.ndarray) -> float | None:
     mean = float(values.mean())
     return mean if math.isfinite(mean) else None
+
+
+@torch.no_grad()
+def one_step_errors(
+    flow: FlowMap, system: HamiltonianSystem, x: np.ndarray, *, times: int = FRACTIONAL_TIMES, omega: float = 1.0
+) -> tuple[float, float]:
+    """Means of ‖ψ̄_t(x) − φ_H,t(x)‖ over the states x (n, 2d): at Δt, and over as many times spread over (0, Δt).
+
+    A flow of which the second is far larger than the first is a map for Δt only. States are measured as [q, p/ω].
+    """
+    units = np.repeat([1.0, omega], system.ndof)
+    t = flow.dt * (np.arange(times) + 0.5) / times
+    labels = Labels.of(system, x, np.append(t, flow.dt))
+    start = torch.as_tensor(labels.x, dtype=flow.dtype, device=flow.device)
+    psi = np.stack([flow.psi(s, start).cpu().numpy() for s in labels.t.tolist()])
+    error = np.linalg.norm((psi - labels.y) / units, axis=-1).mean(-1)
+    return float(error[-1]), float(error[:-1].mean())

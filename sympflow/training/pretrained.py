@@ -4,11 +4,13 @@ python -m sympflow.training.pretrained                                  all of t
 python -m sympflow.training.pretrained henon_heiles --kind sympflow     one
 python -m sympflow.training.pretrained kepler --rung primed-3-0.08      one rung of a ladder of primed flows
 python -m sympflow.training.pretrained --measure                        their figures, without training
+python -m sympflow.training.pretrained --measure --keep                 and put them into the files
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import resources
@@ -22,7 +24,7 @@ from sympflow.domain import Box, EnergySublevel
 from sympflow.flow.io import load
 from sympflow.system import HamiltonianSystem
 from sympflow.systems import harmonic_oscillator, henon_heiles, pendulum
-from sympflow.training.figures import measure
+from sympflow.training.figures import measure, one_step_errors
 from sympflow.training.ladder import certify, ladders
 from sympflow.training.trainer import train
 
@@ -61,14 +63,18 @@ class Recipe:
         """The flow, with its figures, and a certificate if it is symplectic."""
         first, second = zip(self.points, self.steps, strict=True)
         newton: dict[str, Any] = {"optimizer": "gauss-newton", "domain": self.domain, **options}
+        before = time.process_time()
         flow = train(self.system, self.dt, kind=kind, points=first[0], steps=first[1], **newton)
         flow = train(self.system, flow=flow, points=second[0], steps=second[1], seed=1, **newton)
+        flow.figures["training_cpu_seconds"] = round(time.process_time() - before, 3)
         self.judge(flow)
         return flow
 
     def judge(self, flow: Any) -> dict[str, Any]:
         """Its figures, measured (again), with a certificate if it is symplectic."""
         flow.figures |= self.measure(flow)
+        at_end, between = one_step_errors(flow, self.system, self.initial(), omega=self.omega)
+        flow.figures |= {"error_at_dt": at_end, "fractional_error": between}
         if flow.kind == "sympflow":
             certify(flow, self.system)
         return flow.figures
@@ -135,6 +141,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--rung", help="one rung only of a ladder of primed flows: primed-STAGES-DT")
     parser.add_argument("--out", type=Path, help="folder to write to (default: the package)")
     parser.add_argument("--measure", action="store_true", help="only measure the files that are there")
+    parser.add_argument("--keep", action="store_true", help="with --measure: put the figures into the files")
     options = parser.parse_args(arguments)
     unknown = sorted(set(options.scenes) - set(scenes()))
     if unknown:
@@ -156,9 +163,8 @@ def _made(name: str, kind: str, options: argparse.Namespace) -> Iterator[tuple[P
         ladder = ladders()[name]
         if options.measure:
             for rung in ladder.rungs:
-                file = path(name, rung.name, options.out)
                 if options.rung in (None, rung.name):
-                    yield file, ladder.measure(load(file))
+                    yield _measured(path(name, rung.name, options.out), ladder.measure, options.keep)
             return
         for rung, flow in ladder.flows(options.rung):
             flow.save(file := path(name, rung.name, options.out))
@@ -166,11 +172,20 @@ def _made(name: str, kind: str, options: argparse.Namespace) -> Iterator[tuple[P
     elif name in recipes():
         recipe, file = recipes()[name], path(name, kind, options.out)
         if options.measure:
-            yield file, recipe.judge(load(file))
+            yield _measured(file, recipe.judge, options.keep)
         else:
             flow = recipe.train(kind)
             flow.save(file)
             yield file, flow.figures
+
+
+def _measured(file: Path, judge: Callable[[Any], dict[str, Any]], keep: bool) -> tuple[Path, dict[str, Any]]:
+    """A file and its figures, measured again, and kept in it if so wished."""
+    flow = load(file)
+    figures = judge(flow)
+    if keep:
+        flow.save(file)
+    return file, figures
 
 
 if __name__ == "__main__":
