@@ -121,6 +121,31 @@ def test_weights_are_read_only_of_the_flow_that_is_taken(three, monkeypatch):
     assert read == ["pendulum-primed-2"]
 
 
+def test_a_tolerance_is_not_met_outside_the_domain():
+    """All Kepler problems have the same H; the flows that ship hold near e = 0.6."""
+    with pytest.raises(ValueError, match=r"^`y0` is outside the domain that the flow .* `tol`.* pass flow=flow"):
+        solve(systems.kepler(0.1), "sympflow", (0.0, 1.0), tol=1e-3)
+    kepler = systems.kepler()
+    batch = np.stack([kepler.y0, systems.kepler(0.1).y0])
+    with pytest.raises(ValueError, match=r"^`y0` is outside the domain \(trajectory 1\)"):
+        solve(kepler, "sympflow", (0.0, 1.0), y0=batch, tol=1e-3)
+    with pytest.raises(ValueError, match=r"^`y0` is outside the domain"):
+        solve(kepler, "sympflow", (0.0, 1.0), y0=torch.as_tensor(batch[1]), tol=1e-3)
+    assert solve(kepler, "sympflow", (0.0, 1.0), tol=1e-3).success
+    flow = choose(kepler, tol=1e-3).load(kepler)
+    assert "domain" in solve(kepler, flow, (0.0, 1.0), y0=batch[1]).message  # without a tolerance: a note
+
+
+@pytest.mark.parametrize("system", [systems.fput(), systems.spring_pendulum(1e6, coordinates="polar")])
+def test_stiff_flows_are_chosen_by_tolerance(system):
+    """Their figure is over the scene's own interval, and what it says holds on it."""
+    listed = choose(system, tol=1e-3)
+    assert listed.t_end == system.t_span[1]
+    assert listed.cost > 0
+    sol = solve(system, "sympflow", (0.0, 2.0), tol=1e-3)
+    assert np.abs(sol.energy_error()).max() < 1e-3
+
+
 # listing -------------------------------------------------------------------------------------------------------
 
 
@@ -169,7 +194,9 @@ def test_the_command_builds_a_ladder(tmp_path, monkeypatch, capsys):
 
 def test_rebuilding_gives_the_same_weights():
     rung = Rung(2, 0.5, 1, options=QUICK)
-    one, two = (rung.train(PENDULUM, 20.0).state_dict() for _ in range(2))
+    flows = [rung.train(PENDULUM) for _ in range(2)]
+    assert flows[0].figures["training_cpu_seconds"] > 0
+    one, two = (flow.state_dict() for flow in flows)
     assert all(torch.equal(one[name], two[name]) for name in one)
 
 

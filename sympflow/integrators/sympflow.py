@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -129,6 +130,8 @@ class FlowIntegrator(FixedStep):
     def run(self, problem: Problem) -> Outcome:
         if self.flow is None:  # the shipped one, from here on
             chosen: dict[str, Any] = {"flow": self._flow_like(problem.system, problem.y0)}
+            if self._tolerance is not None:
+                _check_start(chosen["flow"], problem.system, problem.y0)
             return replace(self, **chosen, **({} if self._tolerance is None else {"tol": None})).run(problem)
         return super().run(problem)
 
@@ -167,6 +170,20 @@ class FlowIntegrator(FixedStep):
             tensors = Problem(problem.system, problem.t0, problem.t1, torch.from_numpy(np.ascontiguousarray(y0)))
             states, finite, _ = self.rollout(tensors, h, n_steps, save)
         return states.numpy(), finite, "torch"
+
+
+def _check_start(flow: Any, system: HamiltonianSystem, y0: Array) -> None:
+    """A flow that is taken for its accuracy must start where its accuracy was measured."""
+    from sympflow.solver import domain_of
+
+    domain = domain_of(flow, system)
+    inside = np.ones(1, bool) if domain is None else np.asarray(domain.contains(y0))
+    if not inside.all():
+        which = f" (trajectory {', '.join(map(str, np.argwhere(~inside)[0].tolist()))})" if inside.ndim else ""
+        raise ValueError(
+            f"`y0` is outside the domain{which} that the flow with Δt = {flow.dt:g} was trained and measured on, so it "
+            "has no known accuracy to meet `tol` there: start inside, or train a flow there and pass flow=flow."
+        )
 
 
 def _processed_rollout(
@@ -225,7 +242,8 @@ class SympFlowIntegrator(FlowIntegrator):
         The default is the flow shipped for the system.
     tol : float, optional
         Take the cheapest shipped flow whose relative energy error up to T = 1000, the 95 % quantile over held-out
-        states, is at most this; `sympflow.shipped_flows(system)` lists them. It says nothing of a smaller `dt`.
+        states, is at most this; `sympflow.shipped_flows(system)` lists them, and a T that differs. Where y0 is outside
+        the domain of that flow there is no such figure, and a ValueError says so. It says nothing of a smaller `dt`.
     compensated : bool
         Whether to sum with Kahan's compensation, which slows the growth of round-off. Compiled primed flows only.
 
@@ -246,6 +264,8 @@ class SympFlowIntegrator(FlowIntegrator):
         check_flag("compensated", self.compensated)
         if self.tol is None:
             return
+        if not isinstance(self.tol, int | float) or isinstance(self.tol, bool) or not 0 < self.tol < math.inf:
+            raise ValueError(f"`tol` must be a positive number, a relative energy error; got {self.tol!r}.")
         for name in ("flow", "dt"):
             if getattr(self, name) is not None:
                 raise ValueError(f"`tol` chooses the flow and its Δt, but `{name}` is given: leave out one of them.")
