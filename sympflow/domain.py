@@ -32,8 +32,24 @@ class Domain(Protocol):
         """A description that `domain_from_dict` turns back into the domain."""
 
 
+def floats(name: str, value: Any) -> np.ndarray:
+    """`value` as an array of floats, if it is one of real numbers."""
+    try:
+        array = np.array(value)
+    except ValueError:  # rows of different lengths
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"`{name}` must be made of real numbers; got {value!r}.")
+    return array.astype(float)
+
+
+def _number(name: str, value: Any) -> None:
+    if not isinstance(value, int | float | np.number) or isinstance(value, bool) or np.iscomplexobj(value):
+        raise TypeError(f"`{name}` must be a number; got {value!r}.")
+
+
 def _vector(name: str, value: ArrayLike) -> tuple[float, ...]:
-    array = np.asarray(value, dtype=float)
+    array = floats(name, value)
     if array.ndim != 1 or array.size == 0 or array.size % 2:
         raise ValueError(f"`{name}` must have shape (2d,), one entry for each of [q, p]; got {array.shape}.")
     if not np.isfinite(array).all():
@@ -81,6 +97,7 @@ class Ball:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", _vector("center", self.center))
+        _number("radius", self.radius)
         if not 0 < self.radius < np.inf:
             raise ValueError(f"`radius` must be positive and finite; got {self.radius!r}.")
 
@@ -170,10 +187,13 @@ class EnergySublevel:
     angular_momentum: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if not np.isfinite(self.energy):
+        _number("energy", self.energy)
+        if not np.isfinite(float(self.energy)):
             raise ValueError(f"`energy` must be finite; got {self.energy!r}.")
         if not isinstance(self.box, Box):
             raise TypeError(f"`box` must be a Box; got {type(self.box).__name__}.")
+        if self.above is not None:
+            _number("above", self.above)
         if self.above is not None and not self.above < self.energy:
             raise ValueError(f"`above` must be below `energy`; got {self.above!r} and {self.energy!r}.")
         if self.angular_momentum is None:

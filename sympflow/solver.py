@@ -102,14 +102,14 @@ def solve(
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
     every = check_save_every(save_every, times)
-    if backend not in BACKENDS:
+    if not isinstance(backend, str) or backend not in BACKENDS:
         raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
     if backend == "compiled" and not integrator.compiles:
         raise ValueError(f"`backend` 'compiled' does not apply to method {integrator.name!r}: use 'auto'.")
     if not isinstance(dense_output, bool | np.bool_):
         raise TypeError(f"`dense_output` must be True or False; got {dense_output!r}.")
-    action = on_domain_exit or ("warn" if integrator.trained else "ignore")
-    if action not in ("warn", "stop", "ignore"):
+    action = ("warn" if integrator.trained else "ignore") if on_domain_exit is None else on_domain_exit
+    if not isinstance(action, str) or action not in ("warn", "stop", "ignore"):
         raise ValueError(f"`on_domain_exit` must be 'warn', 'stop' or 'ignore'; got {on_domain_exit!r}.")
     search = check_events(y_start, events, event_step, abs(t1 - t0))
     problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend, search)

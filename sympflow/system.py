@@ -162,7 +162,7 @@ class HamiltonianSystem:
         energy_scale: float | None,
     ) -> None:
         self.name, self.params = name, params
-        if not (isinstance(dt, int | float | np.number) and 0 < dt < np.inf):
+        if not (isinstance(dt, int | float | np.number) and 0 < dt < 1e100):
             raise ValueError(f"`dt` must be positive and finite; got {dt!r}.")
         try:
             self.t_span = (float(t_span[0]), float(t_span[1]))

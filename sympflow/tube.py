@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array
-from sympflow.domain import _sample_count, _states
+from sympflow.domain import _sample_count, _states, floats
 
 _AT_ONCE = 2**20  # numbers in one block of distances
 
@@ -43,18 +43,21 @@ class Tube:
     groups: Sequence[Sequence[int]] | None = None
 
     def __post_init__(self) -> None:
-        orbit = np.array(self.orbit, dtype=float)
+        orbit = floats("orbit", self.orbit)
         if orbit.ndim != 2 or len(orbit) < 2 or orbit.shape[1] == 0 or orbit.shape[1] % 2:
             raise ValueError(f"`orbit` must have shape (n, 2d), n ≥ 2 states [q, p]; got {orbit.shape}.")
         if not np.isfinite(orbit).all():
             raise ValueError("`orbit` must be finite; it holds NaN or infinity: end it before the blow-up.")
         width = orbit.shape[1]
-        radius = np.array(self.radius, dtype=float)
+        radius = floats("radius", self.radius)
         if radius.shape not in ((), (width,)):
             raise ValueError(f"`radius` must be a number or have shape ({width},); got {radius.shape}.")
         if not ((radius > 0) & (radius < np.inf)).all():
             raise ValueError(f"`radius` must be positive and finite; got {self.radius!r}.")
-        groups = [list(range(width))] if self.groups is None else [[*group] for group in self.groups]
+        try:
+            groups = [list(range(width))] if self.groups is None else [[*group] for group in self.groups]
+        except TypeError:
+            groups = []
         whole = all(isinstance(i, int | np.integer) and not isinstance(i, bool) for group in groups for i in group)
         groups = [[int(i) for i in group] for group in groups] if whole else []
         if sorted(i for group in groups for i in group) != list(range(width)):

@@ -23,7 +23,7 @@ def check_t_span(t_span: Any) -> tuple[float, float]:
     try:
         if isinstance(t_span, str | bytes | set | frozenset | dict):
             raise TypeError(type(t_span).__name__)
-        t0, t1 = (float(t) for t in t_span)
+        t0, t1 = (_real(t) for t in t_span)
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"`t_span` must be two numbers, start and end; got {t_span!r}: pass a tuple such as (0, 100)."
@@ -39,6 +39,12 @@ def check_t_span(t_span: Any) -> tuple[float, float]:
             f"({t0!r}, {t1!r}). Start at 0: H does not depend on time."
         )
     return t0, t1
+
+
+def _real(x: Any) -> float:
+    if np.iscomplexobj(x):  # NumPy's complex numbers would lose their imaginary part with a warning
+        raise TypeError("a complex number")
+    return float(x)
 
 
 def check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
@@ -90,7 +96,7 @@ def _as_floats(y0: Any, dtype: np.dtype) -> np.ndarray:
 def _check_dtype(dtype: Any) -> np.dtype:
     try:
         chosen = np.dtype(np.float64 if dtype is None else dtype)
-    except TypeError:
+    except Exception:  # NumPy raises errors of many kinds
         chosen = np.dtype(object)
     if chosen not in (np.float32, np.float64):
         raise ValueError(f"`dtype` must be 'float32' or 'float64'; got {dtype!r}.")
@@ -100,7 +106,7 @@ def _check_dtype(dtype: Any) -> np.dtype:
 def check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
     try:
         times = to_numpy(t_eval)
-        if times.size and times.dtype.kind not in "fiu":
+        if times.dtype.kind not in "fiu":
             raise TypeError(f"dtype {times.dtype}")
     except (TypeError, ValueError) as error:
         raise TypeError(f"`t_eval` must be real numbers; got {error}. Pass times such as [0.5, 1.0].") from error
@@ -124,7 +130,7 @@ def check_save_every(save_every: Any, times: np.ndarray | None) -> int:
         raise ValueError("`save_every` and `t_eval` both choose the outputs: give one of them.")
     if not isinstance(save_every, int | np.integer) or isinstance(save_every, bool) or save_every < 1:
         raise ValueError(f"`save_every` must be a positive integer; got {save_every!r}.")
-    return int(save_every)
+    return min(int(save_every), 2**53)
 
 
 def check_events(y0: Array, events: Any, event_step: Any, duration: float) -> EventSearch | None:

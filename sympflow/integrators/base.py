@@ -17,7 +17,6 @@ An integrator is a frozen dataclass whose fields are its options (`dt`, `rtol`, 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -61,6 +60,9 @@ class Outcome:
     stats: dict[str, Any]
     sol: Callable[[Any], Array] | None = None
 
+
+LONGEST_STEP = 1e100
+"""Beyond it the powers of dt in a step are no floating-point numbers."""
 
 FINISHED = "The solver successfully reached the end of the integration interval."
 
@@ -236,8 +238,8 @@ class FixedStep(Integrator):
 def check_dt(dt: Any) -> None:
     """Raise unless `dt` is None or a step length."""
     number = isinstance(dt, int | float | np.number) and not isinstance(dt, bool)
-    if dt is not None and not (number and 0 < dt <= sys.float_info.max):
-        raise ValueError(f"`dt` must be a positive and finite number; got {dt!r}.")
+    if dt is not None and not (number and 0 < dt <= LONGEST_STEP):
+        raise ValueError(f"`dt` must be a positive and finite number, at most {LONGEST_STEP:g}; got {dt!r}.")
 
 
 def check_flag(name: str, value: Any) -> None:

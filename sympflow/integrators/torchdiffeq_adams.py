@@ -37,7 +37,7 @@ class Adams(Watched):
 
     def __post_init__(self) -> None:
         check_dt(self.dt)
-        if self.max_order not in range(4, 13):
+        if not isinstance(self.max_order, int | np.integer) or self.max_order not in range(4, 13):
             raise ValueError(f"`max_order` must be an integer from 4 to 12; got {self.max_order!r}.")
 
     def step_length(self, system: HamiltonianSystem) -> float:

@@ -1,0 +1,218 @@
+"""Laws of the public API, on random input (hypothesis): what must hold for every method, state and time."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from watchdog import watched
+
+import sympflow
+from sympflow import HamiltonianSystem, MLPFlow, SympFlow, get, load, solve, systems
+from sympflow.integrators.grid import Grid
+from sympflow.integrators.registry import _NAMES
+
+PENDULUM = systems.pendulum()
+OSCILLATOR = systems.harmonic_oscillator()
+HENON_HEILES = systems.henon_heiles()
+METHODS = sorted(_NAMES)
+FIXED = [m for m in METHODS if "dt" in get(m).options() and getattr(get(m), "on_grid", True) and not get(m).trained]
+SPLITTINGS = [m for m in FIXED if get(m).symplectic]
+few = settings(max_examples=15, deadline=None)
+some = settings(max_examples=40, deadline=None)
+
+states = hnp.arrays(float, 2, elements=st.floats(-1.2, 1.2))
+batches = hnp.arrays(float, st.tuples(st.integers(1, 4), st.just(2)), elements=st.floats(-1.2, 1.2))
+steps = st.floats(0.01, 0.3)
+
+
+def run(method, *arguments, **options):
+    return solve(OSCILLATOR, method, *arguments, backend="array", **options)
+
+
+# grid arithmetic ------------------------------------------------------------------------------------------------
+
+
+@some
+@given(t0=st.floats(-1e3, 1e3), dt=st.floats(1e-3, 10), n=st.integers(0, 10_000), backward=st.booleans())
+def test_n_steps_of_dt_are_n_steps(t0, dt, n, backward):
+    """⌊0.3/0.1⌋ is 2 in floating point: counts are integers, and times t0 + k·dt."""
+    sign = -1 if backward else 1
+    grid = Grid(t0, t0 + sign * n * dt, dt)
+    assert grid.n_steps == n
+    assert grid.remainder == 0
+    k = n // 2
+    assert grid.time(k) == t0 + k * grid.h
+
+
+@some
+@given(t0=st.floats(-1e3, 1e3), length=st.floats(0.01, 1e3), dt=st.floats(1e-2, 10), x=st.floats(0, 1))
+def test_every_time_is_a_count_and_a_remainder(t0, length, dt, x):
+    grid = Grid(t0, t0 + length, dt)
+    t = min(max(t0 + x * length, t0), grid.t1)
+    (count,), (remainder,) = grid.locate(np.array([t]))
+    assert 0 <= count <= grid.n_steps
+    assert 0 <= remainder < dt
+    assert t0 + count * dt + remainder == pytest.approx(t, abs=1e-12 * (1 + abs(t0) + length))
+
+
+# solve: outputs -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["verlet", "rk45", "dopri5", "rk4", "gauss_legendre4", "log_leapfrog", "sympflow"])
+@few
+@given(
+    y0=states,
+    times=st.lists(st.floats(0, 2, allow_subnormal=False), min_size=1, max_size=6, unique=True),
+    data=st.data(),
+)
+def test_fewer_output_times_do_not_change_the_others(method, y0, times, data):
+    times = sorted(times)
+    keep = sorted(data.draw(st.sets(st.sampled_from(range(len(times))), min_size=1)))
+    options = {"t_span": (0, 2), "y0": y0 * 0.4}  # below the energy to which the logarithmic method is set
+    everything = run(method, t_eval=times, **options)
+    subset = run(method, t_eval=[times[i] for i in keep], **options)
+    np.testing.assert_allclose(subset.y, everything.y[:, keep], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", SPLITTINGS)
+@few
+@given(y0=states, dt=steps, n=st.integers(1, 12))
+def test_time_reversal(method, y0, dt, n):
+    """Symmetric methods on an even H: R ψ R = ψ⁻¹ with R(q, p) = (q, −p). All of them: the inverse undoes the steps."""
+    integrator = get(method)(dt=dt)
+    y = y0
+    for _ in range(n):
+        y = integrator.step(OSCILLATOR, 0.0, y, dt)
+    for _ in range(n):
+        y = integrator.inverse(OSCILLATOR, 0.0, y, dt)
+    np.testing.assert_allclose(y, y0, atol=1e-11)
+    if getattr(getattr(integrator, "scheme", None), "symmetric", False):
+        R = np.array([1.0, -1.0])
+        forward = integrator.step(OSCILLATOR, 0.0, y0, dt)
+        back = R * integrator.step(OSCILLATOR, 0.0, R * forward, dt)
+        np.testing.assert_allclose(back, y0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "method", ["verlet", "kahan_li8", "rk4", "rk45", "implicit_midpoint", "impulse", "mlp", "sympflow"]
+)
+@few
+@given(y0=batches, dt=steps)
+def test_a_batch_is_a_loop(method, y0, dt):
+    options = {"dt": dt} if "dt" in get(method).options() else {}
+    together = run(method, (0, 1), y0, t_eval=[0.37, 1.0], **options)
+    alone = [run(method, (0, 1), y, t_eval=[0.37, 1.0], **options).y for y in y0]
+    np.testing.assert_allclose(together.y, alone, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("method", SPLITTINGS)
+@few
+@given(y0=states, dt=steps)
+def test_symplecticity(method, y0, dt):
+    _, A = get(method)(dt=dt).tangent(
+        PENDULUM if method in sympflow.integrators.schemes.SCHEMES else OSCILLATOR, 0.0, y0, np.array(dt)
+    )
+    J = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    np.testing.assert_allclose(A.T @ J @ A, J, atol=1e-11)
+
+
+@few
+@given(y0=hnp.arrays(float, (3, 4), elements=st.floats(-0.3, 0.3)), t=st.floats(-4, 4), seed=st.integers(0, 100))
+def test_flows_invert_and_are_symplectic_at_every_time(y0, t, seed):
+    flow = SympFlow(2, seed=seed)
+    x = torch.tensor(y0)
+    torch.testing.assert_close(flow.inverse(t, flow(t, x)), x, rtol=1e-9, atol=1e-9)
+    A = torch.func.vmap(torch.func.jacfwd(lambda z: flow(t, z)))(x)
+    J = torch.kron(torch.tensor([[0.0, 1.0], [-1.0, 0.0]], dtype=torch.float64), torch.eye(2, dtype=torch.float64))
+    torch.testing.assert_close(A.mT @ J @ A, J.expand(3, 4, 4), rtol=1e-8, atol=1e-8)
+
+
+@few
+@given(
+    ndof=st.integers(1, 3),
+    pairs=st.integers(1, 3),
+    width=st.integers(1, 8),
+    dt=st.floats(1e-3, 10),
+    seed=st.integers(0, 99),
+    kind=st.sampled_from([SympFlow, MLPFlow]),
+)
+def test_what_is_saved_is_what_is_loaded(ndof, pairs, width, dt, seed, kind, tmp_path_factory):
+    options = {"pairs": pairs} if kind is SympFlow else {}
+    flow = kind(ndof, hidden=(width, width), dt=dt, seed=seed, **options)
+    path = tmp_path_factory.mktemp("flows") / "flow.safetensors"
+    flow.save(path)
+    same = load(path)
+    x = torch.full((2, 2 * ndof), 0.3, dtype=torch.float64)
+    assert torch.equal(same(0.7 * dt, x), flow(0.7 * dt, x))
+    assert same.dt == flow.dt
+
+
+@few
+@given(a=st.floats(0.1, 3), b=st.floats(-1, 1), y0=states)
+def test_derivatives_of_a_symbolic_system(a, b, y0):
+    system = HamiltonianSystem.from_sympy("a*p**2/2 + q**4/4 + b*q**3 + cos(q)", params={"a": a, "b": b})
+    y = torch.tensor(y0)
+    torch.testing.assert_close(system.gradient(y), torch.func.grad(system.hamiltonian)(y), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(system.hessian(y), torch.func.hessian(system.hamiltonian)(y), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(system.vector_field(y0), system.vector_field(y).numpy(), atol=1e-13)
+
+
+# solve: whatever it is given ------------------------------------------------------------------------------------
+
+numbers = st.one_of(st.floats(), st.integers(), st.booleans(), st.none(), st.complex_numbers(), st.text(max_size=3))
+arrays = hnp.arrays(
+    st.sampled_from([np.float64, np.float32, np.int64, np.complex128, np.bool_, np.dtype("U1"), np.float16]),
+    hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=3),
+)
+anything = st.one_of(numbers, arrays, st.lists(numbers, max_size=4), st.dictionaries(numbers, numbers, max_size=2))
+ARGUMENTS = ["t_span", "y0", "t_eval", "dense_output", "save_every", "dtype", "backend", "on_domain_exit"]
+OPTIONS = ["dt", "rtol", "atol", "max_step", "first_step", "compensated", "tol", "flow", "max_order"]
+
+
+def refused(call):
+    """The result of a call, or None if it was refused as it should be: by a message that names an argument."""
+    refusal = None
+    with watched():
+        try:
+            return call()
+        except (ValueError, TypeError) as error:
+            refusal = str(error)
+    assert refusal.startswith("`")
+    assert refusal.rstrip().endswith((".", "?"))
+    return None
+
+
+@pytest.mark.parametrize(
+    "method", ["verlet", "rk45", "dopri5", "explicit_adams", "implicit_midpoint", "log_leapfrog", "mlp"]
+)
+@settings(max_examples=60, deadline=None)
+@given(argument=st.sampled_from(ARGUMENTS), value=anything)
+def test_solve_takes_or_refuses_anything(method, argument, value):
+    """No other exception than those that name the argument, and no result that is silently wrong in kind."""
+    arguments = {"t_span": (0.0, 0.2), "backend": "array", argument: value}
+    sol = refused(lambda: solve(OSCILLATOR, method, **arguments))
+    if sol is not None:
+        assert np.isfinite(np.asarray(sol.y)).all() or (np.asarray(sol.status) == -1).any()
+        assert sol.y.shape[-1] == len(sol.t)
+
+
+@pytest.mark.filterwarnings("ignore:At least one element of `rtol` is too small")  # SciPy's
+@pytest.mark.parametrize("option", OPTIONS)
+@settings(max_examples=40, deadline=None)
+@given(value=anything)
+def test_options_are_taken_or_refused(option, value):
+    for method in ("verlet", "rk45", "dopri5", "explicit_adams", "sympflow"):
+        if option in get(method).options():
+            refused(lambda m=method: solve(OSCILLATOR, m, (0.0, 0.2), t_eval=[0.2], **{option: value}))
+
+
+DOMAINS = [sympflow.Ball, sympflow.Box, sympflow.EnergySublevel, sympflow.Tube]
+
+
+@settings(max_examples=100, deadline=None)
+@given(kind=st.sampled_from(DOMAINS), a=anything, b=anything)
+def test_domains_are_made_or_refused(kind, a, b):
+    domain = refused(lambda: kind(a, b))
+    assert domain is None or kind is sympflow.EnergySublevel or np.isfinite(domain.sample(2, 0)).all()
