@@ -11,9 +11,12 @@ import torch
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, get, load, max_energy_error, shipped_flows, solve, systems
 from sympflow.flow import shipped as catalogue
+from sympflow.flow.base import same_system
 from sympflow.flow.shipped import ShippedFlow, choose
 from sympflow.integrators import sympflow as integrator
+from sympflow.solver import domain_of
 from sympflow.training import ladder, pretrained
+from sympflow.training.figures import one_step_errors
 from sympflow.training.ladder import Ladder, Rung, certify
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
@@ -226,6 +229,26 @@ def test_shipped_flows_are_maps_for_all_times(flow):
     assert flow.path.stat().st_size < 200_000
     assert flow.cost > 0
     assert flow.energy_error < 0.1
+
+
+SCENES = [
+    *(make() for make in systems.SYSTEMS.values()),
+    systems.harmonic_oscillator(100.0),
+    systems.fput(1000.0),
+    systems.spring_pendulum(1e6, coordinates="polar"),
+]
+
+
+@pytest.mark.parametrize("listed", shipped_flows(), ids=lambda f: f.name)
+def test_every_flow_is_a_map_for_all_times(listed):
+    """Whatever its kind, networks and stiff ones included; measured on a few states, not read."""
+    system = next(s for s in SCENES if same_system(listed.fingerprint, s.fingerprint))
+    flow = listed.load(system)
+    x = domain_of(flow, system).sample(6, 987)
+    omega = system.params.get("omega", 1.0) if system.ndof == 1 else 1.0
+    at_end, between = one_step_errors(flow, system, x, times=8, omega=omega)
+    assert between <= 10 * at_end
+    assert at_end <= 10 * listed.one_step_error * max(1.0, omega)
 
 
 @pytest.mark.parametrize("name", LADDERS)

@@ -115,13 +115,17 @@ def cost(flow: SympFlow) -> float:
 
 def ladders() -> dict[str, Ladder]:
     """The ladders, by the name of the scene."""
-    sizes = {  # kicks and Δt
-        "henon-heiles": ((2, 1.5), (2, 1.0), (3, 1.0), (3, 0.8), (3, 0.6), (3, 0.4)),
-        "pendulum": ((2, 1.5), (3, 1.5), (3, 0.75), (3, 0.6), (3, 0.4)),
+    sizes: dict[str, tuple[tuple[float, ...], ...]] = {  # kicks, Δt and, if not 12, starts of the search
+        "henon-heiles": ((2, 1.5), (2, 1.0), (3, 1.0), (3, 0.8), (3, 0.6), (3, 0.4), (3, 0.3, 24)),
+        "pendulum": ((2, 1.5), (3, 1.5), (3, 0.75), (3, 0.6), (3, 0.4), (3, 0.3, 24)),
         "quartic": ((2, 1.0), (2, 0.75), (3, 0.75), (3, 0.6), (3, 0.5), (3, 0.3)),
         "kepler": ((2, 0.25), (2, 0.15), (3, 0.2), (3, 0.15), (3, 0.1), (3, 0.06)),
     }
     return {
-        scene.replace("-", "_"): Ladder(SYSTEMS[scene], tuple(Rung(stages, dt) for stages, dt in rungs))
+        scene.replace("-", "_"): Ladder(SYSTEMS[scene], tuple(_rung(*each) for each in rungs))
         for scene, rungs in sizes.items()
     }
+
+
+def _rung(stages: float, dt: float, starts: float = 12) -> Rung:
+    return Rung(int(stages), dt, restarts=int(starts))
