@@ -182,6 +182,8 @@ ARGUMENTS = {
     "dt a tensor": ({"dt": torch.tensor(0.1)}, ValueError, "`dt` must be a positive"),
     "dt an integer beyond floats": ({"dt": 10**400}, ValueError, "`dt` must be a positive"),
     "dt tiny, every step": ({"dt": 1e-9}, ValueError, "`t_eval` is not given, so .* would be stored"),
+    "dt far too small": ({"dt": 1e-300, "t_eval": [0.0, 1.0]}, ValueError, "`dt` 1e-300 "),
+    "dt of years": ({"dt": 1e-12, "t_eval": [1.0]}, ValueError, r"`dt` 1e-12 needs 1e\+12 steps"),
     "compensated a word": ({"compensated": "yes"}, TypeError, "`compensated` must be True or False"),
     "rtol negative": ({"rtol": -1}, ValueError, "`rtol` must be a finite number"),
     "rtol NaN": ({"rtol": math.nan}, ValueError, "`rtol` must be a finite number"),
@@ -317,6 +319,11 @@ def answers(outcome):
     return plugin(run=lambda self, problem: outcome)
 
 
+def later(spoil, after=0.2):
+    """A step that goes wrong after a while only, or in the shorter step to an output."""
+    return plugin(step=lambda self, system, t, y, h: spoil(y) if t > after else y)
+
+
 STEP, ANSWER = "`step` must return states as those", "`method` 'plugin' must answer with an Outcome"
 
 # an integrator of somebody else's, the error and how its message begins; None: the run ends with status −1
@@ -329,6 +336,10 @@ PLUGINS = {
     "step complex": (plugin(step=lambda self, system, t, y, h: 1j * y), TypeError, STEP),
     "step words": (plugin(step=lambda self, system, t, y, h: np.full(y.shape, "a")), TypeError, STEP),
     "step a tensor": (plugin(step=lambda self, system, t, y, h: torch.tensor(y)), TypeError, STEP),
+    "step too short, later": (later(lambda y: y[..., :1]), TypeError, STEP),
+    "step of float32, later": (later(lambda y: y.astype("f4")), TypeError, STEP),
+    "step of float32": (plugin(step=lambda self, system, t, y, h: y.astype("f4")), TypeError, STEP),
+    "step None, later": (later(lambda y: None), TypeError, STEP),
     "step NaN": (plugin(step=lambda self, system, t, y, h: math.nan * y), None, "non-finite"),
     "no step": (plugin(), TypeError, "`method` 'plugin' has no bare step"),
     "check raises": (plugin(check=divide), ZeroDivisionError, DIVISION),
@@ -376,7 +387,7 @@ def test_arguments(row):
     for method in METHODS:
         foreign = [name for name in arguments if name in OPTIONS and name not in get(method).options()]
         expected = (TypeError, f"`{foreign[0]}` is not an option of method '{method}'") if foreign else (None, None)
-        given = {"t_span": (0.0, 1.0), "backend": "auto", **arguments}
+        given = {"t_span": (0.0, 1.0), "backend": "array", **arguments}
         outcomes.append((method, expected, caught(lambda m=method, a=given: solve(OSCILLATOR, m, **a))))
     assert_each(outcomes, error, message)
 

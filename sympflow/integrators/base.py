@@ -210,12 +210,13 @@ class FixedStep(Integrator):
         lengths = np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), y[extra].shape[:-1]).copy()
         if not is_tensor(y):
             with np.errstate(all="ignore"):
-                y[extra] = self.substep(system, y[extra], lengths.astype(y.dtype), backend)
+                advanced = self.substep(system, y[extra], lengths.astype(y.dtype), backend)
+                y[extra] = checked_state(advanced, y[extra])
             return y
         import torch
 
         h_extra = torch.as_tensor(lengths, dtype=y.dtype, device=y.device)
-        advanced = self.substep(system, y[extra], h_extra, backend)
+        advanced = checked_state(self.substep(system, y[extra], h_extra, backend), y[extra])
         return y.index_copy(0, torch.as_tensor(extra, device=y.device), advanced)
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
@@ -293,7 +294,7 @@ def rollout(
         while k < n_steps and (finite == n_steps).any():
             start, y_start = k, y
             for k in range(start, min(start + block, n_steps)):
-                y = step(k, y) if k else _first(step(k, y), y)
+                y = checked_state(step(k, y), y)
                 if position < len(wanted) and wanted[position] == k + 1:
                     if tensor:
                         out.append(y)
@@ -314,17 +315,16 @@ def rollout(
     return out, np.asarray(finite)
 
 
-def _first(y_next: Any, y: Array) -> Array:
-    """The first step's result, checked: a step may be that of a plug-in."""
+def checked_state(y_next: Any, y: Array) -> Array:
+    """The result of a step from y, of the same kind, shape and dtype: a step may be that of a plug-in."""
+    if type(y_next) is type(y) and y_next.shape == y.shape and y_next.dtype == y.dtype:
+        return y_next
     shape = getattr(y_next, "shape", None)
-    real = shape is not None and (y_next.is_floating_point() if is_tensor(y_next) else y_next.dtype.kind == "f")
-    if is_tensor(y_next) != is_tensor(y) or shape != y.shape or not real:
-        what = "" if shape is None else f" of {y_next.dtype} and shape {tuple(shape)}"
-        raise TypeError(
-            f"`step` must return states as those that it is given, of {y.dtype} and shape {tuple(y.shape)}; got "
-            f"{type(y_next).__name__}{what}. Mend the integrator: check_integrator tests it."
-        )
-    return y_next
+    what = "" if shape is None else f" of {y_next.dtype} and shape {tuple(shape)}"
+    raise TypeError(
+        f"`step` must return states as those that it is given, of {y.dtype} and shape {tuple(y.shape)}; got "
+        f"{type(y_next).__name__}{what}. Mend the integrator: check_integrator tests it."
+    )
 
 
 def _report_failures(outcome: Outcome, grid: Grid, finite: np.ndarray, n_run: int, breakdown: tuple[str, str]) -> None:

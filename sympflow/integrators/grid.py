@@ -7,6 +7,8 @@ import math
 import numpy as np
 
 EPS = float(np.finfo(float).eps)
+MOST_STEPS = 10**11
+"""A run of more is refused: at the 10 ns of the cheapest compiled step it takes a quarter of an hour."""
 
 
 class Grid:
@@ -26,8 +28,11 @@ class Grid:
         self.t0, self.t1 = float(t0), float(t1)
         self.h = math.copysign(dt, t1 - t0)
         quotient = (self.t1 - self.t0) / self.h
-        if quotient > 2**53:
-            raise ValueError(f"`dt` {dt:g} needs {quotient:.3g} steps from {t0:g} to {t1:g}: increase it.")
+        if quotient > 1.000001 * MOST_STEPS:
+            raise ValueError(
+                f"`dt` {dt:g} needs {quotient:.3g} steps from {t0:g} to {t1:g}, more than the {MOST_STEPS:.0e} that are "
+                "run: increase it."
+            )
         far = max(abs(self.t0), abs(self.t1))
         if self.t0 != self.t1 and far + abs(self.h) == far:
             raise ValueError(f"`dt` {dt:g} is below the spacing of floating-point numbers at t = {far:g}: increase it.")

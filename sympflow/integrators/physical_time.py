@@ -76,6 +76,8 @@ class PhysicalRun:
             )
         self.length = abs(problem.t1 - problem.t0)
         self.sign = 1.0 if problem.t1 >= problem.t0 else -1.0
+        if self.length:
+            Grid(problem.t0, problem.t1, integrator.step_length(self.system))  # refuses a dt of too many steps
         self.h = self.sign * integrator.new_step(self.system)
         self.most_steps = 20_000 + 1000 * self.length / integrator.step_length(self.system)
         self.n_steps = np.zeros(len(rows), dtype=int)
