@@ -244,7 +244,7 @@ def _degree(term: sp.Expr, variables: tuple[sp.Symbol, ...]) -> float:
     for base, exponent in powers.items():
         if base in variables and exponent.is_Integer and exponent > 0:
             degree += int(exponent)
-        elif base.free_symbols:
+        elif base.free_symbols or exponent.free_symbols:
             return np.inf
     return degree
 

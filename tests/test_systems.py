@@ -262,6 +262,12 @@ def test_the_toda_lattice_keeps_the_eigenvalues_of_laxs_matrix(n):
     assert system.domain.contains(sol.states).all()
 
 
+def test_the_toda_lattice_has_no_quadratic_terms():
+    """exp(q₁ − q₂) is no monomial."""
+    with pytest.raises(ValueError, match=r"^`system` 'toda_lattice' has no linear part"):
+        solve(systems.toda_lattice(), "impulse", (0, 1))
+
+
 def test_the_toda_lattice_of_three_is_henon_heiles_to_third_order():
     """With differences (2q₂ + 2√3q₁, 2q₂ − 2√3q₁, −4q₂) of neighbours, V/24 is the potential of Hénon and Heiles."""
     toda, hh = systems.toda_lattice(3), systems.henon_heiles()
