@@ -10,7 +10,7 @@ from sympy.printing.pycode import PythonCodePrinter
 
 from sympflow.symbolic import SymbolicHamiltonian, printable
 
-__all__ = ["algebra_source", "gradient_kick_source", "tuple_algebra"]
+__all__ = ["algebra_source", "gradient_kick_source", "printed", "tuple_algebra"]
 
 _MAX_POWER = 16  # integer powers up to this are written as products
 
@@ -51,6 +51,25 @@ class _KernelPrinter(PythonCodePrinter):
             whole = int(exponent.p) // 2
             return f"({_product(factor, whole)}*{root})" if whole else root
         return f"{factor}**{self.parenthesize(exponent, 100)}"
+
+
+_PRINTER = _KernelPrinter({"fully_qualified_modules": True, "human": True})
+
+
+def printed(f: sp.Expr) -> str:
+    """Source text of an expression.
+
+    Raises
+    ------
+    ValueError
+        If a function in it has no counterpart in compiled code.
+    """
+    try:
+        return _PRINTER.doprint(f)
+    except PrintMethodNotImplementedError:
+        raise ValueError(
+            f"`system` has the term {f}, for which there is no compiled function: use backend='array'."
+        ) from None
 
 
 def _product(factor: str, power: int) -> str:
@@ -123,20 +142,13 @@ def _function(
     name: str, arguments: str, variables: Sequence[sp.Symbol], expressions: list[sp.Expr], results: list[str]
 ) -> str:
     """A jitted function that returns the tuple `results`, ``{n}`` in them standing for the n-th expression."""
-    printer = _KernelPrinter({"fully_qualified_modules": True, "human": True})
     expressions = [printable(f) for f in expressions]
     shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("s_", real=True), list=True)
     values = [sp.Symbol(f"v_{n}", real=True) for n in range(len(reduced))]
     lines = ["@njit(**OPTIONS)", f"def {name}({arguments}):"]
     lines.append(f"    {', '.join(s.name for s in variables)}, = {arguments[0]}")
     for symbol, expression in [*shared, *zip(values, reduced, strict=True)]:
-        try:
-            code = printer.doprint(expression)
-        except PrintMethodNotImplementedError:
-            raise ValueError(
-                f"`system` has the term {expression}, for which there is no compiled function: use backend='array'."
-            ) from None
-        lines.append(f"    {symbol.name} = {code}")
+        lines.append(f"    {symbol.name} = {printed(expression)}")
     names = [value.name for value in values]
     lines.append(f"    return ({''.join(result.format(*names) + ', ' for result in results)})")
     return "\n".join(lines)

@@ -18,6 +18,24 @@ def empty_lanes():
     return aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
 
 
+@njit(**OPTIONS)
+def plain_lane(q, p, q_error, p_error, b, a):
+    if SCHEDULED:
+        p = kicked_lane(q, p, b)
+        q, q_error = move(q, q_error, drift(p, a, None))
+        return q, p, q_error, p_error
+    return plain_stage(q, p, q_error, p_error, b, a, 0, None)
+
+
+@njit(**OPTIONS)
+def gradient_lane(q, p, q_error, p_error, b, g, a):
+    if FORCE_GRADIENTS and SCHEDULED:
+        p = gradient_kicked_lane(q, p, b, g)
+        q, q_error = move(q, q_error, drift(p, a, None))
+        return q, p, q_error, p_error
+    return gradient_stage(q, p, q_error, p_error, b, g, a, 0, None)
+
+
 @njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
 def stage_lanes(Y, error, width, b, g, a):
     # Asked outside the loops: a loop with a branch in it, once it is long, is no longer made of vector instructions.
@@ -26,36 +44,37 @@ def stage_lanes(Y, error, width, b, g, a):
             q, p = unpack_lane(Y, lane)
             if COMPENSATED:
                 q_error, p_error = unpack_lane(error, lane)
-                q, p, q_error, p_error = gradient_stage(q, p, q_error, p_error, b, g, a, None)
+                q, p, q_error, p_error = gradient_lane(q, p, q_error, p_error, b, g, a)
                 pack_lane(q_error, p_error, error, lane)
             else:
-                q, p, _, _ = gradient_stage(q, p, None, None, b, g, a, None)
+                q, p, _, _ = gradient_lane(q, p, None, None, b, g, a)
             pack_lane(q, p, Y, lane)
     else:
         for lane in range(width):
             q, p = unpack_lane(Y, lane)
             if COMPENSATED:
                 q_error, p_error = unpack_lane(error, lane)
-                q, p, q_error, p_error = plain_stage(q, p, q_error, p_error, b, a, None)
+                q, p, q_error, p_error = plain_lane(q, p, q_error, p_error, b, a)
                 pack_lane(q_error, p_error, error, lane)
             else:
-                q, p, _, _ = plain_stage(q, p, None, None, b, a, None)
+                q, p, _, _ = plain_lane(q, p, None, None, b, a)
             pack_lane(q, p, Y, lane)
 
 
 @njit(**OPTIONS)
-def close_lane(Y, error, lane, kicks, drifts, gradients):
+def close_lane(Y, error, lane, kicks, drifts, gradients, work):
     q, p = unpack_lane(Y, lane)
     q_error, p_error = no_error(q), no_error(p)
     if COMPENSATED:
         q_error, p_error = unpack_lane(error, lane)
-    return close(q, p, q_error, p_error, kicks, drifts, gradients, None)
+    return close(q, p, q_error, p_error, kicks, drifts, gradients, work)
 
 
 @njit(**OPTIONS)
 def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite):
     """`rollout` of every row of `y0` (N, 2d), `LANES` at a time; outputs as in `rollout_each`."""
     link = len(kicks) - 2
+    work = prepared(kicks, gradients)
     Y, start, error = empty_lanes(), empty_lanes(), empty_lanes()
     for block_start in range(0, y0.shape[0], LANES):
         count = min(LANES, y0.shape[0] - block_start)
@@ -92,10 +111,10 @@ def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite):
                 i = block_start + lane
                 if n_finite[i] < n_steps:
                     continue
-                q, p = close_lane(Y, error, lane, kicks, drifts, gradients)
+                q, p = close_lane(Y, error, lane, kicks, drifts, gradients, work)
                 if not is_finite(q, p):
                     q, p = unpack_lane(start, lane)
-                    before = first_non_finite(q, p, kicks, drifts, gradients, first, block, None) - 1
+                    before = first_non_finite(q, p, kicks, drifts, gradients, first, block, work) - 1
                     n_finite[i] = n + before
                     n_alive -= 1
                     fill_with_nan(out[i], saved)

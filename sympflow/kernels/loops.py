@@ -3,39 +3,57 @@
 The algebra that comes before says what a state is: q and p are tuples held in registers (a symbolic system) or
 arrays changed in place (Numba functions). It defines ``unpack``, ``pack``, ``copy``, ``is_finite``, ``move``,
 ``no_error``, ``kick``, ``gradient_kick``, ``drift`` and ``workspace``. A ``gradient_kick`` has two parts, which are
-added one after the other, the second only where `COUPLED`.
+added one after the other, the second only where `COUPLED`. Where `SCHEDULED`, ``kicked`` and ``gradient_kicked`` give
+the new p at once, in an order of operations that is fast, and stand for these; ``fill_coefficients`` prepares them.
 
 A run executes the table [opening, inner …, link, closing] of stages (kick, then drift). A step is the link (the
 first step, the opening) and the inner stages; consecutive steps share their common kick or drift in the link, and
 an output is the closing stage applied to a copy, so that what is saved never changes the trajectory. The constants
-`FORCE_GRADIENTS` and `COMPENSATED` say whether gradients and errors are used: Numba leaves dead branches out.
+`FORCE_GRADIENTS`, `COMPENSATED` and `SCHEDULED` are known when it is compiled: Numba leaves dead branches out.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
 
+import numpy as np
 from numba import njit
 
 CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where nothing is saved
 
 
 @njit(**OPTIONS)
-def stage(q, p, q_error, p_error, b, g, a, work):
-    """Kick by b (and g), then drift by a."""
-    if FORCE_GRADIENTS and g != 0.0:
-        return gradient_stage(q, p, q_error, p_error, b, g, a, work)
-    return plain_stage(q, p, q_error, p_error, b, a, work)
+def prepared(kicks, gradients):
+    """What the stages work with; where `SCHEDULED`, the products of their coefficients, which no state waits for."""
+    if SCHEDULED:
+        table = np.empty((len(kicks), N_COEFFICIENTS))
+        for j in range(len(kicks)):
+            fill_coefficients(kicks[j], gradients[j], table[j])
+        return table
+    return workspace()
 
 
 @njit(**OPTIONS)
-def plain_stage(q, p, q_error, p_error, b, a, work):
-    p, p_error = move(p, p_error, kick(q, b, work))
+def stage(q, p, q_error, p_error, b, g, a, j, work):
+    """Kick by b (and g), then drift by a."""
+    if FORCE_GRADIENTS and g != 0.0:
+        return gradient_stage(q, p, q_error, p_error, b, g, a, j, work)
+    return plain_stage(q, p, q_error, p_error, b, a, j, work)
+
+
+@njit(**OPTIONS)
+def plain_stage(q, p, q_error, p_error, b, a, j, work):
+    if SCHEDULED:
+        p = kicked(q, p, work, j)
+    else:
+        p, p_error = move(p, p_error, kick(q, b, work))
     q, q_error = move(q, q_error, drift(p, a, work))
     return q, p, q_error, p_error
 
 
 @njit(**OPTIONS)
-def gradient_stage(q, p, q_error, p_error, b, g, a, work):
-    if FORCE_GRADIENTS:
+def gradient_stage(q, p, q_error, p_error, b, g, a, j, work):
+    if FORCE_GRADIENTS and SCHEDULED:
+        p = gradient_kicked(q, p, work, j)
+    elif FORCE_GRADIENTS:
         first, second = gradient_kick(q, b, g, work)
         p, p_error = move(p, p_error, first)
         if COUPLED:
@@ -45,17 +63,10 @@ def gradient_stage(q, p, q_error, p_error, b, g, a, work):
 
 
 @njit(**OPTIONS)
-def inner_stages(q, p, q_error, p_error, kicks, drifts, gradients, work):
-    for j in range(1, len(kicks) - 2):
-        q, p, q_error, p_error = stage(q, p, q_error, p_error, kicks[j], gradients[j], drifts[j], work)
-    return q, p, q_error, p_error
-
-
-@njit(**OPTIONS)
 def close(q, p, q_error, p_error, kicks, drifts, gradients, work):
     """The end of a step, from the running state before its last stage, which is left as it is."""
     q, p, q_error, p_error = copy(q), copy(p), copy(q_error), copy(p_error)
-    q, p, _, _ = stage(q, p, q_error, p_error, kicks[-1], gradients[-1], drifts[-1], work)
+    q, p, _, _ = stage(q, p, q_error, p_error, kicks[-1], gradients[-1], drifts[-1], len(kicks) - 1, work)
     return q, p
 
 
@@ -65,10 +76,12 @@ def first_non_finite(q, p, kicks, drifts, gradients, first, n_steps, work):
     link = len(kicks) - 2
     q_error, p_error = no_error(q), no_error(p)
     for n in range(1, n_steps):
-        q, p, q_error, p_error = stage(q, p, q_error, p_error, kicks[first], gradients[first], drifts[first], work)
+        q, p, q_error, p_error = stage(
+            q, p, q_error, p_error, kicks[first], gradients[first], drifts[first], first, work
+        )
         first = link
         for j in range(1, link):
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, kicks[j], gradients[j], drifts[j], work)
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, kicks[j], gradients[j], drifts[j], j, work)
         end_q, end_p = close(q, p, q_error, p_error, kicks, drifts, gradients, work)
         if not is_finite(end_q, end_p):
             return n
@@ -89,7 +102,7 @@ def rollout(kicks, drifts, gradients, y0, n_steps, save, out):
     Returns the index of the last step that ends in a finite state; rows of later steps are NaN.
     """
     link = len(kicks) - 2
-    work = workspace()
+    work = prepared(kicks, gradients)
     q, p = unpack(y0)
     q_error, p_error = no_error(q), no_error(p)
     n = saved = first = 0
@@ -100,18 +113,18 @@ def rollout(kicks, drifts, gradients, y0, n_steps, save, out):
         block = min(CHECK_EVERY, n_steps - n)
         if saved < len(save):
             block = min(block, save[saved] - n)
-        start_q, start_p = copy(q), copy(p)
-        b, g, a = kicks[first], gradients[first], drifts[first]
+        start_q, start_p, begin = copy(q), copy(p), first
         for _ in range(block):
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, a, work)
+            b, g, a = kicks[first], gradients[first], drifts[first]
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, a, first, work)
             for j in range(1, link):
-                q, p, q_error, p_error = stage(q, p, q_error, p_error, kicks[j], gradients[j], drifts[j], work)
-            b, g, a = kicks[link], gradients[link], drifts[link]
+                q, p, q_error, p_error = stage(q, p, q_error, p_error, kicks[j], gradients[j], drifts[j], j, work)
+            first = link
         end_q, end_p = close(q, p, q_error, p_error, kicks, drifts, gradients, work)
         if not is_finite(end_q, end_p):
             fill_with_nan(out, saved)
-            return n - 1 + first_non_finite(start_q, start_p, kicks, drifts, gradients, first, block, work)
-        n, first = n + block, link
+            return n - 1 + first_non_finite(start_q, start_p, kicks, drifts, gradients, begin, block, work)
+        n += block
         while saved < len(save) and save[saved] == n:
             pack(end_q, end_p, out[saved])
             saved += 1
@@ -128,11 +141,13 @@ def rollout_each(kicks, drifts, gradients, y0, n_steps, save, out, n_finite):
 @njit(**OPTIONS)
 def step_each(kicks, drifts, gradients, h, y, out):
     """One step of length ``h[i]`` from every row of `y` (N, 2d); the coefficients are those for h = 1."""
-    work = workspace()
+    work = prepared(kicks, gradients)
     for i in range(y.shape[0]):
         q, p = unpack(y[i])
         q_error, p_error = no_error(q), no_error(p)
         for j in range(len(kicks)):
             b, g, a = h[i] * kicks[j], h[i] ** 3 * gradients[j], h[i] * drifts[j]
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, a, work)
+            if SCHEDULED:
+                fill_coefficients(b, g, work[j])
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, a, j, work)
         pack(q, p, out[i])

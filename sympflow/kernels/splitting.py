@@ -211,19 +211,22 @@ class _Loops:
     step_each: Callable[..., None]
 
 
-def _header(gradients: bool, compensated: bool, cache: bool) -> str:
+def _header(gradients: bool, compensated: bool, cache: bool, scheduled: bool) -> str:
     return (
-        "import math\n\nfrom numba import njit\n\n"
-        f"OPTIONS = {OPTIONS | {'cache': cache}}\nFORCE_GRADIENTS = {gradients}\nCOMPENSATED = {compensated}"
+        f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': cache}}\n"
+        f"FORCE_GRADIENTS = {gradients}\nCOMPENSATED = {compensated}\nSCHEDULED = {scheduled}"
     )
 
 
 def _symbolic_loops(symbols: SymbolicHamiltonian, algebra: str, gradients: bool, compensated: bool) -> _Loops:
     from sympflow.kernels.codegen import gradient_kick_source
+    from sympflow.kernels.kicks import kicks_source
 
-    if gradients:
+    if not compensated:
+        algebra = f"{algebra}\n\n{kicks_source(symbols, gradients)}"
+    elif gradients:
         algebra = f"{algebra}\n\n{gradient_kick_source(symbols)}"
-    header = _header(gradients, compensated, cache=True)
+    header = _header(gradients, compensated, cache=True, scheduled=not compensated)
     before = ["elementary"] if "fast_" in algebra else []
     after = ["loops", "aligned", "lanes"]
     loops = load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
@@ -248,7 +251,7 @@ def _array_loops(
     """The loops around the user's Numba functions; compiled for this process only."""
     rows = _INVERSE_MASS_TIMES_V[0 if inverse_mass is None else inverse_mass.ndim]
     mass = f"@njit(**OPTIONS)\ndef apply_inverse_mass(v, out):\n    for i in range(NDOF):\n        {rows}"
-    header = _header(gradients, compensated, cache=False)
+    header = _header(gradients, compensated, cache=False, scheduled=False)
     functions: dict[str, Any] = {
         "NDOF": ndof,
         "INVERSE_MASS": inverse_mass,
