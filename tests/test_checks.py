@@ -1,6 +1,6 @@
 """The checks themselves: every built-in method passes, and each lie that an integrator can tell is caught."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -30,7 +30,7 @@ def not_applicable(integrator):
     if name in ("rk45", "dop853") or integrator.tangent_holds:
         skipped.add("dtype_device_and_gradient_of_tensors")
     if name in MULTISTEP:
-        skipped |= NO_STEP
+        skipped |= {*NO_STEP, "the_run_is_its_steps", "states_within_a_step_belong_to_it"}
     if integrator.tangent_holds or name in ("adaptive_heun", "fehlberg2"):
         skipped.add("the_tangent_is_the_derivative_of_the_step")
     return skipped
@@ -39,7 +39,7 @@ def not_applicable(integrator):
 @pytest.mark.parametrize("name", available())
 @pytest.mark.filterwarnings("ignore:Functional iteration did not converge")
 def test_built_in_methods_pass_and_skip_only_what_has_no_meaning(name):
-    integrator = get(name)(**({"rtol": 1e-5, "atol": 1e-7} if name in ADAPTIVE else {}))
+    integrator = get(name)(**({"rtol": 1e-4, "atol": 1e-6} if name in ADAPTIVE else {}))
     assert set(check_integrator(lambda: integrator).skipped) == not_applicable(integrator)
 
 
@@ -76,7 +76,7 @@ def with_numpy_only(self, system, t, y, h):
     d, h = system.ndof, per_state(np.asarray(h), y)
     q, p = np.asarray(y)[..., :d], np.asarray(y)[..., d:]
     p = p + h * system.force(q)
-    return np.concatenate([q + h * system.velocity(p), p], axis=-1)
+    return np.concatenate([q + h * system.velocity(p), p], axis=-1).astype(q.dtype)
 
 
 def numpy_only_and_says_so(self, system, t, y, h):
@@ -88,7 +88,7 @@ def numpy_only_and_says_so(self, system, t, y, h):
 def heun(self, system, t, y, h):
     h = np.asarray(per_state(h, y))
     k = np.asarray(system(t, y))
-    return y + h / 2 * (k + np.asarray(system(t, y + h * k)))
+    return (y + h / 2 * (k + np.asarray(system(t, y + h * k)))).astype(y.dtype)
 
 
 def test_what_runs_on_arrays_alone_is_judged_all_the_same():
@@ -182,6 +182,134 @@ def hides_failure(self, problem):
 def test_lies_are_caught(lie, message):
     with pytest.raises(AssertionError, match=message):
         check_integrator(lying(**lie))
+
+
+Verlet = get("verlet")
+
+
+@dataclass(frozen=True)
+class SoundVerlet(FixedStep):
+    """Verlet as a third party writes it; the liars below derive from it, each correct but for one thing."""
+
+    name: ClassVar[str] = "sound_verlet"
+    order: ClassVar[int | None] = 2
+    symplectic: ClassVar[bool] = True
+
+    def step(self, system, t, y, h):
+        return Verlet().step(system, t, y, h)
+
+
+def unsound(**lie):
+    return dataclass(frozen=True)(type("Liar", (SoundVerlet,), lie))
+
+
+def rollout_of_verlet(self, problem, h, n_steps, save):
+    return SoundVerlet(self.dt).rollout(problem, h, n_steps, save)
+
+
+def euler_within_steps(self, system, y, h, backend):
+    return y + per_state(h, y) * system.vector_field(y)
+
+
+def identity_for_gradients(self, system, t, y, h):
+    plain = SoundVerlet.step(self, system, t, y.detach() if isinstance(y, torch.Tensor) else y, h)
+    return plain + (y - y.detach()) if isinstance(y, torch.Tensor) and y.requires_grad else plain
+
+
+def other_steps(self, system, t_span, y0):
+    for t, y, h in FixedStep.steps(self, system, t_span, y0):
+        yield t, 1.1 * y, h
+
+
+def hides_failures_of_batches(self, problem):
+    outcome = FixedStep.run(self, problem)
+    if np.ndim(outcome.status):
+        outcome.status = np.zeros_like(outcome.status)
+    return outcome
+
+
+def clock_in_the_step(self, system, t, y, h):
+    return SoundVerlet.step(self, system, t, y, h * (1 + 1e-3 * float(np.sin(t))))
+
+
+def first_event_only(self, problem):
+    outcome = FixedStep.run(self, problem)
+    if problem.events is not None:
+        problem.events.found = [zeros[:1] for zeros in problem.events.found]
+    return outcome
+
+
+def upward_events_only(self, problem):
+    if problem.events is not None:
+        problem.events.events = tuple(replace(event, direction=1.0) for event in problem.events.events)
+    return FixedStep.run(self, problem)
+
+
+def no_backward_events(self, problem):
+    outcome = FixedStep.run(self, problem)
+    if problem.events is not None and problem.t1 < problem.t0:
+        problem.events.found = [[] for _ in problem.events.found]
+    return outcome
+
+
+def saves_every_step(self, problem):
+    return FixedStep.run(self, replace(problem, save_every=1))
+
+
+def friction_far_out(self, system, t, y, h):
+    y_next = SoundVerlet.step(self, system, t, y, h)
+    far = (y * y).sum(-1) > 0.5
+    return (
+        y_next * (1 - 1e-3 * (far.to(y.dtype) if isinstance(y, torch.Tensor) else np.asarray(far, y.dtype)))[..., None]
+    )
+
+
+@pytest.mark.parametrize(
+    ("lie", "message"),
+    [
+        (
+            {
+                "order": 6,
+                "step": lambda self, system, t, y, h: get("kahan_li6")().step(system, t, y, h),
+                "rollout": rollout_of_verlet,
+            },
+            r"^the_run_is_its_steps of .*step\(\) does not give the next state of the run",
+        ),
+        ({"substep": euler_within_steps}, r"^(the_run_is_its_steps|states_within_a_step_belong_to_it) of "),
+        ({"step": identity_for_gradients}, r"^dtype_device_and_gradient_of_tensors of .*differences of the run"),
+        ({"steps": other_steps}, r"^the_run_is_its_steps of .*steps\(\) does not begin at y0"),
+        ({"run": hides_failures_of_batches}, r"^a_batch_reports_its_failures of .*call for -1"),
+        ({"step": clock_in_the_step}, r"^(the_run_is_its_steps|the_start_time_does_not_matter) of "),
+        ({"run": first_event_only}, r"^every_event_is_found of .*1 events of direction 0"),
+        ({"run": upward_events_only}, r"^every_event_is_found of .*events of direction 0"),
+        ({"run": no_backward_events}, r"^every_event_is_found of .*0 events of direction 0 towards t = -2.03"),
+        ({"run": saves_every_step}, r"^save_every_thins_the_outputs of .*reports other times"),
+        (
+            {"evaluations": lambda self, *counts: {"force_evaluations": -7, "hessian_evaluations": 0}},
+            r"^statistics of .*a count of force_evaluations; they hold -7",
+        ),
+        ({"step": friction_far_out}, r"^symplecticity_as_declared of .*declared symplectic, but"),
+    ],
+)
+def test_what_is_wrong_in_one_place_only_is_caught(lie, message):
+    """Correct Verlet, but for what the bare step at t = 0 from ordinary states does not show."""
+    with pytest.raises(AssertionError, match=message):
+        check_integrator(unsound(**lie))
+
+
+def test_the_sound_method_passes():
+    assert len(check_integrator(SoundVerlet).passed) == len(CHECKS) - 1
+
+
+def test_a_start_time_that_matters_is_seen_by_its_own_check():
+    with pytest.raises(AssertionError, match=r"^the_start_time_does_not_matter of .*a run from t0 = 5.25 differs"):
+        {check.name: check for check in CHECKS}["the_start_time_does_not_matter"](unsound(step=clock_in_the_step)())
+
+
+def test_states_within_a_step_are_seen_by_their_own_check():
+    check = {check.name: check for check in CHECKS}["states_within_a_step_belong_to_it"]
+    with pytest.raises(AssertionError, match=r"^states_within_a_step_belong_to_it of .*not the shorter step"):
+        check(unsound(substep=euler_within_steps)())
 
 
 def test_nan_is_seen_by_the_step_alone():

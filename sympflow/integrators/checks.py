@@ -3,7 +3,7 @@
 Each check is a function check(integrator, system) that raises an AssertionError which says what is wrong, or
 `NotApplicable` with the reason why there is nothing to check. They judge by the mathematics: the declared order by
 slope, the declared symplecticity by the Jacobian of the step that ran. They are in
-`checks_of_runs` and `checks_of_steps`.
+`checks_of_runs`, `checks_of_steps` and `checks_of_consistency`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from sympflow.integrators import checks_of_runs, checks_of_steps
+from sympflow.integrators import checks_of_consistency, checks_of_runs, checks_of_steps
 from sympflow.integrators.base import Integrator
 from sympflow.integrators.check_setting import NotApplicable, default_system
 from sympflow.system import HamiltonianSystem
@@ -53,7 +53,7 @@ class Check:
             raise AssertionError(f"{self.name} of {integrator!r}: {what}") from error
 
 
-CHECKS = tuple(map(Check, (*checks_of_runs.ALL, *checks_of_steps.ALL)))
+CHECKS = tuple(map(Check, (*checks_of_runs.ALL, *checks_of_steps.ALL, *checks_of_consistency.ALL)))
 
 
 @dataclass(frozen=True)

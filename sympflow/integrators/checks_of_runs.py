@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from sympflow.arrays import to_numpy
-from sympflow.integrators.base import Integrator
+from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.check_setting import (
     EPS,
     T_END,
@@ -21,7 +22,7 @@ from sympflow.integrators.check_setting import (
     start,
     states,
 )
-from sympflow.integrators.checks_of_steps import bare_step
+from sympflow.integrators.checks_of_steps import DIFFERENCES, bare_step
 from sympflow.system import HamiltonianSystem
 
 
@@ -65,8 +66,25 @@ def dtype_device_and_gradient_of_tensors(integrator: Integrator, system: Hamilto
     assert (sol.y.dtype, sol.y.device) == (y0.dtype, y0.device), f"y is {sol.y.dtype} on {sol.y.device}"
     (gradient,) = torch.autograd.grad(sol.y.sum(), y0)
     assert torch.isfinite(gradient).all() and gradient.abs().sum() > 0, "no gradient reaches y0"
+    differences = _gradient_by_differences(integrator, system, to_numpy(y0))
+    tolerance = max(1e-8, 1e3 * float(getattr(integrator, "rtol", 0.0)))
+    assert_close(to_numpy(gradient), differences, tolerance, "the gradient differs from the differences of the run")
     arrays = run(integrator, system, (0.0, 0.1), to_numpy(y0), t_eval=[0.05, 0.1])
     assert_close(to_numpy(sol.y), arrays.y, 1e3 * EPS, "tensors and arrays differ")
+
+
+def _gradient_by_differences(integrator: Integrator, system: HamiltonianSystem, y0: np.ndarray) -> np.ndarray:
+    """The gradient (n, 2d) of the sum of the states at 0.05 and 0.1, from y0 (n, 2d)."""
+
+    def total(y: np.ndarray) -> np.ndarray:
+        return run(integrator, system, (0.0, 0.1), y, t_eval=[0.05, 0.1]).y.sum((-2, -1))
+
+    columns = []
+    for i in range(y0.shape[-1]):
+        e = np.zeros(y0.shape[-1])
+        e[i] = 0.01
+        columns.append(sum(c * (total(y0 + k * e) - total(y0 - k * e)) for k, c in DIFFERENCES) / e[i])
+    return np.stack(columns, axis=-1)
 
 
 def dense_output_equals_the_outputs(integrator: Integrator, system: HamiltonianSystem) -> None:
@@ -159,11 +177,22 @@ def events_are_zeros_of_the_dense_output(integrator: Integrator, system: Hamilto
 
 
 def statistics(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """n_steps, force_evaluations, hessian_evaluations and backend are reported."""
+    """n_steps, force_evaluations, hessian_evaluations and backend are reported, as counts and a word."""
     stats = run(integrator, system, (0.0, T_END)).stats
     for key in ("n_steps", "force_evaluations", "hessian_evaluations", "backend"):
         assert key in stats, f"stats lack {key!r}"
+    for key in ("n_steps", "force_evaluations", "hessian_evaluations"):
+        count = stats[key]
+        whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+        assert whole and count >= 0, f"stats must hold a count of {key}; they hold {count!r}"
+    assert isinstance(stats["backend"], str), f"stats must name the backend; they hold {stats['backend']!r}"
     assert stats["n_steps"] > 0, "stats count no step"
+    if isinstance(integrator, FixedStep) and integrator.on_grid:
+        expected = math.ceil(T_END / integrator.step_length(system))
+        assert stats["n_steps"] == expected, f"stats count {stats['n_steps']} steps of {expected}"
+    longer = run(integrator, system, (0.0, 3 * T_END)).stats
+    for key in ("n_steps", "force_evaluations", "hessian_evaluations"):
+        assert longer[key] >= stats[key], f"stats count fewer {key} in a longer run"
 
 
 ALL: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (

@@ -12,7 +12,7 @@ from sympflow.integrators.check_setting import EPS, NotApplicable, assert_close,
 from sympflow.system import HamiltonianSystem
 
 H = 0.4  # where a Jacobian is judged: long, so that what is not symplectic shows
-_DIFFERENCES = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))  # of order 8, central
+DIFFERENCES = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))  # of order 8, central
 
 
 def bare_step(integrator: Integrator, system: HamiltonianSystem) -> str | None:
@@ -117,7 +117,9 @@ def symplecticity_as_declared(integrator: Integrator, system: HamiltonianSystem)
     if bare_step(integrator, system) is not None:
         assert not integrator.symplectic, "declared symplectic, but there is no bare step that could show it"
     step = _step(integrator, system)
-    y, h, d = states(system, 4), np.full(4, H), system.ndof
+    d, y = system.ndof, states(system, 16)
+    y = np.concatenate([scale * y for scale in ((1.0,) if integrator.trained else (1.0, 0.3, 1.7, 2.5))])
+    h = np.resize([H] if integrator.trained else [H, 0.11, H / 2], len(y))
     try:
         A, low, high = integrator.tangent(system, 0.0, y, h)[1], 1e3 * EPS, 1e3 * EPS
     except Exception:  # whatever keeps it from being differentiated: the step itself can still tell
@@ -136,7 +138,7 @@ def _jacobian(step: Callable[[np.ndarray, np.ndarray], np.ndarray], y: np.ndarra
     for i, scale in enumerate(np.abs(y).max(0)):
         e = np.zeros(y.shape[-1])
         e[i] = 0.02 * (scale or 1.0)
-        columns.append(sum(c * (step(y + k * e, h) - step(y - k * e, h)) for k, c in _DIFFERENCES) / e[i])
+        columns.append(sum(c * (step(y + k * e, h) - step(y - k * e, h)) for k, c in DIFFERENCES) / e[i])
     return np.stack(columns, axis=-1)
 
 
