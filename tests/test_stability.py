@@ -58,6 +58,27 @@ def test_a_singularity_is_found_within_a_step(method, dt):
     assert abs(end.time - SINGULARITY) < dt
 
 
+@pytest.mark.parametrize(
+    ("method", "options"), [("verlet", {"dt": 0.5}), ("implicit_midpoint", {"dt": 0.5}), ("rk45", {}), ("dop853", {})]
+)
+def test_a_singularity_is_found_whatever_the_step_or_the_tolerance(method, options):
+    system = systems.henon_heiles_escape()
+    sol = solve(system, method, (0.0, 20.0), on_domain_exit="ignore", **options)
+    end = blow_up(system, get(method)(**options), (0.0, 20.0), system.y0, float(sol.stats.get("failed_at", sol.t[-1])))
+    assert end.singular
+    assert abs(end.time - SINGULARITY) < 1e-9
+    assert "grows" not in str(end)
+
+
+def test_an_unstable_step_of_a_system_without_singularities_is_not_taken_for_one():
+    system = systems.fput(50.0)  # quartic, so that the growth is faster than by a constant factor
+    sol = solve(system, "verlet", (0.0, 50.0), dt=0.06, on_domain_exit="ignore")
+    assert sol.status == -1
+    end = blow_up(system, get("verlet")(dt=0.06), (0.0, 50.0), system.y0, sol.stats["failed_at"])
+    assert not end.singular
+    assert end.time == sol.stats["failed_at"]
+
+
 def test_rows_of_a_singular_solution():
     report = stability(systems.henon_heiles_escape(), ["kahan_li8", "rk45"], steps=[0.1], t_span=(0, 20))
     fixed, adaptive = report.rows
