@@ -47,8 +47,9 @@ class PartsKernel:
         self.parts = parts
         self._variants: dict[tuple[bool, bool], _Loops] = {}
         self._plain: str | None = None
+        self._moved = bool(np.any(parts.center))
         self._scale = np.concatenate([np.diag(parts.C), np.diag(parts.inverse_C)])
-        self._tables: dict[int, tuple[Sequence[Map], tuple[np.ndarray, np.ndarray]]] = {}
+        self._tables: dict[int, tuple[Sequence[Map], tuple[np.ndarray, np.ndarray], _Loops]] = {}
 
     def run(self, maps: Maps, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` steps of length h from y0 (2d,), as `SplittingKernel.run`."""
@@ -110,15 +111,19 @@ class PartsKernel:
         parts, d = self.parts, self.parts.ndof
         if parts.diagonal:
             modes *= self._scale
-            modes[..., :d] += parts.center
+            if self._moved:
+                modes[..., :d] += parts.center
             states = modes
         else:
             states = parts.from_modes(modes[..., :d], modes[..., d:])
         if save is not None and len(save) and save[0] <= 0:
-            states[..., : np.count_nonzero(save <= 0), :] = y0
+            states[..., : np.searchsorted(save, 0, "right"), :] = y0
         return states
 
     def _loops(self, sequence: Sequence[Map]) -> _Loops:
+        known = self._tables.get(id(sequence))
+        if known is not None and known[0] is sequence:
+            return known[2]
         filters, gradients = any(m.filters is not None for m in sequence), any(map(has_gradient, sequence))
         if gradients and not self.parts.has_force_gradient:
             raise ValueError("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
@@ -179,7 +184,8 @@ class PartsKernel:
         codes, table = self._table(rows, 1)
         if len(self._tables) >= KNOWN_TABLES:
             self._tables.clear()
-        self._tables[id(sequence)] = sequence, (codes, np.ascontiguousarray(table[0]))
+        loops = self._loops(sequence)
+        self._tables[id(sequence)] = sequence, (codes, np.ascontiguousarray(table[0])), loops
         return self._tables[id(sequence)][1]
 
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import sympy as sp
-from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
-from sympflow.kernels.codegen import _KernelPrinter, tuple_algebra
+from sympflow.kernels.codegen import printed, tuple_algebra
+from sympflow.kernels.scheduling import FUSED, Schedule
 from sympflow.parts import LINEAR, ExactParts, PartFunctions
 from sympflow.symbolic import printable
 
@@ -50,7 +50,7 @@ def parts_source(parts: ExactParts, filters: bool, gradients: bool) -> str:
 
 
 def _dispatch(calls: Sequence[tuple[int, str]], row: str) -> str:
-    lines = ["@njit(**OPTIONS)", "def apply_map(x, y, code, table, j):"]
+    lines = ["@njit(**OPTIONS, forceinline=True)", "def apply_map(x, y, code, table, j):"]
     for code, name in calls:
         lines += [f"    if code == {code}:", f"        return {name}(x, y, {row})"]
     return "\n".join([*lines, "    return x, y"])
@@ -74,7 +74,7 @@ def _linear(parts: ExactParts) -> str:
     """Rotations by three shears after a half turn or none (a sign), hyperbolic ones likewise, drifts."""
     assert parts.linear is not None
     d = parts.ndof
-    lines = ["@njit(**OPTIONS)", "def linear(x, y, c):", *_unpacked(d)]
+    lines = ["@njit(**OPTIONS, forceinline=True)", "def linear(x, y, c):", *_unpacked(d)]
     for j, (kind, f) in enumerate(zip(parts.linear.kinds, parts.linear.classes.tolist(), strict=True)):
         t, s, sign, signed_t = (f"c[{4 * f + i}]" for i in range(4))
         if kind == "free":
@@ -89,52 +89,56 @@ def _linear(parts: ExactParts) -> str:
 
 
 def _part(parts: ExactParts, part: PartFunctions, name: str, filters: bool, gradient: bool = False) -> str:
-    """x + b J∇H_k(x), and with a force gradient g ∇²U M⁻¹∇U added to y."""
+    """x + b J∇H_k(x), and with a force gradient g ∇²U M⁻¹∇U added to y; c = [b, g, φ …]."""
     d, q, p = parts.ndof, part.q, part.p
-    lines = ["@njit(**OPTIONS)", f"def {name}(x, y, c):", *_unpacked(d)]
-    phi = [f"c[{2 + j}]" if filters else "" for j in range(d)]
+    x, y, z = (sp.symbols(f"{letter}_0:{d}", real=True) for letter in "xyz")
+    b, g = sp.symbols("b_ g_", real=True)
+    phi = sp.symbols(f"phi_0:{d}", real=True) if filters else (sp.S.One,) * d
     C = np.eye(d) if filters and parts.diagonal else parts.C  # diagonal ones are in the filters
-    active = {int(j) for i in range(d) if part.H.has(q[i]) for j in np.flatnonzero(C[i])}
-    for j in sorted(active):
-        lines.append(f"    u_{j} = {phi[j]} * x_{j}" if filters else f"    u_{j} = x_{j}")
-    for i in range(d):
-        if part.H.has(q[i]):
-            offset = [_literal(parts.center[i])] if parts.center[i] else []
-            lines.append(f"    {q[i]} = {_sum(C[i], 'u_{}', offset)}")
-        if part.H.has(p[i]):
-            lines.append(f"    {p[i]} = {_sum(parts.inverse_C[:, i], 'y_{}')}")
+    # Of the map before, momenta are known before positions.
+    schedule = Schedule({**dict.fromkeys(x, 0.0), **dict.fromkeys(y, -FUSED)}, printed, "s_")
+    at = {
+        q[i]: sp.Add(_number(parts.center[i]), *(_number(C[i, j]) * phi[j] * x[j] for j in range(d))) for i in range(d)
+    } | {p[i]: sp.Add(*(_number(parts.inverse_C[j, i]) * y[j] for j in range(d))) for i in range(d)}
     by_q, by_p = ([sp.diff(part.H, s) for s in symbols] for symbols in (q, p))
-    z = sp.symbols(f"z_0:{d}", real=True)
-    products = _hessian_vector(part.H, q, z) if gradient else []
-    names = [f"{letter}_{i}" for letter in "gvm"[: 2 + gradient] for i in range(d)]
-    expressions = [printable(f) for f in (*by_q, *by_p, *products)]
-    shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("s_", real=True), list=True)
-    late, early_lines, late_lines = set(z), [], []  # late is what holds the direction z, known after the slopes
-    for target, f in [*((s.name, f) for s, f in shared), *zip(names, reduced, strict=True)]:
+    products = [sp.factor_terms(f) for f in _hessian_vector(part.H, q, z)] if gradient else []
+    shared, reduced = sp.cse(
+        [printable(f).xreplace(at) for f in (*by_q, *by_p, *products)],
+        symbols=sp.numbered_symbols("common_", real=True),
+        list=True,
+        order="none",
+    )
+    late: set[sp.Symbol] = set(z)  # what holds the direction z, known after the slopes
+    waiting: list[tuple[sp.Symbol, sp.Expr]] = []
+    for symbol, f in shared:
         if f.free_symbols & late:
-            late.add(sp.Symbol(target, real=True))
-            late_lines.append((target, f))
-        elif f != 0 or target.startswith("m_"):
-            early_lines.append((target, f))
-    lines += _assignments(early_lines)
-    moved = [i for i in range(d) if by_q[i] != 0]
-    for j in range(d):
-        slope = _sum([C[i, j] if i in moved else 0.0 for i in range(d)], "g_{}")
-        if slope:
-            lines.append(f"    G_{j} = {phi[j]} * ({slope})" if filters else f"    G_{j} = {slope}")
-            lines.append(f"    y_{j} -= c[0] * G_{j}")
-        velocity = _sum([parts.inverse_C[j, i] if by_p[i] != 0 else 0.0 for i in range(d)], "v_{}")
-        if velocity:
-            lines.append(f"    x_{j} += c[0] * ({velocity})")
+            late.add(symbol)
+            waiting.append((symbol, f))
+        else:
+            schedule.define(symbol, f)
+    slope, velocity, product = reduced[:d], reduced[d : 2 * d], reduced[2 * d :]
+    force = [sp.Add(*(_number(C[i, j]) * slope[i] for i in range(d))) for j in range(d)]
+    moved = [sp.Add(*(_number(parts.inverse_C[j, i]) * velocity[i] for i in range(d))) for j in range(d)]
+    new_x = [x[j] + sp.Mul(b, moved[j], evaluate=False) if moved[j] != 0 else x[j] for j in range(d)]
+    new_y = [y[j] + sp.Mul(-b * phi[j], force[j], evaluate=False) if force[j] != 0 else y[j] for j in range(d)]
     if gradient:
-        lines += _direction(C, parts.linear.rates if parts.linear else C[0], moved, phi)
-        lines += _assignments(late_lines)
+        rates = parts.linear.rates if parts.linear else C[0]
+        direction = [sp.Mul(_number(rates[j]) * phi[j] ** 2, force[j], evaluate=False) for j in range(d)]
+        for i in range(d):
+            schedule.define(z[i], sp.Add(*(sp.Mul(_number(C[i, j]), direction[j], evaluate=False) for j in range(d))))
+        for symbol, f in waiting:
+            schedule.define(symbol, f)
         for j in range(d):
-            product = _sum([C[i, j] if i in moved else 0.0 for i in range(d)], "m_{}")
-            if product:
-                factor = f" * {phi[j]}" if phi[j] else ""
-                lines.append(f"    y_{j} += c[1]{factor} * ({product})")
-    return "\n".join([*lines, _returned(d)])
+            bent = sp.Add(*(_number(C[i, j]) * product[i] for i in range(d)))
+            if bent != 0:
+                new_y[j] = sp.Add(new_y[j], sp.Mul(g * phi[j], bent, evaluate=False), evaluate=False)
+    results = [[schedule.value(f)[1] for f in values] for values in (new_x, new_y)]
+    body = [*schedule.early, *schedule.lines]
+    lines = ["@njit(**OPTIONS, forceinline=True)", f"def {name}(x, y, c):", *_unpacked(d)]
+    lines += ["    b_, g_, = c[0], c[1]", *(f"    phi_{j} = c[{2 + j}]" for j in range(d) if filters)]
+    lines += [f"    {line}" for line in body]
+    lines.append("    return " + ", ".join(f"({''.join(f'{value}, ' for value in values)})" for values in results))
+    return "\n".join(lines)
 
 
 def _hessian_vector(H: sp.Expr, q: Sequence[sp.Symbol], z: Sequence[sp.Symbol]) -> list[sp.Expr]:
@@ -145,41 +149,8 @@ def _hessian_vector(H: sp.Expr, q: Sequence[sp.Symbol], z: Sequence[sp.Symbol]) 
     return [sp.diff(along, x) for x in q]
 
 
-def _direction(C: np.ndarray, w: np.ndarray, moved: list[int], phi: list[str]) -> list[str]:
-    """z = C φ M⁻¹ φ Cᵀ∇U, along which the Hessian acts; w is the diagonal M⁻¹ of the modes."""
-    d, lines = len(C), []
-    reached = [j for j in range(d) if any(C[i, j] for i in moved) and w[j]]
-    for j in reached:
-        factor = f"{phi[j]} * " if phi[j] else ""
-        lines.append(f"    w_{j} = {factor}{_literal(w[j])} * G_{j}")
-    for i in moved:
-        lines.append(f"    z_{i} = {_sum([C[i, j] if j in reached else 0.0 for j in range(d)], 'w_{}')}")
-    return lines
-
-
-def _assignments(pairs: Sequence[tuple[str, sp.Expr]]) -> list[str]:
-    printer = _KernelPrinter({"fully_qualified_modules": True, "human": True})
-    lines = []
-    for name, expression in pairs:
-        try:
-            lines.append(f"    {name} = {printer.doprint(expression)}")
-        except PrintMethodNotImplementedError:
-            raise ValueError(
-                f"`system` has the term {expression}, for which there is no compiled function: use backend='array'."
-            ) from None
-    return lines
-
-
-def _sum(coefficients: Sequence[float] | np.ndarray, name: str, terms: Sequence[str] = ()) -> str:
-    """Σ c_i name_i without idle terms, '' if there are none."""
-    products = [
-        name.format(i) if c == 1.0 else f"{_literal(c)} * {name.format(i)}" for i, c in enumerate(coefficients) if c
-    ]
-    return " + ".join([*terms, *products])
-
-
-def _literal(value: float) -> str:
-    return repr(float(value)) if value >= 0 else f"({float(value)!r})"
+def _number(value: float) -> sp.Expr:
+    return sp.Integer(int(value)) if value == int(value) else sp.Float(value)
 
 
 def _unpacked(d: int) -> list[str]:

@@ -18,8 +18,8 @@ VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
 
 @njit(**OPTIONS)
 def one_step(x, y, codes, table, first, link):
-    x, y = apply_map(x, y, codes[first], table, first)
-    for j in range(1, link):
+    for k in range(link):
+        j = first if k == 0 else k
         x, y = apply_map(x, y, codes[j], table, j)
     return x, y
 

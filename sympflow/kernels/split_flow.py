@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.integrators.linear_splitting import kernel_of
-from sympflow.kernels.parts import PartsKernel
+from sympflow.kernels.parts import KNOWN_TABLES, PartsKernel
+from sympflow.parts import Map
 
 if TYPE_CHECKING:
     from sympflow.flow.split import SplitFlow
@@ -31,10 +33,13 @@ class SplitFlowKernel:
         self.flow = flow
         self._kernel: PartsKernel = kernel_of(flow.parts, PartsKernel)
         self._kernel.source()
+        self._weights = list(flow.parameters())
+        self._known: dict[float, Sequence[Map]] = {}
+        self._known_for: tuple[tuple[int, int], ...] = ()
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` times ψ̄_h, or for h < 0 the inverse of ψ̄_|h|: see `PartsKernel.run`."""
-        return self._kernel.run(self.flow.numpy_maps, h, y0, n_steps, save)
+        return self._kernel.run(self._maps, h, y0, n_steps, save)
 
     def run_batch(
         self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None
@@ -43,7 +48,17 @@ class SplitFlowKernel:
         if len(y0) == 1:
             Y, n_finite = self.run(h, y0[0], n_steps, save)
             return Y[None], np.array([n_finite])
-        return self._kernel.run_batch(self.flow.numpy_maps, h, y0, n_steps, save, threads=threads)
+        return self._kernel.run_batch(self._maps, h, y0, n_steps, save, threads=threads)
+
+    def _maps(self, h: np.ndarray) -> Sequence[Map]:
+        """The maps of one length, the same object while no weight changes, whose table the loops then know."""
+        weights = tuple((w.data_ptr(), w._version) for w in self._weights)
+        if self._known_for != weights or len(self._known) >= KNOWN_TABLES:
+            self._known, self._known_for = {}, weights
+        t = float(h)
+        if t not in self._known:
+            self._known[t] = self.flow.numpy_maps(h)
+        return self._known[t]
 
     def step(self, h: ArrayLike, y: np.ndarray) -> np.ndarray:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
