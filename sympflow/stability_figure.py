@@ -72,7 +72,7 @@ def _curve(ax: Axes, rows: list[StabilityRow], style: tuple[str, str], note: str
         ax.plot(*zip(*fixed, strict=True), marker=marker, ms=5.5, label=rows[0].label + note, **line)
     elif rows:  # adaptive: no step
         ax.axhline(_shown(rows[0]), color=colour, lw=1.0, ls=":", label=rows[0].label + note)
-    lost = [r.dt for r in rows if r.dt is not None and r.status == "unstable"]
+    lost = [r.dt for r in rows if r.dt is not None and r.status in ("unstable", "outside")]
     if lost:
         ax.plot(lost, [LARGEST] * len(lost), "x", color=colour, ms=7, mew=1.6)
 
@@ -83,7 +83,7 @@ def _shown(row: StabilityRow) -> float:
 
 
 def _map(report: StabilityReport) -> Figure:
-    """A panel for each method: step against stiffness, coloured by energy error; unstable cells dark."""
+    """A panel for each method: step against stiffness, coloured by energy error; unstable cells dark, as those where a flow left its domain."""
     from matplotlib.colors import LogNorm
 
     labels = list(dict.fromkeys(r.label for r in report.rows if r.energy_error is not None and r.dt is not None))
@@ -96,7 +96,7 @@ def _map(report: StabilityReport) -> Figure:
         rows = [r for r in report.rows if r.label == label and r.dt is not None and r.energy_error is not None]
         x, y = np.array([r.dt for r in rows]), np.array([r.value for r in rows])
         error = np.array([_shown(r) for r in rows])
-        bad = np.array([r.status == "unstable" for r in rows])
+        bad = np.array([r.status in ("unstable", "outside") for r in rows])
         image = ax.scatter(
             x[~bad], y[~bad], c=np.clip(error[~bad], norm.vmin, norm.vmax), norm=norm, cmap="viridis", marker="s", s=34
         )

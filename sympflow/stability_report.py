@@ -29,8 +29,10 @@ class StabilityRow:
     t_end : float
         End of the run.
     status : str
-        "stable"; "unstable", if a run became non-finite, could not go on, or its energy error exceeded the bound; "not
-        applicable", if the method cannot run, or not with this step.
+        "stable"; "bounded", as stable, but the energy error exceeds 1: the result says nothing; "outside", if a run of
+        a trained flow left the domain that the flow was trained on, where it says nothing either; "unstable", if a run
+        became non-finite, could not go on, or its energy error exceeded the bound; "not applicable", if the method
+        cannot run, or not with this step.
     reason : str
         Why, in words.
     n_steps : int
@@ -78,14 +80,15 @@ class StepLimit:
     system, parameter, value, method, label, dtype
         As in `StabilityRow`.
     stable : float or None
-        The longest step that was found stable, all shorter ones that were tried being so; None if there is none.
+        The longest step that was found stable or bounded, all shorter ones that were tried being so; None if there is
+        none.
     unstable : float or None
         The next longer one that was tried, which is not; None if all were stable.
     energy_error : float
         The largest energy error with `stable`.
     reached : str
         What else is to be said: that all steps are stable, up to the flow's Δt or the length of the interval; or that
-        the solution itself is singular, so that none is.
+        the solution itself is singular, or leaves the flow's domain, so that none is.
     """
 
     system: str

@@ -27,6 +27,7 @@ STEPS = tuple(2.0**k for k in range(-1, 7))
 FRACTIONS = (0.25, 0.5, 1.0)
 MOST_OUTPUTS, TANGENT_STEPS = 20_000, 256
 LIMIT_PRECISION = 1.002
+STABLE = ("stable", "bounded")
 
 
 @dataclass(frozen=True)
@@ -89,12 +90,26 @@ class Study:
             ]
 
     def stable(self, h: float) -> tuple[bool, float]:
-        """Whether all runs with this step stay below the bound, and their largest energy error."""
+        """Whether all runs with this step stay below the bound and in a flow's domain, and their largest error."""
         try:
-            error = _largest_error(self.runs(self.with_step(h), h, self.starts))
+            integrator = self.with_step(h)
+            sols = self.runs(integrator, h, self.starts)
         except (ValueError, ArithmeticError):  # such as a step above Δt
             return False, math.inf
-        return error <= self.bound, error
+        error = _largest_error(sols)
+        return self._status(error, integrator, sols)[0] in STABLE, error
+
+    def _status(self, error: float, integrator: Integrator, sols: list[Solution]) -> tuple[str, str]:
+        """The status of runs with this largest energy error, and what is to be said."""
+        exit_time = self._exit(integrator, sols) if integrator.trained else None
+        left = (
+            "" if exit_time is None else f"Left the flow's domain at t = {exit_time:.6g}, where the flow says nothing."
+        )
+        if left or not error <= self.bound:
+            return ("unstable" if not error <= self.bound else "outside"), left
+        return (
+            ("stable", "") if error <= 1 else ("bounded", f"The energy error stays bounded, but reaches {error:.3g}.")
+        )
 
     def row(self, h: float | None) -> StabilityRow:
         """Everything that is asked for at one step."""
@@ -118,12 +133,14 @@ class Study:
         except (ValueError, TypeError, ImportError, NotImplementedError) as error:
             return replace(row, status="not applicable", reason=str(error))
         worst = _largest_error(sols)
+        status, words = self._status(worst, integrator, sols)
+        failure = next((s.message for s in sols if not s.success), "")
         row = replace(
             row,
-            status="stable" if worst <= self.bound else "unstable",
+            status=status,
             n_steps=max(int(s.stats["n_steps"]) for s in sols),
             energy_error=worst,
-            reason=next((s.message for s in sols if not s.success), ""),
+            reason=" ".join(x for x in (failure, words) if x),
         )
         row = self._blow_up(row, integrator, sols)
         for metric in self.metrics:
@@ -145,7 +162,7 @@ class Study:
         return row
 
     def _drift(self, row: StabilityRow, integrator: Integrator, sols: list[Solution]) -> StabilityRow:
-        if row.status != "stable" or len(sols[0].t) < 40:
+        if row.status == "unstable" or len(sols[0].t) < 40:
             return row
         drifts = [energy_drift(s) for s in sols]
         slope = np.concatenate([np.ravel(d.slope) for d in drifts])
@@ -177,20 +194,24 @@ class Study:
             return replace(row, reason=f"{row.reason} No {name.replace('_', ' ')}: {error}".strip())
 
     def _domain(self, row: StabilityRow, integrator: Integrator, sols: list[Solution]) -> StabilityRow:
+        return replace(row, domain_exit=self._exit(integrator, sols))
+
+    def _exit(self, integrator: Integrator, sols: list[Solution]) -> float | None:
         """When the first trajectory leaves the domain of the flow, or of the system."""
         flow = getattr(integrator, "flow_for", lambda system: None)(self.system)
         domain = domain_of(flow, self.system)
         if domain is None:
-            return row
+            return None
         slack = float(getattr(flow, "figures", {}).get("energy_error_max") or 0.0)
-        sol = sols[0]
-        thin = max(1, len(sol.t) // 2000)
-        states = sol.states[0] if sol.y.ndim == 3 else sol.states
-        outside = ~domain.contains(states[::thin], slack=slack) & np.isfinite(states[::thin]).all(-1)
-        if not outside.any():
-            return row
-        exit_time = float(sol.t[::thin][int(np.argmax(outside))])
-        return replace(row, domain_exit=exit_time)
+        times = []
+        for sol in sols:
+            thin = max(1, len(sol.t) // 2000)
+            states = np.asarray(sol.states)[..., ::thin, :]
+            outside = ~domain.contains(states, slack=slack) & np.isfinite(states).all(-1)
+            outside = outside.reshape(-1, outside.shape[-1]).any(0)
+            if outside.any():
+                times.append(float(sol.t[::thin][int(np.argmax(outside))]))
+        return min(times) if times else None
 
     def _typed(self, y: np.ndarray) -> np.ndarray:
         return y.astype(self.dtype)
@@ -198,7 +219,7 @@ class Study:
     def limit(self, rows: list[StabilityRow]) -> StepLimit:
         """The longest stable step, from the rows and by bisection below the first unstable one."""
         tried = [row for row in rows if row.dt is not None and row.status != "not applicable"]
-        ran = [(row.dt, row.status == "stable") for row in tried if row.dt is not None]
+        ran = [(row.dt, row.status in STABLE) for row in tried if row.dt is not None]
         first_bad = next((i for i, (_, good) in enumerate(ran) if not good), len(ran))
         low = ran[first_bad - 1][0] if first_bad else None
         high = ran[first_bad][0] if first_bad < len(ran) else None
@@ -207,6 +228,8 @@ class Study:
             low, high, reached = self._longer(low)
         elif low is None and any(row.singular for row in tried):
             reached = "none: the solution is singular"  # no step helps
+        elif low is None and tried and all(row.status == "outside" for row in tried):
+            reached = "none: the solution leaves the flow's domain"
         elif low is None and high is not None:
             low, high = self._shorter(high)
         error = None

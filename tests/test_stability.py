@@ -35,7 +35,7 @@ def test_two_is_unstable_though_one_state_does_not_show_it():
     for z in (1.98, 2.0, 2.02):
         report = stability(oscillator, ["verlet"], steps=[z], metrics=("energy",), limits=False)
         kinds[z] = report.rows[0].status
-    assert kinds == {1.98: "stable", 2.0: "unstable", 2.02: "unstable"}
+    assert kinds == {1.98: "bounded", 2.0: "unstable", 2.02: "unstable"}
 
 
 def test_an_overflow_is_never_a_small_error():
@@ -89,6 +89,26 @@ def test_rows_of_a_singular_solution():
     assert fixed.domain_exit < SINGULARITY
     assert report.limits[0].stable is None
     assert "singular" in report.limits[0].reached
+
+
+def test_a_flow_outside_its_domain_is_not_called_stable():
+    """The solution does not exist beyond t*; the flow goes on, finite and wrong, outside Ω."""
+    escaping = [[0.0, 0.0, 0.0, 0.7]]
+    arguments = {"steps": [0.1], "t_span": (0.0, 20.0), "y0": escaping, "min_steps": 1}
+    report = stability(systems.henon_heiles(), ["sympflow"], metrics=("energy",), **arguments)
+    (row,), (limit,) = report.rows, report.limits
+    assert row.status == "outside"
+    assert re.search(r"Left the flow's domain at t = [\d.]+, where the flow says nothing\.", row.reason)
+    assert limit.stable is None
+    assert limit.reached == "none: the solution leaves the flow's domain"
+
+
+def test_an_energy_error_above_one_is_bounded_rather_than_stable():
+    oscillator = systems.harmonic_oscillator()
+    (row,) = stability(oscillator, ["leapfrog"], steps=[1.99], metrics=("energy",), limits=False).rows
+    assert row.status == "bounded"
+    assert row.energy_error > 1  # (z²/4)/(1 − z²/4) is 99
+    assert "but reaches" in row.reason
 
 
 def test_initial_states_lie_on_one_orbit():
