@@ -17,7 +17,7 @@ import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, stack
 from sympflow.linear_part import LinearPart, linear_part, read_off
-from sympflow.symbolic import SymbolicHamiltonian, _parse
+from sympflow.symbolic import SymbolicHamiltonian, parse
 
 if TYPE_CHECKING:
     import sympy as sp
@@ -371,8 +371,16 @@ def _given(system: HamiltonianSystem, expressions: tuple[str, ...]) -> ExactPart
 
 def _parsed(expression: str, system: HamiltonianSystem) -> sp.Expr:
     """A part in the symbols q1 … pd of the system."""
-    words = set(re.findall(r"[A-Za-z_]\w*", expression))
-    part = _parse(expression, {name: value for name, value in system.params.items() if name in words})
     assert system.symbols is not None
+    if not isinstance(expression, str):
+        raise ValueError(f"`parts` must be expressions as text; got {expression!r}.")
+    words = set(re.findall(r"[A-Za-z_]\w*", expression))
+    try:
+        part = parse(expression, {name: value for name, value in system.params.items() if name in words})
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"`parts` has one that is not admissible: {error}") from None
+    known = {s.name for s in (*system.symbols.q, *system.symbols.p)} | {"q", "p"}
+    if foreign := {s.name for s in part.free_symbols} - known:
+        raise ValueError(f"`parts` has {', '.join(sorted(foreign))}, which the system has not: leave it out.")
     first = {"q": system.symbols.q[0], "p": system.symbols.p[0]}
     return part.xreplace({s: first[s.name] for s in part.free_symbols if s.name in first})

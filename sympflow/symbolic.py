@@ -11,6 +11,7 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from sympflow.arrays import Array, assemble, concatenate, is_tensor
+from sympflow.expression import Unreadable, read
 
 
 class SymbolicHamiltonian:
@@ -38,7 +39,7 @@ class SymbolicHamiltonian:
     """
 
     def __init__(self, expression: str | sp.Expr, params: Mapping[str, float] | None = None) -> None:
-        H = _parse(expression, params or {})
+        H = parse(expression, params or {})
         ndof = max((_index(s) for s in H.free_symbols if _index(s)), default=0)
         if ndof == 0:
             raise ValueError("`expression` must depend on q1 … qd and p1 … pd (or q and p).")
@@ -163,19 +164,26 @@ class SymbolicHamiltonian:
         return {}
 
 
-def _parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
+def parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
+    """The expression in real symbols, its parameters replaced by their values."""
     names = {name: sp.Symbol(name, real=True) for name in params}
     _check_params(params)
     if isinstance(expression, str):
-        words = set(re.findall(r"[A-Za-z_]\w*", expression))
-        local = {w: sp.Symbol(w, real=True) for w in words if w not in vars(sp) or _is_coordinate(w) or w in params}
-        local |= {w: f for w, f in (("abs", sp.Abs), ("max", sp.Max), ("min", sp.Min)) if w in words - params.keys()}
         try:
-            H = sp.sympify(expression, locals=local)
-        except (sp.SympifyError, SyntaxError, TypeError, AttributeError) as error:
-            raise ValueError(f"`expression` cannot be parsed by SymPy: {expression!r} ({error}).") from error
+            H = read(expression, {*params, *(w for w in re.findall(r"[A-Za-z_]\w*", expression) if _is_coordinate(w))})
+        except Unreadable as error:
+            shown = expression if len(expression) <= 200 else expression[:200] + "..."
+            raise ValueError(
+                f"`expression` cannot be parsed: {shown!r} ({error}). Write it with these, or pass a SymPy expression."
+            ) from None
     else:
-        H = sp.sympify(expression)
+        try:
+            H = sp.sympify(expression, strict=True)
+        except sp.SympifyError:
+            raise ValueError(
+                f"`expression` must be a scalar expression; got {type(expression).__name__}: pass a string or a SymPy "
+                "expression."
+            ) from None
     if not isinstance(H, sp.Expr):
         raise ValueError(f"`expression` must be a scalar expression; got {type(H).__name__}.")
     if H.has(sp.I):
@@ -197,7 +205,11 @@ def _check_params(params: Mapping[str, float]) -> None:
     for name, value in params.items():
         if not isinstance(name, str) or _is_coordinate(name) or name == "t":
             raise ValueError(f"`params` gives a value to {name!r}, which is a coordinate: rename the parameter.")
-        if isinstance(value, str) or not sp.sympify(value).is_number or not sp.sympify(value).is_finite:
+        try:
+            number = sp.sympify(value, strict=True)
+        except sp.SympifyError:
+            number = sp.nan
+        if not isinstance(number, sp.Expr) or not number.is_number or not number.is_finite:
             raise ValueError(f"`params` has {name} = {value!r}: give a finite number.")
 
 

@@ -1,8 +1,8 @@
 """Files of flows: safetensors with a JSON record, never pickle; and the flows that ship with the package.
 
 The metadata entry "sympflow" is a JSON object: format, version (of the package), kind, architecture, dt, domain,
-system, fingerprint, recipe, figures, checksum (of the tensors), and certificate, if one was computed. A file is taken
-for hostile until every part of it has been checked.
+system, fingerprint, recipe, figures, checksum (of the tensors), seal (of the architecture), and certificate, if one was
+computed. A file is taken for hostile until every part of it has been checked.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import sympflow
 from sympflow.flow.base import FlowMap
 from sympflow.flow.description import check, describe
 from sympflow.flow.placement import checked_device
-from sympflow.flow.record import Refused, build, checksum, dtype_of, fill, parse, tensor_bytes
+from sympflow.flow.record import Refused, build, checksum, dtype_of, fill, parse, seal, tensor_bytes
 from sympflow.flow.shipped import choose
 
 if TYPE_CHECKING:
@@ -72,6 +72,7 @@ def save(flow: FlowMap, path: str | os.PathLike[str]) -> None:
             )
         record["certificate"] = flow.certified.to_dict()
     record = _finite(record)
+    record["seal"] = seal(record)
     try:
         check(record, flow.ndof)
     except Refused as reason:
@@ -82,6 +83,38 @@ def save(flow: FlowMap, path: str | os.PathLike[str]) -> None:
             f"`flow` cannot be saved as it is: its description takes {length:,} bytes, more than {MAX_HEADER:,}. "
             "Describe its domain with fewer numbers, for instance a Tube around fewer states."
         )
+    _write(path, content)
+
+
+def reseal(path: str | os.PathLike[str]) -> bool:
+    """Give a file of an earlier version its seal, once it has been checked; the weights stay as they are.
+
+    Returns
+    -------
+    bool
+        Whether the file was changed: False if it had a seal.
+
+    Raises
+    ------
+    ValueError
+        As `load`.
+    """
+    path = _path(path)
+    load(path)
+    content, _, record = _read(path)
+    if "seal" in record:
+        return False
+    (length,) = struct.unpack("<Q", content[:8])
+    header = json.loads(content[8 : 8 + length])
+    header["__metadata__"][KEY] = json.dumps({**record, "seal": seal(record)}, allow_nan=False, separators=(",", ":"))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    _write(path, struct.pack("<Q", len(text)) + text + content[8 + length :])
+    return True
+
+
+def _write(path: Path, content: bytes) -> None:
+    """All of it or nothing."""
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -131,6 +131,16 @@ def _split(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> SplitFlow:
         raise Refused("its sequence of maps does not consist of numbers of parts")
     if expressions is not None and not (isinstance(expressions, list) and all(isinstance(e, str) for e in expressions)):
         raise Refused("its parts are not a list of expressions")
+    if expressions is not None:
+        from sympflow.expression import Unreadable, read
+
+        if len(expressions) > len(plan["kinds"]) + 1:
+            raise Refused("it has more parts than kinds of them")
+        try:
+            for expression in expressions:
+                read(expression)
+        except Unreadable as error:
+            raise Refused(f"its parts are not all expressions ({error})") from None
     terms = _integer(plan.get("terms"), "number of terms", MAX_DEGREE)
     if len(sequence) * terms * (len(plan["classes"]) + 2) > MAX_PARAMETERS // 100:
         raise Refused("its architecture is absurdly large")
@@ -177,6 +187,16 @@ def checksum(tensors: dict[str, torch.Tensor]) -> str:
     return digest.hexdigest()
 
 
+def seal(record: dict[str, Any]) -> str:
+    """SHA-256 of what the flow is made by: kind, architecture (with the parts of H that it names), dt, and checksum.
+
+    Like the checksum it tells a damaged file, or one edited by hand, not one that somebody made on purpose: therefore
+    nothing in a file is trusted, sealed or not.
+    """
+    made_of = {name: record.get(name) for name in ("kind", "architecture", "dt", "checksum")}
+    return hashlib.sha256(json.dumps(made_of, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
 def fill(flow: FlowMap, content: bytes, header: dict[str, Any], record: dict[str, Any]) -> None:
     """Put the file's tensors into the flow."""
     expected = flow.state_dict()
@@ -199,5 +219,15 @@ def fill(flow: FlowMap, content: bytes, header: dict[str, Any], record: dict[str
         raise Refused("its record has no checksum of the weights")
     if record["checksum"] != checksum(tensors):
         raise Refused("its weights are not those that were saved: their checksum differs, the file is damaged")
+    _check_seal(record)
     flow.load_state_dict(tensors)
     flow.requires_grad_(False)
+
+
+def _check_seal(record: dict[str, Any]) -> None:
+    """Files of earlier versions have none; those that name parts of H must."""
+    split = record["architecture"].get("split")
+    if "seal" not in record and not (isinstance(split, dict) and split.get("expressions")):
+        return
+    if record.get("seal") != seal(record):
+        raise Refused("its architecture is not the one that was saved: its seal differs, the file is damaged")

@@ -1,0 +1,176 @@
+"""Text as an expression: what is understood, and that nothing in it is executed or runs away."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import sympy as sp
+from watchdog import watched
+
+from sympflow import HamiltonianSystem, SympFlow, load, solve, systems
+from sympflow.expression import Unreadable, read
+from sympflow.flow import seal as command
+from sympflow.flow.io import reseal
+from sympflow.flow.record import seal
+
+q, p, q1, q2 = sp.symbols("q p q1 q2", real=True)
+
+UNDERSTOOD = {
+    "p**2/2 + q^4/4": p**2 / 2 + q**4 / 4,
+    "-q + +p - (-2)": p - q + 2,
+    "q/2/3*p": q * p / 6,
+    "2**3**2*q": 512 * q,
+    "1/(q1**2+q2**2)**(3/2)": (q1**2 + q2**2) ** sp.Rational(-3, 2),
+    "Rational(1, 3)*q\n + pi": q / 3 + sp.pi,
+    "E**q + ln(q2)": sp.exp(q) + sp.log(q2),
+    "max(q, 0) + abs(p)": sp.Max(q, 0) + sp.Abs(p),
+    "besselj(0, q)*gamma(5)": 24 * sp.besselj(0, q),
+    "Piecewise((q, q > 0), (0, True))": sp.Piecewise((q, q > 0), (0, True)),
+}
+
+HOSTILE = {
+    'S(\'__import__("os").system("touch PWNED")\') + q': "the function S is unknown",
+    "__import__('os').system('touch PWNED') + q": "a function is called by its name",
+    "q.__class__": "not understood",
+    "sympify(q)": "the function sympify is unknown",
+    "lambdify(q, q)": "unknown",
+    "preview(q)": "unknown",
+    "[q][5]": "not understood",
+    "'q'": "not a number",
+    "True + q": "not a number",
+    "q if p else 1": "not understood",
+    "(lambda: q)()": "by its name",
+    "q(3)": "unknown",
+    "sin()": "not understood",
+    "sin(q, p)": "not understood",
+    "sin(x=q)": "not understood",
+    "q < 3": "not understood",
+    "Rational(q, 2)": "whole numbers",
+    "Rational(1, 0)": "whole numbers",
+    "Piecewise(q)": "pairs",
+    "Piecewise((q, p))": "condition",
+    "q/0": "divides by zero",
+    "0**-1*q": "divides by zero",
+    "log(0) + q": "infinite or undefined",
+    "1e999*q": "out of range",
+    "9**9**9**9": "out of range",
+    "p**2/2 + q**(9**9**9)": "out of range",
+    "q**1001": "an exponent of 1001",
+    "(q**900)**900": "out of range",
+    "(10**300*q)**1000": "out of range",
+    "(q + 10**300)**1000": "out of range",
+    "exp(exp(exp(exp(9)))) + q": "out of range",
+    "gamma(10**9)*q": "out of range",
+    "(q + p + 1)**900": "more than 50,000 terms",
+    "((q + 1)**99 + p)**99": "more than 50,000 terms",
+    "9" * 5000: "digits",
+    "(" * 5000 + "q" + ")" * 5000: "nested",
+    "-" * 50_000 + "q": "nested",
+    "**".join(["q"] * 300): "nested",
+    "q" * 200_000: "characters",
+    "q + " * 24_000 + "q": "nested",
+    "\0q": "null",
+    "": "syntax",
+}
+
+
+@pytest.mark.parametrize("text", UNDERSTOOD)
+def test_text_means_what_sympy_means_by_it(text):
+    assert sp.simplify(read(text) - UNDERSTOOD[text]) == 0
+
+
+def test_a_parameter_may_have_the_name_of_a_function():
+    assert read("gamma*q", ["gamma"]) == sp.Symbol("gamma", real=True) * q
+
+
+@pytest.mark.parametrize("text", HOSTILE, ids=lambda text: text[:30].replace("\0", "0"))
+def test_hostile_text_is_refused_at_once(text, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with watched(), pytest.raises(Unreadable, match=HOSTILE[text]):
+        read(text)
+    with watched(), pytest.raises(ValueError, match=r"^`expression` cannot be parsed"):
+        HamiltonianSystem.from_sympy(text)
+    with watched(), pytest.raises(ValueError, match=r"^`parts` has one that is not admissible"):
+        SympFlow.split(systems.pendulum(), 1, dt=0.1, parts=("p1**2/2", text))
+    assert not list(tmp_path.iterdir())
+
+
+def test_objects_are_not_read_as_text():
+    class Hostile:
+        def __str__(self):
+            raise AssertionError("it was read as text")
+
+    for value in (Hostile(), {"q": 1}, None, object):
+        with pytest.raises(ValueError, match=r"^`expression` must be a scalar"):
+            HamiltonianSystem.from_sympy(value)
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "flow.safetensors"
+    SympFlow.split(systems.pendulum(), 1, dt=0.1, parts=("1 - cos(q1)", "p1**2/2")).save(path)
+    return path
+
+
+def edit(path, change):
+    content = path.read_bytes()
+    (n,) = struct.unpack("<Q", content[:8])
+    header = json.loads(content[8 : 8 + n])
+    record = json.loads(header["__metadata__"]["sympflow"])
+    change(record)
+    header["__metadata__"]["sympflow"] = json.dumps(record)
+    text = json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + content[8 + n :])
+
+
+def with_parts(*expressions, sealed):
+    def change(record):
+        record["architecture"]["split"]["expressions"] = list(expressions)
+        if sealed:
+            record["seal"] = seal(record)
+
+    return change
+
+
+@pytest.mark.parametrize("text", [t for t in HOSTILE if len(t) < 1000], ids=lambda text: text[:30].replace("\0", "0"))
+def test_a_file_that_names_hostile_parts_is_refused(file, text, monkeypatch):
+    monkeypatch.chdir(file.parent)
+    edit(file, with_parts(text, "p1**2/2", sealed=True))
+    with watched(), pytest.raises(ValueError, match=r"^`path` .* its parts are not all expressions"):
+        load(file, system=systems.pendulum())
+    assert [f.name for f in file.parent.iterdir()] == [file.name]
+
+
+def test_parts_edited_in_a_file_are_noticed(file):
+    edit(file, with_parts("2 - cos(q1)", "p1**2/2 - 1", sealed=False))
+    with pytest.raises(ValueError, match=r"architecture is not the one that was saved"):
+        load(file)
+    edit(file, lambda record: record.pop("seal"))
+    with pytest.raises(ValueError, match=r"architecture is not the one that was saved"):
+        load(file)
+
+
+def test_another_dt_in_a_file_is_noticed(tmp_path):
+    path = tmp_path / "flow.safetensors"
+    SympFlow(1, dt=0.5).save(path)
+    edit(path, lambda record: record.update(dt=0.25))
+    with pytest.raises(ValueError, match=r"its seal differs"):
+        load(path)
+
+
+def test_files_of_earlier_versions_load_and_are_sealed_without_changing_their_weights(tmp_path, capsys):
+    path = tmp_path / "flow.safetensors"
+    flow = SympFlow(1)
+    flow.save(path)
+    edit(path, lambda record: record.pop("seal"))
+    before = load(path)
+    command.main([str(path)])
+    assert "sealed" in capsys.readouterr().out
+    assert not reseal(path)
+    after = load(path)
+    for name, value in after.state_dict().items():
+        assert value.equal(before.state_dict()[name])
+    assert solve(systems.pendulum(), after, (0, 1)).y == pytest.approx(
+        np.asarray(solve(systems.pendulum(), before, (0, 1)).y), abs=0
+    )
