@@ -297,7 +297,7 @@ from sympflow.systems import pendulum
 system = pendulum()
 kernel = splitting_kernel(system)
 Y, n = kernel.run(SCHEMES["verlet"], 0.1, np.array([1.0, 0.0]), 10, np.array([10]))
-rollout = kernel._loops(SCHEMES["verlet"], False).rollout
+rollout = kernel._loops(False, False).rollout
 print(repr(Y.tolist()), sum(rollout.stats.cache_hits.values()), sum(rollout.stats.cache_misses.values()))
 """
 

@@ -140,13 +140,14 @@ def rollout_each(kicks, drifts, gradients, y0, n_steps, save, out, n_finite):
 
 @njit(**OPTIONS)
 def step_each(kicks, drifts, gradients, h, y, out):
-    """One step of length ``h[i]`` from every row of `y` (N, 2d); the coefficients are those for h = 1."""
-    work = prepared(kicks, gradients)
+    """One step of length ``h[i]`` from every row of `y` (N, 2d); the coefficients (1 or N, m) are those for h = 1."""
+    work = prepared(kicks[0], gradients[0])
     for i in range(y.shape[0]):
+        row = i if len(kicks) > 1 else 0
         q, p = unpack(y[i])
         q_error, p_error = no_error(q), no_error(p)
-        for j in range(len(kicks)):
-            b, g, a = h[i] * kicks[j], h[i] ** 3 * gradients[j], h[i] * drifts[j]
+        for j in range(kicks.shape[1]):
+            b, g, a = h[i] * kicks[row, j], h[i] ** 3 * gradients[row, j], h[i] * drifts[row, j]
             if SCHEDULED:
                 fill_coefficients(b, g, work[j])
             q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, a, j, work)

@@ -70,8 +70,8 @@ class SplittingKernel:
             )
         self._variants: dict[tuple[bool, bool], _Loops] = {}
 
-    def _loops(self, scheme: Scheme, compensated: bool) -> _Loops:
-        variant = (any(scheme.gradients), compensated)
+    def _loops(self, gradients: bool, compensated: bool) -> _Loops:
+        variant = (gradients, compensated)
         if variant not in self._variants:
             if variant[0] and not self._has_force_gradient:
                 raise ValueError(
@@ -111,7 +111,7 @@ class SplittingKernel:
         n_finite : int
             Index of the last step that ends in a finite state, `n_steps` if all do; the run stops there.
         """
-        loops = self._loops(scheme, compensated)
+        loops = self._loops(any(scheme.gradients), compensated)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(save), 2 * self.ndof))
         n_finite = loops.rollout(*_scaled(_run_table(scheme), h), y0, n_steps, save, out)
@@ -134,7 +134,7 @@ class SplittingKernel:
         Y : ndarray of shape (N, len(save), 2d)
         n_finite : ndarray of int64, shape (N,)
         """
-        loops = self._loops(scheme, compensated)
+        loops = self._loops(any(scheme.gradients), compensated)
         table = _scaled(_run_table(scheme), h)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(y0), len(save), 2 * self.ndof))
@@ -151,7 +151,20 @@ class SplittingKernel:
         y = np.ascontiguousarray(y, dtype=np.float64)
         h = np.ascontiguousarray(np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1]))
         out = np.empty_like(y)
-        self._loops(scheme, False).step_each(*_step_table(scheme), h, y, out)
+        self._loops(any(scheme.gradients), False).step_each(*_step_table(scheme), h, y, out)
+        return out
+
+    def step_rows(self, table: _Table, h: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own table.
+
+        Parameters
+        ----------
+        table : kicks, drifts, gradients, ndarrays of shape (N, m)
+            Those of row i, for h = 1; a stage is a kick and a drift.
+        """
+        kicks, drifts, gradients = (np.ascontiguousarray(column) for column in table)
+        out = np.empty(y.shape)
+        self._loops(bool(gradients.any()), False).step_each(kicks, drifts, gradients, h, np.ascontiguousarray(y), out)
         return out
 
 
@@ -179,8 +192,9 @@ def _arrays(stages: list[_Stage]) -> _Table:
 
 @lru_cache(maxsize=256)
 def _step_table(scheme: Scheme) -> _Table:
-    """The stages of one step by itself, for h = 1."""
-    return _arrays(_stages(scheme))
+    """The stages of one step by itself, for h = 1: (1, m) each."""
+    kicks, drifts, gradients = _arrays(_stages(scheme))
+    return kicks[None], drifts[None], gradients[None]
 
 
 @lru_cache(maxsize=256)

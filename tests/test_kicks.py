@@ -1,0 +1,110 @@
+"""Kicks as generated code: every shape gives the same momenta; the costs by which one is chosen."""
+
+import math
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from sympflow import SympFlow, systems
+from sympflow.kernels.codegen import printed
+from sympflow.kernels.kicks import _function, _scheduled, _shapes
+from sympflow.kernels.primed_flow import PrimedFlowKernel
+from sympflow.kernels.scheduling import ADD, FUSED, MULTIPLY, Schedule
+from sympflow.system import HamiltonianSystem
+
+SCENES = {
+    "henon_heiles": systems.henon_heiles,
+    "pendulum": systems.pendulum,
+    "quartic": systems.quartic,
+    "kepler": systems.kepler,
+    "masses": lambda: HamiltonianSystem.from_sympy("p1**2 + p1*p2/3 + p2**2/5 + q1**4*q2**2 - q1*q2 + q2**6/7"),
+    "one term": lambda: HamiltonianSystem.from_sympy("p**2/2 - q**4/4"),
+    "roots": lambda: HamiltonianSystem.from_sympy("p**2/2 + sqrt(1 + q**2) - 1/(2 + q**2) + (3 + q)**1.5"),
+    "kinks": lambda: HamiltonianSystem.from_sympy("p**2/2 + Abs(q)**3 + Piecewise((q**2, q > 0), (0, True))"),
+}
+ELEMENTARY = {"math": math, "fast_sin": math.sin, "fast_cos": math.cos, "njit": lambda **_: lambda f: f, "OPTIONS": {}}
+
+
+@pytest.mark.parametrize("gradient", [False, True])
+@pytest.mark.parametrize("name", SCENES)
+def test_every_shape_gives_the_same_momenta(name, gradient):
+    system = SCENES[name]()
+    symbols, d = system.symbols, system.ndof
+    rng = np.random.default_rng(0)
+    shapes = list(_shapes(symbols, gradient))
+    assert len(shapes) >= (1 if name == "kinks" else 3)
+    for shape in shapes:
+        kick = _scheduled(symbols, shape, "s_")
+        functions = dict(ELEMENTARY)
+        lines = [*kick.coefficients, *kick.lines]
+        exec(_function(symbols, "kick", "q, p, b, g", lines, kick.results), functions)
+        for _ in range(5):
+            q, p, (b, g) = rng.uniform(0.3, 1.2, d), rng.normal(size=d), rng.normal(size=2)
+            F = system.force(q)
+            expected = p + b * F
+            if gradient:
+                expected = expected - g * system.potential_hessian(q) @ system.velocity(F)
+            found = functions["kick"](q.tolist(), p.tolist(), float(b), float(g))
+            np.testing.assert_allclose(found, expected, rtol=0, atol=3e-14 * (1 + np.abs(expected).max()))
+
+
+def test_a_sum_begins_with_what_is_known_first():
+    x, y, c = sp.symbols("x y c", real=True)
+    schedule = Schedule({x: 0.0, y: -20.0}, printed)
+    time, name = schedule.value(y + c * x)
+    assert time == FUSED
+    assert schedule.lines == [f"{name} = y + c*x"]
+    assert not schedule.early
+    assert schedule.operations == 1
+
+
+def test_coefficients_wait_for_nothing():
+    x, b, g = sp.symbols("x b g", real=True)
+    schedule = Schedule({x: 0.0}, printed)
+    time, _ = schedule.value(sp.Mul(3 * b - g, x, evaluate=False))
+    assert time == MULTIPLY
+    assert len(schedule.early) >= 2
+    assert len(schedule.lines) == 1
+
+
+def test_long_sums_and_powers_are_split():
+    names = sp.symbols("x_0:8", real=True)
+    time, _ = Schedule(dict.fromkeys(names, 0.0), printed).value(sp.Add(*names))
+    assert time < 7 * ADD
+    time, _ = Schedule({names[0]: 0.0}, printed).value(names[0] ** 8)
+    assert time == 3 * MULTIPLY
+
+
+def test_the_flow_steps_every_row_by_its_own_time():
+    system = systems.henon_heiles()
+    flow = SympFlow.primed(system, 2, dt=0.6, processor=2)
+    rng = np.random.default_rng(1)
+    for parameter in flow.parameters():
+        parameter.data += 0.02 * (parameter.data + 0.5)
+    kernel = PrimedFlowKernel(flow, system)
+    y = system.y0 + rng.uniform(-0.05, 0.05, (40, 4))
+    h = rng.uniform(0.05, 0.6, 40) * np.where(np.arange(40) % 3, 1.0, -1.0)
+    h[7] = 0.0
+    together = kernel.step(h, y)
+    assert np.array_equal(together[7], y[7])
+    apart = np.concatenate([kernel.step(h[i : i + 1], y[i : i + 1]) for i in range(40)])
+    assert np.abs(together - apart).max() < 1e-14
+    assert np.abs(together - y).max() > 1e-3
+    assert np.abs(kernel.step(-h, together) - y).max() < 1e-13
+    with pytest.raises(ValueError, match="`t` must lie in"):
+        kernel.step(np.linspace(0.1, 0.7, 40), y)
+
+
+def test_tables_follow_the_weights():
+    system = systems.henon_heiles()
+    flow = SympFlow.primed(system, 2, dt=0.6)
+    before, _ = PrimedFlowKernel(flow, system).run(0.6, system.y0, 10, np.array([10]))
+    flow.drifts.free.data.add_(0.01)
+    flow.kicks.free.data = flow.kicks.free.data * 1.02
+    after, _ = PrimedFlowKernel(flow, system).run(0.6, system.y0, 10, np.array([10]))
+    expected = system.y0
+    for _ in range(10):
+        expected = PrimedFlowKernel(flow, system).step(np.array([0.6]), expected[None])[0]
+    assert np.abs(after - before).max() > 1e-4
+    assert np.abs(after[0] - expected).max() < 1e-13
