@@ -164,7 +164,7 @@ def ladders() -> dict[str, Ladder]:
     }
     # d = 18: starts are dear, few and short, and the gain of more is small
     short = {"points": 40, "label_times": 5, "reference_states": 20, "steps": 200}
-    planets = tuple(Rung(3, dt, restarts=2, options=short) for dt in (200.0, 100.0))
+    planets = tuple(Rung(3, dt, restarts=2, options=short) for dt in (300.0, 200.0, 100.0))
     return {
         **{
             scene.replace("-", "_"): Ladder(SYSTEMS[scene], tuple(_rung(*each) for each in rungs))
