@@ -83,7 +83,7 @@ def _shown(row: StabilityRow) -> float:
 
 
 def _map(report: StabilityReport) -> Figure:
-    """A panel for each method: step against stiffness, coloured by energy error; unstable cells dark, as those where a flow left its domain."""
+    """A panel for each method: step against stiffness, coloured by energy error; × where it says nothing."""
     from matplotlib.colors import LogNorm
 
     labels = list(dict.fromkeys(r.label for r in report.rows if r.energy_error is not None and r.dt is not None))

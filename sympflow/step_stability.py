@@ -89,7 +89,8 @@ def stability(
     for name, count in (("min_steps", min_steps), ("max_steps", max_steps)):
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise ValueError(f"`{name}` must be a positive integer; got {count!r}.")
-    if not 0 < bound < math.inf:
+    real = isinstance(bound, int | float | np.number) and not isinstance(bound, bool)
+    if not real or np.iscomplexobj(bound) or not 0 < bound < math.inf:
         raise ValueError(f"`bound` must be positive and finite, a relative energy error; got {bound!r}.")
     lengths = None if steps is None else _checked_steps(steps)
     unknown = [d for d in dtypes if d not in ("float32", "float64")]

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from sympflow.linear_part import LinearPart
     from sympflow.symbolic import SymbolicHamiltonian
 
+MOST_DEGREES = 1_000_000
+
 
 class HamiltonianSystem:
     """A Hamiltonian system x' = J∇H(x), x = [q, p], with H autonomous.
@@ -90,8 +92,11 @@ class HamiltonianSystem:
     ) -> None:
         from sympflow.callables import CallableHamiltonian
 
-        if ndof is None or isinstance(ndof, bool) or int(ndof) != ndof or ndof < 1:
-            raise ValueError(f"`ndof` must be a positive integer, the degrees of freedom; got {ndof!r}.")
+        number = isinstance(ndof, int | float | np.number) and not isinstance(ndof, bool) and 1 <= ndof <= MOST_DEGREES
+        if ndof is None or not number or int(ndof) != ndof:
+            raise ValueError(
+                f"`ndof` must be a positive integer, at most {MOST_DEGREES:,}, the degrees of freedom; got {ndof!r}."
+            )
         definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector)
         if definition.separable:
             self._set(definition, _inverse_mass(mass, int(ndof)), True)
@@ -322,15 +327,21 @@ def _like(constant: np.ndarray, x: Array) -> Array:
 
 
 def _inverse_mass(mass: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
-    M = np.asarray(1.0 if mass is None else mass, dtype=float)
-    if M.ndim == 0:
-        M = np.full(ndof, M)
-    full = np.diag(M) if M.ndim == 1 else M
-    if full.shape != (ndof, ndof):
+    M = _real("mass", 1.0 if mass is None else mass)
+    if M.shape not in ((), (ndof,), (ndof, ndof)):
         raise ValueError(f"`mass` must be a number or have shape ({ndof},) or ({ndof}, {ndof}); got {M.shape}.")
-    if not (np.isfinite(full).all() and np.allclose(full, full.T) and np.linalg.eigvalsh(full)[0] > 0):
-        raise ValueError("`mass` must be finite, symmetric and positive definite.")
-    return _simplest_mass(np.diag(1 / M) if M.ndim == 1 else np.linalg.inv(full))
+    if M.ndim < 2:
+        M = np.broadcast_to(M, ndof)
+        if not (np.isfinite(M).all() and (M > 0).all()):
+            raise ValueError(f"`mass` must be finite, symmetric and positive definite; got {mass!r}.")
+        return None if (M == 1).all() else 1 / M
+    _check_symmetric("mass", M)
+    smallest = np.linalg.eigvalsh(M)[0]
+    if not smallest > 0:
+        raise ValueError(
+            f"`mass` must be finite, symmetric and positive definite; its smallest eigenvalue is {smallest:g}."
+        )
+    return _simplest_mass(np.linalg.inv(M))
 
 
 def _stiffness_matrix(matrix: ArrayLike | None, definition: Any) -> np.ndarray | None:
@@ -338,13 +349,31 @@ def _stiffness_matrix(matrix: ArrayLike | None, definition: Any) -> np.ndarray |
         return None
     if not definition.separable:
         raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
-    K = np.asarray(matrix, dtype=float)
-    if K.shape != (definition.ndof, definition.ndof) or not np.isfinite(K).all() or not np.allclose(K, K.T):
-        raise ValueError(
-            f"`stiffness_matrix` must be finite, symmetric and of shape ({definition.ndof}, {definition.ndof}); got "
-            f"shape {K.shape}."
-        )
+    K, d = _real("stiffness_matrix", matrix), definition.ndof
+    if K.shape != (d, d):
+        raise ValueError(f"`stiffness_matrix` must be finite, symmetric and of shape ({d}, {d}); got shape {K.shape}.")
+    _check_symmetric("stiffness_matrix", K)
     return (K + K.T) / 2
+
+
+def _real(name: str, values: ArrayLike) -> np.ndarray:
+    """The values as an array of floats."""
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "biufO":
+            raise TypeError(f"of {array.dtype}")
+        return array.astype(float)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"`{name}` must be real numbers; got {values!r}: pass a number or an array of them.") from error
+
+
+def _check_symmetric(name: str, matrix: np.ndarray) -> None:
+    """Raise with the first entry that is not finite, or differs from its mirror image."""
+    for wrong in (~np.isfinite(matrix), ~np.isclose(matrix, matrix.T)):
+        if wrong.any():
+            i, j = np.argwhere(wrong)[0].tolist()
+            mirror = f", [{j}, {i}] is {matrix[j, i]:g}" if np.isfinite(matrix[i, j]) else ""
+            raise ValueError(f"`{name}` must be finite, symmetric; its entry [{i}, {j}] is {matrix[i, j]:g}{mirror}.")
 
 
 def _simplest_mass(inverse: np.ndarray) -> np.ndarray | None:

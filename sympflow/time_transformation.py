@@ -11,6 +11,8 @@ from sympflow.arrays import Array, concatenate, is_tensor
 from sympflow.domain import Domain
 from sympflow.system import HamiltonianSystem
 
+LARGEST_SHIFT = 1e30
+
 
 def time_transformed(
     system: HamiltonianSystem, shift: float | None = None, domain: Domain | None = None
@@ -89,8 +91,12 @@ def default_shift(system: HamiltonianSystem) -> float:
 
 
 def checked_shift(shift: Any) -> float:
-    if isinstance(shift, bool) or not isinstance(shift, int | float | np.number) or not math.isfinite(shift):
-        raise ValueError(f"`shift` must be a finite number, above the energy; got {shift!r}.")
+    """The shift as a float; beside one of 1e16 times the energies these would be lost already."""
+    real = isinstance(shift, int | float | np.number) and not isinstance(shift, bool) and not np.iscomplexobj(shift)
+    if not (real and math.isfinite(shift)) or abs(shift) > LARGEST_SHIFT:
+        raise ValueError(
+            f"`shift` must be a finite number, above the energy and at most {LARGEST_SHIFT:g}; got {shift!r}."
+        )
     return float(shift)
 
 

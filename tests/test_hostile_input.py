@@ -200,6 +200,7 @@ ARGUMENTS = {
     "parts a number": ({"parts": 3}, TypeError, "`parts` must be a sequence of expressions"),
     "parts a word": ({"parts": "p**2/2"}, TypeError, "`parts` must be a sequence of expressions"),
     "shift NaN": ({"shift": math.nan}, ValueError, "`shift` must be a finite number"),
+    "shift enormous": ({"shift": 1e300}, ValueError, "`shift` must be a finite number"),
     "shift below the energy": ({"shift": -1e9}, ValueError, r"`shift` -1e\+09 does not exceed"),
     "flow a number": ({"flow": 3}, TypeError, "`flow` must be a trained flow"),
     "flow a file's name": ({"flow": "flow.safetensors"}, TypeError, "`flow` must be a trained flow"),

@@ -178,6 +178,9 @@ def test_a_map_of_a_family(tmp_path):
     [
         ({"steps": [0.1, -1]}, r"^`steps` must be positive and finite"),
         ({"steps": 0.1}, r"^`steps` must be a list"),
+        ({"bound": "a"}, r"^`bound` must be positive and finite"),
+        ({"bound": 1j}, r"^`bound` must be positive and finite"),
+        ({"bound": None}, r"^`bound` must be positive and finite"),
         ({"metrics": "energy"}, r"^`metrics` must be a list"),
         ({"metrics": ["speed"]}, r"^`metrics` must be a list of names from"),
         ({"dtypes": ["float16"]}, r"^`dtypes` must be"),

@@ -1,5 +1,6 @@
 """HamiltonianSystem: symbolic and callable definitions agree with each other and with automatic differentiation."""
 
+import math
 import pickle
 
 import numpy as np
@@ -210,6 +211,24 @@ class TestNumbaFunctions:
         (lambda: HamiltonianSystem(3, ndof=1), TypeError, "^`potential` must be callable"),
         (lambda: HamiltonianSystem(lambda q: q, ndof=2, mass=[1.0]), ValueError, "^`mass` must be a number"),
         (lambda: HamiltonianSystem(lambda q: q, ndof=2, mass=[1.0, -1.0]), ValueError, "^`mass` must be finite"),
+        (
+            lambda: HamiltonianSystem(lambda q: q, ndof=2, mass=[[1, 2], [0, 1]]),
+            ValueError,
+            r"^`mass` must be finite, symmetric; its entry \[0, 1\] is 2, \[1, 0\] is 0",
+        ),
+        (lambda: HamiltonianSystem(lambda q: q, ndof=2, mass=1j), TypeError, "^`mass` must be real numbers"),
+        (
+            lambda: HamiltonianSystem(lambda q: q, ndof=2, stiffness_matrix=1j * np.eye(2)),
+            TypeError,
+            "^`stiffness_matrix` must be real numbers",
+        ),
+        (
+            lambda: HamiltonianSystem(lambda q: q, ndof=2, stiffness_matrix=[[1, math.nan], [0, 1]]),
+            ValueError,
+            r"^`stiffness_matrix` must be finite, symmetric; its entry \[0, 1\] is nan\.",
+        ),
+        (lambda: HamiltonianSystem(lambda q: q, ndof="a"), ValueError, "^`ndof` must be a positive integer"),
+        (lambda: HamiltonianSystem(lambda q: q, ndof=math.inf), ValueError, "^`ndof` must be a positive integer"),
         (lambda: HamiltonianSystem(hamiltonian=lambda q, p: q, ndof=1, mass=2), TypeError, "^`mass` only goes with"),
         (lambda: systems.harmonic_oscillator(-1), ValueError, "^`omega` must be positive"),
     ],

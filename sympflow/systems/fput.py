@@ -10,6 +10,8 @@ from sympflow.arrays import Array
 from sympflow.domain import Box
 from sympflow.system import HamiltonianSystem
 
+LARGEST = 50  # stiff springs: H, its gradient and its Hessian are written out symbolically
+
 
 def fput(omega: float = 50.0, m: int = 3) -> HamiltonianSystem:
     """2m unit masses in a row, joined by m stiff linear springs and m + 1 soft quartic ones.
@@ -24,7 +26,7 @@ def fput(omega: float = 50.0, m: int = 3) -> HamiltonianSystem:
     omega : float
         Angular frequency of the stiff springs, positive.
     m : int
-        Number of stiff springs, at least 1.
+        Number of stiff springs, from 1 to 50: H is written out symbolically.
 
     Notes
     -----
@@ -40,8 +42,9 @@ def fput(omega: float = 50.0, m: int = 3) -> HamiltonianSystem:
     """
     if not (isinstance(omega, int | float) and 0 < omega < math.inf):
         raise ValueError(f"`omega` must be positive and finite; got {omega!r}.")
-    if isinstance(m, bool) or int(m) != m or m < 1:
-        raise ValueError(f"`m` must be a positive integer, the number of stiff springs; got {m!r}.")
+    whole = not isinstance(m, bool) and isinstance(m, int | float | np.integer) and 1 <= m <= LARGEST and int(m) == m
+    if not whole:
+        raise ValueError(f"`m` must be a positive integer, at most {LARGEST}, the number of stiff springs; got {m!r}.")
     m = int(m)
     slow, fast = [f"q{i}" for i in range(1, m + 1)], [f"q{m + i}" for i in range(1, m + 1)]
     soft = [f"({slow[0]} - {fast[0]})**4", f"({slow[-1]} + {fast[-1]})**4"]

@@ -10,6 +10,8 @@ from sympflow.arrays import Array, to_numpy
 from sympflow.domain import Ball
 from sympflow.system import HamiltonianSystem
 
+LARGEST = 100  # particles: H, its gradient and its Hessian are written out symbolically
+
 
 def toda_lattice(n: int = 3) -> HamiltonianSystem:
     """H = ½ Σ p_i² + Σ exp(q_i − q_{i+1}) − n over a ring of n unit masses, q_{n+1} = q₁.
@@ -17,7 +19,7 @@ def toda_lattice(n: int = 3) -> HamiltonianSystem:
     Parameters
     ----------
     n : int
-        Number of particles, at least 2.
+        Number of particles, from 2 to 100: H is written out symbolically.
 
     Notes
     -----
@@ -33,8 +35,9 @@ def toda_lattice(n: int = 3) -> HamiltonianSystem:
     .. [2] H. Flaschka, "The Toda lattice. II. Existence of integrals", Phys. Rev. B 9 (1974) 1924–1925.
     .. [3] M. Hénon, "Integrals of the Toda lattice", Phys. Rev. B 9 (1974) 1921–1923.
     """
-    if isinstance(n, bool) or not isinstance(n, int | float) or int(n) != n or n < 2:
-        raise ValueError(f"`n` must be an integer of at least 2, the number of particles; got {n!r}.")
+    whole = not isinstance(n, bool) and isinstance(n, int | float | np.integer) and 2 <= n <= LARGEST and int(n) == n
+    if not whole:
+        raise ValueError(f"`n` must be an integer from 2 to {LARGEST}, the number of particles; got {n!r}.")
     n = int(n)
     kinetic = " + ".join(f"p{i}**2" for i in range(1, n + 1))
     springs = " + ".join(f"exp(q{i} - q{j})" for i, j in pairwise([*range(1, n + 1), 1]))
