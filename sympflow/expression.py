@@ -22,54 +22,17 @@ MAX_TERMS = 50_000  # that the expression may have when it is multiplied out
 MAX_ARGUMENT = 1e4  # of a special function of numbers
 MAX_ARGUMENTS = 64
 
-ELEMENTARY = tuple(
-    [
-        "sqrt",
-        "cbrt",
-        "exp",
-        "log",
-        "sin",
-        "cos",
-        "tan",
-        "cot",
-        "sec",
-        "csc",
-        "asin",
-        "acos",
-        "atan",
-        "acot",
-        "atan2",
-        "sinh",
-        "cosh",
-        "tanh",
-        "coth",
-        "sech",
-        "csch",
-        "asinh",
-        "acosh",
-        "atanh",
-        "sinc",
-        "sign",
-        "Heaviside",
-    ]
+# fmt: off
+ELEMENTARY = (
+    "sqrt", "cbrt", "exp", "log", "sin", "cos", "tan", "cot", "sec", "csc", "asin", "acos", "atan", "acot",
+    "atan2", "sinh", "cosh", "tanh", "coth", "sech", "csch", "asinh", "acosh", "atanh", "sinc", "sign",
+    "Heaviside",
 )
-SPECIAL = tuple(
-    [
-        "erf",
-        "erfc",
-        "gamma",
-        "loggamma",
-        "besselj",
-        "bessely",
-        "besseli",
-        "besselk",
-        "airyai",
-        "airybi",
-        "elliptic_k",
-        "elliptic_e",
-        "LambertW",
-    ]
+SPECIAL = (
+    "erf", "erfc", "gamma", "loggamma", "besselj", "bessely", "besseli", "besselk", "airyai", "airybi",
+    "elliptic_k", "elliptic_e", "LambertW",
 )
+# fmt: on
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(sp, name) for name in (*ELEMENTARY, *SPECIAL, "Abs", "Max", "Min", "Rational")},
     "ln": sp.log,

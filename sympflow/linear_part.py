@@ -17,6 +17,7 @@ ZERO = 1e-12  # of the largest squared frequency: what is below is a free drift
 SAME = 1e-9  # relative difference below which two frequencies are one
 DRAWN, SAMPLES = 4096, 64  # states drawn, and those of lowest potential at which Hessians are compared
 GAP = 10.0  # between the curvatures of a stiff direction and of the others
+EQUILIBRIUM_STEPS = 100
 TURN = 0.1  # radians by which a stiff direction may turn and still count as constant
 
 
@@ -36,7 +37,7 @@ class LinearPart:
     stiffness_matrix : (d, d)
         K, symmetric.
     center : (d,)
-        c.
+        c. Of a system given by functions the equilibrium along the stiff directions, where their forces vanish.
     potential : sympy.Expr or None
         U(q), what the potential has beside the quadratic part, if the system is symbolic.
     interval : float
@@ -152,7 +153,7 @@ def linear_part(system: HamiltonianSystem) -> LinearPart:
     part: LinearPart | None
     if system.stiffness_matrix is not None:
         K = system.stiffness_matrix
-        part = LinearPart(_inverse_mass(system), K, np.zeros(system.ndof), None, _interval(system))
+        part = LinearPart(_inverse_mass(system), K, _equilibrium(system, K), None, _interval(system))
     elif system.symbols is not None:
         part = read_off(system.symbols.H, system.symbols.q, system.symbols.p, _interval(system))
     else:
@@ -162,6 +163,11 @@ def linear_part(system: HamiltonianSystem) -> LinearPart:
         )
     if system.quadratic_kinetic and (reason := _turns(system, part)):
         raise ValueError(f"`system` {system.name!r} has no linear part that would help: {reason}.")
+    if part is None and not system.separable:
+        raise ValueError(
+            f"`system` {system.name!r} has no linear part: no coordinate that quadratic terms bind has a momentum that "
+            "enters H by quadratic terms alone. Use 'implicit_midpoint', 'strang_parts' or a Runge–Kutta method."
+        )
     if part is None:
         raise ValueError(
             f"`system` {system.name!r} has no linear part: its potential has no quadratic terms. Use another splitting "
@@ -174,6 +180,29 @@ def _inverse_mass(system: HamiltonianSystem) -> np.ndarray:
     if not system.quadratic_kinetic:
         raise ValueError("`stiffness_matrix` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
     return np.asarray(system.kinetic_hessian(np.zeros(system.ndof)), dtype=float)
+
+
+def _equilibrium(system: HamiltonianSystem, K: np.ndarray) -> np.ndarray:
+    """c in the range of K where ∇V vanishes along it, so that the rest U stays small beside the stiff ½ (q−c)ᵀK(q−c).
+
+    By q ← q − K⁺∇V(q) from 0, or from y0 where V is singular there. Where that does not converge, K is no curvature of
+    V, and where it starts is as good as any c.
+    """
+    inverse = np.linalg.pinv(K, rcond=1 / GAP**2, hermitian=True)
+    starts = [np.zeros(system.ndof)] + ([] if system.y0 is None else [system.y0[: system.ndof]])
+    with np.errstate(all="ignore"):
+        for start in starts:
+            if not np.isfinite(system.force(start)).all():
+                continue
+            q, last = start.copy(), np.inf
+            for _ in range(EQUILIBRIUM_STEPS):
+                change = inverse @ np.asarray(system.force(q))
+                size = float(np.linalg.norm(change))
+                if not size < last:  # at the level of rounding, or nowhere near
+                    break
+                q, last = q + change, size
+            return inverse @ K @ q if last <= 1e-6 * (1 + np.linalg.norm(q)) else inverse @ K @ start
+    return np.zeros(system.ndof)
 
 
 def _interval(system: HamiltonianSystem) -> float:
@@ -276,19 +305,32 @@ def _turns(system: HamiltonianSystem, part: LinearPart | None) -> str | None:
     if not ratios[m - 1] > GAP:
         return None
     stiff = np.take_along_axis(directions, order[:, None, :m], -1)
+    if (angle := _angle(stiff[0], stiff)) > TURN:
+        return (
+            f"its stiff directions turn, by {np.degrees(angle):.0f}° from one state of the domain to others, so no "
+            "constant matrix K follows them. Write it in coordinates in which they do not turn, such as polar ones"
+        )
     if part is None:
-        reference, whose = stiff[0], "at another state of the domain"
-    else:
-        eigenvalues, W = np.linalg.eigh(L.T @ part.stiffness_matrix @ L)
-        reference, whose = W[:, np.argsort(-np.abs(eigenvalues))[:m]], "in the quadratic terms"
-    cosines = np.linalg.svd(reference.T @ stiff, compute_uv=False)[:, -1]
-    angle = float(np.arccos(np.clip(np.quantile(cosines, 0.1), 0.0, 1.0)))
-    if angle <= TURN:
         return None
+    eigenvalues, W = np.linalg.eigh(L.T @ part.stiffness_matrix @ L)
+    if (angle := _angle(W[:, np.argsort(-np.abs(eigenvalues))[:m]], stiff)) <= TURN:
+        return None
+    if system.stiffness_matrix is not None:
+        return (
+            f"`stiffness_matrix` is stiff in other directions than V, {np.degrees(angle):.0f}° away. Pass ∇²V at a "
+            "state of low potential, without what is not stiff in it"
+        )
     return (
-        f"its stiff directions turn, by {np.degrees(angle):.0f}° from those {whose}, so no constant matrix K follows "
-        "them. Write it in coordinates in which they do not turn, such as polar ones"
+        f"its stiff directions do not turn, but they are none of its quadratic terms, from the stiffest of which "
+        f"they are {np.degrees(angle):.0f}° away. Give the system by functions, HamiltonianSystem(V, ndof=…, "
+        "stiffness_matrix=K) with K the curvature ∇²V of the stiff directions"
     )
+
+
+def _angle(reference: np.ndarray, directions: np.ndarray) -> float:
+    """Angle in radians from the span of m orthonormal columns to those of others (n, d, m), exceeded by one in ten."""
+    cosines = np.linalg.svd(reference.T @ directions, compute_uv=False)[:, -1]
+    return float(np.arccos(np.clip(np.quantile(cosines, 0.1), 0.0, 1.0)))
 
 
 def _positions(system: HamiltonianSystem) -> np.ndarray | None:

@@ -67,20 +67,21 @@ class PartFunctions(SymbolicHamiltonian):
 
 
 class RestOfPotential:
-    """U(q) = V(q) − ½ qᵀKq of a system given by functions."""
+    """U(q) = V(q) − ½ (q − c)ᵀK(q − c) of a system given by functions."""
 
     of_positions = True
 
-    def __init__(self, system: HamiltonianSystem, K: np.ndarray) -> None:
-        self.system, self.K, self.ndof = system, K, system.ndof
+    def __init__(self, system: HamiltonianSystem, linear: LinearPart) -> None:
+        self.system, self.K, self.center, self.ndof = system, linear.stiffness_matrix, linear.center, system.ndof
 
     def hamiltonian(self, y: Array) -> Array:
         q = y[..., : self.ndof]
-        return self.system.potential(q) - (q * (q @ like(self.K, q))).sum(-1) / 2
+        x = q - like(self.center, q)
+        return self.system.potential(q) - (x * (x @ like(self.K, q))).sum(-1) / 2
 
     def gradient(self, y: Array) -> Array:
         q = y[..., : self.ndof]
-        return concatenate([-self.system.force(q) - q @ like(self.K, q), 0 * q])
+        return concatenate([-self.system.force(q) - (q - like(self.center, q)) @ like(self.K, q), 0 * q])
 
     def hessian_vector(self, y: Array, v: Array) -> Array:
         return self.system.hessian_vector(y[..., : self.ndof], v) - v @ like(self.K, v)
@@ -285,7 +286,7 @@ def exact_parts(system: HamiltonianSystem, expressions: Sequence[str] | None = N
         if expressions is not None:
             raise ValueError("`parts` are read as symbols, which the system has not: define it with from_sympy.")
         linear = system.linear_part
-        return ExactParts(linear, [RestOfPotential(system, linear.stiffness_matrix)], system.ndof)
+        return ExactParts(linear, [RestOfPotential(system, linear)], system.ndof)
     if expressions is None:
         return _detected(system)
     return _given(system, tuple(expressions))

@@ -5,10 +5,10 @@ import pytest
 import torch
 from scipy.linalg import expm
 
-from sympflow import HamiltonianSystem, solve
+from sympflow import HamiltonianSystem, SympFlow, solve
 from sympflow.linear_part import LinearPart
 from sympflow.parts import ExactParts, Map, exact_parts
-from sympflow.systems import fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum
+from sympflow.systems import fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum, toda_lattice
 
 
 def test_fput_is_read_off():
@@ -115,3 +115,47 @@ def test_hyperbolic_and_free_modes_compiled():
     t = sol.t
     expected = np.array([np.cos(2 * t), 0.5 * np.cosh(t) + 0.3 * np.sinh(t), 0.2 + t])
     assert np.abs(sol.q - expected).max() < 1e-13 * np.cosh(3) * 10
+
+
+def test_an_exponential_is_no_monomial():
+    morse = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 + (1 - exp(-q1))**2 + 200*q2**2", y0=[0.3, 0.01, 0, 0])
+    part = morse.linear_part
+    assert part.stiffness_matrix.tolist() == [[0, 0], [0, 400]]
+    sol = solve(morse, "linear_srkn6b", (0, 5), dt=0.05)
+    assert np.abs(sol.energy_error()).max() < 1e-4
+    toda = toda_lattice(5)
+    with pytest.raises(ValueError, match=r"has no linear part"):
+        _ = toda.linear_part
+    sol = solve(toda, "strang_parts", (0, 5), dt=0.05)
+    assert np.abs(sol.energy_error()).max() < 1e-2
+    assert SympFlow.split(toda, 2, dt=0.05).sequence == (1, 2, 1, 2, 1)
+
+
+def displaced(symbolic):
+    V = "5000*(q1 - 1)**2 + q2**4/4 + q1*q2"
+    y0 = [1.01, 0.5, 0.3, 0.2]
+    if symbolic:
+        return HamiltonianSystem.from_sympy(f"(p1**2 + p2**2)/2 + {V}", y0=y0)
+
+    def potential(q):
+        return 5000 * (q[..., 0] - 1) ** 2 + q[..., 1] ** 4 / 4 + q[..., 0] * q[..., 1]
+
+    return HamiltonianSystem(potential, ndof=2, y0=y0, stiffness_matrix=np.diag([1e4, 0.0]))
+
+
+def test_a_system_of_functions_is_split_about_its_equilibrium():
+    assert displaced(False).linear_part.center == pytest.approx([1, 0], abs=1e-6)
+    exact = solve(displaced(True), "rk45", (0, 1), rtol=1e-12, atol=1e-12).y[:, -1]
+    found = solve(displaced(False), "impulse", (0, 1), dt=0.02)
+    assert np.abs(found.y[:, -1] - exact).max() < 2e-3  # about q = 0, without the centre, it was 18
+
+
+def test_words_for_stiff_directions_that_do_not_turn():
+    system = HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 + 1e6*(1 - cos(q1)) + q1*q2**3 + q2**2/2", y0=[1e-3, 0.5, 0, 0]
+    )
+    with pytest.raises(ValueError, match=r"do not turn, but they are none of its quadratic terms.*stiffness_matrix=K"):
+        _ = system.linear_part
+    magnetic = HamiltonianSystem.from_sympy("(p1 + q2)**2/2 + (p2 - q1)**2/2 + 30*q1**2 + q2**4", y0=[1, 0, 0, 0])
+    with pytest.raises(ValueError, match=r"quadratic terms alone\. Use 'implicit_midpoint'"):
+        _ = magnetic.linear_part
