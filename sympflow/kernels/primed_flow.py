@@ -45,6 +45,7 @@ class PrimedFlowKernel:
         if str(flow.dtype) != "torch.float64" or flow.device.type != "cpu":
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
         self.flow, self._splitting, self._compensated = flow, splitting_kernel(system), compensated
+        self._weights = tuple(flow.parameters())
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` times ψ̄_h, or for h < 0 the inverse of ψ̄_|h|: see `SplittingKernel.run`."""
@@ -102,7 +103,7 @@ class PrimedFlowKernel:
 
     def _schemes(self, t: float) -> tuple[Scheme, ...]:
         """K_t and its inverse, and with a processor χ_t and its inverse."""
-        weights = tuple((w.data_ptr(), w._version) for w in self.flow.parameters())
+        weights = tuple((w.data_ptr(), w._version) for w in self._weights)
         known = _KNOWN.get(self.flow)
         if known is None or known[0] != weights or len(known[1]) >= MOST_KEPT:
             known = _KNOWN[self.flow] = weights, {}
