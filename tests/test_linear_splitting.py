@@ -6,7 +6,7 @@ import torch
 
 from sympflow import HamiltonianSystem, get, solve, symplecticity_defect
 from sympflow.integrators.linear_splitting import LINEAR_SPLITTINGS, PARTS_SPLITTINGS
-from sympflow.systems import fput, henon_heiles, spring_pendulum
+from sympflow.systems import fput, harmonic_oscillator, henon_heiles, spring_pendulum
 from sympflow.systems.fput import oscillatory_energies
 
 SOFT = fput(omega=2.0)  # where the order shows
@@ -109,3 +109,13 @@ def test_any_separable_system_splits_into_two():
     one, other = (solve(pendulum(), name, (0, 5), dt=0.1).y for name in ("strang_parts", "verlet"))
     assert np.abs(one - other).max() < 1e-13
     assert np.abs(solve(henon_heiles(), "strang_parts", (0, 1), dt=0.1).y).max() < 1
+
+
+@pytest.mark.parametrize("turns", [0.5, 1.0, 1000.0])
+def test_whole_and_half_turns_leave_no_rounding_to_add_up(turns):
+    """The reduced angle is the rounding of hω alone, and would turn the state the same way in every step."""
+    h, n = 2 * np.pi * turns, 1_000_000
+    oscillator = harmonic_oscillator(1.0)
+    sol = solve(oscillator, "impulse", (0.0, n * h), [1.0, 0.3], dt=h, t_eval=[(n - 1) * h, n * h], backend="compiled")
+    assert np.abs(sol.energy_error()).max() < 1e-15
+    np.testing.assert_allclose(sol.y[:, -1], [1.0, 0.3], rtol=1e-15)
