@@ -41,7 +41,8 @@ class ShippedFlow:
     cost : float or None
         Of a unit of time, in force evaluations: see `sympflow.training.ladder.cost`. Outputs are not counted.
     energy_error : float or None
-        Largest relative energy error up to `t_end`, the 95 % quantile over held-out states.
+        Largest relative energy error up to `t_end`, that 95 % of the states of Ω stay below: an upper 99 % confidence
+        limit of the quantile, from 1000 held-out states.
     t_end : float or None
     one_step_error, fractional_error : float or None
         Means over held-out states: at Δt, and over 50 times before it.
