@@ -200,6 +200,8 @@ class SplitFlow(SympFlow):
                 c.set(np.eye(1, terms).repeat(c.n, 0) / (c.n if c.power else 1))
         self._binding = PartsBinding(system, expressions)
         self._known: tuple[Any, list[Map]] | None = None
+        self._counted: tuple[list[Map], tuple[Any, ...], dict[str, int]] | None = None
+        self._free = [column.free for column in self.columns()]  # in a list: walking the modules takes longer
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(SplitLayer(self, i) for i in range(len(self.sequence)))  # type: ignore[assignment]
         if system is not None:
@@ -223,7 +225,7 @@ class SplitFlow(SympFlow):
         """The same of an array of times, for the compiled loops; for t < 0 the inverse of ψ̄_|t| (one sign for all)."""
         t = np.asarray(t, dtype=float)
         if t.ndim == 0:  # every step of every run with this step is made of these
-            key = (float(t), *((id(w), w._version) for w in self.parameters()))
+            key = (float(t), *((w.data_ptr(), w._version) for w in self._free))
             if self._known is None or self._known[0] != key:
                 self._known = key, self._numpy_maps(t)
             return self._known[1]
@@ -280,7 +282,11 @@ class SplitFlow(SympFlow):
         """Evaluations of the slopes of parts, and of force gradients, as `FixedStep.evaluations`."""
         from sympflow.integrators.linear_splitting import map_evaluations
 
-        return map_evaluations(self.numpy_maps(np.array(self.dt)), n_steps, n_saved, n_extra, backend)
+        maps = self.numpy_maps(np.array(self.dt))
+        key = (n_steps, n_saved, n_extra, backend)
+        if self._counted is None or self._counted[0] is not maps or self._counted[1] != key:
+            self._counted = maps, key, map_evaluations(maps, n_steps, n_saved, n_extra, backend)
+        return dict(self._counted[2])
 
     # its system ---------------------------------------------------------------------------------------------
 
