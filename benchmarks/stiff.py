@@ -3,9 +3,10 @@
     python benchmarks/stiff.py                        both frequencies of FPUT, the pendulum, the oscillator
     python benchmarks/stiff.py --only fput --omega 50
 
-FPUT runs over T = 200 from y0; energy errors are the largest of 1000 instants, |I − 1| of 20,000. Of the splitting schemes with the exact linear
-flow (every table of the package, with the drift replaced) the cheapest is sought that has an error of at most 1e-4,
-and the cheapest that is as good as the flow; they are then timed against it in turn, on one thread, by processor time:
+FPUT runs over T = 200 from y0; energy errors are the largest of 1000 instants, |I − 1| of 20,000. Of the splitting
+schemes with the exact linear flow (every table of the package, with the drift replaced) the cheapest is sought that has
+an error of at most 1e-4, and the cheapest that is as good as the flow;
+they are then timed against it in turn, on one thread, by processor time:
 of a whole call of `solve` with 1000 outputs, which for a flow checks its domain as well, and of the compiled loops.
 Radau and DOP853 are SciPy's, over the interval stated.
 """
