@@ -30,8 +30,8 @@ class Grid:
         quotient = (self.t1 - self.t0) / self.h
         if quotient > 1.000001 * MOST_STEPS:
             raise ValueError(
-                f"`dt` {dt:g} needs {quotient:.3g} steps from {t0:g} to {t1:g}, more than the {MOST_STEPS:.0e} that are "
-                "run: increase it."
+                f"`dt` {dt:g} needs {quotient:.3g} steps from {t0:g} to {t1:g}, more than the {MOST_STEPS:.0e} that "
+                "are run: increase it."
             )
         far = max(abs(self.t0), abs(self.t1))
         if self.t0 != self.t1 and far + abs(self.h) == far:
