@@ -352,3 +352,10 @@ def test_mass_and_general_kinetic_energy():
 def test_top_level_names_exist():
     for name in sympflow.__all__:
         assert getattr(sympflow, name) is not None
+
+
+def test_y0_may_be_a_parameter_of_torch():
+    y0 = torch.nn.Parameter(torch.tensor([0.5, 0.3], dtype=torch.float64))
+    sol = sympflow.solve(sympflow.systems.pendulum(), "verlet", (0.0, 1.0), y0, t_eval=[0.33, 1.0])
+    sol.y.sum().backward()
+    assert torch.isfinite(y0.grad).all()

@@ -317,9 +317,9 @@ def rollout(
 
 def checked_state(y_next: Any, y: Array) -> Array:
     """The result of a step from y, of the same kind, shape and dtype: a step may be that of a plug-in."""
-    if type(y_next) is type(y) and y_next.shape == y.shape and y_next.dtype == y.dtype:
-        return y_next
     shape = getattr(y_next, "shape", None)
+    if shape == y.shape and y_next.dtype == y.dtype and is_tensor(y_next) == is_tensor(y):
+        return y_next
     what = "" if shape is None else f" of {y_next.dtype} and shape {tuple(shape)}"
     raise TypeError(
         f"`step` must return states as those that it is given, of {y.dtype} and shape {tuple(y.shape)}; got "
