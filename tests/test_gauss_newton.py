@@ -14,7 +14,8 @@ from sympflow.training.collocation import Stream, states
 from sympflow.training.gauss_newton import GaussNewtonConfig, GaussNewtonRun
 from sympflow.training.labels import Labels
 from sympflow.training.levenberg_marquardt import levenberg_marquardt
-from sympflow.training.table_fit import Table
+from sympflow.training.recipes import default_recipe
+from sympflow.training.table_fit import Table, TableFit
 from sympflow.training.table_jacobian import TableStep
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
@@ -472,3 +473,73 @@ def test_systems_it_does_not_apply_to():
 
 def test_training_states_are_not_the_held_out_ones():
     assert not np.array_equal(states(HH.domain, 3, 0, Stream.RESIDUAL), states(HH.domain, 3, 0, Stream.REFERENCE))
+
+
+# what a fit must not do -----------------------------------------------------------------------------------------
+
+
+def _labels_at(t, n=60):
+    x = PENDULUM.domain.sample(n, 0)
+    y = solve(PENDULUM, "kahan_li8", (0.0, t), y0=x, dt=t / 40, t_eval=[t]).y[..., 0]
+    return np.full(n, t), x, y
+
+
+def test_data_without_labels_at_dt_are_refused():
+    """They fix the polynomials up to t = 0.2, and Δt = 0.5 is where the flow is used."""
+    start = SympFlow.primed(PENDULUM, 2, dt=0.5, processor=2)
+    with pytest.raises(ValueError, match=r"^`data` has no labels at Δt = 0.5.*end at 0.2.*dt=0.2"):
+        train(PENDULUM, flow=start, data=_labels_at(0.2), restarts=2, steps=8, progress=False)
+
+
+def test_a_fit_returns_nothing_worse_than_its_start():
+    """Labels at Δt of another system: the flow as it was given is nearer to the exact one at the held-out states."""
+    start = SympFlow.primed(PENDULUM, 2, dt=0.5, processor=2)
+    t, x, y = _labels_at(0.5)
+    with pytest.warns(RuntimeWarning, match=r"^The fit has a larger held-out error .* started from"):
+        flow = train(PENDULUM, flow=start, data=(t, x, 2 * y), restarts=2, steps=8, progress=False)
+    for name, value in start.state_dict().items():
+        torch.testing.assert_close(flow.state_dict()[name], value, rtol=0, atol=1e-15)
+    assert flow.recipe["stages"][-1]["kept_start"] is True
+    assert flow.figures["one_step_error"] < 0.05
+
+
+def test_a_loss_is_named_once():
+    with pytest.raises(ValueError, match=r"^`loss` 'labels\+labels' names a loss twice"):
+        train(PENDULUM, loss="labels+labels", restarts=1, steps=1, progress=False)
+
+
+def test_a_checkpoint_is_there_before_the_first_search_ends(tmp_path, monkeypatch):
+    """A run that is killed in its first search can be resumed, and ends as one that was not."""
+    path = tmp_path / "run.pt"
+    options = {"restarts": 2, "steps": 6, "points": 30, "reference_states": 10, "progress": False}
+    start = SympFlow.primed(PENDULUM, 2, dt=0.5)
+    whole = train(PENDULUM, flow=start, **options)
+
+    class Killed(BaseException):
+        pass
+
+    def kill(*_, **__):
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(TableFit, "minimize", kill)
+        train(PENDULUM, flow=start, checkpoint=path, **options)
+    resumed = train(PENDULUM, flow=start, resume=path, **options)
+    assert all(torch.equal(v, resumed.state_dict()[k]) for k, v in whole.state_dict().items())
+
+
+def test_nothing_said_means_at_most_a_minute(monkeypatch):
+    """A search that is out of time ends with what it has, says so in the recipe, and does not warn."""
+    monkeypatch.setattr("sympflow.training.trainer.BUDGET", 1.5)
+    flow = train(PENDULUM, points=60, reference_states=20, progress=False)
+    stage = flow.recipe["stages"][-1]
+    assert stage["restarts_taken"] < stage["restarts"] == 24
+    assert stage["ended_early"] == "the time budget was used up"
+    assert flow.figures["one_step_error"] < 1e-3
+    seen = {}
+    monkeypatch.setattr(GaussNewtonRun, "go", lambda self, _, budget, *__: seen.update(budget=budget) or 1 / 0)
+    for options, budget in (({"restarts": 1}, None), ({"steps": 1}, None), ({"time_budget": 7.0}, 7.0)):
+        with pytest.raises(ZeroDivisionError):
+            train(PENDULUM, points=30, reference_states=5, **options)
+        assert seen["budget"] == budget
+    assert default_recipe(PENDULUM).time_budget == 60.0

@@ -39,7 +39,10 @@ def train(
     matching_weight: Annotated[float | None, typer.Option(help="Weight of Hamiltonian matching.")] = None,
     label_weight: Annotated[float | None, typer.Option(help="Weight of labels, the exact flow of states.")] = None,
     restarts: Annotated[int | None, typer.Option(help="Starts of the search for a primed flow.")] = None,
-    time_budget: Annotated[float | None, typer.Option(help="Stop after so many seconds.")] = None,
+    time_budget: Annotated[
+        float | None,
+        typer.Option(help="Stop after so many seconds. Default: 60 for a primed flow without --restarts and --steps."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of points and initial weights.")] = 0,
     to: Annotated[
         Path | None, typer.Option("--out", help="File for the flow. Default: SYSTEM-KIND.safetensors.")
@@ -51,8 +54,8 @@ def train(
 ) -> None:
     """Train a flow for a system and save it.
 
-    With nothing else said, a system with separable H gets a flow primed with its own V and T, in less than a minute;
-    any other, or where an option is one of networks, a SympFlow with neural potentials.
+    With nothing else said, a system with separable H gets a flow primed with its own V and T, in at most
+    about a minute (--time-budget); any other, or where an option is one of networks, a SympFlow with neural potentials.
 
     Examples:
 

@@ -41,6 +41,8 @@ def weights_of(
     names = loss.split("+") if isinstance(loss, str) else []
     if not names or not set(names) <= {"residual", "matching", "labels"}:
         raise ValueError(f"`loss` {loss!r} is unknown: join some of residual, matching and labels by +.")
+    if len(set(names)) < len(names):
+        raise ValueError(f"`loss` {loss!r} names a loss twice: name it once, and give it more weight by its `_weight`.")
     chosen = {
         "residual": residual_weight,
         "matching": 1.0 if matching_weight is None else matching_weight,

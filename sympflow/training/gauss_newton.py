@@ -40,6 +40,7 @@ FITTED = 2  # tables from which the polynomials are fitted
 SEARCH_STEPS = 60  # iterations from each start
 SEARCH_SHARE, FROZEN_SHARE = 0.4, 0.7  # of a time budget, that the search, and all work on frozen tables, may use
 FRACTIONAL_TIMES = 50
+OUT_OF_TIME = "the time budget was used up"
 FEWEST_POINTS, MOST_POINTS, COORDINATES = 40, 250, 1000
 FITTED_POINTS = 120  # that are enough for the polynomials: at each of several times
 
@@ -127,6 +128,7 @@ class GaussNewtonRun:
     minima: list[Minimum] = field(default_factory=list)
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
+    kept_start: bool = False
 
     @classmethod
     def start(
@@ -156,6 +158,12 @@ class GaussNewtonRun:
             parts.append((config.label_weight, TableFit(step, labels, *table.polynomial(t), unit, weight)))
         elif config.label_weight and data is not None:
             at_end = np.abs(data[0] - flow.dt) <= 1e-9 * flow.dt
+            if not (at_end.any() or config.residual_weight or config.matching_weight):
+                raise ValueError(
+                    f"`data` has no labels at Δt = {flow.dt:g}, where the flow is used most: its times end at "
+                    f"{data[0].max():g}, beyond which the fit would be arbitrary. Label states at Δt as well, make the "
+                    f"flow with dt={data[0].max():g}, or add the residual by loss='labels+residual'."
+                )
             if 2 * system.ndof * at_end.sum() >= 2 * table.n:
                 labels = Labels(data[0][at_end][-1:], data[1][at_end], data[2][at_end][None])
                 frozen = TableFit(step, labels, *table.frozen(flow.dt), unit, np.ones(1))
@@ -182,6 +190,7 @@ class GaussNewtonRun:
         begin, before, reason = time.perf_counter(), self.seconds, None
         table = Table(self.flow)
         given = table.parameters()
+        at_start = errors(self.flow, self.step, self.held_out)
 
         def spent(share: float = 1.0) -> bool:
             self.seconds = before + time.perf_counter() - begin
@@ -195,6 +204,8 @@ class GaussNewtonRun:
 
         label = f"{self.system.name} {self.flow.kind}"
         try:
+            if checkpoint is not None and not self.minima:  # a first search may be long
+                self.save(checkpoint)
             with make_progress(progress, self.config.restarts, label, len(self.minima)) as bar:
                 while len(self.minima) < self.config.restarts and not search_is_spent():
                     steps = min(SEARCH_STEPS, self.config.steps)
@@ -212,7 +223,7 @@ class GaussNewtonRun:
         except KeyboardInterrupt:
             reason = "it was interrupted"
         if len(self.minima) < self.config.restarts and reason is None:
-            reason = "the time budget was used up"
+            reason = OUT_OF_TIME
 
         finalists = _distinct(self.minima)[:FINALISTS]
         if self.frozen is not None:
@@ -224,9 +235,24 @@ class GaussNewtonRun:
         if not math.isfinite(best.cost):
             raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
         table.assign(best.x)
+        self._keep_better(table, given, at_start)
         self._record(best)
         spent()
         return reason
+
+    def _keep_better(self, table: Table, given: np.ndarray, at_start: dict[str, float]) -> None:
+        """Go back to where the run began if that is nearer to the exact flow at the held-out states."""
+        before, after = (_distance(e) for e in (at_start, errors(self.flow, self.step, self.held_out)))
+        if after <= before or not math.isfinite(before):
+            return
+        table.assign(given)
+        self.kept_start = True
+        warnings.warn(
+            f"The fit has a larger held-out error ({after:.1e}) than the flow that it started from ({before:.1e}), "
+            "which is returned: its data are too few, too far from Δt, or not of this system.",
+            RuntimeWarning,
+            stacklevel=4,
+        )
 
     def _start(self, table: Table, given: np.ndarray) -> np.ndarray:
         """Where the next search begins: the flow as it was given, then random tables."""
@@ -255,9 +281,9 @@ class GaussNewtonRun:
         self.history.append(figures)
         return figures
 
-    def finish(self, reason: str | None) -> PrimedFlow:
-        """The flow with its record."""
-        if reason is not None:
+    def finish(self, reason: str | None, expected: bool = False) -> PrimedFlow:
+        """The flow with its record; an expected end is only recorded."""
+        if reason is not None and not (expected and reason == OUT_OF_TIME):
             warnings.warn(
                 f"Training ended after {len(self.minima)} of {self.config.restarts} starts because {reason}. "
                 "The best state so far is returned.",
@@ -273,6 +299,7 @@ class GaussNewtonRun:
             "restarts_taken": len(self.minima),
             "iterations": sum(int(h["iterations"]) for h in self.history),
             "ended_early": reason,
+            **({"kept_start": True} if self.kept_start else {}),
         }
         flow.recipe = {
             "stages": [*flow.recipe.get("stages", []), stage],
@@ -296,7 +323,7 @@ class GaussNewtonRun:
     def save(self, path: Path) -> None:
         """The searches so far, each with its end; `best` is the flow that the best of them gives."""
         state = self.flow.state_dict()
-        ends = torch.as_tensor(np.stack([m.x for m in self.minima]))
+        ends = torch.as_tensor(np.stack([m.x for m in self.minima]) if self.minima else np.empty((0, 0)))
         searches = {
             "x": ends,
             "cost": [m.cost for m in self.minima],
@@ -341,8 +368,14 @@ def _tensors(data: tuple[np.ndarray, ...] | None) -> Any:
     return None if data is None else tuple(torch.as_tensor(a, dtype=torch.float64) for a in data)
 
 
+def _distance(figures: dict[str, float]) -> float:
+    """Of a flow from the exact one, at Δt and before it; infinite if anything is not a number."""
+    both = figures["one_step_error"] + figures["fractional_error"]
+    return both if math.isfinite(both) else math.inf
+
+
 def errors(flow: PrimedFlow, step: TableStep, labels: Labels) -> dict[str, float]:
-    """‖ψ̄_t(x) − φ_H,t(x)‖ at the labels: mean and largest at Δt, the last time; mean over the times before it."""
+    """‖ψ̄_t(x) − φ_H,t(x)‖ at the labels: mean, median and largest at Δt, the last time; mean before it."""
     table = Table(flow)
     offset, design = table.polynomial(labels.t)
     coefficients = offset + design @ table.parameters()
@@ -350,6 +383,7 @@ def errors(flow: PrimedFlow, step: TableStep, labels: Labels) -> dict[str, float
     error = np.linalg.norm(psi - labels.y, axis=-1)
     return {
         "one_step_error": float(error[-1].mean()),
+        "one_step_error_median": float(np.median(error[-1])),
         "one_step_error_max": float(error[-1].max()),
         "fractional_error": float(error[:-1].mean()),
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 import math
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,7 +23,7 @@ from sympflow.training.arguments import digest, domain_for, labels_of, weights_o
 from sympflow.training.collocation import Stream, states
 from sympflow.training.config import TrainingConfig
 from sympflow.training.gauss_newton import GaussNewtonConfig, GaussNewtonRun
-from sympflow.training.recipes import default_recipe
+from sympflow.training.recipes import BUDGET, default_recipe
 from sympflow.training.run import Path, Run
 
 SCALING_SAMPLES = 4096
@@ -116,7 +117,8 @@ def train(
         Go on from this checkpoint, given the same arguments otherwise; the weights end bit-identical to those of a
         run that was not interrupted.
     time_budget : float, optional
-        Stop after so many seconds.
+        Stop after so many seconds. The default for a new primed flow is 60, unless `restarts`, `steps` or `resume` is
+        given: the search then takes fewer starts than it might, which the recipe records; else there is none.
     progress : bool, optional
         Show a progress bar; the default is on a terminal only.
     callback : callable, optional
@@ -138,7 +140,7 @@ def train(
     FloatingPointError
         If the loss is not finite from the start.
     """
-    given = dict(locals())
+    given, begin = dict(locals()), time.perf_counter()
     domain = domain_for(system, domain)
     if time_budget is not None and not 0 < time_budget < math.inf:
         raise ValueError(f"`time_budget` must be a positive number of seconds; got {time_budget!r}.")
@@ -172,6 +174,7 @@ def train(
             if new[name] is not None:
                 raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
     optimizer = ("gauss-newton" if kind == "primed" else "adam") if optimizer is None else optimizer
+    hurried = flow is None and time_budget is None and restarts is None and steps is None and resume is None
     if flow is None and kind == "primed":
         flow = _primed(system, domain, dt, stages, processor, dtype, device)
     dt = flow.dt if flow is not None else 1.0 if dt is None else float(dt)
@@ -207,7 +210,9 @@ def train(
         search = GaussNewtonRun.start(flow, system, domain, scaling, labelled, handed)
         if resume is not None:
             search.load(resume)
-        return search.finish(search.go(checkpoint, time_budget, progress, callback))
+        if hurried:  # labels and their compilation are part of the minute
+            time_budget = max(BUDGET - (time.perf_counter() - begin), 1.0)
+        return search.finish(search.go(checkpoint, time_budget, progress, callback), expected=hurried)
     _refuse_options(given, _OF_TABLES, f"optimizer {optimizer!r} for flows of kind {kind!r}")
     if optimizer != "adam":
         _refuse_options(given, ("learning_rate", "schedule", "clip"), f"optimizer {optimizer!r}")
