@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import subprocess
 import sys
 
@@ -217,3 +218,11 @@ def test_bench_writes_the_diagram(tmp_path):
     assert result.exit_code == 0, result.output
     assert "For an energy error of" in result.output
     assert {p.suffix for p in tmp_path.glob("pendulum-work-precision*")} == {".csv", ".json", ".png"}
+
+
+def test_solve_takes_a_tolerance():
+    result = run("solve", "kepler", "--tol", 1e-5, "--t-end", 20)
+    assert result.exit_code == 0
+    assert float(re.search(r"largest energy error (\S+)", result.output)[1]) <= 1e-5
+    refused = run("solve", "kepler", "--method", "verlet", "--tol", 1e-5)
+    assert refused.exit_code != 0 and "`tol` is not an option of" in refused.output

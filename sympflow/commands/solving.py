@@ -22,6 +22,9 @@ def solve(
     t_end: TEnd = None,
     y0: State = None,
     dt: Step = None,
+    tol: Annotated[
+        float | None, typer.Option(help="Take the cheapest shipped flow with so small a relative energy error.")
+    ] = None,
     n_outputs: Annotated[
         int | None, typer.Option(help="Number of equal intervals between outputs. Default: every step.")
     ] = None,
@@ -38,6 +41,8 @@ def solve(
 
       sympflow solve harmonic-oscillator --omega 100 --out orbit.npz
 
+      sympflow solve kepler --tol 1e-6
+
       sympflow solve pendulum --method rk45:rtol=1e-8 --y0 1.5,0
     """
     with reporting():
@@ -53,7 +58,7 @@ def solve(
         times = None if n_outputs is None else np.linspace(*span, n_outputs + 1)
         if to is not None:
             ready_file(to)
-        options: dict[str, Any] = {} if dt is None else {"dt": dt}
+        options: dict[str, Any] = {name: value for name, value in (("dt", dt), ("tol", tol)) if value is not None}
         sol = solve_system(scene.system, chosen, span, state(y0), t_eval=times, backend=backend, **options)
         if to is not None:
             write_solution(sol, to)

@@ -12,6 +12,7 @@ import math
 import os
 import struct
 import tempfile
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,8 +45,12 @@ def save(flow: FlowMap, path: str | os.PathLike[str]) -> None:
     TypeError
         If `path` is not a path.
     ValueError
-        If a weight is not finite, the flow's certificate is one of other weights, or its record is one that `load`
-        would refuse.
+        If a weight is not finite, or the record is one that `load` would refuse.
+
+    Warns
+    -----
+    RuntimeWarning
+        If the flow's certificate is one of other weights: it is left out.
     """
     path = _path(path)
     tensors = {name: value.detach().cpu().contiguous() for name, value in flow.state_dict().items()}
@@ -66,11 +71,15 @@ def save(flow: FlowMap, path: str | os.PathLike[str]) -> None:
         "checksum": checksum(tensors),
     }
     if flow.certified is not None:
-        if flow.certified.weights != record["checksum"]:
-            raise ValueError(
-                "`flow` was changed after its certificate was computed: compute it again by flow.certificate(system)."
+        if flow.certified.weights == record["checksum"]:
+            record["certificate"] = flow.certified.to_dict()
+        else:
+            warnings.warn(
+                "`flow` was changed, or converted to another precision, after its certificate was computed, which is "
+                "therefore not stored: compute it again by flow.certificate(system) before saving.",
+                RuntimeWarning,
+                stacklevel=3,
             )
-        record["certificate"] = flow.certified.to_dict()
     record = _finite(record)
     record["seal"] = seal(record)
     try:

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -186,7 +187,7 @@ def choose(system: HamiltonianSystem, kind: str = "sympflow", tol: float | None 
     ValueError
         If there is none; the message lists those there are.
     """
-    if tol is not None and not (isinstance(tol, int | float) and not isinstance(tol, bool) and 0 < tol < math.inf):
+    if tol is not None and not (isinstance(tol, Real) and not isinstance(tol, bool) and 0 < tol < math.inf):
         raise ValueError(f"`tol` must be a positive number, a relative energy error; got {tol!r}.")
     own = shipped_flows(system, kind)
     if not own:

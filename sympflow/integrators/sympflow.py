@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -264,7 +265,7 @@ class SympFlowIntegrator(FlowIntegrator):
         check_flag("compensated", self.compensated)
         if self.tol is None:
             return
-        if not isinstance(self.tol, int | float) or isinstance(self.tol, bool) or not 0 < self.tol < math.inf:
+        if not isinstance(self.tol, Real) or isinstance(self.tol, bool) or not 0 < self.tol < math.inf:
             raise ValueError(f"`tol` must be a positive number, a relative energy error; got {self.tol!r}.")
         for name in ("flow", "dt"):
             if getattr(self, name) is not None:
