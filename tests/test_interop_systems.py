@@ -120,3 +120,57 @@ class FloatModule(torch.nn.Module):
 def test_what_is_no_function_is_refused():
     with pytest.raises(TypeError, match=r"^`module` must be a function module\(t, y\) or a torch module; got str"):
         from_module("pendulum", ndof=1)
+
+
+def oscillator_in_units_of(e):
+    return lambda q, p: ((p**2).sum(-1) / e + e * (q**2).sum(-1)) / 2
+
+
+@pytest.mark.parametrize("e", [1e-9, 1e-4, 1.0, 3e4, 3e5, 3e6, 7e8])
+def test_the_units_do_not_matter(e):
+    """The mass is found to rounding, and a coupling q·p, or a term linear in p, is never dropped."""
+    plain, y0 = oscillator_in_units_of(e), [1.0, e]
+    system = from_hamiltonian(plain, 1, y0=y0)
+    assert system.separable
+    y = np.array([[0.7, 0.2 * e], [-0.3, 1.1 * e]])
+    np.testing.assert_allclose(system.vector_field(y), np.stack([y[:, 1] / e, -e * y[:, 0]], -1), rtol=1e-14)
+    for extra in (lambda q, p: 0.3 * (q * p).sum(-1), lambda q, p: 0.3 * p.sum(-1)):
+        both = from_hamiltonian(lambda q, p, extra=extra: plain(q, p) + extra(q, p), 1, y0=y0)
+        assert not both.separable
+
+
+@pytest.mark.parametrize("e", [1e-9, 1.0, 7e8])
+def test_the_units_of_a_module_do_not_matter(e):
+    def with_coupling(c, d):
+        return lambda t, y: torch.stack([y[..., 1] / e + c * y[..., 0], -e * y[..., 0] - d * y[..., 1]], -1)
+
+    assert from_module(with_coupling(0.0, 0.0), 1, y0=[1.0, e]).separable
+    assert not from_module(with_coupling(0.3, 0.3), 1, y0=[1.0, e]).separable
+    with pytest.raises(ValueError, match=r"^`module` is not a Hamiltonian field"):
+        from_module(with_coupling(0.3, 0.2), 1, y0=[1.0, e])
+
+
+def test_masses_of_very_different_size():
+    system = from_hamiltonian(lambda q, p: p[..., 0] ** 2 / 2 + p[..., 1] ** 2 / 2e9 + (q**4).sum(-1), 2)
+    assert system.separable
+    np.testing.assert_array_equal(system.vector_field(np.array([0.0, 0.0, 3.0, 3e9]))[:2], [3.0, 3.0])
+    free = from_hamiltonian(lambda q, p: (p**2).sum(-1) / 6e4, 2)
+    np.testing.assert_array_equal(free.vector_field(np.array([0.0, 0.0, 3e4, 6e4]))[:2], [1.0, 2.0])
+
+
+def test_a_field_that_changes_late_is_not_autonomous():
+    with pytest.raises(ValueError, match=r"^`module` depends on t"):
+        from_module(lambda t, y: Field()(t, y) * (1.0 if t < 5 else 2.0), 2, y0=HH.y0)
+
+
+@pytest.mark.parametrize("y0", [[0.0, 0.0], [0.0, 0.0, 0.0, np.nan], [[0.0] * 4]])
+def test_a_bad_y0_is_named(y0):
+    with pytest.raises(ValueError, match=r"^`y0` must be 4 finite numbers, \[q, p\] for ndof = 2; got "):
+        from_hamiltonian(henon_heiles, ndof=2, y0=y0)
+
+
+def test_a_function_of_arrays_is_told_to_use_torch():
+    with pytest.raises(TypeError, match=r"^`H` cannot be differentiated .*torch functions"):
+        from_hamiltonian(lambda q, p: torch.from_numpy((q.numpy() ** 2 + p.numpy() ** 2).sum(-1)), 2)
+    with pytest.raises(ValueError, match=r"^`H` .*with torch functions; .* gave a NumPy array"):
+        from_hamiltonian(lambda q, p: (q.detach().numpy() ** 2).sum(-1), 2)

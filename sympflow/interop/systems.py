@@ -14,7 +14,8 @@ from sympflow.system import HamiltonianSystem
 
 N_NODES = 16  # Gauss–Legendre nodes of the line integral: exact for fields of degree 31
 TOLERANCE = 1e-8
-TIMES = (0.0, 0.3719, 1.0, 3.14159265)  # at which a field must be the same to count as autonomous
+EXACT = 1e-12  # what is smaller by this, in any units, is rounding
+TIMES = (0.0, 0.3719, 1.0, 3.14159265, 5.6, 13.7, -2.3, 51.3, 407.0, 1e4)  # where an autonomous field is the same
 
 
 def from_hamiltonian(H: Callable[[Tensor, Tensor], Tensor], ndof: int, **scene: Any) -> HamiltonianSystem:
@@ -47,16 +48,23 @@ def from_hamiltonian(H: Callable[[Tensor, Tensor], Tensor], ndof: int, **scene: 
     except RuntimeError as error:
         raise TypeError(f"`H` failed on float64 states ({error}): if it is a module, call its .double().") from error
     if not (isinstance(values, Tensor) and values.shape == probes.shape[:-1]):
+        gave = "a NumPy array" if isinstance(values, np.ndarray) else tuple(getattr(values, "shape", ()))
         raise ValueError(
-            f"`H` must map q, p of shape (..., {ndof}) to (...), with torch functions; for (8, {ndof}) it gave "
-            f"{tuple(getattr(values, 'shape', ()))}. Sum over the last axis."
+            f"`H` must map q, p of shape (..., {ndof}) to (...), with torch functions; for (8, {ndof}) it gave {gave}. "
+            "Sum over the last axis."
         )
-    hessian = torch.func.vmap(torch.func.hessian(lambda y: H(y[:ndof], y[ndof:])))(probes)
-    velocity = torch.func.grad(lambda p: H(probes[:, :ndof], p).sum())(probes[:, ndof:])
-    M_inverse = _inverse_mass(hessian[:, :ndof, ndof:], hessian[:, ndof:, ndof:], probes[:, ndof:], velocity)
-    if M_inverse is None:
+    try:
+        hessian = torch.func.vmap(torch.func.hessian(lambda y: H(y[:ndof], y[ndof:])))(probes)
+    except RuntimeError as error:
+        raise TypeError(f"`H` cannot be differentiated ({error}): write it with torch functions throughout.") from error
+
+    def gradient(y: Tensor) -> Tensor:
+        return torch.func.grad(lambda y: H(y[:, :ndof], y[:, ndof:]).sum())(y)
+
+    mass = _mass(hessian, gradient, probes)
+    if mass is None:
         return HamiltonianSystem(hamiltonian=H, ndof=ndof, **scene)
-    return HamiltonianSystem(lambda q: H(q, torch.zeros_like(q)), ndof=ndof, mass=np.linalg.inv(M_inverse), **scene)
+    return HamiltonianSystem(lambda q: H(q, torch.zeros_like(q)), ndof=ndof, mass=mass, **scene)
 
 
 def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any) -> HamiltonianSystem:
@@ -89,7 +97,7 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
         raise TypeError(f"`module` failed on float64 states ({error}): call module.double() first.") from error
     if f.shape != probes.shape:
         raise ValueError(f"`module` must map (..., {2 * ndof}) to the same shape, [q', p']; got {tuple(f.shape)}.")
-    if not all(torch.allclose(f, g, rtol=1e-10, atol=1e-12) for g in later):
+    if not all(_close(g, f, 1e-10) for g in later):
         raise ValueError("`module` depends on t, which is not supported: freeze the time, or extend the phase space.")
 
     zero = torch.zeros((), dtype=probes.dtype)
@@ -99,7 +107,7 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
         return torch.cat([-force, velocity], dim=-1)
 
     jacobian = torch.func.vmap(torch.func.jacrev(minus_J_f))(probes)
-    asymmetry = float((jacobian - jacobian.mT).abs().max() / jacobian.abs().max().clamp(min=1e-300))
+    asymmetry = _asymmetry(jacobian.detach().numpy())
     if asymmetry > TOLERANCE:
         raise ValueError(
             f"`module` is not a Hamiltonian field in y = [q, p]: −J·f' is asymmetric by {asymmetry:.1e}. Check the "
@@ -114,19 +122,18 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
         return (w * (minus_J_f(s * y) * y).sum(-1)).sum(0)
 
     slope = torch.func.grad(lambda y: H(y[:, :ndof], y[:, ndof:]).sum())(probes)
-    if not torch.allclose(slope, minus_J_f(probes).detach(), rtol=TOLERANCE, atol=TOLERANCE):
+    if not _close(slope, minus_J_f(probes), TOLERANCE):
         raise ValueError(
             "`module` is not smooth on the straight lines from the origin to the states, along which H is integrated "
             "(a singularity lies on them): give H itself, with from_hamiltonian or HamiltonianSystem."
         )
-    M_inverse = _inverse_mass(jacobian[:, :ndof, ndof:], jacobian[:, ndof:, ndof:], probes[:, ndof:], f[:, :ndof])
-    if M_inverse is None:
+    mass = _mass(jacobian, minus_J_f, probes)
+    if mass is None:
         return HamiltonianSystem(hamiltonian=H, ndof=ndof, **scene)
 
     def gradient(q: Tensor) -> Tensor:
         return minus_J_f(torch.cat([q, torch.zeros_like(q)], dim=-1))[..., :ndof]
 
-    mass = np.linalg.inv(M_inverse)
     potential = _for_arrays(lambda q: H(q, torch.zeros_like(q)))
     return HamiltonianSystem(potential, ndof=ndof, mass=mass, gradient=_for_arrays(gradient), **scene)
 
@@ -148,20 +155,63 @@ def _probes(ndof: int, y0: ArrayLike | None) -> Tensor:
     if isinstance(ndof, bool) or not isinstance(ndof, int) or ndof < 1:
         raise ValueError(f"`ndof` must be a positive integer, the degrees of freedom; got {ndof!r}.")
     center = np.zeros(2 * ndof) if y0 is None else np.asarray(y0, dtype=float)
+    if center.shape != (2 * ndof,) or not np.isfinite(center).all():
+        what = f"shape {center.shape}" if center.shape != (2 * ndof,) else "NaN or infinity"
+        raise ValueError(f"`y0` must be {2 * ndof} finite numbers, [q, p] for ndof = {ndof}; got {what}. Correct it.")
     spread = 0.25 * np.maximum(np.abs(center).max(initial=0.0), 1.0)
     noise = np.random.default_rng(20260101).uniform(-1, 1, (8, 2 * ndof))
     return torch.from_numpy(center + spread * noise)
 
 
-def _inverse_mass(mixed: Tensor, kinetic: Tensor, p: Tensor, velocity: Tensor) -> np.ndarray | None:
-    """M⁻¹ if ∂²H/∂q∂p vanishes, ∂²H/∂p² is one positive definite matrix and ∂H/∂p = M⁻¹p at all probes."""
-    scale = float(kinetic.abs().max().detach())
-    constant = float((kinetic - kinetic[0]).abs().max().detach())
-    if scale == 0 or max(float(mixed.abs().max().detach()), constant) > TOLERANCE * scale:
+def _mass(hessian: Tensor, gradient: Callable[[Tensor], Tensor], probes: Tensor) -> np.ndarray | None:
+    """M if H is ½ pᵀM⁻¹p + V(q) at all probes, judged by what does not depend on the units of q, p and H.
+
+    Entry (i, j) of ∂²H is small if it is small beside √(∂²H/∂y_i² · ∂²H/∂y_j²), the only product of such units.
+    """
+    d = probes.shape[-1] // 2
+    A = hessian.detach().numpy()
+    size = _size(A)
+    K = A[:, d:, d:]
+    units = size[d:, d:]
+    if not np.isfinite(A).all() or (K.diagonal(axis1=1, axis2=2) <= 0).any():
         return None
-    M = kinetic.mean(0).detach().numpy()
-    M = (M + M.T) / 2
-    M[np.abs(M) < TOLERANCE * scale] = 0.0
-    rounded = np.round(M, 12)
-    linear = np.allclose(velocity.detach().numpy(), p.numpy() @ rounded, rtol=TOLERANCE, atol=TOLERANCE * scale)
-    return rounded if linear and np.linalg.eigvalsh(rounded)[0] > 0 else None
+    if (np.abs(A[:, :d, d:]) > EXACT * size[:d, d:]).any() or (np.abs(K - K[0]) > EXACT * units).any():
+        return None
+    M_inverse = _clean((K[0] + K[0].T) / 2, units)
+    p, at_rest = probes[:, d:].numpy(), probes.clone()
+    at_rest[:, d:] = 0.0
+    slope, rest = (gradient(y).detach().numpy() for y in (probes, at_rest))
+    span = np.ptp((slope[:, :d] * probes[:, :d].numpy()).sum(-1)) * M_inverse.diagonal()
+    linear = np.abs(slope[:, d:] - p @ M_inverse) <= TOLERANCE * (np.abs(p) @ np.abs(M_inverse))
+    if not linear.all() or (rest[:, d:] ** 2 > EXACT**2 * span).any():
+        return None
+    scaled = M_inverse / units
+    if np.linalg.eigvalsh(scaled)[0] <= 0:
+        return None
+    mass = np.linalg.inv(scaled) / units
+    return _clean(mass, np.sqrt(np.outer(mass.diagonal(), mass.diagonal())))
+
+
+def _size(A: np.ndarray) -> np.ndarray:
+    """√(|A_ii| |A_jj|), from the largest of symmetric matrices A (n, 2d, 2d)."""
+    root = np.sqrt(np.abs(A.diagonal(axis1=1, axis2=2)).max(0))
+    return np.outer(root, root)
+
+
+def _asymmetry(A: np.ndarray) -> float:
+    """The largest |A_ij − A_ji| beside A_ij, A_ji or √(A_ii A_jj), whichever is largest, and beside rounding."""
+    beside = np.maximum(np.maximum(np.abs(A), np.abs(A.swapaxes(-1, -2))), _size(A))
+    rounding = 16 * np.finfo(float).eps * np.abs(A).max()
+    return float((np.abs(A - A.swapaxes(-1, -2)) / (beside + rounding / TOLERANCE + 1e-300)).max())
+
+
+def _clean(M: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """M without the last bits of rounding: entries of no size are 0, and those next to a short number are that."""
+    M = np.where(np.abs(M) < EXACT * units, 0.0, M)
+    short = np.array([float(f"{x:.12g}") for x in M.ravel()]).reshape(M.shape)
+    return np.where(np.abs(short - M) <= 4 * np.finfo(float).eps * np.abs(M), short, M)
+
+
+def _close(a: Tensor, b: Tensor, tolerance: float) -> bool:
+    """Whether a is b (n, 2d) within the tolerance, beside the largest of each component."""
+    return bool(((a - b).abs() <= tolerance * b.abs().amax(0, keepdim=True)).all())
