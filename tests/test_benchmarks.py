@@ -28,7 +28,7 @@ from contenders.prose import power
 from contenders.scene import Scene
 
 from sympflow.integrators.schemes import SCHEMES
-from sympflow.systems import pendulum
+from sympflow.systems import henon_heiles, kepler, pendulum
 
 TINY = Scene(t_end=20.0, n_instants=20, trajectories=70)  # more than a block of the hand-written loops, and not two
 
@@ -250,3 +250,18 @@ def test_heyoka_solves_any_symbolic_system():
     np.testing.assert_allclose(taylor.run_lanes(1e-9, y0, 10.0), expected, atol=1e-6)
     np.testing.assert_allclose(taylor.run(1e-9, y0[0], 10.0), expected[0], atol=1e-6)
     np.testing.assert_allclose(taylor.grid(1e-9, y0[0], np.array([0.0, 5.0, 10.0]))[-1], expected[0], atol=1e-6)
+
+
+def test_on_kepler_the_logarithmic_methods_race():
+    """They end where the exact flow does, take few steps for it, and no other system has them."""
+    system = kepler()
+    runners = {r.name: r for r in primed_race.transformed(system)}
+    assert set(runners) == {"log_leapfrog", "log_blanes_moan4", "log_kahan_li8"}
+    assert not primed_race.transformed(henon_heiles())
+    measure = primed_race.Measure(system, "state", 10.0)
+    fixed = primed_race.Runner.of_scheme("kahan_li8", system)
+    assert measure.of(runners["log_kahan_li8"], 100) < 0.1 * measure.of(fixed, 100)
+    energy = primed_race.Measure(system, "energy", 10.0)
+    assert energy.of(runners["log_leapfrog"], 100) < 1e-11
+    single = runners["log_kahan_li8"].one(0.1, system.y0, 100, np.array([0, 100]))[0]
+    assert single.shape == (2, 4)

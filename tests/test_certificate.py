@@ -202,7 +202,8 @@ def test_a_flow_in_another_precision_is_saved_without_its_certificate(tmp_path):
     with pytest.warns(RuntimeWarning, match="another precision"):
         flow.to(torch.float32).save(tmp_path / "single.safetensors")
     single = sympflow.load(tmp_path / "single.safetensors", system=HH)
-    assert single.dtype == torch.float32 and single.certified is None
+    assert single.dtype == torch.float32
+    assert single.certified is None
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow import HamiltonianSystem
+from sympflow import HamiltonianSystem, solve
 from sympflow.flow.primed import PrimedFlow
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.kernels.primed_flow import PrimedFlowKernel
@@ -21,6 +21,8 @@ INSTANTS = 1000
 HELD_OUT, HELD_OUT_SEED = 20, 20_261_121  # a seed that no training uses
 TIMED = 3  # states that are run one after the other for a time
 TIMED_SPAN = 10_000.0  # how far: 1000 units of time may take 20 µs, of which the call would be a good part
+TRANSFORMED = {"log_leapfrog": "leapfrog", "log_blanes_moan4": "blanes_moan4", "log_kahan_li8": "kahan_li8"}
+LONGEST_TRANSFORMED = 0.5  # log_leapfrog keeps Kepler's energy at any step: it shall at least resolve the orbit
 MOST_FORCES = 3_000_000  # beyond which a scheme is out of the race
 SHORTEST = 4  # times that a flow's step may be below its Δt
 CLOSENESS = 1.01  # of the fewest steps, as a ratio
@@ -52,9 +54,27 @@ class Runner:
         one, many = partial(kernel.run, scheme), partial(kernel.run_batch, scheme, threads=1)
         return cls(name, scheme.force_evaluations, scheme.hessian_evaluations, one, many)
 
+    @classmethod
+    def of_transformed(cls, name: str, system: HamiltonianSystem) -> Runner:
+        """A method of equal steps in the transformed time, through `solve`, with the cost of calling it."""
+        forces = SCHEMES[TRANSFORMED[name]].force_evaluations
+
+        def run(h: float, y0: np.ndarray, n: int, save: np.ndarray) -> tuple[np.ndarray]:
+            times = h * save
+            y = solve(system, name, (0.0, float(times[-1])), y0, dt=h, t_eval=times, on_domain_exit="ignore").y
+            missing = [*[(0, 0)] * (y.ndim - 1), (0, len(times) - y.shape[-1])]
+            return (np.moveaxis(np.pad(y, missing, constant_values=np.nan), -1, -2),)
+
+        return cls(name, forces, 0, run, run, LONGEST_TRANSFORMED)
+
+
+def transformed(system: HamiltonianSystem) -> list[Runner]:
+    """The methods for close encounters, where there are any."""
+    return [Runner.of_transformed(name, system) for name in TRANSFORMED] if system.name == "kepler" else []
+
 
 def schemes(system: HamiltonianSystem) -> list[Runner]:
-    """All of the package that apply."""
+    """All splitting schemes of the package that apply."""
     return [
         Runner.of_scheme(name, system)
         for name, scheme in SCHEMES.items()
@@ -143,7 +163,8 @@ def race(
     system, T = measure.system, measure.t_end
     own = {Runner.of_flow(f, system): f for f in flows}
     steps: dict[Runner, int] = {}
-    for runner in [*own, *schemes(system)]:
+    encounters = transformed(system)
+    for runner in [*own, *schemes(system), *encounters]:
         least = max(1, int(np.ceil(T / runner.longest * (1 - 1e-12))))
         guess = max(least, round(2000 * T / 1000 / runner.forces))
         most = MOST_FORCES // runner.forces if runner not in own else SHORTEST * least
@@ -153,8 +174,10 @@ def race(
     work = {r: n * (r.forces + r.hessians / 2) for r, n in steps.items()}
     if not any(r in own for r in steps):
         return None
-    ours, others = [{r for r in steps if (r in own) == mine} for mine in (True, False)]
-    near = [r for side in (ours, others) for r in side if work[r] <= NEAR * min(work[s] for s in side)]
+    ours = {r for r in steps if r in own}
+    others = {r for r in steps if r not in own and r not in encounters}
+    sides = [side for side in (ours, others, {r for r in steps if r in encounters}) if side]
+    near = [r for side in sides for r in side if work[r] <= NEAR * min(work[s] for s in side)]
     tol = None if taylor is None else tolerance(measure, taylor, target)
     times = {
         "one": _single(near, steps, measure, taylor, tol, repeats, outputs=False),

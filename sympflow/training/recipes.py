@@ -80,7 +80,8 @@ def default_recipe(system: HamiltonianSystem, domain: Domain | None = None, dt: 
     """Three kicks and a processor of six, with Δt such that ω Δt = 0.75; for a given Δt as many kicks as it needs.
 
     ω is the fastest frequency of the linearized motion, √ of the largest eigenvalue of M⁻¹∇²V, that 99 % of the states
-    of the domain stay below. After 60 s the fit ends with the best so far. The processor costs nothing over a long run, and is larger than the kernel for that.
+    of the domain stay below. After 60 s the fit ends with the best so far. The processor costs nothing over a long run,
+    and is larger than the kernel for that.
 
     Parameters
     ----------
