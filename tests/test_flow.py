@@ -407,7 +407,8 @@ def test_forward_mode_gives_no_warnings_of_torch_itself():
         system = sympflow.systems.henon_heiles()
         flow = sympflow.SympFlow.primed(system)
         flow.velocity(0.5, torch.zeros(3, 4, dtype=torch.float64))
-        sympflow.train(system, flow=flow, steps=1, points=20, validation_points=20, reference_states=2, progress=False)
+        options = dict(steps=1, points=20, validation_points=20, reference_states=2, progress=False)
+        sympflow.train(system, flow=flow, optimizer="adam", **options)
     """
     run = [sys.executable, "-W", "error", "-c", textwrap.dedent(code)]
     done = subprocess.run(run, capture_output=True, text=True, check=False)

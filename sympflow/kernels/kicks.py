@@ -141,7 +141,9 @@ def _expanded(f: sp.Expr, q: Sequence[sp.Symbol]) -> sp.Expr:
         return kept.setdefault(power, sp.Dummy(real=True))
 
     f = f.replace(lambda e: e.is_Pow and e.base.is_Add and not (e.exp.is_Integer and e.exp > 0), keep)
-    back = {dummy: power for power, dummy in kept.items()}
+    back: dict[sp.Dummy, sp.Expr] = {}
+    for power, dummy in kept.items():  # inner powers come before those that hold them
+        back[dummy] = power.xreplace(back)
     terms: dict[sp.Expr, sp.Expr] = {}
     for term in sp.Add.make_args(sp.expand(f)):
         coefficient, product = term.as_independent(*q, *back, as_Add=False)
