@@ -341,8 +341,8 @@ def test_labels_may_be_handed_in():
     arguments = {name: value for name, value in QUICK.items() if name != "points"}
     flow = train(PENDULUM, flow=SympFlow.primed(PENDULUM, 2), data=data, **arguments)
     assert flow.figures["one_step_error"] < 3e-3
-    without_end = tuple(a[:80] for a in data)
-    other = train(PENDULUM, flow=SympFlow.primed(PENDULUM, 2), data=without_end, **{**arguments, "restarts": 1})
+    fewer = tuple(a[40:] for a in data)
+    other = train(PENDULUM, flow=SympFlow.primed(PENDULUM, 2), data=fewer, **{**arguments, "restarts": 1})
     assert other.figures["fractional_error"] < 1e-3
     assert other.recipe["stages"][0]["data"] != flow.recipe["stages"][0]["data"]
 

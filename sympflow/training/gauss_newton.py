@@ -40,6 +40,7 @@ FITTED = 2  # tables from which the polynomials are fitted
 SEARCH_STEPS = 60  # iterations from each start
 SEARCH_SHARE, FROZEN_SHARE = 0.4, 0.7  # of a time budget, that the search, and all work on frozen tables, may use
 FRACTIONAL_TIMES = 50
+CLOSE = 1.1  # held-out errors that differ by less are the same for a warning
 OUT_OF_TIME = "the time budget was used up"
 FEWEST_POINTS, MOST_POINTS, COORDINATES = 40, 250, 1000
 FITTED_POINTS = 120  # that are enough for the polynomials: at each of several times
@@ -247,6 +248,8 @@ class GaussNewtonRun:
             return
         table.assign(given)
         self.kept_start = True
+        if after < CLOSE * before:  # as when a fit is fitted again
+            return
         warnings.warn(
             f"The fit has a larger held-out error ({after:.1e}) than the flow that it started from ({before:.1e}), "
             "which is returned: its data are too few, too far from Δt, or not of this system.",
