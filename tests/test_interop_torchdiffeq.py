@@ -177,6 +177,22 @@ class TestEvents:
         with pytest.raises(TypeError, match=r"^`t0` must be a floating-point tensor with one time"):
             odeint_event(HH, torch.tensor(HH.y0), 0.0, event_fn=lambda t, y: y[0], method="verlet")
 
+    @pytest.mark.parametrize("unit", [1e-170, 1e-300, 1e300])
+    def test_the_unit_of_the_event_function_does_not_matter(self, unit):
+        found = [
+            odeint_event(HH, torch.tensor(HH.y0), times(0.0)[0], event_fn=lambda t, y, c=c: y[0] * c, method="verlet")
+            for c in (1.0, unit)
+        ]
+        torch.testing.assert_close(found[0][0], found[1][0], rtol=1e-14, atol=0.0)
+
+    def test_torchdiffeqs_own_odeint_is_an_interface(self):
+        arguments = {"event_fn": lambda t, y: y[0], "method": "verlet"}
+        y0, t0 = torch.tensor(HH.y0), times(0.0)[0]
+        theirs = odeint_event(HH, y0, t0, odeint_interface=torchdiffeq.odeint, **arguments)
+        ours = odeint_event(HH, y0, t0, **arguments)
+        assert torch.equal(theirs[0], ours[0])
+        assert torch.equal(theirs[1], ours[1])
+
     def test_no_event_is_an_error(self):
         with pytest.raises(RuntimeError, match=r"^`event_fn` found no zero: the solution became non-finite"):
             odeint_event(

@@ -114,7 +114,7 @@ class Path:
                 for i in range(1, parts + 1):
                     b, y_b = start + self.h * i / parts, inner[j, i - 1] if i < parts else states[j + 1]
                     after = value(b, y_b)
-                    if before * after <= 0:
+                    if np.sign(before) * np.sign(after) <= 0:  # the product itself may underflow
                         return self._locate(value, start, states[j], (a, before), (b, after))
                     if not math.isfinite(after):
                         raise RuntimeError(
@@ -145,10 +145,12 @@ class Path:
         """The zero between two (s, g), in the step from y at `start`."""
         (a, g_a), (b, g_b) = left, right
         known = {a: g_a, b: g_b}
+        # a power of two, exact: Brent's own products shall not underflow, either
+        unit = math.ldexp(1.0, min(-math.frexp(max(abs(g_a), abs(g_b)))[1], 1000))
 
         def f(s: float) -> float:
             if s in known:
-                return known[s]
-            return value(s, self.integrator.step(self.system, 0.0, y, s - start))
+                return known[s] * unit
+            return value(s, self.integrator.step(self.system, 0.0, y, s - start)) * unit
 
         return b if g_b == 0 else float(brentq(f, a, b, xtol=_EPS, rtol=_EPS))

@@ -102,14 +102,15 @@ def odeint_event(
 ) -> Any:
     """`torchdiffeq.odeint_event` with our methods as well: the event time, and [y0, state at the event].
 
-    Arguments as there. Gradients reach y0, t0 and the weights.
+    Arguments as there; with our methods `odeint_interface` is torchdiffeq's `odeint` or ours, which are the same then.
+    Gradients reach y0, t0 and the weights.
     """
     if not _is_ours(kwargs.get("method")):
         theirs = torchdiffeq.odeint if odeint_interface is odeint else odeint_interface
         arguments = {"event_fn": event_fn, "reverse_time": reverse_time, "odeint_interface": theirs, **kwargs}
         with _names_of_both():
             return torchdiffeq.odeint_event(_of_pairs(func, y0), y0, t0, **arguments)
-    if odeint_interface is not odeint:
+    if odeint_interface not in (odeint, torchdiffeq.odeint):
         raise _no_adjoint(kwargs["method"])
     if not (isinstance(t0, Tensor) and t0.numel() == 1 and t0.is_floating_point()):
         raise TypeError("`t0` must be a floating-point tensor with one time: use torch.tensor(0.0).")
