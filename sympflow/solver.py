@@ -13,7 +13,7 @@ from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
 from sympflow.domain import Domain, EnergySublevel
 from sympflow.events import run_and_search
 from sympflow.integrators.base import Integrator, Outcome, Problem
-from sympflow.integrators.registry import build
+from sympflow.integrators.registry import build, naming_plugin
 from sympflow.solution import Solution
 from sympflow.system import HamiltonianSystem
 from sympflow.validation import check_events, check_memory, check_save_every, check_t_eval, check_t_span, check_y0
@@ -86,6 +86,8 @@ def solve(
     ------
     ValueError, TypeError
         For bad arguments, at once: the message names the argument and the remedy.
+    RuntimeError
+        If the method is that of a plug-in and fails: the message names the plug-in.
 
     Examples
     --------
@@ -97,7 +99,8 @@ def solve(
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     integrator = build(method, options)
-    integrator.check(system)
+    with naming_plugin(integrator, passes=(ValueError,)):  # by which it says that it does not apply
+        integrator.check(system)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
@@ -116,12 +119,13 @@ def solve(
     check_memory(integrator, problem)
 
     start = time.perf_counter()
-    outcome = (
-        integrator.run(problem)
-        if search is None or integrator.finds_events
-        else run_and_search(integrator, problem, search)
-    )
-    _check_outcome(outcome, integrator, y_start)
+    with naming_plugin(integrator):
+        outcome = (
+            integrator.run(problem)
+            if search is None or integrator.finds_events
+            else run_and_search(integrator, problem, search)
+        )
+        _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
     if action != "ignore":
         _check_domain(outcome, integrator, system, action)

@@ -43,6 +43,35 @@ class Optionless(SymplecticEuler):
         raise KeyError("options")
 
 
+class FailingStep(SymplecticEuler):
+    def step(self, system, t, y, h):
+        raise KeyError("inner")
+
+
+class LeavingStep(SymplecticEuler):
+    def step(self, system, t, y, h):
+        raise SystemExit(3)
+
+
+class InterruptedStep(SymplecticEuler):
+    def step(self, system, t, y, h):
+        raise KeyboardInterrupt
+
+
+class FailingCheck(SymplecticEuler):
+    def check(self, system):
+        raise AttributeError("inner")
+
+
+class DecliningCheck(SymplecticEuler):
+    def check(self, system):
+        raise ValueError("`method` needs another system.")
+
+
+class Nameless(FixedStep):
+    pass
+
+
 def __getattr__(name):
     if name == "leaving_on_import":
         raise SystemExit("I leave")
@@ -61,8 +90,15 @@ def plugins(monkeypatch):
         EntryPoint("failing", f"{__name__}:Failing", registry.GROUP),
         EntryPoint("refusing", f"{__name__}:Refusing", registry.GROUP),
         EntryPoint("optionless", f"{__name__}:Optionless", registry.GROUP),
+        EntryPoint("failing_step", f"{__name__}:FailingStep", registry.GROUP),
+        EntryPoint("leaving_step", f"{__name__}:LeavingStep", registry.GROUP),
+        EntryPoint("interrupted_step", f"{__name__}:InterruptedStep", registry.GROUP),
+        EntryPoint("failing_check", f"{__name__}:FailingCheck", registry.GROUP),
+        EntryPoint("declining_check", f"{__name__}:DecliningCheck", registry.GROUP),
+        EntryPoint("nameless", f"{__name__}:Nameless", registry.GROUP),
     ]
     monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    monkeypatch.setattr(registry, "_loaded", {})
     registry._plugins.cache_clear()
     yield
     registry._plugins.cache_clear()
@@ -97,6 +133,33 @@ def test_built_ins_cannot_be_replaced():
         register("mine", lambda: None)
 
 
+@pytest.mark.parametrize(("name", "error"), [(3, TypeError), (None, TypeError), ("", ValueError), (" ", ValueError)])
+def test_a_name_must_be_one(name, error):
+    with pytest.raises(error, match=r"^`name` must"):
+        register(name, SymplecticEuler)
+    assert "verlet" in available()
+
+
+def test_a_class_without_name_is_not_registered():
+    with pytest.raises(TypeError, match=r"^`integrator` Nameless has no `name`"):
+        register("nameless", Nameless)
+    assert "nameless" not in available()
+
+
+@pytest.mark.filterwarnings("ignore:The integrator 'verlet' of")
+def test_plugins_are_not_replaced(plugins):
+    with pytest.raises(ValueError, match=r"^`name` 'good' is that of the plug-in .*choose another name"):
+        register("good", FailingStep)
+    assert get("good").__name__ == "SymplecticEuler"
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_shadowing_plugin_is_skipped_where_warnings_are_errors(plugins, caplog):
+    assert "good" in available()
+    assert "The integrator 'verlet' of" in caplog.text
+    assert get("verlet").__name__ != "SymplecticEuler"
+
+
 def test_plugins_break_on_use_and_not_before(plugins):
     with pytest.warns(RuntimeWarning, match="'verlet' of .* is ignored: the name is taken"):
         names = available()
@@ -116,6 +179,16 @@ def test_plugins_break_on_use_and_not_before(plugins):
         ("leaving", ImportError, r"^`method` 'leaving' of the plug-in .* cannot be loaded \(SystemExit: I leave\)"),
         ("failing", RuntimeError, r"^`method` 'failing' of the plug-in test_registry:Failing failed when it was made"),
         ("refusing", ValueError, r"^`dt` is not to my taste. \(Raised by the plug-in test_registry:Refusing.\)"),
+        (
+            "failing_step",
+            RuntimeError,
+            r"^`method` 'failing_step' of the plug-in .*Step failed \(KeyError: 'inner'",
+        ),
+        ("leaving_step", RuntimeError, r"^`method` 'leaving_step' of the plug-in .*LeavingStep failed \(SystemExit: 3"),
+        ("failing_check", RuntimeError, r"^`method` 'failing_check' of the plug-in .* failed \(AttributeError: inner"),
+        ("declining_check", ValueError, r"^`method` needs another system.$"),
+        ("interrupted_step", KeyboardInterrupt, "^$"),
+        ("nameless", ImportError, r"^`method` 'nameless' of the plug-in .*Nameless is a class without `name`"),
         ("optionless", RuntimeError, r"^`method` 'optionless' of the plug-in test_registry:Optionless failed"),
     ],
 )
@@ -123,6 +196,15 @@ def test_a_plugin_that_fails_is_named(method, error, message, plugins):
     with pytest.raises(error, match=message.replace("test_registry", __name__)):
         solve(systems.pendulum(), method, (0, 1))
     assert solve(systems.pendulum(), "verlet", (0, 1)).success
+
+
+@pytest.mark.filterwarnings("ignore:The integrator 'verlet' of")
+def test_the_error_of_a_plugin_is_the_cause(plugins):
+    with pytest.raises(RuntimeError) as caught:
+        solve(systems.pendulum(), get("failing_step")(dt=0.1), (0, 1))
+    assert isinstance(caught.value.__cause__, KeyError)
+    with pytest.raises(KeyError):  # no plug-in's: as it is
+        solve(systems.pendulum(), type("Own", (FailingStep,), {})(dt=0.1), (0, 1))
 
 
 def test_max_step_of_a_fixed_step_method_is_explained():

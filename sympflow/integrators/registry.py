@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import logging
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -39,6 +41,7 @@ _TORCHDIFFEQ = (*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams")
 _NAMES = frozenset((*SCHEMES, *_BUILT_IN, *_WITH_PARTS, *_TORCHDIFFEQ))
 _INSTEAD = {"max_step": "`dt` is the step, and `event_step` samples events within it"}
 _registered: dict[str, type[Integrator]] = {}
+_loaded: dict[type[Integrator], EntryPoint] = {}
 
 
 def available() -> list[str]:
@@ -94,14 +97,25 @@ def register(name: str, integrator: type[Integrator]) -> None:
     Raises
     ------
     ValueError
-        If the name is that of a built-in method.
+        If the name is empty, or that of a built-in method or of an installed plug-in.
     TypeError
-        If `integrator` is not a subclass of Integrator.
+        If `name` is not a string, or `integrator` not a subclass of Integrator that has a `name`.
     """
+    if not isinstance(name, str):
+        raise TypeError(f"`name` must be a string, such as 'my_method'; got {type(name).__name__}.")
+    if not name.strip():
+        raise ValueError(f"`name` must not be empty; got {name!r}. Choose one, such as 'my_method'.")
     if name in _NAMES:
         raise ValueError(f"`name` {name!r} is a built-in method, which cannot be replaced: choose another name.")
     if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
         raise TypeError(f"`integrator` must be a subclass of sympflow.integrators.base.Integrator; got {integrator!r}.")
+    if not named(integrator):
+        raise TypeError(f"`integrator` {integrator.__name__} has no `name`: set that class attribute.")
+    if name in _plugins():
+        raise ValueError(
+            f"`name` {name!r} is that of the plug-in {_distribution(_plugins()[name])}, which would be replaced: "
+            "choose another name."
+        )
     _registered[name] = integrator
 
 
@@ -161,11 +175,11 @@ def _plugins() -> dict[str, EntryPoint]:
     found: dict[str, EntryPoint] = {}
     for point in entry_points(group=GROUP):
         if point.name in _NAMES or point.name in found:
-            warnings.warn(
-                f"The integrator {point.name!r} of {_distribution(point)} is ignored: the name is taken.",
-                RuntimeWarning,
-                stacklevel=4,
-            )
+            message = f"The integrator {point.name!r} of {_distribution(point)} is ignored: the name is taken."
+            try:
+                warnings.warn(message, RuntimeWarning, stacklevel=4)
+            except RuntimeWarning:  # where warnings are errors, it must not take all other methods with it
+                logging.getLogger(__name__).warning(message)
         else:
             found[point.name] = point
     return found
@@ -183,7 +197,36 @@ def _load(point: EntryPoint) -> type[Integrator]:
         raise ImportError(
             f"`method` {point.name!r} of the plug-in {_distribution(point)} is no Integrator class: report it there."
         )
+    if not named(integrator):
+        raise ImportError(
+            f"`method` {point.name!r} of the plug-in {_distribution(point)} is a class without `name`, which every "
+            "integrator must have: report it there."
+        )
+    _loaded[integrator] = point
     return integrator
+
+
+def named(integrator: Integrator | type[Integrator]) -> bool:
+    """Whether the class has the `name` that messages and reports call it by."""
+    return isinstance(getattr(integrator, "name", None), str)
+
+
+@contextmanager
+def naming_plugin(integrator: Integrator, passes: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Turn what fails inside into a RuntimeError that names the plug-in, if the integrator is one's.
+
+    Errors of the kinds `passes` are left as they are: they are answers, not failures.
+    """
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        point = _loaded.get(type(integrator))
+        if point is None or isinstance(error, passes):
+            raise
+        raise RuntimeError(
+            f"`method` {point.name!r} of the plug-in {_distribution(point)} failed ({type(error).__name__}: {error}): "
+            "report it there, unless a function of your own, of the system or an event, raised it."
+        ) from error
 
 
 def _distribution(point: EntryPoint) -> str:
