@@ -332,6 +332,19 @@ def test_what_does_not_apply_is_skipped_with_the_reason():
     assert skipped["rk4-the_inverse_undoes_the_step"].startswith("`method` 'rk4' has no exact inverse")
 
 
+def test_one_method_with_several_options_has_several_ids():
+    _, cases = parametrize_with_checks([get("verlet"), lambda: get("verlet")(dt=0.01), get("rk4")]).args
+    assert len({case.id for case in cases}) == 3 * len(CHECKS)
+    assert any("dt=0.01" in case.id for case in cases)
+    assert any(case.id.startswith("rk4-") for case in cases)
+
+
+def test_a_class_without_a_name_is_refused():
+    nameless = type("Nameless", (FixedStep,), {})
+    with pytest.raises(TypeError, match=r"^`factory` made a Nameless without `name`: set that class attribute"):
+        parametrize_with_checks([nameless])
+
+
 def test_a_method_that_does_not_apply_to_the_system_is_refused():
     with pytest.raises(ValueError, match=r"^`method` 'verlet' needs a separable system"):
         check_integrator(get("verlet"), HamiltonianSystem.from_sympy("(p**2 + 1)*(q**2 + 1)/2", y0=[0.1, 0.2]))

@@ -8,6 +8,7 @@ slope, the declared symplecticity by the Jacobian of the step that ran. They are
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -16,6 +17,7 @@ from typing import Any
 from sympflow.integrators import checks_of_consistency, checks_of_runs, checks_of_steps
 from sympflow.integrators.base import Integrator
 from sympflow.integrators.check_setting import NotApplicable, default_system
+from sympflow.integrators.registry import named
 from sympflow.system import HamiltonianSystem
 
 Factory = Callable[[], Integrator]
@@ -134,9 +136,12 @@ def parametrize_with_checks(factories: Iterable[Factory], system: HamiltonianSys
         except NotApplicable as reason:
             pytest.skip(str(reason))
 
+    integrators = [_made(factory) for factory in factories]
+    count = Counter(integrator.name for integrator in integrators)
+    labels = [one.name if count[one.name] == 1 else repr(one) for one in integrators]
     cases = [
-        pytest.param(integrator, partial(or_skip, check), id=f"{integrator.name}-{check.name}")
-        for integrator in map(_made, factories)
+        pytest.param(integrator, partial(or_skip, check), id=f"{label}-{check.name}")
+        for integrator, label in zip(integrators, labels, strict=True)
         for check in CHECKS
     ]
     return pytest.mark.parametrize(("integrator", "check"), cases)
@@ -149,4 +154,6 @@ def _made(factory: Factory) -> Integrator:
     integrator = factory()
     if not isinstance(integrator, Integrator):
         raise TypeError(f"`factory` must make an Integrator; it made {type(integrator).__name__}.")
+    if not named(integrator):
+        raise TypeError(f"`factory` made a {type(integrator).__name__} without `name`: set that class attribute.")
     return integrator
