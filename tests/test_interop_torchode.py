@@ -54,6 +54,17 @@ def test_backward_time():
     np.testing.assert_allclose(sol.ys[0].numpy(), ours.y.T, atol=200 * EPS)
 
 
+def test_a_step_away_from_the_end_is_refused():
+    register("verlet", HH)
+    y0 = torch.tensor(HH.domain.sample(2, 0))
+    t_eval = torch.tensor([[0.0, 0.5], [0.0, -0.5]], dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"^`dt0` must have the sign of the direction"):
+        run("verlet", y0, t_eval, 0.1)
+    sol = run("verlet", y0, t_eval, [0.1, -0.1])
+    ours = solve(HH, "verlet", (0.0, -0.5), y0=y0[1].numpy(), t_eval=[-0.5], dt=0.1)
+    np.testing.assert_allclose(sol.ys[1, -1].numpy(), ours.y[:, -1], atol=200 * EPS)
+
+
 def test_gradients_to_y0_t_and_weights():
     flow = SympFlow(1, hidden=(5,), dt=0.5)
     y0 = torch.tensor([[1.0, 0.2], [0.3, -0.4]], dtype=torch.float64, requires_grad=True)

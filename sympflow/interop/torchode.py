@@ -5,6 +5,8 @@ torchode drives with a fixed step per sample::
     register("verlet", system)
     controller = torchode.FixedStepController()
     torchode.solve_ivp(system, y0, t_eval, method="verlet", controller=controller, dt0=torch.full((len(y0),), 0.1))
+
+A sample that runs backward needs a negative `dt0`: torchode itself would step away from its end for ever.
 """
 
 from __future__ import annotations
@@ -76,11 +78,13 @@ class SymplecticStep(SingleStepMethod):
         # the longest step that a flow was trained for; the state's own module, so that its weights are parameters
         self.flow = integrator.flow_for(system) if integrator.trained else None  # type: ignore[attr-defined]
 
-    def init(self, term: Any, problem: Any, f0: Tensor | None, *, stats: dict[str, Any], args: Any) -> None:
+    def init(self, term: Any, problem: Any, f0: Tensor | None, *, stats: dict[str, Any], args: Any) -> Tensor:
+        """The state of the method: the end of each sample."""
         if problem.n_features != 2 * self.system.ndof:
             raise ValueError(
                 f"`y0` must have shape (batch, {2 * self.system.ndof}), [q, p]; got {problem.n_features} features."
             )
+        return problem.t_end.detach()
 
     def step(
         self,
@@ -89,23 +93,30 @@ class SymplecticStep(SingleStepMethod):
         y0: Tensor,
         t0: Tensor,
         dt: Tensor,
-        state: None,
+        state: Tensor,
         *,
         stats: dict[str, Any],
         args: Any,
-    ) -> tuple[StepResult, Beginning, None, None]:
+    ) -> tuple[StepResult, Beginning, Tensor, None]:
+        left = state - t0.detach()
+        # torchode cuts a step away from the end to one of length 0, and would go on for ever
+        if ((dt.detach() * left <= 0) & (left.abs() > 1e-9 * (1 + state.abs()))).any():
+            raise ValueError(
+                "`dt0` must have the sign of the direction in which its sample runs: make it negative "
+                "for samples that run backward."
+            )
         if self.flow is not None and (dt.detach().abs() > self.flow.dt * (1 + 1e-12)).any():
             raise ValueError(
                 f"`dt0` must be at most the flow's Δt = {self.flow.dt:g}; got {float(dt.detach().abs().max()):g}. "
                 "Drive it with torchode.FixedStepController and a smaller dt0."
             )
-        return StepResult(self._advance(y0, dt), None), Beginning(t0, y0), None, None
+        return StepResult(self._advance(y0, dt), None), Beginning(t0, y0), state, None
 
     def _advance(self, y: Tensor, h: Tensor) -> Tensor:
         return self.integrator.step(self.system, 0.0, y, h.to(y.dtype))
 
-    def merge_states(self, accept: Tensor, current: None, previous: None) -> None:
-        return None
+    def merge_states(self, accept: Tensor, current: Tensor, previous: Tensor) -> Tensor:
+        return current
 
     def convergence_order(self) -> int:
         return self.integrator.order or 1
