@@ -89,7 +89,7 @@ def _parse_one(g: Any, label: str) -> Event:
     terminal, direction = getattr(g, "terminal", None), getattr(g, "direction", 0)
     if terminal is None or terminal is False or terminal == 0:
         limit = math.inf
-    elif isinstance(terminal, int | float | np.number) and terminal > 0 and int(terminal) == terminal:
+    elif isinstance(terminal, int | float | np.number | np.bool_) and terminal > 0 and int(terminal) == terminal:
         limit = float(terminal)
     else:
         raise ValueError(f"{label} has `terminal` = {terminal!r}: make it True, False or a positive count.")

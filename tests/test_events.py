@@ -113,10 +113,16 @@ def test_directions():
     assert (count(0), count(1), count(-1), count(0.5)) == (6, 3, 3, 3)
 
 
-@pytest.mark.parametrize("terminal", [1, 2, 4])
+@pytest.mark.parametrize("terminal", [1, 2, 4, np.True_, np.int64(2), 2.0])
 def test_the_solution_ends_at_the_occurrence_of_that_number(terminal):
     sol = solve(OSCILLATOR, "kahan_li8", (0, 100), START, events=event(zero_q, terminal=terminal))
-    assert sol.t_events[0] == pytest.approx(np.pi * (np.arange(terminal) + 0.5), abs=1e-12)
+    assert sol.status == 1
+    assert sol.t_events[0] == pytest.approx(np.pi * (np.arange(int(terminal)) + 0.5), abs=1e-12)
+
+
+def test_a_false_of_numpy_does_not_end_the_solution():
+    sol = solve(OSCILLATOR, "kahan_li8", (0, 10), START, events=event(zero_q, terminal=np.False_))
+    assert (sol.status, len(sol.t_events[0])) == (0, 3)
 
 
 def test_of_several_events_in_a_step_the_first_terminal_one_counts():
@@ -203,6 +209,24 @@ def test_events_of_tensors():
         assert isinstance(sol.y_events[0], torch.Tensor)
         assert sol.y_events[0].shape[1] == 2
     assert torch.autograd.grad(sol.y.sum(), y0)[0].isfinite().all()
+
+
+@pytest.mark.parametrize("t_eval", [None, []])
+@pytest.mark.parametrize("t_end", [20.0, 20.05, -20.05])
+def test_every_evaluation_is_counted_with_the_shorter_step_at_the_end(t_end, t_eval):
+    count = 0
+
+    def gradient(q):
+        nonlocal count
+        count += q.size
+        return q
+
+    system = HamiltonianSystem(lambda q: (q**2).sum(-1) / 2, gradient=gradient, ndof=1, y0=START, dt=0.1)
+    n_steps = solve(system, "verlet", (0, t_end)).stats["n_steps"]
+    count = 0
+    sol = solve(system, "verlet", (0, t_end), events=zero_q, t_eval=t_eval)
+    assert sol.nfev == count > 400
+    assert sol.stats["n_steps"] == n_steps == (200 if t_end == 20.0 else 201)
 
 
 def test_no_state_is_stored_for_events():

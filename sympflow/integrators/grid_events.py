@@ -23,7 +23,7 @@ def run_with_events(integrator: FixedStep, problem: Problem, search: EventSearch
     times, count, remainder = grid.outputs(problem.t_eval, problem.save_every)
     outputs: list[Array] = [y[None][:0]]
     kept: list[Array] = []
-    chunk, k, delivered, failed, backend = FIRST_CHUNK, 0, 0, False, ""
+    chunk, k, shorter, delivered, failed, backend = FIRST_CHUNK, 0, 0, 0, False, ""
     largest = max(1, min(LAST_CHUNK, MOST_SAMPLES // search.parts(grid.h, system.dt)))
 
     while True:
@@ -36,6 +36,7 @@ def run_with_events(integrator: FixedStep, problem: Problem, search: EventSearch
 
         taken, ended = _search(integrator, problem, search, grid, k, states[: good + 1], backend)
         if not ended and last and not failed and grid.remainder:
+            shorter = 1
             ended = _search_remainder(integrator, problem, search, grid, states[good], backend)
 
         # outputs before the end of this chunk; a state at its end belongs to the next, unless there is none
@@ -66,7 +67,7 @@ def run_with_events(integrator: FixedStep, problem: Problem, search: EventSearch
     n_extra = search.n_dense + int(np.count_nonzero(remainder[:delivered]))
     stats = {
         "dt": abs(grid.h),
-        "n_steps": k,
+        "n_steps": k + shorter,
         **integrator.evaluations(k, k, n_extra, backend),
         "backend": backend,
     }
@@ -129,6 +130,7 @@ def _search_remainder(
         return integrator.substep(problem.system, y, s - t, backend)
 
     y_end = dense(grid.t1)
+    search.n_dense += 1
     if not to_numpy(all_finite(y_end)):
         return False
     inner = _samples(integrator, problem.system, search, y[None], grid.remainder, backend)
