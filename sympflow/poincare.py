@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import is_tensor
-from sympflow.integrators.base import FixedStep, Integrator
+from sympflow.integrators.base import FINISHED, FixedStep, Integrator, Problem
+from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import build
 from sympflow.solver import solve
 from sympflow.system import HamiltonianSystem
@@ -22,6 +23,9 @@ from sympflow.validation import check_t_span, check_y0
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+Located = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Crossings: trajectory (n,), t (n,), states (n, 2d)."""
 
 
 def poincare_section(
@@ -53,7 +57,8 @@ def poincare_section(
         Index into [q, p], or a name such as "q1" or "p2".
     level : float
     direction : 1, -1 or 0
-        Only crossings upwards, only downwards, or both. A start on the plane counts, as it does for events.
+        Only crossings upwards, only downwards, or both, along the run as for events: in a run backward in time the
+        coordinate decreases with t where it is crossed upwards. A start on the plane counts, as it does for events.
     sample : float, optional
         Longest time between two samples; two crossings within it are missed. The default is `system.dt`, or the
         method's step where that is shorter.
@@ -97,12 +102,14 @@ def poincare_section(
     rows = start.reshape(-1, start.shape[-1])
     if isinstance(integrator, FixedStep) and integrator.on_grid:
         found = _Crossings(integrator, system, index, float(level), direction, float(sample))
-        for t, y, h in integrator.steps(system, span, rows):
-            found.search(t, y, h)
-        trajectory, times, states = found.result(system.ndof, np.sign(span[1] - span[0]))
+        status, message = found.run(span, rows)
+        crossings = found.result(system.ndof, np.sign(span[1] - span[0]))
     else:
-        trajectory, times, states = _events(integrator, system, span, rows, index, float(level), direction, sample)
-    return PoincareSection(system, integrator, span, rows, index, float(level), direction, trajectory, times, states)
+        crossings, status, message = _events(integrator, system, span, rows, index, float(level), direction, sample)
+    ended = int(status[0]) if start.ndim == 1 else status
+    return PoincareSection(
+        system, integrator, span, rows, index, float(level), direction, *crossings, status=ended, message=message
+    )
 
 
 @dataclass(frozen=True)
@@ -121,6 +128,11 @@ class PoincareSection:
         Which of the initial states each crossing belongs to.
     t : ndarray (n,)
     states : ndarray (n, 2d)
+    status : int, or ndarray (N,) of a batch
+        As of a `Solution`: 0 where the end was reached, −1 where the run failed. Crossings shortly before a failure may
+        be those of a solution that is exploding already.
+    message : str
+        In words, with the time and the remedy.
     """
 
     system: HamiltonianSystem
@@ -133,6 +145,13 @@ class PoincareSection:
     trajectory: np.ndarray = field(repr=False)
     t: np.ndarray = field(repr=False)
     states: np.ndarray = field(repr=False)
+    status: int | np.ndarray
+    message: str
+
+    @property
+    def success(self) -> bool:
+        """Whether every trajectory reached the end."""
+        return bool(np.all(np.asarray(self.status) >= 0))
 
     def __len__(self) -> int:
         return len(self.t)
@@ -149,7 +168,7 @@ class PoincareSection:
         )
 
     def table(self, limit: int = 20) -> str:
-        """The first `limit` crossings as text."""
+        """The first `limit` crossings as text, and the message if a trajectory failed."""
         shown = range(min(limit, len(self)))
         columns = [
             Column("trajectory", [str(self.trajectory[i]) for i in shown]),
@@ -161,7 +180,8 @@ class PoincareSection:
             ),
         ]
         more = f"\n… {len(self) - limit} more" if len(self) > limit else ""
-        return text_table(columns) + more if len(self) else "no crossing"
+        failure = "" if self.success else f"\n{self.message}"
+        return (text_table(columns) + more if len(self) else "no crossing") + failure
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write all crossings to a CSV file, numbers to full precision."""
@@ -201,7 +221,8 @@ class PoincareSection:
             rasterized=True,
         )
         way = {1: f", {label[self.coordinate]} increasing", -1: f", {label[self.coordinate]} decreasing", 0: ""}
-        plane = f"{label[self.coordinate]} = {self.level:g}{way[self.direction]}"
+        in_time = self.direction if self.t_span[1] >= self.t_span[0] else -self.direction
+        plane = f"{label[self.coordinate]} = {self.level:g}{way[in_time]}"
         ax.set_title(f"{self.system.name.replace('_', ' ')}, {self.integrator.name}: {plane}", fontsize=9, color=TEXT)
         dress(ax, label[i], label[j])
         return figure
@@ -216,8 +237,8 @@ def _events(
     level: float,
     direction: int,
     sample: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The crossings of trajectories that take steps of their own: events of each."""
+) -> tuple[Located, np.ndarray, str]:
+    """The crossings of trajectories that take steps of their own, events of each; their status and message."""
 
     def g(t: float, y: np.ndarray) -> float:
         return float(y[coordinate] - level)
@@ -228,7 +249,13 @@ def _events(
         for y in rows
     ]
     times, states = zip(*((run.t_events[0], run.y_events[0]) for run in runs), strict=True)  # type: ignore[index]
-    return np.repeat(np.arange(len(rows)), [len(t) for t in times]), np.concatenate(times), np.concatenate(states)
+    trajectory = np.repeat(np.arange(len(rows)), [len(t) for t in times])
+    status = np.array([run.status for run in runs], dtype=int)
+    failed = np.flatnonzero(status < 0)
+    message = runs[failed[0] if failed.size else 0].message
+    if failed.size and len(runs) > 1:
+        message = f"{len(failed)} of {len(runs)} trajectories failed, the first of them (index {failed[0]}): {message}"
+    return (trajectory, np.concatenate(times), np.concatenate(states)), status, message
 
 
 class _Crossings:
@@ -236,7 +263,7 @@ class _Crossings:
 
     def __init__(
         self,
-        integrator: Integrator,
+        integrator: FixedStep,
         system: HamiltonianSystem,
         coordinate: int,
         level: float,
@@ -245,11 +272,51 @@ class _Crossings:
     ) -> None:
         self.integrator, self.system = integrator, system
         self.coordinate, self.level, self.direction, self.sample = coordinate, level, direction, sample
-        self.found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self.found: list[Located] = []
         self.at_start = True
 
-    def search(self, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> None:
-        """Steps (n,) of N trajectories: times (n,) or (n, N), states at their beginnings (n, N, 2d), lengths."""
+    def run(self, t_span: tuple[float, float], rows: np.ndarray) -> tuple[np.ndarray, str]:
+        """Search all steps from `rows` (N, 2d): the status (N,) of the trajectories, and the message."""
+        grid = Grid(*t_span, self.integrator.step_length(self.system))
+        y_end, n_searched = rows, 0
+        finite = np.zeros(len(rows), dtype=int)  # the steps of each trajectory that began at a finite state
+        held: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        for chunk in self.integrator.steps(self.system, t_span, rows):
+            if held:
+                self.search(*held, np.concatenate([held[1][1:], chunk[1][:1]]))
+            held = chunk
+            finite += np.isfinite(chunk[1]).all(-1).sum(0)
+            n_searched += len(chunk[1])
+        if held:
+            t, y, h = held
+            y_end = self._end(grid, t, y, h)
+            self.search(t, y, h, np.concatenate([y[1:], y_end[None]]))
+        reached = np.isfinite(y_end).all(-1) & (n_searched == grid.n_steps + bool(grid.remainder))
+        status = np.where(reached, 0, -1)
+        failed = np.flatnonzero(status)
+        if not failed.size:
+            return status, FINISHED
+        what, remedy = self.integrator.breakdown
+        first = int(failed[0])
+        # the last finite state is that at the beginning of the step that failed, or the end of a run cut short
+        last = int(finite[first]) - (0 if np.isfinite(y_end[first]).all() else 1)
+        whole = f"after t = {grid.time(last):.17g} (step {last + 1} of {grid.n_steps + bool(grid.remainder)})"
+        if len(rows) == 1:
+            return status, f"{what} {whole}. {remedy}, or end `t_span` earlier."
+        which = f"{len(failed)} of {len(rows)} trajectories failed, the first of them (index {first})"
+        return status, f"{which} {whole}. {what}. {remedy}."
+
+    def _end(self, grid: Grid, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """The end (N, 2d) of the last chunk of steps, run again: a single step would differ from it in rounding."""
+        n, step = len(y), float(h[-1])
+        with np.errstate(all="ignore"):
+            piece = Problem(self.system, float(t[0]), float(t[-1]) + step, y[0])
+            states, _, backend = self.integrator.rollout(piece, step, n, np.arange(n + 1))
+            end = states[-1] if step == grid.h else self.integrator.substep(self.system, y[0], step, backend)
+        return np.asarray(end)
+
+    def search(self, t: np.ndarray, y: np.ndarray, h: np.ndarray, y_end: np.ndarray) -> None:
+        """Steps (n,) of N trajectories: times (n,), states at their beginnings and ends (n, N, 2d), lengths."""
         h, t = (np.broadcast_to(a.reshape(len(y), -1), y.shape[:-1]) for a in (h, t))
         parts = max(1, int(np.ceil(np.abs(h).max() / self.sample * (1 - 1e-12))))
         before = y[..., self.coordinate] - self.level
@@ -258,7 +325,9 @@ class _Crossings:
         self.at_start = False
         for part in range(parts):
             with np.errstate(all="ignore"):
-                after = self._step(y, h * ((part + 1) / parts))[..., self.coordinate] - self.level
+                # the end of a step must be the beginning of the next to the last bit, or a zero there is lost
+                y_part = y_end if part == parts - 1 else self._step(y, h * ((part + 1) / parts))
+                after = y_part[..., self.coordinate] - self.level
                 up, down = ((before < 0) | starts) & (after >= 0), ((before > 0) | starts) & (after <= 0)
             starts = np.zeros_like(starts)
             crossed = {1: up, -1: down, 0: up | down}[self.direction] & (h != 0)
@@ -281,7 +350,7 @@ class _Crossings:
     def _step(self, y: np.ndarray, h: np.ndarray) -> np.ndarray:
         return self.integrator.step(self.system, 0.0, y, h)
 
-    def result(self, ndof: int, direction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def result(self, ndof: int, direction: float) -> Located:
         if not self.found:
             return np.empty(0, dtype=int), np.empty(0), np.empty((0, 2 * ndof))
         trajectory, t, states = (np.concatenate(parts) for parts in zip(*self.found, strict=True))

@@ -50,6 +50,46 @@ def test_a_start_on_the_plane_counts_as_it_does_for_events(method, direction, t_
         np.testing.assert_allclose(section.t[section.trajectory == k], sol.t_events[0], atol=1e-12)
 
 
+def test_crossings_at_the_ends_of_steps_are_those_that_events_find():
+    """Levels that grid states take to the last bit, those at the ends of chunks among them.
+
+    Not the last state of the run: rounding decides whether a run that ends on the plane has reached it.
+    """
+    run = solve(HH, "kahan_li8", (0, 60), dt=0.1)
+    for k in (*range(1, 600, 37), 55, 255, 256, 257):
+        level = float(run.y[0, k])
+        section = poincare_section(HH, "kahan_li8", (0, 60), level=level, direction=0, dt=0.1)
+        sol = solve(HH, "kahan_li8", (0, 60), dt=0.1, t_eval=[], events=lambda t, y, level=level: y[0] - level)
+        assert len(section) == len(sol.t_events[0])
+        np.testing.assert_allclose(section.t, sol.t_events[0], atol=1e-11)
+        assert np.abs(section.t - run.t[k]).min() < 1e-11
+
+
+ESCAPING = [0.0, 0.1, 1.0, 5.0]
+
+
+@pytest.mark.parametrize("method", ["verlet", "kahan_li8", "rk45"])
+def test_a_blow_up_is_reported_as_solve_reports_it(method):
+    options = {} if method == "rk45" else {"dt": 0.05}
+    alone = poincare_section(HH, method, (0, 50), ESCAPING, **options)
+    sol = solve(HH, method, (0, 50), ESCAPING, on_domain_exit="ignore", **options)
+    assert (alone.status, alone.success) == (sol.status, sol.success) == (-1, False)
+    assert alone.message == sol.message
+    assert alone.table().endswith(alone.message)
+    together = poincare_section(HH, method, (0, 50), [HH.y0, ESCAPING], **options)
+    assert together.status.tolist() == [0, -1]
+    assert together.message.startswith("1 of 2 trajectories failed, the first of them (index 1)")
+    fine = poincare_section(HH, method, (0, 5), **options)
+    assert (fine.status, fine.success, fine.message) == (0, True, solve(HH, method, (0, 5), **options).message)
+
+
+def test_the_title_says_what_the_coordinate_does_in_time():
+    for t_end, direction, way in ((50, 1, "increasing"), (-50, 1, "decreasing"), (-50, -1, "increasing")):
+        section = poincare_section(HH, "verlet", (0, t_end), direction=direction)
+        assert ((section.states[:, 2] > 0) == (way == "increasing")).all()
+        assert section.plot().axes[0].get_title().endswith(f"q1 = 0, q1 {way}")
+
+
 def test_a_batch_is_the_loop():
     y0 = HH.domain.sample(5, 1)
     together = poincare_section(HH, "verlet", (0, 50), y0.reshape(5, 1, 4), coordinate="q2", level=0.1)
