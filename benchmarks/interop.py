@@ -30,7 +30,7 @@ from scipy.integrate import RK45
 from sympflow import get, solve, systems
 from sympflow.interop.scipy import as_scipy
 from sympflow.interop.torchdiffeq import odeint
-from sympflow.tables import Column, number, seconds, text_table
+from sympflow.studies.tables import Column, number, seconds, text_table
 
 HH = systems.henon_heiles()
 N, T_END = 1000, 20.0

@@ -29,8 +29,8 @@ import stability_words as words
 import sympflow
 from sympflow import HamiltonianSystem, energy_growth, get, max_energy_error, solve, stability, systems
 from sympflow.integrators.logarithmic import LogSympFlow
-from sympflow.singularities import blow_up
-from sympflow.stability_report import StabilityReport, StabilityRow
+from sympflow.studies.singularities import blow_up
+from sympflow.studies.stability_report import StabilityReport, StabilityRow
 from sympflow.systems.fput import oscillatory_energies
 
 CLASSICAL = ("verlet", "leapfrog", "blanes_moan4", "srkn11b", "kahan_li8", "implicit_midpoint", "gauss_legendre4")
@@ -434,8 +434,8 @@ def round_off(figures: Path) -> str:
 
 
 def _round_off_figure(curves: list[tuple[str, Any]], path: Path) -> None:
-    from sympflow.figure_style import dress, method_styles, new_figure
-    from sympflow.plotting import save
+    from sympflow.studies.comparison_figure import save
+    from sympflow.studies.figure_style import dress, method_styles, new_figure
 
     figure = new_figure(6.4, 4.2)
     ax = figure.subplots()

@@ -25,10 +25,10 @@ _HOME = {
     "load": "flow.io",
     "shipped_flows": "flow.shipped",
     "train": "training.trainer",
-    "compare": "comparison",
-    "work_precision": "precision",
-    "stability": "step_stability",
-    "poincare_section": "poincare",
+    "compare": "studies.comparison",
+    "work_precision": "studies.precision",
+    "stability": "studies.step_stability",
+    "poincare_section": "studies.poincare",
     "energy_error": "metrics.energy",
     "max_energy_error": "metrics.energy",
     "energy_drift": "metrics.energy",
@@ -46,7 +46,6 @@ __all__ = ["__version__", *_HOME, *_MODULES]  # noqa: PLE0604
 if TYPE_CHECKING:
     from sympflow import interop as interop
     from sympflow import systems as systems
-    from sympflow.comparison import compare as compare
     from sympflow.domain import Ball as Ball
     from sympflow.domain import Box as Box
     from sympflow.domain import EnergySublevel as EnergySublevel
@@ -66,11 +65,12 @@ if TYPE_CHECKING:
     from sympflow.metrics.symplectic import loop_area_error as loop_area_error
     from sympflow.metrics.symplectic import symplecticity_defect as symplecticity_defect
     from sympflow.metrics.symplectic import volume_error as volume_error
-    from sympflow.poincare import poincare_section as poincare_section
-    from sympflow.precision import work_precision as work_precision
     from sympflow.solution import Solution as Solution
     from sympflow.solver import solve as solve
-    from sympflow.step_stability import stability as stability
+    from sympflow.studies.comparison import compare as compare
+    from sympflow.studies.poincare import poincare_section as poincare_section
+    from sympflow.studies.precision import work_precision as work_precision
+    from sympflow.studies.step_stability import stability as stability
     from sympflow.system import HamiltonianSystem as HamiltonianSystem
     from sympflow.time_transformation import time_transformed as time_transformed
     from sympflow.training.trainer import train as train

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sympflow import HamiltonianSystem, compare, get, reference_error, solve, systems
-from sympflow.comparison_report import combined_table
-from sympflow.matching import match
+from sympflow.studies.comparison_report import combined_table
+from sympflow.studies.matching import match
 from sympflow.timing import interleaved
 
 QUICK = {"n_outputs": 50, "repeats": 1}

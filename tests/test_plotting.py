@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sympflow import compare, get, poincare_section, systems
-from sympflow.plotting import overview, save_comparison
+from sympflow.studies.comparison_figure import overview, save_comparison
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sympflow import HamiltonianSystem, SympFlow, get, systems, work_precision
-from sympflow.precision_points import Point, break_even, cost_at
+from sympflow.studies.precision_points import Point, break_even, cost_at
 
 QUICK = {"t_span": (0, 10), "n_outputs": 10, "repeats": 1}
 

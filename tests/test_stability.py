@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 import sympflow
 from sympflow import get, solve, stability, systems
 from sympflow.commands import app
-from sympflow.singularities import blow_up
-from sympflow.step_stability import initial_states
+from sympflow.studies.singularities import blow_up
+from sympflow.studies.step_stability import initial_states
 
 SINGULARITY = 5.450984210235402  # of Hénon–Heiles from q = 0, p = (0, 0.7)
 

@@ -43,8 +43,8 @@ def compare(
       sympflow compare pendulum --methods verlet,kahan_li8:dt=0.5,rk45:rtol=1e-8 --match evaluations
     """
     with reporting():
-        from sympflow.comparison import compare as compare_methods
-        from sympflow.comparison_report import combined_table
+        from sympflow.studies.comparison import compare as compare_methods
+        from sympflow.studies.comparison_report import combined_table
 
         chosen, found = methods(method_names), scenes(systems)
         start = state(y0)
@@ -99,8 +99,8 @@ def bench(
       sympflow bench pendulum --methods verlet,kahan_li8,dop853 --batch 0 --t-end 50
     """
     with reporting():
-        from sympflow.plotting import save
-        from sympflow.precision import work_precision
+        from sympflow.studies.comparison_figure import save
+        from sympflow.studies.precision import work_precision
 
         chosen, found, start = methods(method_names), scenes(systems), state(y0)
         if to is not None:

@@ -42,7 +42,7 @@ def stability(
       sympflow stability henon-heiles-escape --out out/
     """
     with reporting():
-        from sympflow.step_stability import stability as find_stability
+        from sympflow.studies.step_stability import stability as find_stability
 
         chosen, found = methods(method_names), scenes(systems)
         lengths = None if steps is None else [_number("--steps", word) for word in steps.split(",")]

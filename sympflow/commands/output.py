@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 
 from sympflow.commands.arguments import Scene
-from sympflow.tables import Column, text_table
+from sympflow.studies.tables import Column, text_table
 
 out = Console(soft_wrap=True, highlight=False)
 err = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -64,7 +64,7 @@ def ready_folder(folder: Path) -> None:
     ImportError
         Without matplotlib, which draws the figures.
     """
-    from sympflow.figure_style import new_figure
+    from sympflow.studies.figure_style import new_figure
 
     new_figure(1, 1)
     _ready(folder, folder, "a folder")
@@ -110,8 +110,8 @@ def write_comparisons(
     comparisons: list[Any], found: list[Scene], folder: Path, say: Callable[[str], None]
 ) -> list[Path]:
     """For each system its CSV, JSON and figures; for several also one CSV and one figure of all."""
-    from sympflow.plotting import overview, save, save_comparison
-    from sympflow.tables import write_csv
+    from sympflow.studies.comparison_figure import overview, save, save_comparison
+    from sympflow.studies.tables import write_csv
 
     written: list[Path] = []
     for comparison, scene in zip(comparisons, found, strict=True):

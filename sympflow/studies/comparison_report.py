@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.measurements import Row, Run
 from sympflow.metrics.reference import Reference
+from sympflow.studies.measurements import Row, Run
+from sympflow.studies.tables import Column, number, plain, records, seconds, text_table, write_csv, write_json
 from sympflow.system import HamiltonianSystem
-from sympflow.tables import Column, number, plain, records, seconds, text_table, write_csv, write_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -88,7 +88,7 @@ class Comparison:
 
     def figure(self, kind: str = "overview") -> Figure:
         """A matplotlib figure: "overview", "energy", "volume", "error" (against run time) or "portrait"."""
-        from sympflow.plotting import comparison_figure
+        from sympflow.studies.comparison_figure import comparison_figure
 
         return comparison_figure(self, kind)
 
@@ -104,7 +104,7 @@ class Comparison:
         prefix : str
             What the names of the files in a folder begin with; the kinds follow.
         """
-        from sympflow.plotting import save_comparison
+        from sympflow.studies.comparison_figure import save_comparison
 
         figure = self.figure(kind)
         if path is not None:

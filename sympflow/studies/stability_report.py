@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sympflow.studies.tables import Column, number, plain, text_table, write_csv
 from sympflow.system import HamiltonianSystem
-from sympflow.tables import Column, number, plain, text_table, write_csv
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -143,7 +143,7 @@ class StabilityReport:
 
         The default is the map for a family, else the steps.
         """
-        from sympflow.stability_figure import stability_figure
+        from sympflow.studies.stability_figure import stability_figure
 
         return stability_figure(self, kind)
 
@@ -151,7 +151,7 @@ class StabilityReport:
         """The figure, as `figure`; with a path it is also saved."""
         figure = self.figure(kind)
         if path is not None:
-            from sympflow.plotting import save
+            from sympflow.studies.comparison_figure import save
 
             save(figure, Path(path))
         return figure

@@ -17,8 +17,8 @@ from sympflow.integrators.base import FINISHED, FixedStep, Integrator, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import build
 from sympflow.solver import solve
+from sympflow.studies.tables import Column, text_table, write_csv
 from sympflow.system import HamiltonianSystem
-from sympflow.tables import Column, text_table, write_csv
 from sympflow.validation import check_t_span, check_y0
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ class PoincareSection:
         ImportError
             Without matplotlib.
         """
-        from sympflow.figure_style import TEXT, dress, new_figure
+        from sympflow.studies.figure_style import TEXT, dress, new_figure
 
         d, label = self.system.ndof, names(self.system.ndof)
         position = next((j for j in range(d) if j != self.coordinate), d)

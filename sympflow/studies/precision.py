@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.candidates import Candidate, candidates
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.accuracy import reference_error
 from sympflow.metrics.energy import failed, max_energy_error
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
-from sympflow.precision_points import Point, break_even
-from sympflow.precision_report import WorkPrecision
 from sympflow.solution import Solution
 from sympflow.solver import solve
+from sympflow.studies.candidates import Candidate, candidates
+from sympflow.studies.precision_points import Point, break_even
+from sympflow.studies.precision_report import WorkPrecision
 from sympflow.system import HamiltonianSystem
 from sympflow.timing import interleaved
 from sympflow.validation import check_t_span, check_y0

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sympflow.comparison_report import title
 from sympflow.metrics.reference import Reference
-from sympflow.precision_points import Point, cost_at
+from sympflow.studies.comparison_report import title
+from sympflow.studies.precision_points import Point, cost_at
+from sympflow.studies.tables import Column, number, plain, records, seconds, text_table, write_csv, write_json
 from sympflow.system import HamiltonianSystem
-from sympflow.tables import Column, number, plain, records, seconds, text_table, write_csv, write_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -125,13 +125,13 @@ class WorkPrecision:
         ----------
         measure : "energy_error" or "error"
         """
-        from sympflow.precision_figure import precision_figure
+        from sympflow.studies.precision_figure import precision_figure
 
         return precision_figure(self, measure)
 
     def plot(self, path: str | os.PathLike[str] | None = None, measure: str = "energy_error") -> Figure:
         """The figure, as `figure`; with a path it is also saved."""
-        from sympflow.plotting import save
+        from sympflow.studies.comparison_figure import save
 
         figure = self.figure(measure)
         if path is not None:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.candidates import candidates
 from sympflow.solver import solve
-from sympflow.stability_report import StabilityReport, StabilityRow, StepLimit
-from sympflow.stability_study import Study
+from sympflow.studies.candidates import candidates
+from sympflow.studies.stability_report import StabilityReport, StabilityRow, StepLimit
+from sympflow.studies.stability_study import Study
 from sympflow.system import HamiltonianSystem
 from sympflow.validation import check_t_span, check_y0
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sympflow.candidates import Candidate
 from sympflow.metrics.accuracy import time_reversal_error
 from sympflow.metrics.energy import energy_drift, energy_error, failed, max_energy_error
 from sympflow.metrics.symplectic import symplecticity_defect, volume_error
 from sympflow.solution import Solution
+from sympflow.studies.candidates import Candidate
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.figure_style import TEXT, dress, method_styles, new_figure
-from sympflow.stability_report import StabilityReport, StabilityRow
+from sympflow.studies.figure_style import TEXT, dress, method_styles, new_figure
+from sympflow.studies.stability_report import StabilityReport, StabilityRow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

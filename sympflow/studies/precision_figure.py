@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sympflow.figure_style import dress, method_styles, new_figure
-from sympflow.precision_points import Point
-from sympflow.precision_report import WorkPrecision
+from sympflow.studies.figure_style import dress, method_styles, new_figure
+from sympflow.studies.precision_points import Point
+from sympflow.studies.precision_report import WorkPrecision
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

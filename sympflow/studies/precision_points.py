@@ -19,7 +19,7 @@ class Point:
         1, or the size of the batch.
     dt, tolerance : float or None
     status, reason : str
-        As for `sympflow.comparison.Row`; "uncertain" if the error is not 100 times the reference's own.
+        As for `sympflow.studies.comparison.Row`; "uncertain" if the error is not 100 times the reference's own.
     backend : str
     run_time, run_time_spread : float
         Of all trajectories together, in seconds: median and interquartile range of `repeats` runs.

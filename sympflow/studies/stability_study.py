@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.candidates import Candidate
-from sympflow.comparison_report import title
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.energy import energy_drift, max_energy_error
 from sympflow.metrics.symplectic import symplecticity_defect, volume_error
-from sympflow.singularities import blow_up
 from sympflow.solution import Solution
 from sympflow.solver import domain_of, solve
-from sympflow.stability_report import StabilityRow, StepLimit
+from sympflow.studies.candidates import Candidate
+from sympflow.studies.comparison_report import title
+from sympflow.studies.singularities import blow_up
+from sympflow.studies.stability_report import StabilityRow, StepLimit
 from sympflow.system import HamiltonianSystem
 from sympflow.validation import MAX_SAVED_VALUES
 

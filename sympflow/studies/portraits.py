@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.arrays import Array, to_numpy
-from sympflow.comparison_report import Comparison
-from sympflow.figure_style import TEXT, dress, method_styles, new_figure
 from sympflow.integrators.registry import build
 from sympflow.solver import solve
+from sympflow.studies.comparison_report import Comparison
+from sympflow.studies.figure_style import TEXT, dress, method_styles, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

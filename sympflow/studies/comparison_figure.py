@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.comparison_report import Comparison
-from sympflow.figure_style import TEXT, dress, method_styles, new_figure
-from sympflow.measurements import Run
-from sympflow.portraits import portrait
 from sympflow.solution import Solution
+from sympflow.studies.comparison_report import Comparison
+from sympflow.studies.figure_style import TEXT, dress, method_styles, new_figure
+from sympflow.studies.measurements import Run
+from sympflow.studies.portraits import portrait
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
