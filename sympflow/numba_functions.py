@@ -73,8 +73,8 @@ def _each_row(f: Any, *arguments: np.ndarray) -> np.ndarray:
     shape = np.broadcast_shapes(*(a.shape for a in arguments))
     rows = [_rows(a, shape) for a in arguments]
     out = np.empty_like(rows[0])
-    for i, result in enumerate(out):
-        f(*(row[i] for row in rows), result)
+    for each in zip(*rows, out, strict=True):
+        f(*each)
     return out.reshape(shape).astype(arguments[0].dtype, copy=False)
 
 

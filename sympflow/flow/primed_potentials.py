@@ -58,7 +58,7 @@ def _force_gradient_value(system: HamiltonianSystem, q: Tensor) -> Tensor:
 
 
 def _force_gradient(system: HamiltonianSystem, q: Tensor) -> Tensor:
-    return (system.potential_hessian(q) @ system.velocity(system.force(q))[..., None])[..., 0]
+    return system.hessian_vector(q, system.velocity(system.force(q)))
 
 
 POTENTIAL = Term(lambda system, q: system.potential(q), lambda system, q: -system.force(q))
@@ -69,6 +69,19 @@ KINETIC = Term(lambda system, p: system.kinetic(p), lambda system, p: system.vel
 
 def _gradient_columns(U: Term, system: HamiltonianSystem, x: Tensor) -> Tensor:
     return U.gradient(system, x.T).T
+
+
+def _gradient_and_change(U: Term, system: HamiltonianSystem, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
+    """∇U on columns (d, N), and its derivative along dx.
+
+    Numba functions end at ∇²V·v: the third derivative of V in a force gradient is then a central difference of it.
+    """
+    gradient = partial(_gradient_columns, U, system)
+    if U is not FORCE_GRADIENT or system.numba_functions is None:
+        return jvp(gradient, x, dx)
+    size, length = (v.abs().amax(0) for v in (x, dx))
+    h = torch.finfo(x.dtype).eps ** (1 / 3) * torch.where(size > 0, size, 1.0) / torch.where(length > 0, length, 1.0)
+    return gradient(x), (gradient(x + h * dx) - gradient(x - h * dx)) / (2 * h)
 
 
 class PrimedPotential(Potential):
@@ -100,7 +113,7 @@ class PrimedPotential(Potential):
         system = self.binding.system
         impulse = tangent = torch.zeros_like(x)
         for U, c in self._terms:
-            gradient, change = jvp(partial(_gradient_columns, U, system), x, dx)
+            gradient, change = _gradient_and_change(U, system, x, dx)
             impulse = impulse + c.value(t) * gradient
             tangent = tangent + c.rate(t) * gradient + c.value(t) * change
         return impulse, tangent
