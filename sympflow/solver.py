@@ -13,7 +13,7 @@ from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
 from sympflow.domain import Domain, EnergySublevel
 from sympflow.events import run_and_search
 from sympflow.integrators.base import Integrator, Outcome, Problem
-from sympflow.integrators.registry import build, naming_plugin
+from sympflow.integrators.registry import build, check_applies, naming_plugin
 from sympflow.solution import Solution
 from sympflow.system import HamiltonianSystem
 from sympflow.validation import check_events, check_memory, check_save_every, check_t_eval, check_t_span, check_y0
@@ -99,8 +99,7 @@ def solve(
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     integrator = build(method, options)
-    with naming_plugin(integrator, passes=(ValueError,)):  # by which it says that it does not apply
-        integrator.check(system)
+    check_applies(integrator, system)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
@@ -127,6 +126,10 @@ def solve(
         )
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
+    if np.any(np.asarray(outcome.status) < 0):
+        from sympflow.singularity import note_singularities
+
+        note_singularities(outcome, integrator, problem)
     if action != "ignore":
         _check_domain(outcome, integrator, system, action)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else np.moveaxis(outcome.y, 0, -1)

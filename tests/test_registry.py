@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from sympflow import available, get, register, solve, systems
+from sympflow import available, compare, get, poincare_section, register, solve, systems
 from sympflow.integrators import registry
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.schemes import SCHEMES
@@ -35,6 +35,10 @@ class Failing(SymplecticEuler):
 class Refusing(SymplecticEuler):
     def __post_init__(self):
         raise ValueError("`dt` is not to my taste.")
+
+
+class Refined(SymplecticEuler):
+    """A class that is registered under another name than its own."""
 
 
 class Optionless(SymplecticEuler):
@@ -99,6 +103,7 @@ def plugins(monkeypatch):
     ]
     monkeypatch.setattr(registry, "entry_points", lambda group: points)
     monkeypatch.setattr(registry, "_loaded", {})
+    monkeypatch.setattr(registry, "_registered", {})
     registry._plugins.cache_clear()
     yield
     registry._plugins.cache_clear()
@@ -205,6 +210,48 @@ def test_the_error_of_a_plugin_is_the_cause(plugins):
     assert isinstance(caught.value.__cause__, KeyError)
     with pytest.raises(KeyError):  # no plug-in's: as it is
         solve(systems.pendulum(), type("Own", (FailingStep,), {})(dt=0.1), (0, 1))
+
+
+def run_in_scipy(method, system):
+    from scipy.integrate import solve_ivp
+
+    from sympflow.interop.scipy import as_scipy
+
+    return solve_ivp(system, (0, 1), system.y0, method=as_scipy(method, system))
+
+
+def run_in_torchdiffeq(method, system):
+    import torch
+
+    from sympflow.interop.torchdiffeq import odeint
+
+    return odeint(system, torch.tensor(system.y0), torch.tensor([0.0, 1.0]), method=method)
+
+
+@pytest.mark.filterwarnings("ignore:The integrator 'verlet' of")
+@pytest.mark.parametrize(("method", "kind"), [("failing_step", "KeyError"), ("failing_check", "AttributeError")])
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda method, system: poincare_section(system, method, (0, 1)),
+        run_in_scipy,
+        run_in_torchdiffeq,
+    ],
+    ids=["poincare_section", "scipy", "torchdiffeq"],
+)
+def test_a_plugin_that_fails_elsewhere_is_named_too(use, method, kind, plugins):
+    with pytest.raises(RuntimeError, match=rf"^`method` '{method}' of the plug-in .* failed \({kind}: '?inner"):
+        use(method, systems.pendulum())
+
+
+@pytest.mark.filterwarnings("ignore:The integrator 'verlet' of")
+def test_plugins_are_compared_under_the_name_that_was_asked_for(plugins):
+    register("mine", Refined)
+    methods = ["good", get("good")(dt=0.1), "mine", Refined(), "verlet"]
+    report = compare(systems.pendulum(), methods, ("energy", "volume"), t_span=(0, 1), n_outputs=5, repeats=1)
+    assert [row.method for row in report.rows] == ["good", "good", "mine", "mine", "verlet"]
+    assert [row.label for row in report.rows] == ["good", "good (dt=0.1)", "mine", "mine #2", "verlet"]
+    assert "No volume: `method` 'good' of the plug-in" in report.rows[0].reason  # its NumPy step takes no tensors
 
 
 def test_max_step_of_a_fixed_step_method_is_explained():

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from sympflow.integrators.base import Integrator
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED
+from sympflow.system import HamiltonianSystem
 
 T = TypeVar("T")
 
@@ -227,6 +228,22 @@ def naming_plugin(integrator: Integrator, passes: tuple[type[Exception], ...] = 
             f"`method` {point.name!r} of the plug-in {_distribution(point)} failed ({type(error).__name__}: {error}): "
             "report it there, unless a function of your own, of the system or an event, raised it."
         ) from error
+
+
+def check_applies(integrator: Integrator, system: HamiltonianSystem) -> None:
+    """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named."""
+    with naming_plugin(integrator, passes=(ValueError,)):
+        integrator.check(system)
+
+
+def name_of(integrator: Integrator) -> str:
+    """What `get` knows the integrator's class by: plug-ins and registered classes may have another `name`."""
+    cls = type(integrator)
+    if cls in _loaded:
+        return _loaded[cls].name
+    if integrator.name in _NAMES and get(integrator.name) is cls:
+        return integrator.name
+    return next((name for name, registered in _registered.items() if registered is cls), integrator.name)
 
 
 def _distribution(point: EntryPoint) -> str:

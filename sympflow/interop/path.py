@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.registry import naming_plugin
 from sympflow.system import HamiltonianSystem
 
 MAX_EVENT_STEPS = 1_000_000
@@ -50,7 +51,7 @@ class Path:
         if not (s.requires_grad or np.any(remainder)):
             return states
         h = r.reshape(-1, *[1] * (states.ndim - 2)).expand(states.shape[:-1])
-        return self.integrator.step(self.system, 0.0, states, h)
+        return self._step(states, h)
 
     def _rollout(self, count: np.ndarray) -> Tensor:
         """The states after the steps `count`: compiled where nothing is to be differentiated."""
@@ -59,10 +60,16 @@ class Path:
         plain = not (self.eager or self._differentiable()) and self.y0.device.type == "cpu"
         if plain:
             y0 = self.y0.detach().numpy()
-        states, _, _ = self.integrator.rollout(Problem(self.system, 0.0, n_steps * self.h, y0), self.h, n_steps, save)
+        problem = Problem(self.system, 0.0, n_steps * self.h, y0)
+        with naming_plugin(self.integrator):
+            states, _, _ = self.integrator.rollout(problem, self.h, n_steps, save)
         if plain:
             states = torch.from_numpy(np.ascontiguousarray(states))
         return states[torch.as_tensor(np.searchsorted(save, count), device=self.y0.device)]
+
+    def _step(self, y: Tensor, h: float | Tensor) -> Tensor:
+        with naming_plugin(self.integrator):
+            return self.integrator.step(self.system, 0.0, y, h)
 
     def _differentiable(self) -> bool:
         return torch.is_grad_enabled() and (self.y0.requires_grad or self._learns())
@@ -132,7 +139,7 @@ class Path:
         repeated = states[:, None].expand(-1, parts - 1, *states.shape[1:])
         fractions = torch.arange(1, parts, dtype=states.dtype, device=states.device) / parts
         h = (self.h * fractions).reshape(-1, *[1] * (states.ndim - 2)).expand(repeated.shape[:-1])
-        return repeated if parts == 1 else self.integrator.step(self.system, 0.0, repeated, h)
+        return repeated if parts == 1 else self._step(repeated, h)
 
     def _locate(
         self,
@@ -151,6 +158,6 @@ class Path:
         def f(s: float) -> float:
             if s in known:
                 return known[s] * unit
-            return value(s, self.integrator.step(self.system, 0.0, y, s - start)) * unit
+            return value(s, self._step(y, s - start)) * unit
 
         return b if g_b == 0 else float(brentq(f, a, b, xtol=_EPS, rtol=_EPS))

@@ -13,6 +13,7 @@ from scipy.integrate import DenseOutput, OdeSolver
 
 from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.registry import check_applies, naming_plugin
 from sympflow.interop.matching import fixed_step, warn_of_another_system
 from sympflow.system import HamiltonianSystem
 
@@ -55,7 +56,7 @@ def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: An
         )
     integrator = fixed_step(method, options, "SciPy")
     if system is not None:
-        integrator.check(system)
+        check_applies(integrator, system)
     name = f"{integrator.name.title().replace('_', '')}Solver"
     return type(name, (FlowSolver,), {"integrator": integrator, "system": system, "__doc__": FlowSolver.__doc__})
 
@@ -133,7 +134,7 @@ class FlowSolver(OdeSolver):
         if not np.isfinite(self.y).all():
             raise ValueError("`y0` must be finite; it holds NaN or infinity.")
         if self._solved is not None and self._solved is not self.system:
-            integrator.check(self._solved)
+            check_applies(integrator, self._solved)
         self.y = self.y.astype(float)
         with np.errstate(all="ignore"):
             slope = np.asarray(self.fun(self.t, self.y), dtype=float)
@@ -186,15 +187,16 @@ class FlowSolver(OdeSolver):
             n = min(self._block, self._grid.n_steps - self._k)
             self._block = min(2 * self._block, LOOK_AHEAD)
             piece = Problem(self._solved, self._t_anchor, self._t_anchor + n * self._grid.h, self._anchor)
-            states, _, self._backend = self._counting.rollout(piece, self._grid.h, n, np.arange(1, n + 1))
+            with naming_plugin(self._counting):
+                states, _, self._backend = self._counting.rollout(piece, self._grid.h, n, np.arange(1, n + 1))
+                self.nfev += self._counting.evaluations(n, n, 0, self._backend)["force_evaluations"]
             self._ahead.extend(states)
-            self.nfev += self._counting.evaluations(n, n, 0, self._backend)["force_evaluations"]
         return self._ahead.popleft()
 
     def _shorter(self, h: float) -> np.ndarray:
-        with np.errstate(all="ignore"):
+        with naming_plugin(self._counting), np.errstate(all="ignore"):
             y = self._counting.substep(self._solved, self._anchor, h, self._backend)
-        self.nfev += self._counting.evaluations(0, 0, 1, self._backend)["force_evaluations"]
+            self.nfev += self._counting.evaluations(0, 0, 1, self._backend)["force_evaluations"]
         return y
 
     def _dense_output_impl(self) -> DenseOutput:
@@ -224,7 +226,7 @@ class FlowOutput(DenseOutput):
         moving = (h != 0) & (times != self.t)
         states[times == self.t] = self._y
         if moving.any():
-            with np.errstate(all="ignore"):
+            with naming_plugin(self._integrator), np.errstate(all="ignore"):
                 states[moving] = self._integrator.substep(self._system, states[moving], h[moving], self._backend)
             counts = self._integrator.evaluations(0, 0, int(np.count_nonzero(moving)), self._backend)
             self._evaluations.total += counts["force_evaluations"]

@@ -18,7 +18,7 @@ import torchdiffeq
 from torch import Tensor
 
 from sympflow.integrators.base import FixedStep, Integrator
-from sympflow.integrators.registry import available
+from sympflow.integrators.registry import available, check_applies
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED
 from sympflow.interop.matching import fixed_step, warn_of_another_system
 from sympflow.interop.path import Path
@@ -198,7 +198,7 @@ def _build(func: Any, method: Any, options: dict[str, Any] | None) -> tuple[Fixe
             "or options={'system': system}; sympflow.interop.systems converts a module."
         )
     if system is not None:
-        integrator.check(system)
+        check_applies(integrator, system)
     return integrator, system
 
 

@@ -23,6 +23,7 @@ except ImportError as error:  # pragma: no cover
     raise ImportError("sympflow.interop.torchode needs torchode: pip install torchode.") from error
 
 from sympflow.integrators.base import FixedStep
+from sympflow.integrators.registry import check_applies, naming_plugin
 from sympflow.interop.matching import fixed_step
 from sympflow.system import HamiltonianSystem
 
@@ -58,7 +59,7 @@ def step_method(method: Any, system: HamiltonianSystem, **options: Any) -> Sympl
     if "dt" in options:
         raise TypeError("`dt` is not an option here: the step length is torchode's `dt0`, one for each sample.")
     integrator = fixed_step(method, options, "torchode")
-    integrator.check(system)
+    check_applies(integrator, system)
     return SymplecticStep(integrator, system)
 
 
@@ -113,7 +114,8 @@ class SymplecticStep(SingleStepMethod):
         return StepResult(self._advance(y0, dt), None), Beginning(t0, y0), state, None
 
     def _advance(self, y: Tensor, h: Tensor) -> Tensor:
-        return self.integrator.step(self.system, 0.0, y, h.to(y.dtype))
+        with naming_plugin(self.integrator):
+            return self.integrator.step(self.system, 0.0, y, h.to(y.dtype))
 
     def merge_states(self, accept: Tensor, current: Tensor, previous: Tensor) -> Tensor:
         return current

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sympflow.integrators.base import FixedStep, Integrator
-from sympflow.integrators.registry import build
+from sympflow.integrators.registry import build, name_of
 
 
 @dataclass(frozen=True)
@@ -51,17 +51,18 @@ def candidates(methods: Sequence[Any], dt: float | None = None) -> list[Candidat
             continue
         if dt is not None and isinstance(method, str) and isinstance(integrator, FixedStep) and not integrator.trained:
             integrator = replace(integrator, dt=dt)
-        found.append(Candidate(_distinct(label or _label(method, integrator), found), integrator.name, integrator))
+        name = method if isinstance(method, str) else name_of(integrator)
+        found.append(Candidate(_distinct(label or _label(name, method, integrator), found), name, integrator))
     return found
 
 
-def _label(method: Any, integrator: Integrator) -> str:
+def _label(name: str, method: Any, integrator: Integrator) -> str:
     """The name, with the step or tolerance if the caller configured one."""
     if not isinstance(method, Integrator) or integrator.trained:
-        return integrator.name
+        return name
     if isinstance(integrator, FixedStep):
-        return integrator.name if integrator.dt is None else f"{integrator.name} (dt={integrator.dt:g})"
-    return f"{integrator.name} (rtol={getattr(integrator, 'rtol', 0):g})"
+        return name if integrator.dt is None else f"{name} (dt={integrator.dt:g})"
+    return f"{name} (rtol={integrator.rtol:g})" if hasattr(integrator, "rtol") else name
 
 
 def _distinct(label: str, found: list[Candidate]) -> str:

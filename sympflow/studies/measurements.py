@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.accuracy import time_reversal_error
 from sympflow.metrics.energy import energy_drift, energy_error, failed, max_energy_error
 from sympflow.metrics.symplectic import symplecticity_defect, volume_error
@@ -111,7 +112,8 @@ def measure(one: Run, sol: Solution, asked: tuple[str, ...]) -> None:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", RuntimeWarning)
             try:
-                MEASURES[metric](one, sol)
+                with naming_plugin(sol.integrator, passes=(TypeError, ValueError)):  # by which it says that it cannot
+                    MEASURES[metric](one, sol)
             except Exception as error:
                 one.note(f"No {metric}: {error}")
         for message in dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, RuntimeWarning)):

@@ -13,19 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import is_tensor
-from sympflow.integrators.base import FINISHED, FixedStep, Integrator, Problem
-from sympflow.integrators.grid import Grid
-from sympflow.integrators.registry import build
-from sympflow.solver import solve
+from sympflow.integrators.base import Integrator
+from sympflow.integrators.registry import build, check_applies
+from sympflow.studies.crossings import Plane, crossings
 from sympflow.studies.tables import Column, text_table, write_csv
 from sympflow.system import HamiltonianSystem
 from sympflow.validation import check_t_span, check_y0
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Located = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Crossings: trajectory (n,), t (n,), states (n, 2d)."""
 
 
 def poincare_section(
@@ -86,7 +82,7 @@ def poincare_section(
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     integrator = build(method, options)
-    integrator.check(system)
+    check_applies(integrator, system)
     span = check_t_span(system.t_span if t_span is None else t_span)
     if is_tensor(y0):
         raise TypeError("`y0` is a tensor, but crossings are located on NumPy arrays: pass y0.numpy().")
@@ -100,15 +96,21 @@ def poincare_section(
     if not (_is_number(sample) and sample > 0):
         raise ValueError(f"`sample` must be a positive number, a time; got {sample!r}.")
     rows = start.reshape(-1, start.shape[-1])
-    if isinstance(integrator, FixedStep) and integrator.on_grid:
-        found = _Crossings(integrator, system, index, float(level), direction, float(sample))
-        status, message = found.run(span, rows)
-        crossings = found.result(system.ndof, np.sign(span[1] - span[0]))
-    else:
-        crossings, status, message = _events(integrator, system, span, rows, index, float(level), direction, sample)
-    ended = int(status[0]) if start.ndim == 1 else status
+    plane = Plane(index, float(level), direction)
+    found = crossings(integrator, system, span, rows, plane, float(sample))
     return PoincareSection(
-        system, integrator, span, rows, index, float(level), direction, *crossings, status=ended, message=message
+        system,
+        integrator,
+        span,
+        rows,
+        index,
+        float(level),
+        direction,
+        found.trajectory,
+        found.t,
+        found.states,
+        status=int(found.status[0]) if start.ndim == 1 else found.status,
+        message=found.message,
     )
 
 
@@ -226,136 +228,6 @@ class PoincareSection:
         ax.set_title(f"{self.system.name.replace('_', ' ')}, {self.integrator.name}: {plane}", fontsize=9, color=TEXT)
         dress(ax, label[i], label[j])
         return figure
-
-
-def _events(
-    integrator: Integrator,
-    system: HamiltonianSystem,
-    t_span: tuple[float, float],
-    rows: np.ndarray,
-    coordinate: int,
-    level: float,
-    direction: int,
-    sample: float,
-) -> tuple[Located, np.ndarray, str]:
-    """The crossings of trajectories that take steps of their own, events of each; their status and message."""
-
-    def g(t: float, y: np.ndarray) -> float:
-        return float(y[coordinate] - level)
-
-    g.direction = direction  # type: ignore[attr-defined]
-    runs = [
-        solve(system, integrator, t_span, y, t_eval=[], events=g, event_step=sample, on_domain_exit="ignore")
-        for y in rows
-    ]
-    times, states = zip(*((run.t_events[0], run.y_events[0]) for run in runs), strict=True)  # type: ignore[index]
-    trajectory = np.repeat(np.arange(len(rows)), [len(t) for t in times])
-    status = np.array([run.status for run in runs], dtype=int)
-    failed = np.flatnonzero(status < 0)
-    message = runs[failed[0] if failed.size else 0].message
-    if failed.size and len(runs) > 1:
-        message = f"{len(failed)} of {len(runs)} trajectories failed, the first of them (index {failed[0]}): {message}"
-    return (trajectory, np.concatenate(times), np.concatenate(states)), status, message
-
-
-class _Crossings:
-    """Finds the crossings in the steps of a run, those of all trajectories at once, as they stream by."""
-
-    def __init__(
-        self,
-        integrator: FixedStep,
-        system: HamiltonianSystem,
-        coordinate: int,
-        level: float,
-        direction: int,
-        sample: float,
-    ) -> None:
-        self.integrator, self.system = integrator, system
-        self.coordinate, self.level, self.direction, self.sample = coordinate, level, direction, sample
-        self.found: list[Located] = []
-        self.at_start = True
-
-    def run(self, t_span: tuple[float, float], rows: np.ndarray) -> tuple[np.ndarray, str]:
-        """Search all steps from `rows` (N, 2d): the status (N,) of the trajectories, and the message."""
-        grid = Grid(*t_span, self.integrator.step_length(self.system))
-        y_end, n_searched = rows, 0
-        finite = np.zeros(len(rows), dtype=int)  # the steps of each trajectory that began at a finite state
-        held: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-        for chunk in self.integrator.steps(self.system, t_span, rows):
-            if held:
-                self.search(*held, np.concatenate([held[1][1:], chunk[1][:1]]))
-            held = chunk
-            finite += np.isfinite(chunk[1]).all(-1).sum(0)
-            n_searched += len(chunk[1])
-        if held:
-            t, y, h = held
-            y_end = self._end(grid, t, y, h)
-            self.search(t, y, h, np.concatenate([y[1:], y_end[None]]))
-        reached = np.isfinite(y_end).all(-1) & (n_searched == grid.n_steps + bool(grid.remainder))
-        status = np.where(reached, 0, -1)
-        failed = np.flatnonzero(status)
-        if not failed.size:
-            return status, FINISHED
-        what, remedy = self.integrator.breakdown
-        first = int(failed[0])
-        # the last finite state is that at the beginning of the step that failed, or the end of a run cut short
-        last = int(finite[first]) - (0 if np.isfinite(y_end[first]).all() else 1)
-        whole = f"after t = {grid.time(last):.17g} (step {last + 1} of {grid.n_steps + bool(grid.remainder)})"
-        if len(rows) == 1:
-            return status, f"{what} {whole}. {remedy}, or end `t_span` earlier."
-        which = f"{len(failed)} of {len(rows)} trajectories failed, the first of them (index {first})"
-        return status, f"{which} {whole}. {what}. {remedy}."
-
-    def _end(self, grid: Grid, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """The end (N, 2d) of the last chunk of steps, run again: a single step would differ from it in rounding."""
-        n, step = len(y), float(h[-1])
-        with np.errstate(all="ignore"):
-            piece = Problem(self.system, float(t[0]), float(t[-1]) + step, y[0])
-            states, _, backend = self.integrator.rollout(piece, step, n, np.arange(n + 1))
-            end = states[-1] if step == grid.h else self.integrator.substep(self.system, y[0], step, backend)
-        return np.asarray(end)
-
-    def search(self, t: np.ndarray, y: np.ndarray, h: np.ndarray, y_end: np.ndarray) -> None:
-        """Steps (n,) of N trajectories: times (n,), states at their beginnings and ends (n, N, 2d), lengths."""
-        h, t = (np.broadcast_to(a.reshape(len(y), -1), y.shape[:-1]) for a in (h, t))
-        parts = max(1, int(np.ceil(np.abs(h).max() / self.sample * (1 - 1e-12))))
-        before = y[..., self.coordinate] - self.level
-        starts = np.zeros(before.shape, dtype=bool)
-        starts[:1] = self.at_start & (before[:1] == 0)  # a zero at the end of a step was counted in that step
-        self.at_start = False
-        for part in range(parts):
-            with np.errstate(all="ignore"):
-                # the end of a step must be the beginning of the next to the last bit, or a zero there is lost
-                y_part = y_end if part == parts - 1 else self._step(y, h * ((part + 1) / parts))
-                after = y_part[..., self.coordinate] - self.level
-                up, down = ((before < 0) | starts) & (after >= 0), ((before > 0) | starts) & (after <= 0)
-            starts = np.zeros_like(starts)
-            crossed = {1: up, -1: down, 0: up | down}[self.direction] & (h != 0)
-            if crossed.any():
-                self._locate(t, y, h, crossed, part / parts, (part + 1) / parts, before)
-            before = after
-
-    def _locate(
-        self, t: np.ndarray, y: np.ndarray, h: np.ndarray, crossed: np.ndarray, a: float, b: float, before: np.ndarray
-    ) -> None:
-        """Bisect all crossings together, in the fraction of the step."""
-        y, t, h, sign = y[crossed], t[crossed], h[crossed], np.sign(before[crossed])
-        low, high = np.full(len(y), a), np.where(sign == 0, a, b)
-        for _ in range(54):
-            middle = (low + high) / 2
-            g = self._step(y, h * middle)[:, self.coordinate] - self.level
-            low, high = np.where(g * sign > 0, middle, low), np.where(g * sign > 0, high, middle)
-        self.found.append((np.nonzero(crossed)[1], t + h * high, self._step(y, h * high)))
-
-    def _step(self, y: np.ndarray, h: np.ndarray) -> np.ndarray:
-        return self.integrator.step(self.system, 0.0, y, h)
-
-    def result(self, ndof: int, direction: float) -> Located:
-        if not self.found:
-            return np.empty(0, dtype=int), np.empty(0), np.empty((0, 2 * ndof))
-        trajectory, t, states = (np.concatenate(parts) for parts in zip(*self.found, strict=True))
-        order = np.lexsort((t * direction, trajectory))
-        return trajectory[order], t[order], states[order]
 
 
 def names(ndof: int) -> list[str]:

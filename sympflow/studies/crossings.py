@@ -1,0 +1,177 @@
+"""Where trajectories cross a plane: in steps on a grid for all of them at once, else by events of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sympflow.integrators.base import FINISHED, FixedStep, Integrator, Problem
+from sympflow.integrators.grid import Grid
+from sympflow.integrators.registry import naming_plugin
+from sympflow.solver import solve
+from sympflow.system import HamiltonianSystem
+
+
+@dataclass(frozen=True)
+class Plane:
+    """y[coordinate] = level, crossed upwards (direction 1), downwards (−1) or either way (0) along the run."""
+
+    coordinate: int
+    level: float
+    direction: int
+
+    def height(self, y: np.ndarray) -> np.ndarray:
+        """y[..., coordinate] − level: (..., 2d) to (...)."""
+        return y[..., self.coordinate] - self.level
+
+
+class Crossings(NamedTuple):
+    """Crossings of N trajectories: which one (n,), t (n,), states (n, 2d); the status (N,) of the runs, and words."""
+
+    trajectory: np.ndarray
+    t: np.ndarray
+    states: np.ndarray
+    status: np.ndarray
+    message: str
+
+
+def crossings(
+    integrator: Integrator,
+    system: HamiltonianSystem,
+    t_span: tuple[float, float],
+    rows: np.ndarray,
+    plane: Plane,
+    sample: float,
+) -> Crossings:
+    """All crossings of the trajectories from `rows` (N, 2d), two of one within the time `sample` excepted."""
+    if isinstance(integrator, FixedStep) and integrator.on_grid:
+        with naming_plugin(integrator):
+            return _Search(integrator, system, plane, sample).run(t_span, rows)
+    return _by_events(integrator, system, t_span, rows, plane, sample)
+
+
+def _by_events(
+    integrator: Integrator,
+    system: HamiltonianSystem,
+    t_span: tuple[float, float],
+    rows: np.ndarray,
+    plane: Plane,
+    sample: float,
+) -> Crossings:
+    """The crossings of trajectories that take steps of their own: events of each."""
+
+    def g(t: float, y: np.ndarray) -> float:
+        return float(plane.height(y))
+
+    g.direction = plane.direction  # type: ignore[attr-defined]
+    runs = [
+        solve(system, integrator, t_span, y, t_eval=[], events=g, event_step=sample, on_domain_exit="ignore")
+        for y in rows
+    ]
+    times, states = zip(*((run.t_events[0], run.y_events[0]) for run in runs), strict=True)  # type: ignore[index]
+    trajectory = np.repeat(np.arange(len(rows)), [len(t) for t in times])
+    status = np.array([run.status for run in runs], dtype=int)
+    failed = np.flatnonzero(status < 0)
+    message = runs[failed[0] if failed.size else 0].message
+    if failed.size and len(runs) > 1:
+        message = f"{len(failed)} of {len(runs)} trajectories failed, the first of them (index {failed[0]}): {message}"
+    return Crossings(trajectory, np.concatenate(times), np.concatenate(states), status, message)
+
+
+class _Search:
+    """Finds the crossings in the steps of a run, those of all trajectories at once, as they stream by."""
+
+    def __init__(self, integrator: FixedStep, system: HamiltonianSystem, plane: Plane, sample: float) -> None:
+        self.integrator, self.system, self.plane, self.sample = integrator, system, plane, sample
+        self.found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self.at_start = True
+
+    def run(self, t_span: tuple[float, float], rows: np.ndarray) -> Crossings:
+        """Search all steps from `rows` (N, 2d)."""
+        grid = Grid(*t_span, self.integrator.step_length(self.system))
+        y_end, n_searched = rows, 0
+        finite = np.zeros(len(rows), dtype=int)  # the steps of each trajectory that began at a finite state
+        held: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        for chunk in self.integrator.steps(self.system, t_span, rows):
+            if held:
+                self.search(*held, np.concatenate([held[1][1:], chunk[1][:1]]))
+            held = chunk
+            finite += np.isfinite(chunk[1]).all(-1).sum(0)
+            n_searched += len(chunk[1])
+        if held:
+            t, y, h = held
+            y_end = self._end(grid, t, y, h)
+            self.search(t, y, h, np.concatenate([y[1:], y_end[None]]))
+        n_steps = grid.n_steps + bool(grid.remainder)
+        ends = np.isfinite(y_end).all(-1)
+        status = np.where(ends & (n_searched == n_steps), 0, -1)
+        return Crossings(*self._located(rows.shape[-1], grid.h), status, self._message(grid, status, finite, ends))
+
+    def _message(self, grid: Grid, status: np.ndarray, finite: np.ndarray, ends: np.ndarray) -> str:
+        """In words; `ends` says which of the last states are finite."""
+        failed = np.flatnonzero(status)
+        if not failed.size:
+            return FINISHED
+        what, remedy = self.integrator.breakdown
+        first = int(failed[0])
+        # the last finite state is that at the beginning of the step that failed, or the end of a run cut short
+        last = int(finite[first]) - (0 if ends[first] else 1)
+        where = f"after t = {grid.time(last):.17g} (step {last + 1} of {grid.n_steps + bool(grid.remainder)})"
+        if len(status) == 1:
+            return f"{what} {where}. {remedy}, or end `t_span` earlier."
+        which = f"{len(failed)} of {len(status)} trajectories failed, the first of them (index {first})"
+        return f"{which} {where}. {what}. {remedy}."
+
+    def _end(self, grid: Grid, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """The end (N, 2d) of the last chunk of steps, run again: a single step would differ from it in rounding."""
+        n, step = len(y), float(h[-1])
+        with np.errstate(all="ignore"):
+            piece = Problem(self.system, float(t[0]), float(t[-1]) + step, y[0])
+            states, _, backend = self.integrator.rollout(piece, step, n, np.arange(n + 1))
+            end = states[-1] if step == grid.h else self.integrator.substep(self.system, y[0], step, backend)
+        return np.asarray(end)
+
+    def search(self, t: np.ndarray, y: np.ndarray, h: np.ndarray, y_end: np.ndarray) -> None:
+        """Steps (n,) of N trajectories: times (n,), states at their beginnings and ends (n, N, 2d), lengths."""
+        h, t = (np.broadcast_to(a.reshape(len(y), -1), y.shape[:-1]) for a in (h, t))
+        parts = max(1, int(np.ceil(np.abs(h).max() / self.sample * (1 - 1e-12))))
+        before = self.plane.height(y)
+        starts = np.zeros(before.shape, dtype=bool)
+        starts[:1] = self.at_start & (before[:1] == 0)  # a zero at the end of a step was counted in that step
+        self.at_start = False
+        for part in range(parts):
+            with np.errstate(all="ignore"):
+                # the end of a step must be the beginning of the next to the last bit, or a zero there is lost
+                y_part = y_end if part == parts - 1 else self._step(y, h * ((part + 1) / parts))
+                after = self.plane.height(y_part)
+                up, down = ((before < 0) | starts) & (after >= 0), ((before > 0) | starts) & (after <= 0)
+            starts = np.zeros_like(starts)
+            crossed = {1: up, -1: down, 0: up | down}[self.plane.direction] & (h != 0)
+            if crossed.any():
+                self._locate(t, y, h, crossed, part / parts, (part + 1) / parts, before)
+            before = after
+
+    def _locate(
+        self, t: np.ndarray, y: np.ndarray, h: np.ndarray, crossed: np.ndarray, a: float, b: float, before: np.ndarray
+    ) -> None:
+        """Bisect all crossings together, in the fraction of the step."""
+        y, t, h, sign = y[crossed], t[crossed], h[crossed], np.sign(before[crossed])
+        low, high = np.full(len(y), a), np.where(sign == 0, a, b)
+        for _ in range(54):
+            middle = (low + high) / 2
+            g = self.plane.height(self._step(y, h * middle))
+            low, high = np.where(g * sign > 0, middle, low), np.where(g * sign > 0, high, middle)
+        self.found.append((np.nonzero(crossed)[1], t + h * high, self._step(y, h * high)))
+
+    def _step(self, y: np.ndarray, h: np.ndarray) -> np.ndarray:
+        return self.integrator.step(self.system, 0.0, y, h)
+
+    def _located(self, width: int, direction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What was found: by trajectory, and along the run."""
+        if not self.found:
+            return np.empty(0, dtype=int), np.empty(0), np.empty((0, width))
+        trajectory, t, states = (np.concatenate(parts) for parts in zip(*self.found, strict=True))
+        order = np.lexsort((t * np.sign(direction), trajectory))
+        return trajectory[order], t[order], states[order]
