@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, reduce
 from typing import Any
 
+import numpy as np
 import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
@@ -136,6 +137,7 @@ class SymbolicHamiltonian:
             library = "torch" if is_tensor(x) else "numpy"
             if library not in generated:
                 code = [printable(f) for f in expressions(getattr(self, key[0]), variables)]
+                code = [by_products(f) for f in code] if library == "numpy" else code
                 try:
                     generated[library] = sp.lambdify(variables, code, modules=_modules(library, code), cse=True)
                 except (PrintMethodNotImplementedError, ValueError) as error:
@@ -233,6 +235,28 @@ def printable(f: sp.Expr) -> sp.Expr:
     return _with_numeric_constants(f.replace(sp.DiracDelta, lambda *arguments: sp.S.Zero))
 
 
+MAX_POWER = 16  # integer powers up to this are made of products
+_INTEGER_POWER = sp.Function("integer_power", real=True)
+
+
+def by_products(f: sp.Expr) -> sp.Expr:
+    """Integer powers beyond squares by a function that multiplies: NumPy raises to them by logarithms."""
+
+    def is_large(e: sp.Expr) -> bool:
+        return e.is_Pow and e.exp.is_Integer and 2 < abs(e.exp) <= MAX_POWER
+
+    def product(e: sp.Expr) -> sp.Expr:
+        power = _INTEGER_POWER(e.base, abs(e.exp))
+        return power if e.exp > 0 else 1 / power
+
+    return f.replace(is_large, product)
+
+
+def _integer_power(x: np.ndarray, n: int) -> np.ndarray:
+    half = x if n < 4 else _integer_power(x, n // 2)
+    return half * half * x if n % 2 else half * half
+
+
 def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tuple[sp.Expr | None, sp.Expr | None]:
     """V(q) and T(p) with H = T + V, or (None, None). Constants go to V."""
     qs, ps = set(q), set(p)
@@ -252,12 +276,13 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     from sympy.printing.numpy import NumPyPrinter
 
     known = NumPyPrinter().known_functions
-    names = {type(f).__name__ for expression in code for f in expression.atoms(sp.Function)}
+    names = {type(f).__name__ for expression in code for f in expression.atoms(sp.Function)} - {"integer_power"}
     special = sorted(
         n for n in names - known.keys() if n not in ("Max", "Min", "Abs", "Heaviside", "sign", "Piecewise")
     )
     if library == "numpy":
-        return ["scipy", "numpy"] if special else ["numpy"]
+        own = {"integer_power": _integer_power}
+        return [own, "scipy", "numpy"] if special else [own, "numpy"]
     if special:
         raise TypeError(
             f"`expression` holds {', '.join(special)}, which torch has not: solve on NumPy states, with a method that "
