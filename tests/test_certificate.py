@@ -79,6 +79,31 @@ def test_delta_is_not_exceeded_by_states_that_are_drawn_later():
     assert gain.max() <= found.delta.largest < 3 * gain.max()
 
 
+def test_numba_functions_are_certified_like_their_symbols():
+    """The third derivatives in a force gradient are differences there, good to ε^(2/3) of the defect's terms."""
+    numba = pytest.importorskip("numba")
+
+    @numba.njit
+    def potential(q):
+        return 1 - np.cos(q[0])
+
+    @numba.njit
+    def gradient(q, out):
+        out[0] = np.sin(q[0])
+
+    @numba.njit
+    def hessian_vector(q, v, out):
+        out[0] = np.cos(q[0]) * v[0]
+
+    functions = {"potential": potential, "gradient": gradient, "hessian_vector": hessian_vector}
+    system = HamiltonianSystem(**functions, mass=1.0, ndof=1, domain=PENDULUM.domain)
+    options = {"states": 50, "times": 5, "held_out": 5, "t_end": 2.0}
+    found, expected = (primed(s).certificate(s, **options) for s in (system, PENDULUM))
+    for name in ("defect", "hamiltonian_error", "delta", "one_step_error", "energy_error"):
+        ours, theirs = getattr(found, name), getattr(expected, name)
+        assert (ours.median, ours.largest) == pytest.approx((theirs.median, theirs.largest), rel=1e-6), name
+
+
 def test_an_upper_limit_of_a_quantile():
     """It is below the quantile in 1 % of the samples, for any distribution; what is not a number counts as infinite."""
     rng = np.random.default_rng(0)
@@ -132,7 +157,7 @@ def test_the_measured_errors_are_those_of_solve():
 
 def test_long_runs_go_piece_by_piece(monkeypatch):
     whole = primed().certificate(HH, **QUICK)
-    monkeypatch.setattr("sympflow.flow.certificate.SAVED_VALUES", 20 * 4 * 7)
+    monkeypatch.setattr("sympflow.flow.certification.SAVED_VALUES", 20 * 4 * 7)
     pieces = primed().certificate(HH, **QUICK)
     assert pieces.left == whole.left
     # the rounding of a chaotic orbit differs where a piece begins

@@ -319,7 +319,7 @@ class FlowMap(nn.Module):
         --------
         >>> print(flow.certificate(system))
         """
-        from sympflow.flow.certificate import certificate
+        from sympflow.flow.certification import certificate
 
         self.certified = certificate(
             self, system, states=states, times=times, held_out=held_out, t_end=t_end, seed=seed
