@@ -76,6 +76,8 @@ class _Scipy(RungeKutta):
         stats |= {"hessian_evaluations": 0, "backend": "scipy"}
         if problem.t_eval is None:
             stats["output_step"] = problem.system.dt
+        if failed:
+            stats["failed_at"] = np.reshape([run.stats.get("failed_at", np.nan) for run in runs], batch)
         message = FINISHED if not failed else f"Trajectory {failed[0]} failed: {runs[failed[0]].message}"
         status = np.array([run.status for run in runs]).reshape(batch)
         outcome = Outcome(t_eval, y.reshape(len(t_eval), *problem.y0.shape), status, message, stats)
@@ -105,7 +107,7 @@ class _Scipy(RungeKutta):
         search = problem.events
         if search is not None and t1 == t0:
             search.step(t0, y0, t1, y0, lambda t: y0)
-        y_old = y0
+        y_old, reached = y0, t0
         with np.errstate(all="ignore"):
             while solver is not None and solver.status == "running":
                 failure = solver.step()
@@ -136,7 +138,7 @@ class _Scipy(RungeKutta):
                     states.append(y)
                 if search is not None and search.end is not None:
                     break
-                y_old = y
+                y_old, reached = y, t
         stats["force_evaluations"] = 0 if solver is None else int(solver.nfev)
         if t_eval is None:
             keep = sorted({*range(0, len(times), problem.save_every), len(times) - 1})
@@ -146,6 +148,8 @@ class _Scipy(RungeKutta):
         outcome = Outcome(t, y.astype(y0.dtype), -1 if failure else 0, failure or FINISHED, stats)
         if search is not None and search.end is not None:
             outcome.status, outcome.message = 1, ENDED
+        elif failure:
+            stats["failed_at"] = float(reached)
         if problem.dense_output:
             outcome.sol = OdeSolution(times, interpolants) if interpolants else _Constant(y0)
         return outcome

@@ -13,7 +13,7 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.interpolants import Interpolant, quartic
 from sympflow.integrators.runge_kutta import RungeKutta, weighted
 from sympflow.integrators.tableaux import Tableau
-from sympflow.integrators.torchdiffeq_driver import Trace, Visit, Watched
+from sympflow.integrators.torchdiffeq_driver import TooManyStepsError, Trace, Visit, Watched
 from sympflow.system import HamiltonianSystem
 
 
@@ -29,12 +29,22 @@ class Adaptive(Watched, RungeKutta):
     ----------
     rtol, atol : float
         The local error, in the root mean square over the batch, is kept below atol + rtol·|y|; torchdiffeq's defaults.
+    max_num_steps : int
+        Most steps of a run, those that are tried and rejected included; then it ends with status −1. torchdiffeq's own
+        default, 2³¹ − 1, is none: before a singularity a method of order 2 takes minutes.
     """
 
     rtol: float = 1e-7
     atol: float = 1e-9
+    max_num_steps: int = 10_000
 
     tableau: ClassVar[Tableau]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        most = self.max_num_steps
+        if isinstance(most, bool) or not isinstance(most, int | np.integer) or not 0 < most < 2**31:
+            raise ValueError(f"`max_num_steps` must be a positive integer below 2**31; got {most!r}.")
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         if self.tableau.carries_slope:
@@ -58,7 +68,17 @@ class Adaptive(Watched, RungeKutta):
         from torchdiffeq import odeint
 
         s = torch.tensor([0.0, length], dtype=torch.float64, device=y.device)
-        odeint(trace, y, s, rtol=self.rtol, atol=self.atol, method=self.name)
+        assert isinstance(trace, _Stages)
+        options = {"max_num_steps": self.max_num_steps}
+        try:
+            odeint(trace, y, s, rtol=self.rtol, atol=self.atol, method=self.name, options=options)
+        except AssertionError:
+            if trace.n_tried < self.max_num_steps:
+                raise
+            raise TooManyStepsError(
+                f"After `max_num_steps` = {self.max_num_steps} steps t = {trace.reached:.17g} is reached. Raise "
+                "`max_num_steps` or the tolerances, or end `t_span` earlier."
+            ) from None
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         y0, steps = to_numpy(y0), []
@@ -78,6 +98,7 @@ class _Stages(Trace):
     def __init__(self, tableau: Tableau, *arguments: Any) -> None:
         super().__init__(*arguments)
         self.tableau = tableau
+        self.n_tried = 0
         self.first: Any = None
         self.slopes: list[Any] = []
 
@@ -86,6 +107,7 @@ class _Stages(Trace):
 
     def callback_step(self, s: Any, y: Any, dt: Any) -> None:
         """A step is tried. Its first slope is the last of the step before, or at the start that of the state."""
+        self.n_tried += 1
         self.first = self.slopes[0] if self.first is None else self.first
         self.slopes.clear()
 

@@ -33,6 +33,7 @@ class Trace:
         self.evaluations = self.n_steps = 0
         self.reached = t_span[0]
         self.note = ""  # for the message, when the run ends
+        self.spent = False  # whether it ended because it took too many steps
 
     def __call__(self, s: Any, y: Any) -> Any:
         self.evaluations += 1
@@ -58,6 +59,10 @@ class Trace:
 
 class _EndedError(Exception):
     """Raised to leave torchdiffeq's loop at a terminal event."""
+
+
+class TooManyStepsError(Exception):
+    """Raised by `integrate` where a bound on the number of steps is met: the message says so, and the remedy."""
 
 
 class Watched(Integrator):
@@ -90,6 +95,8 @@ class Watched(Integrator):
                 pass
             except AssertionError as error:  # torchdiffeq's step underflow, or a state that is not finite
                 failure = f"torchdiffeq stopped after t = {trace.reached:.17g} ({error}). End `t_span` earlier."
+            except TooManyStepsError as error:
+                failure, trace.spent = str(error), True
         return trace, failure
 
     def make_trace(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> Trace:
@@ -115,7 +122,7 @@ class Watched(Integrator):
             return search is not None and search.end is not None
 
         trace, failure = self.watch(problem.system, (t0, t_end), y0, visit)
-        if failure and y0.ndim > 1:
+        if failure and y0.ndim > 1 and not trace.spent:
             return self._one_by_one(problem, times, stats)
         if search is not None and t0 == t_end:
             search.step(t0, y0, t0, y0, lambda t: y0)
@@ -125,18 +132,22 @@ class Watched(Integrator):
             "hessian_evaluations": 0,
             "backend": "torchdiffeq",
         }
+        ended = search is not None and search.end is not None
+        if failure and not ended:
+            t_end = trace.reached
+            stats["failed_at"] = t_end if y0.ndim == 1 else np.full(y0.shape[:-1], t_end)
+        if y0.ndim > 1:
+            states += [full_of_nan(y0)] * (len(times) - len(states))
         times = times[: len(states)]
         if search is not None and search.end is not None:
             t_end = search.end[0]
             if problem.t_eval is None and not (times.size and times[-1] == t_end):
                 times, states = np.append(times, t_end), [*states, search.end[1]]
-        elif failure:
-            t_end = trace.reached
-        status: Any = 1 if search is not None and search.end is not None else -int(bool(failure))
+        status: Any = 1 if ended else -int(bool(failure))
         outcome = Outcome(
             times,
             stack(states, axis=0) if states else y0[None][:0],
-            np.zeros(y0.shape[:-1], dtype=int) if y0.ndim > 1 else status,
+            np.full(y0.shape[:-1], status) if y0.ndim > 1 else status,
             (ENDED if status == 1 else failure or FINISHED) + trace.note,
             stats,
         )
@@ -156,6 +167,8 @@ class Watched(Integrator):
         failed = [index for index, run in runs.items() if run.status]
         counts = ("n_steps", "force_evaluations", "hessian_evaluations")
         stats |= {key: sum(run.stats[key] for run in runs.values()) for key in counts} | {"backend": "torchdiffeq"}
+        if failed:
+            stats["failed_at"] = np.reshape([run.stats.get("failed_at", np.nan) for run in runs.values()], batch)
         outcome = Outcome(
             times,
             stack(rows, axis=1).reshape(len(times), *problem.y0.shape),
