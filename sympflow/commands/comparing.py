@@ -99,7 +99,7 @@ def bench(
       sympflow bench pendulum --methods verlet,kahan_li8,dop853 --batch 0 --t-end 50
     """
     with reporting():
-        from sympflow.studies.comparison_figure import save
+        from sympflow.studies.figure_style import save
         from sympflow.studies.precision import work_precision
 
         chosen, found, start = methods(method_names), scenes(systems), state(y0)

@@ -110,7 +110,8 @@ def write_comparisons(
     comparisons: list[Any], found: list[Scene], folder: Path, say: Callable[[str], None]
 ) -> list[Path]:
     """For each system its CSV, JSON and figures; for several also one CSV and one figure of all."""
-    from sympflow.studies.comparison_figure import overview, save, save_comparison
+    from sympflow.studies.comparison_figure import overview, save_comparison
+    from sympflow.studies.figure_style import save
     from sympflow.studies.tables import write_csv
 
     written: list[Path] = []

@@ -1,4 +1,4 @@
-"""Figures with matplotlib: `Figure` objects, never pyplot, so nothing global is touched and any backend will do."""
+"""The figures of comparisons: error against run time, energy and volume errors over time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from sympflow.solution import Solution
 from sympflow.studies.comparison_report import Comparison
-from sympflow.studies.figure_style import TEXT, dress, method_styles, new_figure
+from sympflow.studies.figure_style import TEXT, dress, method_styles, new_figure, save
 from sympflow.studies.measurements import Run
 from sympflow.studies.portraits import portrait
 
@@ -72,14 +72,6 @@ def save_comparison(
     return [save(comparison_figure(comparison, k), path / f"{prefix}{k}.png") for k in kinds]
 
 
-def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write a figure, making its folder."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=200)
-    return path
-
-
 def overview(comparisons: Sequence[Comparison]) -> Figure:
     """One row for each system: error against run time, energy error over time, volume error over time.
 
@@ -108,6 +100,8 @@ def overview(comparisons: Sequence[Comparison]) -> Figure:
 
 def _error_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str, str]]) -> None:
     """Error against run time: one point for each method."""
+    from matplotlib.ticker import NullFormatter
+
     shown = [r.row for r in comparison.runs if r.row.run_time and r.row.error is not None and np.isfinite(r.row.error)]
     for row in shown:
         colour, marker = styles[row.label]
@@ -119,8 +113,10 @@ def _error_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str, 
     ax.set_yscale("log")
     if shown:
         _widen(ax.set_xlim, [row.run_time or 0.0 for row in shown])
-        _widen(ax.set_ylim, [max(row.error or 0.0, ROUNDING_FLOOR) for row in shown])
+        _widen(ax.set_ylim, [max(row.error or 0.0, ROUNDING_FLOOR) for row in shown], share=0.16)
     _annotate(ax, [(row.run_time or 0.0, max(row.error or 0.0, ROUNDING_FLOOR), row.label) for row in shown], styles)
+    for axis in (ax.xaxis, ax.yaxis):  # with a decade there are labels enough; those between would overlap
+        axis.set_minor_formatter(NullFormatter())
     dress(ax, "run time [s]", r"$\max_t\,\|y - y_{\mathrm{ref}}\|$")
 
 
@@ -146,13 +142,13 @@ def _volume_panel(ax: Axes, comparison: Comparison, styles: dict[str, tuple[str,
         worst = v[np.argmax(np.where(np.isfinite(v[:, -1]), v[:, -1], np.inf))]
         worst = np.where(np.isfinite(worst), np.maximum(worst, ROUNDING_FLOOR), np.nan)
         ax.plot(sol.t, worst, _dash(run), color=styles[run.row.label][0], lw=1.4)
+    ax.set_yscale("log")
+    _limits(ax)
     if n_steps:  # else no run reached its end
         rounding = 4 * n_steps * np.finfo(float).eps
         ax.axhspan(ROUNDING_FLOOR / 10, rounding, color="#EEEEEE", zorder=0, lw=0)
-        where = ax.get_yaxis_transform()
-        ax.text(0.98, rounding / 2, "rounding", transform=where, ha="right", va="top", fontsize=8, color="#888888")
-    ax.set_yscale("log")
-    _limits(ax)
+        where, top = ax.get_yaxis_transform(), min(rounding, ax.get_ylim()[1])
+        ax.text(0.98, top / 2, "rounding", transform=where, ha="right", va="top", fontsize=8, color="#888888")
     dress(ax, "t", "|log volume ratio|")
 
 
@@ -216,10 +212,10 @@ def _limits(ax: Axes) -> None:
         ax.set_ylim(low / 3, max(high, 10 * low) * 3)
 
 
-def _widen(set_limits: Any, values: Sequence[float]) -> None:
-    """Limits of a log axis that leave a sixth of it on either side, for labels."""
+def _widen(set_limits: Any, values: Sequence[float], share: float = 0.25) -> None:
+    """Limits of a log axis that leave a share of the range on either side, for labels, and hold a decade at least."""
     low, high = np.log10(min(values)), np.log10(max(values))
-    margin = max(0.25 * (high - low), 0.4)
+    margin = max(share * (high - low), 0.4, (1.3 - (high - low)) / 2)
     set_limits(10 ** (low - margin), 10 ** (high + margin))
 
 

@@ -92,37 +92,25 @@ class _Search:
         """Search all steps from `rows` (N, 2d)."""
         grid = Grid(*t_span, self.integrator.step_length(self.system))
         y_end, n_searched = rows, 0
-        finite = np.zeros(len(rows), dtype=int)  # the steps of each trajectory that began at a finite state
         held: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         for chunk in self.integrator.steps(self.system, t_span, rows):
             if held:
                 self.search(*held, np.concatenate([held[1][1:], chunk[1][:1]]))
             held = chunk
-            finite += np.isfinite(chunk[1]).all(-1).sum(0)
             n_searched += len(chunk[1])
         if held:
             t, y, h = held
             y_end = self._end(grid, t, y, h)
             self.search(t, y, h, np.concatenate([y[1:], y_end[None]]))
-        n_steps = grid.n_steps + bool(grid.remainder)
-        ends = np.isfinite(y_end).all(-1)
-        status = np.where(ends & (n_searched == n_steps), 0, -1)
-        return Crossings(*self._located(rows.shape[-1], grid.h), status, self._message(grid, status, finite, ends))
+        reached = n_searched == grid.n_steps + bool(grid.remainder) and bool(np.isfinite(y_end).all())
+        status, message = (np.zeros(len(rows), dtype=int), FINISHED) if reached else self._failure(t_span, rows)
+        return Crossings(*self._located(rows.shape[-1], grid.h), status, message)
 
-    def _message(self, grid: Grid, status: np.ndarray, finite: np.ndarray, ends: np.ndarray) -> str:
-        """In words; `ends` says which of the last states are finite."""
-        failed = np.flatnonzero(status)
-        if not failed.size:
-            return FINISHED
-        what, remedy = self.integrator.breakdown
-        first = int(failed[0])
-        # the last finite state is that at the beginning of the step that failed, or the end of a run cut short
-        last = int(finite[first]) - (0 if ends[first] else 1)
-        where = f"after t = {grid.time(last):.17g} (step {last + 1} of {grid.n_steps + bool(grid.remainder)})"
-        if len(status) == 1:
-            return f"{what} {where}. {remedy}, or end `t_span` earlier."
-        which = f"{len(failed)} of {len(status)} trajectories failed, the first of them (index {first})"
-        return f"{which} {where}. {what}. {remedy}."
+    def _failure(self, t_span: tuple[float, float], rows: np.ndarray) -> tuple[np.ndarray, str]:
+        """What `solve` says of the run that could not go on: the status (N,), and words."""
+        y0 = rows[0] if len(rows) == 1 else rows
+        sol = solve(self.system, self.integrator, t_span, y0, t_eval=[t_span[1]], on_domain_exit="ignore")
+        return np.broadcast_to(np.asarray(sol.status), len(rows)), sol.message
 
     def _end(self, grid: Grid, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:
         """The end (N, 2d) of the last chunk of steps, run again: a single step would differ from it in rounding."""

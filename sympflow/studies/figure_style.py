@@ -1,9 +1,16 @@
-"""How the figures look: colours and markers of the methods, frame and grid."""
+"""How the figures look: colours and markers of the methods, frame and grid; and how they are saved.
+
+`Figure` objects, never pyplot: nothing global is touched, and any backend will do.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,20 +39,46 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def method_styles(labels: Sequence[tuple[str, str]]) -> dict[str, tuple[str, str]]:
-    """Colour and marker for each (label, method); the methods of the paper have their own."""
+    """Colour and marker for each (label, method).
+
+    Each method of the paper has its own, borne by the one that is labelled with its name, or else by the first.
+    """
+    own = {method: label for label, method in reversed(labels)} | {m: label for label, m in labels if label == m}
     styles: dict[str, tuple[str, str]] = {}
-    taken: set[str] = set()
     others = 0
     for label, method in labels:
         if label in styles:
             continue
-        if method in _STYLES and method not in taken:
+        if method in _STYLES and own[method] == label:
             styles[label] = _STYLES[method]
-            taken.add(method)
         else:
             styles[label] = (_OTHER_COLOURS[others % 6], _OTHER_MARKERS[(others + others // 6) % 6])
             others += 1
     return styles
+
+
+def frame(ax: Axes, points: np.ndarray, margin: float) -> None:
+    """Limits around points (n, 2) with a margin, as a share of their extent.
+
+    An extent below a tenth of the largest coordinate counts as that: where all points are one, the rounding of its
+    coordinates is not magnified into a picture.
+    """
+    points = points[np.isfinite(points).all(1)]
+    if not len(points):
+        return
+    low, high = points.min(0), points.max(0)
+    half = (0.5 + margin) * np.maximum(high - low, 0.1 * np.abs(points).max() + 1e-12)
+    (left, bottom), (right, top) = (low + high) / 2 - half, (low + high) / 2 + half
+    ax.set_xlim(left, right)
+    ax.set_ylim(bottom, top)
+
+
+def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
+    """Write a figure, making its folder."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=200)
+    return path
 
 
 def dress(ax: Axes, x_label: str, y_label: str) -> None:

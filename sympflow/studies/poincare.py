@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 
 from sympflow.arrays import is_tensor
 from sympflow.integrators.base import Integrator
-from sympflow.integrators.registry import build, check_applies
+from sympflow.integrators.registry import build, check_applies, name_of
+from sympflow.studies.comparison_report import title
 from sympflow.studies.crossings import Plane, crossings
 from sympflow.studies.tables import Column, text_table, write_csv
 from sympflow.system import HamiltonianSystem
@@ -204,7 +205,7 @@ class PoincareSection:
         ImportError
             Without matplotlib.
         """
-        from sympflow.studies.figure_style import TEXT, dress, new_figure
+        from sympflow.studies.figure_style import TEXT, dress, frame, new_figure
 
         d, label = self.system.ndof, names(self.system.ndof)
         position = next((j for j in range(d) if j != self.coordinate), d)
@@ -222,10 +223,11 @@ class PoincareSection:
             vmax=max(1.15 * (len(self.y0) - 1), 1),
             rasterized=True,
         )
+        frame(ax, self.states[:, [i, j]], 0.05)
         way = {1: f", {label[self.coordinate]} increasing", -1: f", {label[self.coordinate]} decreasing", 0: ""}
         in_time = self.direction if self.t_span[1] >= self.t_span[0] else -self.direction
         plane = f"{label[self.coordinate]} = {self.level:g}{way[in_time]}"
-        ax.set_title(f"{self.system.name.replace('_', ' ')}, {self.integrator.name}: {plane}", fontsize=9, color=TEXT)
+        ax.set_title(f"{title(self.system)}, {name_of(self.integrator)}: {plane}", fontsize=9, color=TEXT)
         dress(ax, label[i], label[j])
         return figure
 

@@ -6,22 +6,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, to_numpy
+from sympflow.arrays import to_numpy
 from sympflow.integrators.registry import build
 from sympflow.solver import solve
 from sympflow.studies.comparison_report import Comparison
-from sympflow.studies.figure_style import TEXT, dress, method_styles, new_figure
+from sympflow.studies.crossings import Plane, crossings
+from sympflow.studies.figure_style import TEXT, dress, frame, method_styles, new_figure
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
 def portrait(comparison: Comparison) -> Figure:
     """Phase space, a panel for each method with the reference behind in grey.
 
-    One degree of freedom: the orbit in the (q, p) plane. Two: the Poincaré section q₁ = 0, p₁ > 0, by events of each
-    method. More: q₁ against q₂.
+    One degree of freedom: the orbit in the (q, p) plane. Two: the Poincaré section q₁ = 0 with q₁ increasing along the
+    run, on each method's own map. More: q₁ against q₂.
     """
     system = comparison.system
     runs = [run for run in comparison.runs if run.sol is not None]
@@ -47,9 +47,11 @@ def portrait(comparison: Comparison) -> Figure:
             rasterized=True,
         )
         ax.set_title(run.row.label, fontsize=9, color=styles[run.row.label][0])
-        dress(ax, x_label if k // columns == rows - 1 else "", y_label if k % columns == 0 else "")
-    _frame(axes[0, 0], truth)
-    section = " — section q₁ = 0, p₁ > 0" if system.ndof == 2 else ""
+        lowest = k + columns >= len(runs)  # nothing below it, or an empty place
+        dress(ax, x_label if lowest else "", y_label if k % columns == 0 else "")
+        ax.tick_params(labelbottom=lowest)
+    frame(axes[0, 0], truth, 0.25)  # around the reference: a run that leaves shall not shrink everything else
+    section = ": section q₁ = 0, p₁ > 0" if system.ndof == 2 else ""
     figure.suptitle(f"{comparison.title}{section}; reference in grey", fontsize=10, color=TEXT, x=0.01, ha="left")
     return figure
 
@@ -58,48 +60,15 @@ def _phase_points(comparison: Comparison, integrator: Any) -> np.ndarray:
     """What a portrait shows of one run, (m, 2)."""
     system = comparison.system
     if system.ndof == 2:
-        return _section(comparison, integrator)
+        starts = to_numpy(comparison.y0).reshape(-1, 4)
+        found = crossings(integrator, system, comparison.t_span, starts, Plane(0, 0.0, 1), system.dt)
+        return found.states[:, [1, 3]]
     t = comparison.t
     sol = solve(system, integrator, comparison.t_span, comparison.y0, t_eval=t, on_domain_exit="ignore")
     return to_numpy(sol.states).reshape(-1, 2 * system.ndof)[:, [0, 1]]
-
-
-def _section(comparison: Comparison, integrator: Any) -> np.ndarray:
-    """(q₂, p₂) where q₁ passes 0 upwards, (m, 2): events of each trajectory."""
-
-    def q1(t: float, y: Array) -> Array:
-        return y[0]
-
-    q1.direction = 1  # type: ignore[attr-defined]
-    points = []
-    for y0 in to_numpy(comparison.y0).reshape(-1, 4):
-        sol = solve(
-            comparison.system,
-            integrator,
-            comparison.t_span,
-            y0,
-            t_eval=[],
-            events=q1,
-            event_step=comparison.system.dt,
-            on_domain_exit="ignore",
-        )
-        assert sol.y_events is not None
-        points.append(sol.y_events[0])
-    return np.concatenate(points)[:, [1, 3]]
 
 
 def _reference_points(comparison: Comparison) -> np.ndarray:
     system = comparison.system
     accurate = build("kahan_li8", {}) if system.separable else build("dop853", {"rtol": 1e-12, "atol": 1e-12})
     return _phase_points(comparison, accurate)
-
-
-def _frame(ax: Axes, points: np.ndarray) -> None:
-    """Limits around the reference, so that a run that leaves does not shrink everything else."""
-    points = points[np.isfinite(points).all(1)]
-    if not len(points):
-        return
-    low, high = points.min(0), points.max(0)
-    margin = 0.25 * np.maximum(high - low, 1e-12)
-    ax.set_xlim(low[0] - margin[0], high[0] + margin[0])
-    ax.set_ylim(low[1] - margin[1], high[1] + margin[1])

@@ -131,7 +131,7 @@ class WorkPrecision:
 
     def plot(self, path: str | os.PathLike[str] | None = None, measure: str = "energy_error") -> Figure:
         """The figure, as `figure`; with a path it is also saved."""
-        from sympflow.studies.comparison_figure import save
+        from sympflow.studies.figure_style import save
 
         figure = self.figure(measure)
         if path is not None:

@@ -151,7 +151,7 @@ class StabilityReport:
         """The figure, as `figure`; with a path it is also saved."""
         figure = self.figure(kind)
         if path is not None:
-            from sympflow.studies.comparison_figure import save
+            from sympflow.studies.figure_style import save
 
             save(figure, Path(path))
         return figure

@@ -17,7 +17,7 @@ from sympflow.solution import Solution
 from sympflow.solver import domain_of, solve
 from sympflow.studies.candidates import Candidate
 from sympflow.studies.comparison_report import title
-from sympflow.studies.singularities import blow_up
+from sympflow.studies.singularities import blow_up, failure_times
 from sympflow.studies.stability_report import StabilityRow, StepLimit
 from sympflow.system import HamiltonianSystem
 from sympflow.validation import MAX_SAVED_VALUES
@@ -142,21 +142,21 @@ class Study:
             energy_error=worst,
             reason=" ".join(x for x in (failure, words) if x),
         )
-        row = self._blow_up(row, integrator, sols)
+        row = self._blow_up(row, sols)
         for metric in self.metrics:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore", RuntimeWarning)
                 row = getattr(self, f"_{metric}")(row, integrator, sols)
         return row
 
-    def _blow_up(self, row: StabilityRow, integrator: Integrator, sols: list[Solution]) -> StabilityRow:
+    def _blow_up(self, row: StabilityRow, sols: list[Solution]) -> StabilityRow:
         """The time and manner of the first failure, of the first state that fails."""
-        times = np.concatenate([_failure_times(s) for s in sols])
-        if not np.isfinite(times).any():
-            return row
-        first = int(np.argmax(np.isfinite(times)))
-        end = blow_up(self.system, integrator, self.span(row.dt), self._typed(self.starts[first]), float(times[first]))
-        return replace(row, blow_up=end.time, singular=end.singular, reason=f"{row.reason} {end}".strip())
+        for sol in sols:
+            failed = np.isfinite(failure_times(sol))
+            if failed.any():
+                end = blow_up(sol, int(np.argmax(failed)))
+                return replace(row, blow_up=end.time, singular=end.singular, reason=f"{row.reason} {end}".strip())
+        return row
 
     def _energy(self, row: StabilityRow, integrator: Integrator, sols: list[Solution]) -> StabilityRow:
         return row
@@ -282,11 +282,3 @@ def _largest_error(sols: list[Solution]) -> float:
         warnings.simplefilter("ignore", RuntimeWarning)
         worst = [float(np.max(max_energy_error(s))) for s in sols]
     return math.inf if any(math.isnan(x) for x in worst) else max(worst)
-
-
-def _failure_times(sol: Solution) -> np.ndarray:
-    """For each trajectory the time after which it could not go on, NaN if it did not fail."""
-    status = np.atleast_1d(np.asarray(sol.status))
-    last = sol.t[-1] if len(sol.t) else sol.t_span[0]
-    times = np.broadcast_to(np.asarray(sol.stats.get("failed_at", last), dtype=float), status.shape)
-    return np.where(status < 0, times, np.nan)
