@@ -11,10 +11,11 @@ from sympflow import HamiltonianSystem, SympFlow, get, solve, systems, train
 from sympflow.flow.scaling import Scaling
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.collocation import Stream, states
-from sympflow.training.gauss_newton import GaussNewtonConfig, GaussNewtonRun
+from sympflow.training.gauss_newton import GaussNewtonRun
 from sympflow.training.labels import Labels
 from sympflow.training.levenberg_marquardt import levenberg_marquardt
 from sympflow.training.recipes import default_recipe
+from sympflow.training.search_config import TableConfig
 from sympflow.training.table_fit import Table, TableFit
 from sympflow.training.table_jacobian import TableStep
 
@@ -113,7 +114,7 @@ def test_the_fits_derivatives(palindromic):
     """Residuals and Jacobian by the flow's parameters, against the flow itself."""
     flow = SympFlow.primed(PENDULUM, 2, degree=3, palindromic=palindromic, dt=0.8).requires_grad_(False)
     run = GaussNewtonRun.start(
-        flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), GaussNewtonConfig(points=5, label_times=3, frozen_weight=1.0)
+        flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), TableConfig(points=5, label_times=3, frozen_weight=1.0)
     )
     table, labels_x = Table(flow), torch.as_tensor(run.whole._x[:, :5].T)
     theta = table.parameters() + 0.02 * np.random.default_rng(0).normal(size=flow.n_parameters)
@@ -255,7 +256,7 @@ def test_a_degenerate_direction_does_no_harm():
 def test_the_fits_derivatives_with_a_processor():
     flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=2, dt=0.8)
     run = GaussNewtonRun.start(
-        flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), GaussNewtonConfig(points=5, label_times=3, frozen_weight=1.0)
+        flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), TableConfig(points=5, label_times=3, frozen_weight=1.0)
     )
     table = Table(flow)
     theta = table.parameters() + np.random.default_rng(0).normal(0, 0.05, flow.n_parameters)
@@ -320,7 +321,7 @@ def test_other_losses_train_too(loss):
 def test_residuals_of_a_loss_are_those_of_the_flow():
     """Of the whole fit, against Loss: the sum of squares is the loss, and the Jacobian its derivative."""
     flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=1)
-    config = GaussNewtonConfig(label_weight=0.0, residual_weight=2.0, matching_weight=3.0, loss_points=20)
+    config = TableConfig(label_weight=0.0, residual_weight=2.0, matching_weight=3.0, loss_points=20)
     run = GaussNewtonRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), config)
     theta = Table(flow).parameters() + np.random.default_rng(0).normal(0, 0.02, flow.n_parameters)
     r, J = run.whole.linearized(theta)
@@ -416,7 +417,7 @@ def test_a_resumed_run_ends_bit_identical(tmp_path):
     resumed = train(HH, flow=start, resume=path, **arguments)
     assert torch.equal(weights(resumed), weights(whole))
     assert resumed.history == whole.history
-    with pytest.raises(ValueError, match="`resume` is a run with another config"):
+    with pytest.raises(ValueError, match="`resume` is a run with another seed"):
         train(HH, flow=start, resume=path, **{**arguments, "seed": 1})
     with pytest.raises(ValueError, match="`resume` is a run with another architecture"):
         train(HH, flow=SympFlow.primed(HH, 4), resume=path, **arguments)

@@ -9,7 +9,7 @@ import torch
 from sympflow import Box, HamiltonianSystem, SympFlow, get, load, solve
 from sympflow.systems import fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum
 from sympflow.systems.fput import oscillatory_energies
-from sympflow.training.split_fit import fit_split
+from sympflow.training.trainer import train
 
 CASES = {
     "kicks": (henon_heiles, {"dt": 0.7, "stages": 3}),
@@ -119,10 +119,15 @@ def test_the_oscillator_for_a_million_steps(turn):
     assert np.abs(sol.energy_error()).max() < 1e-11
 
 
-def test_a_fit_lowers_the_error_at_all_times():
-    system = HamiltonianSystem.from_sympy(
+def harmonic_pair():
+    """A fast oscillator coupled to a slow particle."""
+    return HamiltonianSystem.from_sympy(
         "(p1**2 + p2**2)/2 + 200*q2**2 + (q1 - q2)**4/4", domain=Box([-1, -0.05, -1, -1], [1, 0.05, 1, 1])
     )
+
+
+def test_a_fit_lowers_the_error_at_all_times():
+    system = harmonic_pair()
     start = SympFlow.split(system, 2, dt=0.25, terms=4)
     x = torch.as_tensor(system.domain.sample(50, 99))
     t = torch.linspace(0.05, 0.25, 5, dtype=torch.float64)[:, None]
@@ -130,12 +135,40 @@ def test_a_fit_lowers_the_error_at_all_times():
 
     exact = np.stack([reference_step(system, x.numpy(), float(s)) for s in t[:, 0]])
     before = np.linalg.norm(start(t, x).detach().numpy() - exact, axis=-1).mean(1)
-    flow = fit_split(copy.deepcopy(start), system, points=20, label_times=4, restarts=1, steps=20)
+    flow = train(system, flow=start, points=20, label_times=4, restarts=1, steps=20)
     after = np.linalg.norm(flow(t, x).numpy() - exact, axis=-1).mean(1)
     assert after[-1] < 0.1 * before[-1]
     assert (after < before).all()
-    again = fit_split(copy.deepcopy(start), system, points=20, label_times=4, restarts=1, steps=20)
+    again = train(system, flow=start, points=20, label_times=4, restarts=1, steps=20)
     assert all(torch.equal(a, b) for a, b in zip(flow.parameters(), again.parameters(), strict=True))
+
+
+def test_split_flows_train_as_all_others_do(tmp_path):
+    """Resumed bit-identical, recorded, by other optimizers too; what they have no use for is refused."""
+    system, path = harmonic_pair(), tmp_path / "run.ckpt"
+    start = SympFlow.split(system, 1, dt=0.2, terms=3)
+    options = {"points": 20, "label_times": 3, "restarts": 3, "steps": 10, "reference_states": 10}
+    whole = train(system, flow=start, **options)
+
+    class Killed(Exception):
+        pass
+
+    def kill(step, figures):
+        if step == 2:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(system, flow=start, checkpoint=path, callback=kill, **options)
+    resumed = train(system, flow=start, resume=path, **options)
+    assert all(torch.equal(a, b) for a, b in zip(whole.parameters(), resumed.parameters(), strict=True))
+    assert whole.recipe["stages"][0]["restarts_taken"] == 3
+    assert whole.figures["one_step_error"] < 0.1
+    adam = train(system, flow=start, optimizer="adam", steps=2, points=20, validation_points=40, reference_states=5)
+    assert any(not torch.equal(a, b) for a, b in zip(start.parameters(), adam.parameters(), strict=True))
+    with pytest.raises(TypeError, match=r"^`learning_rate` is not an option of the optimizer 'gauss-newton' for split"):
+        train(system, flow=start, learning_rate=1.0)
+    with pytest.raises(ValueError, match=r"^`loss` 'residual' is not one"):
+        train(system, flow=start, loss="residual")
 
 
 def test_the_shipped_flow_of_fput_reaches_its_figures():

@@ -9,7 +9,7 @@ import torch
 from sympflow import solve
 from sympflow.flow.io import shipped
 from sympflow.systems import fput
-from sympflow.training.pretrained_stiff import PHASES
+from sympflow.training.stiff import PHASES
 
 
 @pytest.mark.parametrize("omega", [50.0, 1000.0])

@@ -8,9 +8,9 @@ from sympflow.flow.io import load, shipped
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.sympflow import SympFlow
 from sympflow.systems import harmonic_oscillator, henon_heiles
-from sympflow.training import pretrained
+from sympflow.training import networks, pretrained
 
-RECIPES = pretrained.recipes()
+RECIPES = networks.recipes()
 
 # error of one step and of the energy over 1000 steps, as `measure` defines them: level with the published checkpoints
 TARGETS = {
@@ -34,7 +34,7 @@ def test_shipped_sympflows_reach_their_targets(scene):
         assert flow.figures[name] == pytest.approx(value, rel=1e-3 if name in ("error_1", "error_10") else 0.5)
 
 
-@pytest.mark.parametrize("kind", pretrained.KINDS)
+@pytest.mark.parametrize("kind", networks.KINDS)
 @pytest.mark.parametrize("name", RECIPES)
 def test_shipped_flows_are_found_by_their_system(name, kind):
     recipe = RECIPES[name]
@@ -49,7 +49,7 @@ def test_shipped_flows_are_found_by_their_system(name, kind):
 @pytest.mark.parametrize("name", RECIPES)
 def test_shipped_baselines_compare(name):
     """As many parameters within 2 %, and a map that solves the problem."""
-    flow, baseline = (load(pretrained.path(name, kind)) for kind in pretrained.KINDS)
+    flow, baseline = (load(pretrained.path(name, kind)) for kind in networks.KINDS)
     assert abs(baseline.n_parameters - flow.n_parameters) <= 0.02 * flow.n_parameters
     assert RECIPES[name].measure(baseline, steps=1)["error_1"] <= 1e-3
 
@@ -71,8 +71,8 @@ def test_a_blow_up_is_not_a_small_error():
 
 
 def test_the_command_trains_and_measures(tmp_path, monkeypatch, capsys):
-    quick = pretrained.Recipe(henon_heiles(), lambda: np.full((2, 4), 0.1), points=(40, 50), steps=(2, 1))
-    monkeypatch.setattr(pretrained, "recipes", lambda: {"henon_heiles": quick})
+    quick = networks.NetworkRecipe(henon_heiles(), lambda: np.full((2, 4), 0.1), points=(40, 50), steps=(2, 1))
+    monkeypatch.setattr(networks, "recipes", lambda: {"henon_heiles": quick})
     pretrained.main(["henon_heiles", "--kind", "sympflow", "--out", str(tmp_path)])
     trained = capsys.readouterr().out
     flow = load(tmp_path / "henon_heiles-sympflow.safetensors")

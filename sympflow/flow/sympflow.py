@@ -181,7 +181,7 @@ class SympFlow(FlowMap):
     ) -> SplitFlow:
         """A SympFlow of exact flows of the parts of H, the linear one among them, for stiff systems.
 
-        Untrained it is so many equal Strang steps; `training.split_fit.fit_split` fits it to the system and its domain.
+        Untrained it is so many equal Strang steps; `train(system, flow=flow)` fits it to the system and its domain.
 
         Parameters
         ----------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,13 @@ def domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
     if width != 2 * system.ndof:
         raise ValueError(f"`domain` has states of length {width}, the system {2 * system.ndof}: give [q, p].")
     return domain
+
+
+def check_step_and_budget(dt: Any, time_budget: Any) -> None:
+    if dt is not None and (isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf):
+        raise ValueError(f"`dt` must be a positive finite number; got {dt!r}.")
+    if time_budget is not None and not 0 < time_budget < math.inf:
+        raise ValueError(f"`time_budget` must be a positive number of seconds; got {time_budget!r}.")
 
 
 def weights_of(

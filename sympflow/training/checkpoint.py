@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
+
+if TYPE_CHECKING:
+    from sympflow.flow.base import FlowMap
+    from sympflow.system import HamiltonianSystem
 
 FORMAT = 1
 FIELDS = {
@@ -22,6 +27,36 @@ FIELDS = {
     "history",
     "seconds",
 }
+
+
+def identity(flow: FlowMap, system: HamiltonianSystem, config: dict[str, Any]) -> dict[str, Any]:
+    """What a run must share with the one that it goes on with."""
+    return {
+        "config": json.dumps(config),
+        "architecture": json.dumps({"kind": flow.kind, "dt": flow.dt, **flow.architecture()}),
+        "fingerprint": list(system.fingerprint),
+    }
+
+
+def read_same(path: str | os.PathLike[str], mine: dict[str, Any]) -> dict[str, Any]:
+    """`read`, of a run with this identity; how often it writes checkpoints may differ.
+
+    Raises
+    ------
+    ValueError
+        If it is another run; the message names what differs.
+    """
+    state = read(path)
+    theirs, ours = (json.loads(run["config"]) for run in (state, mine))
+    names = (set(theirs) | set(ours)) - {"checkpoint_every"}
+    nothing = object()
+    differing = sorted(n for n in names if theirs.get(n, nothing) != ours.get(n, nothing))
+    if differing:
+        raise ValueError(f"`resume` is a run with another {', '.join(differing)}: pass the same arguments as then.")
+    for name in ("architecture", "fingerprint"):
+        if state[name] != mine[name]:
+            raise ValueError(f"`resume` is a run with another {name}: pass the same system and flow as then.")
+    return state
 
 
 def write(path: str | os.PathLike[str], state: dict[str, Any]) -> None:

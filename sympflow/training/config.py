@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
+
+from sympflow.training.choices import check_counts, check_positive, check_seed, check_weights
 
 DEFAULTS: dict[str, dict[str, Any]] = {
     "adam": {"steps": 20_000, "points": 700, "refresh": 1, "validate_every": 500, "checkpoint_every": 1000},
@@ -83,32 +85,14 @@ class TrainingConfig:
         ):
             if value not in known:
                 raise ValueError(f"`{name}` {value!r} is unknown: choose one of {', '.join(known)}.")
-        for name in (
-            "steps",
-            "points",
-            "matching_times",
-            "label_times",
-            "validate_every",
-            "validation_points",
-            "reference_states",
-            "checkpoint_every",
-        ):
-            _positive_integer(name, getattr(self, name))
-        if self.refresh is not None:
-            _positive_integer("refresh", self.refresh)
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
-            raise ValueError(f"`seed` must be a non-negative integer; got {self.seed!r}.")
-        for name in ("residual_weight", "matching_weight", "label_weight"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"`{name}` must be finite and at least 0; got {getattr(self, name)!r}.")
-        if self.residual_weight == self.matching_weight == self.label_weight == 0:
-            raise ValueError(
-                "`residual_weight`, `matching_weight` and `label_weight` are all 0: give one of them a positive value."
-            )
-        for name in ("learning_rate", "clip"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ValueError(f"`{name}` must be positive and finite; got {value!r}.")
+        counts = ["steps", "points", "matching_times", "label_times", "refresh", "validate_every", "validation_points"]
+        counts += ["reference_states", "checkpoint_every"]
+        check_counts(**{name: getattr(self, name) for name in counts})
+        check_seed(self.seed)
+        check_weights(
+            **{f"{name}_weight": getattr(self, f"{name}_weight") for name in ("residual", "matching", "label")}
+        )
+        check_positive(learning_rate=self.learning_rate, clip=self.clip)
         if self.matching_times > min(self.points, self.validation_points) // 2:
             raise ValueError("`matching_times` must leave two points for each time: make it at most half of `points`.")
 
@@ -133,14 +117,3 @@ class TrainingConfig:
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
-
-    def differences(self, other: dict[str, Any]) -> list[str]:
-        """Names of the choices in which a recorded run differs from this one, intervals of checkpoints aside."""
-        mine = self.to_dict()
-        names = {f.name for f in fields(self)} | set(other)
-        return sorted(n for n in names - {"checkpoint_every"} if n not in other or mine.get(n) != other[n])
-
-
-def _positive_integer(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from sympflow.domain import Domain
@@ -25,6 +22,7 @@ from sympflow.training.config import TrainingConfig
 from sympflow.training.labels import Labels
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.optimizers import optimizer as make_optimizer
+from sympflow.training.outcome import OUT_OF_TIME, recorded, warn_of_early_end
 from sympflow.training.progress import progress as make_progress
 from sympflow.training.validation import Validation
 
@@ -48,6 +46,7 @@ class Run:
     validation: Validation
     source: PointSource
     optimizer: Any
+    searches: ClassVar[bool] = False
     step: int = 0
     seconds: float = 0.0
     best: dict[str, Tensor] = field(default_factory=dict)
@@ -121,7 +120,7 @@ class Run:
                     if last:
                         break
                     if spent:
-                        return "the time budget was used up"
+                        return OUT_OF_TIME
         except KeyboardInterrupt:
             return "it was interrupted"
         return None
@@ -140,26 +139,12 @@ class Run:
     def _best_loss(self) -> float:
         return min((f["loss"] for f in self.history if math.isfinite(f["loss"])), default=math.inf)
 
-    def finish(self, reason: str | None) -> FlowMap:
-        """The flow in its best state, with its record."""
-        if reason is not None:
-            warnings.warn(
-                f"Training ended after {self.step} of {self.config.steps} steps because {reason}. "
-                "The best state so far is returned.",
-                RuntimeWarning,
-                stacklevel=3,
-            )
-        flow = self.flow
-        flow.load_state_dict(self.best)
-        flow.requires_grad_(False)
-        flow.zero_grad(set_to_none=True)
-        flow.domain, flow.fingerprint, flow.system_name = (
-            self.domain,
-            self.system.fingerprint,
-            self.system.name,
-        )
+    def finish(self, reason: str | None, expected: bool = False) -> FlowMap:
+        """The flow in its best state, with its record; an expected end does not warn."""
+        if reason is not None and not (expected and reason == OUT_OF_TIME):
+            warn_of_early_end(reason, self.step, self.config.steps, "steps")
+        self.flow.load_state_dict(self.best)
         best = min((f for f in self.history if math.isfinite(f["loss"])), key=lambda f: f["loss"])
-        earlier = float(flow.figures.get("training_seconds", 0.0))
         stage = {
             **self.config.to_dict(),
             "steps_taken": self.step,
@@ -167,30 +152,16 @@ class Run:
             "finished": self._finished(),
             "best_step": best["step"],
         }
-        flow.recipe = {
-            "stages": [*flow.recipe.get("stages", []), stage],
-            "scaling": self.scaling.to_dict(),
-            "torch": torch.__version__,
-        }
-        flow.figures = {k: v for k, v in best.items() if k not in ("step", "loss")}
-        flow.figures["training_seconds"] = round(earlier + self.seconds, 3)
-        flow.history = self.history
-        return flow
+        shape = (self.flow, self.system, self.domain, self.scaling)
+        return recorded(*shape, stage, self.history, best, self.seconds)
 
     # checkpoints ------------------------------------------------------------------------------------------
-
-    def _identity(self) -> dict[str, Any]:
-        return {
-            "config": json.dumps(self.config.to_dict()),
-            "architecture": json.dumps({"kind": self.flow.kind, "dt": self.flow.dt, **self.flow.architecture()}),
-            "fingerprint": list(self.system.fingerprint),
-        }
 
     def save(self, path: Path) -> None:
         checkpoints.write(
             path,
             {
-                **self._identity(),
+                **checkpoints.identity(self.flow, self.system, self.config.to_dict()),
                 "step": self.step,
                 "flow": self.flow.state_dict(),
                 "best": self.best,
@@ -201,13 +172,7 @@ class Run:
         )
 
     def load(self, path: Path) -> None:
-        state, mine = checkpoints.read(path), self._identity()
-        differing = self.config.differences(json.loads(state["config"]))
-        if differing:
-            raise ValueError(f"`resume` is a run with another {', '.join(differing)}: pass the same arguments as then.")
-        for name in ("architecture", "fingerprint"):
-            if state[name] != mine[name]:
-                raise ValueError(f"`resume` is a run with another {name}: pass the same system and flow as then.")
+        state = checkpoints.read_same(path, checkpoints.identity(self.flow, self.system, self.config.to_dict()))
         try:
             self.flow.load_state_dict(state["flow"])
             self.optimizer.load_state_dict(state["optimizer"])

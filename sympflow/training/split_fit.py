@@ -1,24 +1,18 @@
-"""Gauss–Newton training of split flows: their weights, filters and angles, fitted to the exact flow of a system.
+"""The fit of a split flow's weights, filters and angles to labels, as a least-squares problem.
 
-First the maps frozen at Δt, a dozen numbers, from many random starts. Then numbers are followed from equal steps at a
-small t up to Δt, each fit starting where the last ended (or down from the best at Δt, if those are much better);
-polynomials in t are put through them, and these are fitted to labels at all times together. Derivatives of a step by a
-number of its table are central differences of the compiled step, exact to 1e-10, which Gauss–Newton steps do not see.
+Derivatives of a step by a number of its table are central differences of the compiled step, exact to 1e-10, which
+Gauss–Newton steps do not see.
 """
 
 from __future__ import annotations
 
 import math
-import time
-import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 import torch
 
-from sympflow.domain import Domain, EnergySublevel
+from sympflow.domain import Domain
 from sympflow.flow.columns import Column
 from sympflow.flow.split import SplitFlow
 from sympflow.integrators.linear_splitting import kernel_of
@@ -28,6 +22,7 @@ from sympflow.system import HamiltonianSystem
 from sympflow.training.collocation import Stream, states, stream_seed
 from sympflow.training.labels import Labels
 from sympflow.training.levenberg_marquardt import Minimum, levenberg_marquardt
+from sympflow.training.search_config import SplitConfig
 
 DIFFERENCE = 1e-5  # of a coefficient, relative to its unit
 SPREAD = 0.3  # of random weights about those of equal steps
@@ -37,125 +32,15 @@ PULL = 0.3  # towards equal steps, as a share of the error: it chooses among coe
 ROUGHNESS = 1e-6  # how reluctantly polynomials are made to vary with t
 
 
-@dataclass(frozen=True)
-class SplitFitConfig:
-    """The choices of a fit; with the seed they determine the trained weights.
-
-    Parameters
-    ----------
-    points : int
-        Number of labelled states, drawn from the domain.
-    label_times : int
-        Number of times in (0, Δt] at which the states are labelled: Δt sin(πj/2J), dense towards Δt, where polynomials
-        between labels are worst.
-    frozen_weight : float
-        Weight of the residuals at t = Δt, which alone are composed over many steps; those at other times have 1.
-    restarts : int
-        Starts of the frozen search.
-    steps : int
-        The most iterations from each start.
-    seed : int
-    reference_states : int
-        Held-out states of the figures.
-    """
-
-    points: int = 150
-    label_times: int = 16
-    frozen_weight: float = 30.0
-    restarts: int = 8
-    steps: int = 150
-    seed: int = 0
-    reference_states: int = 100
-
-    def __post_init__(self) -> None:
-        for name in ("points", "label_times", "restarts", "steps", "reference_states"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
-            raise ValueError(f"`seed` must be a non-negative integer; got {self.seed!r}.")
-        if not 0 < self.frozen_weight < math.inf:
-            raise ValueError(f"`frozen_weight` must be positive and finite; got {self.frozen_weight!r}.")
-
-
-def fit_split(
-    flow: SplitFlow,
-    system: HamiltonianSystem,
-    domain: Domain | None = None,
-    *,
-    time_budget: float | None = None,
-    **options: Any,
-) -> SplitFlow:
-    """Fit a flow made by `SympFlow.split` to the exact flow of its system, in place.
-
-    Parameters
-    ----------
-    flow : SplitFlow
-    system : HamiltonianSystem
-        Symbolic.
-    domain : Domain, optional
-        Ω, where labels are drawn; the default is the system's.
-    time_budget : float, optional
-        Seconds after which the best so far is taken, with a warning.
-    **options
-        Of `SplitFitConfig`.
-
-    Returns
-    -------
-    SplitFlow
-        The flow, with its domain, recipe, history and figures: mean and largest one-step error ‖ψ̄_Δt − φ_H,Δt‖ of
-        held-out states, each mode in its unit over Ω, and the mean over times in (0, Δt).
-
-    Raises
-    ------
-    ValueError
-        If the system is not the flow's, or cannot be compiled, or there is no domain.
-    """
-    config = SplitFitConfig(**options)
-    flow.bind(system)
-    domain = system.domain if domain is None else domain
-    if domain is None:
-        raise ValueError("`domain` is needed: the system has none. Pass domain=, a Box or an EnergySublevel around 0.")
-    if isinstance(domain, EnergySublevel):
-        domain = domain.attach(system.hamiltonian)
-    begin = time.perf_counter()
-
-    def spent() -> bool:
-        return time_budget is not None and time.perf_counter() - begin > time_budget
-
-    fit = _Fit(flow, system, domain, config)
-    minima = fit.search(spent)
-    best = min(minima, key=lambda m: m.cost)
-    if not math.isfinite(best.cost):
-        raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
-    whole = fit.whole(best.x, spent)
-    if spent():
-        warnings.warn("Training ended because the time budget was used up.", RuntimeWarning, stacklevel=2)
-    flow.domain = domain
-    stage = {
-        "optimizer": "gauss-newton",
-        "loss": "labels",
-        **asdict(config),
-        "restarts_taken": len(minima),
-        "iterations": sum(m.iterations for m in minima) + whole.iterations,
-        "ended_early": "the time budget was used up" if spent() else None,
-    }
-    flow.recipe = {"stages": [*flow.recipe.get("stages", []), stage], "torch": torch.__version__}
-    flow.history = [{"step": i, "loss": m.cost} for i, m in enumerate(minima, 1)]
-    flow.figures = {**fit.errors(), "training_seconds": round(time.perf_counter() - begin, 3)}
-    flow.requires_grad_(False)
-    return flow
-
-
 def _phases(share: np.ndarray) -> np.ndarray:
     """Chebyshev's points of even polynomials on (0, 1]."""
     return np.where(share == 1, 1.0, np.sin(np.pi / 2 * share))
 
 
-class _Fit:
+class SplitFit:
     """Labels in modes, and the flow's coefficients as numbers: those of the first half of the palindrome."""
 
-    def __init__(self, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, config: SplitFitConfig) -> None:
+    def __init__(self, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, config: SplitConfig) -> None:
         self.flow, self.config, self.parts = flow, config, flow.parts
         self.kernel: PartsKernel = kernel_of(self.parts, PartsKernel)
         self.kernel.source()
@@ -262,17 +147,6 @@ class _Fit:
             if c.power > 1:
                 u[part] = 0.0
         return u
-
-    def search(self, stop: Callable[[], bool]) -> list[Minimum]:
-        """Minima at Δt, their x the numbers u, from the flow as it is and from random ones."""
-        last = len(self.t) - 1
-        minima: list[Minimum] = []
-        for restart in range(self.config.restarts):
-            if minima and stop():
-                break
-            u = self.random(restart) if restart else self.current(self.t[last])
-            minima.append(self.minimize(u, last, self.config.steps, stop))
-        return minima
 
     def current(self, t: float) -> np.ndarray:
         """The numbers of the flow as it is."""

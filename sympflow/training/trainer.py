@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import inspect
-import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,19 +11,12 @@ from numpy.typing import ArrayLike
 
 from sympflow.domain import Domain
 from sympflow.flow.base import FlowMap
-from sympflow.flow.mlp import MLPFlow, matching_widths
-from sympflow.flow.primed import PrimedFlow
-from sympflow.flow.scaling import Scaling
-from sympflow.flow.sympflow import SympFlow
 from sympflow.system import HamiltonianSystem
-from sympflow.training.arguments import digest, domain_for, labels_of, weights_of
-from sympflow.training.collocation import Stream, states
-from sympflow.training.config import TrainingConfig
-from sympflow.training.gauss_newton import GaussNewtonConfig, GaussNewtonRun
-from sympflow.training.recipes import BUDGET, default_recipe
-from sympflow.training.run import Path, Run
-
-SCALING_SAMPLES = 4096
+from sympflow.training.architecture import check_flow, kind_of, new_primed
+from sympflow.training.arguments import check_step_and_budget, domain_for
+from sympflow.training.recipes import BUDGET
+from sympflow.training.run import Path
+from sympflow.training.starts import start
 
 
 def train(
@@ -74,7 +64,8 @@ def train(
 
     For a separable symbolic system with T = ½ pᵀM⁻¹p that is a primed flow (`SympFlow.primed`), whose few numbers are
     fitted to the exact flow in seconds. For any other it is a SympFlow with MLP potentials, symplectic for every H,
-    trained by Adam on its residual and by Hamiltonian matching, without data.
+    trained by Adam on its residual and by Hamiltonian matching, without data. A flow of any kind, one made by
+    `SympFlow.primed` or `SympFlow.split` among them, is trained further as `flow`.
 
     Parameters
     ----------
@@ -96,7 +87,8 @@ def train(
     pairs, hidden, activation, dtype, device
         Of a new network, see `SympFlow`; the defaults are 3, (10, 10), "tanh" and float64 on the CPU.
     optimizer : {"gauss-newton", "adam", "bfgs", "lbfgs"}, optional
-        The default is "gauss-newton" for primed flows, "adam" for networks, which "gauss-newton" trains far better.
+        The default is "gauss-newton" for primed and split flows, "adam" for networks, which "gauss-newton" trains far
+        better.
     steps, points, residual_weight, matching_weight, label_weight, matching_times, learning_rate, schedule, clip,
     refresh, seed, validate_every, validation_points, reference_states, checkpoint_every
         See `TrainingConfig`. What is left out gets the optimizer's own default: 20,000 steps on 700 fresh points
@@ -109,8 +101,8 @@ def train(
         Some of "residual", "matching" and "labels", joined by "+": those that are left out get the weight 0. The
         default is "labels" for primed flows with optimizer="gauss-newton", else what the weights say.
     restarts, label_times, frozen_weight
-        Of "gauss-newton" on a primed flow, which takes of those above `steps`, `points`, `seed` and
-        `reference_states`: see `GaussNewtonConfig`. `label_times` counts for a network's `label_weight` too.
+        Of "gauss-newton" on a primed or a split flow, which takes of those above `steps`, `points`, `seed` and
+        `reference_states`: see `search_config`. `label_times` counts for a network's `label_weight` too.
     checkpoint : path, optional
         Write the state of the run there every `checkpoint_every` steps, atomically.
     resume : path, optional
@@ -142,197 +134,17 @@ def train(
     """
     given, begin = dict(locals()), time.perf_counter()
     domain = domain_for(system, domain)
-    if time_budget is not None and not 0 < time_budget < math.inf:
-        raise ValueError(f"`time_budget` must be a positive number of seconds; got {time_budget!r}.")
-    new = {
-        "kind": kind,
-        "stages": stages,
-        "processor": processor,
-        "pairs": pairs,
-        "hidden": hidden,
-        "activation": activation,
-        "dtype": dtype,
-        "device": device,
-    }
-    if flow is not None:
-        if not isinstance(flow, FlowMap):
-            raise TypeError(f"`flow` must be a SympFlow or an MLPFlow; got {flow!r}: leave it out for a new one.")
-        for name, value in new.items():
-            if value is not None:
-                raise ValueError(f"`{name}` describes a new flow, but `flow` is given: leave out one of them.")
-        if dt is not None and dt != flow.dt:
-            raise ValueError(f"`dt` is {dt!r} but the flow has {flow.dt!r}: leave `dt` out to train it further.")
-        dt, kind = flow.dt, "primed" if isinstance(flow, PrimedFlow) else flow.kind
-        flow.check_system(system)
-    if dt is not None and (isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf):
-        raise ValueError(f"`dt` must be a positive finite number; got {dt!r}.")
-    kind = _kind(system, given) if kind is None else kind
-    if kind not in KINDS:
-        raise ValueError(f"`kind` {kind!r} is unknown: choose one of {', '.join(KINDS)}.")
-    if flow is None:
-        for name in _OF_NETWORKS if kind == "primed" else ("stages", "processor"):
-            if new[name] is not None:
-                raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
-    optimizer = ("gauss-newton" if kind == "primed" else "adam") if optimizer is None else optimizer
+    check_step_and_budget(dt, time_budget)
     hurried = flow is None and time_budget is None and restarts is None and steps is None and resume is None
-    if flow is None and kind == "primed":
-        flow = _primed(system, domain, dt, stages, processor, dtype, device)
-    dt = flow.dt if flow is not None else 1.0 if dt is None else float(dt)
-    single = dtype not in (None, torch.float64) or (flow is not None and flow.dtype != torch.float64)
-    if optimizer == "gauss-newton" and single:
-        raise TypeError("`optimizer` 'gauss-newton' fits flows in float64: leave out `dtype`, or use 'adam'.")
-    if loss is not None or (kind == "primed" and optimizer == "gauss-newton"):
-        weights = weights_of("labels" if loss is None else loss, residual_weight, matching_weight, label_weight)
-        residual_weight, matching_weight, label_weight = weights
-    if optimizer == "gauss-newton" and kind == "primed":
-        _refuse_options(given, _NOT_OF_TABLES, f"optimizer {optimizer!r} for primed flows")
-        if loss is None:
-            _refuse_options(given, _OF_LOSSES, f"optimizer {optimizer!r} for primed flows without a `loss`")
-        handed = None if data is None else labels_of(data, system, dt)
-        choices: dict[str, Any] = {
-            "points": points,
-            "steps": steps,
-            "restarts": restarts,
-            "label_times": label_times,
-            "frozen_weight": frozen_weight,
-            "residual_weight": residual_weight,
-            "matching_weight": matching_weight,
-            "label_weight": label_weight,
-            "matching_times": matching_times,
-            "data": None if handed is None else digest(handed),
-        }
-        choices = {name: value for name, value in choices.items() if value is not None}
-        labelled = GaussNewtonConfig(seed=seed, reference_states=reference_states, **choices)
-        assert isinstance(flow, PrimedFlow)
-        flow = copy.deepcopy(flow).bound(system)
-        flow.certified = None  # of the numbers as they were
-        scaling = Scaling.of_samples(states(domain, SCALING_SAMPLES, seed, Stream.SCALING), flow.dt)
-        search = GaussNewtonRun.start(flow, system, domain, scaling, labelled, handed)
-        if resume is not None:
-            search.load(resume)
-        if hurried:  # labels and their compilation are part of the minute
-            time_budget = max(BUDGET - (time.perf_counter() - begin), 1.0)
-        return search.finish(search.go(checkpoint, time_budget, progress, callback), expected=hurried)
-    _refuse_options(given, _OF_TABLES, f"optimizer {optimizer!r} for flows of kind {kind!r}")
-    if optimizer != "adam":
-        _refuse_options(given, ("learning_rate", "schedule", "clip"), f"optimizer {optimizer!r}")
-    if kind == "mlp" and matching_weight:
-        raise ValueError("`matching_weight` needs a Hamiltonian, which an MLP flow has not: leave it out.")
-    labels = None if data is None else labels_of(data, system, dt)
-    if matching_weight is None:
-        matching_weight = 0.0 if kind == "mlp" or optimizer == "gauss-newton" else 1.0
-    config = TrainingConfig.of(
-        optimizer,
-        steps=steps,
-        points=points,
-        refresh=refresh,
-        validate_every=validate_every,
-        checkpoint_every=checkpoint_every,
-        residual_weight=residual_weight,
-        matching_weight=matching_weight,
-        label_weight=(0.0 if data is None else 1.0) if label_weight is None else label_weight,
-        matching_times=matching_times,
-        label_times=8 if label_times is None else label_times,
-        data=None if labels is None else digest(labels),
-        learning_rate=learning_rate,
-        schedule=schedule,
-        clip=clip,
-        seed=seed,
-        validation_points=validation_points,
-        reference_states=reference_states,
-    )
-    scaling = Scaling.of_samples(states(domain, SCALING_SAMPLES, seed, Stream.SCALING), dt)
-    if flow is None:
-        flow = SympFlow(
-            system.ndof,
-            3 if pairs is None else pairs,
-            (10, 10) if hidden is None else hidden,
-            "tanh" if activation is None else activation,
-            dt,
-            torch.float64 if dtype is None else dtype,
-            device,
-            seed,
-            scaling,
-        )
-        if kind == "mlp":
-            if matching_widths(flow.ndof, flow.n_parameters) is None:
-                raise ValueError(
-                    f"`hidden` and `pairs` describe a SympFlow of only {flow.n_parameters} parameters, which no "
-                    "MLPFlow matches within 2 %: give wider layers or more pairs."
-                )
-            flow = MLPFlow.matching(flow, seed, scaling, "tanh" if activation is None else activation)
-    flow = copy.deepcopy(flow).bound(system).requires_grad_(True)
-    flow.certified = None  # of the weights as they were
-    run = Run.start(flow, system, domain, scaling, config, labels)
+    kind = kind_of(system, given)
+    if flow is not None:
+        check_flow(flow, system, dt)
+    elif kind == "primed":
+        flow = new_primed(system, domain, dt, stages, processor, dtype, device)
+    run = start(system, domain, kind, flow, given)
     if resume is not None:
         run.load(resume)
-    return run.finish(run.go(checkpoint, time_budget, progress, callback))
-
-
-KINDS = ("primed", "sympflow", "mlp")
-_OF_NETWORKS = ("pairs", "hidden", "activation")
-_OF_TABLES = ("restarts", "frozen_weight")
-_OF_LOSSES = ("residual_weight", "matching_weight", "label_weight", "matching_times")
-_NOT_OF_TABLES = (
-    "learning_rate",
-    "schedule",
-    "clip",
-    "refresh",
-    "validate_every",
-    "validation_points",
-    "checkpoint_every",
-)
-
-
-def _kind(system: HamiltonianSystem, given: dict[str, Any]) -> str:
-    """The architecture that is meant where none is named."""
-    if _given(given, ("stages", "processor", *_OF_TABLES)):
-        return "primed"
-    fits = system.separable and system.quadratic_kinetic and system.symbols is not None
-    of_networks = (*_OF_NETWORKS, *_NOT_OF_TABLES, *((*_OF_LOSSES, "data") if given["loss"] is None else ()))
-    wants_network = given["optimizer"] not in (None, "gauss-newton") or _given(given, of_networks)
-    return "primed" if fits and not wants_network else "sympflow"
-
-
-def _primed(
-    system: HamiltonianSystem,
-    domain: Domain,
-    dt: float | None,
-    stages: int | None,
-    processor: int | None,
-    dtype: torch.dtype | None,
-    device: torch.device | str | None,
-) -> PrimedFlow:
-    """A new primed flow: what is not given is as `default_recipe` has it, Δt in proportion to the kicks."""
-    recipe = None
-    if system.separable and (dt is None or stages is None or processor is None):
-        recipe = default_recipe(system, domain, dt)
-        if dt is None:
-            dt = recipe.dt if stages is None else float(f"{recipe.dt * stages / recipe.stages:.3g}")
-        stages = recipe.stages if stages is None else stages
-        processor = recipe.processor if processor is None else processor
-    return SympFlow.primed(
-        system,
-        stages,
-        dt=1.0 if dt is None else float(dt),
-        processor=0 if processor is None else processor,
-        dtype=torch.float64 if dtype is None else dtype,
-        device=device,
-    )
-
-
-def _given(given: dict[str, Any], names: Sequence[str]) -> list[str]:
-    """Those of the named arguments of `train` that have another value than their default."""
-    defaults = inspect.signature(train).parameters
-    return [
-        name for name in names if given[name] is not defaults[name].default and given[name] != defaults[name].default
-    ]
-
-
-def _differs(value: Any, default: Any) -> bool:
-    return value is not default and (default is None or value != default)
-
-
-def _refuse_options(given: dict[str, Any], names: Sequence[str], what: str) -> None:
-    for name in _given(given, names):
-        raise TypeError(f"`{name}` is not an option of the {what}: leave it out.")
+    hurried = hurried and run.searches
+    if hurried:  # labels and their compilation are part of the minute
+        time_budget = max(BUDGET - (time.perf_counter() - begin), 1.0)
+    return run.finish(run.go(checkpoint, time_budget, progress, callback), expected=hurried)

@@ -1,0 +1,128 @@
+"""Which flow `train` is to train: the one that is given, or a new one of the kind that its options describe."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from sympflow.domain import Domain
+from sympflow.flow.base import FlowMap
+from sympflow.flow.mlp import MLPFlow, matching_widths
+from sympflow.flow.primed import PrimedFlow
+from sympflow.flow.scaling import Scaling
+from sympflow.flow.split import SplitFlow
+from sympflow.flow.sympflow import SympFlow
+from sympflow.system import HamiltonianSystem
+from sympflow.training.recipes import default_recipe
+
+KINDS = ("primed", "sympflow", "mlp")
+OF_NETWORKS = ("pairs", "hidden", "activation")
+OF_PRIMED = ("stages", "processor")
+OF_SEARCHES = ("restarts", "frozen_weight")
+OF_LOSSES = ("residual_weight", "matching_weight", "label_weight", "matching_times")
+OF_GRADIENTS = ("learning_rate", "schedule", "clip")
+NOT_OF_SEARCHES = (*OF_GRADIENTS, "refresh", "validate_every", "validation_points", "checkpoint_every")
+
+
+def kind_of(system: HamiltonianSystem, given: dict[str, Any]) -> str:
+    """Of the flow that is given, or of the new one that the arguments of `train` describe; these are checked."""
+    flow, kind = given["flow"], given["kind"]
+    new = ("kind", *OF_PRIMED, *OF_NETWORKS, "dtype", "device")
+    if flow is not None:
+        if not isinstance(flow, FlowMap):
+            raise TypeError(f"`flow` must be a SympFlow or an MLPFlow; got {flow!r}: leave it out for a new one.")
+        for name in new:
+            if given[name] is not None:
+                raise ValueError(f"`{name}` describes a new flow, but `flow` is given: leave out one of them.")
+        return "primed" if isinstance(flow, PrimedFlow) else "split" if isinstance(flow, SplitFlow) else flow.kind
+    kind = _meant(system, given) if kind is None else kind
+    if kind not in KINDS:
+        raise ValueError(f"`kind` {kind!r} is unknown: choose one of {', '.join(KINDS)}.")
+    for name in OF_NETWORKS if kind == "primed" else OF_PRIMED:
+        if given[name] is not None:
+            raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
+    return kind
+
+
+def check_flow(flow: FlowMap, system: HamiltonianSystem, dt: float | None) -> None:
+    if dt is not None and dt != flow.dt:
+        raise ValueError(f"`dt` is {dt!r} but the flow has {flow.dt!r}: leave `dt` out to train it further.")
+    flow.check_system(system)
+
+
+def _meant(system: HamiltonianSystem, given: dict[str, Any]) -> str:
+    """The architecture that is meant where none is named."""
+    if options_given(given, (*OF_PRIMED, *OF_SEARCHES)):
+        return "primed"
+    fits = system.separable and system.quadratic_kinetic and system.symbols is not None
+    of_networks = (*OF_NETWORKS, *NOT_OF_SEARCHES, *((*OF_LOSSES, "data") if given["loss"] is None else ()))
+    wants_network = given["optimizer"] not in (None, "gauss-newton") or options_given(given, of_networks)
+    return "primed" if fits and not wants_network else "sympflow"
+
+
+def new_primed(
+    system: HamiltonianSystem,
+    domain: Domain,
+    dt: float | None,
+    stages: int | None,
+    processor: int | None,
+    dtype: torch.dtype | None,
+    device: torch.device | str | None,
+) -> PrimedFlow:
+    """A new primed flow: what is not given is as `default_recipe` has it, Δt in proportion to the kicks."""
+    if system.separable and (dt is None or stages is None or processor is None):
+        recipe = default_recipe(system, domain, dt)
+        if dt is None:
+            dt = recipe.dt if stages is None else float(f"{recipe.dt * stages / recipe.stages:.3g}")
+        stages = recipe.stages if stages is None else stages
+        processor = recipe.processor if processor is None else processor
+    return SympFlow.primed(
+        system,
+        stages,
+        dt=1.0 if dt is None else float(dt),
+        processor=0 if processor is None else processor,
+        dtype=torch.float64 if dtype is None else dtype,
+        device=device,
+    )
+
+
+def new_network(system: HamiltonianSystem, kind: str, dt: float, scaling: Scaling, given: dict[str, Any]) -> FlowMap:
+    """A SympFlow with MLP potentials, or the baseline of as many parameters."""
+    activation = "tanh" if given["activation"] is None else given["activation"]
+    flow = SympFlow(
+        system.ndof,
+        3 if given["pairs"] is None else given["pairs"],
+        (10, 10) if given["hidden"] is None else given["hidden"],
+        activation,
+        dt,
+        torch.float64 if given["dtype"] is None else given["dtype"],
+        given["device"],
+        given["seed"],
+        scaling,
+    )
+    if kind != "mlp":
+        return flow
+    if matching_widths(flow.ndof, flow.n_parameters) is None:
+        raise ValueError(
+            f"`hidden` and `pairs` describe a SympFlow of only {flow.n_parameters} parameters, which no "
+            "MLPFlow matches within 2 %: give wider layers or more pairs."
+        )
+    return MLPFlow.matching(flow, given["seed"], scaling, activation)
+
+
+def options_given(given: dict[str, Any], names: Sequence[str]) -> list[str]:
+    """Those of the named arguments of `train` that have another value than their default."""
+    from sympflow.training.trainer import train
+
+    defaults = inspect.signature(train).parameters
+    return [
+        name for name in names if given[name] is not defaults[name].default and given[name] != defaults[name].default
+    ]
+
+
+def refuse_options(given: dict[str, Any], names: Sequence[str], what: str) -> None:
+    for name in options_given(given, names):
+        raise TypeError(f"`{name}` is not an option of the {what}: leave it out.")

@@ -1,0 +1,134 @@
+"""The training of a flow's clock: the times that the exact solution takes to where a scheme comes, by least squares.
+
+A splitting scheme on a logarithmic Hamiltonian comes in a step s from x to a state near the orbit through x, and holds
+a time for it. The label is the time at which the exact solution in the physical time is nearest to that state; the
+clock is linear in its numbers.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.integrate import solve_ivp
+
+from sympflow.flow.clocked import ClockedFlow
+from sympflow.integrators.logarithmic import LogSympFlow
+from sympflow.metrics.energy import max_energy_error
+from sympflow.solver import solve
+from sympflow.system import HamiltonianSystem
+from sympflow.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
+from sympflow.training.collocation import Stream, states
+
+TOLERANCE = 1e-13
+NEWTON_STEPS = 5  # to the nearest point of an orbit
+FRACTIONAL_TIMES = 50
+
+
+def train_clock(
+    system: HamiltonianSystem,
+    dt: float,
+    scheme: str = "leapfrog",
+    terms: int = 10,
+    points: int = 100,
+    label_times: int = 12,
+    seed: int = 0,
+) -> ClockedFlow:
+    """A flow with a trained clock for a separable system, with its record.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        With a domain.
+    dt : float
+        The physical length of the longest step, as of `sympflow.integrators.logarithmic.Logarithmic`.
+    scheme, terms
+        See `ClockedFlow`.
+    points, label_times, seed : int
+        Seeded states of the domain, and steps in (0, Δ] at which each is labelled.
+
+    Raises
+    ------
+    ValueError
+        If the system has no domain.
+    """
+    if system.domain is None:
+        raise ValueError(f"`system` {system.name!r} has no domain to sample: give it one.")
+    started, cpu = time.perf_counter(), time.process_time()
+    shift = default_shift(system)
+    transformed = time_transformed(system, shift)
+    flow = ClockedFlow(transformed.ndof, scheme, terms, dt * time_scale(system, shift), transformed)
+    x = lifted(system, states(system.domain, points, seed, Stream.RESIDUAL), shift)
+    s = np.repeat(flow.dt * np.arange(1, label_times + 1) / label_times, len(x))
+    late = _lateness(flow, system, np.tile(x, (label_times, 1)), s)[1]
+    B = np.tile(x[:, -1], label_times)
+    columns = np.stack([s ** (3 + 2 * k) * B**k for k in range(terms)], axis=-1)
+    unit = np.abs(columns).max(0)
+    numbers = np.linalg.lstsq(columns / unit, late, rcond=None)[0] / unit
+    with torch.no_grad():
+        flow.clock.numbers.copy_(torch.as_tensor(numbers))
+    flow.requires_grad_(False)
+    stage = {"optimizer": "least squares", "loss": "clock", "points": points, "label_times": label_times, "seed": seed}
+    flow.recipe = {
+        "stages": [stage],
+        "torch": torch.__version__,
+        "transforms": {"system": system.name, "shift": shift, "fingerprint": list(system.fingerprint)},
+    }
+    flow.figures = {"step": dt, **_errors(flow, system, seed)}
+    flow.figures["training_seconds"] = round(time.perf_counter() - started, 3)
+    flow.figures["training_cpu_seconds"] = round(time.process_time() - cpu, 3)
+    return flow
+
+
+def energy_errors(flow: ClockedFlow, system: HamiltonianSystem, y0: np.ndarray, t_end: float, outputs: int) -> Any:
+    """The largest relative energy error of each run in the physical time, over equidistant outputs: (N,)."""
+    times = np.linspace(0.0, t_end, outputs + 1)
+    integrator = LogSympFlow(flow=flow, shift=flow.recipe["transforms"]["shift"])
+    return max_energy_error(solve(system, integrator, (0.0, t_end), y0, t_eval=times, on_domain_exit="ignore"))
+
+
+def _lateness(
+    flow: ClockedFlow, system: HamiltonianSystem, x: np.ndarray, s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """ψ̄_s(x) of rows, and how much later than it holds the exact solution is where it comes: (N, 2d + 2), (N,)."""
+    transformed = flow.system
+    assert transformed is not None
+    end = flow.kernel_for(transformed).step(s, x)
+    held = end[:, system.ndof]
+    y, start, t = projected(end), projected(x), held.copy()
+    for _ in range(NEWTON_STEPS):
+        exact = _at(system, start, t)
+        v = system.vector_field(exact)
+        t = t + ((y - exact) * v).sum(-1) / (v * v).sum(-1)
+    return end, t - held
+
+
+def _errors(flow: ClockedFlow, system: HamiltonianSystem, seed: int, points: int = 100) -> dict[str, float]:
+    """‖[q, p] of ψ̄_s(x) − φ_t(x)‖, t the time that ψ̄_s(x) holds: at Δ, and its mean over fractional steps."""
+    assert system.domain is not None
+    shift = flow.recipe["transforms"]["shift"]
+    x = lifted(system, states(system.domain, points, seed, Stream.REFERENCE), shift)
+    kernel = flow.kernel_for(flow.system)  # type: ignore[arg-type]
+    errors = []
+    for s in flow.dt * np.append((np.arange(FRACTIONAL_TIMES) + 0.5) / FRACTIONAL_TIMES, 1.0):
+        end = kernel.step(np.full(len(x), s), x)
+        exact = _at(system, projected(x), end[:, system.ndof])
+        errors.append(np.linalg.norm(projected(end) - exact, axis=-1))
+    return {
+        "one_step_error": float(errors[-1].mean()),
+        "one_step_error_median": float(np.median(errors[-1])),
+        "one_step_error_max": float(errors[-1].max()),
+        "fractional_error": float(np.mean(errors[:-1])),
+    }
+
+
+def _at(system: HamiltonianSystem, x: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """φ_t(x) of rows, each at its own time t (N,), by DOP853: all of them in a time that runs from 0 to 1."""
+
+    def velocity(_: float, y: np.ndarray) -> np.ndarray:
+        return (t[:, None] * system.vector_field(y.reshape(x.shape))).ravel()
+
+    run = solve_ivp(velocity, (0.0, 1.0), x.ravel(), "DOP853", rtol=TOLERANCE, atol=1e-2 * TOLERANCE)
+    return run.y[:, -1].reshape(x.shape)
