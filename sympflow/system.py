@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow import matrices
 from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
 from sympflow.domain import Domain, EnergySublevel
 
@@ -99,12 +100,16 @@ class HamiltonianSystem:
             )
         definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector)
         if definition.separable:
-            self._set(definition, _inverse_mass(mass, int(ndof)), True)
+            self._set(definition, matrices.inverse_mass(mass, int(ndof)), True)
         elif mass is not None:
             raise TypeError("`mass` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         else:
             self._set(definition, None, False)
-        self.stiffness_matrix: np.ndarray | None = _stiffness_matrix(stiffness_matrix, definition)
+        if stiffness_matrix is not None and not definition.separable:
+            raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
+        self.stiffness_matrix: np.ndarray | None = (
+            None if stiffness_matrix is None else matrices.stiffness_matrix(stiffness_matrix, definition.ndof)
+        )
         self._set_scene(name, {}, domain, y0, t_span, dt, energy_scale)
 
     @classmethod
@@ -142,7 +147,7 @@ class HamiltonianSystem:
         symbols = SymbolicHamiltonian(expression, params)
         self = cls.__new__(cls)
         M = symbols.inverse_mass
-        inverse_mass = None if M is None else _simplest_mass(np.array(M.tolist(), dtype=float))
+        inverse_mass = None if M is None else matrices.simplest(np.array(M.tolist(), dtype=float))
         self._set(symbols, inverse_mass, M is not None)
         self.symbols, self.stiffness_matrix = symbols, None
         self._set_scene(name, dict(params or {}), domain, y0, t_span, dt, energy_scale)
@@ -324,61 +329,3 @@ def _like(constant: np.ndarray, x: Array) -> Array:
 
         return torch.as_tensor(constant, dtype=x.dtype, device=x.device)
     return constant.astype(x.dtype, copy=False)
-
-
-def _inverse_mass(mass: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
-    M = _real("mass", 1.0 if mass is None else mass)
-    if M.shape not in ((), (ndof,), (ndof, ndof)):
-        raise ValueError(f"`mass` must be a number or have shape ({ndof},) or ({ndof}, {ndof}); got {M.shape}.")
-    if M.ndim < 2:
-        M = np.broadcast_to(M, ndof)
-        if not (np.isfinite(M).all() and (M > 0).all()):
-            raise ValueError(f"`mass` must be finite, symmetric and positive definite; got {mass!r}.")
-        return None if (M == 1).all() else 1 / M
-    _check_symmetric("mass", M)
-    smallest = np.linalg.eigvalsh(M)[0]
-    if not smallest > 0:
-        raise ValueError(
-            f"`mass` must be finite, symmetric and positive definite; its smallest eigenvalue is {smallest:g}."
-        )
-    return _simplest_mass(np.linalg.inv(M))
-
-
-def _stiffness_matrix(matrix: ArrayLike | None, definition: Any) -> np.ndarray | None:
-    if matrix is None:
-        return None
-    if not definition.separable:
-        raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
-    K, d = _real("stiffness_matrix", matrix), definition.ndof
-    if K.shape != (d, d):
-        raise ValueError(f"`stiffness_matrix` must be finite, symmetric and of shape ({d}, {d}); got shape {K.shape}.")
-    _check_symmetric("stiffness_matrix", K)
-    return (K + K.T) / 2
-
-
-def _real(name: str, values: ArrayLike) -> np.ndarray:
-    """The values as an array of floats."""
-    try:
-        array = np.asarray(values)
-        if array.dtype.kind not in "biufO":
-            raise TypeError(f"of {array.dtype}")
-        return array.astype(float)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"`{name}` must be real numbers; got {values!r}: pass a number or an array of them.") from error
-
-
-def _check_symmetric(name: str, matrix: np.ndarray) -> None:
-    """Raise with the first entry that is not finite, or differs from its mirror image."""
-    for wrong in (~np.isfinite(matrix), ~np.isclose(matrix, matrix.T)):
-        if wrong.any():
-            i, j = np.argwhere(wrong)[0].tolist()
-            mirror = f", [{j}, {i}] is {matrix[j, i]:g}" if np.isfinite(matrix[i, j]) else ""
-            raise ValueError(f"`{name}` must be finite, symmetric; its entry [{i}, {j}] is {matrix[i, j]:g}{mirror}.")
-
-
-def _simplest_mass(inverse: np.ndarray) -> np.ndarray | None:
-    """None for the identity, the diagonal for a diagonal matrix, else the matrix."""
-    if np.array_equal(inverse, np.eye(len(inverse))):
-        return None
-    diagonal = np.diag(inverse).copy()
-    return diagonal if np.array_equal(inverse, np.diag(diagonal)) else inverse

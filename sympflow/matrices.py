@@ -1,0 +1,64 @@
+"""The matrices that a user gives, the mass M and the stiffness K: checked, and in their simplest form."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+def inverse_mass(mass: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
+    """M⁻¹ in its simplest form for a mass M: a number, (d,) or (d, d)."""
+    M = _real("mass", 1.0 if mass is None else mass)
+    if M.shape not in ((), (ndof,), (ndof, ndof)):
+        raise ValueError(f"`mass` must be a number or have shape ({ndof},) or ({ndof}, {ndof}); got {M.shape}.")
+    if M.ndim < 2:
+        M = np.broadcast_to(M, ndof)
+        if not (np.isfinite(M).all() and (M > 0).all()):
+            raise ValueError(f"`mass` must be finite, symmetric and positive definite; got {mass!r}.")
+        return None if (M == 1).all() else 1 / M
+    _check_symmetric("mass", M)
+    smallest = np.linalg.eigvalsh(M)[0]
+    if not smallest > 0:
+        raise ValueError(
+            f"`mass` must be finite, symmetric and positive definite; its smallest eigenvalue is {smallest:g}."
+        )
+    return simplest(np.linalg.inv(M))
+
+
+def stiffness_matrix(matrix: ArrayLike, ndof: int) -> np.ndarray:
+    """K (d, d), exactly symmetric."""
+    K = _real("stiffness_matrix", matrix)
+    if K.shape != (ndof, ndof):
+        raise ValueError(
+            f"`stiffness_matrix` must be finite, symmetric and of shape ({ndof}, {ndof}); got shape {K.shape}."
+        )
+    _check_symmetric("stiffness_matrix", K)
+    return (K + K.T) / 2
+
+
+def _real(name: str, values: ArrayLike) -> np.ndarray:
+    """The values as an array of floats."""
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "biufO":
+            raise TypeError(f"of {array.dtype}")
+        return array.astype(float)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"`{name}` must be real numbers; got {values!r}: pass a number or an array of them.") from error
+
+
+def _check_symmetric(name: str, matrix: np.ndarray) -> None:
+    """Raise with the first entry that is not finite, or differs from its mirror image."""
+    for wrong in (~np.isfinite(matrix), ~np.isclose(matrix, matrix.T)):
+        if wrong.any():
+            i, j = np.argwhere(wrong)[0].tolist()
+            mirror = f", [{j}, {i}] is {matrix[j, i]:g}" if np.isfinite(matrix[i, j]) else ""
+            raise ValueError(f"`{name}` must be finite, symmetric; its entry [{i}, {j}] is {matrix[i, j]:g}{mirror}.")
+
+
+def simplest(inverse: np.ndarray) -> np.ndarray | None:
+    """None for the identity, the diagonal for a diagonal matrix, else the matrix."""
+    if np.array_equal(inverse, np.eye(len(inverse))):
+        return None
+    diagonal = np.diag(inverse).copy()
+    return diagonal if np.array_equal(inverse, np.diag(diagonal)) else inverse
