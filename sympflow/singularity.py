@@ -13,7 +13,7 @@ from sympflow.system import HamiltonianSystem
 
 TAIL = 200  # steps before the end of a run, at least, from which the solution is followed
 AHEAD = 4  # steps beyond the end: an implicit method gives up before a singularity
-MOST_TRIED, MOST_ROWS = 500, 4096  # steps of the reference; trajectories at once
+MOST_TRIED, MOST_ROWS, MOST_STORED = 500, 4096, 10**7  # steps of the reference; trajectories at once; numbers
 RTOL = 1e-10
 LOST = 0.01  # of y·∇H: a state whose energy differs by more is no longer on the solution
 SHORT = 1e-11  # of the way: steps below it go on no more
@@ -93,30 +93,31 @@ def _tail_states(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,) and states (n, 2d), `TAIL` to 2·`TAIL` steps before the end where `wanted`; else the beginning.
 
-    From the outputs, where they reach so far, and else by executing the run again, all trajectories together.
+    From the outputs where they hold one, and else by executing the run again from its beginning, bit by bit the same:
+    from elsewhere a chaotic orbit would take another course.
     """
-    sign, d2 = 1.0 if problem.t1 >= problem.t0 else -1.0, 2 * problem.system.ndof
-    blocks = np.maximum(0, np.abs(failed_at - problem.t0) // (TAIL * h) - 1)
+    sign, d2, y0 = 1.0 if problem.t1 >= problem.t0 else -1.0, 2 * problem.system.ndof, to_numpy(problem.y0)
+    blocks = np.where(wanted, np.maximum(0, np.abs(failed_at - problem.t0) // (TAIL * h) - 1), 0)
     goal = problem.t0 + sign * blocks * TAIL * h
-    states = to_numpy(problem.y0).reshape(-1, d2)[rows].astype(float)
-    start, found = np.full(len(rows), problem.t0), states.copy()
-    outputs = to_numpy(outcome.y).reshape(len(outcome.t), len(to_numpy(problem.y0).reshape(-1, d2)), d2)[:, rows]
-    now, left = problem.t0, np.flatnonzero((goal != problem.t0) & wanted)
-    for time in sorted(set(goal[left].tolist()), key=lambda t: sign * t):
-        stored = int(np.searchsorted(sign * outcome.t, sign * time, "right")) - 1
-        if stored >= 0 and sign * (outcome.t[stored] - now) > 0:
-            now, states[left] = float(outcome.t[stored]), outputs[stored, left]
-        if sign * (time - now) > TAIL * h[left].max():
-            y = states[left].astype(to_numpy(problem.y0).dtype)
-            y = y[0] if problem.y0.ndim == 1 else y
-            piece = replace(
-                problem, t0=now, t1=time, y0=y, t_eval=np.array([time]), save_every=1, dense_output=False, events=None
-            )
-            now, states[left] = time, np.asarray(integrator.run(piece).y[-1], dtype=float)
-        here = left[goal[left] == time]
-        start[here], found[here] = now, states[here]
-        left = left[goal[left] != time]
-    return start, found
+    t, y = np.full(len(rows), problem.t0), y0.reshape(-1, d2)[rows].astype(float)
+    near = np.zeros(len(rows), dtype=bool)
+    if len(outcome.t):
+        stored = (np.searchsorted(sign * outcome.t, sign * goal, "right") - 1).clip(0)
+        near = (blocks > 0) & (np.abs(goal - outcome.t[stored]) <= TAIL * h)
+        outputs = to_numpy(outcome.y).reshape(len(outcome.t), -1, d2)
+        t[near], y[near] = outcome.t[stored[near]], outputs[stored[near], rows[near]]
+    again = np.flatnonzero((blocks > 0) & ~near)
+    if len(again):
+        times = np.array(sorted(set(goal[again].tolist()), key=lambda x: sign * x))
+        times = times[:: max(1, -(-len(times) * len(again) * d2 // MOST_STORED))]
+        start = y0 if y0.ndim == 1 else y0.reshape(-1, d2)[rows[again]]
+        piece = replace(
+            problem, t1=float(times[-1]), y0=start, t_eval=times, save_every=1, dense_output=False, events=None
+        )
+        found = np.asarray(integrator.run(piece).y, dtype=float).reshape(len(times), len(again), d2)
+        index = np.searchsorted(sign * times, sign * goal[again], "right") - 1
+        t[again], y[again] = times[index], found[index, np.arange(len(again))]
+    return t, y
 
 
 def _end_of_solution(

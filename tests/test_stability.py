@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import sympflow
-from sympflow import get, solve, stability, systems
+from sympflow import HamiltonianSystem, solve, stability, systems
 from sympflow.commands import app
 from sympflow.studies.singularities import blow_up
 from sympflow.studies.step_stability import initial_states
@@ -53,9 +53,11 @@ def test_a_singularity_is_found_within_a_step(method, dt):
     system = systems.henon_heiles_escape()
     sol = solve(system, method, (0.0, 10.0), dt=dt)
     assert sol.status == -1
-    end = blow_up(system, get(method)(dt=dt), (0.0, 10.0), system.y0, sol.stats["failed_at"])
+    end = blow_up(sol)
     assert end.singular
+    assert end.time == sol.stats["blow_up_time"]
     assert abs(end.time - SINGULARITY) < dt
+    assert f"becomes infinite, at about t = {end.time:.10g}" in sol.message
 
 
 @pytest.mark.parametrize(
@@ -64,9 +66,9 @@ def test_a_singularity_is_found_within_a_step(method, dt):
 def test_a_singularity_is_found_whatever_the_step_or_the_tolerance(method, options):
     system = systems.henon_heiles_escape()
     sol = solve(system, method, (0.0, 20.0), on_domain_exit="ignore", **options)
-    end = blow_up(system, get(method)(**options), (0.0, 20.0), system.y0, float(sol.stats.get("failed_at", sol.t[-1])))
+    end = blow_up(sol)
     assert end.singular
-    assert abs(end.time - SINGULARITY) < 1e-9
+    assert abs(end.time - SINGULARITY) < 1e-8
     assert "grows" not in str(end)
 
 
@@ -74,9 +76,57 @@ def test_an_unstable_step_of_a_system_without_singularities_is_not_taken_for_one
     system = systems.fput(50.0)  # quartic, so that the growth is faster than by a constant factor
     sol = solve(system, "verlet", (0.0, 50.0), dt=0.06, on_domain_exit="ignore")
     assert sol.status == -1
-    end = blow_up(system, get("verlet")(dt=0.06), (0.0, 50.0), system.y0, sol.stats["failed_at"])
+    end = blow_up(sol)
     assert not end.singular
     assert end.time == sol.stats["failed_at"]
+    assert "blow_up_time" not in sol.stats
+    assert sol.message.endswith("The solution itself goes on there: it takes shorter steps.")
+
+
+@pytest.mark.parametrize("options", [{}, {"t_eval": [9.0]}, {"backend": "array"}, {"dense_output": True}])
+@pytest.mark.parametrize("method", ["verlet", "rk45"])
+def test_each_trajectory_of_a_batch_has_its_blow_up_time(method, options):
+    """Both ways in time, whatever is asked for: the estimate is that of the trajectory alone."""
+    system = systems.henon_heiles()
+    y0 = np.array([[0, 0, 0, 0.7], system.y0, [0, 0, 0, 0.71]])
+    if method == "rk45":
+        options = {key: value for key, value in options.items() if key != "backend"}
+    sol = solve(system, method, (0, 9), y0, **options)
+    assert sol.status.tolist() == [-1, 0, -1]
+    times = sol.stats["blow_up_time"]
+    assert np.isnan(times[1])
+    assert abs(times[0] - SINGULARITY) < 1e-8
+    alone = solve(system, method, (0, 9), y0[2], **options)
+    assert abs(alone.stats["blow_up_time"] - times[2]) < 1e-8
+    assert "The solution of trajectory 0 itself becomes infinite" in sol.message
+    y0[:, 2:] *= -1  # time runs backwards
+    back = solve(system, method, (9, 0), y0, **{**options, "t_eval": [0.0]})
+    np.testing.assert_allclose(9 - back.stats["blow_up_time"], times, rtol=0, atol=1e-8)
+
+
+def test_an_escape_after_a_long_run_is_that_of_the_orbit_that_ran():
+    """Too far for the solution from y0: it is followed from a state that the run has stored, or reaches once more."""
+    system = systems.henon_heiles_escape(1 / 6 + 1e-3)
+    y0 = np.array([[0.138, 0.04, 0.554, -0.076], [-0.11, -0.074, -0.565, 0.021], [-0.256, -0.152, -0.459, -0.232]])
+    for start, options in ((y0, {}), (y0, {"t_eval": [1e4]}), (y0[0], {"t_eval": [1e4]}), (y0[0], {"save_every": 999})):
+        sol = solve(system, "kahan_li8", (0, 1e4), start, dt=0.1, **options)
+        assert np.max(sol.stats["failed_at"]) > 1000
+        assert np.abs(sol.stats["blow_up_time"] - sol.stats["failed_at"]).max() < 2 * 0.1
+
+
+def test_what_is_no_singularity_is_not_called_one():
+    """A step beyond the limit, a force that ends, a collision that p survives, and one that it does not."""
+    unstable = solve(systems.harmonic_oscillator(), "verlet", (0, 1e4), dt=2.01)
+    wall = HamiltonianSystem.from_sympy("p**2/2 + sqrt(q)", y0=[1.0, 0.0], dt=0.01)
+    ended = [solve(wall, method, (0, 20)) for method in ("verlet", "rk45")]
+    for sol in (unstable, *ended):
+        assert sol.status == -1
+        assert "blow_up_time" not in sol.stats
+        assert "infinite" not in sol.message
+    falling = solve(systems.kepler(0.9), "rk45", (0, 10), [1.0, 0, 0, 0])
+    assert abs(falling.stats["blow_up_time"] - np.pi / 2**1.5) < 1e-8
+    well = solve(systems.harmonic_oscillator(), "verlet", (0, 10), dt=0.1)
+    assert "blow_up_time" not in well.stats
 
 
 def test_rows_of_a_singular_solution():

@@ -155,7 +155,8 @@ class Study:
             failed = np.isfinite(failure_times(sol))
             if failed.any():
                 end = blow_up(sol, int(np.argmax(failed)))
-                return replace(row, blow_up=end.time, singular=end.singular, reason=f"{row.reason} {end}".strip())
+                words = "" if end.singular and "infinite" in row.reason else str(end)
+                return replace(row, blow_up=end.time, singular=end.singular, reason=f"{row.reason} {words}".strip())
         return row
 
     def _energy(self, row: StabilityRow, integrator: Integrator, sols: list[Solution]) -> StabilityRow:
