@@ -2,6 +2,7 @@
 # ruff: noqa: E402  (the benchmarks are no package that is installed)
 
 import argparse
+import dataclasses
 import importlib.util
 import json
 import math
@@ -16,8 +17,11 @@ if not BENCHMARKS.exists():
     pytest.skip("the benchmarks are not part of the source distribution", allow_module_level=True)
 sys.path.insert(0, str(BENCHMARKS))
 
+import drift
 import peers
 import primed
+import solar_system
+import training_optimizers
 from contenders import compiled_loops, interpreted_loops, ours, primed_race, runge_kutta
 from contenders.calibration import Judged, largest_control
 from contenders.contender import Skipped, Work
@@ -27,6 +31,8 @@ from contenders.page import duration, page, three
 from contenders.prose import power
 from contenders.scene import Scene
 
+from sympflow import shipped_flows
+from sympflow.flow.base import same_system
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.systems import henon_heiles, kepler, pendulum
 
@@ -265,3 +271,36 @@ def test_on_kepler_the_logarithmic_methods_race():
     assert energy.of(runners["log_leapfrog"], 100) < 1e-11
     single = runners["log_kahan_li8"].one(0.1, system.y0, 100, np.array([0, 100]))[0]
     assert single.shape == (2, 4)
+
+
+# training, drift, planets -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("optimizer", training_optimizers.OPTIMIZERS)
+def test_each_optimizer_stops_when_its_time_is_over(optimizer):
+    made = training_optimizers.recipes()["harmonic_oscillator"]
+    quick = dataclasses.replace(made, points=(40, 60))
+    result = training_optimizers.trained(quick, "harmonic_oscillator", "sympflow", optimizer, 0.05)
+    assert result.steps >= 1
+    assert 0 < result.at_dt < 10
+    assert training_optimizers.row(result).count("|") == 9
+
+
+def test_a_tiny_search_for_drift():
+    table = drift.run(2_000, ["pendulum"])
+    n = sum(f.system == "pendulum" for f in shipped_flows(pendulum(), "sympflow"))
+    assert f"{n} of {n} flows show no drift" in table
+    drifting = drift.Drift("rk4", 100, 1.0, change=1e-3, three_errors=1e-4, rounding=1e-13, seconds=0.0, left=None)
+    assert not drifting.passed
+
+
+def test_scenes_of_the_drift_are_those_of_all_flows():
+    prints = [s.fingerprint for s in drift.scenes()]
+    for entry in shipped_flows(kind="sympflow"):
+        assert any(same_system(entry.fingerprint, p) for p in prints), entry.name
+
+
+def test_a_tiny_race_of_planets(capsys):
+    table = solar_system.run(years=30.0, target=1e-6, repeats=1, names=("kahan_li8",))
+    assert "| kahan_li8 |" in table
+    assert "| flow, Δt = " in table

@@ -1,0 +1,128 @@
+"""No drift: the energy error of every shipped symplectic flow over a million steps, along a bounded regular orbit.
+
+    python benchmarks/drift.py                    every file, ten minutes or so on one core
+    python benchmarks/drift.py --quick            20,000 steps of the flows of the pendulum
+    python benchmarks/drift.py --system kepler
+
+The slope of the relative energy error is fitted to the means over 20 blocks of the run, and its standard error to their
+scatter (`sympflow.energy_drift`). A flow passes if |slope|·T ≤ max(3 standard errors · T, 10 ε √N), N steps of Δt in T,
+with ε the rounding unit. The orbit starts at the `y0` of the scene, but for Hénon–Heiles, whose y0 is chaotic: there it
+is near the periodic orbit along q1. A thousand states count, at equal times. A flow that fails does not pass.
+"""
+
+# ruff: noqa: E402
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from dataclasses import dataclass
+
+from contenders.environment import pin_to_one_thread
+
+pin_to_one_thread()
+
+import numpy as np
+
+import sympflow
+from sympflow import HamiltonianSystem, energy_drift, solve, systems
+from sympflow.flow.base import same_system
+from sympflow.flow.shipped import ShippedFlow
+
+STEPS, OUTPUTS, BLOCKS = 1_000_000, 1000, 20
+QUICK_STEPS = 20_000
+EPS = float(np.finfo(float).eps)
+REGULAR = {"henon_heiles": [0.0, 0.1, 0.35, 0.0]}  # E = 0.0659: near the periodic orbit in the q1 direction
+
+
+def scenes() -> list[HamiltonianSystem]:
+    """The systems that flows ship for."""
+    return [
+        systems.harmonic_oscillator(),
+        systems.harmonic_oscillator(100.0),
+        systems.pendulum(),
+        systems.quartic(),
+        systems.henon_heiles(),
+        systems.kepler(),
+        systems.outer_solar_system(),
+        systems.fput(50.0),
+        systems.fput(1000.0),
+        systems.spring_pendulum(1e6, coordinates="polar"),
+    ]
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What a flow's energy does over N steps."""
+
+    flow: str
+    steps: int
+    largest: float
+    change: float  # |slope|·T
+    three_errors: float
+    rounding: float  # 10 ε √N
+    seconds: float
+    left: float | None  # when the orbit left the domain
+
+    @property
+    def passed(self) -> bool:
+        return self.change <= max(self.three_errors, self.rounding)
+
+
+def drift_of(entry: ShippedFlow, system: HamiltonianSystem, steps: int) -> Drift:
+    """That of a shipped flow."""
+    flow = sympflow.load(entry.path, system=system)
+    y0 = np.asarray(REGULAR.get(system.name, system.y0), dtype=float)
+    T, every = steps * flow.dt, max(1, steps // OUTPUTS)
+    begin = time.process_time()
+    sol = solve(system, flow, (0.0, T), y0=y0, save_every=every)
+    seconds = time.process_time() - begin
+    fitted = energy_drift(sol, BLOCKS)
+    slope, error = float(fitted.slope), float(fitted.standard_error)
+    largest = float(sympflow.max_energy_error(sol))
+    rounding = 10 * EPS * math.sqrt(steps)
+    exit_time = sol.stats.get("domain_exit")
+    left = None if exit_time is None else float(np.min(exit_time))
+    return Drift(entry.name, steps, largest, abs(slope) * T, 3 * error * T, rounding, seconds, left)
+
+
+def run(steps: int, named: list[str] | None = None) -> str:
+    """The table, its rows printed as they are made."""
+    lines = [
+        "| flow | largest energy error | change by the slope | 3 standard errors | 10 ε √N | verdict |",
+        "|---|---|---|---|---|---|",
+    ]
+    entries = sympflow.shipped_flows(kind="sympflow")
+    found: list[Drift] = []
+    for system in scenes():
+        if named and system.name not in named:
+            continue
+        for entry in entries:
+            if not same_system(entry.fingerprint, system.fingerprint):
+                continue
+            d = drift_of(entry, system, steps)
+            found.append(d)
+            verdict = "no drift" if d.passed else "**drifts**"
+            if d.left is not None:
+                verdict += f", leaves Ω at t = {d.left:.3g}"
+            lines.append(
+                f"| {d.flow} | {d.largest:.1e} | {d.change:.1e} | {d.three_errors:.1e} | {d.rounding:.1e} | {verdict} |"
+            )
+            print(f"{lines[-1]} ({d.seconds:.0f} s)", flush=True)
+    passed = sum(d.passed for d in found)
+    return "\n".join([*lines, "", f"{passed} of {len(found)} flows show no drift over {steps:,} steps."])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="20,000 steps of the flows of the pendulum")
+    parser.add_argument("--steps", type=int, default=STEPS)
+    parser.add_argument("--system", action="append", help="name of a system; all if none is named")
+    options = parser.parse_args()
+    steps = QUICK_STEPS if options.quick else options.steps
+    print("\n" + run(steps, options.system or (["pendulum"] if options.quick else None)))
+
+
+if __name__ == "__main__":
+    main()
