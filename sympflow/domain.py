@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from copy import copy
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -149,8 +151,13 @@ class Box:
         low, high = np.asarray(self.low), np.asarray(self.high)
         return rng.uniform(low, high, (_sample_count(n), low.size))
 
+    @cached_property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """`low` and `high` as arrays."""
+        return np.asarray(self.low), np.asarray(self.high)
+
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
-        low, high = np.asarray(self.low), np.asarray(self.high)
+        low, high = self.bounds
         x = _states(x, low.size)
         return ((x >= low) & (x <= high)).all(-1)
 
@@ -210,7 +217,9 @@ class EnergySublevel:
 
     def attach(self, hamiltonian: Callable[[Array], Array]) -> EnergySublevel:
         """The same domain with the H of a system."""
-        return replace(self, hamiltonian=hamiltonian)
+        attached = copy(self)  # whose fields have been checked
+        object.__setattr__(attached, "hamiltonian", hamiltonian)
+        return attached
 
     def _within(self, x: np.ndarray, slack: float) -> np.ndarray:
         """Whether the energy, and the angular momentum if it is bounded, are within their bounds."""
@@ -254,13 +263,18 @@ class EnergySublevel:
         return np.concatenate(accepted)[:n]
 
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
-        x = _states(x, np.size(self.box.low))
+        low, high = self.bounds(slack)
+        x = _states(x, low.size)
         with np.errstate(all="ignore"):
-            within = self._within(x, slack)
-        low, high = np.asarray(self.box.low), np.asarray(self.box.high)
-        # the box grows by the relative size of the slack, so that a state on its face does not leave by rounding
-        margin = (high - low) * slack / max(abs(self.energy), 1e-300)
-        return within & ((x >= low - margin) & (x <= high + margin)).all(-1)
+            return ((x >= low) & (x <= high)).all(-1) & self._within(x, slack)
+
+    def bounds(self, slack: float) -> tuple[np.ndarray, np.ndarray]:
+        """The box, grown by the relative size of the slack: a state on its face does not leave by rounding."""
+        low, high = self.box.bounds
+        if slack == 0.0:
+            return low, high
+        margin = (high - low) * (slack / max(abs(self.energy), 1e-300))
+        return low - margin, high + margin
 
     def to_dict(self) -> dict[str, Any]:
         description = {"kind": "EnergySublevel", "energy": self.energy, "box": self.box.to_dict()}

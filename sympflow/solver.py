@@ -18,6 +18,7 @@ from sympflow.solution import Solution
 from sympflow.system import HamiltonianSystem
 from sympflow.validation import check_events, check_memory, check_save_every, check_t_eval, check_t_span, check_y0
 
+_TRUE = np.array(True)
 BACKENDS = ("auto", "compiled", "array")
 
 
@@ -102,6 +103,8 @@ def solve(
     check_applies(integrator, system)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
+    if hasattr(integrator, "resolved"):  # which integrator a method is may depend on what it is asked for
+        integrator = integrator.resolved(system, y_start)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
     every = check_save_every(save_every, times)
     if not isinstance(backend, str) or backend not in BACKENDS:
@@ -132,7 +135,7 @@ def solve(
         note_singularities(outcome, integrator, problem)
     if action != "ignore":
         _check_domain(outcome, integrator, system, action)
-    y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else np.moveaxis(outcome.y, 0, -1)
+    y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else np.transpose(outcome.y, (*range(1, y_start.ndim + 1), 0))
     return Solution(
         t=outcome.t,
         y=y,
@@ -157,6 +160,16 @@ def domain_of(flow: Any, system: HamiltonianSystem) -> Domain | None:
     return domain
 
 
+def contained(domain: Domain, system: HamiltonianSystem, y: Array, slack: float, compiled: bool) -> np.ndarray:
+    """Whether the states y (..., 2d) are in the domain: (...), or () if all are and `compiled` code could tell."""
+    if compiled and isinstance(domain, EnergySublevel):
+        from sympflow.kernels.sublevel import all_within
+
+        if all_within(system, domain, y.reshape(-1, y.shape[-1]), slack):
+            return _TRUE
+    return np.asarray(domain.contains(y, slack=slack))
+
+
 def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
     """Refuse what is no answer (of a plug-in), and flag states that are not finite, whatever the method says."""
     what = type(outcome).__name__
@@ -171,6 +184,8 @@ def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
             f"`method` {integrator.name!r} must answer with an Outcome that has an integer status, t of shape (n,) and "
             f"y of shape (n, *y0.shape); got {what}. Mend its run(): check_integrator tests it."
         )
+    if not is_tensor(outcome.y) and np.isfinite(outcome.y).all():
+        return
     finite = to_numpy(all_finite(outcome.y))
     bad = ~finite.all(0) & (np.asarray(outcome.status) >= 0)
     if not bad.any():
@@ -193,7 +208,7 @@ def _check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianS
     if domain is None or not len(outcome.t):
         return
     slack = float(getattr(flow, "figures", {}).get("energy_error_max") or 0.0)
-    inside = domain.contains(outcome.y, slack=slack)  # (n, ...)
+    inside = contained(domain, system, outcome.y, slack, outcome.stats.get("backend") == "compiled")  # (n, ...)
     if inside.all():
         return
     with np.errstate(invalid="ignore"):

@@ -16,6 +16,7 @@ MAX_SAVED_VALUES = 10_000_000
 MAX_ASKED_VALUES = 1_000_000_000
 """Of a batch, or of outputs that were asked for one by one: 8 GB."""
 MAX_EVENT_SAMPLES = 100_000_000
+_FLOAT64 = np.dtype(np.float64)
 FEWEST_TIMES = 8  # floating-point numbers that an interval must span
 
 
@@ -42,6 +43,8 @@ def check_t_span(t_span: Any) -> tuple[float, float]:
 
 
 def _real(x: Any) -> float:
+    if type(x) is float:
+        return x
     if np.iscomplexobj(x):  # NumPy's complex numbers would lose their imaginary part with a warning
         raise TypeError("a complex number")
     return float(x)
@@ -77,6 +80,8 @@ def check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
 
 
 def _as_floats(y0: Any, dtype: np.dtype) -> np.ndarray:
+    if type(y0) is np.ndarray and y0.dtype == dtype and y0.size <= MAX_ASKED_VALUES:
+        return y0.copy()
     try:
         array = np.asarray(y0)
         if not np.issubdtype(array.dtype, np.number):
@@ -94,8 +99,10 @@ def _as_floats(y0: Any, dtype: np.dtype) -> np.ndarray:
 
 
 def _check_dtype(dtype: Any) -> np.dtype:
+    if dtype is None:
+        return _FLOAT64
     try:
-        chosen = np.dtype(np.float64 if dtype is None else dtype)
+        chosen = np.dtype(dtype)
     except Exception:  # NumPy raises errors of many kinds
         chosen = np.dtype(object)
     if chosen not in (np.float32, np.float64):
@@ -116,11 +123,18 @@ def check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
         raise ValueError(f"`t_eval` has {times.size:.3g} times, more than {MAX_ASKED_VALUES:.0e}: choose fewer.")
     times = times.astype(float)
     low, high = min(t0, t1), max(t0, t1)
+    if times.size and low <= times[0] <= high and low <= times[-1] <= high and _ordered(times, t1 >= t0):
+        return times
     if times.size and not (times.min() >= low and times.max() <= high):
         raise ValueError(f"`t_eval` must lie within `t_span`, [{low:g}, {high:g}]: extend `t_span` or drop times.")
     if (np.diff(times) * (1 if t1 >= t0 else -1) < 0).any():
         raise ValueError("`t_eval` must be ordered from the start of `t_span` to its end: sort it.")
     return times
+
+
+def _ordered(times: np.ndarray, forwards: bool) -> bool:
+    earlier, later = (times[:-1], times[1:]) if forwards else (times[1:], times[:-1])
+    return len(times) == 1 or bool((earlier <= later).all())
 
 
 def check_save_every(save_every: Any, times: np.ndarray | None) -> int:

@@ -11,10 +11,9 @@ of Δt only K is executed, as the χ between two steps cancel.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from sympflow.flow.base import FlowMap
 from sympflow.flow.coefficients import Coefficients, Entry
+from sympflow.flow.frozen import KeptTables, Kind, Substep, Tables
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.placement import checked_device, checked_dtype
 from sympflow.flow.primed_potentials import FORCE_GRADIENT, KINETIC, POTENTIAL, Binding, PrimedPotential, Term
@@ -30,20 +30,8 @@ from sympflow.integrators.schemes import SCHEMES, Scheme, compose
 
 if TYPE_CHECKING:
     from sympflow.flow.potentials import Time
+    from sympflow.kernels.primed_flow import PrimedFlowKernel
     from sympflow.system import HamiltonianSystem
-
-Kind = Literal["kick", "drift"]
-
-MOST_KEPT = 64  # frozen tables
-
-
-@dataclass(frozen=True)
-class Substep:
-    """A kick or a drift of the flow: its coefficient, and for a kick that of its force gradient."""
-
-    kind: Kind
-    weight: Entry
-    gradient: Entry | None = None
 
 
 class PrimedFlow(SympFlow):
@@ -132,8 +120,7 @@ class PrimedFlow(SympFlow):
         }
         self.substeps: tuple[Substep, ...] = (*reversed(outer[-1]), *inner, *outer[1])
         self._n_outer = len(chi)
-        self._kept: dict[tuple[str, float], Scheme] = {}
-        self._kept_for: tuple[tuple[int, int], ...] = ()
+        self._tables = KeptTables(self.substeps, self._n_outer, self.dt)
         self._binding = Binding(system)
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(self._layer(substep) for substep in self.substeps)  # type: ignore[assignment]
@@ -142,15 +129,15 @@ class PrimedFlow(SympFlow):
 
     @property
     def dtype(self) -> torch.dtype:
-        return self.kicks.free.dtype
+        return self._number().dtype
 
     @property
     def device(self) -> torch.device:
-        return self.kicks.free.device
+        return self._number().device
 
-    @property
-    def _columns_in_use(self) -> list[Coefficients]:
-        return [column for column in self._modules.values() if isinstance(column, Coefficients)]
+    def _number(self) -> Tensor:
+        """One of its parameters, found without the detours of a module's attributes."""
+        return self._modules["kicks"]._parameters["free"]  # type: ignore[union-attr, return-value]
 
     @cached_property
     def sequence(self) -> tuple[Kind, ...]:
@@ -196,57 +183,37 @@ class PrimedFlow(SympFlow):
 
     # the frozen tables --------------------------------------------------------------------------------------
 
+    @property
+    def tables(self) -> Tables:
+        """Those of the numbers that the flow has now."""
+        return self._tables.current()
+
     def scheme(self, t: float | None = None) -> Scheme:
         """ψ̄_t as a splitting scheme of step t, for t ∈ (0, Δt]; the default is Δt.
 
         Its coefficients depend on t, and so it has no classical order.
         """
-        return self._frozen("primed", self.substeps, t)
+        return self.tables.scheme("primed", t)
 
     def kernel_scheme(self, t: float | None = None) -> Scheme:
         """K_t, likewise: ψ̄_t where there is no processor."""
-        return self._frozen("primed kernel", self.substeps[self._n_outer : len(self.substeps) - self._n_outer], t)
+        return self.tables.scheme("primed kernel", t)
 
     def processor_scheme(self, t: float | None = None) -> Scheme:
         """χ_t, likewise."""
         if not self.processor:
             raise ValueError("`flow` has no processor: see its `scheme`.")
-        return self._frozen("primed processor", self.substeps[-self._n_outer :], t)
+        return self.tables.scheme("primed processor", t)
 
-    def _frozen(self, name: str, substeps: Iterable[Substep], t: float | None) -> Scheme:
-        t = self.dt if t is None else float(t)
-        if not 0 < t <= self.dt * (1 + 1e-12):
-            raise ValueError(f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t!r}.")
-        # Kept while no number changes: making a table takes longer than many a step.
-        numbers = tuple((column.free.data_ptr(), column.free._version) for column in self._columns_in_use)
-        if self._kept_for != numbers or len(self._kept) > MOST_KEPT:
-            self._kept, self._kept_for = {}, numbers
-        if (name, t) not in self._kept:
-            self._kept[name, t] = self._table(name, substeps, t)
-        return self._kept[name, t]
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Force and force-gradient evaluations of a run, as `FixedStep.evaluations`."""
+        return self.tables.evaluations(n_steps, n_saved, n_extra, backend)
 
-    def _table(self, name: str, substeps: Iterable[Substep], t: float) -> Scheme:
-        stages: list[list[float]] = []
-        before = "drift"
-        for kind, c, g in self._values(substeps, t / self.dt):
-            if kind == "drift" and stages:
-                stages[-1][2] += c
-            elif kind == "kick" and before == "kick" and stages:
-                stages[-1][0] += c
-                stages[-1][1] += g
-            else:
-                stages.append([c, g, 0.0] if kind == "kick" else [0.0, 0.0, c])
-            before = kind
-        kicks, gradients, drifts = zip(*stages, strict=True)
-        source = f"a SympFlow primed with {self.system_name}, Δt = {self.dt:g}, frozen at t = {t:g}"
-        return Scheme(name, None, kicks, drifts, gradients, source, self.gradients is not None)
+    def kernel_for(self, system: HamiltonianSystem) -> PrimedFlowKernel:
+        """The compiled loops of this flow."""
+        from sympflow.kernels.primed_flow import PrimedFlowKernel
 
-    def _values(self, substeps: Iterable[Substep], tau: float) -> Iterable[tuple[Kind, float, float]]:
-        values = {id(column): column.at(tau) for column in self._columns_in_use}
-        for s in substeps:
-            w, g = s.weight, s.gradient
-            gradient = 0.0 if g is None else g.sign * float(values[id(g.column)][g.row])
-            yield s.kind, w.sign * float(values[id(w.column)][w.row]), gradient
+        return PrimedFlowKernel(self, system)
 
     # kernel and processor as maps ---------------------------------------------------------------------------
 

@@ -176,16 +176,16 @@ class FixedStep(Integrator):
         system = problem.system
         grid = Grid(problem.t0, problem.t1, self.step_length(system))
         t, count, remainder = grid.outputs(problem.t_eval, problem.save_every)
-        save = np.arange(grid.n_steps + 1) if problem.dense_output else np.unique(count)
+        save, place = (np.arange(grid.n_steps + 1), count) if problem.dense_output else distinct(count)
         last = int(save[-1]) if save.size else 0
         saved, finite, backend = self.rollout(problem, grid.h, last, save)
 
-        y = saved[np.searchsorted(save, count)]
+        y = saved if place is None else saved[place]
         extra = np.flatnonzero(remainder)
         if extra.size:
             y = self._shorter_steps(system, y, extra, remainder[extra], backend)
-        n_steps = int(min(last, finite.max() + 1))
-        n_saved = int(np.count_nonzero((save > 0) & (save <= n_steps)))
+        n_steps = int(min(last, np.max(finite) + 1))
+        n_saved = int(save.searchsorted(n_steps, "right") - save.searchsorted(0, "right"))
         at_end = int(bool(extra.size) and extra[-1] == len(t) - 1 and t[-1] == grid.t1)
         stats = {
             "dt": abs(grid.h),
@@ -207,16 +207,17 @@ class FixedStep(Integrator):
         self, system: HamiltonianSystem, y: Array, extra: np.ndarray, h: np.ndarray, backend: str
     ) -> Array:
         """Replace the states y[extra] by those a step h later."""
-        lengths = np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), y[extra].shape[:-1]).copy()
+        states = y[extra]
+        lengths = h if y.ndim == 2 else np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy()
         if not is_tensor(y):
             with np.errstate(all="ignore"):
-                advanced = self.substep(system, y[extra], lengths.astype(y.dtype), backend)
-                y[extra] = checked_state(advanced, y[extra])
+                advanced = self.substep(system, states, lengths.astype(y.dtype), backend)
+                y[extra] = checked_state(advanced, states)
             return y
         import torch
 
         h_extra = torch.as_tensor(lengths, dtype=y.dtype, device=y.device)
-        advanced = checked_state(self.substep(system, y[extra], h_extra, backend), y[extra])
+        advanced = checked_state(self.substep(system, states, h_extra, backend), states)
         return y.index_copy(0, torch.as_tensor(extra, device=y.device), advanced)
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
@@ -234,6 +235,16 @@ class FixedStep(Integrator):
             y, k = states[n], k + n
         if grid.remainder:
             yield np.array([grid.time(k)]), y[None], np.array([grid.remainder])
+
+
+def distinct(count: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """The distinct ones of sorted counts, and where among them each is; None where all are distinct."""
+    if len(count) < 2:
+        return count, None
+    new = np.empty(len(count), dtype=bool)
+    new[0] = True
+    np.not_equal(count[1:], count[:-1], out=new[1:])
+    return (count, None) if new.all() else (count[new], np.cumsum(new) - 1)
 
 
 def check_dt(dt: Any) -> None:
@@ -334,6 +345,11 @@ def _report_failures(outcome: Outcome, grid: Grid, finite: np.ndarray, n_run: in
     reached their end.
     """
     what, remedy = breakdown
+    done = bool(np.all(finite >= n_run))
+    if done and not is_tensor(outcome.y) and np.isfinite(outcome.y).all():
+        if finite.ndim:
+            outcome.status = np.zeros(finite.shape, dtype=int)
+        return
     ok = to_numpy(all_finite(outcome.y))  # (n, ...): shorter steps may overflow too
     if finite.ndim:
         outcome.status = np.where((finite < n_run) | ~ok.all(0), -1, 0)

@@ -36,12 +36,20 @@ class Grid:
         far = max(abs(self.t0), abs(self.t1))
         if self.t0 != self.t1 and far + abs(self.h) == far:
             raise ValueError(f"`dt` {dt:g} is below the spacing of floating-point numbers at t = {far:g}: increase it.")
-        count, remainder = self.locate(np.array([self.t1]), bounded=False)
-        self.n_steps, self.remainder = int(count[0]), float(remainder[0])
+        self.n_steps, self.remainder = self.place(self.t1)
 
     def time(self, k: int) -> float:
         """t0 + k·h, and exactly t1 at the end if h divides the interval."""
         return self.t1 if k == self.n_steps and self.remainder == 0 else self.t0 + k * self.h
+
+    def place(self, t: float) -> tuple[int, float]:
+        """`locate` of one time, unchecked."""
+        x = (t - self.t0) / self.h
+        nearest = round(x)
+        if abs(x - nearest) <= 4 * EPS * (abs(nearest) + (abs(t) + abs(self.t0)) / abs(self.h)):
+            return nearest, 0.0
+        count = math.floor(x)
+        return count, t - (self.t0 + count * self.h)
 
     def locate(self, t: np.ndarray, bounded: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Counts k and signed remainders r with t = t0 + k·h + r, 0 ≤ r/h < 1."""
@@ -61,6 +69,9 @@ class Grid:
     def outputs(self, t_eval: np.ndarray | None, save_every: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Output times (n,), their counts and remainders: `t_eval`, or every `save_every`-th step and the end."""
         if t_eval is not None:
+            if len(t_eval) == 1:
+                k, r = self.place(float(t_eval[0]))
+                return t_eval, np.array([k]), np.array([r])
             return t_eval, *self.locate(t_eval, bounded=False)
         count = np.arange(0, self.n_steps + 1, save_every)
         t = self.t0 + count * self.h

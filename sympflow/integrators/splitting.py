@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -142,7 +142,7 @@ class Splitting(FixedStep):
 
 def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
     """Force and force-gradient evaluations of a run, as `FixedStep.evaluations`."""
-    kicks = [c3 != 0 for kind, _, c3 in scheme.substeps if kind == "kick"]
+    kicks = _kicks(scheme)
     if backend != "compiled":
         n = n_steps + n_extra
         return {"force_evaluations": n * len(kicks), "hessian_evaluations": n * sum(kicks)}
@@ -155,6 +155,12 @@ def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int,
         "force_evaluations": n_steps * forces + closed + n_extra * len(kicks),
         "hessian_evaluations": n_steps * hessians + closed * kicks[-1] + n_extra * sum(kicks),
     }
+
+
+@lru_cache(maxsize=256)
+def _kicks(scheme: Scheme) -> tuple[bool, ...]:
+    """Whether each of its kicks has a force gradient."""
+    return tuple(c3 != 0 for kind, _, c3 in scheme.substeps if kind == "kick")
 
 
 def _kick(system: HamiltonianSystem, q: Array, c: float | Array, c3: float | Array) -> Array:

@@ -94,6 +94,8 @@ class FlowIntegrator(FixedStep):
             If the given flow has another dtype or device.
         """
         flow = self.flow_for(system)
+        if not is_tensor(y) and y.dtype == np.float64 and flow.dtype == torch.float64 and flow.device.type == "cpu":
+            return flow
         tensor = y if is_tensor(y) else torch.from_numpy(np.empty(0, y.dtype))
         if tensor.dtype == flow.dtype and tensor.device == flow.device:
             return flow
@@ -117,6 +119,8 @@ class FlowIntegrator(FixedStep):
         kernel = _kernel(system, flow, y, "array" if backend == "torch" else backend)
         if kernel is None:
             return _apply(flow, y, h)
+        if y.ndim == 2 and np.shape(h) == (len(y),):
+            return kernel.step(h, y)
         rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
         lengths = np.broadcast_to(h, y.shape[:-1]).reshape(-1)
         return kernel.step(lengths, rows).reshape(y.shape)
@@ -132,25 +136,15 @@ class FlowIntegrator(FixedStep):
         if self.flow is None:  # the shipped one, from here on
             chosen: dict[str, Any] = {"flow": self._flow_like(problem.system, problem.y0)}
             if self._tolerance is not None:
-                _check_start(chosen["flow"], problem.system, problem.y0)
+                compiled = _kernel(problem.system, chosen["flow"], problem.y0, problem.backend) is not None
+                _check_start(chosen["flow"], problem.system, problem.y0, compiled)
             return replace(self, **chosen, **({} if self._tolerance is None else {"tol": None})).run(problem)
         return super().run(problem)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        if hasattr(self.flow, "kernel_for"):
-            return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
-        if not hasattr(self.flow, "kernel_scheme"):  # an MLP flow evaluates no forces
+        if not hasattr(self.flow, "evaluations"):  # an MLP flow evaluates no forces
             return super().evaluations(n_steps, n_saved, n_extra, backend)
-        from sympflow.integrators.splitting import scheme_evaluations
-
-        flow = self.flow
-        counts = [scheme_evaluations(flow.kernel_scheme(self.dt), n_steps, n_saved, 0, backend)]
-        if n_extra:
-            counts.append(scheme_evaluations(flow.scheme(self.dt), 0, 0, n_extra, backend))
-        if flow.processor:  # once at the start, and for each output
-            n = n_saved + (n_steps > 0)
-            counts.append(scheme_evaluations(flow.processor_scheme(self.dt), 0, 0, n, backend))
-        return {name: sum(count[name] for count in counts) for name in counts[0]}
+        return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         y0 = problem.y0
@@ -159,6 +153,9 @@ class FlowIntegrator(FixedStep):
         if isinstance(self, SympFlowIntegrator) and self.compensated:
             kernel = self._compensated_kernel(problem, flow)
         if kernel is not None:
+            if y0.ndim == 1:
+                states, last = kernel.run(h, y0, n_steps, save)
+                return states, np.asarray(last), "compiled"
             rows = y0.reshape(-1, y0.shape[-1])
             states, finite = kernel.run_batch(h, rows, n_steps, save)
             states = states.swapaxes(0, 1).reshape(len(save), *y0.shape)
@@ -173,12 +170,14 @@ class FlowIntegrator(FixedStep):
         return states.numpy(), finite, "torch"
 
 
-def _check_start(flow: Any, system: HamiltonianSystem, y0: Array) -> None:
+def _check_start(flow: Any, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:
     """A flow that is taken for its accuracy must start where its accuracy was measured."""
-    from sympflow.solver import domain_of
+    from sympflow.solver import contained, domain_of
 
     domain = domain_of(flow, system)
-    inside = np.ones(1, bool) if domain is None else np.asarray(domain.contains(y0))
+    if domain is None:
+        return
+    inside = contained(domain, system, y0, 0.0, compiled)
     if not inside.all():
         which = f" (trajectory {', '.join(map(str, np.argwhere(~inside)[0].tolist()))})" if inside.ndim else ""
         raise ValueError(
@@ -218,10 +217,6 @@ def _kernel(system: HamiltonianSystem, flow: Any, y: Array, backend: str) -> MLP
             raise ValueError("`method` 'mlp' has no compiled form: use backend='array'.")
         if hasattr(flow, "kernel_for"):
             return flow.kernel_for(system)
-        if hasattr(flow, "scheme"):
-            from sympflow.kernels.primed_flow import PrimedFlowKernel
-
-            return PrimedFlowKernel(flow, system)
         from sympflow.kernels.mlp_flow import mlp_flow_kernel
 
         return mlp_flow_kernel(flow)
@@ -270,6 +265,24 @@ class SympFlowIntegrator(FlowIntegrator):
         for name in ("flow", "dt"):
             if getattr(self, name) is not None:
                 raise ValueError(f"`tol` chooses the flow and its Δt, but `{name}` is given: leave out one of them.")
+
+    def resolved(self, system: HamiltonianSystem, y0: Array) -> FixedStep:
+        """What runs: with `tol` the cheapest flow may be one in another time, whose runs `LogSympFlow` drives."""
+        if self.tol is None or self.compensated or is_tensor(y0) or y0.dtype != np.float64:
+            return self
+        key = ("in another time", self.name, system.fingerprint, self.tol)
+        if key not in _SHIPPED:
+            from sympflow.flow.shipped import choose
+
+            chosen = choose(system, self.name, self.tol, transformed=True)
+            _SHIPPED[key] = None if chosen.shift is None else (chosen.load(system), chosen.shift)
+        if _SHIPPED[key] is None:
+            return self
+        from sympflow.integrators.logarithmic import LogSympFlow
+
+        flow, shift = _SHIPPED[key]
+        _check_start(flow, system, y0, False)
+        return LogSympFlow(flow=flow, shift=shift)
 
     def _compensated_kernel(self, problem: Problem, flow: Any) -> PrimedFlowKernel:
         kernel = _kernel(problem.system, flow, problem.y0, problem.backend)

@@ -93,10 +93,11 @@ def store(q, p, s, row):
 
 
 @njit(**OPTIONS)
-def rollout(weights, backwards, t_steps, y0, n_steps, save, out, n_finite):
+def rollout(weights, backwards, t_steps, y0, n_steps, save, out, n_finite, stop):
     """`n_steps` steps of ``t_steps[i] ≥ 0`` from ``y0[i]``, the states after ``save[j]`` steps into ``out[i, j]``.
 
-    ``n_finite[i]`` is the last step that ends in a finite state; rows of later steps are NaN.
+    ``n_finite[i]`` is the last step that ends in a finite state; rows of later steps are NaN. Ends early when
+    another thread sets ``stop[0]``.
     """
     q, p, t = aligned_zeros(NDOF * STATES), aligned_zeros(NDOF * STATES), aligned_zeros(STATES)
     scratch = aligned_zeros(PADDED), aligned_zeros(PADDED), aligned_zeros(DEPTH * PADDED).reshape((DEPTH, PADDED))
@@ -124,6 +125,6 @@ def rollout(weights, backwards, t_steps, y0, n_steps, save, out, n_finite):
                     else:
                         out[first + s, saved] = np.nan
                 saved += 1
-            if n_alive == 0:
+            if n_alive == 0 or stop[0] != 0:
                 break
         out[first : first + count, saved:] = np.nan

@@ -79,8 +79,8 @@ class ImplicitKernel:
         out = np.empty((len(y0), len(save), 2 * self.ndof))
         n_finite, iterations = np.empty(len(y0), dtype=np.int64), np.empty(len(y0), dtype=np.int64)
 
-        def rows(i: slice) -> None:
-            loops.rollout_each(h, y0[i], n_steps, save, out[i], n_finite[i], iterations[i])
+        def rows(i: slice, stop: np.ndarray) -> None:
+            loops.rollout_each(h, y0[i], n_steps, save, out[i], n_finite[i], iterations[i], stop)
 
         size = 2 * self.ndof * len(self._tableau[1])
         run_rows(rows, len(y0), n_steps * 4 * size**3, None)

@@ -129,10 +129,11 @@ def advance(y, error, K):
 
 
 @njit(**OPTIONS)
-def rollout(h, y0, n_steps, save, out, work):
+def rollout(h, y0, n_steps, save, out, work, stop):
     """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``; later rows are NaN.
 
-    Returns the index of the last step that was solved and ends in a finite state, and the iterations taken.
+    Returns the index of the last step that was solved and ends in a finite state, and the iterations taken. Ends early,
+    with rows unset, when another thread sets ``stop[0]``.
     """
     y, error = y0.copy(), np.zeros(SIZE)
     saved = iterations = 0
@@ -140,6 +141,8 @@ def rollout(h, y0, n_steps, save, out, work):
         out[saved] = y
         saved += 1
     for n in range(1, n_steps + 1):
+        if stop[0] != 0:
+            break
         taken = stages(y, h, work)
         iterations += abs(taken)
         if taken < 0 or not advance(y, error, work[0]):
@@ -152,11 +155,11 @@ def rollout(h, y0, n_steps, save, out, work):
 
 
 @njit(**OPTIONS)
-def rollout_each(h, y0, n_steps, save, out, n_finite, iterations):
+def rollout_each(h, y0, n_steps, save, out, n_finite, iterations, stop):
     """`rollout` of every row of `y0` (N, 2d)."""
     work = workspace()
     for i in range(y0.shape[0]):
-        n_finite[i], iterations[i] = rollout(h, y0[i], n_steps, save, out[i], work)
+        n_finite[i], iterations[i] = rollout(h, y0[i], n_steps, save, out[i], work, stop)
 
 
 @njit(**OPTIONS)

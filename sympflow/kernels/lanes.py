@@ -7,6 +7,7 @@ over the lanes of a stage into vector instructions. Lanes never mix: one that ov
 # ruff: noqa: F821
 # mypy: ignore-errors
 
+import numpy as np
 from numba import njit
 
 LANES = 64
@@ -71,7 +72,7 @@ def close_lane(Y, error, lane, kicks, drifts, gradients, work):
 
 
 @njit(**OPTIONS)
-def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite):
+def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite, stop):
     """`rollout` of every row of `y0` (N, 2d), `LANES` at a time; outputs as in `rollout_each`."""
     link = len(kicks) - 2
     work = prepared(kicks, gradients)
@@ -94,7 +95,7 @@ def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite):
         while saved < len(save) and save[saved] <= 0:
             saved += 1
         n_alive = count
-        while n < n_steps and n_alive > 0:
+        while n < n_steps and n_alive > 0 and stop[0] == 0:
             block = min(CHECK_EVERY, n_steps - n)
             if saved < len(save):
                 block = min(block, save[saved] - n)
@@ -123,3 +124,48 @@ def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite):
                         pack(q, p, out[i, row])
             start[:] = Y
             n, saved, first = n + block, next_saved, link
+
+
+@njit(**OPTIONS, inline="always")
+def fill_lanes(out, width, coefficients, x, factor):
+    """Σ_k coefficients[k] x^k, times a factor, of every lane."""
+    for lane in range(width):
+        out[lane] = coefficients[-1]
+    for k in range(len(coefficients) - 2, -1, -1):
+        for lane in range(width):
+            out[lane] = out[lane] * x[lane] + coefficients[k]
+    for lane in range(width):
+        out[lane] *= factor[lane]
+
+
+@njit(**OPTIONS)
+def step_lanes(kicks, drifts, gradients, x, h, y, out):
+    """`step_each`, `LANES` rows at a time."""
+    Y = empty_lanes()
+    numbers = aligned_zeros(6 * LANES).reshape((6, LANES))
+    X, H, H3, B, G, A = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5]
+    for block_start in range(0, y.shape[0], LANES):
+        count = min(LANES, y.shape[0] - block_start)
+        width = (count + VECTOR - 1) // VECTOR * VECTOR
+        for lane in range(width):
+            i = block_start + min(lane, count - 1)
+            q, p = unpack(y[i])
+            pack_lane(q, p, Y, lane)
+            X[lane], H[lane], H3[lane] = x[i], h[i], h[i] ** 3
+        for j in range(len(kicks)):
+            fill_lanes(B, width, kicks[j], X, H)
+            fill_lanes(A, width, drifts[j], X, H)
+            if FORCE_GRADIENTS and np.any(gradients[j] != 0.0):
+                fill_lanes(G, width, gradients[j], X, H3)
+                for lane in range(width):
+                    q, p = unpack_lane(Y, lane)
+                    q, p, _, _ = gradient_lane(q, p, None, None, B[lane], G[lane], A[lane])
+                    pack_lane(q, p, Y, lane)
+            else:
+                for lane in range(width):
+                    q, p = unpack_lane(Y, lane)
+                    q, p, _, _ = plain_lane(q, p, None, None, B[lane], A[lane])
+                    pack_lane(q, p, Y, lane)
+        for lane in range(count):
+            q, p = unpack_lane(Y, lane)
+            pack(q, p, out[block_start + lane])

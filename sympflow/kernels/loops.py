@@ -96,10 +96,11 @@ def fill_with_nan(rows, first):
 
 
 @njit(**OPTIONS)
-def rollout(kicks, drifts, gradients, y0, n_steps, save, out):
+def rollout(kicks, drifts, gradients, y0, n_steps, save, out, stop):
     """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
 
-    Returns the index of the last step that ends in a finite state; rows of later steps are NaN.
+    Returns the index of the last step that ends in a finite state; rows of later steps are NaN. Ends early, with
+    rows unset, when another thread sets ``stop[0]``.
     """
     link = len(kicks) - 2
     work = prepared(kicks, gradients)
@@ -109,7 +110,7 @@ def rollout(kicks, drifts, gradients, y0, n_steps, save, out):
     while saved < len(save) and save[saved] <= 0:
         pack(q, p, out[saved])
         saved += 1
-    while n < n_steps:
+    while n < n_steps and stop[0] == 0:
         block = min(CHECK_EVERY, n_steps - n)
         if saved < len(save):
             block = min(block, save[saved] - n)
@@ -132,23 +133,32 @@ def rollout(kicks, drifts, gradients, y0, n_steps, save, out):
 
 
 @njit(**OPTIONS)
-def rollout_each(kicks, drifts, gradients, y0, n_steps, save, out, n_finite):
+def rollout_each(kicks, drifts, gradients, y0, n_steps, save, out, n_finite, stop):
     """`rollout` of every row of `y0` (N, 2d) by itself."""
     for i in range(y0.shape[0]):
-        n_finite[i] = rollout(kicks, drifts, gradients, y0[i], n_steps, save, out[i])
+        n_finite[i] = rollout(kicks, drifts, gradients, y0[i], n_steps, save, out[i], stop)
 
 
 @njit(**OPTIONS)
-def step_each(kicks, drifts, gradients, h, y, out):
-    """One step of length ``h[i]`` from every row of `y` (N, 2d); the coefficients (1 or N, m) are those for h = 1."""
-    work = prepared(kicks[0], gradients[0])
+def polynomial(coefficients, x):
+    total = 0.0
+    for k in range(len(coefficients) - 1, -1, -1):
+        total = total * x + coefficients[k]
+    return total
+
+
+@njit(**OPTIONS)
+def step_each(kicks, drifts, gradients, x, h, y, out):
+    """One step of length ``h[i]`` from every row of `y` (N, 2d).
+
+    The coefficients (m, K) of stage j are those for h = 1, polynomials Σ_k kicks[j, k] x^k of ``x[i]``.
+    """
+    work = prepared(kicks[:, 0], gradients[:, 0])
     for i in range(y.shape[0]):
-        row = i if len(kicks) > 1 else 0
         q, p = unpack(y[i])
         q_error, p_error = no_error(q), no_error(p)
-        for j in range(kicks.shape[1]):
-            b, g, a = h[i] * kicks[row, j], h[i] ** 3 * gradients[row, j], h[i] * drifts[row, j]
-            if SCHEDULED:
-                fill_coefficients(b, g, work[j])
+        for j in range(len(kicks)):
+            b, a = h[i] * polynomial(kicks[j], x[i]), h[i] * polynomial(drifts[j], x[i])
+            g = h[i] ** 3 * polynomial(gradients[j], x[i])
             q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, a, j, work)
         pack(q, p, out[i])

@@ -141,8 +141,8 @@ class MLPFlowKernel:
         out = np.empty((len(y0), len(save), y0.shape[1]))
         n_finite = np.empty(len(y0), dtype=np.int64)
 
-        def rows(i: slice) -> None:
-            rollout(self._weights, backwards, t[i], y0[i], n_steps, save, out[i], n_finite[i])
+        def rows(i: slice, stop: np.ndarray) -> None:
+            rollout(self._weights, backwards, t[i], y0[i], n_steps, save, out[i], n_finite[i], stop)
 
         run_rows(rows, len(y0), 1000 * n_steps, threads)
         return out, n_finite

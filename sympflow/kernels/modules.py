@@ -9,22 +9,29 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
+from typing import TypeVar
 
 import numba
+import numpy as np
 
-__all__ = ["OPTIONS", "cache_folder", "load_module", "run_rows", "template"]
+__all__ = ["NEVER", "OPTIONS", "cache_folder", "load_module", "run_one", "run_rows", "template"]
+
+T = TypeVar("T")
 
 OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 """How kernels are compiled: 1/0 is inf, a·b + c may be fused; nothing else about rounding or NaN is relaxed."""
 
 _BLOCK = 64  # rows that a thread takes at a time: the lanes of a block
+LONG = 100_000_000  # units of work from which a run can be interrupted
+NEVER = np.zeros(1, dtype=np.int64)
+"""The `stop` of what is not."""
 _WORTH_A_THREAD = 500_000  # units of work, about a nanosecond each, below which another thread does not pay
 
 
@@ -94,16 +101,40 @@ def _write_once(folder: Path, name: str, source: str) -> Path:
     return path
 
 
-def run_rows(rows: Callable[[slice], None], n_rows: int, work_per_row: int, threads: int | None) -> None:
-    """Call ``rows(slice)`` over 0 … n_rows, on several threads if the work is worth it; `rows` releases the GIL."""
+def run_one(call: Callable[[np.ndarray], T], work: int) -> T:
+    """``call(stop)``, whose work takes about so many nanoseconds or more; it must end soon once ``stop[0]`` is set.
+
+    Compiled code in the main thread holds Ctrl-C off until it returns. So what takes long runs in another thread, and
+    this one waits.
+    """
+    if work < LONG:
+        return call(NEVER)
+    return _run_in_threads([call])[0]
+
+
+def run_rows(rows: Callable[[slice, np.ndarray], None], n_rows: int, work_per_row: int, threads: int | None) -> None:
+    """Call ``rows(slice, stop)`` over 0 … n_rows, on several threads if the work is worth it.
+
+    `rows` releases the GIL; for `stop` see `run_one`.
+    """
     n_blocks = -(-n_rows // _BLOCK)
     if threads is None:
         threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         threads = min(threads, 1 + n_rows * work_per_row // _WORTH_A_THREAD)
     threads = max(1, min(threads, n_blocks))
     if threads == 1:
-        rows(slice(0, n_rows))
+        run_one(partial(rows, slice(0, n_rows)), n_rows * work_per_row)
         return
     bounds = [_BLOCK * (n_blocks * k // threads) for k in range(threads)] + [n_rows]
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(rows, [slice(*ends) for ends in pairwise(bounds)]))
+    _run_in_threads([partial(rows, slice(*ends)) for ends in pairwise(bounds)])
+
+
+def _run_in_threads(calls: Sequence[Callable[[np.ndarray], T]]) -> list[T]:
+    stop = np.zeros(1, dtype=np.int64)
+    with ThreadPoolExecutor(len(calls)) as pool:
+        futures = [pool.submit(call, stop) for call in calls]
+        try:
+            return [future.result() for future in futures]
+        except BaseException:  # of the user's, most likely: the threads need not go on
+            stop[0] = 1
+            raise

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.kernels.modules import OPTIONS, load_module, run_rows, template
+from sympflow.kernels.modules import NEVER, OPTIONS, load_module, run_one, run_rows, template
 from sympflow.kernels.parts_codegen import IDLE, WITH_GRADIENT, parts_source, row_width
 from sympflow.parts import LINEAR, ExactParts, Map, PartFunctions
 
 __all__ = ["PartsKernel"]
 
+ONE = np.ones(1, dtype=np.int64)
 EPS = float(np.finfo(float).eps)
 KNOWN_TABLES = 64  # run tables that are kept: those of the steps in use
 
@@ -60,7 +61,11 @@ class PartsKernel:
         loops, save = self._loops(sequence), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(save), 2 * self.parts.ndof))
         codes, table = self._run_table(sequence)
-        n_finite = loops.rollout(codes, table, self._modes(y0), n_steps, save, out)
+        modes = self._modes(y0)
+        n_finite = run_one(
+            lambda stop: loops.rollout(codes, table, modes, n_steps, save, out, stop),
+            n_steps * len(codes) * self.parts.ndof,
+        )
         return self._states(out, save, y0), n_finite
 
     def run_batch(
@@ -74,10 +79,10 @@ class PartsKernel:
         out = np.empty((len(y0), len(save), 2 * self.parts.ndof))
         n_finite = np.empty(len(y0), dtype=np.int64)
 
-        def rows(i: slice) -> None:
-            loops.rollout_batch(codes, table, modes[i], n_steps, save, out[i], n_finite[i])
+        def rows(i: slice, stop: np.ndarray) -> None:
+            loops.rollout_batch(codes, table, modes[i], n_steps, save, out[i], n_finite[i], stop)
 
-        run_rows(rows, len(y0), n_steps * len(codes), threads)
+        run_rows(rows, len(y0), n_steps * len(codes) * self.parts.ndof, threads)
         return self._states(out, save, y0[:, None]), n_finite
 
     def step(self, maps: Maps, h: Any, y: np.ndarray) -> np.ndarray:
@@ -92,7 +97,7 @@ class PartsKernel:
         """The maps applied once to every row [X, Y] of `modes` (N, 2d), which stay modes."""
         loops = self._loops(sequence)
         out, n_finite = np.empty((len(modes), 1, modes.shape[1])), np.empty(len(modes), dtype=np.int64)
-        loops.rollout_batch(*self._run_table(sequence), modes, 1, np.ones(1, dtype=np.int64), out, n_finite)
+        loops.rollout_batch(*self._run_table(sequence), modes, 1, ONE, out, n_finite, NEVER)
         return out[:, 0]
 
     def source(self) -> str:

@@ -38,10 +38,11 @@ def first_non_finite(x, y, codes, table, first, n_steps):
 
 
 @njit(**OPTIONS)
-def rollout(codes, table, z0, n_steps, save, out):
+def rollout(codes, table, z0, n_steps, save, out, stop):
     """`n_steps` steps from the modes `z0` (2d,), those after ``save[i]`` steps into ``out[i]``.
 
-    Returns the index of the last step that ends in a finite state; rows of later steps are NaN.
+    Returns the index of the last step that ends in a finite state; rows of later steps are NaN. Ends early, with
+    rows unset, when another thread sets ``stop[0]``.
     """
     link = len(codes) - 2
     x, y = unpack(z0)
@@ -49,7 +50,7 @@ def rollout(codes, table, z0, n_steps, save, out):
     while saved < len(save) and save[saved] <= 0:
         pack(x, y, out[saved])
         saved += 1
-    while n < n_steps:
+    while n < n_steps and stop[0] == 0:
         block = min(CHECK_EVERY, n_steps - n)
         if saved < len(save):
             block = min(block, save[saved] - n)
@@ -79,7 +80,7 @@ def step_each(codes, tables, z, out):
 
 
 @njit(**OPTIONS)
-def rollout_lanes(codes, table, z0, n_steps, save, out, n_finite):
+def rollout_lanes(codes, table, z0, n_steps, save, out, n_finite, stop):
     """`rollout` of every row of `z0` (N, 2d), `LANES` at a time."""
     link = len(codes) - 2
     Z = aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
@@ -100,7 +101,7 @@ def rollout_lanes(codes, table, z0, n_steps, save, out, n_finite):
         while saved < len(save) and save[saved] <= 0:
             saved += 1
         n_alive = count
-        while n < n_steps and n_alive > 0:
+        while n < n_steps and n_alive > 0 and stop[0] == 0:
             start[:] = Z
             begin = first
             block = min(CHECK_EVERY, n_steps - n)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.integrators.schemes import Scheme
-from sympflow.kernels.modules import OPTIONS, load_module, run_rows, template
+from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
@@ -111,10 +111,13 @@ class SplittingKernel:
         n_finite : int
             Index of the last step that ends in a finite state, `n_steps` if all do; the run stops there.
         """
+        table = _scaled_run_table(scheme, h)
         loops = self._loops(any(scheme.gradients), compensated)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(save), 2 * self.ndof))
-        n_finite = loops.rollout(*_scaled(_run_table(scheme), h), y0, n_steps, save, out)
+        n_finite = run_one(
+            lambda stop: loops.rollout(*table, y0, n_steps, save, out, stop), n_steps * len(table[0]) * self.ndof
+        )
         return out, n_finite
 
     def run_batch(
@@ -135,36 +138,35 @@ class SplittingKernel:
         n_finite : ndarray of int64, shape (N,)
         """
         loops = self._loops(any(scheme.gradients), compensated)
-        table = _scaled(_run_table(scheme), h)
+        table = _scaled_run_table(scheme, h)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(y0), len(save), 2 * self.ndof))
         n_finite = np.empty(len(y0), dtype=np.int64)
 
-        def rows(i: slice) -> None:
-            loops.rollout_batch(*table, y0[i], n_steps, save, out[i], n_finite[i])
+        def rows(i: slice, stop: np.ndarray) -> None:
+            loops.rollout_batch(*table, y0[i], n_steps, save, out[i], n_finite[i], stop)
 
-        run_rows(rows, len(y0), n_steps * len(table[0]), threads)
+        run_rows(rows, len(y0), n_steps * len(table[0]) * self.ndof, threads)
         return out, n_finite
 
     def step(self, scheme: Scheme, h: ArrayLike, y: np.ndarray) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
-        y = np.ascontiguousarray(y, dtype=np.float64)
-        h = np.ascontiguousarray(np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1]))
-        out = np.empty_like(y)
-        self._loops(any(scheme.gradients), False).step_each(*_step_table(scheme), h, y, out)
-        return out
+        h = np.asarray(h, dtype=np.float64)
+        h = np.full(len(y), h) if h.ndim == 0 else h
+        return self.step_rows(_step_table(scheme), h, h, y)
 
-    def step_rows(self, table: _Table, h: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own table.
+    def step_rows(self, table: _Table, x: np.ndarray, h: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
 
         Parameters
         ----------
-        table : kicks, drifts, gradients, ndarrays of shape (N, m)
-            Those of row i, for h = 1; a stage is a kick and a drift.
+        table : kicks, drifts, gradients, ndarrays of shape (m, K)
+            Of the stages, a kick and a drift each, for h = 1: those of row i are Σ_k kicks[:, k] x[i]^k.
         """
-        kicks, drifts, gradients = (np.ascontiguousarray(column) for column in table)
+        y = np.ascontiguousarray(y, dtype=np.float64)
         out = np.empty(y.shape)
-        self._loops(bool(gradients.any()), False).step_each(kicks, drifts, gradients, h, np.ascontiguousarray(y), out)
+        x, h = np.ascontiguousarray(x), np.ascontiguousarray(h)
+        self._loops(bool(table[2].any()), False).step_rows(*table, x, h, y, out)
         return out
 
 
@@ -192,12 +194,11 @@ def _arrays(stages: list[_Stage]) -> _Table:
 
 @lru_cache(maxsize=256)
 def _step_table(scheme: Scheme) -> _Table:
-    """The stages of one step by itself, for h = 1: (1, m) each."""
+    """The stages of one step by itself, for h = 1: (m, 1) each."""
     kicks, drifts, gradients = _arrays(_stages(scheme))
-    return kicks[None], drifts[None], gradients[None]
+    return kicks[:, None], drifts[:, None], gradients[:, None]
 
 
-@lru_cache(maxsize=256)
 def _run_table(scheme: Scheme) -> _Table:
     """The table [opening, inner …, link, closing] of a run, for h = 1: see `loops`."""
     stages = _stages(scheme)
@@ -211,8 +212,10 @@ def _run_table(scheme: Scheme) -> _Table:
     return _arrays([opening, *inner, link, closing])
 
 
-def _scaled(table: _Table, h: float) -> _Table:
-    kicks, drifts, gradients = table
+@lru_cache(maxsize=256)
+def _scaled_run_table(scheme: Scheme, h: float) -> _Table:
+    """The table of a run whose steps are h."""
+    kicks, drifts, gradients = _run_table(scheme)
     return h * kicks, h * drifts, h**3 * gradients
 
 
@@ -222,7 +225,7 @@ class _Loops:
 
     rollout: Callable[..., int]
     rollout_batch: Callable[..., None]
-    step_each: Callable[..., None]
+    step_rows: Callable[..., None]
 
 
 def _header(gradients: bool, compensated: bool, cache: bool, scheduled: bool) -> str:
@@ -244,7 +247,7 @@ def _symbolic_loops(symbols: SymbolicHamiltonian, algebra: str, gradients: bool,
     before = ["elementary"] if "fast_" in algebra else []
     after = ["loops", "aligned", "lanes"]
     loops = load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
-    return _Loops(loops.rollout, loops.rollout_lanes, loops.step_each)
+    return _Loops(loops.rollout, loops.rollout_lanes, loops.step_lanes)
 
 
 _INVERSE_MASS_TIMES_V = {

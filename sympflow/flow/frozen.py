@@ -1,0 +1,164 @@
+"""The tables of numbers that a primed flow is at a fixed t, kept while no number of the flow changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from sympflow.flow.coefficients import Coefficients, Entry
+from sympflow.flow.contents import Contents
+from sympflow.integrators.schemes import Scheme
+from sympflow.integrators.splitting import scheme_evaluations
+
+Kind = Literal["kick", "drift"]
+
+MOST_KEPT = 256  # a flow with a processor has five for each step length
+
+
+@dataclass(frozen=True)
+class Substep:
+    """A kick or a drift of the flow: its coefficient, and for a kick that of its force gradient."""
+
+    kind: Kind
+    weight: Entry
+    gradient: Entry | None = None
+
+
+class Tables:
+    """Kicks, drifts and force gradients of ψ̄_t, K_t and χ_t: at one t as a `Scheme`, at all t as polynomials.
+
+    Parameters
+    ----------
+    substeps : sequence of Substep
+        χ⁻¹, K, χ, with the numbers that they have now.
+    outer : int
+        How many of them χ has.
+    dt : float
+        Δt.
+    """
+
+    def __init__(self, substeps: Sequence[Substep], outer: int, dt: float) -> None:
+        last = len(substeps) - outer
+        self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
+        self.dt, self.processed = dt, outer > 0
+        self._coefficients = {id(c): c.table.detach().cpu().double().numpy() for c in columns_of(substeps)}
+        exponents = columns_of(substeps)[0].exponents
+        self._exponents = np.array(exponents, dtype=float)
+        self._even = exponents[1:2] != (1,)
+        self._kept: dict[Any, Any] = {}
+
+    def _keep(self, key: Any, make: Callable[[], Any]) -> Any:
+        if key not in self._kept:
+            if len(self._kept) > MOST_KEPT:
+                self._kept.clear()
+            self._kept[key] = make()
+        return self._kept[key]
+
+    def scheme(self, part: str, t: float | None, back: bool = False) -> Scheme:
+        """The part at t ∈ (0, Δt], the default Δt; `back` its inverse."""
+
+        def make() -> Scheme:
+            return self.scheme(part, t).inverse() if back else self._frozen(part, t)
+
+        return self._keep((part, t, back), make)
+
+    def polynomials(self, back: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Kicks, drifts and gradients (m, K) of the stages of ψ̄_t, or of its inverse, divided by t, t and t³.
+
+        They multiply the powers 0 … K−1 of `variable`.
+        """
+
+        def make() -> tuple[np.ndarray, ...]:
+            parts, sign = self._parts["primed"], -1 if back else 1
+            substeps = reversed(parts) if back else parts
+            stages = _stages((s.kind, *_pair(s, self._coefficients, sign)) for s in substeps)
+            kicks, gradients, drifts = (np.array(column, dtype=float) for column in zip(*stages, strict=True))
+            return kicks, drifts, gradients
+
+        return self._keep(("polynomials", back), make)
+
+    def variable(self, t: np.ndarray) -> np.ndarray:
+        """t/Δt, or its square where all polynomials are even.
+
+        Raises
+        ------
+        ValueError
+            If a t lies beyond Δt.
+        """
+        tau = t / self.dt
+        if not (tau <= 1 + 1e-12).all():
+            raise ValueError(f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t.max():g}.")
+        return tau * tau if self._even else tau
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Forces and force gradients of a run, as `FixedStep.evaluations`."""
+
+        def make() -> dict[str, int]:
+            counts = [scheme_evaluations(self.scheme("primed kernel", None), n_steps, n_saved, 0, backend)]
+            if n_extra:
+                counts.append(scheme_evaluations(self.scheme("primed", None), 0, 0, n_extra, backend))
+            if self.processed:  # once at the start, and for each output
+                n = n_saved + (n_steps > 0)
+                counts.append(scheme_evaluations(self.scheme("primed processor", None), 0, 0, n, backend))
+            return {name: sum(count[name] for count in counts) for name in counts[0]}
+
+        return dict(self._keep((n_steps, n_saved, n_extra, backend), make))
+
+    def _frozen(self, part: str, t: float | None) -> Scheme:
+        t = self.dt if t is None else float(t)
+        if not 0 < t <= self.dt * (1 + 1e-12):
+            raise ValueError(f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t!r}.")
+        powers = (t / self.dt) ** self._exponents
+        values = {column: table @ powers for column, table in self._coefficients.items()}
+        stages = _stages((s.kind, *map(float, _pair(s, values, 1))) for s in self._parts[part])
+        kicks, gradients, drifts = zip(*stages, strict=True)
+        source = f"a primed SympFlow, Δt = {self.dt:g}, frozen at t = {t:g}"
+        nystrom = any(s.gradient is not None for s in self._parts["primed"])
+        return Scheme(part, None, kicks, drifts, gradients, source, nystrom)
+
+
+class KeptTables:
+    """The `Tables` of a flow, made anew when one of its numbers has changed."""
+
+    def __init__(self, substeps: Sequence[Substep], outer: int, dt: float) -> None:
+        self._of = tuple(substeps), outer, dt
+        self._contents = Contents(column._parameters for column in columns_of(substeps))
+        self._known: tuple[bytes, Tables] | None = None
+
+    def current(self) -> Tables:
+        snapshot = self._contents.snapshot()
+        if self._known is None or self._known[0] != snapshot:
+            self._known = snapshot, Tables(*self._of)
+        return self._known[1]
+
+
+def columns_of(substeps: Sequence[Substep]) -> list[Coefficients]:
+    """The distinct columns that the substeps take their numbers from."""
+    entries = [entry for s in substeps for entry in (s.weight, s.gradient) if entry is not None]
+    return list({id(entry.column): entry.column for entry in entries}.values())
+
+
+def _pair(s: Substep, values: dict[int, np.ndarray], sign: int) -> tuple[Any, Any]:
+    """Coefficient and force gradient of a substep, out of those of the columns."""
+    gradient = None if s.gradient is None else sign * s.gradient.sign * values[id(s.gradient.column)][s.gradient.row]
+    weight = sign * s.weight.sign * values[id(s.weight.column)][s.weight.row]
+    return weight, 0 * weight if gradient is None else gradient
+
+
+def _stages(substeps: Iterable[tuple[Kind, Any, Any]]) -> list[tuple[Any, Any, Any]]:
+    """(kick, gradient, drift) of the stages, neighbours of one kind merged."""
+    stages: list[tuple[Any, Any, Any]] = []
+    before = "drift"
+    for kind, c, g in substeps:
+        b, gradient, a = stages[-1] if stages else (0.0, 0.0, 0.0)
+        if kind == "drift" and stages:
+            stages[-1] = b, gradient, a + c
+        elif kind == "kick" and before == "kick" and stages:
+            stages[-1] = b + c, gradient + g, a
+        else:
+            stages.append((c, g, 0 * c) if kind == "kick" else (0 * c, 0 * c, c))
+        before = kind
+    return stages

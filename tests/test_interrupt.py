@@ -1,0 +1,43 @@
+"""Ctrl-C ends compiled runs, however long they are."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+SCRIPT = """
+import os, signal, threading
+import numpy as np
+from sympflow import solve, systems
+
+hh, fput = systems.henon_heiles(), systems.fput(omega=50.0)
+pair = hh.domain.sample(70, 0)
+cases = [
+    (hh, "verlet", hh.y0, {"dt": 1e-2}, 1e9),
+    (hh, "kahan_li8", pair, {"dt": 1e-2}, 1e8),
+    (hh, "verlet", hh.y0, {"dt": 1e-2, "compensated": True}, 1e9),
+    (hh, "sympflow", hh.y0, {"tol": 1e-4}, 1e11),
+    (hh, "sympflow", hh.y0, {}, 1e9),
+    (hh, "implicit_midpoint", hh.y0, {"dt": 1e-2}, 1e8),
+    (fput, "linear_srkn6b", fput.y0, {"dt": 1e-2}, 1e8),
+    (fput, "sympflow", np.stack([fput.y0] * 9), {}, 1e9),
+]
+for system, method, y0, options, t_end in cases:
+    t_eval = [system.dt]
+    solve(system, method, (0, t_end), y0, t_eval=t_eval, **options)  # compiled
+    timer = threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    try:
+        solve(system, method, (0, t_end), y0, t_eval=[t_end], **options)
+    except KeyboardInterrupt:
+        print(method, "interrupted", flush=True)
+    timer.join()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends the process there")
+def test_compiled_runs_can_be_interrupted():
+    found = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=300)
+    assert found.returncode != -signal.SIGINT, found.stderr
+    assert found.stdout.split().count("interrupted") == 8, found.stderr
