@@ -14,7 +14,7 @@ from sympflow.training.collocation import Points, PointSource
 from sympflow.training.config import TrainingConfig
 from sympflow.training.labels import Labels
 from sympflow.training.losses import Loss, Objective, jacobian
-from sympflow.training.marquardt import GaussNewton
+from sympflow.training.marquardt import PULL, GaussNewton
 
 HH, OSCILLATOR, PENDULUM = systems.henon_heiles(), systems.harmonic_oscillator(), systems.pendulum()
 QUICK = {
@@ -131,7 +131,22 @@ def test_a_linear_problem_is_solved_at_once(damping, worst):
     cost = [method.step(0, Quadratic(target, A, b)) for _ in range(8)]
     assert cost[-1] < 1e-12 * cost[0]
     if damping == 1e-14:
-        torch.testing.assert_close(target.x.detach(), torch.arange(1.0, 6.0, dtype=torch.float64), rtol=1e-5, atol=0)
+        pulled = torch.cat([A, PULL**0.5 * torch.eye(5)]), torch.cat([b, torch.zeros(5, dtype=b.dtype)])
+        torch.testing.assert_close(target.x.detach(), torch.linalg.lstsq(*pulled).solution, rtol=1e-5, atol=0)
+
+
+def test_a_weight_that_no_point_sees_does_not_run_away():
+    """A saturated neuron of the first Gauss–Newton networks had a slope of 5e7 between two points."""
+    A, b = torch.zeros(10, 2, dtype=torch.float64), torch.linspace(0, 1, 10, dtype=torch.float64)
+    A[:, 0] = 1.0
+    target = module(2)
+    with torch.no_grad():
+        target.x[1] = 1e8
+    method = GaussNewton(target, TrainingConfig())
+    for _ in range(40):
+        method.step(0, Quadratic(target, A, b))
+    assert target.x[1].abs() < 1.0
+    assert target.x[0].item() == pytest.approx(0.5, rel=1e-9)
 
 
 def test_it_stops_by_itself():

@@ -21,6 +21,7 @@ WELL_CONDITIONED = 1e-8  # damping above which (JᵀJ + λD²)s = −Jᵀr loses
 PATIENCE = 20
 GAIN = 1e-2
 PROBE = 0.1  # share of a step over which the curvature of the residuals is measured
+PULL = 1e-16  # towards 0, per squared weight: it costs nothing until a weight runs away
 CURVED = 0.75  # largest ratio of the second-order correction to the step
 
 
@@ -29,7 +30,9 @@ class GaussNewton:
 
     A step s minimizes ‖J s + r‖² + λ‖D s‖², D the largest norms that the columns of J have had, so that λ bounds
     the condition number: by the normal equations where it is large, else by a QR factorization of J. λ follows the
-    gain ratio, actual over predicted decrease, as in [2]_. The steps end where `PATIENCE` of them on the same points
+    gain ratio, actual over predicted decrease, as in [2]_. To r belongs a tiny multiple of the weights: a neuron that
+    is saturated at all points may else run off to a step of any slope, which no held-out point sees, but an orbit meets
+    after some ten thousand steps. The steps end where `PATIENCE` of them on the same points
     lower the loss by less than 1 %, or none does.
 
     Attributes
@@ -78,7 +81,10 @@ class GaussNewton:
 
     def step(self, index: int, objective: Objective) -> float:
         """Take a step; the loss before it."""
+        x = torch.cat([w.detach().reshape(-1) for w in self.parameters])
         r, J = objective.linearized()
+        loss = float(r @ r)
+        r, J = torch.cat([r, PULL**0.5 * x]), torch.cat([J, PULL**0.5 * torch.eye(len(x)).to(J)])
         cost = float(r @ r)
         if not math.isfinite(cost):
             return cost
@@ -88,7 +94,6 @@ class GaussNewton:
         squares = G.diagonal()
         self.scale = squares.clone() if self.scale is None else torch.maximum(self.scale, squares)
         D = torch.where(self.scale > 0, self.scale, 1.0).sqrt()
-        x = torch.cat([w.detach().reshape(-1) for w in self.parameters])
         for _ in range(MAX_REJECTED):
             solve = self._damped(J, G, D)
             s = -solve(g)
@@ -96,7 +101,7 @@ class GaussNewton:
             s = s + self._bend(objective, solve, x, s, r, J, D)
             self._put(x + s)
             with torch.no_grad():
-                after = float(objective())
+                after = float(objective()) + PULL * float((x + s) @ (x + s))
             gain = (cost - after) / predicted if predicted > 0 and math.isfinite(after) else -1.0
             if gain > 0:
                 shrink = max(1 / 5, 1 - (2 * min(gain, 1.0) - 1) ** 3)
@@ -104,11 +109,11 @@ class GaussNewton:
                 self.costs = [*self.costs[-PATIENCE:], after]
                 if len(self.costs) > PATIENCE and after > (1 - GAIN) * self.costs[0]:
                     self.finished = "it has converged"
-                return cost
+                return loss
             self.damping, self.growth = self.damping * self.growth, self.growth * 2
         self._put(x)
         self.damping, self.growth, self.finished = FIRST_DAMPING, 2.0, "no step lowers the loss"
-        return cost
+        return loss
 
     def _damped(self, J: Tensor, G: Tensor, D: Tensor) -> Callable[[Tensor], Tensor]:
         """v → (JᵀJ + λD²)⁻¹ v."""
@@ -131,7 +136,8 @@ class GaussNewton:
     ) -> Tensor:
         """The geodesic acceleration of [3]_, by which a step follows a curved valley; 0 where it would lead astray."""
         self._put(x + PROBE * s)
-        curvature = (objective.residuals() - r - PROBE * (J @ s)) / PROBE**2
+        probed = torch.cat([objective.residuals(), PULL**0.5 * (x + PROBE * s)])
+        curvature = (probed - r - PROBE * (J @ s)) / PROBE**2
         bend = -solve(J.T @ curvature)
         small = 2 * torch.linalg.vector_norm(D * bend) <= CURVED * torch.linalg.vector_norm(D * s)
         return bend if small else torch.zeros_like(s)  # NaN is not small
