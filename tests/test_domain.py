@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sympflow import Ball, Box, EnergySublevel, HamiltonianSystem, Tube, systems
@@ -34,6 +34,7 @@ DOMAINS = [
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=lambda d: type(d).__name__)
+@settings(deadline=None)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 300))
 def test_samples_lie_inside_and_depend_on_the_seed_only(domain, seed, n):
     x = domain.sample(n, seed)
@@ -181,3 +182,19 @@ def test_what_are_not_states_of_the_domain_is_refused(domain):
 def test_bad_arguments_are_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("system", [systems.henon_heiles(), systems.kepler(0.6), systems.fput(omega=50.0)], ids=str)
+@pytest.mark.parametrize("slack", [0.0, 0.01])
+def test_compiled_code_agrees_on_what_lies_in_a_sublevel(system, slack):
+    from sympflow.kernels.sublevel import all_within
+
+    rng = np.random.default_rng(0)
+    inside = system.domain.sample(50, 0)
+    assert all_within(system, system.domain, inside, slack)
+    for x in (inside * 1.3, inside + 0.2 * rng.standard_normal(inside.shape), np.full((1, inside.shape[1]), np.nan)):
+        expected = system.domain.contains(x, slack=slack)
+        assert expected.tolist() == [all_within(system, system.domain, row[None], slack) for row in x]
+        assert all_within(system, system.domain, x, slack) == expected.all()
+    other = system.domain.attach(system.symbols.hamiltonian)
+    assert not all_within(system, other, inside, slack)  # an H of its own, which is not compiled

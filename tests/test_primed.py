@@ -246,7 +246,22 @@ def test_trained_weights_are_never_compiled_in():
     flow = random_flow(HH, stages=2)
     before = solve(HH, flow, (0.0, 3.0)).y
     flow.kicks.free.add_(0.01)
-    assert np.abs(solve(HH, flow, (0.0, 3.0)).y - before).max() > 1e-4
+    after = solve(HH, flow, (0.0, 3.0)).y
+    assert np.abs(after - before).max() > 1e-4
+    flow.kicks.free.data -= 0.01  # an edit that no version counter sees
+    np.testing.assert_allclose(solve(HH, flow, (0.0, 3.0)).y, before, atol=1e3 * EPS)
+    flow.kicks.free = torch.nn.Parameter(flow.kicks.free.detach() + 0.01)
+    np.testing.assert_allclose(solve(HH, flow, (0.0, 3.0)).y, after, atol=1e3 * EPS)
+
+
+def test_at_one_time_the_polynomials_are_the_table(flow):
+    from sympflow.kernels.primed_flow import PrimedFlowKernel
+    from sympflow.kernels.splitting import splitting_kernel
+
+    y, t = flow.system.domain.sample(70, 3), 0.7 * flow.dt
+    for h, scheme in ((t, flow.scheme(t)), (-t, flow.scheme(t).inverse())):
+        by_table = splitting_kernel(flow.system).step(scheme, t, y)
+        np.testing.assert_allclose(PrimedFlowKernel(flow, flow.system).step(h, y), by_table, atol=1e3 * EPS)
 
 
 def test_evaluations_are_counted():

@@ -52,6 +52,7 @@ def test_every_time_is_a_count_and_a_remainder(t0, length, dt, x):
     grid = Grid(t0, t0 + length, dt)
     t = min(max(t0 + x * length, t0), grid.t1)
     (count,), (remainder,) = grid.locate(np.array([t]))
+    assert grid.place(t) == (count, remainder)
     assert 0 <= count <= grid.n_steps
     assert 0 <= remainder < dt
     assert t0 + count * dt + remainder == pytest.approx(t, abs=1e-12 * (1 + abs(t0) + length))

@@ -25,6 +25,10 @@ class Contents:
         self._views: list[np.ndarray] = []
         self._shared = False  # whether the views are the memory of the tensors, which lie on the CPU
 
+    def first(self) -> Tensor:
+        """One of the tensors."""
+        return next(w for d in self._tensors for w in d.values() if w is not None)
+
     def snapshot(self) -> bytes:
         """Equal to an earlier one as long as no number has changed."""
         tensors = [w for d in self._tensors for w in d.values() if w is not None]

@@ -44,6 +44,7 @@ class Tables:
         last = len(substeps) - outer
         self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
         self.dt, self.processed = dt, outer > 0
+        self.force_gradient = any(s.gradient is not None for s in substeps)
         self._coefficients = {id(c): c.table.detach().cpu().double().numpy() for c in columns_of(substeps)}
         exponents = columns_of(substeps)[0].exponents
         self._exponents = np.array(exponents, dtype=float)
@@ -68,14 +69,15 @@ class Tables:
     def polynomials(self, back: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Kicks, drifts and gradients (m, K) of the stages of ψ̄_t, or of its inverse, divided by t, t and t³.
 
-        They multiply the powers 0 … K−1 of `variable`.
+        They multiply the powers 0 … K−1 of `variable`; K is at least 3, by zeros if need be.
         """
 
         def make() -> tuple[np.ndarray, ...]:
             parts, sign = self._parts["primed"], -1 if back else 1
             substeps = reversed(parts) if back else parts
             stages = _stages((s.kind, *_pair(s, self._coefficients, sign)) for s in substeps)
-            kicks, gradients, drifts = (np.array(column, dtype=float) for column in zip(*stages, strict=True))
+            columns = (np.array(column, dtype=float) for column in zip(*stages, strict=True))
+            kicks, gradients, drifts = (np.pad(c, ((0, 0), (0, max(0, 3 - c.shape[1])))) for c in columns)
             return kicks, drifts, gradients
 
         return self._keep(("polynomials", back), make)
@@ -116,8 +118,7 @@ class Tables:
         stages = _stages((s.kind, *map(float, _pair(s, values, 1))) for s in self._parts[part])
         kicks, gradients, drifts = zip(*stages, strict=True)
         source = f"a primed SympFlow, Δt = {self.dt:g}, frozen at t = {t:g}"
-        nystrom = any(s.gradient is not None for s in self._parts["primed"])
-        return Scheme(part, None, kicks, drifts, gradients, source, nystrom)
+        return Scheme(part, None, kicks, drifts, gradients, source, self.force_gradient)
 
 
 class KeptTables:

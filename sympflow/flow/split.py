@@ -11,26 +11,29 @@ are the untrained cases. Frozen at any t the flow is a list of maps, and runs in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sympflow.decomposition import exact_parts
 from sympflow.flow.base import FlowMap
 from sympflow.flow.columns import Column
+from sympflow.flow.contents import Contents
 from sympflow.flow.layers import Layer
 from sympflow.flow.placement import checked_device, checked_dtype
 from sympflow.flow.potentials import Time
 from sympflow.flow.sympflow import SympFlow
 from sympflow.forward_mode import jvp
-from sympflow.parts import LINEAR, ExactParts, Map, exact_parts
+from sympflow.parts import LINEAR, ExactParts, Map
 
 if TYPE_CHECKING:
     from sympflow.kernels.split_flow import SplitFlowKernel
     from sympflow.system import HamiltonianSystem
 
+MOST_KEPT = 64  # steps whose maps are kept
 FILTERED = ("oscillator", "hyperbolic")
 """The kinds of modes that filters act on; others pass."""
 
@@ -58,6 +61,32 @@ class PartsBinding:
         copied = PartsBinding(None, self.expressions)
         copied.system, copied._parts = self.system, self._parts
         return copied
+
+
+class KeptMaps:
+    """The maps of a flow of fixed numbers, the same objects for the same step, and what they cost."""
+
+    def __init__(self, make: Callable[[np.ndarray], list[Map]], dt: float) -> None:
+        self._make, self._dt = make, dt
+        self._maps: dict[float, list[Map]] = {}
+        self._counts: dict[tuple[int, int, int, str], dict[str, int]] = {}
+
+    def maps(self, t: float) -> list[Map]:
+        if t not in self._maps:
+            if len(self._maps) >= MOST_KEPT:
+                self._maps.clear()
+            self._maps[t] = self._make(np.array(t))
+        return self._maps[t]
+
+    def evaluations(self, *run: Any) -> dict[str, int]:
+        """As `FixedStep.evaluations`."""
+        from sympflow.integrators.linear_splitting import map_evaluations
+
+        if run not in self._counts:
+            if len(self._counts) >= MOST_KEPT:
+                self._counts.clear()
+            self._counts[run] = map_evaluations(self.maps(self._dt), *run)
+        return dict(self._counts[run])
 
 
 class SplitLayer(Layer):
@@ -199,9 +228,8 @@ class SplitFlow(SympFlow):
             if c.power < 3:
                 c.set(np.eye(1, terms).repeat(c.n, 0) / (c.n if c.power else 1))
         self._binding = PartsBinding(system, expressions)
-        self._known: tuple[Any, list[Map]] | None = None
-        self._counted: tuple[list[Map], tuple[Any, ...], dict[str, int]] | None = None
-        self._free = [column.free for column in self.columns()]  # in a list: walking the modules takes longer
+        self._known: tuple[bytes, KeptMaps] | None = None
+        self._contents = Contents(column._parameters for column in self.columns())
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(SplitLayer(self, i) for i in range(len(self.sequence)))  # type: ignore[assignment]
         if system is not None:
@@ -212,6 +240,14 @@ class SplitFlow(SympFlow):
         """All coefficients: s, w, φ, γ."""
         groups = (self.linear, self.weights, self.filters, self.gradients)
         return [column for group in groups for column in group if isinstance(column, Column)]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self._contents.first().dtype
+
+    @property
+    def device(self) -> torch.device:
+        return self._contents.first().device
 
     # the maps -----------------------------------------------------------------------------------------------
 
@@ -224,12 +260,14 @@ class SplitFlow(SympFlow):
     def numpy_maps(self, t: np.ndarray) -> list[Map]:
         """The same of an array of times, for the compiled loops; for t < 0 the inverse of ψ̄_|t| (one sign for all)."""
         t = np.asarray(t, dtype=float)
-        if t.ndim == 0:  # every step of every run with this step is made of these
-            key = (float(t), *((w.data_ptr(), w._version) for w in self._free))
-            if self._known is None or self._known[0] != key:
-                self._known = key, self._numpy_maps(t)
-            return self._known[1]
-        return self._numpy_maps(t)
+        return self.frozen().maps(float(t)) if t.ndim == 0 else self._numpy_maps(t)
+
+    def frozen(self) -> KeptMaps:
+        """The maps of the numbers that the flow has now."""
+        snapshot = self._contents.snapshot()
+        if self._known is None or self._known[0] != snapshot:
+            self._known = snapshot, KeptMaps(self._numpy_maps, self.dt)
+        return self._known[1]
 
     def _numpy_maps(self, t: np.ndarray) -> list[Map]:
         maps = self._assemble(
@@ -280,13 +318,7 @@ class SplitFlow(SympFlow):
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Evaluations of the slopes of parts, and of force gradients, as `FixedStep.evaluations`."""
-        from sympflow.integrators.linear_splitting import map_evaluations
-
-        maps = self.numpy_maps(np.array(self.dt))
-        key = (n_steps, n_saved, n_extra, backend)
-        if self._counted is None or self._counted[0] is not maps or self._counted[1] != key:
-            self._counted = maps, key, map_evaluations(maps, n_steps, n_saved, n_extra, backend)
-        return dict(self._counted[2])
+        return self.frozen().evaluations(n_steps, n_saved, n_extra, backend)
 
     # its system ---------------------------------------------------------------------------------------------
 

@@ -184,7 +184,7 @@ class FixedStep(Integrator):
         extra = np.flatnonzero(remainder)
         if extra.size:
             y = self._shorter_steps(system, y, extra, remainder[extra], backend)
-        n_steps = int(min(last, np.max(finite) + 1))
+        n_steps = min(last, int(finite.max() if finite.ndim else finite) + 1)
         n_saved = int(save.searchsorted(n_steps, "right") - save.searchsorted(0, "right"))
         at_end = int(bool(extra.size) and extra[-1] == len(t) - 1 and t[-1] == grid.t1)
         stats = {
@@ -345,7 +345,7 @@ def _report_failures(outcome: Outcome, grid: Grid, finite: np.ndarray, n_run: in
     reached their end.
     """
     what, remedy = breakdown
-    done = bool(np.all(finite >= n_run))
+    done = bool((finite >= n_run).all()) if finite.ndim else int(finite) >= n_run
     if done and not is_tensor(outcome.y) and np.isfinite(outcome.y).all():
         if finite.ndim:
             outcome.status = np.zeros(finite.shape, dtype=int)

@@ -81,8 +81,7 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
 
         return torchdiffeq_method(method)
     if method in _BUILT_IN:
-        module, _, attribute = _BUILT_IN[method].partition(":")
-        return getattr(import_module(f"sympflow.integrators.{module}"), attribute)
+        return _built_in(method)
     if method in _registered:
         return _registered[method]
     if method in _plugins():
@@ -90,6 +89,12 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
     close = difflib.get_close_matches(method.lower(), available(), n=1)
     hint = f" Did you mean {close[0]!r}?" if close else ""
     raise ValueError(f"`method` {method!r} is unknown.{hint} Choose one of {', '.join(available())}.")
+
+
+@cache
+def _built_in(method: str) -> type[Integrator]:
+    module, _, attribute = _BUILT_IN[method].partition(":")
+    return getattr(import_module(f"sympflow.integrators.{module}"), attribute)
 
 
 def register(name: str, integrator: type[Integrator]) -> None:

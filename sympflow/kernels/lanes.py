@@ -126,24 +126,33 @@ def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite, st
             n, saved, first = n + block, next_saved, link
 
 
+X, H, H3, B, G, A = [2 * NDOF + i for i in range(6)]  # rows of what a stage needs, beside the states: see `step_lanes`
+
+
 @njit(**OPTIONS, inline="always")
-def fill_lanes(out, width, coefficients, x, factor):
-    """Σ_k coefficients[k] x^k, times a factor, of every lane."""
-    for lane in range(width):
-        out[lane] = coefficients[-1]
-    for k in range(len(coefficients) - 2, -1, -1):
+def fill_lanes(Y, width, row, coefficients, factor):
+    """Σ_k coefficients[k] x^k, one or at least three, times a factor, into a row."""
+    if len(coefficients) == 1:
         for lane in range(width):
-            out[lane] = out[lane] * x[lane] + coefficients[k]
+            Y[row, lane] = coefficients[0] * Y[factor, lane]
+        return
+    c0, c1, c2 = coefficients[-3], coefficients[-2], coefficients[-1]
     for lane in range(width):
-        out[lane] *= factor[lane]
+        Y[row, lane] = (c2 * Y[X, lane] + c1) * Y[X, lane] + c0
+    for k in range(len(coefficients) - 4, -1, -1):
+        for lane in range(width):
+            Y[row, lane] = Y[row, lane] * Y[X, lane] + coefficients[k]
+    for lane in range(width):
+        Y[row, lane] *= Y[factor, lane]
 
 
 @njit(**OPTIONS)
 def step_lanes(kicks, drifts, gradients, x, h, y, out):
-    """`step_each`, `LANES` rows at a time."""
-    Y = empty_lanes()
-    numbers = aligned_zeros(6 * LANES).reshape((6, LANES))
-    X, H, H3, B, G, A = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5]
+    """`step_each`, `LANES` rows at a time.
+
+    All numbers lie in one array: of several the compiler would have to find out that they do not overlap.
+    """
+    Y = aligned_zeros((2 * NDOF + 6) * LANES).reshape((2 * NDOF + 6, LANES))
     for block_start in range(0, y.shape[0], LANES):
         count = min(LANES, y.shape[0] - block_start)
         width = (count + VECTOR - 1) // VECTOR * VECTOR
@@ -151,20 +160,20 @@ def step_lanes(kicks, drifts, gradients, x, h, y, out):
             i = block_start + min(lane, count - 1)
             q, p = unpack(y[i])
             pack_lane(q, p, Y, lane)
-            X[lane], H[lane], H3[lane] = x[i], h[i], h[i] ** 3
+            Y[X, lane], Y[H, lane], Y[H3, lane] = x[i], h[i], h[i] ** 3
         for j in range(len(kicks)):
-            fill_lanes(B, width, kicks[j], X, H)
-            fill_lanes(A, width, drifts[j], X, H)
+            fill_lanes(Y, width, B, kicks[j], H)
+            fill_lanes(Y, width, A, drifts[j], H)
             if FORCE_GRADIENTS and np.any(gradients[j] != 0.0):
-                fill_lanes(G, width, gradients[j], X, H3)
+                fill_lanes(Y, width, G, gradients[j], H3)
                 for lane in range(width):
                     q, p = unpack_lane(Y, lane)
-                    q, p, _, _ = gradient_lane(q, p, None, None, B[lane], G[lane], A[lane])
+                    q, p, _, _ = gradient_lane(q, p, None, None, Y[B, lane], Y[G, lane], Y[A, lane])
                     pack_lane(q, p, Y, lane)
             else:
                 for lane in range(width):
                     q, p = unpack_lane(Y, lane)
-                    q, p, _, _ = plain_lane(q, p, None, None, B[lane], A[lane])
+                    q, p, _, _ = plain_lane(q, p, None, None, Y[B, lane], Y[A, lane])
                     pack_lane(q, p, Y, lane)
         for lane in range(count):
             q, p = unpack_lane(Y, lane)

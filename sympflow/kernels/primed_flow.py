@@ -59,7 +59,7 @@ class PrimedFlowKernel:
     def step(self, h: ArrayLike, y: np.ndarray) -> np.ndarray:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,); its numbers are polynomials in h."""
         h = np.asarray(h, dtype=np.float64)
-        h = np.full(len(y), h) if h.ndim == 0 else h
+        h = h.repeat(len(y)) if h.ndim == 0 else h
         forwards = h > 0
         if forwards.all():
             return self._stepped(h, y, False)
@@ -72,7 +72,8 @@ class PrimedFlowKernel:
         return out
 
     def _stepped(self, t: np.ndarray, y: np.ndarray, back: bool) -> np.ndarray:
-        return self._splitting.step_rows(self._tables.polynomials(back), self._tables.variable(t), t, y)
+        tables = self._tables
+        return self._splitting.step_rows(tables.polynomials(back), tables.force_gradient, tables.variable(t), t, y)
 
     def _kernel(self, h: float) -> Scheme:
         """K_h, or for h < 0 its inverse."""

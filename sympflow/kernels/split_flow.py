@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 
 from sympflow.integrators.linear_splitting import kernel_of
-from sympflow.kernels.parts import KNOWN_TABLES, PartsKernel
+from sympflow.kernels.parts import PartsKernel
 from sympflow.parts import Map
 
 if TYPE_CHECKING:
@@ -28,14 +29,12 @@ class SplitFlowKernel:
     """
 
     def __init__(self, flow: SplitFlow) -> None:
-        if str(flow.dtype) != "torch.float64" or flow.device.type != "cpu":
+        if flow.dtype != torch.float64 or flow.device.type != "cpu":
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
         self.flow = flow
         self._kernel: PartsKernel = kernel_of(flow.parts, PartsKernel)
         self._kernel.source()
-        self._weights = list(flow.parameters())
-        self._known: dict[float, Sequence[Map]] = {}
-        self._known_for: tuple[tuple[int, int], ...] = ()
+        self._frozen = flow.frozen()
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` times ψ̄_h, or for h < 0 the inverse of ψ̄_|h|: see `PartsKernel.run`."""
@@ -52,13 +51,7 @@ class SplitFlowKernel:
 
     def _maps(self, h: np.ndarray) -> Sequence[Map]:
         """The maps of one length, the same object while no weight changes, whose table the loops then know."""
-        weights = tuple((w.data_ptr(), w._version) for w in self._weights)
-        if self._known_for != weights or len(self._known) >= KNOWN_TABLES:
-            self._known, self._known_for = {}, weights
-        t = float(h)
-        if t not in self._known:
-            self._known[t] = self.flow.numpy_maps(h)
-        return self._known[t]
+        return self._frozen.maps(float(h))
 
     def step(self, h: ArrayLike, y: np.ndarray) -> np.ndarray:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""

@@ -152,21 +152,24 @@ class SplittingKernel:
     def step(self, scheme: Scheme, h: ArrayLike, y: np.ndarray) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
         h = np.asarray(h, dtype=np.float64)
-        h = np.full(len(y), h) if h.ndim == 0 else h
-        return self.step_rows(_step_table(scheme), h, h, y)
+        h = h.repeat(len(y)) if h.ndim == 0 else h
+        return self.step_rows(_step_table(scheme), any(scheme.gradients), h, h, y)
 
-    def step_rows(self, table: _Table, x: np.ndarray, h: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def step_rows(self, table: _Table, gradients: bool, x: np.ndarray, h: np.ndarray, y: np.ndarray) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
 
         Parameters
         ----------
         table : kicks, drifts, gradients, ndarrays of shape (m, K)
-            Of the stages, a kick and a drift each, for h = 1: those of row i are Σ_k kicks[:, k] x[i]^k.
+            Of the stages, a kick and a drift each, for h = 1: those of row i are Σ_k kicks[:, k] x[i]^k. In a batch K
+            is 1 or at least 3.
+        gradients : bool
+            Whether there are any.
         """
         y = np.ascontiguousarray(y, dtype=np.float64)
         out = np.empty(y.shape)
         x, h = np.ascontiguousarray(x), np.ascontiguousarray(h)
-        self._loops(bool(table[2].any()), False).step_rows(*table, x, h, y, out)
+        self._loops(gradients, False).step_rows(*table, x, h, y, out)
         return out
 
 

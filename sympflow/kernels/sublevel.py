@@ -16,6 +16,8 @@ from sympflow.system import HamiltonianSystem
 
 __all__ = ["all_within"]
 
+NO_BOUND = 0.0, np.inf
+
 _KERNELS: WeakKeyDictionary[SymbolicHamiltonian, Callable[..., bool] | None] = WeakKeyDictionary()
 
 
@@ -33,7 +35,7 @@ def all_within(system: HamiltonianSystem, domain: EnergySublevel, states: np.nda
     if kernel is None:
         return False
     least, most = -np.inf if domain.above is None else domain.above - slack, domain.energy + slack
-    turning = domain.angular_momentum or (0.0, np.inf)
+    turning = domain.angular_momentum or NO_BOUND
     return kernel(np.ascontiguousarray(states), *domain.bounds(slack), float(least), float(most), *turning)
 
 
