@@ -12,9 +12,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor
+from sympflow.decomposition import exact_parts, linear_and_rest
 from sympflow.integrators.base import FixedStep, Outcome, Problem, rollout
 from sympflow.integrators.schemes import SCHEMES, Scheme
-from sympflow.parts import LINEAR, ExactParts, Map, exact_parts, like, linear_and_rest
+from sympflow.parts import LINEAR, ExactParts, Map, like
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
@@ -130,11 +131,13 @@ def rollout_in_modes(
 ) -> tuple[Array, np.ndarray]:
     """`rollout` by array operations, in the modes from beginning to end."""
     d = parts.ndof
+    start = parts.to_modes(y0)
+    known = parts.prepared(maps, start[0])
 
     def step(k: int, z: Array) -> Array:
-        return concatenate(parts.apply(maps, z[..., :d], z[..., d:]))
+        return concatenate(parts.apply(known, z[..., :d], z[..., d:]))
 
-    modes, finite = rollout(step, concatenate(parts.to_modes(y0)), n_steps, save)
+    modes, finite = rollout(step, concatenate(start), n_steps, save)
     states = parts.from_modes(modes[..., :d], modes[..., d:])
     if len(save) and save[0] == 0:
         states = concatenate_first(y0, states)

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from sympflow.kernels.modules import NEVER, OPTIONS, load_module, run_one, run_rows, template
-from sympflow.kernels.parts_codegen import IDLE, WITH_GRADIENT, parts_source, row_width
+from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source, row_width
 from sympflow.parts import LINEAR, ExactParts, Map, PartFunctions
+from sympflow.shears import shears
 
 __all__ = ["PartsKernel"]
 
 ONE = np.ones(1, dtype=np.int64)
-EPS = float(np.finfo(float).eps)
 KNOWN_TABLES = 64  # run tables that are kept: those of the steps in use
 
 Maps = Callable[[np.ndarray], Sequence[Map]]
@@ -34,10 +34,10 @@ class _Loops:
 class PartsKernel:
     """Compiled loops over the maps of any splitting of one system; states are [q, p], float64.
 
-    Rounding cannot make the linear part drift off resonance: its modes rotate by three shears, each with determinant 1
-    whatever its number, by at most a quarter turn, after an exact half turn where that is needed; the run stays in the
-    modes. Whole and half turns are exact. Near them, and at other simple fractions of 2π, the state comes back to
-    nearly the same numbers, whose rounding repeats: the energy then drifts, by up to 4e-16 of it with each step.
+    The linear part's modes rotate by three shears, each with determinant 1 whatever its number, by at most an eighth of
+    a turn, after exact quarter turns; the run stays in the modes. So rounding is none at whole quarter turns, and a
+    random walk elsewhere, but at some simple fractions of a turn, such as a sixth: the state comes back to nearly
+    the same numbers, whose rounding repeats, and the energy drifts by up to 5e-17 of it with each step.
 
     Parameters
     ----------
@@ -53,6 +53,7 @@ class PartsKernel:
         self._plain: str | None = None
         self._moved = bool(np.any(parts.center))
         self._scale = np.concatenate([np.diag(parts.C), np.diag(parts.inverse_C)])
+        self._unscale = np.concatenate([np.diag(parts.inverse_C), np.diag(parts.C)])
         self._tables: dict[int, tuple[Sequence[Map], tuple[np.ndarray, np.ndarray], _Loops]] = {}
 
     def run(self, maps: Maps, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
@@ -113,6 +114,8 @@ class PartsKernel:
         return self._plain
 
     def _modes(self, y: np.ndarray) -> np.ndarray:
+        if self.parts.diagonal and not self._moved:
+            return np.ascontiguousarray(np.asarray(y, dtype=np.float64) * self._unscale)
         return np.ascontiguousarray(np.concatenate(self.parts.to_modes(np.asarray(y, dtype=np.float64)), axis=-1))
 
     def _states(self, modes: np.ndarray, save: np.ndarray | None = None, y0: np.ndarray | None = None) -> np.ndarray:
@@ -148,11 +151,11 @@ class PartsKernel:
     def _table(self, sequence: Sequence[Map], n: int) -> tuple[np.ndarray, np.ndarray]:
         """Codes (m,) and coefficients (n, m, W)."""
         codes, tables = np.empty(len(sequence), dtype=np.int64), np.zeros((n, len(sequence), row_width(self.parts)))
-        F = self.parts.n_classes
+        F = TURN_WIDTH * self.parts.n_classes
         for j, m in enumerate(sequence):
             codes[j] = m.part + WITH_GRADIENT * has_gradient(m)
             if m.part == LINEAR:
-                tables[:, j, : 4 * F] = self._turns(np.asarray(m.length)).reshape(-1, 4 * F)
+                tables[:, j, :F] = self._turns(np.asarray(m.length)).reshape(-1, F)
                 continue
             tables[:, j, 0], tables[:, j, 1] = m.length, m.gradient
             if m.filters is not None:
@@ -161,26 +164,12 @@ class PartsKernel:
         return codes, tables
 
     def _turns(self, s: np.ndarray) -> np.ndarray:
-        """What turns each frequency by Ω s, (..., F, 4): tan(r/2), sin r, the sign s of a half turn, s tan(r/2)."""
+        """What turns each frequency by Ω s, (..., F, 6): t, σ, c and d of `shears`, c − td and d + tc."""
         linear = self.parts.linear
         assert linear is not None
-        out = np.zeros((*s.shape, 4))
-        for f, j in enumerate(linear.representatives):
-            kind, theta = linear.kinds[j], linear.rates[j] * s[..., f]
-            if kind == "oscillator":
-                angle = np.arctan2(np.sin(theta), np.cos(theta))  # exact reduction, of angles of any size
-                halves = np.rint(angle / np.pi)
-                r, sign = angle - halves * np.pi, np.where(halves == 0, 1.0, -1.0)
-                # what rounding of Ω s leaves of a whole or half turn is none: its shears would round one way each step
-                r = np.where(np.abs(r) <= 4 * EPS * np.abs(theta), 0.0, r)
-                values: tuple[Any, ...] = np.tan(r / 2), np.sin(r), sign, sign * np.tan(r / 2)
-            elif kind == "hyperbolic":
-                values = np.tanh(theta / 2), -np.sinh(theta), 1.0, np.tanh(theta / 2)
-            else:
-                values = theta, 0.0, 1.0, 0.0
-            for i, value in enumerate(values):
-                out[..., f, i] = value
-        return out
+        kinds = [linear.kinds[j] for j in linear.representatives]
+        t, sigma, c, d = shears(kinds, linear.rates[linear.representatives], s)
+        return np.stack([t, sigma, c, d, c - t * d, d + t * c], axis=-1)
 
     def _run_table(self, sequence: Sequence[Map]) -> tuple[np.ndarray, np.ndarray]:
         """Codes and rows of [opening, inner …, link, closing]: see `parts_loops`."""

@@ -15,12 +15,13 @@ from sympflow.symbolic import printable
 __all__ = ["IDLE", "WITH_GRADIENT", "parts_source", "row_width"]
 
 IDLE = -1  # code of no map
+TURN_WIDTH = 6  # numbers that turn a frequency
 WITH_GRADIENT = 100  # added to the code of a part that carries a force gradient
 
 
 def row_width(parts: ExactParts) -> int:
-    """Numbers that a map may need: four for each frequency, or a weight, a force gradient and the filters of modes."""
-    return max(4 * parts.n_classes, 2 + parts.ndof)
+    """Numbers that a map may need: six for each frequency, or a weight, a force gradient and the filters of modes."""
+    return max(TURN_WIDTH * parts.n_classes, 2 + parts.ndof)
 
 
 def parts_source(parts: ExactParts, filters: bool, gradients: bool) -> str:
@@ -71,18 +72,21 @@ def _dispatch_lanes(calls: Sequence[tuple[int, str]], row: str) -> str:
 
 
 def _linear(parts: ExactParts) -> str:
-    """Rotations by three shears after a half turn or none (a sign), hyperbolic ones likewise, drifts."""
+    """Rotations by three shears after exact quarter turns, hyperbolic ones by shears alone, drifts."""
     assert parts.linear is not None
     d = parts.ndof
     lines = ["@njit(**OPTIONS, forceinline=True)", "def linear(x, y, c):", *_unpacked(d)]
     for j, (kind, f) in enumerate(zip(parts.linear.kinds, parts.linear.classes.tolist(), strict=True)):
-        t, s, sign, signed_t = (f"c[{4 * f + i}]" for i in range(4))
+        t, s, c, d_, a, b = (f"c[{TURN_WIDTH * f + i}]" for i in range(TURN_WIDTH))
         if kind == "free":
-            lines.append(f"    x_{j} += {t} * y_{j}")
-        elif kind != "idle":
+            lines.append(f"    x_{j} += 2.0 * {t} * y_{j}")
+        elif kind == "hyperbolic":
+            lines += [f"    x_{j} += {t} * y_{j}", f"    y_{j} -= {s} * x_{j}", f"    x_{j} += {t} * y_{j}"]
+        elif kind == "oscillator":  # of each pair of products that are added first, one is 0 and the other exact
             lines += [
-                f"    x_{j} = {sign} * x_{j} + {signed_t} * y_{j}",
-                f"    y_{j} = {sign} * y_{j} - {s} * x_{j}",
+                f"    turned_{j} = {c} * y_{j} - {d_} * x_{j}",
+                f"    x_{j} = {a} * x_{j} + {b} * y_{j}",
+                f"    y_{j} = turned_{j} - {s} * x_{j}",
                 f"    x_{j} += {t} * y_{j}",
             ]
     return "\n".join([*lines, _returned(d)])
