@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from sympflow import max_energy_error, shipped_flows, solve
 from sympflow.flow.io import load, shipped
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.sympflow import SympFlow
@@ -52,6 +53,24 @@ def test_shipped_baselines_compare(name):
     flow, baseline = (load(pretrained.path(name, kind)) for kind in networks.KINDS)
     assert abs(baseline.n_parameters - flow.n_parameters) <= 0.02 * flow.n_parameters
     assert RECIPES[name].measure(baseline, steps=1)["error_1"] <= 1e-3
+
+
+@pytest.mark.parametrize("scene", RECIPES)
+def test_shipped_sympflows_stay_for_a_hundred_thousand_steps(scene):
+    """No neuron has a slope that the figures, of 1000 steps, do not see, but a long orbit meets."""
+    system = RECIPES[scene].system
+    y0 = [0.0, 0.1, 0.35, 0.0] if scene == "henon_heiles" else system.y0  # a regular orbit
+    flow = load(pretrained.path(scene, "sympflow"))
+    sol = solve(system, flow, (0.0, 1e5 * flow.dt), y0=y0, save_every=100, on_domain_exit="ignore")
+    assert max_energy_error(sol) <= 1e-4
+
+
+def test_every_shipped_sympflow_has_its_certificate():
+    """But for those in another time, whose H has another flow."""
+    for entry in (e for e in shipped_flows(kind="sympflow") if "-log-" not in e.name):
+        flow = load(entry.path)
+        assert flow.certified is not None, entry.name
+        assert flow.certified.delta.largest > 0
 
 
 def test_no_shipped_flow():
