@@ -39,7 +39,8 @@ def not_applicable(integrator):
 @pytest.mark.parametrize("name", available())
 @pytest.mark.filterwarnings("ignore:Functional iteration did not converge")
 def test_built_in_methods_pass_and_skip_only_what_has_no_meaning(name):
-    integrator = get(name)(**({"rtol": 1e-4, "atol": 1e-6} if name in ADAPTIVE else {}))
+    loose = 1e-3 if name == "adaptive_heun" else 1e-4  # of order 2: else it takes many times the others' steps
+    integrator = get(name)(**({"rtol": loose, "atol": loose / 100} if name in ADAPTIVE else {}))
     assert set(check_integrator(lambda: integrator).skipped) == not_applicable(integrator)
 
 
