@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from sympflow import HamiltonianSystem, SympFlow, get, max_energy_error, solve, systems, time_transformed
+from sympflow import HamiltonianSystem, SympFlow, get, load, max_energy_error, solve, systems, time_transformed
+from sympflow.flow.clocked import ClockedFlow
+from sympflow.flow.shipped import choose
 from sympflow.integrators.checks import check_integrator
 from sympflow.integrators.logarithmic import LogSympFlow
 from sympflow.systems.kepler import kepler_ellipse
+from sympflow.time_transformation import lifted
+from sympflow.training.clock_fit import train_clock
 
 METHODS = ("log_leapfrog", "log_blanes_moan4", "log_kahan_li8")
 EPS = np.finfo(float).eps
@@ -164,3 +168,94 @@ def test_a_sympflow_on_the_transformed_system_runs_in_physical_time():
         solve(kepler, LogSympFlow(flow=flow, dt=0.03), (0.0, 1.0))
     with pytest.raises(ValueError, match=r"^`flow` is needed"):
         solve(kepler, LogSympFlow(), (0.0, 1.0))
+
+
+# flows with a trained clock ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def clocked():
+    return train_clock(systems.kepler(), 1.0)
+
+
+def rows(n=5):
+    kepler = systems.kepler()
+    return lifted(kepler, kepler.domain.sample(n, 7), 0.0)
+
+
+def test_the_clock_learns_how_late_the_leapfrog_is(clocked):
+    """2 z³ a^(3/2) (1/3 − z²/5 + z⁴/7 − …), z = s/(2√a), a = 1/(2B): the time that it is ahead of 2 arctan z."""
+    np.testing.assert_allclose(clocked.clock.numbers[:3], [-1 / 12, 1 / 40, -1 / 112], rtol=1e-4)
+    assert clocked.figures["one_step_error_max"] < 1e-11  # labels to 1e-13, times the speed near the pericentre
+    assert clocked.figures["fractional_error"] <= clocked.figures["one_step_error"]
+
+
+def test_a_clocked_flow_is_the_flow_of_its_hamiltonian(clocked):
+    s, x = torch.tensor(0.7, dtype=torch.float64), torch.from_numpy(rows())
+    end, velocity = clocked.psi_and_velocity(s, x)
+    z = end.detach().requires_grad_(True)
+    (slope,) = torch.autograd.grad(clocked.hamiltonian(s, z).sum(), z)
+    expected = torch.cat([slope[:, 3:], -slope[:, :3]], dim=-1)
+    torch.testing.assert_close(velocity, expected, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(clocked.psi_inverse(s, end), x, rtol=1e-12, atol=1e-12)
+
+
+def test_compiled_clocks_agree_with_the_layers(clocked):
+    x, kernel = rows(), clocked.kernel_for(clocked.system)
+    s = np.array([0.1, 0.4, 0.7, 0.9, 1.0])
+    with torch.no_grad():
+        there = clocked.psi(torch.from_numpy(s), torch.from_numpy(x)).numpy()
+        back = clocked.psi_inverse(torch.from_numpy(s), torch.from_numpy(x)).numpy()
+        two = clocked.psi(0.5, clocked.psi(0.5, torch.from_numpy(x))).numpy()
+    np.testing.assert_allclose(kernel.step(s, x), there, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(kernel.step(-s, x), back, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(kernel.run_batch(0.5, x, 2, np.array([2]))[0][:, 0], two, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(kernel.run(0.5, x[0], 2, np.array([2]))[0][0], two[0], rtol=1e-13, atol=1e-13)
+
+
+def test_it_is_right_in_the_physical_time(clocked):
+    e, kepler = 0.6, systems.kepler()
+    anomaly = np.linspace(0.0, 40 * np.pi, 61)
+    times = anomaly - e * np.sin(anomaly)
+    sol = solve(kepler, LogSympFlow(flow=clocked), (0.0, times[-1]), t_eval=times)
+    # rounding in t, 1e-14 a step, times the largest speed, 2, and acceleration, 6
+    np.testing.assert_allclose(sol.y.T, kepler_ellipse(e, anomaly), rtol=0, atol=1e-11)
+    dense = solve(kepler, LogSympFlow(flow=clocked), (0.0, times[-1]), dense_output=True)
+    np.testing.assert_allclose(dense.sol(times).T, kepler_ellipse(e, anomaly), rtol=0, atol=1e-11)
+
+
+def test_a_tolerance_takes_it_where_it_is_the_faster_one():
+    kepler = systems.kepler()
+    assert choose(kepler, tol=1e-8, transformed=True).shift == 0.0
+    assert choose(kepler, tol=1e-8).shift is None
+    long = solve(kepler, "sympflow", (0.0, 2000.0), tol=1e-8, t_eval=[1000.0, 2000.0])
+    assert long.integrator.name == "log_sympflow"
+    assert max_energy_error(long) < 1e-12
+    for options in ({"t_span": (0.0, 1.0)}, {"t_span": (0.0, 2000.0), "compensated": True, "t_eval": [2000.0]}):
+        assert solve(kepler, "sympflow", tol=1e-8, **options).integrator.name == "sympflow"
+    tensor = torch.as_tensor(kepler.y0)
+    assert isinstance(solve(kepler, "sympflow", (0.0, 0.1), y0=tensor, tol=1e-8).y, torch.Tensor)
+    with pytest.raises(ValueError, match=r"^`y0` is outside the domain"):
+        solve(kepler, "sympflow", (0.0, 2000.0), y0=systems.kepler(0.1).y0, tol=1e-8)
+
+
+def test_clocked_flows_are_kept_in_files(clocked, tmp_path):
+    clocked.save(tmp_path / "f.safetensors")
+    with pytest.raises(ValueError, match=r"^`flow` is primed with the V and T"):
+        load(tmp_path / "f.safetensors").psi(0.5, torch.from_numpy(rows()))
+    flow = load(tmp_path / "f.safetensors", system=time_transformed(systems.kepler()))
+    x = torch.from_numpy(rows())
+    assert torch.equal(flow.psi(0.5, x), clocked.psi(0.5, x))
+    with pytest.raises(ValueError, match=r"^`system` 'kepler'"):
+        load(tmp_path / "f.safetensors", system=systems.kepler())
+
+
+def test_schemes_and_systems_without_a_clock_are_refused():
+    with pytest.raises(ValueError, match=r"^`scheme` 'chin4a' is not a symmetric one without force gradients"):
+        ClockedFlow(3, "chin4a")
+    with pytest.raises(ValueError, match=r"^`system` is no logarithmic Hamiltonian"):
+        ClockedFlow(2, system=systems.kepler())
+    with pytest.raises(ValueError, match=r"^`terms` must be a positive integer"):
+        ClockedFlow(3, terms=0)
+    with pytest.raises(ValueError, match=r"^`system` 'plain' has no domain"):
+        train_clock(HamiltonianSystem.from_sympy("p**2/2 - 1/sqrt(1 + q**2)", y0=[1, 0], name="plain"), 0.1)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torch import Tensor
 
-from sympflow.flow.coefficients import Entry
 from sympflow.flow.potentials import Potential, Time
 from sympflow.forward_mode import jvp
 
@@ -42,6 +41,16 @@ class Binding:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Binding:
         return Binding(self._system)
+
+
+class Factor(Protocol):
+    """A function of t that vanishes at 0."""
+
+    def value(self, t: Time) -> Time: ...
+
+    def rate(self, t: Time) -> Time:
+        """Its derivative."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -91,11 +100,11 @@ class PrimedPotential(Potential):
     ----------
     ndof : int
     binding : Binding
-    terms : sequence of (Term, Entry)
-        U_j, and c_j as an entry of a table.
+    terms : sequence of (Term, Factor)
+        U_j, and c_j, for instance an entry of a table.
     """
 
-    def __init__(self, ndof: int, binding: Binding, terms: list[tuple[Term, Entry]]) -> None:
+    def __init__(self, ndof: int, binding: Binding, terms: Sequence[tuple[Term, Factor]]) -> None:
         super().__init__()
         self.ndof, self.binding = ndof, binding
         self._terms = terms

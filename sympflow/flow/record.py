@@ -11,6 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 
 from sympflow.flow.base import MAX_DT, MIN_DT, FlowMap
+from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.layers import LAYERS
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.potentials import MLPPotential
@@ -74,6 +75,8 @@ def build(record: dict[str, Any], dtype: torch.dtype) -> FlowMap:
             return MLPFlow(ndof, hidden, str(plan.get("activation")), dt, dtype)
         if "split" in plan:
             return _split(ndof, plan["split"], dt, dtype)
+        if "clocked" in plan:
+            return _clocked(ndof, plan["clocked"], dt, dtype)
         if "primed" in plan:
             return _primed(ndof, plan["primed"], dt, dtype)
         layers = plan.get("layers")
@@ -109,6 +112,14 @@ def _primed(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> PrimedFlow:
         processor = _integer(processor, "processor", MAX_LAYERS)
     shape = (plan["first"], maps, degree, plan["palindromic"], plan["force_gradient"])
     return PrimedFlow(ndof, *shape, dt, processor=processor, dtype=dtype)
+
+
+def _clocked(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> ClockedFlow:
+    """A flow with a trained clock, which `bind` will give its system."""
+    if not isinstance(plan, dict) or not isinstance(plan.get("scheme"), str):
+        raise Refused("its scheme is missing")
+    terms = _integer(plan.get("terms"), "number of terms", MAX_DEGREE)
+    return ClockedFlow(ndof, plan["scheme"], terms, dt, dtype=dtype)
 
 
 def _split(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> SplitFlow:

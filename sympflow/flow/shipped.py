@@ -48,6 +48,9 @@ class ShippedFlow:
     one_step_error, fractional_error : float or None
         Means over held-out states: at Δt, and over 50 times before it.
     training_seconds : float or None
+    shift : float or None
+        Of a flow on the logarithmic Hamiltonian of `system`, see `sympflow.time_transformed`; `dt` is then the physical
+        length of its step, and its errors are those in the physical time. None for a flow of the system itself.
     path : Path
     """
 
@@ -63,6 +66,7 @@ class ShippedFlow:
     one_step_error: float | None
     fractional_error: float | None
     training_seconds: float | None
+    shift: float | None
     path: Path = field(repr=False)
     fingerprint: tuple[float, ...] = field(repr=False)
 
@@ -71,11 +75,13 @@ class ShippedFlow:
         """What the header of a file tells."""
         record = _record(path)
         figures, plan = record["figures"], record["architecture"].get("primed")
+        origin = record["recipe"].get("transforms")  # of a flow in another time, the system that it is for
+        of = record if origin is None else origin
         return cls(
             name=path.stem,
             kind=record["kind"],
-            system=record["system"],
-            dt=record["dt"],
+            system=of["system"],
+            dt=record["dt"] if origin is None else figures["step"],
             stages=None if plan is None else (plan["maps"] + (plan["first"] == "kick")) // 2,
             processor=0 if plan is None else plan.get("processor", 0),
             cost=figures.get("cost"),
@@ -84,15 +90,20 @@ class ShippedFlow:
             one_step_error=figures.get("one_step_error"),
             fractional_error=figures.get("fractional_error"),
             training_seconds=figures.get("training_seconds"),
+            shift=None if origin is None else origin["shift"],
             path=path,
-            fingerprint=tuple(math.nan if v is None else v for v in record["fingerprint"]),
+            fingerprint=tuple(math.nan if v is None else v for v in of["fingerprint"]),
         )
 
     def load(self, system: HamiltonianSystem | None = None) -> Any:
         """The flow itself; see `sympflow.load`."""
         from sympflow.flow.io import load
 
-        return load(self.path, system=system)
+        if system is None or self.shift is None:
+            return load(self.path, system=system)
+        from sympflow.time_transformation import time_transformed
+
+        return load(self.path, system=time_transformed(system, self.shift))
 
 
 class ShippedFlows(Sequence[ShippedFlow]):
@@ -111,6 +122,7 @@ class ShippedFlows(Sequence[ShippedFlow]):
         """A row of text for each: see `HEADINGS`."""
         for f in self._flows:
             architecture = f.kind if f.stages is None else f"primed, {f.stages} kicks"
+            architecture = architecture if f.shift is None else "logarithmic, with a clock"
             architecture += f", processor {f.processor}" if f.processor else ""
             until = "" if f.t_end is None else f" (T = {f.t_end:g})"
             yield (
@@ -176,11 +188,13 @@ def shipped_flows(system: HamiltonianSystem | None = None, kind: str | None = No
     return ShippedFlows(sorted(found, key=lambda f: (f.system, math.inf if f.cost is None else f.cost)))
 
 
-def choose(system: HamiltonianSystem, kind: str = "sympflow", tol: float | None = None) -> ShippedFlow:
+def choose(
+    system: HamiltonianSystem, kind: str = "sympflow", tol: float | None = None, transformed: bool = False
+) -> ShippedFlow:
     """The flow that `solve` takes: with `tol` the cheapest whose energy error is at most that.
 
     Without `tol` it is the network that ships for the system, or else the cheapest of its primed flows that reaches
-    1e-6, or else the most accurate of them.
+    1e-6, or else the most accurate of them. Flows in another time are among those only if `transformed`.
 
     Raises
     ------
@@ -189,7 +203,7 @@ def choose(system: HamiltonianSystem, kind: str = "sympflow", tol: float | None 
     """
     if tol is not None and not (isinstance(tol, Real) and not isinstance(tol, bool) and 0 < tol < math.inf):
         raise ValueError(f"`tol` must be a positive number, a relative energy error; got {tol!r}.")
-    own = shipped_flows(system, kind)
+    own = ShippedFlows([f for f in shipped_flows(system, kind) if transformed or f.shift is None])
     if not own:
         there = ", ".join(f.name for f in shipped_flows(kind=kind))
         raise ValueError(
@@ -208,6 +222,15 @@ def choose(system: HamiltonianSystem, kind: str = "sympflow", tol: float | None 
             "it, or train a flow and pass flow=flow."
         )
     return able[0]
+
+
+def forces_saved(flow: ShippedFlow, system: HamiltonianSystem, tol: float) -> float:
+    """How many forces a unit of time less a flow takes than the cheapest of those in the system's own time."""
+    try:
+        plain = choose(system, flow.kind, tol)
+    except ValueError:
+        return math.inf
+    return (plain.cost or 0.0) - (flow.cost or 0.0)
 
 
 def _error(flow: ShippedFlow) -> float:

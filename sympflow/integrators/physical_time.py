@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from sympflow.integrators.logarithmic import Logarithmic
 
 LARGEST_CHUNK = 2**20  # numbers in one chunk of states
+FIRST_CHUNK = 4096  # steps, at most, before it is known how fast time goes
+LONGEST_STRIDE = 64  # steps from one state that is kept to the next, where few outputs are wanted
 MOST_KEPT = 100_000_000  # numbers that a run may store where every step is an output
 
 
@@ -25,10 +27,7 @@ def reach(
     target: np.ndarray,
     guess: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The states step(σ), σ from 0 to `longest`, whose time is `target`, and σ: Newton's method within brackets.
-
-    The slope dt/ds = 1/(T + B) is that of the exact flow at the end of the step, so a few iterations reach rounding.
-    """
+    """The states step(σ), σ from 0 to `longest`, whose time is `target`, and σ: the secant method within brackets."""
     d = start.shape[1] // 2 - 1
     eps = float(np.finfo(start.dtype).eps)
     tolerance = 2 * eps * np.maximum(np.abs(target), np.abs(start[:, d]))
@@ -36,6 +35,7 @@ def reach(
     sign = np.sign(longest)
     sigma = np.where((guess - low) * sign < 0, low, np.where((guess - high) * sign > 0, high, guess))
     best, best_sigma, best_residual = start.copy(), np.zeros_like(sigma), np.abs(start[:, d] - target)
+    last_sigma, last_t = np.zeros_like(sigma), start[:, d].copy()
     for _ in range(80):
         x = step(sigma)
         residual = x[:, d] - target
@@ -45,12 +45,12 @@ def reach(
             break
         beyond = ~(residual * sign < 0)  # NaN counts as too far
         high, low = np.where(beyond, sigma, high), np.where(beyond, low, sigma)
-        # dt/ds by the chord of the step so far: exact enough, and needs nothing but the step
-        slope = (x[:, d] - start[:, d]) / sigma
+        slope = (x[:, d] - last_t) / (sigma - last_sigma)  # the first time of the chord of the step so far
         rate = np.where(np.isfinite(slope) & (slope > 0), slope, np.inf)
-        newton = sigma - residual / rate
-        inside = ((newton - low) * sign > 0) & ((high - newton) * sign > 0)
-        sigma = np.where(inside & np.isfinite(newton), newton, (low + high) / 2)
+        secant = sigma - residual / rate
+        inside = ((secant - low) * sign > 0) & ((high - secant) * sign > 0)
+        last_sigma, last_t = sigma, x[:, d].copy()
+        sigma = np.where(inside & np.isfinite(secant), secant, (low + high) / 2)
     best[best_residual > np.maximum(1e-3 * np.abs(target - start[:, d]), 100 * tolerance)] = np.nan  # no such σ
     return best, best_sigma
 
@@ -83,43 +83,55 @@ class PhysicalRun:
         self.n_steps = np.zeros(len(rows), dtype=int)
         self.n_extra, self.backend = 0, ""
         self.failed_at = np.full(len(rows), np.nan)
-        self.stalled = False
+        self.stalled, self.stride = False, 1
 
     def chunks(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Chunks of states (N, n + 1, 2d + 2) and for each trajectory the steps (N,) of it that belong to the run.
-
-        The last step of a trajectory is the one that reaches or passes the end.
+        """Chunks of states (N, n + 1, 2d + 2), `self.stride` steps apart, and for each trajectory the last (N,) of them
+        that belongs to the run: the one that reaches or passes the end.
         """
-        x, n, total = self.start, 16, 0
+        x, total = self.start, 0
+        n = self._chunk(1.02 * self.length / self.integrator.step_length(self.system) + 2, FIRST_CHUNK)
         running = np.full(len(x), self.length > 0)
         while running.any():
-            piece = Problem(self.transformed, 0.0, self.h * n, x[running], backend=self.problem.backend)
-            found, finite, self.backend = self.inner.rollout(piece, self.h, n, np.arange(n + 1))
-            states = np.repeat(x[:, None], n + 1, axis=1)
-            states[running] = np.moveaxis(np.asarray(found), 0, 1)
-            good = np.zeros(len(x), dtype=int)
-            good[running] = np.minimum(finite, n)
+            states, good = x[:, None].repeat(n + 1, axis=1), np.zeros(len(x), dtype=int)
+            states[running], finite = self._steps(x[running], n * self.stride, self.stride)
+            good[running] = np.minimum(finite // self.stride, n)
             t = self.sign * states[..., self.d]
             forward = np.isfinite(t) & (np.maximum.accumulate(np.where(np.isfinite(t), t, np.inf), axis=1) <= t)
             good = np.minimum(good, np.where(forward.all(1), n, np.argmin(forward, axis=1) - 1))  # time must not turn
             passed = (t >= self.length) & (np.arange(n + 1) <= good[:, None])
             last = np.where(passed.any(1), passed.argmax(1), good)
             last[~running] = 0
-            self.n_steps += last
-            total += n
             lost = running & ~passed.any(1) & (good < n)
-            rows = np.arange(len(x))
-            self.stalled = total > self.most_steps
+            self.stalled = total + n * self.stride > self.most_steps
             if self.stalled:
                 lost |= running & ~passed.any(1)
+            if self.stride > 1 and lost.any():  # step by step, to see where
+                n, self.stride = min(n * self.stride, FIRST_CHUNK), 1
+                n = self._chunk(n, n)
+                continue
+            self.n_steps += self.stride * last
+            total += n * self.stride
+            rows = np.arange(len(x))
             self.failed_at[lost] = self.problem.t0 + self.sign * t[rows, last][lost]
             yield states, last
-            pace = np.nanmin(np.where(running, (t[rows, last] - t[:, 0]) / np.maximum(last, 1), np.nan))
+            pace = np.nanmin(np.where(running, (t[rows, last] - t[:, 0]) / np.maximum(last, 1), np.nan)) / self.stride
             running = running & ~passed.any(1) & ~lost
             x = states[rows, last]
-            most = max(16, LARGEST_CHUNK // (len(x) * x.shape[1]))
             left = (self.length - t[rows, last][running]).max(initial=0.0)
-            n = int(min(max(16, 1.02 * left / pace + 2 if pace > 0 else 2 * n), 4 * n, most))
+            n = self._chunk(1.02 * left / pace + 2 if pace > 0 else np.inf, 4 * n * self.stride)
+
+    def _chunk(self, steps: float, most: int) -> int:
+        """How many states of a chunk so many steps are, or the most that there may be."""
+        kept = max(16, LARGEST_CHUNK // (self.start.size))
+        return int(min(max(16, min(steps, most) / self.stride), kept))
+
+    def _steps(self, x: np.ndarray, n: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
+        """Of n steps from the states x (N, 2d + 2) each `stride`-th, (N, 1 + n/stride, 2d + 2), and the last finite."""
+        alone = len(x) == 1
+        piece = Problem(self.transformed, 0.0, self.h * n, x[0] if alone else x, backend=self.problem.backend)
+        found, finite, self.backend = self.inner.rollout(piece, self.h, n, np.arange(0, n + 1, stride))
+        return (found[None] if alone else np.moveaxis(found, 0, 1)), np.atleast_1d(finite)
 
     def reach(self, before: np.ndarray, after: np.ndarray, target: np.ndarray) -> np.ndarray:
         """States [q, t, p, B] at the elapsed times `target`, within the steps from `before` to `after`."""
@@ -152,6 +164,9 @@ class PhysicalRun:
         out[at_start] = projected(self.start)
         delivered = np.full(N, int(at_start.sum()))
         kept: list[tuple[np.ndarray, np.ndarray]] = []
+        if times is not None and not problem.dense_output:  # what few outputs do not need is not kept
+            steps = self.length / self.integrator.step_length(self.system) / (len(wanted) + 1)
+            self.stride = int(min(max(1.0, steps**0.5), LONGEST_STRIDE))
         for states, last in self.chunks():
             if problem.dense_output or times is None:
                 kept.append((states, last))
@@ -207,19 +222,39 @@ class PhysicalRun:
         self, states: np.ndarray, last: np.ndarray, wanted: np.ndarray, delivered: np.ndarray, out: np.ndarray
     ) -> None:
         """The outputs that fall into a chunk."""
-        due: list[tuple[int, np.ndarray, np.ndarray]] = []
-        for i in np.flatnonzero(last).tolist():
-            t = self.sign * states[i, : last[i] + 1, self.d]
-            end = int(np.searchsorted(self.sign * wanted, t[-1], side="right"))
-            if end > delivered[i]:
-                chosen = np.arange(delivered[i], end)
-                due.append((i, chosen, np.searchsorted(t, self.sign * wanted[chosen], side="left").clip(1) - 1))
-                delivered[i] = end
-        if due:
-            row = np.concatenate([np.full(len(chosen), i) for i, chosen, _ in due])
-            output = np.concatenate([chosen for _, chosen, _ in due])
-            k = np.concatenate([steps for _, _, steps in due])
-            out[output, row] = projected(self.reach(states[row, k], states[row, k + 1], wanted[output]))
+        t = self.sign * states[..., self.d]
+        ahead = t[np.arange(len(t)), last]
+        end = np.where(last > 0, np.searchsorted(self.sign * wanted, ahead, side="right"), delivered)
+        count = np.maximum(end - delivered, 0)
+        ended = np.flatnonzero((last > 0) & (ahead >= self.length))
+        row = np.repeat(np.arange(len(t)), count)
+        output = np.arange(len(row)) - np.repeat(np.cumsum(count) - count - delivered, count)
+        due = self.sign * wanted[output]
+        if len(row) <= len(t):  # few outputs of many trajectories
+            k = (np.where(np.arange(t.shape[1]) <= last[row, None], t[row], np.inf) >= due[:, None]).argmax(1)
+        else:
+            k = np.concatenate([t[i, : last[i] + 1].searchsorted(due[row == i]) for i in np.flatnonzero(count)])
+        k = k.clip(1) - 1
+        delivered += count
+        target = wanted[output]
+        if self.stride > 1 and (len(row) or len(ended)):
+            rows, ks = np.append(row, ended).astype(int), np.append(k, last[ended] - 1).astype(int)
+            targets = np.append(target, np.full(len(ended), self.sign * self.length, target.dtype))
+            before, after, step = self._between(states[rows, ks], targets)
+            self.n_steps[ended] += step[len(row) :] + 1 - self.stride
+            before, after = before[: len(row)], after[: len(row)]
+        else:
+            before, after = states[row, k], states[row, k + 1]
+        if len(row):
+            out[output, row] = projected(self.reach(before, after, target))
+
+    def _between(self, x: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of `stride` steps from x (n, 2d + 2), the states before and after the one that passes a time, and which."""
+        states, _ = self._steps(x, self.stride, 1)
+        beyond = self.sign * (states[..., self.d] - target[:, None]) >= 0
+        k = np.where(beyond.any(1), beyond.argmax(1), self.stride).clip(1) - 1
+        rows = np.arange(len(x))
+        return states[rows, k], states[rows, k + 1], k
 
     def _every_step(self, path: _Path | None) -> tuple[np.ndarray, np.ndarray]:
         """Times and states (n, 1, 2d) of every `save_every`-th step of a single trajectory, and of the end."""

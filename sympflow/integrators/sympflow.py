@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from sympflow.kernels.primed_flow import PrimedFlowKernel
 
 
+SEARCH, SEARCH_OF_EACH = 50_000, 2_000
+"""Forces that take as long as finding the outputs of a run, or of each trajectory in a batch, by their times."""
+
 _SHIPPED: dict[tuple[Any, ...], Any] = {}  # read from their files once in a process
 
 
@@ -136,7 +139,7 @@ class FlowIntegrator(FixedStep):
         if self.flow is None:  # the shipped one, from here on
             chosen: dict[str, Any] = {"flow": self._flow_like(problem.system, problem.y0)}
             if self._tolerance is not None:
-                compiled = _kernel(problem.system, chosen["flow"], problem.y0, problem.backend) is not None
+                compiled = problem.backend != "array" and not is_tensor(problem.y0)
                 _check_start(chosen["flow"], problem.system, problem.y0, compiled)
             return replace(self, **chosen, **({} if self._tolerance is None else {"tol": None})).run(problem)
         return super().run(problem)
@@ -266,21 +269,25 @@ class SympFlowIntegrator(FlowIntegrator):
             if getattr(self, name) is not None:
                 raise ValueError(f"`tol` chooses the flow and its Δt, but `{name}` is given: leave out one of them.")
 
-    def resolved(self, system: HamiltonianSystem, y0: Array) -> FixedStep:
-        """What runs: with `tol` the cheapest flow may be one in another time, whose runs `LogSympFlow` drives."""
+    def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> FixedStep:
+        """What runs: with `tol`, and over a `length` that is worth it, a flow in another time, by `LogSympFlow`."""
         if self.tol is None or self.compensated or is_tensor(y0) or y0.dtype != np.float64:
             return self
         key = ("in another time", self.name, system.fingerprint, self.tol)
         if key not in _SHIPPED:
-            from sympflow.flow.shipped import choose
+            from sympflow.flow.shipped import choose, forces_saved
 
             chosen = choose(system, self.name, self.tol, transformed=True)
-            _SHIPPED[key] = None if chosen.shift is None else (chosen.load(system), chosen.shift)
+            saved = forces_saved(chosen, system, self.tol)
+            _SHIPPED[key] = None if chosen.shift is None else (chosen.load(system), chosen.shift, saved)
         if _SHIPPED[key] is None:
+            return self
+        flow, shift, saved = _SHIPPED[key]
+        trajectories = y0.size // y0.shape[-1]
+        if trajectories * length * saved < SEARCH + SEARCH_OF_EACH * trajectories:
             return self
         from sympflow.integrators.logarithmic import LogSympFlow
 
-        flow, shift = _SHIPPED[key]
         _check_start(flow, system, y0, False)
         return LogSympFlow(flow=flow, shift=shift)
 

@@ -76,7 +76,7 @@ def train_clock(
         "torch": torch.__version__,
         "transforms": {"system": system.name, "shift": shift, "fingerprint": list(system.fingerprint)},
     }
-    flow.figures = {"step": dt, **_errors(flow, system, seed)}
+    flow.figures = {"step": dt, **clock_errors(flow, system, seed)}
     flow.figures["training_seconds"] = round(time.perf_counter() - started, 3)
     flow.figures["training_cpu_seconds"] = round(time.process_time() - cpu, 3)
     return flow
@@ -105,7 +105,7 @@ def _lateness(
     return end, t - held
 
 
-def _errors(flow: ClockedFlow, system: HamiltonianSystem, seed: int, points: int = 100) -> dict[str, float]:
+def clock_errors(flow: ClockedFlow, system: HamiltonianSystem, seed: int, points: int = 100) -> dict[str, float]:
     """‖[q, p] of ψ̄_s(x) − φ_t(x)‖, t the time that ψ̄_s(x) holds: at Δ, and its mean over fractional steps."""
     assert system.domain is not None
     shift = flow.recipe["transforms"]["shift"]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.flow.certificate import upper_limit
+from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
@@ -17,9 +18,12 @@ from sympflow.metrics.energy import max_energy_error
 from sympflow.solver import solve
 from sympflow.system import HamiltonianSystem
 from sympflow.systems import SYSTEMS
+from sympflow.training.clock_fit import energy_errors, train_clock
 from sympflow.training.trainer import train
 
 OF_A_GRADIENT, OF_A_PARAMETER = 0.6, 0.4  # forces
+OF_A_LOGARITHM = 2.0  # forces: a kick and a drift of the logarithmic Hamiltonian, a division in each
+CLOCK_SEED = 1_000_003  # of the held-out states of flows without a certificate
 HELD_OUT = 1000  # states of the certificate
 OUTPUTS = 1000  # at which an energy error is looked at, where it is not the certificate that does
 YEAR = 365.25  # days
@@ -60,6 +64,28 @@ class Rung:
 
 
 @dataclass(frozen=True)
+class ClockRung:
+    """A flow of a ladder that is one on the logarithmic Hamiltonian, its clock trained (`sympflow.flow.clocked`).
+
+    Parameters
+    ----------
+    dt : float
+        The physical length of its longest step.
+    """
+
+    dt: float
+
+    @property
+    def name(self) -> str:
+        """Of its file, after that of the scene."""
+        return f"log-{self.dt:g}"
+
+    def train(self, system: HamiltonianSystem, **options: Any) -> ClockedFlow:
+        """The flow, without the energy errors; `options` of `train` say nothing to it."""
+        return train_clock(system, self.dt)
+
+
+@dataclass(frozen=True)
 class Ladder:
     """The flows of a system.
 
@@ -67,7 +93,7 @@ class Ladder:
     ----------
     make : callable
         The system.
-    rungs : tuple of Rung
+    rungs : tuple of Rung or ClockRung
     t_end : float
         T of the energy errors, in the system's units of time.
     held_out : callable, optional
@@ -77,12 +103,12 @@ class Ladder:
     """
 
     make: Callable[[], HamiltonianSystem]
-    rungs: tuple[Rung, ...]
+    rungs: tuple[Rung | ClockRung, ...]
     t_end: float = 1000.0
     held_out: Callable[[HamiltonianSystem], np.ndarray] | None = None
     t_certified: float = 1000.0
 
-    def flows(self, rung: str | None = None, **options: Any) -> Iterator[tuple[Rung, PrimedFlow]]:
+    def flows(self, rung: str | None = None, **options: Any) -> Iterator[tuple[Rung | ClockRung, SympFlow]]:
         """Each rung and its flow, as they are made; or one rung only, by its name."""
         system = self.make()
         for each in self.rungs:
@@ -91,12 +117,22 @@ class Ladder:
                 self._judge(flow, system)
                 yield each, flow
 
-    def measure(self, flow: PrimedFlow) -> dict[str, Any]:
+    def measure(self, flow: SympFlow) -> dict[str, Any]:
         """The figures by which flows are chosen, measured again."""
         self._judge(flow, self.make())
         return flow.figures
 
     def _judge(self, flow: SympFlow, system: HamiltonianSystem) -> None:
+        if isinstance(flow, ClockedFlow):
+            assert system.domain is not None
+            errors = energy_errors(flow, system, system.domain.sample(HELD_OUT, CLOCK_SEED), self.t_end, OUTPUTS)
+            flow.figures |= {
+                "energy_error_median": float(np.quantile(errors, 0.5, method="higher")),
+                "energy_error_95": upper_limit(np.asarray(errors)),
+                "t_end": self.t_end,
+                "cost": round(OF_A_LOGARITHM * flow.scheme.force_evaluations / flow.figures["step"], 3),
+            }
+            return
         if self.held_out is None:
             certify(flow, system, self.t_end)
             return
@@ -177,9 +213,10 @@ def ladders() -> dict[str, Ladder]:
     # d = 18: starts are dear, few and short, and the gain of more is small
     short = {"points": 40, "label_times": 5, "reference_states": 20, "steps": 200}
     planets = tuple(Rung(3, dt, restarts=2, options=short) for dt in (300.0, 200.0, 100.0))
+    clocks = {"kepler": (ClockRung(1.0),)}
     return {
         **{
-            scene.replace("-", "_"): Ladder(SYSTEMS[scene], tuple(_rung(*each) for each in rungs))
+            scene.replace("-", "_"): Ladder(SYSTEMS[scene], (*(_rung(*each) for each in rungs), *clocks.get(scene, ())))
             for scene, rungs in sizes.items()
         },
         "outer_solar_system": Ladder(SYSTEMS["outer-solar-system"], planets, 1e5 * YEAR, along_the_orbit, 100 * YEAR),

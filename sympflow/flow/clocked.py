@@ -1,0 +1,225 @@
+"""SympFlows of a logarithmic Hamiltonian whose clock is trained: a splitting scheme, and a correction of the time.
+
+In the variables [q, t, p, B] of `sympflow.time_transformed` every kick and drift keeps B, and nothing depends on t. So
+the flow of any function of B alone,
+
+    V_m(t, P) = Σ_k c_k t^(3+2k) B^(k+1)/(k+1),        t ← t + Σ_k c_k t^(3+2k) B^k,
+
+commutes with all maps of a splitting scheme: it leaves the orbit as it is, and moves the time along it. Of a Kepler
+ellipse the leapfrog in these variables is late by a function of the step and of B, the same everywhere on the orbit:
+with the c_k trained, orbit and time are exact but for what the series leaves out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from sympflow.flow.base import FlowMap
+from sympflow.flow.layers import Drift, Kick, Layer
+from sympflow.flow.placement import checked_device, checked_dtype
+from sympflow.flow.potentials import Potential, Time
+from sympflow.flow.primed_potentials import KINETIC, POTENTIAL, Binding, PrimedPotential
+from sympflow.flow.sympflow import SympFlow
+from sympflow.integrators.schemes import SCHEMES
+
+if TYPE_CHECKING:
+    from sympflow.kernels.clocked_flow import ClockedFlowKernel
+    from sympflow.system import HamiltonianSystem
+
+
+class ClockPotential(Potential):
+    """Σ_k c_k t^(3+2k) B^(k+1)/(k+1), B the last momentum.
+
+    Parameters
+    ----------
+    ndof : int
+        d + 1, that of the transformed system.
+    terms : int
+        How many c_k.
+
+    Attributes
+    ----------
+    numbers : (terms,)
+        c_k.
+    """
+
+    def __init__(
+        self, ndof: int, terms: int, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
+    ) -> None:
+        super().__init__()
+        self.ndof = ndof
+        self.numbers = nn.Parameter(torch.zeros(terms, dtype=dtype, device=device))
+
+    def advance(self, t: Time, B: Tensor, rate: bool = False) -> Tensor:
+        """Σ_k c_k t^(3+2k) B^k, by which the time is put forward, or its derivative by t."""
+        total = torch.zeros_like(B)
+        for k, c in enumerate(self.numbers):
+            power = 3 + 2 * k
+            total = total + c * (power * t ** (power - 1) if rate else t**power) * B**k
+        return total
+
+    def impulse(self, t: Time, x: Tensor) -> Tensor:
+        advance = self.advance(t, x[-1])
+        return torch.cat([torch.zeros_like(x[:-1]), advance[None]])
+
+    def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
+        B = x[-1]
+        rate = torch.zeros_like(B)
+        for k, c in enumerate(self.numbers):
+            rate = rate + c * (3 + 2 * k) * t ** (2 + 2 * k) * B ** (k + 1) / (k + 1)
+        return self.impulse(t, x), rate
+
+    def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
+        B = x[-1]
+        along = self.advance(t, B, rate=True)
+        for k, c in enumerate(self.numbers):
+            if k:
+                along = along + c * t ** (3 + 2 * k) * k * B ** (k - 1) * dx[-1]
+        return self.impulse(t, x), torch.cat([torch.zeros_like(x[:-1]), along[None]])
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"type": "clock"}
+
+
+@dataclass(frozen=True)
+class Share:
+    """The coefficient c·t of a fixed scheme."""
+
+    c: float
+
+    def value(self, t: Time) -> Time:
+        return self.c * t
+
+    def rate(self, t: Time) -> Time:
+        """Its time derivative."""
+        return self.c + 0 * t
+
+
+class ClockedFlow(SympFlow):
+    """A symmetric splitting scheme on a logarithmic Hamiltonian, and after it the trained clock.
+
+    Both are odd in the flow's time s, and commute: ψ̄_{−s} = (ψ̄_s)⁻¹, continued to negative s by its formulas. What is
+    trained is the clock; it is no approximation of the exact flow in s, for a scheme is early or late there, but in
+    the physical time: ψ̄_s(x) lies on the solution through x, at the time t that it holds.
+
+    Parameters
+    ----------
+    ndof : int
+        Of the transformed system.
+    scheme : str
+        A symmetric one of `sympflow.integrators.schemes.SCHEMES`, without force gradients.
+    terms : int
+        Of the clock.
+    dt : float
+        Δ, the longest step in s.
+    system : HamiltonianSystem, optional
+        One of `sympflow.time_transformed`. Without it the flow has no values.
+    dtype, device
+        Of the parameters.
+
+    Raises
+    ------
+    ValueError
+        If the scheme is not symmetric or has force gradients, or the system has no `shift`.
+    """
+
+    def __init__(
+        self,
+        ndof: int,
+        scheme: str = "leapfrog",
+        terms: int = 8,
+        dt: float = 1.0,
+        system: HamiltonianSystem | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> None:
+        FlowMap.__init__(self, ndof, dt)
+        table = SCHEMES.get(scheme)
+        if table is None or not table.symmetric or any(table.gradients) or table.nystrom:
+            raise ValueError(f"`scheme` {scheme!r} is not a symmetric one without force gradients: take 'leapfrog'.")
+        if isinstance(terms, bool) or not isinstance(terms, int) or terms < 1:
+            raise ValueError(f"`terms` must be a positive integer; got {terms!r}.")
+        self.scheme = table
+        self.clock = ClockPotential(ndof, terms, checked_dtype(dtype), checked_device(device))
+        self._binding = Binding(system)
+        self._kernel: ClockedFlowKernel | None = None
+        self._numbers: tuple[tuple[int, int], list[float]] | None = None
+        maps: list[Layer] = []
+        for kind, c, _ in table.substeps:
+            term = KINETIC if kind == "drift" else POTENTIAL
+            potential = PrimedPotential(ndof, self._binding, [(term, Share(float(c)))])
+            maps.append(Drift(potential) if kind == "drift" else Kick(potential))
+        # A tuple, not a ModuleList: the clock is the only one with parameters, and they are the flow's.
+        self.layers = (*maps, Drift(self.clock))  # type: ignore[assignment]
+        if system is not None:
+            self._check(system)
+            self.fingerprint, self.system_name = system.fingerprint, system.name
+
+    @staticmethod
+    def _check(system: HamiltonianSystem) -> None:
+        if "shift" not in system.params:
+            raise ValueError("`system` is no logarithmic Hamiltonian: make one by sympflow.time_transformed(system).")
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.clock.numbers.dtype
+
+    @property
+    def device(self) -> torch.device:
+        return self.clock.numbers.device
+
+    def advance(self, s: np.ndarray | float, B: np.ndarray) -> np.ndarray:
+        """By how much the clock puts the time forward in a step s, which may be negative, at B."""
+        numbers = self.clock.numbers
+        if self._numbers is None or self._numbers[0] != (numbers.data_ptr(), numbers._version):
+            values = numbers.detach().cpu().double().numpy()[::-1].tolist()
+            self._numbers = (numbers.data_ptr(), numbers._version), values
+        square = np.asarray(s) ** 2 * B
+        total = 0.0
+        for c in self._numbers[1]:
+            total = total * square + c
+        return np.asarray(s) ** 3 * total
+
+    def kernel_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
+        """The compiled loops of this flow."""
+        if self._kernel is None or self._kernel.system is not system:
+            from sympflow.kernels.clocked_flow import ClockedFlowKernel
+
+            self._kernel = ClockedFlowKernel(self, system)
+        return self._kernel
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Evaluations of the forces, as `FixedStep.evaluations`."""
+        from sympflow.integrators.splitting import scheme_evaluations
+
+        return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
+
+    @property
+    def system(self) -> HamiltonianSystem | None:
+        """The transformed system whose V and T the flow uses, None for one loaded without it."""
+        return self._binding.system if self._binding.known else None
+
+    def bind(self, system: HamiltonianSystem) -> ClockedFlow:
+        """Give a flow that was loaded from a file its transformed system; itself.
+
+        Raises
+        ------
+        ValueError
+            If it is not the system that the flow was made for.
+        """
+        self.check_system(system)
+        self._check(system)
+        self._binding.bind(system)
+        return self
+
+    def bound(self, system: HamiltonianSystem) -> ClockedFlow:
+        """This flow, bound to `system` if it was loaded without one."""
+        return self if self._binding.known else self.bind(system)
+
+    def architecture(self) -> dict[str, Any]:
+        return {"ndof": self.ndof, "clocked": {"scheme": self.scheme.name, "terms": len(self.clock.numbers)}}
