@@ -101,7 +101,7 @@ def recipes() -> dict[str, NetworkRecipe]:
     return {
         "henon_heiles": NetworkRecipe(henon_heiles(), lambda: _well(1 / 8), points=(1000, 4000)),
         "harmonic_oscillator": NetworkRecipe(harmonic_oscillator(), lambda: _square(1.0), margin=1.1),
-        "pendulum": NetworkRecipe(swing, lambda: swing.domain.sample(100, 0), margin=1.03),  # type: ignore[union-attr]
+        "pendulum": NetworkRecipe(swing, lambda: swing.domain.sample(100, 0), margin=1.03, steps=(40, 160)),  # type: ignore[union-attr]
         "harmonic_oscillator_100": NetworkRecipe(
             harmonic_oscillator(100.0), lambda: _square(100.0), dt=0.01, omega=100.0, margin=1.1
         ),
