@@ -24,8 +24,8 @@ print(report.table())  # also .rows, .limits, .to_csv(path), .plot(path)
 ```
 
 A run counts as unstable if it becomes non-finite, cannot go on, or its energy error exceeds `bound` (1e3). It starts from four states along one orbit, for a single one can
-hide an instability: at exactly dt·ω = 2 Verlet's energy error from q = 1, p = 0 is 0, while every other state grows without bound. A run that ends is looked at: where an accurate
-reference comes to an end too, the solution is singular, at that time; else the method was unstable. Two more states are told apart from "stable": a run of a flow that left its domain is "outside", whatever its
+hide an instability: at exactly dt·ω = 2 Verlet's energy error from q = 1, p = 0 is 0, while every other state grows without bound. A run that ends is looked at by `solve` itself: where an accurate
+reference becomes infinite too, the solution is singular, at that time; else the method was unstable. Two more states are told apart from "stable": a run of a flow that left its domain is "outside", whatever its
 energy error, for the flow says nothing there; and one whose energy error exceeds 1 without growing beyond the bound is "bounded": its step counts for the longest stable one, its result for nothing. A family of systems gives a map of step against stiffness:
 `sympflow stability fput --vary omega=10,100,1000 --out out/`.
 """
@@ -132,9 +132,9 @@ the geometry of the next. Energy errors peak in the encounters and come back aft
 ESCAPE = """## Escape and blow-up: Hénon–Heiles above 1/6
 
 From q = 0, p = (0, 0.7) the solution is infinite at t* = 5.450984210235402. Every method ends with status −1 and keeps what it had; an explicit step leaps over the singularity and overflows a few steps later,
-an implicit one fails in Newton's iteration before it. The last finite state is therefore not the singularity. `stability` lets dop853, at a relative tolerance
-of 1e-11, go over the last 400 steps again, from y0 if there were no more: if it too runs into an end, its state growing without bound, the solution is singular there, else the method was unstable. At the step 0.01 it
-starts from the method's own state four units of time before, and the error is the method's phase:
+an implicit one fails in Newton's iteration before it. The last finite state is therefore not the singularity. So after a failure, and only then, `solve` follows the solution again by Dormand and Prince's method of
+order 8 at a tolerance of 1e-10: from y0, or where that takes more than 500 steps from a state of the run 200 to 400 steps before its end, if it still has the energy of y0. If the steps become too short to move t while the
+state grows without bound, the solution is singular there: the message says so, and `stats["blow_up_time"]` is the time, an estimate. If it goes on instead, the step was too long, and the message says that:
 
 {escape}
 
@@ -225,7 +225,9 @@ GUARDS = """## What `solve` does when it goes wrong
 | Newton's iteration finds no solution of an implicit step | the same |
 | T + B or c − V ceases to be positive, or time hardly advances, in the methods `log_…` | the same |
 | one trajectory of a batch fails | its own status is −1, with NaN after its last finite output; the others go on; `failed_at` is an array |
+| the solution itself becomes infinite | the message says about when, and `stats["blow_up_time"]`, in a batch an array; no step leads beyond that |
 | a singularity is approached by an adaptive method | status −1 when its step underflows |
+| an adaptive method of torchdiffeq takes more than `max_num_steps` steps, 10,000 by default | status −1 with what it has, and that option as the remedy |
 | a step so short that more than 1e11 of them are needed | a ValueError before anything runs |
 | an adaptive method would need years | status −1 after ten thousand steps, with the pace in the message |
 | the state leaves the domain of a flow | a note in the message and `stats["domain_exit"]`; status −1 with `on_domain_exit="stop"` |
