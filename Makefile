@@ -37,6 +37,7 @@ bench: .venv/installed  ## The benchmarks that the docs quote (ten minutes or so
 	$(BIN)/python benchmarks/kernels.py
 	$(BIN)/python benchmarks/interop.py
 	$(BIN)/python benchmarks/primed.py
+	$(BIN)/python benchmarks/through_solve.py
 	$(BIN)/python benchmarks/stability.py --out docs/stability.md
 	$(BIN)/python benchmarks/peers.py --out docs/benchmarks.md
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 if not BENCHMARKS.exists():
@@ -20,6 +21,8 @@ sys.path.insert(0, str(BENCHMARKS))
 import drift
 import peers
 import primed
+import through_solve
+import primed_ideas
 import solar_system
 import training_optimizers
 from contenders import compiled_loops, interpreted_loops, ours, primed_race, runge_kutta
@@ -31,7 +34,7 @@ from contenders.page import duration, page, three
 from contenders.prose import power
 from contenders.scene import Scene
 
-from sympflow import shipped_flows
+from sympflow import SympFlow, shipped_flows
 from sympflow.flow.base import same_system
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.systems import henon_heiles, kepler, pendulum
@@ -244,6 +247,14 @@ def test_a_tiny_ablation():
     assert [line.split(" | ")[0] for line in lines[2:]] == [f"| {v.name}" for v in primed.ABLATION[:3]]
 
 
+def test_whole_calls_are_timed_beside_their_loops(capsys):
+    through_solve.main(["--quick"])
+    lines = [line for line in capsys.readouterr().out.splitlines() if "times faster" in line]
+    assert len(lines) == 8
+    assert all(line.count(" ms") == 2 for line in lines)
+    assert sum("loops" in line for line in lines) == 7  # no loops alone where outputs lie between steps
+
+
 def test_heyoka_solves_any_symbolic_system():
     pytest.importorskip("heyoka")
     from contenders.heyoka_systems import Taylor
@@ -304,3 +315,17 @@ def test_a_tiny_race_of_planets(capsys):
     table = solar_system.run(years=30.0, target=1e-6, repeats=1, names=("kahan_li8",))
     assert "| kahan_li8 |" in table
     assert "| flow, Δt = " in table
+
+
+def test_a_network_on_top_of_a_primed_flow_starts_as_nothing_and_trains():
+    system = henon_heiles()
+    well = SympFlow.primed(system, 2, dt=0.5, processor=2).requires_grad_(False)
+    flow = primed_ideas.with_network(well, (4,))
+    assert flow.n_parameters == 2 * (4 * 2 + 4 + 4 + 4)
+    x = torch.as_tensor(system.domain.sample(5, 0))
+    torch.testing.assert_close(flow.psi(0.3, x).detach(), well.psi(0.3, x), atol=1e-4, rtol=0)
+    options = {"optimizer": "gauss-newton", "loss": "labels", "steps": 3, "points": 20}
+    table = primed_ideas.network(system, well, 2.0, ((4,),), **options)
+    assert table.count("|") == 6 * 4
+    errors = [float(row.split("|")[3].split("/")[0]) for row in table.splitlines()[2:]]
+    assert errors[1] <= errors[0]

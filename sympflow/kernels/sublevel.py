@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -15,8 +16,6 @@ from sympflow.symbolic import SymbolicHamiltonian, printable
 from sympflow.system import HamiltonianSystem
 
 __all__ = ["all_within"]
-
-NO_BOUND = 0.0, np.inf
 
 _KERNELS: WeakKeyDictionary[SymbolicHamiltonian, Callable[..., bool] | None] = WeakKeyDictionary()
 
@@ -34,9 +33,16 @@ def all_within(system: HamiltonianSystem, domain: EnergySublevel, states: np.nda
     kernel = _KERNELS[symbols]
     if kernel is None:
         return False
-    least, most = -np.inf if domain.above is None else domain.above - slack, domain.energy + slack
-    turning = domain.angular_momentum or NO_BOUND
-    return kernel(np.ascontiguousarray(states), *domain.bounds(slack), float(least), float(most), *turning)
+    return kernel(np.ascontiguousarray(states), _limits(domain, slack))
+
+
+@lru_cache(maxsize=64)
+def _limits(domain: EnergySublevel, slack: float) -> np.ndarray:
+    """Lower bounds of the state, of H and of |L|, and the upper ones: (2, 2d + 2)."""
+    low, high = domain.bounds(slack)
+    least = -np.inf if domain.above is None else domain.above - slack
+    slowest, fastest = domain.angular_momentum or (0.0, np.inf)
+    return np.array([[*low, least, slowest], [*high, domain.energy + slack, fastest]])
 
 
 def _compiled(symbols: SymbolicHamiltonian) -> Callable[..., bool] | None:
@@ -50,7 +56,7 @@ def _compiled(symbols: SymbolicHamiltonian) -> Callable[..., bool] | None:
 
 
 def sublevel_source(symbols: SymbolicHamiltonian) -> str:
-    """``all_within(y, low, high, least, most, slowest, fastest)``: bounds of the states, of H and of |L| where d = 2.
+    """``all_within(y, limits)``: whether the states, H and, where d = 2, |L| keep to `_limits`.
 
     Raises
     ------
@@ -59,15 +65,16 @@ def sublevel_source(symbols: SymbolicHamiltonian) -> str:
     """
     variables = symbols.q + symbols.p
     shared, (H,) = sp.cse([printable(symbols.H)], symbols=sp.numbered_symbols("s_", real=True), list=True)
-    box = " & ".join(f"({v} >= low[{i}]) & ({v} <= high[{i}])" for i, v in enumerate(variables))
+    n = len(variables)
+    box = " & ".join(f"({v} >= limits[0, {i}]) & ({v} <= limits[1, {i}])" for i, v in enumerate(variables))
     lines = [f"{v} = y[i, {i}]" for i, v in enumerate(variables)]
     lines += [f"{name} = {printed(f)}" for name, f in shared]
-    lines += [f"H = {printed(H)}", f"inside &= {box} & (H > least) & (H < most)"]
+    lines += [f"H = {printed(H)}", f"inside &= {box} & (H > limits[0, {n}]) & (H < limits[1, {n}])"]
     if symbols.ndof == 2:
-        lines += ["L = abs(q1*p2 - q2*p1)", "inside &= (L >= slowest) & (L <= fastest)"]
+        lines += ["L = abs(q1*p2 - q2*p1)", "inside &= (L >= limits[0, 5]) & (L <= limits[1, 5])"]
     body = "\n        ".join(lines)
     return f"""@njit(**OPTIONS)
-def all_within(y, low, high, least, most, slowest, fastest):
+def all_within(y, limits):
     inside = True
     for i in range(y.shape[0]):
         {body}
