@@ -1,0 +1,146 @@
+"""Two ways on from a primed flow, measured on Hénon–Heiles: training on an orbit's tube, and a small network on top.
+
+    python benchmarks/primed_ideas.py             both: ten minutes or so on one core
+    python benchmarks/primed_ideas.py --quick     tiny fits
+    python benchmarks/primed_ideas.py --idea tube
+
+*Tube.* A flow of 3 kicks, a processor of 6 and Δt = 1 is fitted to the tube of radius 0.03 around one orbit in place of
+the whole well, for three orbits, and its largest energy error over T = 1000 along that orbit stands beside that of the
+same flow fitted to the well, with as many starts.
+
+*Network.* To the flow of the well, whose numbers stay, a kick and a drift with small MLP potentials are appended, which
+start as the identity and are trained by Gauss–Newton on labels. The one-step error over held-out states, and the median
+energy error over T = 1000, stand beside those without them. The cost is the processor time of a compiled step of the
+kernel, plus that of the same kick and drift alone: too little, as such a composition has no processor that telescopes.
+"""
+
+# ruff: noqa: E402
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+from contenders.environment import pin_to_one_thread
+
+pin_to_one_thread()
+
+import numpy as np
+import torch
+
+from sympflow import HamiltonianSystem, SympFlow, Tube, max_energy_error, solve, systems, train
+from sympflow.flow.layers import Drift, Kick
+from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.primed import PrimedFlow
+from sympflow.training.figures import one_step_errors
+
+DT, STAGES, PROCESSOR = 1.0, 3, 6
+RADIUS, T_END = 0.03, 1000.0
+ORBITS = {
+    "near the periodic orbit along q1": [0.0, 0.1, 0.35, 0.0],
+    "regular": [0.1, -0.2, 0.2, 0.3],
+    "chaotic, the scene's own": [0.3, -0.3, 0.3, 0.15],
+}
+HELD_OUT, SEED = 100, 20_261_121
+FULL = {"restarts": 8}
+QUICK = {"restarts": 1, "steps": 5, "points": 40, "reference_states": 10}
+
+
+def fitted(system: HamiltonianSystem, domain: Any = None, **options: Any) -> PrimedFlow:
+    start = SympFlow.primed(system, STAGES, dt=DT, processor=PROCESSOR)
+    return train(system, flow=start, domain=domain, progress=False, **options)
+
+
+def energy_error(system: HamiltonianSystem, flow: SympFlow, y0: Any, t_end: float) -> float:
+    """The median over the states of the largest relative one."""
+    steps = round(t_end / flow.dt)
+    sol = solve(system, flow, (0.0, steps * flow.dt), np.asarray(y0, float), save_every=1, on_domain_exit="ignore")
+    return float(np.median(max_energy_error(sol)))
+
+
+def tube(system: HamiltonianSystem, well: PrimedFlow, t_end: float, **options: Any) -> str:
+    """The first idea."""
+    lines = ["| orbit | fitted to the well | fitted to its tube | times less |", "|---|---|---|---|"]
+    for name, y0 in ORBITS.items():
+        orbit = solve(system, "kahan_li8", (0.0, t_end), y0, dt=0.02, save_every=5).states
+        own = fitted(system, Tube(orbit[:5000], RADIUS), **options)
+        errors = [energy_error(system, flow, y0, t_end) for flow in (well, own)]
+        lines.append(f"| {name} | {errors[0]:.1e} | {errors[1]:.1e} | {errors[0] / errors[1]:.1f} |")
+        print(lines[-1], flush=True)
+    return "\n".join(lines)
+
+
+def with_network(well: PrimedFlow, hidden: tuple[int, ...]) -> SympFlow:
+    """ψ̄ of the well, then a kick and a drift with MLP potentials that are 0; only their weights are trained."""
+    generator = torch.Generator().manual_seed(0)
+    potentials = [MLPPotential(well.ndof, hidden, tau=well.dt, generator=generator) for _ in range(2)]
+    with torch.no_grad():
+        for potential in potentials:
+            potential.weight_out.mul_(1e-6)
+    flow = SympFlow.from_layers([*well.layers, Kick(potentials[0]), Drift(potentials[1])], well.dt)
+    flow.fingerprint, flow.system_name = well.fingerprint, well.system_name
+    return flow
+
+
+def microseconds(system: HamiltonianSystem, flow: SympFlow) -> float:
+    """Processor time of a compiled step."""
+    n = 20_000
+    solve(system, flow, (0.0, 10 * flow.dt), save_every=10)
+    begin = time.process_time()
+    solve(system, flow, (0.0, n * flow.dt), save_every=n, on_domain_exit="ignore")
+    return 1e6 * (time.process_time() - begin) / n
+
+
+def network(system: HamiltonianSystem, well: PrimedFlow, t_end: float, sizes: Any, **options: Any) -> str:
+    """The second."""
+    assert system.domain is not None
+    x = system.domain.sample(HELD_OUT, SEED)
+    alone = microseconds(system, well)
+    at_dt, between = one_step_errors(well, system, x)
+    error = energy_error(system, well, x[:20], t_end)
+    lines = [
+        "| on top | weights | error at Δt / at fractional t | energy error | µs a step |",
+        "|---|---|---|---|---|",
+        f"| nothing | 0 | {at_dt:.1e} / {between:.1e} | {error:.1e} | {alone:.2f} |",
+    ]
+    print(lines[-1], flush=True)
+    for hidden in sizes:
+        flow = train(system, flow=with_network(well, hidden), progress=False, **options)
+        at_dt, between = one_step_errors(flow, system, x)
+        bare = SympFlow(system.ndof, 1, hidden, dt=well.dt)  # the same kick and drift, compiled
+        cost = alone + microseconds(system, bare)
+        lines.append(
+            f"| a kick and a drift, {hidden} | {flow.n_parameters} | {at_dt:.1e} / {between:.1e} | "
+            f"{energy_error(system, flow, x[:20], t_end):.1e} | {cost:.2f} |"
+        )
+        print(lines[-1], flush=True)
+    return "\n".join(lines)
+
+
+def run(ideas: list[str], quick: bool) -> str:
+    system = systems.henon_heiles()
+    options = QUICK if quick else FULL
+    t_end = 20.0 if quick else T_END
+    well = fitted(system, **options)
+    tables = []
+    if "tube" in ideas:
+        tables.append(tube(system, well, t_end, **options))
+    if "network" in ideas:
+        gauss_newton: dict[str, Any] = {"optimizer": "gauss-newton", "loss": "labels"}
+        gauss_newton |= {"steps": 3, "points": 40} if quick else {"steps": 100, "points": 200}
+        tables.append(network(system, well, t_end, ((4,),) if quick else ((5,), (10,), (10, 10)), **gauss_newton))
+    return "\n\n".join(tables)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--idea", action="append", choices=("tube", "network"), help="both if none is named")
+    parser.add_argument("--quick", action="store_true", help="tiny fits, short runs")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    print("\n" + run(options.idea or ["tube", "network"], options.quick))
+
+
+if __name__ == "__main__":
+    main()
