@@ -45,7 +45,7 @@ class MapsStepper(FixedStep):
 
     def counting(self, system: HamiltonianSystem) -> Self:
         counted = copy.copy(self)  # one that knows the maps whose evaluations it counts
-        object.__setattr__(counted, "counted_maps", self.maps(self.parts_of(system), 1.0))
+        object.__setattr__(counted, "counted_maps", known_maps(self, self.parts_of(system), 1.0))
         return counted
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
@@ -155,11 +155,16 @@ def concatenate_first(y0: Array, states: Array) -> Array:
 
 def map_evaluations(maps: Sequence[Map], n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
     """Evaluations of slopes and force gradients, as `FixedStep.evaluations`; linear flows cost none."""
-    costs = np.array([(m.part != LINEAR, bool(np.any(m.gradient))) for m in maps] or [(False, False)], dtype=int)
-    counts = costs.sum(0) * (n_steps + n_extra)
+    counts = [sum(m.part != LINEAR for m in maps), sum(_has_gradient(m) for m in maps)]
+    counts = [count * (n_steps + n_extra) for count in counts]
     if backend == "compiled" and len(maps) > 1 and maps[0].part == maps[-1].part:
-        counts = counts - n_steps * costs[-1] + n_saved * costs[-1]  # the last map is the next step's first one
-    return {"force_evaluations": int(counts[0]), "hessian_evaluations": int(counts[1])}
+        last = maps[-1].part != LINEAR, _has_gradient(maps[-1])  # it is the next step's first one
+        counts = [count - (n_steps - n_saved) * one for count, one in zip(counts, last, strict=True)]
+    return {"force_evaluations": counts[0], "hessian_evaluations": counts[1]}
+
+
+def _has_gradient(m: Map) -> bool:
+    return m.gradient != 0.0 if isinstance(m.gradient, float) else bool(np.any(m.gradient))
 
 
 _LINEAR_AND_REST: WeakKeyDictionary[HamiltonianSystem, ExactParts] = WeakKeyDictionary()
