@@ -56,6 +56,9 @@ def test_what_it_needs_is_said(runs):
         energy_growth(solve(systems.harmonic_oscillator(), get("verlet")(dt=3.0), (0, 1e5)))
     with pytest.raises(TypeError, match=r"^`solution`|^`sol`"):
         energy_growth(1)
+    few = solve(systems.pendulum(), "verlet", (0, 1000), t_eval=[0, 500, 1000])
+    with pytest.raises(ValueError, match=r"^`sol` has outputs in 1 of .* windows between"):
+        energy_growth(few)
 
 
 def test_a_primed_flow_sums_with_compensation_too():

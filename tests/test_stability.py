@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
 import sympflow
@@ -234,6 +235,11 @@ def test_a_map_of_a_family(tmp_path):
         ({"metrics": "energy"}, r"^`metrics` must be a list"),
         ({"metrics": ["speed"]}, r"^`metrics` must be a list of names from"),
         ({"dtypes": ["float16"]}, r"^`dtypes` must be"),
+        ({"dtypes": []}, r"^`dtypes` must be"),
+        ({"steps": [True]}, r"^`steps` must be a list"),
+        ({"steps": "0.1"}, r"^`steps` must be a list"),
+        ({"progress": 3}, r"^`progress` must be a function"),
+        ({"y0": torch.tensor([1.0, 0.0])}, r"^`y0` must be a NumPy array"),
         ({"bound": np.nan}, r"^`bound` must be positive"),
         ({"min_steps": 0}, r"^`min_steps` must be a positive integer"),
         ({"t_span": (1, 1)}, r"^`t_span` has length zero"),

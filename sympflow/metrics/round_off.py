@@ -79,6 +79,11 @@ def energy_growth(sol: Solution, first: float = 1000.0) -> EnergyGrowth:
     edges = np.geomspace(first, n[-1] * (1 + 1e-9), windows + 1)
     index = np.searchsorted(edges, n, side="right") - 1
     filled = [k for k in range(windows) if (index == k).any()]
+    if len(filled) < 3:
+        raise ValueError(
+            f"`sol` has outputs in {len(filled)} of {windows} windows between {first:g} and {n[-1]:g} steps: leave "
+            "`t_eval` out, or give it more times."
+        )
     steps = np.sqrt(edges[:-1] * edges[1:])[filled]
     rms = np.array([np.sqrt(np.mean(error[:, index == k] ** 2)) for k in filled])
     x, y = np.log(steps), np.log(np.maximum(rms, np.finfo(float).tiny))

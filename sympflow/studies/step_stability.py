@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.arrays import is_tensor
 from sympflow.solver import solve
 from sympflow.studies.candidates import candidates
 from sympflow.studies.stability_report import StabilityReport, StabilityRow, StepLimit
@@ -59,6 +60,7 @@ def stability(
     bound : float
         A run whose energy error exceeds it counts as unstable, as one that becomes non-finite does.
     min_steps, max_steps : int
+        Steps of a run; where both cannot be, `max_steps` holds.
     limits : bool
         Whether to find the longest stable step, by bisection between the longest stable and the shortest unstable one,
         to 0.2 %. If all are stable, longer ones are tried, and shorter ones if none is.
@@ -92,9 +94,11 @@ def stability(
     real = isinstance(bound, int | float | np.number) and not isinstance(bound, bool)
     if not real or np.iscomplexobj(bound) or not 0 < bound < math.inf:
         raise ValueError(f"`bound` must be positive and finite, a relative energy error; got {bound!r}.")
+    if progress is not None and not callable(progress):
+        raise TypeError(f"`progress` must be a function of one line of text; got {progress!r}.")
     lengths = None if steps is None else _checked_steps(steps)
     unknown = [d for d in dtypes if d not in ("float32", "float64")]
-    if isinstance(dtypes, str) or unknown:
+    if isinstance(dtypes, str) or unknown or not len(dtypes):
         raise ValueError(f"`dtypes` must be a list of 'float32' and 'float64'; got {dtypes!r}.")
     rows: list[StabilityRow] = []
     found: list[StepLimit] = []
@@ -116,6 +120,8 @@ def stability(
 
 def initial_states(system: HamiltonianSystem, y0: ArrayLike | None) -> np.ndarray:
     """The states (n, 2d) that runs start from: those given, or one and three more along its orbit."""
+    if is_tensor(y0):
+        raise TypeError("`y0` must be a NumPy array, for every method of the study takes one: pass y0.numpy().")
     given = check_y0(system, system.y0 if y0 is None else y0, None)
     if given.ndim > 2:
         raise ValueError(f"`y0` must have shape (2d,) or (n, 2d); got {given.shape}.")
@@ -128,6 +134,8 @@ def initial_states(system: HamiltonianSystem, y0: ArrayLike | None) -> np.ndarra
 
 def _checked_steps(steps: Sequence[float]) -> list[float]:
     try:
+        if any(isinstance(h, bool | np.bool_ | str) for h in steps):
+            raise TypeError("no step lengths")
         lengths = sorted(float(h) for h in steps)
     except (TypeError, ValueError) as error:
         raise TypeError(f"`steps` must be a list of step lengths; got {steps!r}.") from error
