@@ -12,22 +12,18 @@ from torch import Tensor, nn
 from sympflow.flow.potentials import Time
 
 
-class Coefficients(nn.Module):
-    """c_i(τ) = Σ_k c_ik τ^(e_k), i = 1 … n: a column of a splitting table, and how it enters, as t^m c_i(t/Δt).
-
-    Only what is free is a parameter. In a palindrome, c_i = c_{n+1−i}. With a `total`, Σ c_i(0) = total for every
-    value of the parameters: the constant term of the middle (or else the last) c_i is what the others leave.
+class FreeTable(nn.Module):
+    """Numbers c_ik, i = 1 … n, k = 0 … K−1, of which only the free ones are a parameter.
 
     Parameters
     ----------
-    n : int
-    exponents : tuple of int
-        e_k ≥ 0, the first of them 0.
-    dt : float
-        Δt.
-    power : int
-        m.
+    n, terms : int
+        n and K.
     palindromic : bool
+        Whether c_ik = c_(n+1−i)k.
+    bound : int
+        For how many k, from 0, the sum over i is fixed, whatever the parameters: Σ_i c_i0 = total, the others 0. The
+        middle (or else the last) c_ik is what the others leave.
     total : float, optional
 
     Attributes
@@ -44,27 +40,23 @@ class Coefficients(nn.Module):
     def __init__(
         self,
         n: int,
-        exponents: tuple[int, ...],
-        dt: float,
-        power: int,
+        terms: int,
         palindromic: bool,
-        total: float | None = None,
+        bound: int,
+        total: float | None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__()
-        self.exponents, self.dt, self.power = exponents, dt, power
         representative = np.minimum(np.arange(n), np.arange(n)[::-1]) if palindromic else np.arange(n)
         count = np.bincount(representative)
         last = len(count) - 1
-        self._free = [
-            (i, k) for i in range(last + 1) for k in range(len(exponents)) if total is None or (i, k) != (last, 0)
-        ]
-        basis, offset = np.zeros((n, len(exponents), len(self._free))), np.zeros((n, len(exponents)))
+        self._free = [(i, k) for i in range(last + 1) for k in range(terms) if i != last or k >= bound]
+        basis, offset = np.zeros((n, terms, len(self._free))), np.zeros((n, terms))
         for column, (i, k) in enumerate(self._free):
             basis[representative == i, k, column] = 1.0
-            if k == 0 and total is not None:
-                basis[representative == last, 0, column] = -count[i] / count[last]
+            if k < bound:
+                basis[representative == last, k, column] = -count[i] / count[last]
         if total is not None:
             offset[representative == last, 0] = total / count[last]
         like: dict[str, Any] = {"dtype": dtype, "device": device}
@@ -81,6 +73,39 @@ class Coefficients(nn.Module):
     def set(self, table: np.ndarray) -> None:
         """Take the free c_ik from a table (n, K)."""
         self.free.copy_(torch.tensor([float(table[i, k]) for i, k in self._free], dtype=torch.float64))
+
+
+class Coefficients(FreeTable):
+    """c_i(τ) = Σ_k c_ik τ^(e_k), i = 1 … n: a column of a splitting table, and how it enters, as t^m c_i(t/Δt).
+
+    In a palindrome, c_i = c_{n+1−i}. With a `total`, Σ c_i(0) = total for every value of the parameters.
+
+    Parameters
+    ----------
+    n : int
+    exponents : tuple of int
+        e_k ≥ 0, the first of them 0.
+    dt : float
+        Δt.
+    power : int
+        m.
+    palindromic : bool
+    total : float, optional
+    """
+
+    def __init__(
+        self,
+        n: int,
+        exponents: tuple[int, ...],
+        dt: float,
+        power: int,
+        palindromic: bool,
+        total: float | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> None:
+        super().__init__(n, len(exponents), palindromic, int(total is not None), total, dtype, device)
+        self.exponents, self.dt, self.power = exponents, dt, power
 
     def at(self, tau: float | np.ndarray) -> np.ndarray:
         """c_i(τ): (n,), or (n, N) for N values of τ."""

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from sympflow.flow.coefficients import FreeTable
 from sympflow.flow.potentials import Time
 
 
-class Column(nn.Module):
+class Column(FreeTable):
     """c_i(τ) = c_i0 + τ² Σ_k c_ik T_{k−1}(2τ² − 1), i = 1 … n, c_i = c_{n+1−i}; it enters as t^m c_i(t/Δt).
 
     Even polynomials in τ, so that a palindrome of such maps is time-reversible; Chebyshev's T_k keep them well
@@ -29,17 +30,7 @@ class Column(nn.Module):
         m.
     total : {"always", "start", None}
         Whether Σ c_i(τ) = 1 for every τ, or Σ c_i(0) = 1, whatever the parameters.
-
-    Attributes
-    ----------
-    free : (f,)
-        The free c_ik, i slowest.
-    basis, offset : (n, K, f), (n, K)
-        c = offset + basis · free.
     """
-
-    basis: Tensor
-    offset: Tensor
 
     def __init__(
         self,
@@ -51,39 +42,19 @@ class Column(nn.Module):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        super().__init__()
+        bound = terms if total == "always" else int(total == "start")
+        super().__init__(n, terms, True, bound, None if total is None else 1.0, dtype, device)
         self.n, self.terms, self.dt, self.power, self.total = n, terms, dt, power, total
-        representative = np.minimum(np.arange(n), np.arange(n)[::-1])
-        count = np.bincount(representative)
-        last = len(count) - 1
-        bound = range(terms) if total == "always" else range(total == "start")
-        self._free = [(i, k) for i in range(last + 1) for k in range(terms) if i != last or k not in bound]
-        basis, offset = np.zeros((n, terms, len(self._free))), np.zeros((n, terms))
-        for column, (i, k) in enumerate(self._free):
-            basis[representative == i, k, column] = 1.0
-            if k in bound:
-                basis[representative == last, k, column] = -count[i] / count[last]
-        if total is not None:
-            offset[representative == last, 0] = 1.0 / count[last]
-        like: dict[str, Any] = {"dtype": dtype, "device": device}
-        self.register_buffer("basis", torch.as_tensor(basis, **like), persistent=False)
-        self.register_buffer("offset", torch.as_tensor(offset, **like), persistent=False)
-        self.free = nn.Parameter(torch.zeros(len(self._free), **like))
-
-    @torch.no_grad()
-    def set(self, table: np.ndarray) -> None:
-        """Take the free c_ik from a table (n, K)."""
-        self.free.copy_(torch.as_tensor([float(table[i, k]) for i, k in self._free]))
 
     def values(self, t: Time) -> Tensor:
         """t^m c_i(t/Δt): (n, …), the shape of t behind."""
-        c = self.offset + self.basis @ self.free
+        c = self.table
         t = torch.as_tensor(t, dtype=c.dtype, device=c.device)
         return t**self.power * torch.tensordot(c, torch.stack(self._functions(t / self.dt)), dims=1)
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """`values` of an array of times: (…, n)."""
-        c = (self.offset + self.basis @ self.free).detach().cpu().double().numpy()
+        c = self.table.detach().cpu().double().numpy()
         return np.asarray(t)[..., None] ** self.power * (self.functions(t) @ c.T)
 
     def functions(self, t: np.ndarray) -> np.ndarray:

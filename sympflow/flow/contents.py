@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from torch import Tensor
@@ -19,7 +19,7 @@ class Contents:
         `_parameters` or `_buffers` of modules.
     """
 
-    def __init__(self, tensors: Iterable[dict[str, Tensor | None]]) -> None:
+    def __init__(self, tensors: Iterable[Mapping[str, Tensor | None]]) -> None:
         self._tensors = [d for d in tensors if d]
         self._addresses: list[int] = []
         self._views: list[np.ndarray] = []

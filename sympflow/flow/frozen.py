@@ -115,8 +115,8 @@ class Tables:
             raise ValueError(f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t!r}.")
         powers = (t / self.dt) ** self._exponents
         values = {column: table @ powers for column, table in self._coefficients.items()}
-        stages = _stages((s.kind, *map(float, _pair(s, values, 1))) for s in self._parts[part])
-        kicks, gradients, drifts = zip(*stages, strict=True)
+        stages = _stages((s.kind, *_pair(s, values, 1)) for s in self._parts[part])
+        kicks, gradients, drifts = (tuple(map(float, column)) for column in zip(*stages, strict=True))
         source = f"a primed SympFlow, Δt = {self.dt:g}, frozen at t = {t:g}"
         return Scheme(part, None, kicks, drifts, gradients, source, self.force_gradient)
 
