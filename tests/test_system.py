@@ -280,3 +280,11 @@ def test_special_functions_run_on_arrays_and_torch_says_that_it_has_none():
     assert system.force(np.array([0.3]))[0] == pytest.approx(-0.148318816)
     with pytest.raises(TypeError, match=r"^`expression` holds besselj, which torch has not"):
         system.force(torch.tensor([0.3]))
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 7, 16, 17, -3, -8])
+def test_integer_powers_are_those_of_numpy(n):
+    """Made of products: n of them may round n times."""
+    q = np.linspace(0.3, 2, 50)[:, None]
+    V = HamiltonianSystem.from_sympy(f"p**2/2 + q**({n})").potential
+    np.testing.assert_allclose(V(q), q[:, 0] ** n, rtol=abs(n) * np.finfo(float).eps)
