@@ -73,6 +73,9 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
     H is recovered from the field f = J∇H as the line integral H(y) = ∫₀¹ (−J f(s y))·y ds from the origin, by
     Gauss–Legendre quadrature, after it has been tested at random states that f is the field of some autonomous H.
 
+    That the field does not depend on t is tested at ten times only (`TIMES`): one that changes between them passes for
+    autonomous, and is solved as it is at t = 0.
+
     Parameters
     ----------
     module : torch.nn.Module or callable
