@@ -27,6 +27,8 @@ class Splitting(FixedStep):
         Step length; the default is `system.dt`.
     compensated : bool
         Whether to sum with Kahan's compensation, which slows the growth of round-off over many steps. Compiled only.
+        The sums begin anew with each piece of a run that is executed in pieces: with events, within SciPy's
+        `solve_ivp`, and where the metrics execute it again.
     """
 
     compensated: bool = False
