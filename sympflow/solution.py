@@ -41,8 +41,8 @@ class Solution:
         In words, with the time and the remedy.
     stats : dict
         n_steps, force_evaluations, hessian_evaluations, wall_time (seconds), backend, and dt for fixed steps; where
-        fixed steps failed, failed_at, the time of the last finite state (in a batch an array, NaN for the others);
-        newton_iterations of implicit methods.
+        a run failed, failed_at, the time of its last finite state, and where its solution becomes infinite
+        blow_up_time, an estimate (in a batch arrays, NaN for the others); newton_iterations of implicit methods.
     system, integrator, t_span, y0
         The problem that was solved and the method that did it: metrics execute the run again from these.
     """

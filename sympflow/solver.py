@@ -81,7 +81,8 @@ def solve(
     Returns
     -------
     Solution
-        A run that becomes non-finite ends with status −1 and keeps what was computed.
+        A run that becomes non-finite ends with status −1 and keeps what was computed. If the solution itself becomes
+        infinite, the message and `stats["blow_up_time"]` say when, by an estimate.
 
     Raises
     ------
