@@ -65,8 +65,9 @@ def trained(recipe: NetworkRecipe, scene: str, kind: str, optimizer: str, second
     options |= {"progress": False, "validate_every": 1}
     new = {"dt": recipe.dt, "kind": kind}
     if optimizer == "adam":
-        begin = time.process_time()
-        train(recipe.system, **new, **(options | {"steps": TRIAL, "validate_every": TRIAL}))
+        for _ in range(2):  # the first sets up what later steps find
+            begin = time.process_time()
+            train(recipe.system, **new, **(options | {"steps": TRIAL, "validate_every": TRIAL}))
         options["steps"] = max(TRIAL, int(TRIAL * seconds / (time.process_time() - begin)))
         options["validate_every"] = max(1, options["steps"] // 40)
     elif optimizer == "gauss-newton":
