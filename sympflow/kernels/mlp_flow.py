@@ -72,20 +72,16 @@ class MLPFlowKernel:
     """
 
     def __init__(self, flow: SympFlow) -> None:
+        from sympflow.flow.contents import Contents
+
         self.ndof = flow.ndof
         self._architecture, self._weights = _freeze(flow)
-        self._tensors: list[dict[str, Any]] = [d for m in flow.modules() for d in (m._parameters, m._buffers) if d]
-        self._views = [tensor.detach().numpy() for tensors in self._tensors for tensor in tensors.values()]
-        self._contents = self._snapshot()
+        self._contents = Contents(d for m in flow.modules() for d in (m._parameters, m._buffers))
+        self._snapshot = self._contents.snapshot()
 
     def outdated(self) -> bool:
         """Whether the flow's weights are no longer those that were compiled in."""
-        return self._contents != self._snapshot()
-
-    def _snapshot(self) -> tuple[list[int], bytes]:
-        """Where the weights lie in memory, and their values there."""
-        addresses = [tensor.data_ptr() for tensors in self._tensors for tensor in tensors.values()]
-        return addresses, b"".join(map(np.ndarray.tobytes, self._views))
+        return self._contents.snapshot() != self._snapshot
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` times ψ̄_h, or for h < 0 the inverse of ψ̄_|h|, from one state.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
 
 from sympflow.integrators.schemes import Scheme
@@ -34,7 +33,7 @@ class PrimedFlowKernel:
     """
 
     def __init__(self, flow: PrimedFlow, system: HamiltonianSystem, compensated: bool = False) -> None:
-        if flow.dtype != torch.float64 or flow.device.type != "cpu":
+        if str(flow.dtype) != "torch.float64" or flow.device.type != "cpu":
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
         self._tables, self._splitting, self._compensated = flow.tables, splitting_kernel(system), compensated
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
 
 from sympflow.integrators.linear_splitting import kernel_of
@@ -29,7 +28,7 @@ class SplitFlowKernel:
     """
 
     def __init__(self, flow: SplitFlow) -> None:
-        if flow.dtype != torch.float64 or flow.device.type != "cpu":
+        if str(flow.dtype) != "torch.float64" or flow.device.type != "cpu":
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
         self.flow = flow
         self._kernel: PartsKernel = kernel_of(flow.parts, PartsKernel)
