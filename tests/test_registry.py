@@ -259,3 +259,9 @@ def test_max_step_of_a_fixed_step_method_is_explained():
         TypeError, match=r"^`max_step` is not an option of method 'verlet'.*`event_step` samples events"
     ):
         solve(systems.pendulum(), "verlet", (0, 1), max_step=0.1)
+
+
+@pytest.mark.parametrize("name", ["h", "step", "step_size"])
+def test_other_names_of_the_step_are_answered_with_ours(name):
+    with pytest.raises(TypeError, match=rf"^`{name}` is not an option of method 'verlet'.*: the step .* is `dt`"):
+        solve(systems.pendulum(), "verlet", (0, 1), **{name: 0.1})

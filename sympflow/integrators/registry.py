@@ -40,7 +40,10 @@ _WITH_PARTS = (
 )
 _TORCHDIFFEQ = (*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams")
 _NAMES = frozenset((*SCHEMES, *_BUILT_IN, *_WITH_PARTS, *_TORCHDIFFEQ))
-_INSTEAD = {"max_step": "`dt` is the step, and `event_step` samples events within it"}
+_INSTEAD = {
+    "max_step": "`dt` is the step, and `event_step` samples events within it",
+    **dict.fromkeys(("h", "step", "step_size"), "the step of fixed-step methods is `dt`"),
+}
 _registered: dict[str, type[Integrator]] = {}
 _loaded: dict[type[Integrator], EntryPoint] = {}
 
