@@ -92,7 +92,12 @@ def test_solve_takes_the_flow_by_default_and_either_spelling_of_a_system():
 @pytest.mark.parametrize("command", ["solve", "compare", "bench", "train"])
 def test_an_output_that_cannot_be_written_is_refused_before_anything_is_computed(command, tmp_path, monkeypatch):
     computed = []
-    for function in ("comparison.compare", "precision.work_precision", "solver.solve", "training.trainer.train"):
+    for function in (
+        "studies.comparison.compare",
+        "studies.precision.work_precision",
+        "solver.solve",
+        "training.trainer.train",
+    ):
         monkeypatch.setattr(f"sympflow.{function}", lambda *args, **options: computed.append(args))
     (tmp_path / "file").write_text("")
     name = {"solve": "y.csv", "train": "flow.safetensors"}.get(command, "folder")
@@ -109,7 +114,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_anything_is_computed
 @pytest.mark.parametrize("command", ["compare", "bench"])
 def test_missing_matplotlib_is_reported_before_anything_is_computed(command, tmp_path, monkeypatch):
     computed = []
-    for function in ("comparison.compare", "precision.work_precision"):
+    for function in ("studies.comparison.compare", "studies.precision.work_precision"):
         monkeypatch.setattr(f"sympflow.{function}", lambda *args, **options: computed.append(args))
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     result = run(command, "pendulum", "--out", tmp_path / "out")
