@@ -168,7 +168,8 @@ def test_a_run_of_too_many_steps_ends_with_what_it_has(y0):
     sol = solve(HH, "bosh3", (0, 20), y0, t_eval=t, max_num_steps=500, dense_output=True)
     assert np.all(sol.status == -1)
     assert re.match(
-        r"After `max_num_steps` = 500 steps t = [\d.]+ is reached\. Raise `max_num_steps` or the tolerances, or end",
+        r"After `max_num_steps` = 500 steps t = [\d.]+ is reached, and at this pace the end needs about [\de+.]+ "
+        r"more\. Raise `max_num_steps` or the tolerances, or end `t_span` earlier\.",
         sol.message,
     )
     whole = solve(HH, "bosh3", (0, 20), y0, t_eval=t, max_num_steps=5000)

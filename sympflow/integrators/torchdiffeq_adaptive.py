@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -75,9 +76,11 @@ class Adaptive(Watched, RungeKutta):
         except AssertionError:
             if trace.n_tried < self.max_num_steps:
                 raise
+            (t0, t1), t = trace.t_span, trace.reached
+            more = self.max_num_steps * abs(t1 - t) / abs(t - t0) if t != t0 else math.inf
             raise TooManyStepsError(
-                f"After `max_num_steps` = {self.max_num_steps} steps t = {trace.reached:.17g} is reached. Raise "
-                "`max_num_steps` or the tolerances, or end `t_span` earlier."
+                f"After `max_num_steps` = {self.max_num_steps} steps t = {t:.17g} is reached, and at this pace the end "
+                f"needs about {more:.2g} more. Raise `max_num_steps` or the tolerances, or end `t_span` earlier."
             ) from None
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
