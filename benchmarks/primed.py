@@ -11,7 +11,8 @@ the fewest steps (for a flow, of at most its Δt and at least a quarter of it) w
 held-out states is no larger; the flow that is then the fastest is the row. Everything runs in the same compiled loops,
 in turn, on one thread: one trajectory of which the end is kept; one of which 1000 outputs are kept, with the processor
 executed at each; and a batch of 1000. On Kepler's problem the logarithmic methods (log_leapfrog, log_blanes_moan4,
-log_kahan_li8) race as well, through `solve`; the exact linear flows of `linear_*` do not.
+log_kahan_li8) and the flow with a trained clock race as well, through `solve`, with steps of at most 0.5; the exact
+linear flows of `linear_*` do not.
 """
 
 # ruff: noqa: E402
@@ -34,8 +35,9 @@ from contenders import primed_race
 from contenders.primed_race import Measure, Row, Runner, fewest_steps, race, schemes
 
 import sympflow
-from sympflow import HamiltonianSystem, SympFlow, systems, train
+from sympflow import HamiltonianSystem, SympFlow, systems, time_transformed, train
 from sympflow.flow.base import same_system
+from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.training.recipes import PrimedRecipe
 
@@ -65,13 +67,17 @@ def fitted(system: HamiltonianSystem, recipe: PrimedRecipe, folder: Path, **opti
     return flow
 
 
-def stored(system: HamiltonianSystem, folder: Path) -> list[PrimedFlow]:
-    """The primed flows of the system in a folder."""
-    flows = []
+def stored(system: HamiltonianSystem, folder: Path) -> list[PrimedFlow | ClockedFlow]:
+    """The primed flows of the system in a folder, and those on its logarithmic Hamiltonian."""
+    flows: list[PrimedFlow | ClockedFlow] = []
     for path in sorted(folder.glob(f"{system.name}*.safetensors")):
         flow = sympflow.load(path)
         if isinstance(flow, PrimedFlow) and same_system(flow.fingerprint, system.fingerprint):
             flows.append(flow.bind(system))
+        elif isinstance(flow, ClockedFlow) and same_system(
+            flow.recipe["transforms"]["fingerprint"], system.fingerprint
+        ):
+            flows.append(flow.bind(time_transformed(system, flow.recipe["transforms"]["shift"])))
     return flows
 
 

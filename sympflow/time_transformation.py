@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from sympflow.domain import Domain
 from sympflow.system import HamiltonianSystem
 
 LARGEST_SHIFT = 1e30
+_ENERGIES: WeakKeyDictionary[HamiltonianSystem, tuple[bytes, float]] = WeakKeyDictionary()
 
 
 def time_transformed(
@@ -86,8 +88,17 @@ def time_transformed(
 
 def default_shift(system: HamiltonianSystem) -> float:
     """c = E + |E| with the energy E of the system's y0: 0 for a bound system whose V vanishes far out, else 2E."""
-    E = 0.0 if system.y0 is None else float(system.hamiltonian(system.y0))
+    E = 0.0 if system.y0 is None else _energy(system)
     return E + abs(E) if math.isfinite(E) else 0.0
+
+
+def _energy(system: HamiltonianSystem) -> float:
+    """H at the system's y0, kept: every run asks for it several times."""
+    y0 = np.asarray(system.y0, dtype=float)
+    known = _ENERGIES.get(system)
+    if known is None or known[0] != y0.tobytes():
+        known = _ENERGIES[system] = y0.tobytes(), float(system.hamiltonian(y0))
+    return known[1]
 
 
 def checked_shift(shift: Any) -> float:
@@ -108,7 +119,7 @@ def time_scale(system: HamiltonianSystem, c: float) -> float:
     """
     if system.y0 is None:
         return 1.0
-    B = c - float(system.hamiltonian(system.y0))
+    B = c - _energy(system)
     scale = 2 * B if B > 0 else c - float(system.potential(system.y0[: system.ndof]))
     if not scale > 0:
         raise ValueError(

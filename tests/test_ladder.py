@@ -234,6 +234,20 @@ def test_the_figure_is_met_by_95_per_cent_of_other_states(name):
     assert np.mean(max_energy_error(sol) > listed.energy_error) <= 0.05
 
 
+def test_a_rung_starts_from_the_one_with_a_longer_step():
+    """Up to its own Δt it begins as the same map; alone it needs the other."""
+    rungs = (Rung(2, 0.5, 1, 1, options=QUICK), Rung(2, 0.25, 1, 1, None, "primed-2-0.5", options=QUICK))
+    (_, longer), (_, shorter) = Ladder(lambda: PENDULUM, rungs, t_end=5.0).flows()
+    start = SympFlow.primed(PENDULUM, 2, dt=0.25, processor=1)
+    ladder._restrict(start, longer)
+    x = torch.from_numpy(PENDULUM.domain.sample(5, 0))
+    torch.testing.assert_close(start.psi(0.2, x), longer.psi(0.2, x), rtol=1e-14, atol=1e-14)
+    both = lambda flow: flow.figures["one_step_error"] + flow.figures["fractional_error"]  # noqa: E731
+    assert both(shorter) < both(longer)
+    with pytest.raises(ValueError, match=r"^`rung` 'primed-2-0.25' starts from 'primed-2-0.5'"):
+        list(Ladder(lambda: PENDULUM, rungs).flows("primed-2-0.25"))
+
+
 # what ships ----------------------------------------------------------------------------------------------------
 
 

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from sympflow import HamiltonianSystem, solve
+from sympflow import HamiltonianSystem, get, solve
+from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
+from sympflow.integrators.logarithmic import LogSympFlow
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.kernels.primed_flow import PrimedFlowKernel
 from sympflow.kernels.splitting import splitting_kernel
@@ -42,7 +44,10 @@ class Runner:
     longest: float = np.inf
 
     @classmethod
-    def of_flow(cls, flow: PrimedFlow, system: HamiltonianSystem) -> Runner:
+    def of_flow(cls, flow: PrimedFlow | ClockedFlow, system: HamiltonianSystem) -> Runner:
+        if isinstance(flow, ClockedFlow):
+            name = f"{flow.scheme.name} with a clock, Δt = {flow.figures['step']:g}"
+            return cls._through_solve(name, flow.scheme.force_evaluations, system, partial(LogSympFlow, flow=flow))
         kernel, scheme = PrimedFlowKernel(flow, system), flow.kernel_scheme()
         name = f"Δt = {flow.dt:g}, {scheme.force_evaluations} + {flow.processor}"
         many = partial(kernel.run_batch, threads=1)
@@ -57,11 +62,13 @@ class Runner:
     @classmethod
     def of_transformed(cls, name: str, system: HamiltonianSystem) -> Runner:
         """A method of equal steps in the transformed time, through `solve`, with the cost of calling it."""
-        forces = SCHEMES[TRANSFORMED[name]].force_evaluations
+        return cls._through_solve(name, SCHEMES[TRANSFORMED[name]].force_evaluations, system, get(name))
 
+    @classmethod
+    def _through_solve(cls, name: str, forces: int, system: HamiltonianSystem, method: Callable[..., Any]) -> Runner:
         def run(h: float, y0: np.ndarray, n: int, save: np.ndarray) -> tuple[np.ndarray]:
             times = h * save
-            y = solve(system, name, (0.0, float(times[-1])), y0, dt=h, t_eval=times, on_domain_exit="ignore").y
+            y = solve(system, method(dt=h), (0.0, float(times[-1])), y0, t_eval=times, on_domain_exit="ignore").y
             missing = [*[(0, 0)] * (y.ndim - 1), (0, len(times) - y.shape[-1])]
             return (np.moveaxis(np.pad(y, missing, constant_values=np.nan), -1, -2),)
 
@@ -157,7 +164,7 @@ class Row:
 
 
 def race(
-    measure: Measure, target: float, flows: Sequence[PrimedFlow], taylor: Any, repeats: int, batch: int
+    measure: Measure, target: float, flows: Sequence[PrimedFlow | ClockedFlow], taylor: Any, repeats: int, batch: int
 ) -> Row | None:
     """All at the error `target`, on one thread: one trajectory, one with 1000 outputs, and a batch."""
     system, T = measure.system, measure.t_end
@@ -176,7 +183,8 @@ def race(
         return None
     ours = {r for r in steps if r in own}
     others = {r for r in steps if r not in own and r not in encounters}
-    sides = [side for side in (ours, others, {r for r in steps if r in encounters}) if side]
+    timed = {r for r in ours if isinstance(own[r], ClockedFlow)}  # each side against itself, for their forces differ
+    sides = [side for side in (ours - timed, timed, others, {r for r in steps if r in encounters}) if side]
     near = [r for side in sides for r in side if work[r] <= NEAR * min(work[s] for s in side)]
     tol = None if taylor is None else tolerance(measure, taylor, target)
     times = {

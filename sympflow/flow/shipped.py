@@ -36,7 +36,7 @@ class ShippedFlow:
     dt : float
         Δt.
     stages : int or None
-        Number of kicks of a primed flow, None for a network.
+        Number of kicks in a step of a primed flow, two of which in a row are one; None for a network.
     processor : int
         Number of pairs of its processor.
     cost : float or None
@@ -82,7 +82,7 @@ class ShippedFlow:
             kind=record["kind"],
             system=of["system"],
             dt=record["dt"] if origin is None else figures["step"],
-            stages=None if plan is None else (plan["maps"] + (plan["first"] == "kick")) // 2,
+            stages=None if plan is None else plan["maps"] // 2,
             processor=0 if plan is None else plan.get("processor", 0),
             cost=figures.get("cost"),
             energy_error=figures.get("energy_error_95"),

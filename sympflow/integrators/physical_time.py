@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sympflow.integrators.logarithmic import Logarithmic
 
 LARGEST_CHUNK = 2**20  # numbers in one chunk of states
-FIRST_CHUNK = 4096  # steps, at most, before it is known how fast time goes
+FIRST_CHUNK = 2**16  # steps, at most, before it is known how fast time goes
 LONGEST_STRIDE = 64  # steps from one state that is kept to the next, where few outputs are wanted
 MOST_KEPT = 100_000_000  # numbers that a run may store where every step is an output
 
@@ -86,11 +86,9 @@ class PhysicalRun:
         self.stalled, self.stride = False, 1
 
     def chunks(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Chunks of states (N, n + 1, 2d + 2), `self.stride` steps apart, and for each trajectory the last (N,) of them
-        that belongs to the run: the one that reaches or passes the end.
-        """
+        """Chunks of states (N, n + 1, 2d + 2), `stride` steps apart, and the last (N,) of a run, at or past its end."""
         x, total = self.start, 0
-        n = self._chunk(1.02 * self.length / self.integrator.step_length(self.system) + 2, FIRST_CHUNK)
+        n = self._chunk(1.1 * self.length / self.integrator.step_length(self.system) + 2, FIRST_CHUNK)
         running = np.full(len(x), self.length > 0)
         while running.any():
             states, good = x[:, None].repeat(n + 1, axis=1), np.zeros(len(x), dtype=int)
@@ -107,8 +105,8 @@ class PhysicalRun:
             if self.stalled:
                 lost |= running & ~passed.any(1)
             if self.stride > 1 and lost.any():  # step by step, to see where
-                n, self.stride = min(n * self.stride, FIRST_CHUNK), 1
-                n = self._chunk(n, n)
+                steps, self.stride = n * self.stride, 1
+                n = self._chunk(steps, FIRST_CHUNK)
                 continue
             self.n_steps += self.stride * last
             total += n * self.stride
@@ -123,8 +121,8 @@ class PhysicalRun:
 
     def _chunk(self, steps: float, most: int) -> int:
         """How many states of a chunk so many steps are, or the most that there may be."""
-        kept = max(16, LARGEST_CHUNK // (self.start.size))
-        return int(min(max(16, min(steps, most) / self.stride), kept))
+        kept = max(16, LARGEST_CHUNK // self.start.size)
+        return int(min(max(16, steps if steps < most else most) / self.stride + 1, kept))
 
     def _steps(self, x: np.ndarray, n: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
         """Of n steps from the states x (N, 2d + 2) each `stride`-th, (N, 1 + n/stride, 2d + 2), and the last finite."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import torch
 
 from sympflow.flow.certificate import upper_limit
 from sympflow.flow.clocked import ClockedFlow
+from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
@@ -39,6 +42,12 @@ class Rung:
         See `SympFlow.primed`.
     restarts : int
         Starts of the search.
+    scheme : str, optional
+        Of `stages` kicks, from which the search starts in place of equal leapfrog steps: one of a high order leads to
+        valleys that random tables, most of whose numbers are positive, do not lie near.
+    after : str, optional
+        The name of the rung with a longer Δt, the same kicks and the same processor whose table, continued to this Δt,
+        is where the search starts: deep valleys are found at a long Δt, and followed to a short one.
     options : dict
         Other options of `train`.
     """
@@ -47,6 +56,8 @@ class Rung:
     dt: float
     processor: int = 6
     restarts: int = 12
+    scheme: str | None = None
+    after: str | None = None
     options: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -54,10 +65,13 @@ class Rung:
         """Of its file, after that of the scene."""
         return f"primed-{self.stages}-{self.dt:g}"
 
-    def train(self, system: HamiltonianSystem, **options: Any) -> PrimedFlow:
-        """The flow, without a certificate."""
+    def train(self, system: HamiltonianSystem, longer: PrimedFlow | None = None, **options: Any) -> PrimedFlow:
+        """The flow, without a certificate; `longer` is that of the rung `after` which it comes."""
         before = time.process_time()
-        start = SympFlow.primed(system, self.stages, dt=self.dt, processor=self.processor)
+        first: dict[str, Any] = {"stages": self.stages} if self.scheme is None else {"scheme": self.scheme}
+        start = SympFlow.primed(system, **first, dt=self.dt, processor=self.processor)
+        if longer is not None:
+            _restrict(start, longer)
         flow = train(system, flow=start, **{"restarts": self.restarts, **self.options, **options})
         flow.figures["training_cpu_seconds"] = round(time.process_time() - before, 3)
         return flow
@@ -80,8 +94,8 @@ class ClockRung:
         """Of its file, after that of the scene."""
         return f"log-{self.dt:g}"
 
-    def train(self, system: HamiltonianSystem, **options: Any) -> ClockedFlow:
-        """The flow, without the energy errors; `options` of `train` say nothing to it."""
+    def train(self, system: HamiltonianSystem, longer: PrimedFlow | None = None, **options: Any) -> ClockedFlow:
+        """The flow, without the energy errors; neither a longer one nor the `options` of `train` say anything to it."""
         return train_clock(system, self.dt)
 
 
@@ -108,13 +122,27 @@ class Ladder:
     held_out: Callable[[HamiltonianSystem], np.ndarray] | None = None
     t_certified: float = 1000.0
 
-    def flows(self, rung: str | None = None, **options: Any) -> Iterator[tuple[Rung | ClockRung, SympFlow]]:
-        """Each rung and its flow, as they are made; or one rung only, by its name."""
+    def flows(
+        self, rung: str | None = None, made: Callable[[str], SympFlow] | None = None, **options: Any
+    ) -> Iterator[tuple[Rung | ClockRung, SympFlow]]:
+        """Each rung and its flow, as they are made; or one rung only, by its name.
+
+        `made` gives, by the name of a rung, a flow that was made before, for those that start from another.
+        """
         system = self.make()
+        there: dict[str, SympFlow] = {}
         for each in self.rungs:
             if rung in (None, each.name):
-                flow = each.train(system, **options)
+                after = getattr(each, "after", None)
+                if after is not None and after not in there:
+                    if made is None:
+                        raise ValueError(f"`rung` {rung!r} starts from {after!r}: make that first, or all of them.")
+                    there[after] = made(after).bound(system)  # type: ignore[assignment]
+                longer = None if after is None else there[after]
+                assert longer is None or isinstance(longer, PrimedFlow)
+                flow = each.train(system, longer, **options)
                 self._judge(flow, system)
+                there[each.name] = flow
                 yield each, flow
 
     def measure(self, flow: SympFlow) -> dict[str, Any]:
@@ -146,6 +174,17 @@ class Ladder:
             "t_end": self.t_end,
             "cost": round(cost(flow), 8),
         }
+
+
+@torch.no_grad()
+def _restrict(flow: PrimedFlow, longer: PrimedFlow) -> None:
+    """Give a flow the numbers of one with a longer Δt and the same architecture: up to its own Δt the same map."""
+    for name, column in flow.named_children():
+        if isinstance(column, Coefficients):
+            same = longer.get_submodule(name)
+            assert isinstance(same, Coefficients)
+            powers = (flow.dt / longer.dt) ** np.array(same.exponents, dtype=float)
+            column.set(same.table.cpu().double().numpy() * powers)
 
 
 def certify(flow: SympFlow, system: HamiltonianSystem, t_end: float = 1000.0) -> None:
@@ -186,8 +225,7 @@ def ladders() -> dict[str, Ladder]:
     """The ladders, by the name of the scene."""
     sizes: dict[str, tuple[tuple[float, ...], ...]] = {  # kicks, Δt and, if not 12, starts of the search
         "henon-heiles": (
-            (2, 1.5),
-            (2, 1.0),
+            (1, 0.75),
             (3, 1.2, 24),
             (3, 1.0),
             (3, 0.9, 16),
@@ -197,26 +235,19 @@ def ladders() -> dict[str, Ladder]:
             (3, 0.3, 24),
         ),
         "pendulum": ((2, 1.5), (3, 1.5), (3, 0.75), (3, 0.6), (3, 0.4), (3, 0.3, 24)),
-        "quartic": (
-            (2, 1.0),
-            (2, 0.75),
-            (3, 0.75),
-            (3, 0.6),
-            (3, 0.5),
-            (3, 0.4, 16),
-            (3, 0.3),
-            (3, 0.2, 24),
-            (3, 0.15, 24),
-        ),
+        "quartic": ((1, 0.5), (3, 0.75), (3, 0.6), (3, 0.5), (3, 0.4, 16)),
         "kepler": ((2, 0.25), (2, 0.15), (3, 0.2), (3, 0.15), (3, 0.1), (3, 0.08), (3, 0.06), (3, 0.045), (3, 0.03)),
     }
     # d = 18: starts are dear, few and short, and the gain of more is small
     short = {"points": 40, "label_times": 5, "reference_states": 20, "steps": 200}
     planets = tuple(Rung(3, dt, restarts=2, options=short) for dt in (300.0, 200.0, 100.0))
-    clocks = {"kepler": (ClockRung(1.0),)}
+    others: dict[str, tuple[Rung | ClockRung, ...]] = {
+        "quartic": (Rung(6, 0.6, 8, 1, "srkn6b"), *_continued(6, (0.6, 0.45, 0.3), 8, "srkn6b")),
+        "kepler": (ClockRung(1.0),),
+    }
     return {
         **{
-            scene.replace("-", "_"): Ladder(SYSTEMS[scene], (*(_rung(*each) for each in rungs), *clocks.get(scene, ())))
+            scene.replace("-", "_"): Ladder(SYSTEMS[scene], (*(_rung(*each) for each in rungs), *others.get(scene, ())))
             for scene, rungs in sizes.items()
         },
         "outer_solar_system": Ladder(SYSTEMS["outer-solar-system"], planets, 1e5 * YEAR, along_the_orbit, 100 * YEAR),
@@ -235,3 +266,12 @@ def along_the_orbit(system: HamiltonianSystem, n: int = 10, span: float = 1e5 * 
 
 def _rung(stages: float, dt: float, starts: float = 12) -> Rung:
     return Rung(int(stages), dt, restarts=int(starts))
+
+
+def _continued(
+    stages: int, steps: tuple[float, ...], processor: int = 6, scheme: str | None = None
+) -> tuple[Rung, ...]:
+    """Rungs of shorter and shorter Δt, each from the one before; the first is there."""
+    return tuple(
+        Rung(stages, dt, processor, 1, scheme, Rung(stages, longer).name) for longer, dt in itertools.pairwise(steps)
+    )

@@ -71,7 +71,7 @@ def _made(name: str, kind: str, options: argparse.Namespace) -> Iterator[tuple[P
                 if options.rung in (None, rung.name):
                     yield _measured(path(name, rung.name, options.out), ladder.measure, options.keep)
             return
-        for rung, flow in ladder.flows(options.rung):
+        for rung, flow in ladder.flows(options.rung, lambda other: load(path(name, other, options.out))):
             flow.save(file := path(name, rung.name, options.out))
             yield file, flow.figures
         return
