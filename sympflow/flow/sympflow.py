@@ -186,7 +186,7 @@ class SympFlow(FlowMap):
         Parameters
         ----------
         system : HamiltonianSystem
-            One with parts that are solved exactly: `sympflow.parts.exact_parts`.
+            One with parts that are solved exactly: `sympflow.decomposition.exact_parts`.
         stages : int
             Number of Strang steps, palindromic throughout.
         dt : float
