@@ -173,17 +173,17 @@ class ClockedFlow(SympFlow):
     def device(self) -> torch.device:
         return self.clock.numbers.device
 
-    def advance(self, s: np.ndarray | float, B: np.ndarray) -> np.ndarray:
-        """By how much the clock puts the time forward in a step s, which may be negative, at B."""
+    def advance(self, s: Any, B: Any) -> Any:
+        """By how much the clock puts the time forward in steps s, which may be negative, at B: numbers or arrays."""
         numbers = self.clock.numbers
         if self._numbers is None or self._numbers[0] != (numbers.data_ptr(), numbers._version):
             values = numbers.detach().cpu().double().numpy()[::-1].tolist()
             self._numbers = (numbers.data_ptr(), numbers._version), values
-        square = np.asarray(s) ** 2 * B
-        total = 0.0
+        square = s * s * B
+        total = 0.0 * square
         for c in self._numbers[1]:
             total = total * square + c
-        return np.asarray(s) ** 3 * total
+        return s * s * s * total
 
     def kernel_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
         """The compiled loops of this flow."""

@@ -38,7 +38,7 @@ class ClockedFlowKernel:
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` times ψ̄_h, or for h < 0 the inverse of ψ̄_|h|: see `SplittingKernel.run`."""
         Y, n_finite = self._splitting.run(self._scheme, h, y0, n_steps, save)
-        Y[:, self.flow.ndof - 1] += np.asarray(save) * self.flow.advance(h, y0[-1])
+        Y[:, self.flow.ndof - 1] += np.asarray(save) * self.flow.advance(float(h), float(y0[-1]))
         return Y, n_finite
 
     def run_batch(
@@ -52,5 +52,8 @@ class ClockedFlowKernel:
     def step(self, h: ArrayLike, y: np.ndarray) -> np.ndarray:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
         out = self._splitting.step(self._scheme, h, y)
-        out[:, self.flow.ndof - 1] += self.flow.advance(np.asarray(h, dtype=np.float64), y[:, -1])
+        if len(out) == 1:  # as plain numbers, ten times faster
+            out[0, self.flow.ndof - 1] += self.flow.advance(float(np.ravel(h)[0]), float(y[0, -1]))
+        else:
+            out[:, self.flow.ndof - 1] += self.flow.advance(np.asarray(h, dtype=np.float64), y[:, -1])
         return out
