@@ -18,7 +18,7 @@ help:  ## Show the targets
 	@touch $@
 
 demo: .venv/installed  ## Solve and compare on Hénon–Heiles with the shipped flow; figures in out/
-	$(BIN)/sympflow compare henon-heiles --methods sympflow:tol=1e-6,sympflow,mlp,verlet,leapfrog,srkn11b,rk45 --t-end 1000 --out out/
+	$(BIN)/sympflow compare henon-heiles --methods sympflow,sympflow:flow=henon_heiles-sympflow,mlp,verlet,leapfrog,srkn11b,rk45 --t-end 1000 --out out/
 
 test: .venv/installed-test lint  ## Lint, types and tests
 	$(BIN)/python -m pytest -n 2 --dist loadfile

@@ -1,4 +1,4 @@
-"""The paper's figures, and a Poincaré section, from the flows that ship with the package.
+"""The paper's figures, and a Poincaré section, from the networks that ship with the package.
 
 Long-time energy of SympFlow against the unconstrained MLP, and trajectories of SympFlow and ODE45 (SciPy's RK45 at its
 default tolerances), for the harmonic oscillator and Hénon–Heiles. Then the section q₁ = 0, p₁ > 0 of Hénon–Heiles at
@@ -23,12 +23,17 @@ TITLES = {"harmonic_oscillator": "Harmonic oscillator", "henon_heiles": "Hénon�
 COLOURS = {"sympflow": "C0", "mlp": "C3", "rk45": "C1", "kahan_li8": "black"}
 
 
+def network(system: HamiltonianSystem, method: str) -> dict[str, str]:
+    """The option that asks for the paper's kind of flow: by default a primed one is taken where one ships."""
+    return {"flow": f"{system.name}-{method}"} if method in ("sympflow", "mlp") else {}
+
+
 def energy_figure(system: HamiltonianSystem, t_end: float) -> Figure:
     """Energy over time of SympFlow and of the MLP, from the system's default initial state."""
     figure = Figure(figsize=(8.0, 3.2), layout="constrained")
     axes = figure.subplots(1, 2)
     for ax, method in zip(axes, ("sympflow", "mlp"), strict=True):
-        sol = solve(system, method, (0.0, t_end), on_domain_exit="ignore")
+        sol = solve(system, method, (0.0, t_end), on_domain_exit="ignore", **network(system, method))
         H0 = system.hamiltonian(system.y0)
         ax.plot(sol.t, (sol.energy() - H0) / H0, color=COLOURS[method], lw=0.8)
         ax.axhline(0.0, color="black", lw=0.8, ls="--")
@@ -46,7 +51,7 @@ def trajectory_figure(system: HamiltonianSystem, t_end: float) -> Figure:
     axes = figure.subplots(system.ndof, 1, sharex=True, squeeze=False)[:, 0]
     times = np.linspace(0.0, t_end, 2001)
     for method in ("kahan_li8", "rk45", "sympflow"):
-        sol = solve(system, method, (0.0, t_end), t_eval=times)
+        sol = solve(system, method, (0.0, t_end), t_eval=times, **network(system, method))
         for i, ax in enumerate(axes):
             style = {"lw": 1.6, "alpha": 0.4} if method == "kahan_li8" else {"lw": 0.9}
             ax.plot(sol.t, sol.q[i], color=COLOURS[method], label=LABELS[method], **style)
@@ -67,7 +72,8 @@ def section_figure(t_end: float, energy: float = 0.1) -> Figure:
     y0 = np.stack([0 * q2, q2, p1, p2], -1)
     figure = Figure(figsize=(8.0, 4.9), layout="constrained")
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
-    for ax, method, options in zip(axes, ("sympflow", "kahan_li8"), ({}, {"dt": 0.1}), strict=True):
+    choices = {"sympflow": network(system, "sympflow"), "kahan_li8": {"dt": 0.1}}
+    for ax, (method, options) in zip(axes, choices.items(), strict=True):
         points = poincare_section(system, method, (0.0, t_end), y0, sample=1.0, **options).states
         ax.plot(points[:, 1], points[:, 3], ".", ms=1.2, color=COLOURS[method])
         ax.set(xlabel="$q_2$", ylabel="$p_2$", title=LABELS[method], aspect="equal")

@@ -76,7 +76,7 @@ def test_if_none_meets_it_those_there_are_are_listed(three):
 
 
 def test_without_a_tolerance(three):
-    """The network, if there is one; else the cheapest rung that reaches 1e-6, else the most accurate."""
+    """The cheapest that reaches 1e-6; where no figures are known, the network."""
     assert choose(OSCILLATOR).dt == 0.7
     assert choose(PENDULUM).stages == 6
     assert solve(PENDULUM, "sympflow", (0.0, 1.0)).stats["force_evaluations"] == 2 * 6

@@ -141,13 +141,13 @@ def methods(words: str) -> list[Any]:
 
 
 def method(word: str) -> Any:
-    """One method: a name, a name with options, or the file of a trained flow."""
+    """One method: a name, a name with options (``sympflow:flow=`` takes the name of one that ships), or a flow's file."""
     if word.endswith(".safetensors"):
         from sympflow.flow.io import load
 
         return Path(word).stem, load(word)
     name, *pairs = word.split(":")
-    options = {key: _float(key, value) for key, value in _pairs(pairs)}
+    options = {key: value if key == "flow" else _float(key, value) for key, value in _pairs(pairs)}
     return (word, build(name, options)) if options else name
 
 

@@ -5,6 +5,7 @@ Only the headers of the files are read, once in a process: a flow's weights when
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 import struct
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from sympflow.system import HamiltonianSystem
 
 DEFAULT_TOL = 1e-6
-"""What the default flow of a system reaches if it has no network, and one of its primed flows does."""
+"""What the default flow of a system reaches, if one does."""
 
 
 @dataclass(frozen=True)
@@ -193,8 +194,8 @@ def choose(
 ) -> ShippedFlow:
     """The flow that `solve` takes: with `tol` the cheapest whose energy error is at most that.
 
-    Without `tol` it is the network that ships for the system, or else the cheapest of its primed flows that reaches
-    1e-6, or else the most accurate of them. Flows in another time are among those only if `transformed`.
+    Without `tol` it is the cheapest that reaches 1e-6, or else the most accurate of those whose error is known, or else
+    the network. Flows in another time are among those only if `transformed`.
 
     Raises
     ------
@@ -211,9 +212,7 @@ def choose(
             f"flow = sympflow.train(system{', kind=' + repr(kind) if kind != 'sympflow' else ''}) and pass flow=flow."
         )
     if tol is None:
-        networks = [f for f in own if f.stages is None]
-        able = [f for f in own if _error(f) <= DEFAULT_TOL]
-        return networks[0] if networks else able[0] if able else min(own, key=_error)
+        return next((f for f in own if _error(f) <= DEFAULT_TOL), min(own, key=lambda f: (_error(f), f.stages is not None)))
     able = [f for f in own if _error(f) <= tol]
     if not able:
         there = ", ".join(f"{f.name} {_brief(f.energy_error)}" for f in own)
@@ -222,6 +221,25 @@ def choose(
             "it, or train a flow and pass flow=flow."
         )
     return able[0]
+
+
+def named(name: str) -> ShippedFlow:
+    """The flow that ships under a name, that of its file.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    found = [f for f in _catalogue() if f.name == name]
+    if not found:
+        close = difflib.get_close_matches(name, [f.name for f in _catalogue()], n=3)
+        hint = f"Is it {' or '.join(map(repr, close))}? " if close else ""
+        raise ValueError(
+            f"`flow` {name!r} is the name of no flow that ships. {hint}`sympflow flows` lists them; flows from other "
+            "files are read by sympflow.load."
+        )
+    return found[0]
 
 
 def forces_saved(flow: ShippedFlow, system: HamiltonianSystem, tol: float) -> float:

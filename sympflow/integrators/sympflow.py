@@ -37,8 +37,8 @@ class FlowIntegrator(FixedStep):
     ----------
     dt : float, optional
         Step length, at most the flow's Δt, which is the default. A smaller one composes ψ̄_dt, which is another map.
-    flow : SympFlow or MLPFlow, optional
-        The default is the flow shipped for the system.
+    flow : SympFlow, MLPFlow or str, optional
+        A flow, or the name of one that ships. The default is the one shipped for the system.
     """
 
     flow: Any = field(default=None, repr=False)
@@ -51,6 +51,8 @@ class FlowIntegrator(FixedStep):
         super().__post_init__()
         if self.flow is None:
             return
+        if isinstance(self.flow, str):
+            object.__setattr__(self, "flow", _named(self.flow))
         if getattr(self.flow, "kind", None) != self.name:
             raise TypeError(
                 f"`flow` must be a trained flow of kind {self.name!r}; got {type(self.flow).__name__}. Load one with "
@@ -173,6 +175,15 @@ class FlowIntegrator(FixedStep):
         return states.numpy(), finite, "torch"
 
 
+def _named(name: str) -> Any:
+    """The flow that ships under a name."""
+    if (name,) not in _SHIPPED:
+        from sympflow.flow.shipped import named
+
+        _SHIPPED[name,] = named(name).load()
+    return _SHIPPED[name,]
+
+
 def _check_start(flow: Any, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:
     """A flow that is taken for its accuracy must start where its accuracy was measured."""
     from sympflow.solver import contained, domain_of
@@ -237,8 +248,9 @@ class SympFlowIntegrator(FlowIntegrator):
     ----------
     dt : float, optional
         Step length, at most the flow's Δt, which is the default. A smaller one composes ψ̄_dt, which is another map.
-    flow : SympFlow, optional
-        The default is the flow shipped for the system.
+    flow : SympFlow or str, optional
+        A flow, or the name of one that ships, as `sympflow.shipped_flows()` lists them. The default is, of those that
+        ship for the system, the cheapest whose figure is at most 1e-6, or else the most accurate.
     tol : float, optional
         Take the cheapest shipped flow whose relative energy error up to T = 1000, the 95 % quantile over held-out
         states, is at most this; `sympflow.shipped_flows(system)` lists them, and a T that differs. Where y0 is outside
@@ -311,8 +323,8 @@ class MLPIntegrator(FlowIntegrator):
     ----------
     dt : float, optional
         Step length, at most the flow's Δt, which is the default.
-    flow : MLPFlow, optional
-        The default is the flow shipped for the system.
+    flow : MLPFlow or str, optional
+        A flow, or the name of one that ships. The default is the one shipped for the system.
     """
 
     name: ClassVar[str] = "mlp"
