@@ -141,7 +141,7 @@ def methods(words: str) -> list[Any]:
 
 
 def method(word: str) -> Any:
-    """One method: a name, a name with options (``sympflow:flow=`` takes the name of one that ships), or a flow's file."""
+    """One method: a name, with options or without, such as ``sympflow:flow=pendulum-sympflow``, or a flow's file."""
     if word.endswith(".safetensors"):
         from sympflow.flow.io import load
 

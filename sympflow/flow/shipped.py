@@ -212,7 +212,8 @@ def choose(
             f"flow = sympflow.train(system{', kind=' + repr(kind) if kind != 'sympflow' else ''}) and pass flow=flow."
         )
     if tol is None:
-        return next((f for f in own if _error(f) <= DEFAULT_TOL), min(own, key=lambda f: (_error(f), f.stages is not None)))
+        best = min(own, key=lambda f: (_error(f), f.stages is not None))
+        return next((f for f in own if _error(f) <= DEFAULT_TOL), best)
     able = [f for f in own if _error(f) <= tol]
     if not able:
         there = ", ".join(f"{f.name} {_brief(f.energy_error)}" for f in own)
