@@ -43,8 +43,8 @@ def check_t_span(t_span: Any) -> tuple[float, float]:
 
 
 def _real(x: Any) -> float:
-    if type(x) is float:
-        return x
+    if type(x) is float or type(x) is int:
+        return float(x)
     if np.iscomplexobj(x):  # NumPy's complex numbers would lose their imaginary part with a warning
         raise TypeError("a complex number")
     return float(x)

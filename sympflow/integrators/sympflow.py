@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -138,13 +138,15 @@ class FlowIntegrator(FixedStep):
         return super().tangent(system, t, y, h)
 
     def run(self, problem: Problem) -> Outcome:
-        if self.flow is None:  # the shipped one, from here on
-            chosen: dict[str, Any] = {"flow": self._flow_like(problem.system, problem.y0)}
-            if self._tolerance is not None:
-                compiled = problem.backend != "array" and not is_tensor(problem.y0)
-                _check_start(chosen["flow"], problem.system, problem.y0, compiled)
-            return replace(self, **chosen, **({} if self._tolerance is None else {"tol": None})).run(problem)
-        return super().run(problem)
+        if self.flow is not None:
+            return super().run(problem)
+        flow = self._flow_like(problem.system, problem.y0)
+        if self._tolerance is not None:
+            compiled = problem.backend != "array" and not is_tensor(problem.y0)
+            _check_start(flow, problem.system, problem.y0, compiled)
+        chosen = copy.copy(self)  # with the shipped flow from here on; its fields have been checked
+        vars(chosen).update({"flow": flow} if self._tolerance is None else {"flow": flow, "tol": None})
+        return chosen.run(problem)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         if not hasattr(self.flow, "evaluations"):  # an MLP flow evaluates no forces
