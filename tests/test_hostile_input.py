@@ -132,6 +132,7 @@ ARGUMENTS = {
     "t_eval None inside": ({"t_eval": [None]}, TypeError, "`t_eval` must be real numbers"),
     "t_eval ragged": ({"t_eval": [[0.0], [0.0, 1.0]]}, TypeError, "`t_eval` must be real numbers"),
     "t_eval a set": ({"t_eval": {0.5}}, TypeError, "`t_eval` must be real numbers"),
+    "t_eval masked": ({"t_eval": np.ma.masked_array([0.0, 0.5], [0, 1])}, ValueError, "`t_eval` has masked entries"),
     "t_eval of 80 GB": ({"t_eval": far(0.5, 10**10)}, ValueError, r"`t_eval` has 1e\+10 times"),
     "t_eval times a batch": (
         {"t_eval": far(0.5, 10**6), "y0": np.zeros((1000, 2))},
@@ -205,7 +206,7 @@ ARGUMENTS = {
     "shift NaN": ({"shift": math.nan}, ValueError, "`shift` must be a finite number"),
     "shift enormous": ({"shift": 1e300}, ValueError, "`shift` must be a finite number"),
     "shift below the energy": ({"shift": -1e9}, ValueError, r"`shift` -1e\+09 does not exceed"),
-    "flow a number": ({"flow": 3}, TypeError, "`flow` must be a trained flow"),
+    "flow a file's name": ({"flow": "flow.safetensors"}, ValueError, "`flow` 'flow.safetensors' is the name of no flow"),
     "flow a file's name": ({"flow": "flow.safetensors"}, TypeError, "`flow` must be a trained flow"),
     "tol NaN": ({"tol": math.nan}, ValueError, "`tol` must be a positive number"),
     "tol out of reach": ({"tol": 1e-300}, ValueError, "`tol` 1e-300 is met by no flow"),
