@@ -101,11 +101,11 @@ def solve(
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     integrator = build(method, options)
-    check_applies(integrator, system)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
     if hasattr(integrator, "resolved"):  # which integrator a method is may depend on what it is asked for
         integrator = integrator.resolved(system, y_start, abs(t1 - t0))
+    check_applies(integrator, system)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
     every = check_save_every(save_every, times)
     if not isinstance(backend, str) or backend not in BACKENDS:

@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from sympflow import HamiltonianSystem, SympFlow, get, load, max_energy_error, solve, systems, time_transformed
+from sympflow import (
+    HamiltonianSystem,
+    SympFlow,
+    get,
+    load,
+    max_energy_error,
+    shipped_flows,
+    solve,
+    systems,
+    time_transformed,
+)
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.shipped import choose
 from sympflow.integrators.checks import check_integrator
@@ -259,3 +269,18 @@ def test_schemes_and_systems_without_a_clock_are_refused():
         ClockedFlow(3, terms=0)
     with pytest.raises(ValueError, match=r"^`system` 'plain' has no domain"):
         train_clock(HamiltonianSystem.from_sympy("p**2/2 - 1/sqrt(1 + q**2)", y0=[1, 0], name="plain"), 0.1)
+
+
+def test_a_flow_in_another_time_is_asked_for_by_name_or_by_a_tolerance_that_no_other_meets():
+    kepler = systems.kepler()
+    anomaly = np.linspace(0.0, 6 * np.pi, 7)
+    times = anomaly - 0.6 * np.sin(anomaly)
+    flow = next(f for f in shipped_flows(kepler) if f.shift is not None)
+    for options in ({"flow": flow.name}, {"flow": flow.load(kepler)}, {"tol": 1e-10}):
+        sol = solve(kepler, "sympflow", (0.0, times[-1]), t_eval=times, **options)
+        assert sol.integrator.name == "log_sympflow"
+        np.testing.assert_allclose(sol.y.T, kepler_ellipse(0.6, anomaly), rtol=0, atol=1e-11)
+    with pytest.raises(ValueError, match=r"^`compensated`"):
+        solve(kepler, "sympflow", (0.0, 1.0), flow=flow.name, compensated=True)
+    with pytest.raises(ValueError, match=r"^`tol` 1e-20 is met by no flow"):
+        solve(kepler, "sympflow", (0.0, 1.0), tol=1e-20)

@@ -284,7 +284,12 @@ class SympFlowIntegrator(FlowIntegrator):
                 raise ValueError(f"`tol` chooses the flow and its Δt, but `{name}` is given: leave out one of them.")
 
     def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> FixedStep:
-        """What runs: with `tol`, and over a `length` that is worth it, a flow in another time, by `LogSympFlow`."""
+        """What runs: with `tol`, and over a `length` that is worth it, a flow in another time, by `LogSympFlow`.
+
+        So does a flow in another time of this system that is given. A `tol` that no other meets is worth any length.
+        """
+        if self.flow is not None:
+            return self._given_in_another_time(system)
         if self.tol is None or self.compensated or is_tensor(y0) or y0.dtype != np.float64:
             return self
         key = ("in another time", self.name, system.fingerprint, self.tol)
@@ -304,6 +309,18 @@ class SympFlowIntegrator(FlowIntegrator):
 
         _check_start(flow, system, y0, False)
         return LogSympFlow(flow=flow, shift=shift)
+
+    def _given_in_another_time(self, system: HamiltonianSystem) -> FixedStep:
+        from sympflow.flow.base import same_system
+
+        origin = (self.flow.recipe or {}).get("transforms")
+        if origin is None or not same_system(origin["fingerprint"], system.fingerprint):
+            return self
+        from sympflow.integrators.logarithmic import LogSympFlow
+
+        if self.compensated:
+            raise ValueError("`compensated` sums are not for a flow in another time: leave it out.")
+        return LogSympFlow(flow=self.flow, shift=origin["shift"], dt=self.dt)
 
     def _compensated_kernel(self, problem: Problem, flow: Any) -> PrimedFlowKernel:
         kernel = _kernel(problem.system, flow, problem.y0, problem.backend)
