@@ -206,8 +206,8 @@ ARGUMENTS = {
     "shift NaN": ({"shift": math.nan}, ValueError, "`shift` must be a finite number"),
     "shift enormous": ({"shift": 1e300}, ValueError, "`shift` must be a finite number"),
     "shift below the energy": ({"shift": -1e9}, ValueError, r"`shift` -1e\+09 does not exceed"),
-    "flow a file's name": ({"flow": "flow.safetensors"}, ValueError, "`flow` 'flow.safetensors' is the name of no flow"),
-    "flow a file's name": ({"flow": "flow.safetensors"}, TypeError, "`flow` must be a trained flow"),
+    "flow a number": ({"flow": 3}, TypeError, "`flow` must be a trained flow"),
+    "flow a file's name": ({"flow": "f.safetensors"}, ValueError, "`flow` 'f.safetensors' is the name of no flow"),
     "tol NaN": ({"tol": math.nan}, ValueError, "`tol` must be a positive number"),
     "tol out of reach": ({"tol": 1e-300}, ValueError, "`tol` 1e-300 is met by no flow"),
 }
