@@ -47,7 +47,7 @@ class Event:
     label: str = "`events`"
 
     def value(self, t: float, y: Array) -> float:
-        value = self.g(t, y)
+        value = self.g(t, y.clone() if is_tensor(y) else y.copy())  # a g that writes into its y changes no result
         try:
             number = float(to_numpy(value))
         except (TypeError, ValueError) as error:

@@ -117,6 +117,8 @@ def check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
             raise TypeError(f"dtype {times.dtype}")
     except (TypeError, ValueError) as error:
         raise TypeError(f"`t_eval` must be real numbers; got {error}. Pass times such as [0.5, 1.0].") from error
+    if np.ma.is_masked(t_eval):
+        raise ValueError("`t_eval` has masked entries: fill them, or leave these times out.")
     if times.ndim != 1:
         raise ValueError(f"`t_eval` must be one-dimensional; got shape {times.shape}: pass a list of times.")
     if times.size > MAX_ASKED_VALUES:

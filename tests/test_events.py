@@ -309,3 +309,14 @@ def test_an_empty_list_of_events_is_an_empty_list_of_results():
     assert solve(OSCILLATOR, "verlet", (0, 1)).t_events is None
     fixed = HamiltonianSystem.from_sympy("p**2/2 + q**2/2", y0=START)
     assert solve(fixed, "verlet", (2, 2), events=lambda t, y: y[1]).t_events[0].size == 0
+
+
+@pytest.mark.parametrize("method", ["verlet", "rk45", "dopri5", "log_leapfrog"])
+def test_an_event_function_that_writes_into_its_state_changes_no_result(method):
+    def spoils(t, y):
+        y[0] = 99.0
+        return 1.0
+
+    oscillator = systems.harmonic_oscillator()
+    sol = solve(oscillator, method, (0.0, 1.0), events=spoils)
+    np.testing.assert_array_equal(sol.y, solve(oscillator, method, (0.0, 1.0), events=lambda t, y: 1.0).y)

@@ -192,6 +192,7 @@ def test_the_shipped_flow_of_the_spring_pendulum_beats_its_parts():
     ("options", "message"),
     [
         ({"stages": 0}, r"^`stages` must be a positive integer"),
+        ({"stages": 10**6}, r"^`stages` must be a positive integer, at most 1000"),
         ({"terms": 0}, r"^`terms` must be a positive integer"),
         ({"force_gradient": (0,), "stages": 3}, r"^`force_gradient` .* not the same from either end"),
         ({"force_gradient": (0, 7), "stages": 8, "parts": ("p2**2/2",)}, r"^`parts` do not add up"),

@@ -218,6 +218,9 @@ def test_a_map_of_a_family(tmp_path):
     for kind in ("map", "steps"):
         report.plot(tmp_path / f"{kind}.png", kind)
         assert (tmp_path / f"{kind}.png").stat().st_size > 5000
+    first = report.figure("map").axes[0]
+    assert [label.get_text() for label in first.get_yticklabels()] == ["1", "10"]  # not 6×10⁰ and its like
+    assert [label.get_text() for label in first.get_xticklabels()] == ["0.1", "1"]
     with pytest.raises(ValueError, match=r"^`kind` must be 'steps' or 'map'"):
         report.figure("pie")
     with pytest.raises(ValueError, match=r"^`kind` 'map' needs several systems"):

@@ -231,6 +231,7 @@ class TestNumbaFunctions:
         (lambda: HamiltonianSystem(lambda q: q, ndof=math.inf), ValueError, "^`ndof` must be a positive integer"),
         (lambda: HamiltonianSystem(hamiltonian=lambda q, p: q, ndof=1, mass=2), TypeError, "^`mass` only goes with"),
         (lambda: systems.harmonic_oscillator(-1), ValueError, "^`omega` must be positive"),
+        (lambda: systems.harmonic_oscillator(1e308), ValueError, "^`omega` must be positive"),
     ],
 )
 def test_bad_definitions_are_named(make, error, message):

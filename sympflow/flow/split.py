@@ -297,8 +297,8 @@ def split(
     device: torch.device | str | None,
 ) -> SplitFlow:
     """`SympFlow.split`."""
-    if isinstance(stages, bool) or not isinstance(stages, int) or stages < 1:
-        raise ValueError(f"`stages` must be a positive integer; got {stages!r}.")
+    if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= 1000:
+        raise ValueError(f"`stages` must be a positive integer, at most 1000; got {stages!r}.")
     parts = exact_parts(system, expressions)
     if force_gradient is None:
         force_gradient = parts.has_force_gradient

@@ -160,7 +160,7 @@ def map_evaluations(maps: Sequence[Map], n_steps: int, n_saved: int, n_extra: in
     if backend == "compiled" and len(maps) > 1 and maps[0].part == maps[-1].part:
         last = maps[-1].part != LINEAR, _has_gradient(maps[-1])  # it is the next step's first one
         counts = [count - (n_steps - n_saved) * one for count, one in zip(counts, last, strict=True)]
-    return {"force_evaluations": counts[0], "hessian_evaluations": counts[1]}
+    return {"force_evaluations": int(counts[0]), "hessian_evaluations": int(counts[1])}
 
 
 def _has_gradient(m: Map) -> bool:

@@ -12,6 +12,7 @@ from sympflow.studies.stability_report import StabilityReport, StabilityRow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 SMALLEST, LARGEST = 1e-15, 1e3
@@ -48,9 +49,10 @@ def _steps(report: StabilityReport) -> Figure:
         for label, dtype in dict.fromkeys((r.label, r.dtype) for r in rows):
             own = [r for r in rows if (r.label, r.dtype) == (label, dtype)]
             _curve(ax, own, styles[label], "" if dtype == "float64" else f" ({dtype})")
+        ax.set_ylim(SMALLEST / 3, 3 * LARGEST)  # before the scale, which warns where all errors are the same
         ax.set_xscale("log")
         ax.set_yscale("log")
-        ax.set_ylim(SMALLEST / 3, 3 * LARGEST)
+        _plain_ticks(ax.xaxis, [r.dt for r in rows if r.dt is not None])
         dress(ax, "step", "largest |energy error|, relative")
         ax.set_title(name, loc="left", fontsize=10, color=TEXT)
     handles = {h.get_label(): h for ax in axes for h in ax.lines if not str(h.get_label()).startswith("_")}
@@ -75,6 +77,15 @@ def _curve(ax: Axes, rows: list[StabilityRow], style: tuple[str, str], note: str
     lost = [r.dt for r in rows if r.dt is not None and r.status in ("unstable", "outside")]
     if lost:
         ax.plot(lost, [LARGEST] * len(lost), "x", color=colour, ms=7, mew=1.6)
+
+
+def _plain_ticks(axis: Axis, values: list[float]) -> None:
+    """The values themselves as ticks where powers of ten are too few for a scale; matplotlib would write 6×10⁰."""
+    ticks = sorted(set(values))
+    if ticks and ticks[-1] < 100 * ticks[0]:
+        spread = [t for i, t in enumerate(ticks) if i == 0 or t > 1.15 * ticks[i - 1]]
+        axis.set_ticks(spread, labels=[f"{t:.3g}" for t in spread])
+        axis.set_ticks([], minor=True)
 
 
 def _shown(row: StabilityRow) -> float:
@@ -108,6 +119,8 @@ def _map(report: StabilityReport) -> Figure:
             ax.plot(*zip(*limits, strict=True), color="#D55E00", lw=1.4)
         ax.set_xscale("log")
         ax.set_yscale("log")
+        _plain_ticks(ax.xaxis, [r.dt for r in report.rows if r.dt is not None])
+        _plain_ticks(ax.yaxis, [r.value for r in report.rows if r.value is not None])
         parameter = next((r.parameter for r in rows if r.parameter), "parameter")
         dress(ax, "step", _GREEK.get(parameter, parameter))
         ax.set_title(label, loc="left", fontsize=10, color=TEXT)
