@@ -2,6 +2,7 @@
 
 import copy
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -418,3 +419,9 @@ def test_no_drift_over_a_million_steps(system, stages, processor):
     assert abs(drift.slope) * T <= max(3 * drift.standard_error * T, 10 * EPS * n**0.5)
     assert error.max() < 2 * error[:400].max()
     assert sol.stats["force_evaluations"] == n * stages + (4000 + 1) * processor
+
+
+def test_flows_travel_to_other_processes():
+    flow = random_flow(HH, stages=2, processor=2, dt=0.5)
+    copied, x = pickle.loads(pickle.dumps(flow)), states(HH)
+    assert torch.equal(copied(0.3, x), flow(0.3, x))

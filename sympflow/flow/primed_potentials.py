@@ -70,10 +70,27 @@ def _force_gradient(system: HamiltonianSystem, q: Tensor) -> Tensor:
     return system.hessian_vector(q, system.velocity(system.force(q)))
 
 
-POTENTIAL = Term(lambda system, q: system.potential(q), lambda system, q: -system.force(q))
+def _potential(system: HamiltonianSystem, q: Tensor) -> Tensor:
+    return system.potential(q)
+
+
+def _potential_gradient(system: HamiltonianSystem, q: Tensor) -> Tensor:
+    return -system.force(q)
+
+
+def _kinetic(system: HamiltonianSystem, p: Tensor) -> Tensor:
+    return system.kinetic(p)
+
+
+def _velocity(system: HamiltonianSystem, p: Tensor) -> Tensor:
+    return system.velocity(p)
+
+
+# Functions with names, by which pickle finds them.
+POTENTIAL = Term(_potential, _potential_gradient)
 FORCE_GRADIENT = Term(_force_gradient_value, _force_gradient)
 """−½|∇V|²_{M⁻¹}; −∇²V M⁻¹∇V."""
-KINETIC = Term(lambda system, p: system.kinetic(p), lambda system, p: system.velocity(p))
+KINETIC = Term(_kinetic, _velocity)
 
 
 def _gradient_columns(U: Term, system: HamiltonianSystem, x: Tensor) -> Tensor:
