@@ -492,6 +492,12 @@ def test_data_without_labels_at_dt_are_refused():
         train(PENDULUM, flow=start, data=_labels_at(0.2), restarts=2, steps=8, progress=False)
 
 
+@pytest.mark.parametrize("options", [{"flow": SympFlow.primed(PENDULUM, 2, dt=0.5)}, {"kind": "sympflow", "dt": 0.5}])
+def test_labels_that_the_loss_leaves_out_are_refused(options):
+    with pytest.raises(ValueError, match=r"^`data` has labels, which `loss` 'residual'"):
+        train(PENDULUM, loss="residual", data=_labels_at(0.5), progress=False, **options)
+
+
 def test_a_fit_returns_nothing_worse_than_its_start():
     """Labels at Δt of another system: the flow as it was given is nearer to the exact one at the held-out states."""
     start = SympFlow.primed(PENDULUM, 2, dt=0.5, processor=2)

@@ -120,6 +120,10 @@ def _of_gradients(
 
 def _weights(loss: str, given: dict[str, Any]) -> dict[str, Any]:
     names = ("residual_weight", "matching_weight", "label_weight")
+    if given["data"] is not None and isinstance(loss, str) and "labels" not in loss.split("+"):
+        raise ValueError(
+            f"`data` has labels, which `loss` {loss!r} does not use: add +labels to it, or leave `data` out."
+        )
     return dict(zip(names, weights_of(loss, *(given[name] for name in names)), strict=True))
 
 
