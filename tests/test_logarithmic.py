@@ -7,9 +7,11 @@ import torch
 from sympflow import (
     HamiltonianSystem,
     SympFlow,
+    compare,
     get,
     load,
     max_energy_error,
+    poincare_section,
     shipped_flows,
     solve,
     systems,
@@ -284,3 +286,15 @@ def test_a_flow_in_another_time_is_asked_for_by_name_or_by_a_tolerance_that_no_o
         solve(kepler, "sympflow", (0.0, 1.0), flow=flow.name, compensated=True)
     with pytest.raises(ValueError, match=r"^`tol` 1e-20 is met by no flow"):
         solve(kepler, "sympflow", (0.0, 1.0), tol=1e-20)
+
+
+def test_comparisons_and_sections_take_what_solve_takes():
+    kepler, exact = systems.kepler(), get("sympflow")(tol=1e-10)
+    row = compare(kepler, [("flow", exact)], t_span=(0.0, 20.0), metrics=("energy",), repeats=1).rows[0]
+    assert row.status == "ok"
+    assert row.training_time is not None
+    assert row.energy_error < 1e-12
+    section = poincare_section(kepler, exact, (0.0, 20.0))
+    # q1 = 0 on the ellipse: cos E = e, upwards before the perihelion
+    anomaly = 2 * np.pi * np.arange(1, 4) - np.arccos(0.6)
+    np.testing.assert_allclose(section.t, anomaly - 0.6 * np.sin(anomaly), rtol=0, atol=1e-11)

@@ -190,8 +190,10 @@ def _first_run(one: Run, run: Callable[[Any], Solution]) -> None:
     )
     if sol.success and "domain_exit" in stats:
         one.note(f"The state left the flow's domain at t = {stats['domain_exit']:.4g}.")
-    if integrator.trained:
-        figures = integrator.flow_for(sol.system).figures
+    ran: Any = sol.integrator  # with `tol` it may be another than was asked for: see `SympFlowIntegrator.resolved`
+    if ran.trained:
+        flow = getattr(ran, "flow", None)
+        figures = (ran.flow_for(sol.system) if flow is None else flow).figures
         one.row = replace(one.row, training_time=figures.get("training_seconds"))
 
 

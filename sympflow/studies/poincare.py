@@ -83,11 +83,13 @@ def poincare_section(
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     integrator = build(method, options)
-    check_applies(integrator, system)
     span = check_t_span(system.t_span if t_span is None else t_span)
     if is_tensor(y0):
         raise TypeError("`y0` is a tensor, but crossings are located on NumPy arrays: pass y0.numpy().")
     start = check_y0(system, system.y0 if y0 is None else y0, None)
+    if hasattr(integrator, "resolved"):
+        integrator = integrator.resolved(system, start, abs(span[1] - span[0]))
+    check_applies(integrator, system)
     index = _check_coordinate(coordinate, system.ndof)
     if direction not in (-1, 0, 1):
         raise ValueError(f"`direction` must be 1 (upwards), -1 (downwards) or 0 (both); got {direction!r}.")
