@@ -282,6 +282,8 @@ def test_a_flow_in_another_time_is_asked_for_by_name_or_by_a_tolerance_that_no_o
         sol = solve(kepler, "sympflow", (0.0, times[-1]), t_eval=times, **options)
         assert sol.integrator.name == "log_sympflow"
         np.testing.assert_allclose(sol.y.T, kepler_ellipse(0.6, anomaly), rtol=0, atol=1e-11)
+    with pytest.raises(ValueError, match=r"^`system` 'kepler' .* in another time: pass time_transformed\(system, 0\)"):
+        load(flow.path, system=kepler)
     with pytest.raises(ValueError, match=r"^`compensated`"):
         solve(kepler, "sympflow", (0.0, 1.0), flow=flow.name, compensated=True)
     with pytest.raises(ValueError, match=r"^`tol` 1e-20 is met by no flow"):

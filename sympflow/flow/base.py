@@ -262,6 +262,12 @@ class FlowMap(nn.Module):
 
     def check_system(self, system: HamiltonianSystem) -> None:
         """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
+        origin = self.recipe.get("transforms")
+        if origin is not None and same_system(origin["fingerprint"], system.fingerprint):
+            raise ValueError(
+                f"`system` {system.name!r} is the one of this flow, but in another time: pass time_transformed(system, "
+                f"{origin['shift']:g}) here; solve(system, 'sympflow', flow=flow) runs it in the physical time."
+            )
         if system.ndof != self.ndof:
             raise ValueError(
                 f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: "
