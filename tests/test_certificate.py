@@ -12,11 +12,13 @@ from safetensors.torch import load_file, save_file
 import sympflow
 from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, solve, systems
 from sympflow.flow.certificate import Certificate, Quantiles, upper_limit
-from sympflow.flow.io import KEY, shipped
+from sympflow.flow.io import KEY, load, shipped
+from sympflow.flow.shipped import named
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 QUICK = {"states": 300, "times": 9, "held_out": 20, "t_end": 100.0}
 EPS = np.finfo(float).eps
+NETWORK = named("henon_heiles-sympflow").path
 
 
 def primed(system=HH, **options):
@@ -25,10 +27,10 @@ def primed(system=HH, **options):
 
 
 FLOWS = {
-    "network": (lambda: shipped(HH), HH),
+    "network": (lambda: load(NETWORK), HH),
     "primed": (primed, HH),
     "pendulum": (lambda: primed(PENDULUM), PENDULUM),
-    "layers": (lambda: SympFlow.from_layers(list(shipped(HH).layers), 1.0), HH),
+    "layers": (lambda: SympFlow.from_layers(list(load(NETWORK).layers), 1.0), HH),
 }
 
 

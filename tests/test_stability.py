@@ -146,7 +146,8 @@ def test_a_flow_outside_its_domain_is_not_called_stable():
     """The solution does not exist beyond t*; the flow goes on, finite and wrong, outside Ω."""
     escaping = [[0.0, 0.0, 0.0, 0.7]]
     arguments = {"steps": [0.1], "t_span": (0.0, 20.0), "y0": escaping, "min_steps": 1}
-    report = stability(systems.henon_heiles(), ["sympflow"], metrics=("energy",), **arguments)
+    network = sympflow.get("sympflow")(flow="henon_heiles-sympflow")
+    report = stability(systems.henon_heiles(), [network], metrics=("energy",), **arguments)
     (row,), (limit,) = report.rows, report.limits
     assert row.status == "outside"
     assert re.search(r"Left the flow's domain at t = [\d.]+, where the flow says nothing\.", row.reason)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -249,11 +250,13 @@ class FlowMap(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        return next(self.parameters()).dtype
+        """That of its numbers; float64 if it has none."""
+        return next((w.dtype for w in chain(self.parameters(), self.buffers())), torch.float64)
 
     @property
     def device(self) -> torch.device:
-        return next(self.parameters()).device
+        """Where its numbers are; the CPU if it has none."""
+        return next((w.device for w in chain(self.parameters(), self.buffers())), torch.device("cpu"))
 
     @property
     def n_parameters(self) -> int:
