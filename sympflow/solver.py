@@ -130,7 +130,7 @@ def solve(
         )
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
-    if np.any(np.asarray(outcome.status) < 0):
+    if outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0):
         from sympflow.singularity import note_singularities
 
         note_singularities(outcome, integrator, problem)

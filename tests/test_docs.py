@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from sympflow import shipped_flows
+
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 CUT_SHORT = {"restarts=4)": "restarts=1, steps=8, points=40)"}  # a search, where only that it runs is tested
@@ -41,6 +43,10 @@ def test_the_code_on_a_page_runs(page, tmp_path):
         [sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stderr
+
+
+def test_the_table_of_flows_is_that_of_the_package():
+    assert shipped_flows().table() in (DOCS / "training.md").read_text()
 
 
 def test_relative_links_lead_somewhere():

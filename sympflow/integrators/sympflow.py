@@ -144,8 +144,8 @@ class FlowIntegrator(FixedStep):
         if self._tolerance is not None:
             compiled = problem.backend != "array" and not is_tensor(problem.y0)
             _check_start(flow, problem.system, problem.y0, compiled)
-        chosen = copy.copy(self)  # with the shipped flow from here on; its fields have been checked
-        vars(chosen).update({"flow": flow} if self._tolerance is None else {"flow": flow, "tol": None})
+        chosen = object.__new__(type(self))  # with the shipped flow from here on; the fields have been checked
+        vars(chosen).update(vars(self), flow=flow, **({} if self._tolerance is None else {"tol": None}))
         return chosen.run(problem)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
