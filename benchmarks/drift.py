@@ -72,7 +72,7 @@ class Drift:
 
 def drift_of(entry: ShippedFlow, system: HamiltonianSystem, steps: int) -> Drift:
     """That of a shipped flow."""
-    flow = sympflow.load(entry.path, system=system)
+    flow = entry.load(system)
     y0 = np.asarray(REGULAR.get(system.name, system.y0), dtype=float)
     T, every = steps * flow.dt, max(1, steps // OUTPUTS)
     begin = time.process_time()

@@ -82,7 +82,9 @@ def __getattr__(name: str) -> Any:
         return import_module(f"sympflow.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'sympflow' has no attribute {name!r}")
-    value = getattr(import_module(f"sympflow.{_HOME[name]}"), name)
+    from sympflow.imports import whole_import
+
+    value = getattr(whole_import(f"sympflow.{_HOME[name]}"), name)
     globals()[name] = value
     return value
 

@@ -453,5 +453,5 @@ def test_blow_up_is_reported(method):
         assert "The state left the domain at t = 0" in got.message
         return
     assert got.status == -1
-    assert re.search(ENDINGS + "|hardly advances|`max_num_steps` = 10000", got.message)
+    assert re.search(ENDINGS + "|hardly advances|`max_num_steps` = 5000", got.message)
     assert abs(got.stats["blow_up_time"] - t_star) < got.stats.get("dt", ESCAPE.dt)

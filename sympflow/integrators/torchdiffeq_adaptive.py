@@ -37,7 +37,7 @@ class Adaptive(Watched, RungeKutta):
 
     rtol: float = 1e-7
     atol: float = 1e-9
-    max_num_steps: int = 10_000
+    max_num_steps: int = 5_000
 
     tableau: ClassVar[Tableau]
 

@@ -88,7 +88,7 @@ class Watched(Integrator):
         if t_span[0] == t_span[1]:
             return trace, failure
         y = y0 if is_tensor(y0) else torch.from_numpy(np.ascontiguousarray(y0))
-        with torch.set_grad_enabled(is_tensor(y0) and torch.is_grad_enabled()):
+        with torch.set_grad_enabled(is_tensor(y0) and torch.is_grad_enabled()), np.errstate(all="ignore"):
             try:
                 self.integrate(trace, y, abs(t_span[1] - t_span[0]))
             except _EndedError:
