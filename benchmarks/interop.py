@@ -3,7 +3,8 @@
     python benchmarks/interop.py                 # a table; about a minute on two cores
     python benchmarks/interop.py --json out.json # the same as JSON
 
-1. The time of a step inside `solve_ivp`: the shipped Hénon–Heiles flow (Δt = 1) against SciPy's RK45.
+1. The time of a step inside `solve_ivp`: the default Hénon–Heiles flow (Δt = 0.8) and the network (Δt = 1) against
+   SciPy's RK45 on the system object, and on a right-hand side written in plain NumPy.
 2. Batched `odeint` of 1000 Hénon–Heiles trajectories to T = 20: ours against dopri5 at the same median error of the
    state, dopri5's tolerance being bisected until its error is that of ours. Without gradients ours run compiled; with
    gradients (forward and backward) both are eager torch.
@@ -28,12 +29,20 @@ import torch
 from scipy.integrate import RK45
 
 from sympflow import get, solve, systems
+from sympflow.flow.shipped import named
 from sympflow.interop.scipy import as_scipy
 from sympflow.interop.torchdiffeq import odeint
 from sympflow.studies.tables import Column, number, seconds, text_table
 
 HH = systems.henon_heiles()
 N, T_END = 1000, 20.0
+NETWORK = "henon_heiles-sympflow"
+
+
+def plain(t: float, y: np.ndarray) -> np.ndarray:
+    """The right-hand side of Hénon–Heiles as a user of SciPy writes it."""
+    q1, q2, p1, p2 = y
+    return np.array([p1, p2, -q1 - 2 * q1 * q2, -q2 - q1 * q1 + q2 * q2])
 
 
 def best(run: Callable[[], Any], repeats: int = 3) -> float:
@@ -49,19 +58,25 @@ def best(run: Callable[[], Any], repeats: int = 3) -> float:
 
 def step_costs(n: int = 1000) -> list[dict[str, Any]]:
     """Seconds for each step of `solve_ivp`'s solvers, without and with the dense output that events need."""
-    solvers = {"sympflow (Δt = 1)": as_scipy("sympflow", HH), "verlet": as_scipy("verlet", HH), "RK45 of SciPy": RK45}
+    solvers = {
+        "sympflow (Δt = 0.8)": (as_scipy("sympflow", HH), HH),
+        "sympflow, network (Δt = 1)": (as_scipy("sympflow", HH, flow=NETWORK), HH),
+        "verlet": (as_scipy("verlet", HH), HH),
+        "RK45 of SciPy, plain NumPy": (RK45, plain),
+        "RK45 of SciPy": (RK45, HH),
+    }
 
-    def steps(solver: Any, dense: bool) -> None:
-        s = solver(HH, 0.0, HH.y0, 1e5)
+    def steps(solver: Any, function: Any, dense: bool) -> None:
+        s = solver(function, 0.0, HH.y0, 1e5)
         for _ in range(n):
             s.step()
             if dense:
                 s.dense_output()(0.5 * (s.t_old + s.t))
 
     rows = []
-    for name, solver in solvers.items():
-        plain, dense = (best(lambda d=d, s=solver: steps(s, d)) / n for d in (False, True))
-        rows.append({"solver": name, "step": plain, "step_and_dense": dense})
+    for name, pair in solvers.items():
+        bare, dense = (best(lambda d=d, p=pair: steps(*p, d)) / n for d in (False, True))
+        rows.append({"solver": name, "step": bare, "step_and_dense": dense})
     return rows
 
 
@@ -81,6 +96,7 @@ def equal_errors() -> list[dict[str, Any]]:
     rows = []
     for method, options in (
         ("sympflow", {}),
+        ("sympflow", {"flow": named(NETWORK).load(HH)}),
         ("srkn6b", {"dt": 0.5}),
         ("srkn11b", {"dt": 0.5}),
         ("kahan_li8", {"dt": 0.25}),
@@ -95,7 +111,11 @@ def equal_errors() -> list[dict[str, Any]]:
             middle = (low + high) / 2
             low, high = (middle, high) if error(dopri5(10**middle), reference) < target else (low, middle)
         tolerance = 10**low
-        row = {"method": method, "error": target, "dopri5_tolerance": tolerance}
+        row = {
+            "method": f"{method}, network" if "flow" in options else method,
+            "error": target,
+            "dopri5_tolerance": tolerance,
+        }
         row["dopri5_error"] = error(dopri5(tolerance), reference)
         graph = y0.clone().requires_grad_(True)
         row |= {"time": best(ours), "dopri5_time": best(lambda e=tolerance: dopri5(e), 1)}
