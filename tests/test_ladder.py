@@ -72,7 +72,7 @@ def test_if_none_meets_it_those_there_are_are_listed(three):
     with pytest.raises(ValueError, match=message):
         solve(PENDULUM, "sympflow", (0.0, 1.0), tol=1e-9)
     with pytest.raises(ValueError, match=r"^`system` 'plain_quartic' has no shipped sympflow flow"):
-        solve(QUARTIC, "sympflow", (0.0, 1.0), tol=1e-3)
+        solve(QUARTIC, "sympflow", (0.0, 1.0), [0.5, 0.0], tol=1e-3)
 
 
 def test_without_a_tolerance(three):
