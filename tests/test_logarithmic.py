@@ -147,6 +147,21 @@ def test_a_collision_ends_the_run_with_its_time():
     assert escape.t[-1] <= escape.stats["failed_at"] < 5.450984210235402
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_force_evaluations_on_arrays_are_bounded_before_a_singularity(method):
+    """Time hardly advances there: 20,000 evaluations, and those of 6 steps (at least 50) for each dt of the interval."""
+    system, length = systems.henon_heiles(), 6.0
+    sol = solve(system, method, (0.0, length), y0=[0.0, 0.0, 0.0, 0.7], backend="array")
+    stages = sol.stats["force_evaluations"] / sol.stats["n_steps"]
+    most = 20_000 + max(50, 6 * stages) * length / system.dt
+    assert sol.status == -1
+    assert "time hardly advances any more" in sol.message
+    assert most - stages <= sol.stats["force_evaluations"] <= most
+    batch = solve(system, method, (0.0, 6.0), y0=[[0, 0, 0, 0.7], [0, 0, 0, 0.1]], backend="array", t_eval=[1.0, 6.0])
+    assert batch.status.tolist() == [-1, 0]
+    assert batch.stats["n_steps"] <= most / stages
+
+
 def test_bad_shifts_and_systems_are_refused():
     with pytest.raises(
         ValueError, match=r"^`shift` 0.1 does not exceed the potential at `y0`.*give one above the energy"

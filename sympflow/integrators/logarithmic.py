@@ -16,9 +16,10 @@ import numpy as np
 
 from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.integrators.base import FixedStep, Outcome, Problem, Steps, check_flag
-from sympflow.integrators.physical_time import PhysicalRun, reach
+from sympflow.integrators.physical_time import PhysicalRun
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.integrators.splitting import splitting
+from sympflow.integrators.time_search import reach
 from sympflow.system import HamiltonianSystem
 from sympflow.time_transformation import checked_shift, default_shift, lifted, projected, time_scale, time_transformed
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sympflow.integrators.base import FINISHED, Outcome, Problem
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.time_search import reach
 from sympflow.time_transformation import lifted, projected
 
 if TYPE_CHECKING:
@@ -18,41 +19,10 @@ LARGEST_CHUNK = 2**20  # numbers in one chunk of states
 FIRST_CHUNK = 2**16  # steps, at most, before it is known how fast time goes
 LONGEST_STRIDE = 64  # steps from one state that is kept to the next, where few outputs are wanted
 MOST_KEPT = 100_000_000  # numbers that a run may store where every step is an output
-
-
-def reach(
-    step: Callable[[np.ndarray], np.ndarray],
-    start: np.ndarray,
-    longest: np.ndarray,
-    target: np.ndarray,
-    guess: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The states step(σ), σ from 0 to `longest`, whose time is `target`, and σ: the secant method within brackets."""
-    d = start.shape[1] // 2 - 1
-    eps = float(np.finfo(start.dtype).eps)
-    tolerance = 2 * eps * np.maximum(np.abs(target), np.abs(start[:, d]))
-    low, high = np.zeros_like(longest), longest.copy()
-    sign = np.sign(longest)
-    sigma = np.where((guess - low) * sign < 0, low, np.where((guess - high) * sign > 0, high, guess))
-    best, best_sigma, best_residual = start.copy(), np.zeros_like(sigma), np.abs(start[:, d] - target)
-    last_sigma, last_t = np.zeros_like(sigma), start[:, d].copy()
-    for _ in range(80):
-        x = step(sigma)
-        residual = x[:, d] - target
-        better = np.abs(residual) < best_residual
-        best[better], best_sigma[better], best_residual[better] = x[better], sigma[better], np.abs(residual)[better]
-        if not (best_residual > tolerance).any():
-            break
-        beyond = ~(residual * sign < 0)  # NaN counts as too far
-        high, low = np.where(beyond, sigma, high), np.where(beyond, low, sigma)
-        slope = (x[:, d] - last_t) / (sigma - last_sigma)  # the first time of the chord of the step so far
-        rate = np.where(np.isfinite(slope) & (slope > 0), slope, np.inf)
-        secant = sigma - residual / rate
-        inside = ((secant - low) * sign > 0) & ((high - secant) * sign > 0)
-        last_sigma, last_t = sigma, x[:, d].copy()
-        sigma = np.where(inside & np.isfinite(secant), secant, (low + high) / 2)
-    best[best_residual > np.maximum(1e-3 * np.abs(target - start[:, d]), 100 * tolerance)] = np.nan  # no such σ
-    return best, best_sigma
+FEW_EVALUATIONS = 20_000  # of forces on arrays, half a second, before a run whose time hardly advances is ended;
+EVALUATIONS_EACH = 50  # and these for each step of the physical length dt within the interval,
+STEPS_EACH = 6  # or as many as so many steps take
+COMPILED_FOR_ONE = 10  # compiled evaluations that are allowed for one on arrays, which takes a thousand times longer
 
 
 class PhysicalRun:
@@ -80,12 +50,19 @@ class PhysicalRun:
             Grid(problem.t0, problem.t1, integrator.step_length(self.system))  # refuses a dt of too many steps
         self.h = self.sign * integrator.new_step(self.system)
         compiled = problem.backend != "array" and problem.y0.dtype == np.float64 and self.system.symbols is not None
-        few, each = (20_000, 1000) if compiled else (10_000, 100)  # a step of arrays takes a thousand times longer
-        self.most_steps = few + each * self.length / integrator.step_length(self.system)
+        self.most_steps = self._most_steps(COMPILED_FOR_ONE if compiled else 1)
         self.n_steps = np.zeros(len(rows), dtype=int)
         self.n_extra, self.backend = 0, ""
         self.failed_at = np.full(len(rows), np.nan)
-        self.stalled, self.stride = False, 1
+        self.stalled = np.zeros(len(rows), dtype=bool)
+        self.stride = 1
+
+    def _most_steps(self, allowance: int) -> int:
+        """Steps after which time hardly advances: before a collision they would never end, so it is evaluations."""
+        made = self.inner.evaluations(1000, 0, 0, "numpy")
+        stages = max(1, round(sum(made.values()) / 1000))
+        nominal = self.length / self.integrator.step_length(self.system)
+        return int(allowance * (FEW_EVALUATIONS / stages + max(EVALUATIONS_EACH / stages, STEPS_EACH) * nominal))
 
     def chunks(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Chunks of states (N, n + 1, 2d + 2), `stride` steps apart, and the last (N,) of a run, at or past its end."""
@@ -93,6 +70,9 @@ class PhysicalRun:
         n = self._chunk(1.1 * self.length / self.integrator.step_length(self.system) + 2, FIRST_CHUNK)
         running = np.full(len(x), self.length > 0)
         while running.any():
+            if self.most_steps - total < self.stride:
+                self.stride = 1
+            n = min(n, max(1, (self.most_steps - total) // self.stride))
             states, good = x[:, None].repeat(n + 1, axis=1), np.zeros(len(x), dtype=int)
             states[running], finite = self._steps(x[running], n * self.stride, self.stride)
             good[running] = np.minimum(finite // self.stride, n)
@@ -103,13 +83,13 @@ class PhysicalRun:
             last = np.where(passed.any(1), passed.argmax(1), good)
             last[~running] = 0
             lost = running & ~passed.any(1) & (good < n)
-            self.stalled = total + n * self.stride > self.most_steps
-            if self.stalled:
-                lost |= running & ~passed.any(1)
             if self.stride > 1 and lost.any():  # step by step, to see where
                 steps, self.stride = n * self.stride, 1
                 n = self._chunk(steps, FIRST_CHUNK)
                 continue
+            if total + n * self.stride >= self.most_steps:
+                self.stalled = running & ~passed.any(1) & ~lost
+                lost |= self.stalled
             self.n_steps += self.stride * last
             total += n * self.stride
             rows = np.arange(len(x))
@@ -210,7 +190,7 @@ class PhysicalRun:
 
     def _failure(self, i: int, count: int) -> str:
         what, remedy = self.integrator.breakdown
-        if self.stalled:
+        if self.stalled[i]:
             what = f"After {self.n_steps[i]} steps time hardly advances any more, as before a collision"
             remedy = "End `t_span` earlier, or raise `dt`"
         which = (
