@@ -149,7 +149,7 @@ def test_a_collision_ends_the_run_with_its_time():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_force_evaluations_on_arrays_are_bounded_before_a_singularity(method):
-    """Time hardly advances there: 20,000 evaluations, and those of 6 steps (at least 50) for each dt of the interval."""
+    """Time hardly advances: 20,000 evaluations, and those of 6 steps (at least 50) for each dt in the interval."""
     system, length = systems.henon_heiles(), 6.0
     sol = solve(system, method, (0.0, length), y0=[0.0, 0.0, 0.0, 0.7], backend="array")
     stages = sol.stats["force_evaluations"] / sol.stats["n_steps"]

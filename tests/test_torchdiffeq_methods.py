@@ -117,6 +117,31 @@ def test_a_batch_of_which_one_fails_keeps_the_dense_output_of_the_others():
     assert np.isnan(sol.y[1, :, 1]).all()
 
 
+def test_the_steps_of_a_batch_that_fails_are_bounded_in_sum():
+    """The parts that it is run in share one bound; those that it ends keep their outputs before the joint failure."""
+    y0 = np.stack([[[0, 0, 0, 0.7], [0, 0, 0, 0.1]], [[0, 0, 0, 0.6], [0, 0.1, 0, 0]]])
+    t = np.array([1.0, 4.0, 6.0])
+    loose = {"t_eval": t, "rtol": 1e-4, "dense_output": True}
+    whole = solve(HH, "dopri5", (0, 8), y0, **loose)
+    np.testing.assert_array_equal(whole.status, [[-1, 0], [-1, 0]])
+    assert "Trajectory 0, 0: torchdiffeq stopped after t = 5.4" in whole.message
+    reference = solve(HH, "dop853", (0, 8), y0[:, 1], t_eval=t, rtol=1e-10, atol=1e-10).y
+    np.testing.assert_allclose(whole.y[:, 1], reference, atol=1e-3)
+    assert np.isnan(whole.sol(7.0)[0, 0]).all()
+    assert np.isfinite(whole.sol(7.0)[:, 1]).all()
+
+    few = solve(HH, "dopri5", (0, 8), y0, max_num_steps=250, **loose)
+    assert few.stats["n_steps"] <= 250
+    assert (few.status == -1).any(axis=None)
+    assert re.search(
+        r"`max_num_steps` = 250 steps, in sum over the batch and the parts .* ended before \d of 4 trajectories: they "
+        r"are kept up to where they were.*Raise `max_num_steps`, or solve those that fail in another call",
+        few.message,
+    )
+    assert np.isfinite(few.y[..., :2]).all()
+    np.testing.assert_allclose(few.sol(4.0), few.y[..., 1], atol=64 * EPS)
+
+
 @pytest.mark.parametrize("method", ADAPTIVE)
 def test_one_step_of_the_tableau_is_torchdiffeqs(method):
     """Against an accepted first step of prescribed length."""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sympflow.arrays import Array, is_tensor, stack
+
+if TYPE_CHECKING:
+    from sympflow.integrators.base import Outcome
 
 Time = Any
 """A number, or a tensor that carries a gradient."""
@@ -107,14 +110,31 @@ class Piecewise:
 
 
 class Batch:
-    """The dense outputs of the trajectories of a batch, each by itself, as one: (..., 2d) or (..., 2d, n)."""
+    """The dense output of a batch that was run in parts: (..., 2d) or (..., 2d, n), NaN after the end of a part.
 
-    def __init__(self, solutions: Sequence[Callable[[Any], Array]], batch: tuple[int, ...]) -> None:
-        self.solutions, self.batch = solutions, batch
+    Parameters
+    ----------
+    sources : sequence of (Outcome, int)
+        For each trajectory the run that it was part of, and its place there.
+    """
 
-    def __call__(self, t: Any) -> Array:
-        y = stack([sol(t) for sol in self.solutions], axis=0)
-        return y.reshape(*self.batch, *y.shape[1:])
+    def __init__(self, sources: Sequence[tuple[Outcome, int]], batch: tuple[int, ...], t_span: tuple[float, float]):
+        self.batch, (self.t_min, self.t_max) = batch, sorted(t_span)
+        self.places = [(run.sol, j) for run, j in sources]
+
+    def __call__(self, t: float | np.ndarray) -> Array:
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        if times.size and not (times.min() >= self.t_min and times.max() <= self.t_max):
+            raise ValueError(f"`t` must lie in [{self.t_min:g}, {self.t_max:g}], the interval that was solved.")
+        found: dict[int, Array] = {}
+        for sol, _ in self.places:
+            if isinstance(sol, Piecewise) and id(sol) not in found:
+                y = sol(times.clip(sol.t_min, sol.t_max))
+                y[..., np.flatnonzero((times < sol.t_min) | (times > sol.t_max))] = np.nan
+                found[id(sol)] = y.reshape(-1, *y.shape[-2:])
+        y = stack([found[id(sol)][j] for sol, j in self.places], axis=0)
+        y = y.reshape(*self.batch, *y.shape[1:])
+        return y[..., 0] if np.ndim(t) == 0 else y
 
 
 def _horner(coefficients: Sequence[Array], x: Any) -> Array:

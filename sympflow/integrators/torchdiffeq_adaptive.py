@@ -22,7 +22,8 @@ from sympflow.system import HamiltonianSystem
 class Adaptive(Watched, RungeKutta):
     """An adaptive Runge–Kutta method of torchdiffeq.
 
-    The trajectories of a batch share their steps; if that fails, each is integrated by itself. Without `t_eval` the
+    The trajectories of a batch share their steps; if that fails, it is run in parts, so that those of its trajectories
+    that can reach their end do. Without `t_eval` the
     states are reported every `system.dt`. Between the steps, for outputs, events and the dense output alike, the state
     is torchdiffeq's interpolation: the quartic through both ends, their slopes and the state at the middle of the step.
 
@@ -31,8 +32,9 @@ class Adaptive(Watched, RungeKutta):
     rtol, atol : float
         The local error, in the root mean square over the batch, is kept below atol + rtol·|y|; torchdiffeq's defaults.
     max_num_steps : int
-        Most steps of a run, those that are tried and rejected included; then it ends with status −1. torchdiffeq's own
-        default, 2³¹ − 1, is none: before a singularity a method of order 2 takes minutes.
+        Most steps of a call, those that are tried and rejected included, in sum over the parts of a batch; then it ends
+        with status −1. torchdiffeq's own default, 2³¹ − 1, is none: before a singularity a method of order 2 takes
+        minutes.
     """
 
     rtol: float = 1e-7
@@ -61,6 +63,10 @@ class Adaptive(Watched, RungeKutta):
         dt = problem.system.dt
         return Grid(problem.t0, problem.t1, dt).outputs(None, problem.save_every)[0], {"output_step": dt}
 
+    @property
+    def most_steps(self) -> int:
+        return int(self.max_num_steps)
+
     def make_trace(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> Trace:
         return _Stages(self.tableau, system, t_span, y0, visit)
 
@@ -70,14 +76,15 @@ class Adaptive(Watched, RungeKutta):
 
         s = torch.tensor([0.0, length], dtype=torch.float64, device=y.device)
         assert isinstance(trace, _Stages)
-        options = {"max_num_steps": self.max_num_steps}
+        most = trace.most_steps or self.max_num_steps
+        options = {"max_num_steps": most}
         try:
             odeint(trace, y, s, rtol=self.rtol, atol=self.atol, method=self.name, options=options)
         except AssertionError:
-            if trace.n_tried < self.max_num_steps:
+            if trace.n_tried < most:
                 raise
             (t0, t1), t = trace.t_span, trace.reached
-            more = self.max_num_steps * abs(t1 - t) / abs(t - t0) if t != t0 else math.inf
+            more = most * abs(t1 - t) / abs(t - t0) if t != t0 else math.inf
             raise TooManyStepsError(
                 f"After `max_num_steps` = {self.max_num_steps} steps t = {t:.17g} is reached, and at this pace the end "
                 f"needs about {more:.2g} more. Raise `max_num_steps` or the tolerances, or end `t_span` earlier."
@@ -101,7 +108,6 @@ class _Stages(Trace):
     def __init__(self, tableau: Tableau, *arguments: Any) -> None:
         super().__init__(*arguments)
         self.tableau = tableau
-        self.n_tried = 0
         self.first: Any = None
         self.slopes: list[Any] = []
 

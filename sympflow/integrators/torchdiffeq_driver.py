@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,8 +11,9 @@ import numpy as np
 from sympflow.arrays import Array, full_of_nan, is_tensor, stack
 from sympflow.events import ENDED
 from sympflow.integrators.base import FINISHED, Integrator, Outcome, Problem
-from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise
+from sympflow.integrators.interpolants import Interpolant, Piecewise
 from sympflow.integrators.runge_kutta import hopeless
+from sympflow.integrators.torchdiffeq_batches import run_in_parts
 from sympflow.system import HamiltonianSystem
 
 Visit = Callable[[Interpolant], bool]
@@ -32,8 +32,12 @@ class Trace:
         self.tensor = is_tensor(y0)
         self.evaluations = self.n_steps = 0
         self.reached = t_span[0]
+        self.last: Array | None = None  # the state at the beginning of the step that ended there
         self.note = ""  # for the message, when the run ends
-        self.spent = False  # whether it ended because it took too many steps
+        self.most_steps: int | None = None
+        self.n_tried = 0  # steps, where they are bounded, with those that were rejected
+        self.failed = False
+        self.spent = False  # whether it failed because it took too many steps
 
     def __call__(self, s: Any, y: Any) -> Any:
         self.evaluations += 1
@@ -50,7 +54,7 @@ class Trace:
 
     def announce(self, step: Interpolant) -> None:
         self.n_steps += 1
-        self.reached = step.t1
+        self.reached, self.last = step.t1, step.y0
         if stuck := hopeless(self.n_steps, self.t_span[0], self.reached, self.t_span[1]):
             raise AssertionError(stuck)
         if self.visit(step):
@@ -79,12 +83,18 @@ class Watched(Integrator):
         raise NotImplementedError
 
     def watch(
-        self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit
+        self,
+        system: HamiltonianSystem,
+        t_span: tuple[float, float],
+        y0: Array,
+        visit: Visit,
+        most_steps: int | None = None,
     ) -> tuple[Trace, str | None]:
         """Run, handing over every step until `visit` says so; and why it failed, if it did."""
         import torch
 
         trace, failure = self.make_trace(system, t_span, y0, visit), None
+        trace.most_steps = self.most_steps if most_steps is None else most_steps
         if t_span[0] == t_span[1]:
             return trace, failure
         y = y0 if is_tensor(y0) else torch.from_numpy(np.ascontiguousarray(y0))
@@ -99,11 +109,24 @@ class Watched(Integrator):
                 failure, trace.spent = str(error), True
         return trace, failure
 
+    @property
+    def most_steps(self) -> int | None:
+        """Most steps of a call, those that are tried and rejected included; None if there is no bound."""
+        return None
+
     def make_trace(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> Trace:
         raise NotImplementedError
 
     def run(self, problem: Problem) -> Outcome:
         times, stats = self.outputs(problem)
+        outcome, trace = self.run_jointly(problem, times)
+        if trace.failed and problem.y0.ndim > 1 and not trace.spent:
+            outcome = run_in_parts(self, problem, outcome, trace)
+        outcome.stats = stats | outcome.stats
+        return outcome
+
+    def run_jointly(self, problem: Problem, times: np.ndarray, most_steps: int | None = None) -> tuple[Outcome, Trace]:
+        """All trajectories with the same steps, at the times (n,); with NaN in a batch after the last finite state."""
         t0, y0, search = problem.t0, problem.y0, problem.events
         sign = 1 if problem.t1 >= t0 else -1
         everything = problem.t_eval is None or problem.dense_output or search is not None
@@ -121,19 +144,18 @@ class Watched(Integrator):
                 kept.append(step)
             return search is not None and search.end is not None
 
-        trace, failure = self.watch(problem.system, (t0, t_end), y0, visit)
-        if failure and y0.ndim > 1 and not trace.spent:
-            return self._one_by_one(problem, times, stats)
+        trace, failure = self.watch(problem.system, (t0, t_end), y0, visit, most_steps)
         if search is not None and t0 == t_end:
             search.step(t0, y0, t0, y0, lambda t: y0)
-        stats |= {
+        stats: dict[str, Any] = {
             "n_steps": trace.n_steps,
             "force_evaluations": trace.evaluations,
             "hessian_evaluations": 0,
             "backend": "torchdiffeq",
         }
         ended = search is not None and search.end is not None
-        if failure and not ended:
+        trace.failed = bool(failure) and not ended
+        if trace.failed:
             t_end = trace.reached
             stats["failed_at"] = t_end if y0.ndim == 1 else np.full(y0.shape[:-1], t_end)
         if y0.ndim > 1:
@@ -153,29 +175,4 @@ class Watched(Integrator):
         )
         if problem.dense_output:
             outcome.sol = Piecewise(kept, y0, t0, t_end)
-        return outcome
-
-    def _one_by_one(self, problem: Problem, times: np.ndarray, stats: dict[str, Any]) -> Outcome:
-        """A batch, some of whose trajectories fail: each by itself, with NaN after its last finite state."""
-        batch = problem.y0.shape[:-1]
-        starts = {index: problem.y0[index] for index in np.ndindex(batch)}
-        runs = {index: self.run(replace(problem, y0=y, t_eval=times)) for index, y in starts.items()}
-        rows = [
-            stack([*run.y, *[full_of_nan(starts[index])] * (len(times) - len(run.y))], axis=0)
-            for index, run in runs.items()
-        ]
-        failed = [index for index, run in runs.items() if run.status]
-        counts = ("n_steps", "force_evaluations", "hessian_evaluations")
-        stats |= {key: sum(run.stats[key] for run in runs.values()) for key in counts} | {"backend": "torchdiffeq"}
-        if failed:
-            stats["failed_at"] = np.reshape([run.stats.get("failed_at", np.nan) for run in runs.values()], batch)
-        outcome = Outcome(
-            times,
-            stack(rows, axis=1).reshape(len(times), *problem.y0.shape),
-            np.array([run.status for run in runs.values()]).reshape(batch),
-            f"Trajectory {', '.join(map(str, failed[0]))}: {runs[failed[0]].message}" if failed else FINISHED,
-            stats,
-        )
-        if problem.dense_output:
-            outcome.sol = Batch([run.sol for run in runs.values() if run.sol is not None], batch)
-        return outcome
+        return outcome, trace
