@@ -202,6 +202,16 @@ def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
         outcome.t, outcome.y = outcome.t[:first], outcome.y[:first]
 
 
+def _meaning(flow: Any) -> str:
+    """What is left of a trained flow outside its domain: a primed one still evaluates the system's own forces there."""
+    if flow is None or (hasattr(flow, "evaluations") and any(flow.evaluations(1, 1, 0, "array").values())):
+        return ""
+    return (
+        ", where its network was not trained: it stays finite, even past a singularity, and what it gives from that "
+        "time on means nothing. Start inside the domain, or use a classical method"
+    )
+
+
 def _check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:
     """Note the first output outside the domain, or end the run there."""
     flow = getattr(integrator, "flow_for", lambda system: None)(system)
@@ -227,7 +237,7 @@ def _check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianS
     note = f"The state left the domain at t = {t:.17g}{which}"
     if action == "warn":
         held = "the figures" if getattr(flow, "certified", None) is None else "the figures and the certificate"
-        outcome.message += f" {note}: {held} of a trained flow do not hold there."
+        outcome.message += f" {note}: {held} of a trained flow do not hold there{_meaning(flow)}."
         return
     outcome.message = f"{note}. Start inside the domain, or pass on_domain_exit='warn'."
     if inside.ndim == 1:

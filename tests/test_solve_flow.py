@@ -153,3 +153,21 @@ def test_a_forced_backend_that_does_not_apply_says_why():
         solve(HH, FLOW, (0.0, 1.0), y0=torch.tensor(HH.y0), backend="compiled")
     with pytest.raises(ValueError, match=r"^`backend` 'compiled' does not apply. `method` 'mlp'"):
         solve(HH, MLP, (0.0, 1.0), backend="compiled")
+
+
+@pytest.mark.parametrize("flow", ["henon_heiles-mlp", "henon_heiles-sympflow"])
+@pytest.mark.parametrize("batch", [False, True])
+def test_a_network_outside_its_domain_says_that_it_means_nothing_there(flow, batch):
+    """Networks stay finite past the singularity at t* = 5.45: the state is outside the domain, and the message says so."""
+    outside = np.array([0.0, 0.0, 0.0, 0.7])
+    y0 = np.stack([outside, HH.y0]) if batch else outside
+    method = flow.rpartition("-")[2]
+    sol = solve(HH, method, (0, 7), y0, flow=flow)
+    assert np.all(sol.status == 0)
+    assert sol.stats["domain_exit"] == 0.0
+    assert "where its network was not trained" in sol.message
+    assert "means nothing. Start inside the domain" in sol.message
+    assert "means nothing" not in solve(HH, method, (0, 7), 0.5 * HH.y0, flow=flow).message
+    stopped = solve(HH, method, (0, 7), y0, flow=flow, on_domain_exit="stop")
+    np.testing.assert_array_equal(stopped.status, [-1, 0] if batch else -1)
+    assert "domain" not in solve(HH, method, (0, 7), y0, flow=flow, on_domain_exit="ignore").message
