@@ -158,7 +158,7 @@ def test_a_forced_backend_that_does_not_apply_says_why():
 @pytest.mark.parametrize("flow", ["henon_heiles-mlp", "henon_heiles-sympflow"])
 @pytest.mark.parametrize("batch", [False, True])
 def test_a_network_outside_its_domain_says_that_it_means_nothing_there(flow, batch):
-    """Networks stay finite past the singularity at t* = 5.45: the state is outside the domain, and the message says so."""
+    """Networks stay finite past the singularity at t* = 5.45: the message says that the state is outside the domain."""
     outside = np.array([0.0, 0.0, 0.0, 0.7])
     y0 = np.stack([outside, HH.y0]) if batch else outside
     method = flow.rpartition("-")[2]
