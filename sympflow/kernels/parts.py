@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.kernels.modules import NEVER, OPTIONS, load_module, run_one, run_rows, template
-from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source, row_width
+from sympflow.kernels.parts_codegen import IDLE, PRODUCT, TURN_WIDTH, WITH_GRADIENT, parts_source
 from sympflow.parts import LINEAR, ExactParts, Map, PartFunctions
 from sympflow.shears import shears
 
@@ -29,6 +29,8 @@ class _Loops:
     rollout: Callable[..., int]
     rollout_batch: Callable[..., None]
     step_each: Callable[..., None]
+    fill_rows: Callable[..., None]
+    row_width: int
 
 
 class PartsKernel:
@@ -51,9 +53,7 @@ class PartsKernel:
         self.parts = parts
         self._variants: dict[tuple[bool, bool], _Loops] = {}
         self._plain: str | None = None
-        self._moved = bool(np.any(parts.center))
-        self._scale = np.concatenate([np.diag(parts.C), np.diag(parts.inverse_C)])
-        self._unscale = np.concatenate([np.diag(parts.inverse_C), np.diag(parts.C)])
+        self._mixed = not parts.diagonal  # modes that are sums of coordinates: transformed outside the loops
         self._tables: dict[int, tuple[Sequence[Map], tuple[np.ndarray, np.ndarray], _Loops]] = {}
 
     def run(self, maps: Maps, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
@@ -62,9 +62,9 @@ class PartsKernel:
         loops, save = self._loops(sequence), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(save), 2 * self.parts.ndof))
         codes, table = self._run_table(sequence)
-        modes = self._modes(y0)
+        start, mixed = self._modes(y0), self._mixed
         n_finite = run_one(
-            lambda stop: loops.rollout(codes, table, modes, n_steps, save, out, stop),
+            lambda stop: loops.rollout(codes, table, start, mixed, n_steps, save, out, stop),
             n_steps * len(codes) * self.parts.ndof,
         )
         return self._states(out, save, y0), n_finite
@@ -76,12 +76,12 @@ class PartsKernel:
         sequence = maps(np.asarray(h, dtype=float))
         loops, save = self._loops(sequence), np.ascontiguousarray(save, dtype=np.int64)
         codes, table = self._run_table(sequence)
-        modes = self._modes(y0)
+        start, mixed = self._modes(y0), self._mixed
         out = np.empty((len(y0), len(save), 2 * self.parts.ndof))
         n_finite = np.empty(len(y0), dtype=np.int64)
 
         def rows(i: slice, stop: np.ndarray) -> None:
-            loops.rollout_batch(codes, table, modes[i], n_steps, save, out[i], n_finite[i], stop)
+            loops.rollout_batch(codes, table, start[i], mixed, n_steps, save, out[i], n_finite[i], stop)
 
         run_rows(rows, len(y0), n_steps * len(codes) * self.parts.ndof, threads)
         return self._states(out, save, y0[:, None]), n_finite
@@ -90,15 +90,16 @@ class PartsKernel:
         """One step from each row of y (N, 2d), each of its own length h (N,)."""
         sequence = maps(np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1]))
         out = np.empty(y.shape)
-        codes, tables = self._table(sequence, len(y))
-        self._loops(sequence).step_each(codes, tables, self._modes(y), out)
+        loops = self._loops(sequence)
+        codes, tables = self._table(sequence, len(y), loops)
+        loops.step_each(codes, tables, self._modes(y), self._mixed, out)
         return self._states(out)
 
     def step_modes(self, sequence: Sequence[Map], modes: np.ndarray) -> np.ndarray:
         """The maps applied once to every row [X, Y] of `modes` (N, 2d), which stay modes."""
         loops = self._loops(sequence)
         out, n_finite = np.empty((len(modes), 1, modes.shape[1])), np.empty(len(modes), dtype=np.int64)
-        loops.rollout_batch(*self._run_table(sequence), modes, 1, ONE, out, n_finite, NEVER)
+        loops.rollout_batch(*self._run_table(sequence), modes, True, 1, ONE, out, n_finite, NEVER)
         return out[:, 0]
 
     def source(self) -> str:
@@ -114,19 +115,16 @@ class PartsKernel:
         return self._plain
 
     def _modes(self, y: np.ndarray) -> np.ndarray:
-        if self.parts.diagonal and not self._moved:
-            return np.ascontiguousarray(np.asarray(y, dtype=np.float64) * self._unscale)
-        return np.ascontiguousarray(np.concatenate(self.parts.to_modes(np.asarray(y, dtype=np.float64)), axis=-1))
+        """What the loops take: modes where these are mixed, else states."""
+        y = np.ascontiguousarray(y, dtype=np.float64)
+        return np.ascontiguousarray(np.concatenate(self.parts.to_modes(y), axis=-1)) if self._mixed else y
 
-    def _states(self, modes: np.ndarray, save: np.ndarray | None = None, y0: np.ndarray | None = None) -> np.ndarray:
-        parts, d = self.parts, self.parts.ndof
-        if parts.diagonal:
-            modes *= self._scale
-            if self._moved:
-                modes[..., :d] += parts.center
-            states = modes
-        else:
-            states = parts.from_modes(modes[..., :d], modes[..., d:])
+    def _states(self, out: np.ndarray, save: np.ndarray | None = None, y0: np.ndarray | None = None) -> np.ndarray:
+        """States of what the loops gave."""
+        if not self._mixed:
+            return out
+        d = self.parts.ndof
+        states = self.parts.from_modes(out[..., :d], out[..., d:])
         if save is not None and len(save) and save[0] <= 0:
             states[..., : np.searchsorted(save, 0, "right"), :] = y0
         return states
@@ -142,15 +140,17 @@ class PartsKernel:
             options = f"OPTIONS = {OPTIONS | {'cache': True}}\nCOMPENSATED = False"
             header = f"import math\n\nfrom numba import njit\n\n{options}"
             algebra = parts_source(self.parts, filters, gradients)
-            before = ["elementary"] if "fast_" in algebra else []
+            before = ["elementary"] if "fast_" in algebra or PRODUCT in algebra else []
             texts = [header, *map(template, before), algebra, *map(template, ["aligned", "parts_loops"])]
             module = load_module("\n\n\n".join(texts))
-            self._variants[filters, gradients] = _Loops(module.rollout, module.rollout_lanes, module.step_each)
+            self._variants[filters, gradients] = _Loops(
+                module.rollout, module.rollout_lanes, module.step_each, module.fill_rows, module.ROW_WIDTH
+            )
         return self._variants[filters, gradients]
 
-    def _table(self, sequence: Sequence[Map], n: int) -> tuple[np.ndarray, np.ndarray]:
+    def _table(self, sequence: Sequence[Map], n: int, loops: _Loops) -> tuple[np.ndarray, np.ndarray]:
         """Codes (m,) and coefficients (n, m, W)."""
-        codes, tables = np.empty(len(sequence), dtype=np.int64), np.zeros((n, len(sequence), row_width(self.parts)))
+        codes, tables = np.empty(len(sequence), dtype=np.int64), np.zeros((n, len(sequence), loops.row_width))
         F = TURN_WIDTH * self.parts.n_classes
         for j, m in enumerate(sequence):
             codes[j] = m.part + WITH_GRADIENT * has_gradient(m)
@@ -161,6 +161,7 @@ class PartsKernel:
             if m.filters is not None:
                 scale = np.diag(self.parts.C) if self.parts.diagonal else 1.0
                 tables[:, j, 2 : 2 + self.parts.ndof] = self.parts.by_class(np.asarray(m.filters)) * scale
+        loops.fill_rows(codes, tables)
         return codes, tables
 
     def _turns(self, s: np.ndarray) -> np.ndarray:
@@ -180,10 +181,10 @@ class PartsKernel:
         first, last = sequence[0], sequence[-1]
         merged = merge(last, first) if len(sequence) > 1 else None
         rows = [idle, *sequence, idle, idle] if merged is None else [first, *sequence[1:-1], merged, last]
-        codes, table = self._table(rows, 1)
+        loops = self._loops(sequence)
+        codes, table = self._table(rows, 1, loops)
         if len(self._tables) >= KNOWN_TABLES:
             self._tables.clear()
-        loops = self._loops(sequence)
         self._tables[id(sequence)] = sequence, (codes, np.ascontiguousarray(table[0])), loops
         return self._tables[id(sequence)][1]
 

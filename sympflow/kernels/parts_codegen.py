@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import sympy as sp
@@ -12,20 +14,35 @@ from sympflow.kernels.scheduling import FUSED, Schedule
 from sympflow.parts import LINEAR, ExactParts, PartFunctions
 from sympflow.symbolic import printable
 
-__all__ = ["IDLE", "WITH_GRADIENT", "parts_source", "row_width"]
+__all__ = ["IDLE", "PRODUCT", "WITH_GRADIENT", "parts_source"]
 
 IDLE = -1  # code of no map
 TURN_WIDTH = 6  # numbers that turn a frequency
 WITH_GRADIENT = 100  # added to the code of a part that carries a force gradient
+PRODUCT = "fused_multiply_add"  # of `elementary`
 
 
-def row_width(parts: ExactParts) -> int:
-    """Numbers that a map may need: six for each frequency, or a weight, a force gradient and the filters of modes."""
-    return max(TURN_WIDTH * parts.n_classes, 2 + parts.ndof)
+@dataclass(frozen=True)
+class _Flow:
+    """The flow of a part as code: its name, what it reads of a row of the table, and what it stores there before."""
+
+    code: int
+    name: str
+    source: str
+    row: Sequence[int]
+    stored: list[str] = field(default_factory=list)
+    width: int = 0
+
+    @property
+    def arguments(self) -> str:
+        return "(" + "".join(f"table[j, {i}], " for i in self.row) + ")"
 
 
 def parts_source(parts: ExactParts, filters: bool, gradients: bool) -> str:
     """The functions that `parts_loops` asks for.
+
+    A row of the table has `ROW_WIDTH` numbers: six for each frequency; or a weight, a force gradient and the filters
+    of the modes, and then products of these, which ``fill_rows`` computes.
 
     Raises
     ------
@@ -33,45 +50,80 @@ def parts_source(parts: ExactParts, filters: bool, gradients: bool) -> str:
         If a function in H has no counterpart in compiled code.
     """
     d = parts.ndof
-    functions = [f"NDOF = {d}", tuple_algebra(d)]
-    calls: list[tuple[int, str]] = []
+    flows = []
     if parts.linear is not None:
-        functions.append(_linear(parts))
-        calls.append((LINEAR, "linear"))
+        flows.append(_linear(parts))
     for k, part in enumerate(parts.rest, 1):
-        functions.append(_part(parts, part, f"part_{k}", filters))
-        calls.append((k, f"part_{k}"))
+        flows.append(_part(parts, part, k, f"part_{k}", filters))
         if gradients and part.of_positions:
-            functions.append(_part(parts, part, f"gradient_{k}", filters, gradient=True))
-            calls.append((WITH_GRADIENT + k, f"gradient_{k}"))
-    width = row_width(parts)
-    row = "(" + "".join(f"table[j, {i}], " for i in range(width)) + ")"
-    functions += [_dispatch(calls, row), _dispatch_lanes(calls, row)]
+            flows.append(_part(parts, part, WITH_GRADIENT + k, f"gradient_{k}", filters, gradient=True))
+    width = max([2 + d, TURN_WIDTH * parts.n_classes, *(flow.width for flow in flows)])
+    functions = [f"NDOF = {d}\nROW_WIDTH = {width}", tuple_algebra(d), *_between_modes(parts)]
+    functions += [*(flow.source for flow in flows), _dispatch(flows), _dispatch_lanes(flows), _fill(flows)]
     return "\n\n\n".join(functions) + "\n"
 
 
-def _dispatch(calls: Sequence[tuple[int, str]], row: str) -> str:
+def _dispatch(flows: Sequence[_Flow]) -> str:
     lines = ["@njit(**OPTIONS, forceinline=True)", "def apply_map(x, y, code, table, j):"]
-    for code, name in calls:
-        lines += [f"    if code == {code}:", f"        return {name}(x, y, {row})"]
+    for flow in flows:
+        lines += [f"    if code == {flow.code}:", f"        return {flow.name}(x, y, {flow.arguments})"]
     return "\n".join([*lines, "    return x, y"])
 
 
-def _dispatch_lanes(calls: Sequence[tuple[int, str]], row: str) -> str:
+def _dispatch_lanes(flows: Sequence[_Flow]) -> str:
     lines = ["@njit(**OPTIONS, inline='always')", "def apply_map_lanes(Z, width, code, table, j):"]
-    for number, (code, name) in enumerate(calls):
+    for number, flow in enumerate(flows):
         lines += [
-            f"    {'elif' if number else 'if'} code == {code}:",
-            f"        c = {row}",
+            f"    {'elif' if number else 'if'} code == {flow.code}:",
+            f"        c = {flow.arguments}",
             "        for lane in range(width):",
             "            x, y = unpack_lane(Z, lane)",
-            f"            x, y = {name}(x, y, c)",
+            f"            x, y = {flow.name}(x, y, c)",
             "            pack_lane(x, y, Z, lane)",
         ]
     return "\n".join(lines)
 
 
-def _linear(parts: ExactParts) -> str:
+def _fill(flows: Sequence[_Flow]) -> str:
+    """The products of weights, force gradients and filters, which no state waits for, computed once for a run."""
+    lines = ["@njit(**OPTIONS)", "def fill_rows(codes, tables):", "    for i in range(tables.shape[0]):"]
+    lines.append("        for j in range(len(codes)):")
+    for flow in flows:
+        if flow.stored:
+            lines += [f"            if codes[j] == {flow.code}:", "                row = tables[i, j]"]
+            lines += [f"                {line}" for line in flow.stored]
+    return "\n".join([*lines, "            pass"])
+
+
+def _between_modes(parts: ExactParts) -> list[str]:
+    """``to_modes`` and ``from_modes``, where each coordinate is a mode; mixed ones are transformed outside the loops."""
+
+    def function(name: str, values: Sequence[str], others: Sequence[str]) -> str:
+        lines = ["@njit(**OPTIONS, forceinline=True)", f"def {name}(x, y):", *_unpacked(parts.ndof)]
+        results = ["".join(f"{value}, " for value in group) for group in (values, others)]
+        return "\n".join([*lines, f"    return ({results[0]}), ({results[1]})"])
+
+    if not parts.diagonal:
+        kept = [[f"{v}_{j}" for j in range(parts.ndof)] for v in "xy"]
+        return [function("to_modes", *kept), function("from_modes", *kept)]
+    center, C, inverse_C = (a.tolist() for a in (parts.center, np.diag(parts.C), np.diag(parts.inverse_C)))
+
+    def scaled(value: str, factor: float) -> str:
+        return value if factor == 1 else f"{value}*{factor!r}"
+
+    moved = [f"x_{j}" if c == 0 else f"(x_{j} - {c!r})" for j, c in enumerate(center)]
+    back = [scaled(f"x_{j}", s) for j, s in enumerate(C)]
+    return [
+        function("to_modes", [*map(scaled, moved, inverse_C)], [scaled(f"y_{j}", s) for j, s in enumerate(C)]),
+        function(
+            "from_modes",
+            [x if c == 0 else f"{x} + {c!r}" for x, c in zip(back, center, strict=True)],
+            [scaled(f"y_{j}", s) for j, s in enumerate(inverse_C)],
+        ),
+    ]
+
+
+def _linear(parts: ExactParts) -> _Flow:
     """Rotations by three shears after exact quarter turns, hyperbolic ones by shears alone, drifts."""
     assert parts.linear is not None
     d = parts.ndof
@@ -85,22 +137,31 @@ def _linear(parts: ExactParts) -> str:
         elif kind == "oscillator":  # of each pair of products that are added first, one is 0 and the other exact
             lines += [
                 f"    turned_{j} = {c} * y_{j} - {d_} * x_{j}",
-                f"    x_{j} = {a} * x_{j} + {b} * y_{j}",
+                f"    x_{j} = {PRODUCT}({b}, y_{j}, {a} * x_{j})",  # y comes from a kick, later than x
                 f"    y_{j} = turned_{j} - {s} * x_{j}",
                 f"    x_{j} += {t} * y_{j}",
             ]
-    return "\n".join([*lines, _returned(d)])
+    return _Flow(LINEAR, "linear", "\n".join([*lines, _returned(d)]), range(TURN_WIDTH * parts.n_classes))
 
 
-def _part(parts: ExactParts, part: PartFunctions, name: str, filters: bool, gradient: bool = False) -> str:
-    """x + b J∇H_k(x), and with a force gradient g ∇²U M⁻¹∇U added to y; c = [b, g, φ …]."""
+def _known(parts: ExactParts) -> tuple[list[float], list[float]]:
+    """When positions and momenta of the modes are known, in cycles, after a linear map that follows a kick."""
+    kinds = ("idle",) * parts.ndof if parts.linear is None else parts.linear.kinds
+    turns = [kind in ("oscillator", "hyperbolic") for kind in kinds]
+    return [FUSED * (3 if t else kind == "free") for t, kind in zip(turns, kinds, strict=True)], [
+        FUSED * (2 if t else 0) for t in turns
+    ]
+
+
+def _part(parts: ExactParts, part: PartFunctions, code: int, name: str, filters: bool, gradient: bool = False) -> _Flow:
+    """x + b J∇H_k(x), and with a force gradient g ∇²U M⁻¹∇U added to y, of a row b, g, φ …"""
     d, q, p = parts.ndof, part.q, part.p
     x, y, z = (sp.symbols(f"{letter}_0:{d}", real=True) for letter in "xyz")
     b, g = sp.symbols("b_ g_", real=True)
     phi = sp.symbols(f"phi_0:{d}", real=True) if filters else (sp.S.One,) * d
     C = np.eye(d) if filters and parts.diagonal else parts.C  # diagonal ones are in the filters
-    # Of the map before, momenta are known before positions.
-    schedule = Schedule({**dict.fromkeys(x, 0.0), **dict.fromkeys(y, -FUSED)}, printed, "s_")
+    positions, momenta = _known(parts)
+    schedule = Schedule(dict(zip((*x, *y), positions + momenta, strict=True)), printed, "s_", PRODUCT)
     at = {
         q[i]: sp.Add(_number(parts.center[i]), *(_number(C[i, j]) * phi[j] * x[j] for j in range(d))) for i in range(d)
     } | {p[i]: sp.Add(*(_number(parts.inverse_C[j, i]) * y[j] for j in range(d))) for i in range(d)}
@@ -112,6 +173,7 @@ def _part(parts: ExactParts, part: PartFunctions, name: str, filters: bool, grad
         list=True,
         order="none",
     )
+    shared, reduced = _with_products(shared, reduced, {*x, *y, *z})
     late: set[sp.Symbol] = set(z)  # what holds the direction z, known after the slopes
     waiting: list[tuple[sp.Symbol, sp.Expr]] = []
     for symbol, f in shared:
@@ -137,12 +199,38 @@ def _part(parts: ExactParts, part: PartFunctions, name: str, filters: bool, grad
             if bent != 0:
                 new_y[j] = sp.Add(new_y[j], sp.Mul(g * phi[j], bent, evaluate=False), evaluate=False)
     results = [[schedule.value(f)[1] for f in values] for values in (new_x, new_y)]
-    body = [*schedule.early, *schedule.lines]
+    raw = ["b_", "g_", *(f"phi_{j}" for j in range(d) if filters)]
+    body = [f"    {line}" for line in schedule.lines]
+    body.append("    return " + ", ".join(f"({''.join(f'{value}, ' for value in values)})" for values in results))
+    used = set(re.findall(r"\w+", "\n".join(body)))
+    stored = [line.partition(" = ")[0] for line in schedule.early]
+    stored = [name for name in stored if name in used]
+    place = {name: i for i, name in enumerate([*raw, *stored])}
+    row = [n for n in place if n in used]
     lines = ["@njit(**OPTIONS, forceinline=True)", f"def {name}(x, y, c):", *_unpacked(d)]
-    lines += ["    b_, g_, = c[0], c[1]", *(f"    phi_{j} = c[{2 + j}]" for j in range(d) if filters)]
-    lines += [f"    {line}" for line in body]
-    lines.append("    return " + ", ".join(f"({''.join(f'{value}, ' for value in values)})" for values in results))
-    return "\n".join(lines)
+    lines += [f"    {n} = c[{i}]" for i, n in enumerate(row)]
+    fill = [f"{n} = row[{i}]" for i, n in enumerate(raw)] + schedule.early
+    fill += [f"row[{place[n]}] = {n}" for n in stored]
+    source = "\n".join([*lines, *body])
+    return _Flow(code, name, source, [place[n] for n in row], fill if stored else [], len(place))
+
+
+def _with_products(
+    shared: Sequence[tuple[sp.Symbol, sp.Expr]], reduced: Sequence[sp.Expr], variables: set[sp.Symbol]
+) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
+    """Common subexpressions without those that are one variable times numbers: fused, they cost nothing where used."""
+    known: set[sp.Symbol] = set()
+    inlined: dict[sp.Symbol, sp.Expr] = {}
+    kept = []
+    for symbol, f in shared:
+        value = f.xreplace(inlined)
+        numbers = [v for v in value.free_symbols if v not in variables and v not in known]
+        if value.is_Mul and len(numbers) == len(value.free_symbols) - 1 and value.free_symbols & variables:
+            inlined[symbol] = value
+        else:
+            known.add(symbol)
+            kept.append((symbol, value))
+    return kept, [f.xreplace(inlined) for f in reduced]
 
 
 def _hessian_vector(H: sp.Expr, q: Sequence[sp.Symbol], z: Sequence[sp.Symbol]) -> list[sp.Expr]:

@@ -1,7 +1,8 @@
 """The loops of a splitting into exactly solvable parts. Source text, pasted after the algebra of a system.
 
-The algebra that comes before defines tuples of normal modes x, y (``unpack``, ``pack``, …), ``apply_map`` and
-``apply_map_lanes``. A step is a list of maps, a code and a row of coefficients each. A run executes the rows
+The algebra that comes before defines tuples of normal modes x, y (``unpack``, ``pack``, …), ``to_modes`` and
+``from_modes``, ``apply_map`` and ``apply_map_lanes``. Where a run is asked to be `in_modes`, it takes and gives modes
+instead of states. A step is a list of maps, a code and a row of coefficients each. A run executes the rows
 [opening, inner …, link, closing]: a step is the link (the first step, the opening) and the inner maps, so that
 consecutive steps share their common map; an output is the closing map applied to a copy.
 """
@@ -16,40 +17,49 @@ LANES = 64
 VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
 
 
-@njit(**OPTIONS)
+@njit(**OPTIONS, forceinline=True)  # called, it would take and give its states in memory
 def one_step(x, y, codes, table, first, link):
-    for k in range(link):
-        j = first if k == 0 else k
+    x, y = apply_map(x, y, codes[first], table, first)
+    for j in range(1, link):
         x, y = apply_map(x, y, codes[j], table, j)
     return x, y
 
 
+@njit(**OPTIONS, forceinline=True)
+def closed(x, y, codes, table, in_modes):
+    """What a step ends in."""
+    x, y = apply_map(x, y, codes[len(codes) - 1], table, len(codes) - 1)
+    return (x, y) if in_modes else from_modes(x, y)
+
+
 @njit(**OPTIONS)
-def first_non_finite(x, y, codes, table, first, n_steps):
+def first_non_finite(x, y, codes, table, first, n_steps, in_modes):
     """The first of `n_steps` steps from a running state whose end is not finite; `n_steps` if none is."""
     link = len(codes) - 2
     for n in range(1, n_steps):
         x, y = one_step(x, y, codes, table, first, link)
         first = link
-        end_x, end_y = apply_map(x, y, codes[link + 1], table, link + 1)
+        end_x, end_y = closed(x, y, codes, table, in_modes)
         if not is_finite(end_x, end_y):
             return n
     return n_steps
 
 
 @njit(**OPTIONS)
-def rollout(codes, table, z0, n_steps, save, out, stop):
-    """`n_steps` steps from the modes `z0` (2d,), those after ``save[i]`` steps into ``out[i]``.
+def rollout(codes, table, y0, in_modes, n_steps, save, out, stop):
+    """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
 
     Returns the index of the last step that ends in a finite state; rows of later steps are NaN. Ends early, with
     rows unset, when another thread sets ``stop[0]``.
     """
     link = len(codes) - 2
-    x, y = unpack(z0)
+    x, y = unpack(y0)
     n = saved = first = 0
     while saved < len(save) and save[saved] <= 0:
         pack(x, y, out[saved])
         saved += 1
+    if not in_modes:
+        x, y = to_modes(x, y)
     while n < n_steps and stop[0] == 0:
         block = min(CHECK_EVERY, n_steps - n)
         if saved < len(save):
@@ -58,10 +68,10 @@ def rollout(codes, table, z0, n_steps, save, out, stop):
         for _ in range(block):
             x, y = one_step(x, y, codes, table, first, link)
             first = link
-        end_x, end_y = apply_map(x, y, codes[link + 1], table, link + 1)
+        end_x, end_y = closed(x, y, codes, table, in_modes)
         if not is_finite(end_x, end_y):
             out[saved:] = np.nan
-            return n - 1 + first_non_finite(start_x, start_y, codes, table, start, block)
+            return n - 1 + first_non_finite(start_x, start_y, codes, table, start, block, in_modes)
         n += block
         while saved < len(save) and save[saved] == n:
             pack(end_x, end_y, out[saved])
@@ -70,33 +80,39 @@ def rollout(codes, table, z0, n_steps, save, out, stop):
 
 
 @njit(**OPTIONS)
-def step_each(codes, tables, z, out):
+def step_each(codes, tables, z, in_modes, out):
     """One step from every row of `z` (N, 2d) by the maps `codes`, each row with its own table (N, n, W)."""
     for i in range(z.shape[0]):
         x, y = unpack(z[i])
+        if not in_modes:
+            x, y = to_modes(x, y)
         for j in range(len(codes)):
             x, y = apply_map(x, y, codes[j], tables[i], j)
+        if not in_modes:
+            x, y = from_modes(x, y)
         pack(x, y, out[i])
 
 
 @njit(**OPTIONS)
-def rollout_lanes(codes, table, z0, n_steps, save, out, n_finite, stop):
-    """`rollout` of every row of `z0` (N, 2d), `LANES` at a time."""
+def rollout_lanes(codes, table, y0, in_modes, n_steps, save, out, n_finite, stop):
+    """`rollout` of every row of `y0` (N, 2d), `LANES` at a time."""
     link = len(codes) - 2
     Z = aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
     start = aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
-    for block_start in range(0, z0.shape[0], LANES):
-        count = min(LANES, z0.shape[0] - block_start)
+    for block_start in range(0, y0.shape[0], LANES):
+        count = min(LANES, y0.shape[0] - block_start)
         width = (count + VECTOR - 1) // VECTOR * VECTOR
         for lane in range(width):
             i = block_start + min(lane, count - 1)
-            x, y = unpack(z0[i])
-            pack_lane(x, y, Z, lane)
+            x, y = unpack(y0[i])
             n_finite[i] = n_steps
             for row in range(len(save)):
                 if save[row] > 0:
                     break
                 pack(x, y, out[i, row])
+            if not in_modes:
+                x, y = to_modes(x, y)
+            pack_lane(x, y, Z, lane)
         n = saved = first = 0
         while saved < len(save) and save[saved] <= 0:
             saved += 1
@@ -120,10 +136,10 @@ def rollout_lanes(codes, table, z0, n_steps, save, out, n_finite, stop):
                 if n_finite[i] < n_steps:
                     continue
                 x, y = unpack_lane(Z, lane)
-                x, y = apply_map(x, y, codes[link + 1], table, link + 1)
+                x, y = closed(x, y, codes, table, in_modes)
                 if not is_finite(x, y):
                     x, y = unpack_lane(start, lane)
-                    n_finite[i] = n - 1 + first_non_finite(x, y, codes, table, begin, block)
+                    n_finite[i] = n - 1 + first_non_finite(x, y, codes, table, begin, block, in_modes)
                     n_alive -= 1
                     out[i, saved:] = np.nan
                 else:

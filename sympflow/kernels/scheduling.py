@@ -36,6 +36,9 @@ class Schedule:
         Source text of a SymPy expression, for what is neither a sum, a product nor a power.
     prefix : str
         Names of the values begin with it.
+    fused : str, optional
+        The function of a, b and c that is a·b + c, where the compiler is not to choose what is fused: of a sum of two
+        products it takes either for c, the one known late as well, and a product that is used twice it fuses nowhere.
 
     Attributes
     ----------
@@ -45,12 +48,19 @@ class Schedule:
         Of the rest, in a batch, in units of an addition.
     """
 
-    def __init__(self, known: dict[sp.Symbol, float], printed: Callable[[sp.Expr], str], prefix: str = "s_") -> None:
+    def __init__(
+        self,
+        known: dict[sp.Symbol, float],
+        printed: Callable[[sp.Expr], str],
+        prefix: str = "s_",
+        fused: str | None = None,
+    ) -> None:
         self.early: list[str] = []
         self.lines: list[str] = []
         self.operations = 0.0
         self.ready: dict[str, float] = {symbol.name: time for symbol, time in known.items()}
         self._printed, self._prefix = printed, prefix
+        self._fused = "{2} + {0}*{1}" if fused is None else fused + "({0}, {1}, {2})"
         self._names: dict[str, str] = {}
         self._values: dict[sp.Expr, _Item] = {}
 
@@ -151,7 +161,7 @@ class Schedule:
                 elif item[0][1] == "-1.0":
                     total = self._line(f"{total[1]} - {item[1][1]}", max(total[0], item[1][0]), ADD)
                 else:
-                    text = f"{total[1]} + {item[0][1]}*{item[1][1]}"
+                    text = self._fused.format(item[0][1], item[1][1], total[1])
                     total = self._line(text, max(total[0], time), FUSED)
             assert total is not None
             heapq.heappush(ends, total)
