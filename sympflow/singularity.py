@@ -130,10 +130,10 @@ def _end_of_solution(
     A, B, E3, E5 = DOP853.A, DOP853.B, DOP853.E3, DOP853.E5
     n, d, begin = len(t), system.ndof, t.copy()
     h = (end - t) / 100
-    running = np.isfinite(y).all(-1) & (h != 0)
+    f = system.vector_field(y)
+    running = np.isfinite(y).all(-1) & np.isfinite(f).all(-1) & (h != 0)  # of ẏ not finite no step is ever good
     stuck, passed, refused = (np.zeros(n, dtype=bool) for _ in range(3))
     history = [(t.copy(), _sizes(y, d))]
-    f = system.vector_field(y)
     for _ in range(MOST_TRIED):
         i = np.flatnonzero(running)
         if not len(i):
