@@ -21,7 +21,7 @@ demo: .venv/installed  ## Solve and compare on Hénon–Heiles with the shipped 
 	$(BIN)/sympflow compare henon-heiles --methods sympflow,sympflow:flow=henon_heiles-sympflow,mlp,verlet,leapfrog,srkn11b,rk45 --t-end 1000 --out out/
 
 test: .venv/installed-test lint  ## Lint, types and tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: .venv/installed-test  ## Lint and types
 	$(BIN)/ruff check .
