@@ -20,6 +20,8 @@ help:  ## Show the targets
 demo: .venv/installed  ## Solve and compare on Hénon–Heiles with the shipped flow; figures in out/
 	$(BIN)/sympflow compare henon-heiles --methods sympflow,sympflow:flow=henon_heiles-sympflow,mlp,verlet,leapfrog,srkn11b,rk45 --t-end 1000 --out out/
 
+# One thread for each of the two workers: on arrays as small as the tests' those of BLAS and torch only wait, spinning.
+test: export OMP_NUM_THREADS = 1
 test: .venv/installed-test lint  ## Lint, types and tests
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 

@@ -1,14 +1,9 @@
 """Fixtures shared by several test modules."""
 
 import importlib.util
-import os
 from pathlib import Path
 
 import pytest
-
-# before NumPy and torch are imported: on arrays as small as these their threads cost four times what they save, for
-# those of two workers wait for each other, spinning
-os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
