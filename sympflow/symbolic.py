@@ -66,6 +66,14 @@ class SymbolicHamiltonian:
             return None
         return M
 
+    @cached_property
+    def W(self) -> sp.Expr:
+        """½ v·∇²V v with v = M⁻¹∇V."""
+        assert self.inverse_mass is not None
+        slope = sp.Matrix([sp.diff(self.V, s) for s in self.q])
+        v = self.inverse_mass * slope
+        return (v.T * sp.hessian(self.V, self.q) * v)[0] / 2
+
     # array functions, state y = [q, p] on the last axis -------------------------------------------
 
     def hamiltonian(self, y: Array) -> Array:
@@ -89,6 +97,12 @@ class SymbolicHamiltonian:
     def potential_hessian(self, q: Array) -> Array:
         return self._matrix("V")(q)
 
+    def curvature(self, q: Array) -> Array:
+        return self._scalar("W")(q)
+
+    def curvature_gradient(self, q: Array) -> Array:
+        return self._vector("W")(q)
+
     def kinetic(self, p: Array) -> Array:
         return self._scalar("T")(p)
 
@@ -101,7 +115,7 @@ class SymbolicHamiltonian:
     # generation -----------------------------------------------------------------------------------
 
     def _variables(self, name: str) -> tuple[sp.Symbol, ...]:
-        return {"H": self.q + self.p, "V": self.q, "T": self.p}[name]
+        return {"H": self.q + self.p, "V": self.q, "T": self.p, "W": self.q}[name]
 
     def _scalar(self, name: str) -> Callable[[Array], Array]:
         return self._function(name + "", lambda f, x: [f], lambda values, like, n: assemble(values, like)[..., 0])

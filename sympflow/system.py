@@ -252,6 +252,28 @@ class HamiltonianSystem:
         product = getattr(self._separable()._definition, "hessian_vector", None)
         return (self.potential_hessian(q) @ v[..., None])[..., 0] if product is None else product(q, v)
 
+    def curvature(self, q: Array) -> Array:
+        """½ v·∇²V(q) v, the curvature of V along the acceleration v = M⁻¹∇V(q): (..., d) to (...).
+
+        Raises
+        ------
+        ValueError
+            If the system has no symbols, or T is not ½ pᵀM⁻¹p.
+        """
+        return self._with_curvature().curvature(q)
+
+    def curvature_gradient(self, q: Array) -> Array:
+        """The gradient of `curvature`, ∇²V M⁻¹∇²V v + ½ ∇³V(v, v): (..., d) to (..., d)."""
+        return self._with_curvature().curvature_gradient(q)
+
+    def _with_curvature(self) -> SymbolicHamiltonian:
+        if self.symbols is None or not self._separable().quadratic_kinetic:
+            raise ValueError(
+                f"`system` {self.name!r} has no curvature terms, which take third derivatives of V and a kinetic "
+                "energy ½ pᵀM⁻¹p: define it with HamiltonianSystem.from_sympy, or leave them out."
+            )
+        return self.symbols
+
     def kinetic(self, p: Array) -> Array:
         """T(p): (..., d) to (...)."""
         if self._separable().quadratic_kinetic:

@@ -120,7 +120,7 @@ def run_kahan_li8(scene: Scene, trajectories: int, dt: float, t_end: float) -> n
 
 def composition_table(name: str, h: float) -> tuple[float, np.ndarray, np.ndarray]:
     """The first drift, and the drifts that follow the kicks, of a drift-first scheme run many times; times h."""
-    substeps = [(kind, c) for kind, c, _ in SCHEMES[name].substeps]
+    substeps = [(kind, c) for kind, c, *_ in SCHEMES[name].substeps]
     drifts = h * np.array([c for kind, c in substeps if kind == "drift"])
     kicks = h * np.array([c for kind, c in substeps if kind == "kick"])
     assert substeps[0][0] == substeps[-1][0] == "drift"

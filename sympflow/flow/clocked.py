@@ -149,7 +149,7 @@ class ClockedFlow(SympFlow):
         self._kernel: ClockedFlowKernel | None = None
         self._numbers: tuple[tuple[int, int], list[float]] | None = None
         maps: list[Layer] = []
-        for kind, c, _ in table.substeps:
+        for kind, c, *_ in table.substeps:
             term = KINETIC if kind == "drift" else POTENTIAL
             potential = PrimedPotential(ndof, self._binding, [(term, Share(float(c)))])
             maps.append(Drift(potential) if kind == "drift" else Kick(potential))

@@ -10,7 +10,7 @@ import numpy as np
 
 from sympflow.flow.coefficients import Coefficients, Entry
 from sympflow.flow.contents import Contents
-from sympflow.integrators.schemes import Scheme
+from sympflow.integrators.schemes import CURVATURE, Scheme
 from sympflow.integrators.splitting import scheme_evaluations
 
 Kind = Literal["kick", "drift"]
@@ -20,15 +20,20 @@ MOST_KEPT = 256  # a flow with a processor has five for each step length
 
 @dataclass(frozen=True)
 class Substep:
-    """A kick or a drift of the flow: its coefficient, and for a kick that of its force gradient."""
+    """A kick or a drift of the flow: its coefficient, and for a kick those of its force gradient and its curvature."""
 
     kind: Kind
     weight: Entry
     gradient: Entry | None = None
+    curvature: Entry | None = None
+
+    @property
+    def entries(self) -> tuple[Entry | None, Entry | None, Entry | None]:
+        return self.weight, self.gradient, self.curvature
 
 
 class Tables:
-    """Kicks, drifts and force gradients of ψ̄_t, K_t and χ_t: at one t as a `Scheme`, at all t as polynomials.
+    """The numbers of kicks and drifts of ψ̄_t, K_t and χ_t: at one t as a `Scheme`, at all t as polynomials.
 
     Parameters
     ----------
@@ -44,7 +49,7 @@ class Tables:
         last = len(substeps) - outer
         self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
         self.dt, self.processed = dt, outer > 0
-        self.force_gradient = any(s.gradient is not None for s in substeps)
+        self.level = max(s.entries[1:].index(None) if None in s.entries[1:] else CURVATURE for s in substeps)
         self._coefficients = {id(c): c.table.detach().cpu().double().numpy() for c in columns_of(substeps)}
         exponents = columns_of(substeps)[0].exponents
         self._exponents = np.array(exponents, dtype=float)
@@ -66,8 +71,10 @@ class Tables:
 
         return self._keep((part, t, back), make)
 
-    def polynomials(self, back: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Kicks, drifts and gradients (m, K) of the stages of ψ̄_t, or of its inverse, divided by t, t and t³.
+    def polynomials(self, back: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Kicks, drifts, gradients and curvatures (m, K) of the stages of ψ̄_t, or of its inverse.
+
+        They are divided by t, t, t³ and t⁵.
 
         They multiply the powers 0 … K−1 of `variable`; K is at least 3, by zeros if need be.
         """
@@ -75,10 +82,10 @@ class Tables:
         def make() -> tuple[np.ndarray, ...]:
             parts, sign = self._parts["primed"], -1 if back else 1
             substeps = reversed(parts) if back else parts
-            stages = _stages((s.kind, *_pair(s, self._coefficients, sign)) for s in substeps)
+            stages = _stages((s.kind, _numbers(s, self._coefficients, sign)) for s in substeps)
             columns = (np.array(column, dtype=float) for column in zip(*stages, strict=True))
-            kicks, gradients, drifts = (np.pad(c, ((0, 0), (0, max(0, 3 - c.shape[1])))) for c in columns)
-            return kicks, drifts, gradients
+            kicks, gradients, curvatures, drifts = (np.pad(c, ((0, 0), (0, max(0, 3 - c.shape[1])))) for c in columns)
+            return kicks, drifts, gradients, curvatures
 
         return self._keep(("polynomials", back), make)
 
@@ -96,7 +103,7 @@ class Tables:
         return tau * tau if self._even else tau
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Forces and force gradients of a run, as `FixedStep.evaluations`."""
+        """Forces, force gradients and curvature terms of a run, as `FixedStep.evaluations`."""
 
         def make() -> dict[str, int]:
             counts = [scheme_evaluations(self.scheme("primed kernel", None), n_steps, n_saved, 0, backend)]
@@ -115,10 +122,11 @@ class Tables:
             raise ValueError(f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t!r}.")
         powers = (t / self.dt) ** self._exponents
         values = {column: table @ powers for column, table in self._coefficients.items()}
-        stages = _stages((s.kind, *_pair(s, values, 1)) for s in self._parts[part])
-        kicks, gradients, drifts = (tuple(map(float, column)) for column in zip(*stages, strict=True))
+        stages = _stages((s.kind, _numbers(s, values, 1)) for s in self._parts[part])
+        kicks, gradients, curvatures, drifts = (tuple(map(float, column)) for column in zip(*stages, strict=True))
         source = f"a primed SympFlow, Δt = {self.dt:g}, frozen at t = {t:g}"
-        return Scheme(part, None, kicks, drifts, gradients, source, self.force_gradient)
+        more = (curvatures,) if self.level == CURVATURE else ()
+        return Scheme(part, None, kicks, drifts, gradients, source, self.level > 0, *more)
 
 
 class KeptTables:
@@ -138,28 +146,27 @@ class KeptTables:
 
 def columns_of(substeps: Sequence[Substep]) -> list[Coefficients]:
     """The distinct columns that the substeps take their numbers from."""
-    entries = [entry for s in substeps for entry in (s.weight, s.gradient) if entry is not None]
+    entries = [entry for s in substeps for entry in s.entries if entry is not None]
     return list({id(entry.column): entry.column for entry in entries}.values())
 
 
-def _pair(s: Substep, values: dict[int, np.ndarray], sign: int) -> tuple[Any, Any]:
-    """Coefficient and force gradient of a substep, out of those of the columns."""
-    gradient = None if s.gradient is None else sign * s.gradient.sign * values[id(s.gradient.column)][s.gradient.row]
-    weight = sign * s.weight.sign * values[id(s.weight.column)][s.weight.row]
-    return weight, 0 * weight if gradient is None else gradient
+def _numbers(s: Substep, values: dict[int, np.ndarray], sign: int) -> list[Any]:
+    """Coefficient, force gradient and curvature of a substep, out of those of the columns."""
+    zero = 0 * values[id(s.weight.column)][s.weight.row]
+    return [zero if e is None else sign * e.sign * values[id(e.column)][e.row] for e in s.entries]
 
 
-def _stages(substeps: Iterable[tuple[Kind, Any, Any]]) -> list[tuple[Any, Any, Any]]:
-    """(kick, gradient, drift) of the stages, neighbours of one kind merged."""
-    stages: list[tuple[Any, Any, Any]] = []
+def _stages(substeps: Iterable[tuple[Kind, list[Any]]]) -> list[list[Any]]:
+    """[kick, gradient, curvature, drift] of the stages, neighbours of one kind merged."""
+    stages: list[list[Any]] = []
     before = "drift"
-    for kind, c, g in substeps:
-        b, gradient, a = stages[-1] if stages else (0.0, 0.0, 0.0)
+    for kind, numbers in substeps:
         if kind == "drift" and stages:
-            stages[-1] = b, gradient, a + c
+            stages[-1][-1] = stages[-1][-1] + numbers[0]
         elif kind == "kick" and before == "kick" and stages:
-            stages[-1] = b + c, gradient + g, a
+            stages[-1][:-1] = [one + two for one, two in zip(stages[-1][:-1], numbers, strict=True)]
         else:
-            stages.append((c, g, 0 * c) if kind == "kick" else (0 * c, 0 * c, c))
+            zero = 0 * numbers[0]
+            stages.append([*numbers, zero] if kind == "kick" else [zero, zero, zero, numbers[0]])
         before = kind
     return stages

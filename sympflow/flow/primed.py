@@ -1,9 +1,10 @@
 """Primed SympFlows: every potential is the system's own V or T times a trained function of t.
 
-    kick    V_p(t, q) = t b(τ) V(q) − t³ γ(τ) ½|∇V(q)|²_{M⁻¹}        drift    V_m(t, p) = t a(τ) T(p)        τ = t/Δt
+    kick    V_p(t, q) = t b(τ) V(q) − t³ γ(τ) ½|∇V(q)|²_{M⁻¹} + t⁵ c(τ) ½ v·∇²V(q) v,   v = M⁻¹∇V(q)
+    drift   V_m(t, p) = t a(τ) T(p)                                                         τ = t/Δt
 
-Frozen at any t such a flow is a splitting scheme, kicks b, force gradients γ and drifts a in the convention of
-`sympflow.integrators.schemes`: a SympFlow of this kind is a table of numbers that varies smoothly with t.
+Frozen at any t such a flow is a splitting scheme, kicks b, force gradients γ, curvatures c and drifts a in the
+convention of `sympflow.integrators.schemes`: a SympFlow of this kind is a table of numbers that varies smoothly with t.
 
 With a processor it is ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹, the kernel K and the processor χ being such tables: over many steps
 of Δt only K is executed, as the χ between two steps cancel.
@@ -24,7 +25,15 @@ from sympflow.flow.coefficients import Coefficients, Entry
 from sympflow.flow.frozen import KeptTables, Kind, Substep, Tables
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.placement import checked_device, checked_dtype
-from sympflow.flow.primed_potentials import FORCE_GRADIENT, KINETIC, POTENTIAL, Binding, PrimedPotential, Term
+from sympflow.flow.primed_potentials import (
+    CURVATURE,
+    FORCE_GRADIENT,
+    KINETIC,
+    POTENTIAL,
+    Binding,
+    PrimedPotential,
+    Term,
+)
 from sympflow.flow.sympflow import SympFlow
 from sympflow.integrators.schemes import SCHEMES, Scheme, compose
 
@@ -37,7 +46,7 @@ if TYPE_CHECKING:
 class PrimedFlow(SympFlow):
     """A SympFlow of kicks and drifts, in turn, that are primed with V and T; made by `SympFlow.primed`.
 
-    A palindromic one has even polynomials b, γ, a, and its kernel reads the same backwards, which makes K
+    A palindromic one has even polynomials b, γ, c, a, and its kernel reads the same backwards, which makes K
     time-reversible: continued to negative t by its formulas, K_{−t} = K_t⁻¹. With a processor ψ̄ is conjugate to it.
 
     Parameters
@@ -56,6 +65,8 @@ class PrimedFlow(SympFlow):
         Without it the flow has a `scheme`, but no values.
     processor : int
         Number C of pairs of χ, 2C + 1 maps; 0 for none.
+    curvature : bool
+        Whether kicks with force gradients have curvature terms too, for symbolic systems.
     dtype, device
         Of the parameters.
 
@@ -63,9 +74,9 @@ class PrimedFlow(SympFlow):
     ----------
     kicks, drifts : Coefficients
         b and a of the kernel.
-    gradients : Coefficients or None
-        γ, one for each kick.
-    processor_kicks, processor_drifts, processor_gradients : Coefficients or None
+    gradients, curvatures : Coefficients or None
+        γ and c, one for each kick.
+    processor_kicks, processor_drifts, processor_gradients, processor_curvatures : Coefficients or None
         Those of χ.
     substeps : tuple of Substep
         What is executed, in this order: χ⁻¹, K, χ.
@@ -82,6 +93,7 @@ class PrimedFlow(SympFlow):
         dt: float = 1.0,
         system: HamiltonianSystem | None = None,
         processor: int = 0,
+        curvature: bool = False,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
@@ -103,21 +115,23 @@ class PrimedFlow(SympFlow):
 
         def columns(sequence: Sequence[Kind], mirrored: bool, total: float | None) -> list[Any]:
             exponents = tuple(range(0, degree, stride))
-            n = [sequence.count(kind) for kind in ("kick", "drift", "kick")]
-            made: list[Any] = [
-                Coefficients(n[i], exponents, self.dt, power, mirrored, total if power == 1 else None, **like)
-                for i, power in enumerate((1, 1, 3))
+            wanted: list[tuple[Kind, int, bool]] = [("kick", 1, True), ("drift", 1, True)]
+            wanted += [("kick", 3, force_gradient), ("kick", 5, curvature)]
+            return [
+                Coefficients(
+                    sequence.count(kind), exponents, self.dt, power, mirrored, total if power == 1 else None, **like
+                )
+                if there
+                else None
+                for kind, power, there in wanted
             ]
-            return made if force_gradient else [*made[:2], None]
 
-        self.kicks, self.drifts, self.gradients = columns(kernel, palindromic, 1.0)
-        outside: list[Any] = columns(chi, False, None) if processor else [None, None, None]
-        self.processor_kicks, self.processor_drifts, self.processor_gradients = outside
-        inner = _substeps(kernel, self.kicks, self.drifts, self.gradients, 1)
-        outer = {
-            sign: _substeps(chi, self.processor_kicks, self.processor_drifts, self.processor_gradients, sign)
-            for sign in (1, -1)
-        }
+        inside = columns(kernel, palindromic, 1.0)
+        outside: list[Any] = columns(chi, False, None) if processor else [None] * len(inside)
+        self.kicks, self.drifts, self.gradients, self.curvatures = inside
+        self.processor_kicks, self.processor_drifts, self.processor_gradients, self.processor_curvatures = outside
+        inner = _substeps(kernel, inside, 1)
+        outer = {sign: _substeps(chi, outside, sign) for sign in (1, -1)}
         self.substeps: tuple[Substep, ...] = (*reversed(outer[-1]), *inner, *outer[1])
         self._n_outer = len(chi)
         self._tables = KeptTables(self.substeps, self._n_outer, self.dt)
@@ -150,6 +164,8 @@ class PrimedFlow(SympFlow):
         terms: list[tuple[Term, Entry]] = [(POTENTIAL, substep.weight)]
         if substep.gradient is not None:
             terms.append((FORCE_GRADIENT, substep.gradient))
+        if substep.curvature is not None:
+            terms.append((CURVATURE, substep.curvature))
         return Kick(PrimedPotential(self.ndof, self._binding, terms))
 
     @classmethod
@@ -162,6 +178,7 @@ class PrimedFlow(SympFlow):
         palindromic: bool,
         force_gradient: bool,
         processor: int = 0,
+        curvature: bool = False,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> PrimedFlow:
@@ -172,9 +189,10 @@ class PrimedFlow(SympFlow):
             raise ValueError(f"`force_gradient` is False but {scheme.name!r} has force gradients: leave it out.")
         substeps = scheme.substeps
         first: Kind = "kick" if substeps[0][0] == "kick" else "drift"
-        shape = (degree, palindromic, force_gradient, dt, system, processor, dtype, device)
+        shape = (degree, palindromic, force_gradient, dt, system, processor, curvature, dtype, device)
         flow = cls(system.ndof, first, len(substeps), *shape)
-        for column, kind, entry in ((flow.kicks, "kick", 1), (flow.drifts, "drift", 1), (flow.gradients, "kick", 2)):
+        columns: Any = (flow.kicks, "kick", 1), (flow.drifts, "drift", 1), (flow.gradients, "kick", 2)
+        for column, kind, entry in (*columns, (flow.curvatures, "kick", 3)):
             if column is not None:
                 table = np.zeros(tuple(column.offset.shape))
                 table[:, 0] = [float(substep[entry]) for substep in substeps if substep[0] == kind]
@@ -269,6 +287,7 @@ class PrimedFlow(SympFlow):
                 "palindromic": self.palindromic,
                 "force_gradient": self.gradients is not None,
                 "processor": self.processor,
+                "curvature": self.curvatures is not None,
             },
         }
 
@@ -278,19 +297,12 @@ def _alternating(first: Kind, n: int) -> tuple[Kind, ...]:
     return tuple(first if i % 2 == 0 else other for i in range(n))
 
 
-def _substeps(
-    sequence: Sequence[Kind],
-    kicks: Coefficients | None,
-    drifts: Coefficients | None,
-    gradients: Coefficients | None,
-    sign: int,
-) -> list[Substep]:
+def _substeps(sequence: Sequence[Kind], columns: Sequence[Coefficients | None], sign: int) -> list[Substep]:
+    kicks, drifts, *more = columns
     made = []
     for i, kind in enumerate(sequence):
-        column = kicks if kind == "kick" else drifts
-        assert column is not None
-        gradient = Entry(gradients, i // 2, sign) if kind == "kick" and gradients is not None else None
-        made.append(Substep(kind, Entry(column, i // 2, sign), gradient))
+        of = [kicks, *more] if kind == "kick" else [drifts]
+        made.append(Substep(kind, *[None if c is None else Entry(c, i // 2, sign) for c in of]))  # type: ignore[arg-type]
     return made
 
 
@@ -303,6 +315,7 @@ def primed(
     degree: int | None,
     force_gradient: bool | None,
     processor: int,
+    curvature: bool,
     dtype: torch.dtype,
     device: torch.device | str | None,
 ) -> PrimedFlow:
@@ -314,6 +327,10 @@ def primed(
         force_gradient = system.quadratic_kinetic and (functions is None or functions[2] is not None)
     elif force_gradient and not system.quadratic_kinetic:
         raise ValueError("`force_gradient` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
+    if curvature and not (force_gradient and system.symbols is not None):
+        raise ValueError(
+            "`curvature` goes with force gradients of a symbolic system, H = ½ pᵀM⁻¹p + V(q): leave it out."
+        )
     if degree is None:
         degree = 5 if processor else 7
     if scheme is None:
@@ -329,4 +346,6 @@ def primed(
         scheme = SCHEMES[scheme]
     if (scheme.nystrom or any(scheme.gradients)) and not system.quadratic_kinetic:
         raise ValueError(f"`scheme` {scheme.name!r} needs a kinetic energy ½ pᵀM⁻¹p: take 'kahan_li8', for instance.")
-    return PrimedFlow.from_scheme(system, scheme, dt, degree, palindromic, force_gradient, processor, dtype, device)
+    return PrimedFlow.from_scheme(
+        system, scheme, dt, degree, palindromic, force_gradient, processor, curvature, dtype, device
+    )

@@ -1,4 +1,4 @@
-"""Potentials made of a system's own functions, V(q), T(p) and −½|∇V(q)|²_{M⁻¹}, times functions of t."""
+"""Potentials made of a system's own functions, V(q), T(p), −½|∇V|²_{M⁻¹} and ½v·∇²V v, times functions of t."""
 
 from __future__ import annotations
 
@@ -70,6 +70,14 @@ def _force_gradient(system: HamiltonianSystem, q: Tensor) -> Tensor:
     return system.hessian_vector(q, system.velocity(system.force(q)))
 
 
+def _curvature(system: HamiltonianSystem, q: Tensor) -> Tensor:
+    return system.curvature(q)
+
+
+def _curvature_gradient(system: HamiltonianSystem, q: Tensor) -> Tensor:
+    return system.curvature_gradient(q)
+
+
 def _potential(system: HamiltonianSystem, q: Tensor) -> Tensor:
     return system.potential(q)
 
@@ -90,6 +98,8 @@ def _velocity(system: HamiltonianSystem, p: Tensor) -> Tensor:
 POTENTIAL = Term(_potential, _potential_gradient)
 FORCE_GRADIENT = Term(_force_gradient_value, _force_gradient)
 """−½|∇V|²_{M⁻¹}; −∇²V M⁻¹∇V."""
+CURVATURE = Term(_curvature, _curvature_gradient)
+"""½ v·∇²V v with v = M⁻¹∇V, and its gradient."""
 KINETIC = Term(_kinetic, _velocity)
 
 

@@ -102,8 +102,9 @@ def _primed(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> PrimedFlow:
     """A primed flow, which `bind` will give its system."""
     if not isinstance(plan, dict) or plan.get("first") not in ("kick", "drift"):
         raise Refused("its plan of a primed flow is missing")
-    for name in ("palindromic", "force_gradient"):
-        if not isinstance(plan.get(name), bool):
+    curvature = plan.get("curvature", False)  # files of earlier versions have none
+    for name, value in (*((n, plan.get(n)) for n in ("palindromic", "force_gradient")), ("curvature", curvature)):
+        if not isinstance(value, bool):
             raise Refused(f"its {name} is neither true nor false")
     maps = _integer(plan.get("maps"), "number of maps", MAX_LAYERS)
     degree = _integer(plan.get("degree"), "degree", MAX_DEGREE)
@@ -111,7 +112,7 @@ def _primed(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> PrimedFlow:
     if processor != 0 or isinstance(processor, bool):
         processor = _integer(processor, "processor", MAX_LAYERS)
     shape = (plan["first"], maps, degree, plan["palindromic"], plan["force_gradient"])
-    return PrimedFlow(ndof, *shape, dt, processor=processor, dtype=dtype)
+    return PrimedFlow(ndof, *shape, dt, processor=processor, curvature=curvature, dtype=dtype)
 
 
 def _clocked(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> ClockedFlow:

@@ -126,6 +126,7 @@ class SympFlow(FlowMap):
         degree: int | None = None,
         force_gradient: bool | None = None,
         processor: int = 0,
+        curvature: bool = False,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> PrimedFlow:
@@ -153,6 +154,9 @@ class SympFlow(FlowMap):
         processor : int
             Number of kicks of χ in ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹, 0 for none. A run executes χ⁻¹ once, the kernel K of
             `stages` kicks in every step, and χ for every output.
+        curvature : bool
+            Whether the kicks also have a term in ½ v·∇²V v, v = M⁻¹∇V, which takes third derivatives of V: for symbolic
+            systems. A trained kick with it comes tens of times nearer, and takes 1.1 to 1.5 times as long.
         dtype, device
             Of the parameters.
 
@@ -163,7 +167,8 @@ class SympFlow(FlowMap):
         """
         from sympflow.flow.primed import primed
 
-        return primed(system, stages, dt, palindromic, scheme, degree, force_gradient, processor, dtype, device)
+        shape = (stages, dt, palindromic, scheme, degree, force_gradient, processor, curvature)
+        return primed(system, *shape, dtype, device)
 
     @staticmethod
     def split(

@@ -27,6 +27,7 @@ class MapsStepper(FixedStep):
 
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
+    saves_finite: ClassVar[bool] = True
     counted_maps: ClassVar[Sequence[Map]] = ()
 
     def parts_of(self, system: HamiltonianSystem) -> ExactParts:
@@ -198,7 +199,7 @@ class LinearSplitting(MapsStepper):
     def maps(self, parts: ExactParts, h: Any) -> list[Map]:
         filters = _sinc(parts, h) if self.mollified else None
         maps = []
-        for kind, c, c3 in self.scheme.substeps:
+        for kind, c, c3, _ in self.scheme.substeps:
             if kind == "drift":
                 maps.append(Map(LINEAR, self._times(parts, c * h)))
             elif parts.rest:

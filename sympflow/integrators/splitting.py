@@ -47,7 +47,7 @@ class Splitting(FixedStep):
                 f"`method` {self.name!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use a "
                 "Runge–Kutta method or train a SympFlow."
             )
-        if (self.scheme.nystrom or any(self.scheme.gradients)) and not system.quadratic_kinetic:
+        if (self.scheme.nystrom or self.scheme.level) and not system.quadratic_kinetic:
             raise ValueError(
                 f"`method` {self.name!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.name!r} has not: use a scheme "
                 "for any separable system, such as 'kahan_li8'."
@@ -57,32 +57,32 @@ class Splitting(FixedStep):
         self.check(system)
         q, p = y[..., : system.ndof], y[..., system.ndof :]
         h = per_state(h, y)
-        for kind, c, c3 in self.scheme.substeps:
+        for kind, c, c3, c5 in self.scheme.substeps:
             if kind == "drift":
                 q = q + (c * h) * system.velocity(p)
             else:
-                p = p + _kick(system, q, c * h, c3 * h**3 if c3 else 0.0)
+                p = p + _kick(system, q, c * h, c3 * h**3 if c3 else 0.0, c5 * h**5 if c5 else 0.0)
         return concatenate([q, p])
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         self.check(system)
         q, p = y[..., : system.ndof], y[..., system.ndof :]
         h = per_state(h, y)
-        for kind, c, c3 in reversed(self.scheme.substeps):
+        for kind, c, c3, c5 in reversed(self.scheme.substeps):
             if kind == "drift":
                 q = q - (c * h) * system.velocity(p)
             else:
-                p = p - _kick(system, q, c * h, c3 * h**3 if c3 else 0.0)
+                p = p - _kick(system, q, c * h, c3 * h**3 if c3 else 0.0, c5 * h**5 if c5 else 0.0)
         return concatenate([q, p])
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
-        if any(self.scheme.gradients):  # would need third derivatives of V: differentiate the step itself
+        if self.scheme.level:  # would need third derivatives of V: differentiate the step itself
             return super().tangent(system, t, y, h)
         d = system.ndof
         y = to_numpy(y)
         q, p, h = y[..., :d], y[..., d:], np.asarray(h, dtype=y.dtype)[..., None]
         A = np.broadcast_to(np.eye(2 * d, dtype=y.dtype), (*y.shape, 2 * d)).copy()
-        for kind, c, _ in self.scheme.substeps:
+        for kind, c, *_ in self.scheme.substeps:
             if kind == "drift":
                 q = q + c * h * system.velocity(p)
                 A[..., :d, :] += c * h[..., None] * (system.kinetic_hessian(p) @ A[..., d:, :])
@@ -143,34 +143,37 @@ class Splitting(FixedStep):
 
 
 def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-    """Force and force-gradient evaluations of a run, as `FixedStep.evaluations`."""
+    """Evaluations of the force, of force gradients and of curvature terms in a run, as `FixedStep.evaluations`."""
     kicks = _kicks(scheme)
-    if backend != "compiled":
-        n = n_steps + n_extra
-        return {"force_evaluations": n * len(kicks), "hessian_evaluations": n * sum(kicks)}
+    counts = {"force_evaluations": (scheme.force_evaluations, [1] * len(kicks))}
+    counts["hessian_evaluations"] = scheme.hessian_evaluations, [g for g, _ in kicks]
+    if any(scheme.curvatures):
+        counts["curvature_evaluations"] = scheme.curvature_evaluations, [c for _, c in kicks]
+    if backend != "compiled" or not kicks:
+        return {name: (n_steps + n_extra) * sum(each) for name, (_, each) in counts.items()}
     # compiled, the last kick of a step is merged with the next step's first, except where a state is saved
-    forces, hessians = scheme.force_evaluations, scheme.hessian_evaluations
-    if not kicks:
-        return {"force_evaluations": 0, "hessian_evaluations": 0}
-    closed = n_saved if len(kicks) > forces else 0
+    closed = n_saved if len(kicks) > scheme.force_evaluations else 0
     return {
-        "force_evaluations": n_steps * forces + closed + n_extra * len(kicks),
-        "hessian_evaluations": n_steps * hessians + closed * kicks[-1] + n_extra * sum(kicks),
+        name: n_steps * of_a_step + closed * each[-1] + n_extra * sum(each)
+        for name, (of_a_step, each) in counts.items()
     }
 
 
 @lru_cache(maxsize=256)
-def _kicks(scheme: Scheme) -> tuple[bool, ...]:
-    """Whether each of its kicks has a force gradient."""
-    return tuple(c3 != 0 for kind, _, c3 in scheme.substeps if kind == "kick")
+def _kicks(scheme: Scheme) -> tuple[tuple[bool, bool], ...]:
+    """Whether each of its kicks has a Hessian, and a curvature term."""
+    return tuple((g != 0 or c != 0, c != 0) for kind, _, g, c in scheme.substeps if kind == "kick")
 
 
-def _kick(system: HamiltonianSystem, q: Array, c: float | Array, c3: float | Array) -> Array:
-    """c·F(q) + c3·∇²V(q) M⁻¹∇V(q), the second term only where the scheme has a force gradient."""
+def _kick(system: HamiltonianSystem, q: Array, c: Any, c3: Any, c5: Any) -> Array:
+    """c F(q) + c3 ∇²V M⁻¹∇V(q) − c5 ∇(½ v·∇²V v)(q), v = M⁻¹∇V, the last two only where the scheme has them."""
     force = system.force(q)
-    if isinstance(c3, float) and c3 == 0.0:
-        return c * force
-    return c * force - c3 * system.hessian_vector(q, system.velocity(force))
+    change = c * force
+    if not (isinstance(c3, float) and c3 == 0.0):
+        change = change - c3 * system.hessian_vector(q, system.velocity(force))
+    if not (isinstance(c5, float) and c5 == 0.0):
+        change = change - c5 * system.curvature_gradient(q)
+    return change
 
 
 def __getattr__(name: str) -> type[Splitting]:

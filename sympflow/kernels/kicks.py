@@ -14,10 +14,11 @@ from sympflow.symbolic import SymbolicHamiltonian, printable
 
 __all__ = ["kicks_source"]
 
+PRODUCT = "fused_multiply_add"  # of `elementary`
 MOST_OPERATIONS = 400  # of a kick whose shapes are tried: rewriting longer ones takes longer than it saves
 MOST_TERMS = 120  # of a sum multiplied out
 CROWDED = 0.4  # cycles by which each operation of a single trajectory delays the others, as measured
-B, G = sp.Symbol("b", real=True), sp.Symbol("g", real=True)
+B, G, C = sp.symbols("b g c", real=True)
 UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
 """What holds one of these is taken as it is."""
 
@@ -38,12 +39,13 @@ class _Kick:
         return self.latency + CROWDED * self.operations
 
 
-def kicks_source(symbols: SymbolicHamiltonian, gradients: bool) -> str:
-    """The new p after a kick, p − b∇V + g∇²V M⁻¹∇V, each in two shapes that differ by rounding alone.
+def kicks_source(symbols: SymbolicHamiltonian, level: int) -> str:
+    """The new p after a kick, p − b∇V + g∇²V v − c∇(½ v·∇²V v), v = M⁻¹∇V, each in two shapes, equal but for rounding.
 
-    ``kicked(q, p, c, j)`` and with `gradients` ``gradient_kicked`` are the fastest for one trajectory; what depends on
-    b and g alone is in row j of the table c, which ``fill_coefficients(b, g, row)`` computes. ``kicked_lane(q, p, b)``
-    and ``gradient_kicked_lane(q, p, b, g)`` have the fewest operations, for many trajectories at once.
+    ``kicked(q, p, table, j)``, from `level` 1 on ``gradient_kicked`` and from 2 on ``curvature_kicked``, are the
+    fastest for one trajectory; what depends on b, g and c alone is in row j of the table, which ``fill_coefficients(b,
+    g, c, row)`` computes. ``kicked_lane(q, p, b)``, ``gradient_kicked_lane(q, p, b, g)`` and
+    ``curvature_kicked_lane(q, p, b, g, c)`` have the fewest operations, for many trajectories at once.
 
     Raises
     ------
@@ -53,22 +55,23 @@ def kicks_source(symbols: SymbolicHamiltonian, gradients: bool) -> str:
     functions: list[str] = []
     fill: list[str] = []
     stored: list[str] = []
-    for name, gradient in [("kicked", False)] + [("gradient_kicked", True)] * gradients:
-        tried = [_scheduled(symbols, shape, f"{name[0]}_") for shape in _shapes(symbols, gradient)]
+    for terms, name in enumerate(("kicked", "gradient_kicked", "curvature_kicked")[: level + 1], 1):
+        numbers = ("b", "g", "c")[:terms]
+        tried = [_scheduled(symbols, shape, f"{name[0]}_") for shape in _shapes(symbols, terms)]
         one = min(tried, key=lambda kick: (kick.cycles, kick.operations))
         many = min(tried, key=lambda kick: (kick.operations, kick.latency))
         used = [n for n in _names(one.coefficients) if any(_mentions(line, n) for line in [*one.lines, *one.results])]
-        loads = [f"{n} = c[j, {len(stored) + i}]" for i, n in enumerate(used)]
+        loads = [f"{n} = table[j, {len(stored) + i}]" for i, n in enumerate(used)]
         fill += one.coefficients
         stored += used
-        takes_b = any(_mentions(line, v) for line in [*one.lines, *one.results] for v in ("b", "g"))
-        loads += [f"{v} = c[j, -{2 - i}]" for i, v in enumerate(("b", "g"))] if takes_b else []
-        functions.append(_function(symbols, name, "q, p, c, j", [*loads, *one.lines], one.results))
-        arguments = "q, p, b, g" if gradient else "q, p, b"
+        taken = [v for v in numbers if any(_mentions(line, v) for line in [*one.lines, *one.results])]
+        loads += [f"{v} = table[j, -{3 - i}]" for i, v in enumerate(numbers) if v in taken]
+        functions.append(_function(symbols, name, "q, p, table, j", [*loads, *one.lines], one.results))
+        arguments = ", ".join(("q", "p", *numbers))
         functions.append(_function(symbols, f"{name}_lane", arguments, [*many.coefficients, *many.lines], many.results))
-    rows = [*fill, *(f"row[{i}] = {name}" for i, name in enumerate([*stored, "b", "g"]))]
-    filled = "\n    ".join(["@njit(**OPTIONS)\ndef fill_coefficients(b, g, row):", *rows])
-    return "\n\n\n".join([f"N_COEFFICIENTS = {len(stored) + 2}", filled, *functions]) + "\n"
+    rows = [*fill, *(f"row[{i}] = {name}" for i, name in enumerate([*stored, "b", "g", "c"]))]
+    filled = "\n    ".join(["@njit(**OPTIONS)\ndef fill_coefficients(b, g, c, row):", *rows])
+    return "\n\n\n".join([f"N_COEFFICIENTS = {len(stored) + 3}", filled, *functions]) + "\n"
 
 
 def _names(assignments: Sequence[str]) -> list[str]:
@@ -84,13 +87,17 @@ def _function(
 ) -> str:
     unpacked = [f"{', '.join(s.name for s in v)}, = {x}" for v, x in ((symbols.q, "q"), (symbols.p, "p"))]
     returned = f"return ({''.join(f'{value}, ' for value in results)})"
-    return "\n    ".join([f"@njit(**OPTIONS)\ndef {name}({arguments}):", *unpacked, *lines, returned])
+    return "\n    ".join([f"@njit(**OPTIONS, forceinline=True)\ndef {name}({arguments}):", *unpacked, *lines, returned])
 
 
 def _scheduled(symbols: SymbolicHamiltonian, shape: Sequence[sp.Expr], prefix: str) -> _Kick:
     """The shape as code. Momenta are known before positions, whose drift waited for them."""
     known = {**dict.fromkeys(symbols.q, 0.0), **dict.fromkeys(symbols.p, -FUSED)}
-    schedule = Schedule(known, printed, prefix)
+    schedule = Schedule(known, printed, prefix, PRODUCT)
+    numbers: dict[sp.Expr, sp.Symbol] = {}
+    shape = [_numbered(f, {*symbols.q, *symbols.p}, numbers) for f in shape]
+    for coefficient, symbol in numbers.items():  # as one: what is common to several would else be taken out of them
+        schedule.define(symbol, coefficient)
     shared, reduced = sp.cse(shape, symbols=sp.numbered_symbols("common_", real=True), list=True, order="none")
     for symbol, expression in shared:
         schedule.define(symbol, expression)
@@ -99,11 +106,25 @@ def _scheduled(symbols: SymbolicHamiltonian, shape: Sequence[sp.Expr], prefix: s
     return _Kick(schedule.early, schedule.lines, [name for _, name in results], latency, schedule.operations)
 
 
-def _shapes(symbols: SymbolicHamiltonian, gradient: bool) -> Iterator[list[sp.Expr]]:
-    """Ways to write the new momenta, equal but for rounding."""
+def _numbered(f: sp.Expr, states: set[sp.Symbol], numbers: dict[sp.Expr, sp.Symbol]) -> sp.Expr:
+    """The expression with a symbol for the part of each product that depends on b, g and c alone."""
+    if not f.args or not f.free_symbols & {B, G, C}:
+        return f
+    if f.is_Mul:
+        fixed = [a for a in f.args if not a.free_symbols & states]
+        if any(a.free_symbols for a in fixed) and len(fixed) < len(f.args):
+            coefficient = sp.Mul(*fixed)
+            if not coefficient.is_Symbol:
+                symbol = numbers.setdefault(coefficient, sp.Symbol(f"number_{len(numbers)}", real=True))
+                f = sp.Mul(symbol, *[a for a in f.args if a.free_symbols & states], evaluate=False)
+    return f.func(*[_numbered(a, states, numbers) for a in f.args], evaluate=False)
+
+
+def _shapes(symbols: SymbolicHamiltonian, terms: int) -> Iterator[list[sp.Expr]]:
+    """Ways to write the new momenta, equal but for rounding, of kicks with one term to three."""
     q, p, d = symbols.q, symbols.p, symbols.ndof
     slope = [sp.diff(symbols.V, s) for s in q]
-    if not gradient:
+    if terms == 1:
         yield [printable(p[i] - B * slope[i]) for i in range(d)]
         changes = [-B * f for f in slope]
     else:
@@ -111,13 +132,20 @@ def _shapes(symbols: SymbolicHamiltonian, gradient: bool) -> Iterator[list[sp.Ex
         assert M is not None
         velocity = [sp.Add(*[_number(M[j, k]) * slope[k] for k in range(d)]) for j in range(d)]
         hessian = [[sp.diff(f, s) for s in q] for f in slope]
-        products = [sp.Add(*[hessian[i][j] * velocity[j] for j in range(d)]) for i in range(d)]
-        yield [printable(p[i] - B * slope[i] + G * products[i]) for i in range(d)]
-        W = sp.Add(*[f * v for f, v in zip(slope, velocity, strict=True)]) / 2
-        if W.has(*UNTOUCHED) or sp.count_ops(W) > MOST_OPERATIONS:
+        products = [_dot(row, velocity) for row in hessian]
+        changes = [-B * slope[i] + G * products[i] for i in range(d)]
+        if terms == 3:
+            again = [_dot([_number(M[j, k]) for k in range(d)], products) for j in range(d)]
+            bent = [_dot([_dot([sp.diff(h, s) for h in row], velocity) for row in hessian], velocity) for s in q]
+            changes = [f - C * (_dot(hessian[i], again) + bent[i] / 2) for i, f in enumerate(changes)]
+        yield [printable(p[i] + f) for i, f in enumerate(changes)]
+        W = [_dot(slope, velocity) / 2, _dot(velocity, products) / 2][: terms - 1]
+        if any(f.has(*UNTOUCHED) or sp.count_ops(f) > MOST_OPERATIONS for f in W):
             return
-        W = sp.factor(sp.powsimp(W))
-        changes = [-B * f + G * sp.diff(W, s) for f, s in zip(slope, q, strict=True)]
+        W = [sp.factor(sp.powsimp(f)) for f in W]
+        changes = [
+            -B * slope[i] + sp.Add(*[c * sp.diff(f, q[i]) for c, f in zip((G, -C), W, strict=False)]) for i in range(d)
+        ]
     if any(f.has(*UNTOUCHED) or sp.count_ops(f) > MOST_OPERATIONS for f in changes):
         return
     yield [printable(p[i] + f) for i, f in enumerate(changes)]
@@ -129,12 +157,16 @@ def _shapes(symbols: SymbolicHamiltonian, gradient: bool) -> Iterator[list[sp.Ex
         yield [printable(p[i] + _by_common_factors(f, q)) for i, f in enumerate(expanded)]
 
 
+def _dot(x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
+    return sp.Add(*[a * b for a, b in zip(x, y, strict=True)])
+
+
 def _number(value: float) -> sp.Expr:
     return sp.Integer(int(value)) if value == int(value) else sp.Float(value)
 
 
 def _expanded(f: sp.Expr, q: Sequence[sp.Symbol]) -> sp.Expr:
-    """Σ coefficient(b, g) · product, what is divided by left as it is."""
+    """Σ coefficient(b, g, c) · product, what is divided by left as it is."""
     kept: dict[sp.Expr, sp.Dummy] = {}
 
     def keep(power: sp.Expr) -> sp.Expr:

@@ -19,7 +19,7 @@ def empty_lanes():
     return aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
 
 
-@njit(**OPTIONS)
+@njit(**OPTIONS, forceinline=True)
 def plain_lane(q, p, q_error, p_error, b, a):
     if SCHEDULED:
         p = kicked_lane(q, p, b)
@@ -28,7 +28,7 @@ def plain_lane(q, p, q_error, p_error, b, a):
     return plain_stage(q, p, q_error, p_error, b, a, 0, None)
 
 
-@njit(**OPTIONS)
+@njit(**OPTIONS, forceinline=True)
 def gradient_lane(q, p, q_error, p_error, b, g, a):
     if FORCE_GRADIENTS and SCHEDULED:
         p = gradient_kicked_lane(q, p, b, g)
@@ -37,10 +37,23 @@ def gradient_lane(q, p, q_error, p_error, b, g, a):
     return gradient_stage(q, p, q_error, p_error, b, g, a, 0, None)
 
 
+@njit(**OPTIONS, forceinline=True)
+def curvature_lane(q, p, b, g, c, a):
+    if CURVATURES and SCHEDULED:
+        p = curvature_kicked_lane(q, p, b, g, c)
+    q, _ = move(q, None, drift(p, a, None))
+    return q, p
+
+
 @njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
-def stage_lanes(Y, error, width, b, g, a):
+def stage_lanes(Y, error, width, b, g, c, a):
     # Asked outside the loops: a loop with a branch in it, once it is long, is no longer made of vector instructions.
-    if FORCE_GRADIENTS and g != 0.0:
+    if CURVATURES and c != 0.0:
+        for lane in range(width):
+            q, p = unpack_lane(Y, lane)
+            q, p = curvature_lane(q, p, b, g, c, a)
+            pack_lane(q, p, Y, lane)
+    elif FORCE_GRADIENTS and g != 0.0:
         for lane in range(width):
             q, p = unpack_lane(Y, lane)
             if COMPENSATED:
@@ -63,19 +76,19 @@ def stage_lanes(Y, error, width, b, g, a):
 
 
 @njit(**OPTIONS)
-def close_lane(Y, error, lane, kicks, drifts, gradients, work):
+def close_lane(Y, error, lane, kicks, drifts, gradients, curvatures, work):
     q, p = unpack_lane(Y, lane)
     q_error, p_error = no_error(q), no_error(p)
     if COMPENSATED:
         q_error, p_error = unpack_lane(error, lane)
-    return close(q, p, q_error, p_error, kicks, drifts, gradients, work)
+    return close(q, p, q_error, p_error, kicks, drifts, gradients, curvatures, work)
 
 
 @njit(**OPTIONS)
-def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite, stop):
+def rollout_lanes(kicks, drifts, gradients, curvatures, y0, n_steps, save, out, n_finite, stop):
     """`rollout` of every row of `y0` (N, 2d), `LANES` at a time; outputs as in `rollout_each`."""
     link = len(kicks) - 2
-    work = prepared(kicks, gradients)
+    work = prepared(kicks, gradients, curvatures)
     Y, start, error = empty_lanes(), empty_lanes(), empty_lanes()
     for block_start in range(0, y0.shape[0], LANES):
         count = min(LANES, y0.shape[0] - block_start)
@@ -99,12 +112,12 @@ def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite, st
             block = min(CHECK_EVERY, n_steps - n)
             if saved < len(save):
                 block = min(block, save[saved] - n)
-            b, g, a = kicks[first], gradients[first], drifts[first]
+            b, g, c, a = kicks[first], gradients[first], curvatures[first], drifts[first]
             for _ in range(block):
-                stage_lanes(Y, error, width, b, g, a)
+                stage_lanes(Y, error, width, b, g, c, a)
                 for j in range(1, link):
-                    stage_lanes(Y, error, width, kicks[j], gradients[j], drifts[j])
-                b, g, a = kicks[link], gradients[link], drifts[link]
+                    stage_lanes(Y, error, width, kicks[j], gradients[j], curvatures[j], drifts[j])
+                b, g, c, a = kicks[link], gradients[link], curvatures[link], drifts[link]
             next_saved = saved
             while next_saved < len(save) and save[next_saved] == n + block:
                 next_saved += 1
@@ -112,10 +125,10 @@ def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite, st
                 i = block_start + lane
                 if n_finite[i] < n_steps:
                     continue
-                q, p = close_lane(Y, error, lane, kicks, drifts, gradients, work)
+                q, p = close_lane(Y, error, lane, kicks, drifts, gradients, curvatures, work)
                 if not is_finite(q, p):
                     q, p = unpack_lane(start, lane)
-                    before = first_non_finite(q, p, kicks, drifts, gradients, first, block, work) - 1
+                    before = first_non_finite(q, p, kicks, drifts, gradients, curvatures, first, block, work) - 1
                     n_finite[i] = n + before
                     n_alive -= 1
                     fill_with_nan(out[i], saved)
@@ -126,7 +139,9 @@ def rollout_lanes(kicks, drifts, gradients, y0, n_steps, save, out, n_finite, st
             n, saved, first = n + block, next_saved, link
 
 
-X, H, H3, B, G, A = [2 * NDOF + i for i in range(6)]  # rows of what a stage needs, beside the states: see `step_lanes`
+X, H, H3, H5, B, G, C, A = [
+    2 * NDOF + i for i in range(8)
+]  # rows of what a stage needs, beside the states: see `step_lanes`
 
 
 @njit(**OPTIONS, inline="always")
@@ -147,12 +162,12 @@ def fill_lanes(Y, width, row, coefficients, factor):
 
 
 @njit(**OPTIONS)
-def step_lanes(kicks, drifts, gradients, x, h, y, out):
+def step_lanes(kicks, drifts, gradients, curvatures, x, h, y, out):
     """`step_each`, `LANES` rows at a time.
 
     All numbers lie in one array: of several the compiler would have to find out that they do not overlap.
     """
-    Y = aligned_zeros((2 * NDOF + 6) * LANES).reshape((2 * NDOF + 6, LANES))
+    Y = aligned_zeros((2 * NDOF + 8) * LANES).reshape((2 * NDOF + 8, LANES))
     for block_start in range(0, y.shape[0], LANES):
         count = min(LANES, y.shape[0] - block_start)
         width = (count + VECTOR - 1) // VECTOR * VECTOR
@@ -160,11 +175,18 @@ def step_lanes(kicks, drifts, gradients, x, h, y, out):
             i = block_start + min(lane, count - 1)
             q, p = unpack(y[i])
             pack_lane(q, p, Y, lane)
-            Y[X, lane], Y[H, lane], Y[H3, lane] = x[i], h[i], h[i] ** 3
+            Y[X, lane], Y[H, lane], Y[H3, lane], Y[H5, lane] = x[i], h[i], h[i] ** 3, h[i] ** 5
         for j in range(len(kicks)):
             fill_lanes(Y, width, B, kicks[j], H)
             fill_lanes(Y, width, A, drifts[j], H)
-            if FORCE_GRADIENTS and np.any(gradients[j] != 0.0):
+            if CURVATURES and np.any(curvatures[j] != 0.0):
+                fill_lanes(Y, width, G, gradients[j], H3)
+                fill_lanes(Y, width, C, curvatures[j], H5)
+                for lane in range(width):
+                    q, p = unpack_lane(Y, lane)
+                    q, p = curvature_lane(q, p, Y[B, lane], Y[G, lane], Y[C, lane], Y[A, lane])
+                    pack_lane(q, p, Y, lane)
+            elif FORCE_GRADIENTS and np.any(gradients[j] != 0.0):
                 fill_lanes(Y, width, G, gradients[j], H3)
                 for lane in range(width):
                     q, p = unpack_lane(Y, lane)

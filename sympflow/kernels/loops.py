@@ -3,13 +3,15 @@
 The algebra that comes before says what a state is: q and p are tuples held in registers (a symbolic system) or
 arrays changed in place (Numba functions). It defines ``unpack``, ``pack``, ``copy``, ``is_finite``, ``move``,
 ``no_error``, ``kick``, ``gradient_kick``, ``drift`` and ``workspace``. A ``gradient_kick`` has two parts, which are
-added one after the other, the second only where `COUPLED`. Where `SCHEDULED`, ``kicked`` and ``gradient_kicked`` give
-the new p at once, in an order of operations that is fast, and stand for these; ``fill_coefficients`` prepares them.
+added one after the other, the second only where `COUPLED`. Where `SCHEDULED`, ``kicked``, ``gradient_kicked`` and
+``curvature_kicked`` give the new p at once, in an order of operations that is fast, and stand for these;
+``fill_coefficients`` prepares them. Curvature terms there are only so.
 
 A run executes the table [opening, inner …, link, closing] of stages (kick, then drift). A step is the link (the
 first step, the opening) and the inner stages; consecutive steps share their common kick or drift in the link, and
 an output is the closing stage applied to a copy, so that what is saved never changes the trajectory. The constants
-`FORCE_GRADIENTS`, `COMPENSATED` and `SCHEDULED` are known when it is compiled: Numba leaves dead branches out.
+`FORCE_GRADIENTS`, `CURVATURES`, `COMPENSATED` and `SCHEDULED` are known when it is compiled: Numba leaves dead branches
+out.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -21,25 +23,27 @@ CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where noth
 
 
 @njit(**OPTIONS)
-def prepared(kicks, gradients):
+def prepared(kicks, gradients, curvatures):
     """What the stages work with; where `SCHEDULED`, the products of their coefficients, which no state waits for."""
     if SCHEDULED:
         table = np.empty((len(kicks), N_COEFFICIENTS))
         for j in range(len(kicks)):
-            fill_coefficients(kicks[j], gradients[j], table[j])
+            fill_coefficients(kicks[j], gradients[j], curvatures[j], table[j])
         return table
     return workspace()
 
 
 @njit(**OPTIONS)
-def stage(q, p, q_error, p_error, b, g, a, j, work):
-    """Kick by b (and g), then drift by a."""
+def stage(q, p, q_error, p_error, b, g, c, a, j, work):
+    """Kick by b (and g and c), then drift by a."""
+    if CURVATURES and c != 0.0:
+        return curvature_stage(q, p, q_error, p_error, a, j, work)
     if FORCE_GRADIENTS and g != 0.0:
         return gradient_stage(q, p, q_error, p_error, b, g, a, j, work)
     return plain_stage(q, p, q_error, p_error, b, a, j, work)
 
 
-@njit(**OPTIONS)
+@njit(**OPTIONS, forceinline=True)
 def plain_stage(q, p, q_error, p_error, b, a, j, work):
     if SCHEDULED:
         p = kicked(q, p, work, j)
@@ -49,7 +53,7 @@ def plain_stage(q, p, q_error, p_error, b, a, j, work):
     return q, p, q_error, p_error
 
 
-@njit(**OPTIONS)
+@njit(**OPTIONS, forceinline=True)
 def gradient_stage(q, p, q_error, p_error, b, g, a, j, work):
     if FORCE_GRADIENTS and SCHEDULED:
         p = gradient_kicked(q, p, work, j)
@@ -62,27 +66,39 @@ def gradient_stage(q, p, q_error, p_error, b, g, a, j, work):
     return q, p, q_error, p_error
 
 
+@njit(**OPTIONS, forceinline=True)
+def curvature_stage(q, p, q_error, p_error, a, j, work):
+    if CURVATURES and SCHEDULED:
+        p = curvature_kicked(q, p, work, j)
+    q, q_error = move(q, q_error, drift(p, a, work))
+    return q, p, q_error, p_error
+
+
 @njit(**OPTIONS)
-def close(q, p, q_error, p_error, kicks, drifts, gradients, work):
+def close(q, p, q_error, p_error, kicks, drifts, gradients, curvatures, work):
     """The end of a step, from the running state before its last stage, which is left as it is."""
     q, p, q_error, p_error = copy(q), copy(p), copy(q_error), copy(p_error)
-    q, p, _, _ = stage(q, p, q_error, p_error, kicks[-1], gradients[-1], drifts[-1], len(kicks) - 1, work)
+    q, p, _, _ = stage(
+        q, p, q_error, p_error, kicks[-1], gradients[-1], curvatures[-1], drifts[-1], len(kicks) - 1, work
+    )
     return q, p
 
 
 @njit(**OPTIONS)
-def first_non_finite(q, p, kicks, drifts, gradients, first, n_steps, work):
+def first_non_finite(q, p, kicks, drifts, gradients, curvatures, first, n_steps, work):
     """The first of `n_steps` steps from a running state whose end is not finite; `n_steps` if none is."""
     link = len(kicks) - 2
     q_error, p_error = no_error(q), no_error(p)
     for n in range(1, n_steps):
         q, p, q_error, p_error = stage(
-            q, p, q_error, p_error, kicks[first], gradients[first], drifts[first], first, work
+            q, p, q_error, p_error, kicks[first], gradients[first], curvatures[first], drifts[first], first, work
         )
         first = link
         for j in range(1, link):
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, kicks[j], gradients[j], drifts[j], j, work)
-        end_q, end_p = close(q, p, q_error, p_error, kicks, drifts, gradients, work)
+            q, p, q_error, p_error = stage(
+                q, p, q_error, p_error, kicks[j], gradients[j], curvatures[j], drifts[j], j, work
+            )
+        end_q, end_p = close(q, p, q_error, p_error, kicks, drifts, gradients, curvatures, work)
         if not is_finite(end_q, end_p):
             return n
     return n_steps
@@ -96,14 +112,14 @@ def fill_with_nan(rows, first):
 
 
 @njit(**OPTIONS)
-def rollout(kicks, drifts, gradients, y0, n_steps, save, out, stop):
+def rollout(kicks, drifts, gradients, curvatures, y0, n_steps, save, out, stop):
     """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
 
     Returns the index of the last step that ends in a finite state; rows of later steps are NaN. Ends early, with
     rows unset, when another thread sets ``stop[0]``.
     """
     link = len(kicks) - 2
-    work = prepared(kicks, gradients)
+    work = prepared(kicks, gradients, curvatures)
     q, p = unpack(y0)
     q_error, p_error = no_error(q), no_error(p)
     n = saved = first = 0
@@ -116,15 +132,17 @@ def rollout(kicks, drifts, gradients, y0, n_steps, save, out, stop):
             block = min(block, save[saved] - n)
         start_q, start_p, begin = copy(q), copy(p), first
         for _ in range(block):
-            b, g, a = kicks[first], gradients[first], drifts[first]
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, a, first, work)
+            b, g, c, a = kicks[first], gradients[first], curvatures[first], drifts[first]
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, c, a, first, work)
             for j in range(1, link):
-                q, p, q_error, p_error = stage(q, p, q_error, p_error, kicks[j], gradients[j], drifts[j], j, work)
+                q, p, q_error, p_error = stage(
+                    q, p, q_error, p_error, kicks[j], gradients[j], curvatures[j], drifts[j], j, work
+                )
             first = link
-        end_q, end_p = close(q, p, q_error, p_error, kicks, drifts, gradients, work)
+        end_q, end_p = close(q, p, q_error, p_error, kicks, drifts, gradients, curvatures, work)
         if not is_finite(end_q, end_p):
             fill_with_nan(out, saved)
-            return n - 1 + first_non_finite(start_q, start_p, kicks, drifts, gradients, begin, block, work)
+            return n - 1 + first_non_finite(start_q, start_p, kicks, drifts, gradients, curvatures, begin, block, work)
         n += block
         while saved < len(save) and save[saved] == n:
             pack(end_q, end_p, out[saved])
@@ -133,10 +151,10 @@ def rollout(kicks, drifts, gradients, y0, n_steps, save, out, stop):
 
 
 @njit(**OPTIONS)
-def rollout_each(kicks, drifts, gradients, y0, n_steps, save, out, n_finite, stop):
+def rollout_each(kicks, drifts, gradients, curvatures, y0, n_steps, save, out, n_finite, stop):
     """`rollout` of every row of `y0` (N, 2d) by itself."""
     for i in range(y0.shape[0]):
-        n_finite[i] = rollout(kicks, drifts, gradients, y0[i], n_steps, save, out[i], stop)
+        n_finite[i] = rollout(kicks, drifts, gradients, curvatures, y0[i], n_steps, save, out[i], stop)
 
 
 @njit(**OPTIONS)
@@ -148,17 +166,17 @@ def polynomial(coefficients, x):
 
 
 @njit(**OPTIONS)
-def step_each(kicks, drifts, gradients, x, h, y, out):
+def step_each(kicks, drifts, gradients, curvatures, x, h, y, out):
     """One step of length ``h[i]`` from every row of `y` (N, 2d).
 
     The coefficients (m, K) of stage j are those for h = 1, polynomials Σ_k kicks[j, k] x^k of ``x[i]``.
     """
-    work = prepared(kicks[:, 0], gradients[:, 0])
+    work = prepared(kicks[:, 0], gradients[:, 0], curvatures[:, 0])
     for i in range(y.shape[0]):
         q, p = unpack(y[i])
         q_error, p_error = no_error(q), no_error(p)
         for j in range(len(kicks)):
             b, a = h[i] * polynomial(kicks[j], x[i]), h[i] * polynomial(drifts[j], x[i])
-            g = h[i] ** 3 * polynomial(gradients[j], x[i])
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, a, j, work)
+            g, c = h[i] ** 3 * polynomial(gradients[j], x[i]), h[i] ** 5 * polynomial(curvatures[j], x[i])
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, c, a, j, work)
         pack(q, p, out[i])

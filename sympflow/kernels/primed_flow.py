@@ -72,7 +72,7 @@ class PrimedFlowKernel:
 
     def _stepped(self, t: np.ndarray, y: np.ndarray, back: bool) -> np.ndarray:
         tables = self._tables
-        return self._splitting.step_rows(tables.polynomials(back), tables.force_gradient, tables.variable(t), t, y)
+        return self._splitting.step_rows(tables.polynomials(back), tables.level, tables.variable(t), t, y)
 
     def _kernel(self, h: float) -> Scheme:
         """K_h, or for h < 0 its inverse."""

@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.integrators.schemes import Scheme
+from sympflow.integrators.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
 from sympflow.system import HamiltonianSystem
 
@@ -68,15 +68,21 @@ class SplittingKernel:
                 "`system` cannot be compiled: it is given by plain functions. Define it with "
                 "HamiltonianSystem.from_sympy or by Numba functions, or use backend='array'."
             )
-        self._variants: dict[tuple[bool, bool], _Loops] = {}
+        self._has_curvature = system.symbols is not None
+        self._variants: dict[tuple[int, bool], _Loops] = {}
 
-    def _loops(self, gradients: bool, compensated: bool) -> _Loops:
-        variant = (gradients, compensated)
+    def _loops(self, level: int, compensated: bool) -> _Loops:
+        variant = (level, compensated)
         if variant not in self._variants:
-            if variant[0] and not self._has_force_gradient:
+            if level >= FORCE_GRADIENT and not self._has_force_gradient:
                 raise ValueError(
                     "`scheme` has force gradients, which need a kinetic energy quadratic in p and, for a system of "
                     "Numba functions, `hessian_vector`: take a scheme without them, for instance 'kahan_li8'."
+                )
+            if level == CURVATURE and (compensated or not self._has_curvature):
+                raise ValueError(
+                    "`scheme` has curvature terms, which are compiled for symbolic systems, without `compensated` "
+                    "sums: leave that out, or use backend='array'."
                 )
             self._variants[variant] = self._compile(*variant)
         return self._variants[variant]
@@ -112,7 +118,7 @@ class SplittingKernel:
             Index of the last step that ends in a finite state, `n_steps` if all do; the run stops there.
         """
         table = _scaled_run_table(scheme, h)
-        loops = self._loops(any(scheme.gradients), compensated)
+        loops = self._loops(scheme.level, compensated)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(save), 2 * self.ndof))
         n_finite = run_one(
@@ -137,7 +143,7 @@ class SplittingKernel:
         Y : ndarray of shape (N, len(save), 2d)
         n_finite : ndarray of int64, shape (N,)
         """
-        loops = self._loops(any(scheme.gradients), compensated)
+        loops = self._loops(scheme.level, compensated)
         table = _scaled_run_table(scheme, h)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(y0), len(save), 2 * self.ndof))
@@ -153,101 +159,102 @@ class SplittingKernel:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
         h = np.asarray(h, dtype=np.float64)
         h = h.repeat(len(y)) if h.ndim == 0 else h
-        return self.step_rows(_step_table(scheme), any(scheme.gradients), h, h, y)
+        return self.step_rows(_step_table(scheme), scheme.level, h, h, y)
 
-    def step_rows(self, table: _Table, gradients: bool, x: np.ndarray, h: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def step_rows(self, table: _Table, level: int, x: np.ndarray, h: np.ndarray, y: np.ndarray) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
 
         Parameters
         ----------
-        table : kicks, drifts, gradients, ndarrays of shape (m, K)
+        table : kicks, drifts, gradients, curvatures, ndarrays of shape (m, K)
             Of the stages, a kick and a drift each, for h = 1: those of row i are Σ_k kicks[:, k] x[i]^k. In a batch K
             is 1 or at least 3.
-        gradients : bool
-            Whether there are any.
+        level : int
+            What the kicks have: see `Scheme.level`.
         """
         y = np.ascontiguousarray(y, dtype=np.float64)
         out = np.empty(y.shape)
         x, h = np.ascontiguousarray(x), np.ascontiguousarray(h)
-        self._loops(gradients, False).step_rows(*table, x, h, y, out)
+        self._loops(level, False).step_rows(*table, x, h, y, out)
         return out
 
 
-_Stage = tuple[float, float, float]  # kick b, gradient g, drift a
-_Table = tuple[np.ndarray, np.ndarray, np.ndarray]  # kicks, drifts, gradients of the stages
+_Stage = tuple[float, float, float, float]  # kick b, gradient g, curvature c, drift a
+_Table = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # kicks, drifts, gradients, curvatures of the stages
 
 
 def _stages(scheme: Scheme) -> list[_Stage]:
     """The scheme as kick-drift pairs without idle maps, except a zero kick in front or a zero drift at the end."""
     stages: list[_Stage] = []
-    for kind, c, g in scheme.substeps:
+    for kind, one, three, five in scheme.substeps:
         if kind == "kick":
-            stages.append((c, g, 0.0))
-        elif stages and stages[-1][2] == 0.0:
-            stages[-1] = (stages[-1][0], stages[-1][1], c)
+            stages.append((one, three, five, 0.0))
+        elif stages and stages[-1][-1] == 0.0:
+            stages[-1] = (*stages[-1][:-1], one)
         else:
-            stages.append((0.0, 0.0, c))
-    return stages or [(0.0, 0.0, 0.0)]
+            stages.append((0.0, 0.0, 0.0, one))
+    return stages or [(0.0, 0.0, 0.0, 0.0)]
 
 
 def _arrays(stages: list[_Stage]) -> _Table:
-    kicks, gradients, drifts = (np.array(column) for column in zip(*stages, strict=True))
-    return kicks, drifts, gradients
+    kicks, gradients, curvatures, drifts = (np.array(column) for column in zip(*stages, strict=True))
+    return kicks, drifts, gradients, curvatures
 
 
 @lru_cache(maxsize=256)
 def _step_table(scheme: Scheme) -> _Table:
     """The stages of one step by itself, for h = 1: (m, 1) each."""
-    kicks, drifts, gradients = _arrays(_stages(scheme))
-    return kicks[:, None], drifts[:, None], gradients[:, None]
+    kicks, drifts, gradients, curvatures = _arrays(_stages(scheme))
+    return kicks[:, None], drifts[:, None], gradients[:, None], curvatures[:, None]
 
 
 def _run_table(scheme: Scheme) -> _Table:
     """The table [opening, inner …, link, closing] of a run, for h = 1: see `loops`."""
     stages = _stages(scheme)
-    (b0, g0, a0), (b, g, a) = stages[0], stages[-1]
-    opening: _Stage = (0.0, 0.0, 0.0)
+    (b0, g0, c0, a0), (b, g, c, a) = stages[0], stages[-1]
+    opening: _Stage = (0.0, 0.0, 0.0, 0.0)
     inner, link, closing = stages[:-1], stages[-1], stages[-1]
     if len(stages) > 1 and a == 0.0:  # kick … kick: the last kick and the next first stage are one
-        opening, inner, link = stages[0], stages[1:-1], (b + b0, g + g0, a0)
-    elif len(stages) > 1 and b0 == g0 == 0.0:  # drift … drift
-        opening, inner, link = stages[0], stages[1:-1], (b, g, a + a0)
+        opening, inner, link = stages[0], stages[1:-1], (b + b0, g + g0, c + c0, a0)
+    elif len(stages) > 1 and b0 == g0 == c0 == 0.0:  # drift … drift
+        opening, inner, link = stages[0], stages[1:-1], (b, g, c, a + a0)
     return _arrays([opening, *inner, link, closing])
 
 
 @lru_cache(maxsize=256)
 def _scaled_run_table(scheme: Scheme, h: float) -> _Table:
     """The table of a run whose steps are h."""
-    kicks, drifts, gradients = _run_table(scheme)
-    return h * kicks, h * drifts, h**3 * gradients
+    kicks, drifts, gradients, curvatures = _run_table(scheme)
+    return h * kicks, h * drifts, h**3 * gradients, h**5 * curvatures
 
 
 @dataclass(frozen=True)
 class _Loops:
-    """The compiled functions of one variant (with or without force gradients, compensated sums)."""
+    """The compiled functions of one variant (what kicks have, with or without compensated sums)."""
 
     rollout: Callable[..., int]
     rollout_batch: Callable[..., None]
     step_rows: Callable[..., None]
 
 
-def _header(gradients: bool, compensated: bool, cache: bool, scheduled: bool) -> str:
+def _header(level: int, compensated: bool, cache: bool, scheduled: bool) -> str:
     return (
         f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': cache}}\n"
-        f"FORCE_GRADIENTS = {gradients}\nCOMPENSATED = {compensated}\nSCHEDULED = {scheduled}"
+        f"FORCE_GRADIENTS = {level >= FORCE_GRADIENT}\nCURVATURES = {level == CURVATURE}\n"
+        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}"
     )
 
 
-def _symbolic_loops(symbols: SymbolicHamiltonian, algebra: str, gradients: bool, compensated: bool) -> _Loops:
+def _symbolic_loops(symbols: SymbolicHamiltonian, algebra: str, level: int, compensated: bool) -> _Loops:
     from sympflow.kernels.codegen import gradient_kick_source
     from sympflow.kernels.kicks import kicks_source
 
     if not compensated:
-        algebra = f"{algebra}\n\n{kicks_source(symbols, gradients)}"
-    elif gradients:
+        algebra = f"{algebra}\n\n{kicks_source(symbols, level)}"
+    elif level:
         algebra = f"{algebra}\n\n{gradient_kick_source(symbols)}"
-    header = _header(gradients, compensated, cache=True, scheduled=not compensated)
-    before = ["elementary"] if "fast_" in algebra else []
+    header = _header(level, compensated, cache=True, scheduled=not compensated)
+    before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
     after = ["loops", "aligned", "lanes"]
     loops = load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
     return _Loops(loops.rollout, loops.rollout_lanes, loops.step_lanes)
@@ -265,13 +272,13 @@ def _array_loops(
     gradient: Any,
     hessian_vector: Any | None,
     inverse_mass: np.ndarray | None,
-    gradients: bool,
+    level: int,
     compensated: bool,
 ) -> _Loops:
     """The loops around the user's Numba functions; compiled for this process only."""
     rows = _INVERSE_MASS_TIMES_V[0 if inverse_mass is None else inverse_mass.ndim]
     mass = f"@njit(**OPTIONS)\ndef apply_inverse_mass(v, out):\n    for i in range(NDOF):\n        {rows}"
-    header = _header(gradients, compensated, cache=False, scheduled=False)
+    header = _header(level, compensated, cache=False, scheduled=False)
     functions: dict[str, Any] = {
         "NDOF": ndof,
         "INVERSE_MASS": inverse_mass,

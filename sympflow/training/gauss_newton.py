@@ -73,7 +73,7 @@ class GaussNewtonRun(SearchRun):
         data: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> GaussNewtonRun:
         """A run for labels made on the spot, or for `data`: times (n,), states and where they go, (n, 2d)."""
-        step, table = TableStep(system, flow.sequence, flow.gradients is not None), Table(flow)
+        step, table = TableStep(system, flow.sequence, flow.tables.level), Table(flow)
         unit = np.array(scaling.x)
         parts: list[tuple[float, Fit]] = []
         frozen = None

@@ -132,26 +132,26 @@ class TableFit(Fit):
 class Table:
     """A primed flow's parameters θ as one vector, and its table at any t as an affine function of them.
 
-    The coefficients are those of `TableStep`: of each map in order, then the force gradients of the kicks. One of the
-    processor stands in two places, χ and with the opposite sign χ⁻¹.
+    The coefficients are those of `TableStep`: of each map in order, then the force gradients of the kicks, then their
+    curvatures. One of the processor stands in two places, χ and with the opposite sign χ⁻¹.
     """
 
     def __init__(self, flow: PrimedFlow) -> None:
         self.dt, self.flow = flow.dt, flow
         kicks = [i for i, kind in enumerate(flow.sequence) if kind == "kick"]
         n = len(flow.sequence)
-        self.n = n + (len(kicks) if flow.gradients is not None else 0)
-        named = (flow.kicks, flow.drifts, flow.gradients)
-        processor = (flow.processor_kicks, flow.processor_drifts, flow.processor_gradients)
-        self.columns = [c for c in (*named, *processor) if c is not None]
+        self.n = n + flow.tables.level * len(kicks)
+        named = (flow.kicks, flow.drifts, flow.gradients, flow.curvatures)
+        outside = (flow.processor_kicks, flow.processor_drifts, flow.processor_gradients, flow.processor_curvatures)
+        self.columns = [c for c in (*named, *outside) if c is not None]
         self._kernel = len([c for c in named if c is not None])
         self._places = [np.zeros((self.n, c.offset.shape[0])) for c in self.columns]
         index = {id(c): place for c, place in zip(self.columns, self._places, strict=True)}
         for i, substep in enumerate(flow.substeps):
-            index[id(substep.weight.column)][i, substep.weight.row] = substep.weight.sign
-            if substep.gradient is not None:
-                row = n + kicks.index(i)
-                index[id(substep.gradient.column)][row, substep.gradient.row] = substep.gradient.sign
+            for term, entry in enumerate(substep.entries):
+                if entry is not None:
+                    row = n + (term - 1) * len(kicks) + kicks.index(i) if term else i
+                    index[id(entry.column)][row, entry.row] = entry.sign
 
     def polynomial(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Offset (J, n) and design (J, n, f) of the coefficients at the times t by the flow's parameters."""

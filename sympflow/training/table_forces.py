@@ -1,6 +1,8 @@
-"""What a splitting step and its derivatives need of a system: F = −∇V, G = ∇²V M⁻¹∇V and their Jacobians.
+"""What a splitting step and its derivatives need of a system, and the Jacobians of these.
 
-Arrays are feature-major: q and F, G are (d, P), Jacobians (d, d, P).
+F = −∇V, G = ∇²V v and C = −∇(½ v·∇²V v), with v = M⁻¹∇V.
+
+Arrays are feature-major: q and F, G, C are (d, P), Jacobians (d, d, P).
 """
 
 from __future__ import annotations
@@ -10,78 +12,80 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from sympflow.integrators.schemes import CURVATURE, FORCE_GRADIENT
 from sympflow.system import HamiltonianSystem
 
 ALONG = 1e-4  # length of the difference, relative to q, that gives the third derivative of V along M⁻¹∇V
 
 
 class Forces(Protocol):
-    """F, and G where the step has force gradients."""
+    """The terms of a kick and their Jacobians, as many as the kicks have: F, G, C."""
 
-    def values(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """F and G."""
+    def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
+        """F, G and C."""
 
-    def all(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """F, G and their Jacobians."""
+    def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        """These, and their Jacobians."""
 
 
-def forces_of(system: HamiltonianSystem, force_gradient: bool) -> Forces:
+def forces_of(system: HamiltonianSystem, level: int) -> Forces:
     """The forces of a separable system with T = ½ pᵀM⁻¹p: from its symbols, its Numba functions, or its own arrays."""
     if system.symbols is not None:
-        return SymbolicForces(system.symbols, force_gradient)
+        return SymbolicForces(system.symbols, level)
     if system.numba_functions is not None and system.numba_functions[2] is not None:
-        return NumbaForces(system, force_gradient)
-    return CallableForces(system, force_gradient)
+        return NumbaForces(system, level)
+    return CallableForces(system, level)
 
 
 class SymbolicForces:
     """All derivatives in closed form, generated from the symbols."""
 
-    def __init__(self, symbols: Any, force_gradient: bool) -> None:
+    def __init__(self, symbols: Any, level: int) -> None:
         import sympy as sp
 
-        d = symbols.ndof
         slope = sp.Matrix([sp.diff(symbols.V, s) for s in symbols.q])
-        G = sp.hessian(symbols.V, symbols.q) * symbols.inverse_mass * slope if force_gradient else sp.zeros(0, 1)
-        values = [*(-slope), *G]
-        jacobians = [*(-slope).jacobian(symbols.q), *(G.jacobian(symbols.q) if force_gradient else [])]
-        self._d, self._n = d, len(values)
+        terms = [-slope]
+        if level >= FORCE_GRADIENT:
+            terms.append(sp.hessian(symbols.V, symbols.q) * symbols.inverse_mass * slope)
+        if level == CURVATURE:
+            terms.append(sp.Matrix([-sp.diff(symbols.W, s) for s in symbols.q]))
+        values = [f for term in terms for f in term]
+        self._d, self._n = symbols.ndof, len(terms)
         self._values = _generated(symbols.q, values)
-        self._all = _generated(symbols.q, [*values, *jacobians])
+        self._all = _generated(symbols.q, [*values, *(f for term in terms for f in term.jacobian(symbols.q))])
 
-    def values(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rows = self._values(q)
-        return rows[: self._d], rows[self._d :]
+    def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
+        return self._values(q).reshape(self._n, self._d, q.shape[1])  # type: ignore[return-value]
 
-    def all(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         d, n = self._d, self._n
         rows = self._all(q)
-        jacobians = rows[n:].reshape(-1, d, q.shape[1])
-        return rows[:d], rows[d:n], jacobians[:d], jacobians[d:]
+        return rows[: n * d].reshape(n, d, -1), rows[n * d :].reshape(n, d, d, -1)  # type: ignore[return-value]
 
 
 class CallableForces:
     """From the system's gradients and Hessians of arrays.
 
     The Jacobian of G(q) = ∇²V(q) v(q), v = M⁻¹∇V, is ∇²V M⁻¹ ∇²V and the derivative of ∇²V along v, a central
-    difference of two Hessians: third derivatives of V are never asked for.
+    difference of two Hessians: third derivatives of V are never asked for, so there is no C.
     """
 
-    def __init__(self, system: HamiltonianSystem, force_gradient: bool) -> None:
-        self.system, self.force_gradient = system, force_gradient
+    def __init__(self, system: HamiltonianSystem, level: int) -> None:
+        assert level < CURVATURE
+        self.system, self.force_gradient = system, level >= FORCE_GRADIENT
 
-    def values(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
         F = self.system.force(q.T)
         if not self.force_gradient:
-            return F.T, F.T[:0]
+            return (F.T,)
         return F.T, self.system.hessian_vector(q.T, -self.system.velocity(F)).T
 
-    def all(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         F = self.system.force(q.T)
         hessian = self.system.potential_hessian(q.T)  # (P, d, d)
         DF = np.moveaxis(-hessian, 0, -1)
         if not self.force_gradient:
-            return F.T, F.T[:0], DF, DF[:0]
+            return (F.T,), (DF,)
         v = -self.system.velocity(F)
         G = (hessian @ v[..., None])[..., 0]
         largest = np.abs(v).max(-1, keepdims=True)
@@ -90,35 +94,35 @@ class CallableForces:
         along = (ends[0] - ends[1]) / (2 * step[..., None])
         inverse_mass = self.system.kinetic_hessian(np.zeros(self.system.ndof))
         DG = along + hessian @ inverse_mass @ hessian
-        return F.T, G.T, DF, np.moveaxis(DG, 0, -1)
+        return (F.T, G.T), (DF, np.moveaxis(DG, 0, -1))
 
 
 class NumbaForces(CallableForces):
     """`CallableForces` in one compiled loop over the states, around the user's functions of one state."""
 
-    def __init__(self, system: HamiltonianSystem, force_gradient: bool) -> None:
-        super().__init__(system, force_gradient)
+    def __init__(self, system: HamiltonianSystem, level: int) -> None:
+        super().__init__(system, level)
         assert system.numba_functions is not None
         _, gradient, hessian_vector = system.numba_functions
         self._loops = _compiled(gradient, hessian_vector)
         self._inverse_mass = system.kinetic_hessian(np.zeros(system.ndof))
 
-    def values(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
         rows = np.ascontiguousarray(q.T)
         F, G = np.empty_like(rows), np.empty_like(rows)
         self._loops[0](rows, self._inverse_mass, self.force_gradient, F, G)
-        return F.T, G.T if self.force_gradient else G.T[:0]
+        return (F.T, G.T) if self.force_gradient else (F.T,)
 
-    def all(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         d, n = q.shape
         F, G, DF, DG = np.empty((n, d)), np.empty((n, d)), np.empty((n, d, d)), np.empty((n, d, d))
         rows = np.ascontiguousarray(q.T)
         self._loops[1](rows, self._inverse_mass, ALONG if self.force_gradient else 0.0, F, G, DF, DG)
         if self.force_gradient:
             DG += DF @ self._inverse_mass @ DF
-        last = [np.moveaxis(a, 0, -1) for a in (F, G, DF, DG)]
-        keep = None if self.force_gradient else 0
-        return last[0], last[1][:keep], last[2], last[3][:keep]
+        forces, jacobians = ([np.moveaxis(a, 0, -1) for a in pair] for pair in ((F, G), (DF, DG)))
+        n_terms = 2 if self.force_gradient else 1
+        return forces[:n_terms], jacobians[:n_terms]
 
 
 def _compiled(gradient: Any, hessian_vector: Any) -> tuple[Callable[..., None], Callable[..., None]]:

@@ -11,7 +11,7 @@ from sympflow.training.table_forces import forces_of
 
 
 class TableStep:
-    """The map of kicks p += w F(q) + g ∇²V M⁻¹∇V(q) and drifts q += a M⁻¹p of a system.
+    """The map of kicks p += w F(q) + g ∇²V v − c ∇(½ v·∇²V v), v = M⁻¹∇V(q), and drifts q += a M⁻¹p of a system.
 
     Arrays are feature-major: states y (2d, P). A coefficient is a row of P numbers, one a state, so that states may
     be at different times: c (n, P), or (n, 1).
@@ -21,35 +21,36 @@ class TableStep:
     system : HamiltonianSystem
         Separable, with T = ½ pᵀM⁻¹p.
     sequence : sequence of "kick" or "drift"
-    force_gradient : bool
-        Whether the kicks have the term g.
+    level : int
+        How many terms the kicks have beside the force: none, g, or g and c.
     """
 
-    def __init__(self, system: HamiltonianSystem, sequence: Sequence[str], force_gradient: bool) -> None:
+    def __init__(self, system: HamiltonianSystem, sequence: Sequence[str], level: int) -> None:
         if not system.quadratic_kinetic:
             raise ValueError(
                 f"`system` {system.name!r} must have a kinetic energy ½ pᵀM⁻¹p for its table to be fitted by "
                 "Gauss–Newton steps: use optimizer='bfgs'."
             )
-        self.ndof, self.sequence, self.force_gradient = system.ndof, tuple(sequence), force_gradient
+        self.ndof, self.sequence = system.ndof, tuple(sequence)
         self._inverse_mass = system.kinetic_hessian(np.zeros(system.ndof))
-        self._forces = forces_of(system, force_gradient)
+        self._forces = forces_of(system, level)
         n = len(sequence)
         kicks = [i for i in range(n) if sequence[i] == "kick"]
-        self.n_coefficients = n + (len(kicks) if force_gradient else 0)
-        self._gradient_of = {kick: n + j for j, kick in enumerate(kicks)}  # where g stands among the coefficients
+        self.n_coefficients = n + level * len(kicks)
+        # where w, g and c stand among the coefficients
+        self._places = {
+            kick: [kick, *(n + term * len(kicks) + j for term in range(level))] for j, kick in enumerate(kicks)
+        }
 
     def __call__(self, c: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """The step: coefficients c in the order of the sequence, then the g of each kick."""
+        """The step: coefficients c in the order of the sequence, then the g of each kick, then the c of each."""
         q, p = y[: self.ndof], y[self.ndof :]
         for i, kind in enumerate(self.sequence):
             if kind == "drift":
                 q = q + c[i] * (self._inverse_mass @ p)
             else:
-                F, G = self._forces.values(q)
-                p = p + c[i] * F
-                if self.force_gradient:
-                    p = p + c[self._gradient_of[i]] * G
+                for place, F in zip(self._places[i], self._forces.values(q), strict=True):
+                    p = p + c[place] * F
         return np.concatenate([q, p])
 
     def with_jacobian(self, c: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -67,13 +68,10 @@ class TableStep:
                 passed.append((velocity,))
                 q = q + c[i] * velocity
             else:
-                F, G, DF, DG = self._forces.all(q)
-                change, slope = c[i] * F, c[i] * DF
-                if self.force_gradient:
-                    g = c[self._gradient_of[i]]
-                    change, slope = change + g * G, slope + g * DG
-                passed.append((F, G, slope))
-                p = p + change
+                forces, jacobians = self._forces.all(q)
+                weights = [c[place] for place in self._places[i]]
+                passed.append((sum(w * D for w, D in zip(weights, jacobians, strict=True)), *forces))
+                p = p + sum(w * F for w, F in zip(weights, forces, strict=True))
         J = np.empty((self.n_coefficients, *y.shape))
         after_q, after_p = np.zeros((2 * d, d, y.shape[1])), np.zeros((2 * d, d, y.shape[1]))
         after_q[np.arange(d), np.arange(d)] = 1.0
@@ -84,10 +82,9 @@ class TableStep:
                 J[i] = _apply(after_q, velocity)
                 after_p += c[i] * np.einsum("rkP,kj->rjP", after_q, self._inverse_mass)
             else:
-                F, G, slope = passed[i]
-                J[i] = _apply(after_p, F)
-                if self.force_gradient:
-                    J[self._gradient_of[i]] = _apply(after_p, G)
+                slope, *forces = passed[i]
+                for place, F in zip(self._places[i], forces, strict=True):
+                    J[place] = _apply(after_p, F)
                 for k in range(d):
                     after_q += after_p[:, k, None] * slope[k]
         return np.concatenate([q, p]), J
