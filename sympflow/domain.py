@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
@@ -215,10 +214,23 @@ class EnergySublevel:
             raise ValueError(f"`angular_momentum` must be 0 ≤ low < high; got {self.angular_momentum!r}.")
         object.__setattr__(self, "angular_momentum", (low, high))
 
+    @cached_property
+    def _limits(self) -> dict[float, tuple[np.ndarray, np.ndarray]]:
+        return {}
+
+    def limits(self, slack: float) -> tuple[np.ndarray, np.ndarray]:
+        """Lower bounds of the state, of H and of |L|, and the upper ones: (2d + 2,) each."""
+        if slack not in self._limits:
+            low, high = self.bounds(slack)
+            least = -np.inf if self.above is None else self.above - slack
+            slowest, fastest = self.angular_momentum or (0.0, np.inf)
+            self._limits[slack] = np.array([*low, least, slowest]), np.array([*high, self.energy + slack, fastest])
+        return self._limits[slack]
+
     def attach(self, hamiltonian: Callable[[Array], Array]) -> EnergySublevel:
         """The same domain with the H of a system."""
-        attached = copy(self)  # whose fields have been checked
-        object.__setattr__(attached, "hamiltonian", hamiltonian)
+        attached = object.__new__(EnergySublevel)  # the fields have been checked
+        vars(attached).update(vars(self), _limits=self._limits, hamiltonian=hamiltonian)
         return attached
 
     def _within(self, x: np.ndarray, slack: float) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
-from sympflow.domain import Domain, EnergySublevel
+from sympflow.domain import Box, Domain, EnergySublevel
 from sympflow.events import run_and_search
 from sympflow.integrators.base import Integrator, Outcome, Problem
 from sympflow.integrators.registry import build, check_applies, naming_plugin
@@ -136,7 +136,7 @@ def solve(
         note_singularities(outcome, integrator, problem)
     if action != "ignore":
         _check_domain(outcome, integrator, system, action)
-    y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else np.transpose(outcome.y, (*range(1, y_start.ndim + 1), 0))
+    y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
     return Solution(
         t=outcome.t,
         y=y,
@@ -163,12 +163,16 @@ def domain_of(flow: Any, system: HamiltonianSystem) -> Domain | None:
 
 def contained(domain: Domain, system: HamiltonianSystem, y: Array, slack: float, compiled: bool) -> np.ndarray:
     """Whether the states y (..., 2d) are in the domain: (...), or () if all are and `compiled` code could tell."""
-    if compiled and isinstance(domain, EnergySublevel):
+    if compiled and isinstance(domain, Box | EnergySublevel):
         from sympflow.kernels.sublevel import all_within
 
-        if all_within(system, domain, y.reshape(-1, y.shape[-1]), slack):
+        if all_within(system, domain, y, slack):
             return _TRUE
     return np.asarray(domain.contains(y, slack=slack))
+
+
+def _time_last(y: np.ndarray) -> np.ndarray:
+    return y.T if y.ndim == 2 else np.moveaxis(y, 0, -1)
 
 
 def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
@@ -185,7 +189,7 @@ def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
             f"`method` {integrator.name!r} must answer with an Outcome that has an integer status, t of shape (n,) and "
             f"y of shape (n, *y0.shape); got {what}. Mend its run(): check_integrator tests it."
         )
-    if not is_tensor(outcome.y) and np.isfinite(outcome.y).all():
+    if outcome.finite or (not is_tensor(outcome.y) and np.isfinite(outcome.y).all()):
         return
     finite = to_numpy(all_finite(outcome.y))
     bad = ~finite.all(0) & (np.asarray(outcome.status) >= 0)

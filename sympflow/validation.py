@@ -22,9 +22,12 @@ FEWEST_TIMES = 8  # floating-point numbers that an interval must span
 
 def check_t_span(t_span: Any) -> tuple[float, float]:
     try:
-        if isinstance(t_span, str | bytes | set | frozenset | dict):
+        if type(t_span) is tuple and len(t_span) == 2 and type(t_span[0]) is type(t_span[1]) is float:
+            t0, t1 = t_span
+        elif isinstance(t_span, str | bytes | set | frozenset | dict):
             raise TypeError(type(t_span).__name__)
-        t0, t1 = (_real(t) for t in t_span)
+        else:
+            t0, t1 = (_real(t) for t in t_span)
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"`t_span` must be two numbers, start and end; got {t_span!r}: pass a tuple such as (0, 100)."
@@ -74,7 +77,7 @@ def check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
         )
     if math.prod(y0.shape) == 0:
         raise ValueError(f"`y0` is an empty batch, of shape {tuple(y0.shape)}: pass at least one state.")
-    if not np.isfinite(to_numpy(y0)).all():
+    if not np.isfinite(to_numpy(y0) if is_tensor(y0) else y0).all():
         raise ValueError("`y0` must be finite; it holds NaN or infinity. Remove these states.")
     return y0
 
@@ -111,6 +114,9 @@ def _check_dtype(dtype: Any) -> np.dtype:
 
 
 def check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
+    plain = type(t_eval) is np.ndarray and t_eval.dtype == _FLOAT64 and t_eval.ndim == 1
+    if plain and 0 < t_eval.size <= MAX_SAVED_VALUES and _proper(t_eval, t0, t1):
+        return t_eval.copy()
     try:
         times = to_numpy(t_eval)
         if times.dtype.kind not in "fiu":
@@ -124,9 +130,9 @@ def check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
     if times.size > MAX_ASKED_VALUES:
         raise ValueError(f"`t_eval` has {times.size:.3g} times, more than {MAX_ASKED_VALUES:.0e}: choose fewer.")
     times = times.astype(float)
-    low, high = min(t0, t1), max(t0, t1)
-    if times.size and low <= times[0] <= high and low <= times[-1] <= high and _ordered(times, t1 >= t0):
+    if times.size and _proper(times, t0, t1):
         return times
+    low, high = min(t0, t1), max(t0, t1)
     if times.size and not (times.min() >= low and times.max() <= high):
         raise ValueError(f"`t_eval` must lie within `t_span`, [{low:g}, {high:g}]: extend `t_span` or drop times.")
     if (np.diff(times) * (1 if t1 >= t0 else -1) < 0).any():
@@ -134,9 +140,12 @@ def check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
     return times
 
 
-def _ordered(times: np.ndarray, forwards: bool) -> bool:
-    earlier, later = (times[:-1], times[1:]) if forwards else (times[1:], times[:-1])
-    return len(times) == 1 or bool((earlier <= later).all())
+def _proper(times: np.ndarray, t0: float, t1: float) -> bool:
+    """Whether times lie between t0 and t1, in this order."""
+    first, last = float(times[0]), float(times[-1])
+    if t0 <= t1:
+        return t0 <= first <= last <= t1 and bool((times[:-1] <= times[1:]).all())
+    return t0 >= first >= last >= t1 and bool((times[:-1] >= times[1:]).all())
 
 
 def check_save_every(save_every: Any, times: np.ndarray | None) -> int:

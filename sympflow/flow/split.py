@@ -161,7 +161,7 @@ class SplitFlow(SympFlow):
         """The maps of the numbers that the flow has now."""
         snapshot = self._contents.snapshot()
         if self._known is None or self._known[0] != snapshot:
-            self._known = snapshot, KeptMaps(self._numpy_maps, self.dt)
+            self._known = snapshot, KeptMaps(self._numpy_maps, self.dt, self._contents.first())
         return self._known[1]
 
     def _numpy_maps(self, t: np.ndarray) -> list[Map]:

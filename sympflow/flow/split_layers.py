@@ -48,10 +48,17 @@ class PartsBinding:
 
 
 class KeptMaps:
-    """The maps of a flow of fixed numbers, the same objects for the same step, and what they cost."""
+    """The maps of a flow of fixed numbers, the same objects for the same step, and what they cost.
 
-    def __init__(self, make: Callable[[np.ndarray], list[Map]], dt: float) -> None:
+    Attributes
+    ----------
+    compilable : bool
+        Whether the numbers are float64 on the CPU: asked once, as torch answers slowly.
+    """
+
+    def __init__(self, make: Callable[[np.ndarray], list[Map]], dt: float, like: Tensor) -> None:
         self._make, self._dt = make, dt
+        self.compilable = like.dtype == torch.float64 and like.device.type == "cpu"
         self._maps: dict[float, list[Map]] = {}
         self._counts: dict[tuple[int, int, int, str], dict[str, int]] = {}
 

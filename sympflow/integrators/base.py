@@ -19,12 +19,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
 from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
-from sympflow.integrators.grid import Grid
+from sympflow.integrators.grid import EPS, Grid
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
@@ -59,8 +60,12 @@ class Outcome:
     message: str
     stats: dict[str, Any]
     sol: Callable[[Any], Array] | None = None
+    finite: bool = False
+    """Whether `y` has been looked at and is finite all over; `solve` looks again where this is not said."""
 
 
+FEW = 8
+"""Outputs that are placed on the grid by NumPy: a compiled pass is worth its loading for more."""
 LONGEST_STEP = 1e100
 """Beyond it the powers of dt in a step are no floating-point numbers."""
 
@@ -82,7 +87,7 @@ class Integrator:
     @classmethod
     def options(cls) -> tuple[str, ...]:
         """The names of the options that this method takes."""
-        return tuple(f.name for f in fields(cls))  # type: ignore[arg-type]
+        return _field_names(cls)  # type: ignore[arg-type]
 
     def check(self, system: HamiltonianSystem) -> None:
         """Raise a ValueError with the reason if the method does not apply to the system."""
@@ -140,6 +145,8 @@ class FixedStep(Integrator):
     finds_events: ClassVar[bool] = True
     on_grid: ClassVar[bool] = True
     """Whether the steps are those of the grid t0 + k·dt, as a peer that drives them presumes."""
+    saves_finite: ClassVar[bool] = False
+    """Whether the states that a compiled `rollout` saves up to the last finite one are known to be finite."""
     breakdown: ClassVar[tuple[str, str]] = ("The solution became non-finite", "Reduce `dt`")
     """What it means when the run cannot go on, and the remedy: for the message of status −1."""
 
@@ -175,17 +182,17 @@ class FixedStep(Integrator):
             return run_with_events(self, problem, problem.events)
         system = problem.system
         grid = Grid(problem.t0, problem.t1, self.step_length(system))
-        t, count, remainder = grid.outputs(problem.t_eval, problem.save_every)
-        save, place = (np.arange(grid.n_steps + 1), count) if problem.dense_output else distinct(count)
+        t, remainder, save, place = self._placed(problem, grid)
         last = int(save[-1]) if save.size else 0
         saved, finite, backend = self.rollout(problem, grid.h, last, save)
 
         y = saved if place is None else saved[place]
-        extra = np.flatnonzero(remainder)
+        extra = remainder.nonzero()[0]
         if extra.size:
             y = self._shorter_steps(system, y, extra, remainder[extra], backend)
         n_steps = min(last, int(finite.max() if finite.ndim else finite) + 1)
-        n_saved = int(save.searchsorted(n_steps, "right") - save.searchsorted(0, "right"))
+        end = len(save) if n_steps == last else int(save.searchsorted(n_steps, "right"))
+        n_saved = end - int(save.searchsorted(0, "right") if end and save[0] <= 0 else 0)
         at_end = int(bool(extra.size) and extra[-1] == len(t) - 1 and t[-1] == grid.t1)
         stats = {
             "dt": abs(grid.h),
@@ -196,8 +203,26 @@ class FixedStep(Integrator):
         outcome = Outcome(t, y, 0, FINISHED, stats)
         if problem.dense_output:
             outcome.sol = GridSolution(self, system, grid, saved, backend)
+        outcome.finite = backend == "compiled" and self.saves_finite and not extra.size
         _report_failures(outcome, grid, finite, last, self.breakdown)
         return outcome
+
+    def _placed(self, problem: Problem, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+        """Output times and their remainders, the counts whose states are to be saved, and where among these each is.
+
+        The last is None where every output is a state of its own.
+        """
+        t, y0, system = problem.t_eval, problem.y0, problem.system
+        compiled = self.compiles and problem.backend != "array" and type(y0) is np.ndarray and y0.dtype == np.float64
+        compiled = compiled and (system.symbols is not None or system.numba_functions is not None)
+        if compiled and t is not None and len(t) > FEW and not problem.dense_output:
+            from sympflow.kernels.outputs import place
+
+            count, remainder, new = place(t, grid.t0, grid.h, 4 * EPS)
+            return t, remainder, *((count, None) if new else distinct(count))
+        t, count, remainder = grid.outputs(t, problem.save_every)
+        save, position = (np.arange(grid.n_steps + 1), count) if problem.dense_output else distinct(count)
+        return t, remainder, save, position
 
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
         """`step` on the backend of the run that it belongs to."""
@@ -338,6 +363,22 @@ def checked_state(y_next: Any, y: Array) -> Array:
     )
 
 
+def _all_finite(y: Array, backend: str) -> bool:
+    """Whether an array is known to be finite all over, by the means of a run of that backend."""
+    if is_tensor(y):
+        return False
+    if backend != "compiled" or y.dtype != np.float64 or not (y.flags.c_contiguous or y.flags.f_contiguous):
+        return bool(np.isfinite(y).all())
+    from sympflow.kernels.outputs import all_finite
+
+    return all_finite(y)
+
+
+@cache
+def _field_names(cls: type) -> tuple[str, ...]:
+    return tuple(f.name for f in fields(cls))
+
+
 def _report_failures(outcome: Outcome, grid: Grid, finite: np.ndarray, n_run: int, breakdown: tuple[str, str]) -> None:
     """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there.
 
@@ -346,7 +387,8 @@ def _report_failures(outcome: Outcome, grid: Grid, finite: np.ndarray, n_run: in
     """
     what, remedy = breakdown
     done = bool((finite >= n_run).all()) if finite.ndim else int(finite) >= n_run
-    if done and not is_tensor(outcome.y) and np.isfinite(outcome.y).all():
+    outcome.finite = done and (outcome.finite or _all_finite(outcome.y, outcome.stats["backend"]))
+    if outcome.finite:
         if finite.ndim:
             outcome.status = np.zeros(finite.shape, dtype=int)
         return

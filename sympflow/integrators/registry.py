@@ -5,8 +5,7 @@ from __future__ import annotations
 import difflib
 import logging
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
@@ -145,6 +144,8 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
             )
         return method
     if _is_flow(method):
+        if not options:
+            return get(method.kind)(flow=method)  # type: ignore[call-arg]
         options = {"flow": method, **options}
         method = method.kind
     cls = get(method)
@@ -220,18 +221,22 @@ def named(integrator: Integrator | type[Integrator]) -> bool:
     return isinstance(getattr(integrator, "name", None), str)
 
 
-@contextmanager
-def naming_plugin(integrator: Integrator, passes: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+class naming_plugin:
     """Turn what fails inside into a RuntimeError that names the plug-in, if the integrator is one's.
 
     Errors of the kinds `passes` are left as they are: they are answers, not failures.
     """
-    try:
-        yield
-    except (Exception, SystemExit) as error:
-        point = _loaded.get(type(integrator))
-        if point is None or isinstance(error, passes):
-            raise
+
+    def __init__(self, integrator: Integrator, passes: tuple[type[Exception], ...] = ()) -> None:
+        self._point, self._passes = _loaded.get(type(integrator)), passes
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
+        point = self._point
+        if point is None or not isinstance(error, Exception | SystemExit) or isinstance(error, self._passes):
+            return
         raise RuntimeError(
             f"`method` {point.name!r} of the plug-in {_distribution(point)} failed ({type(error).__name__}: {error}): "
             "report it there, unless a function of your own, of the system or an event, raised it."

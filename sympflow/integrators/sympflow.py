@@ -46,6 +46,8 @@ class FlowIntegrator(FixedStep):
     order: ClassVar[int | None] = None
     trained: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
+    prepared: ClassVar[tuple[Any, Any] | None] = None
+    """Of a copy that makes one run: the flow for its states, with the numbers that it has now, and its kernel."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -119,9 +121,15 @@ class FlowIntegrator(FixedStep):
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         return self.substep(system, y, h, "auto")
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in ("prepared", "saves_finite")}
+
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
-        flow = self._flow_like(system, y)
-        kernel = _kernel(system, flow, y, "array" if backend == "torch" else backend)
+        if self.prepared is not None and backend == "compiled":
+            flow, kernel = self.prepared
+        else:
+            flow = self._flow_like(system, y)
+            kernel = _kernel(system, flow, y, "array" if backend == "torch" else backend)
         if kernel is None:
             return _apply(flow, y, h)
         if y.ndim == 2 and np.shape(h) == (len(y),):
@@ -138,27 +146,38 @@ class FlowIntegrator(FixedStep):
         return super().tangent(system, t, y, h)
 
     def run(self, problem: Problem) -> Outcome:
-        if self.flow is not None:
-            return super().run(problem)
-        flow = self._flow_like(problem.system, problem.y0)
+        flow, kernel = self._flow_and_kernel(problem)
+        chosen = object.__new__(type(self))  # with this flow from here on; the fields have been checked
+        vars(chosen).update(vars(self), flow=flow, prepared=(flow, kernel))
+        if hasattr(kernel, "saves_finite"):
+            vars(chosen).update(saves_finite=kernel.saves_finite)
         if self._tolerance is not None:
             compiled = problem.backend != "array" and not is_tensor(problem.y0)
             _check_start(flow, problem.system, problem.y0, compiled)
-        chosen = object.__new__(type(self))  # with the shipped flow from here on; the fields have been checked
-        vars(chosen).update(vars(self), flow=flow, **({} if self._tolerance is None else {"tol": None}))
-        return chosen.run(problem)
+            vars(chosen).update(tol=None)
+        return super(FlowIntegrator, chosen).run(problem)
+
+    def _flow_and_kernel(self, problem: Problem) -> tuple[Any, Any]:
+        """The flow for the states of the problem, and its compiled loops or None."""
+        system, y0 = problem.system, problem.y0
+        flow = self.flow_for(system)
+        if type(y0) is np.ndarray and y0.dtype == np.float64:  # a kernel says itself what flow it is for
+            kernel = _kernel(system, flow, y0, problem.backend)
+            if kernel is not None:
+                return flow, kernel
+        flow = self._flow_like(system, y0)
+        return flow, _kernel(system, flow, y0, problem.backend)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        if self.prepared is not None and hasattr(self.prepared[1], "evaluations"):
+            return self.prepared[1].evaluations(n_steps, n_saved, n_extra, backend)
         if not hasattr(self.flow, "evaluations"):  # an MLP flow evaluates no forces
             return super().evaluations(n_steps, n_saved, n_extra, backend)
         return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         y0 = problem.y0
-        flow = self._flow_like(problem.system, y0)
-        kernel = _kernel(problem.system, flow, y0, problem.backend)
-        if isinstance(self, SympFlowIntegrator) and self.compensated:
-            kernel = self._compensated_kernel(problem, flow)
+        flow, kernel = self._flow_and_kernel(problem) if self.prepared is None else self.prepared
         if kernel is not None:
             if y0.ndim == 1:
                 states, last = kernel.run(h, y0, n_steps, save)
@@ -311,10 +330,12 @@ class SympFlowIntegrator(FlowIntegrator):
         return LogSympFlow(flow=flow, shift=shift)
 
     def _given_in_another_time(self, system: HamiltonianSystem) -> FixedStep:
+        origin = (self.flow.recipe or {}).get("transforms")
+        if origin is None:
+            return self
         from sympflow.flow.base import same_system
 
-        origin = (self.flow.recipe or {}).get("transforms")
-        if origin is None or not same_system(origin["fingerprint"], system.fingerprint):
+        if not same_system(origin["fingerprint"], system.fingerprint):
             return self
         from sympflow.integrators.logarithmic import LogSympFlow
 
@@ -322,8 +343,10 @@ class SympFlowIntegrator(FlowIntegrator):
             raise ValueError("`compensated` sums are not for a flow in another time: leave it out.")
         return LogSympFlow(flow=self.flow, shift=origin["shift"], dt=self.dt)
 
-    def _compensated_kernel(self, problem: Problem, flow: Any) -> PrimedFlowKernel:
-        kernel = _kernel(problem.system, flow, problem.y0, problem.backend)
+    def _flow_and_kernel(self, problem: Problem) -> tuple[Any, Any]:
+        flow, kernel = super()._flow_and_kernel(problem)
+        if not self.compensated:
+            return flow, kernel
         if kernel is None or not hasattr(flow, "kernel_scheme"):
             raise ValueError(
                 "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave "
@@ -331,7 +354,7 @@ class SympFlowIntegrator(FlowIntegrator):
             )
         from sympflow.kernels.primed_flow import PrimedFlowKernel
 
-        return PrimedFlowKernel(flow, problem.system, compensated=True)
+        return flow, PrimedFlowKernel(flow, problem.system, compensated=True)
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ class PartsKernel:
         """`n_steps` steps of length h from y0 (2d,), as `SplittingKernel.run`."""
         sequence = maps(np.asarray(h, dtype=float))
         loops, save = self._loops(sequence), np.ascontiguousarray(save, dtype=np.int64)
-        out = np.empty((len(save), 2 * self.parts.ndof))
+        out = np.empty((2 * self.parts.ndof, len(save))).T  # each component in one piece, as a solution has them
         codes, table = self._run_table(sequence)
         start, mixed = self._modes(y0), self._mixed
         n_finite = run_one(

@@ -96,7 +96,7 @@ def _fill(flows: Sequence[_Flow]) -> str:
 
 
 def _between_modes(parts: ExactParts) -> list[str]:
-    """``to_modes`` and ``from_modes``, where each coordinate is a mode; mixed ones are transformed outside the loops."""
+    """``to_modes`` and ``from_modes``; where modes are mixed nothing, as they are transformed outside the loops."""
 
     def function(name: str, values: Sequence[str], others: Sequence[str]) -> str:
         lines = ["@njit(**OPTIONS, forceinline=True)", f"def {name}(x, y):", *_unpacked(parts.ndof)]

@@ -27,13 +27,16 @@ class SplitFlowKernel:
         Bound to a system that can be compiled, in float64 on the CPU.
     """
 
+    saves_finite = True
+
     def __init__(self, flow: SplitFlow) -> None:
-        if str(flow.dtype) != "torch.float64" or flow.device.type != "cpu":
+        self._frozen = flow.frozen()
+        if not self._frozen.compilable:
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
         self.flow = flow
         self._kernel: PartsKernel = kernel_of(flow.parts, PartsKernel)
         self._kernel.source()
-        self._frozen = flow.frozen()
+        self.evaluations = self._frozen.evaluations
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` times ψ̄_h, or for h < 0 the inverse of ψ̄_|h|: see `PartsKernel.run`."""

@@ -1,0 +1,43 @@
+"""Passes over the times and the states of outputs. Source text for `outputs`; sums and products are not fused here."""
+# ruff: noqa: F821
+# mypy: ignore-errors
+
+import math
+
+import numpy as np
+from numba import njit
+
+
+@njit(**OPTIONS)
+def place(t, t0, h, rounding, count, remainder):
+    """`Grid.locate` into `count` and `remainder`; whether all counts are distinct."""
+    distinct = True
+    for i in range(len(t)):
+        x = (t[i] - t0) / h
+        nearest = np.rint(x)
+        if abs(x - nearest) <= rounding * (abs(nearest) + (abs(t[i]) + abs(t0)) / abs(h)):
+            count[i], remainder[i] = np.int64(nearest), 0.0
+        else:
+            whole = math.floor(x)
+            count[i], remainder[i] = whole, t[i] - (t0 + whole * h)
+        distinct &= i == 0 or count[i] != count[i - 1]
+    return distinct
+
+
+@njit(**OPTIONS)
+def all_finite(y):
+    finite = True
+    for i in range(len(y)):
+        finite &= abs(y[i]) < math.inf
+    return finite
+
+
+@njit(**OPTIONS)
+def all_between(x, low, high):
+    """Whether all of x (w, N) lies between `low` and `high`."""
+    inside = True
+    for j in range(x.shape[0]):
+        least, most = low[j], high[j]
+        for value in x[j]:
+            inside &= (value >= least) & (value <= most)
+    return inside

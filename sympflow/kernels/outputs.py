@@ -1,0 +1,34 @@
+"""Compiled passes over the outputs of a run: of a thousand states each takes a microsecond or two."""
+
+from __future__ import annotations
+
+from functools import cache
+from types import ModuleType
+
+import numpy as np
+
+from sympflow.kernels.modules import OPTIONS, load_module, template
+
+__all__ = ["all_between", "all_finite", "place"]
+
+
+@cache
+def _loops() -> ModuleType:
+    options = {name: value for name, value in OPTIONS.items() if name != "fastmath"} | {"cache": True}
+    return load_module(f"OPTIONS = {options}\n\n\n{template('output_loops')}")
+
+
+def place(t: np.ndarray, t0: float, h: float, rounding: float) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Counts (n,) and remainders (n,) of ordered times, as `Grid.locate`; and whether all counts are distinct."""
+    count, remainder = np.empty(len(t), dtype=np.int64), np.empty(len(t))
+    return count, remainder, _loops().place(t, t0, h, rounding, count, remainder)
+
+
+def all_finite(y: np.ndarray) -> bool:
+    """Whether all of an array of float64, contiguous in either order, is finite."""
+    return _loops().all_finite((y if y.flags.c_contiguous else y.T).reshape(-1))
+
+
+def all_between(x: np.ndarray, low: np.ndarray, high: np.ndarray) -> bool:
+    """Whether all of x (w, N), contiguous, lies between `low` and `high` (w,)."""
+    return _loops().all_between(x, low, high)
