@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sympflow import Box, HamiltonianSystem, SympFlow, get, load, solve
-from sympflow.systems import fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum
+from sympflow.systems import double_well, fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum
 from sympflow.systems.fput import oscillatory_energies
 from sympflow.training.trainer import train
 
@@ -89,6 +89,33 @@ def test_compiled_and_array_runs_agree_and_files_keep_it(case, tmp_path):
     again = load(tmp_path / "flow.safetensors", system=system)
     assert torch.equal(again(t, x), flow(t, x))
     assert torch.equal(copy.deepcopy(flow)(t, x), flow(t, x))
+
+
+MIXED = "(p1**2 + p2**2)/2 + (q1**2 + q2**2 + 3*(q1 - q2)**2)/2 + q1**4/4"
+
+
+@pytest.mark.parametrize(
+    "make",
+    [double_well, henon_heiles, lambda: fput(omega=1000.0), lambda: HamiltonianSystem.from_sympy(MIXED)],
+    ids=["hyperbolic", "oscillators", "turns_far", "mixed_modes"],
+)
+def test_compiled_steps_of_any_lengths_are_the_flow(make):
+    """Lengths from nearly 0 to Δt, for which ωt is up to 300, that is known to its rounding, 3e-14; and back."""
+    system = make()
+    flow = SympFlow.split(system, 2, dt=0.3, terms=4).requires_grad_(False)
+    generator = torch.Generator().manual_seed(0)
+    for w in flow.parameters():
+        w.add_(torch.randn(w.shape, generator=generator, dtype=w.dtype), alpha=0.05)
+    x = np.random.default_rng(0).uniform(-0.3, 0.3, (70, 2 * system.ndof))
+    t = np.linspace(1e-3, 1, 70) * flow.dt
+    kernel = flow.kernel_for(system)
+    y = kernel.step(t, x)
+    expected = flow.psi(torch.as_tensor(t), torch.as_tensor(x)).numpy()
+    scale = np.abs(expected).max()
+    assert np.abs(y - expected).max() < 1e-12 * scale
+    signs = np.where(np.arange(70) % 3, -1.0, 1.0)
+    back = flow.psi_inverse(torch.as_tensor(t), torch.as_tensor(x)).numpy()
+    assert np.abs(kernel.step(signs * t, x) - np.where(signs[:, None] > 0, y, back)).max() < 1e-12 * scale
 
 
 def test_a_changed_parameter_changes_the_compiled_map():

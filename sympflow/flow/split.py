@@ -161,7 +161,10 @@ class SplitFlow(SympFlow):
         """The maps of the numbers that the flow has now."""
         snapshot = self._contents.snapshot()
         if self._known is None or self._known[0] != snapshot:
-            self._known = snapshot, KeptMaps(self._numpy_maps, self.dt, self._contents.first())
+            self._known = (
+                snapshot,
+                KeptMaps(self._numpy_maps, self._coefficient_maps(), self.dt, self._contents.first()),
+            )
         return self._known[1]
 
     def _numpy_maps(self, t: np.ndarray) -> list[Map]:
@@ -170,7 +173,15 @@ class SplitFlow(SympFlow):
         )
         return [m.inverse() for m in reversed(maps)] if (t < 0).any() else maps
 
-    def _assemble(self, values: Any, stack: Any) -> list[Map]:
+    def _coefficient_maps(self) -> list[Map]:
+        """The maps with the coefficients of the columns, (K, …), in place of their values."""
+        return self._assemble(
+            lambda column: column.table.detach().cpu().double().numpy(),
+            lambda entries: np.stack(entries, axis=-1),
+            np.eye(1, self.terms)[0],
+        )
+
+    def _assemble(self, values: Any, stack: Any, unity: Any = None) -> list[Map]:
         linear = [values(column) for column in self.linear]
         weights, filters, gradients = (
             [values(c) for c in group] for group in (self.weights, self.filters, self.gradients)
@@ -185,7 +196,7 @@ class SplitFlow(SympFlow):
             slot = self._slot[part]
             phi = None
             if filters:
-                n, one = len(self._turning), 1 + 0 * weights[slot][i]
+                n, one = len(self._turning), 1 + 0 * weights[slot][i] if unity is None else unity
                 own = dict(zip(self._turning, filters[slot * n : (slot + 1) * n], strict=True))
                 phi = stack([own[f][i] if f in own else one for f in range(len(self.classes))])
             gradient = gradients[0][self.gradient_kicks.index(i)] if i in self.gradient_kicks else 0.0

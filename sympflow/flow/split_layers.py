@@ -56,8 +56,11 @@ class KeptMaps:
         Whether the numbers are float64 on the CPU: asked once, as torch answers slowly.
     """
 
-    def __init__(self, make: Callable[[np.ndarray], list[Map]], dt: float, like: Tensor) -> None:
+    def __init__(
+        self, make: Callable[[np.ndarray], list[Map]], coefficients: list[Map], dt: float, like: Tensor
+    ) -> None:
         self._make, self._dt = make, dt
+        self._coefficients = coefficients, [m.inverse() for m in reversed(coefficients)]
         self.compilable = like.dtype == torch.float64 and like.device.type == "cpu"
         self._maps: dict[float, list[Map]] = {}
         self._counts: dict[tuple[int, int, int, str], dict[str, int]] = {}
@@ -68,6 +71,10 @@ class KeptMaps:
                 self._maps.clear()
             self._maps[t] = self._make(np.array(t))
         return self._maps[t]
+
+    def coefficients(self, back: bool) -> list[Map]:
+        """The maps at all t, or those of the inverse: see `PartsKernel.step_by_coefficients`."""
+        return self._coefficients[back]
 
     def evaluations(self, *run: Any) -> dict[str, int]:
         """As `FixedStep.evaluations`."""

@@ -29,6 +29,7 @@ class _Loops:
     rollout: Callable[..., int]
     rollout_batch: Callable[..., None]
     step_each: Callable[..., None]
+    step_lanes: Callable[..., None]
     fill_rows: Callable[..., None]
     row_width: int
 
@@ -54,6 +55,7 @@ class PartsKernel:
         self._variants: dict[tuple[bool, bool], _Loops] = {}
         self._plain: str | None = None
         self._mixed = not parts.diagonal  # modes that are sums of coordinates: transformed outside the loops
+        self._coefficients: dict[int, tuple[Sequence[Map], np.ndarray, np.ndarray]] = {}
         self._tables: dict[int, tuple[Sequence[Map], tuple[np.ndarray, np.ndarray], _Loops]] = {}
 
     def run(self, maps: Maps, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
@@ -94,6 +96,39 @@ class PartsKernel:
         codes, tables = self._table(sequence, len(y), loops)
         loops.step_each(codes, tables, self._modes(y), self._mixed, out)
         return self._states(out)
+
+    def step_by_coefficients(self, sequence: Sequence[Map], dt: float, t: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """One step from each row of y (N, 2d), each of its own length t (N,) > 0, by maps that are functions of t.
+
+        Parameters
+        ----------
+        sequence : sequence of Map
+            With coefficients (K, …) in place of numbers: of 1 and τ² T_k(2τ² − 1), k = 0 … K−2, where τ = t/dt and T_k
+            are Chebyshev's polynomials; lengths are t and force gradients t³ times these sums.
+        """
+        known = self._coefficients.get(id(sequence))
+        if known is None or known[0] is not sequence:
+            if len(self._coefficients) >= KNOWN_TABLES:
+                self._coefficients.clear()
+            known = self._coefficients[id(sequence)] = sequence, *self._coefficient_table(sequence)
+        out = np.empty(y.shape)
+        loops, t = self._loops(sequence), np.ascontiguousarray(t, dtype=np.float64)
+        loops.step_lanes(*known[1:], dt, t, self._modes(y), self._mixed, out)
+        return self._states(out)
+
+    def _coefficient_table(self, sequence: Sequence[Map]) -> tuple[np.ndarray, np.ndarray]:
+        """Codes (m,) and coefficients (m, 2 + F, K): lengths, or a weight, a force gradient and filters."""
+        F, terms = self.parts.n_classes, len(sequence[0].length)
+        codes, table = np.empty(len(sequence), dtype=np.int64), np.zeros((len(sequence), 2 + F, terms))
+        for j, m in enumerate(sequence):
+            codes[j] = m.part + WITH_GRADIENT * has_gradient(m)
+            if m.part == LINEAR:
+                table[j, :F] = m.length.T
+                continue
+            table[j, 0], table[j, 1] = m.length, m.gradient
+            if m.filters is not None:
+                table[j, 2:] = m.filters.T
+        return codes, table
 
     def step_modes(self, sequence: Sequence[Map], modes: np.ndarray) -> np.ndarray:
         """The maps applied once to every row [X, Y] of `modes` (N, 2d), which stay modes."""
@@ -144,7 +179,12 @@ class PartsKernel:
             texts = [header, *map(template, before), algebra, *map(template, ["aligned", "parts_loops"])]
             module = load_module("\n\n\n".join(texts))
             self._variants[filters, gradients] = _Loops(
-                module.rollout, module.rollout_lanes, module.step_each, module.fill_rows, module.ROW_WIDTH
+                module.rollout,
+                module.rollout_lanes,
+                module.step_each,
+                module.step_lanes,
+                module.fill_rows,
+                module.ROW_WIDTH,
             )
         return self._variants[filters, gradients]
 

@@ -58,8 +58,10 @@ def parts_source(parts: ExactParts, filters: bool, gradients: bool) -> str:
         if gradients and part.of_positions:
             flows.append(_part(parts, part, WITH_GRADIENT + k, f"gradient_{k}", filters, gradient=True))
     width = max([2 + d, TURN_WIDTH * parts.n_classes, *(flow.width for flow in flows)])
-    functions = [f"NDOF = {d}\nROW_WIDTH = {width}", tuple_algebra(d), *_between_modes(parts)]
-    functions += [*(flow.source for flow in flows), _dispatch(flows), _dispatch_lanes(flows), _fill(flows)]
+    constants = f"NDOF = {d}\nROW_WIDTH = {width}\nN_CLASSES = {parts.n_classes}\nFILTERS = {filters}"
+    functions = [constants, tuple_algebra(d), *_between_modes(parts), *(flow.source for flow in flows)]
+    functions += [_dispatch(flows), _dispatch_lanes(flows), _fill(flows), _dispatch_each(flows), _turns_each(parts)]
+    functions.append(_filters_each(parts))
     return "\n\n\n".join(functions) + "\n"
 
 
@@ -81,6 +83,65 @@ def _dispatch_lanes(flows: Sequence[_Flow]) -> str:
             f"            x, y = {flow.name}(x, y, c)",
             "            pack_lane(x, y, Z, lane)",
         ]
+    return "\n".join(lines)
+
+
+def _dispatch_each(flows: Sequence[_Flow]) -> str:
+    """The same where each lane has a row of its own, in the lines of Z from `TABLE` on; products are made here."""
+    lines = ["@njit(**OPTIONS, inline='always')", "def apply_map_each(Z, width, code):"]
+    for number, flow in enumerate(flows):
+        lines += [f"    {'elif' if number else 'if'} code == {flow.code}:", "        for lane in range(width):"]
+        lines += ["            " + re.sub(r"row\[(\d+)\]", r"Z[TABLE + \1, lane]", line) for line in flow.stored]
+        arguments = "".join(f"Z[TABLE + {i}, lane], " for i in flow.row)
+        lines += [
+            "            x, y = unpack_lane(Z, lane)",
+            f"            x, y = {flow.name}(x, y, ({arguments}))",
+            "            pack_lane(x, y, Z, lane)",
+        ]
+    return "\n".join(lines)
+
+
+def _turns_each(parts: ExactParts) -> str:
+    """What turns each frequency by Ω s, as `shears` and the kernel's tables have it, s in the lines from `NUMBERS` on.
+
+    θ = Ω s is reduced with the rounding of the product added again, tan(r/2) is sin r/(1 + cos r).
+    """
+    lines = ["@njit(**OPTIONS, inline='always')", "def fill_turns(Z, width):"]
+    linear = parts.linear
+    for f, j in enumerate([] if linear is None else linear.representatives.tolist()):
+        assert linear is not None
+        kind, rate, row = linear.kinds[j], float(linear.rates[j]), f"TABLE + {TURN_WIDTH * f}"
+        lines += ["    for lane in range(width):", f"        s = Z[NUMBERS + {f}, lane]"]
+        if kind == "free":
+            lines += [f"        Z[{row}, lane] = s / 2.0"]
+        elif kind == "hyperbolic":
+            lines += [
+                f"        Z[{row}, lane] = math.tanh({rate!r} * s / 2.0)",
+                f"        Z[{row} + 1, lane] = -math.sinh({rate!r} * s)",
+            ]
+        elif kind == "oscillator":
+            lines += [
+                f"        theta = {rate!r} * s",
+                "        r, n = reduced(theta)",
+                f"        r += {PRODUCT}({rate!r}, s, -theta)",
+                f"        r = 0.0 if abs(r) <= {4 * np.finfo(float).eps!r} * abs(theta) else r",
+                "        sine, cosine = sin_of_quadrant(r, 0), sin_of_quadrant(r, 1)",
+                "        tangent, quarter = sine / (1.0 + cosine), n & 3",
+                "        c = 1.0 if quarter == 0 else (-1.0 if quarter == 2 else 0.0)",
+                "        d = 1.0 if quarter == 1 else (-1.0 if quarter == 3 else 0.0)",
+                f"        Z[{row}, lane], Z[{row} + 1, lane] = tangent, sine",
+                f"        Z[{row} + 2, lane], Z[{row} + 3, lane] = c, d",
+                f"        Z[{row} + 4, lane], Z[{row} + 5, lane] = c - tangent * d, d + tangent * c",
+            ]
+    return "\n".join([*lines, "    return"])
+
+
+def _filters_each(parts: ExactParts) -> str:
+    """φ of the modes, times their C where each is a coordinate, from those of the frequencies."""
+    scale = np.diag(parts.C).tolist() if parts.diagonal else [1.0] * parts.ndof
+    lines = ["@njit(**OPTIONS, inline='always')", "def fill_filters(Z, width):", "    for lane in range(width):"]
+    for j, (f, factor) in enumerate(zip(parts.classes.tolist(), scale, strict=True)):
+        lines.append(f"        Z[TABLE + {2 + j}, lane] = {factor!r} * Z[NUMBERS + {2 + f}, lane]")
     return "\n".join(lines)
 
 

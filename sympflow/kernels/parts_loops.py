@@ -93,6 +93,72 @@ def step_each(codes, tables, z, in_modes, out):
         pack(x, y, out[i])
 
 
+TABLE = 2 * NDOF  # lines of the row of a map, for each lane; then come its numbers, the time and the basis functions
+NUMBERS = TABLE + ROW_WIDTH
+TIME = NUMBERS + 2 + N_CLASSES
+BASIS = TIME + 1
+
+
+@njit(**OPTIONS, inline="always")
+def fill_number(Z, width, i, coefficients, power):
+    """t to a power, times the sum of the basis functions with these coefficients."""
+    for lane in range(width):
+        Z[NUMBERS + i, lane] = coefficients[0]
+    for k in range(1, len(coefficients)):
+        for lane in range(width):
+            Z[NUMBERS + i, lane] += coefficients[k] * Z[BASIS + k, lane]
+    for _ in range(power):
+        for lane in range(width):
+            Z[NUMBERS + i, lane] *= Z[TIME, lane]
+
+
+@njit(**OPTIONS)
+def step_lanes(codes, coefficients, dt, t, y, in_modes, out):
+    """One step from every row of `y` (N, 2d), each of its own length t[i] > 0, `LANES` rows at a time.
+
+    The numbers of the maps, coefficients (m, numbers, K), are sums of the functions 1 and τ² T_k(2τ² − 1), τ = t/dt,
+    with Chebyshev's T_k: lengths times t, force gradients times t³, and filters.
+    """
+    terms = coefficients.shape[2]
+    Z = aligned_zeros((BASIS + max(terms, 3)) * LANES).reshape((BASIS + max(terms, 3), LANES))
+    for block_start in range(0, y.shape[0], LANES):
+        count = min(LANES, y.shape[0] - block_start)
+        width = (count + VECTOR - 1) // VECTOR * VECTOR
+        for lane in range(width):
+            i = block_start + min(lane, count - 1)
+            q, p = unpack(y[i])
+            if not in_modes:
+                q, p = to_modes(q, p)
+            pack_lane(q, p, Z, lane)
+            square = (t[i] / dt) ** 2
+            Z[TIME, lane] = t[i]
+            Z[BASIS + 1, lane], Z[BASIS + 2, lane] = square, square * (2.0 * square - 1.0)
+        for k in range(3, terms):
+            for lane in range(width):
+                x = 2.0 * (2.0 * Z[BASIS + 1, lane] - 1.0)
+                Z[BASIS + k, lane] = x * Z[BASIS + k - 1, lane] - Z[BASIS + k - 2, lane]
+        for j in range(len(codes)):
+            if codes[j] == 0:
+                for f in range(N_CLASSES):
+                    fill_number(Z, width, f, coefficients[j, f], 1)
+                fill_turns(Z, width)
+            else:
+                fill_number(Z, width, 0, coefficients[j, 0], 1)
+                fill_number(Z, width, 1, coefficients[j, 1], 3)
+                for lane in range(width):
+                    Z[TABLE, lane], Z[TABLE + 1, lane] = Z[NUMBERS, lane], Z[NUMBERS + 1, lane]
+                if FILTERS:
+                    for f in range(N_CLASSES):
+                        fill_number(Z, width, 2 + f, coefficients[j, 2 + f], 0)
+                    fill_filters(Z, width)
+            apply_map_each(Z, width, codes[j])
+        for lane in range(count):
+            q, p = unpack_lane(Z, lane)
+            if not in_modes:
+                q, p = from_modes(q, p)
+            pack(q, p, out[block_start + lane])
+
+
 @njit(**OPTIONS)
 def rollout_lanes(codes, table, y0, in_modes, n_steps, save, out, n_finite, stop):
     """`rollout` of every row of `y0` (N, 2d), `LANES` at a time."""

@@ -59,7 +59,10 @@ class SplitFlowKernel:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
         h = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
         out = np.array(y, dtype=np.float64)
-        for rows in (h > 0, h < 0):
+        for back, rows in ((False, h > 0), (True, h < 0)):
+            sequence, dt = self._frozen.coefficients(back), self.flow.dt
+            if rows.all():
+                return self._kernel.step_by_coefficients(sequence, dt, np.abs(h), y)
             if rows.any():
-                out[rows] = self._kernel.step(self.flow.numpy_maps, h[rows], y[rows])
+                out[rows] = self._kernel.step_by_coefficients(sequence, dt, np.abs(h[rows]), y[rows])
         return out
