@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from sympflow import HamiltonianSystem, compare, get, reference_error, solve, systems
+from sympflow import HamiltonianSystem, SympFlow, compare, get, reference_error, solve, stability, systems
 from sympflow.studies.comparison_report import combined_table
 from sympflow.studies.matching import match
 from sympflow.timing import interleaved
@@ -201,3 +201,21 @@ def test_table_fits_the_width_by_turning_round(report):
 def test_bad_arguments_are_refused_at_once(arguments, message):
     with pytest.raises((ValueError, TypeError), match=message):
         compare(systems.pendulum(), **arguments)
+
+
+def test_writers_name_the_path_that_they_cannot_write(tmp_path):
+    report = compare(systems.harmonic_oscillator(), ["verlet"], metrics=("energy",), t_span=(0, 1), repeats=1)
+    study = stability(systems.harmonic_oscillator(), ["verlet"], steps=[0.1], metrics=("energy",), limits=False)
+    flow = SympFlow(1, hidden=(3,))
+    (tmp_path / "file").write_text("")
+    for write in (report.to_csv, report.to_json, study.to_csv, study.plot, flow.save):
+        with pytest.raises(ValueError, match=r"^`path` .* is a folder: name a file"):
+            write(tmp_path)
+        with pytest.raises(ValueError, match=r"^`path` .* cannot be written \(.*\): name a file that can be"):
+            write(tmp_path / "file" / "below.csv")
+        with pytest.raises(TypeError, match=r"^`path` must be"):
+            write(3)
+        write(tmp_path / f"new_{write.__name__}" / "folder" / "x.png")
+        assert (tmp_path / f"new_{write.__name__}" / "folder" / "x.png").is_file()
+    with pytest.raises(ValueError, match=r"^`path` 'x.xyz' ends in '.xyz', which is no format of figures"):
+        study.plot(tmp_path / "x.xyz")

@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import math
 import re
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch
 from typer.testing import CliRunner
 
 import sympflow
-from sympflow import HamiltonianSystem, solve, stability, systems
+from sympflow import HamiltonianSystem, max_energy_error, solve, stability, systems
 from sympflow.commands import app
 from sympflow.studies.singularities import blow_up
 from sympflow.studies.step_stability import initial_states
@@ -173,9 +174,16 @@ def test_initial_states_lie_on_one_orbit():
     np.testing.assert_array_equal(initial_states(system, given), given)
 
 
-def test_both_precisions_and_every_metric(tmp_path):
-    report = stability(systems.pendulum(), ["verlet", "gauss_legendre4"], steps=[0.1], dtypes=["float64", "float32"])
-    double, single = report.rows[:2]
+@pytest.mark.parametrize(
+    ("method", "span"),
+    [
+        ("verlet", {}),
+        ("gauss_legendre4", {"t_span": (0.0, 20.0), "min_steps": 200}),
+    ],  # implicit steps by arrays are dear
+)
+def test_both_precisions_and_every_metric(tmp_path, method, span):
+    report = stability(systems.pendulum(), [method], steps=[0.1], dtypes=["float64", "float32"], **span)
+    double, single = report.rows
     assert (double.dtype, single.dtype) == ("float64", "float32")
     assert double.symplecticity_defect < 1e-14 < single.symplecticity_defect < 1e-5
     assert double.volume_error < 1e-12 < single.volume_error < 1e-3
@@ -281,3 +289,32 @@ def test_the_words_of_the_page_hold_a_place_for_every_table():
     sections = re.findall(r'^    "(\w+)": ', source[source.index("SECTIONS: dict") :], re.MULTILINE)
     page = words.page({name: f"<{name}>" for name in sections})
     assert [name for name in sections if f"<{name}>" not in page] == ["maps"]  # figures alone
+
+
+def test_a_limit_that_is_not_found_is_explained_and_progress_names_every_step():
+    said = []
+    family = [systems.harmonic_oscillator(w) for w in (1.0, 2.0)]
+    report = stability(
+        family, ["verlet", "impulse", "rk45"], steps=[0.5, 3.0], metrics=("energy",), progress=said.append
+    )
+    notes = report.without_limit()
+    assert notes == [
+        "No limit of impulse on harmonic oscillator, ω = 1, 2: stable: all up to the length of the interval.",
+        "No limit of rk45 on harmonic oscillator, ω = 1, 2: an adaptive method.",
+    ]
+    assert all(note in report.table() for note in notes)
+    assert "No limit of impulse" in report.figure("map").get_supxlabel()
+    for text in (
+        "harmonic oscillator, ω = 2: verlet, float64, dt = 3",
+        "ω = 1: verlet, float64, longest stable step: dt",
+    ):
+        assert any(text in line for line in said)
+
+
+def test_the_bound_is_missed_where_the_orbit_of_the_map_has_a_short_period():
+    """Verlet's step turns the oscillator by θ, cos θ = 1 − z²/2: for θ = 2π/n the error is max_k sin²(kθ)·z²/4."""
+    for n in (3, 5, 6, 7, 8):
+        z = 2 * math.sin(math.pi / n)
+        sol = solve(systems.harmonic_oscillator(), "verlet", (0.0, 100 * n * z), [1.0, 0.0], dt=z)
+        share = max(math.sin(2 * math.pi * k / n) ** 2 for k in range(n))
+        assert max_energy_error(sol) == pytest.approx(share * z**2 / 4, rel=1e-10)

@@ -20,6 +20,7 @@ import torch
 from safetensors.torch import save as save_tensors
 
 import sympflow
+from sympflow.files import naming_path, writable
 from sympflow.flow.base import FlowMap
 from sympflow.flow.description import check, describe
 from sympflow.flow.placement import checked_device
@@ -45,7 +46,7 @@ def save(flow: FlowMap, path: str | os.PathLike[str]) -> None:
     TypeError
         If `path` is not a path.
     ValueError
-        If a weight is not finite, or the record is one that `load` would refuse.
+        If a weight is not finite, the record is one that `load` would refuse, or the file cannot be written.
 
     Warns
     -----
@@ -124,7 +125,8 @@ def reseal(path: str | os.PathLike[str]) -> bool:
 
 def _write(path: Path, content: bytes) -> None:
     """All of it or nothing."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    with naming_path(writable(path)):
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)

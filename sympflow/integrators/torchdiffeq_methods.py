@@ -69,29 +69,31 @@ class FixedGrid(ExplicitStep, FixedStep):
     tableau: ClassVar[Tableau]
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
-        """One call of `odeint` for each stretch between saved states, in the time s = (t − t0)/h, where h is exact."""
+        """Calls of `odeint` for 64 steps each, in the time s = (t − t0)/h, where h is exact."""
         import torch
         from torchdiffeq import odeint
 
         tensor = is_tensor(problem.y0)
         y = problem.y0 if tensor else torch.from_numpy(np.ascontiguousarray(problem.y0))
-        states, k = [], 0
+        states, k, last = [y] * int((save == 0).sum()), 0, int(save[-1]) if len(save) else 0
         finite = np.full(y.shape[:-1], n_steps)
 
         def scaled(s: Any, y: Any) -> Any:
             return h * problem.system.vector_field(y)
 
         with torch.set_grad_enabled(tensor and torch.is_grad_enabled()):
-            for target in save.tolist():
-                while k < target:
-                    n = min(target - k, 64)
-                    if (finite == n_steps).any():
-                        block = odeint(scaled, y, torch.arange(n + 1, dtype=y.dtype, device=y.device), method=self.name)
-                        ok = to_numpy(all_finite(block))
-                        finite = np.where((finite == n_steps) & ~ok[-1], k + np.argmin(ok, axis=0) - 1, finite)
-                        y = block[-1]
-                    k += n
-                states.append(y)
+            while k < last:
+                n = min(last - k, 64)
+                wanted = save[(save > k) & (save <= k + n)] - k
+                if (finite == n_steps).any():
+                    block = odeint(scaled, y, torch.arange(n + 1, dtype=y.dtype, device=y.device), method=self.name)
+                    ok = to_numpy(all_finite(block))
+                    finite = np.where((finite == n_steps) & ~ok[-1], k + np.argmin(ok, axis=0) - 1, finite)
+                    y = block[-1]
+                    states += [block[i] for i in wanted.tolist()]
+                else:
+                    states += [y] * len(wanted)
+                k += n
         out = torch.stack(states) if states else y[None][:0]
         return (out if tensor else out.numpy()), finite, "torchdiffeq"
 

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sympflow.files import naming_path, writable
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -74,10 +76,17 @@ def frame(ax: Axes, points: np.ndarray, margin: float) -> None:
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write a figure, making its folder."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=200)
+    """Write a figure, making its folder; errors as for `tables.writable`, and a ValueError for an unknown format."""
+    path = writable(path)
+    known = figure.canvas.get_supported_filetypes()
+    if path.suffix and path.suffix[1:].lower() not in known:
+        raise ValueError(
+            f"`path` {path.name!r} ends in {path.suffix!r}, which is no format of figures: take one of "
+            f"{', '.join(sorted(known))}."
+        )
+    path = path if path.suffix else path.with_name(f"{path.name}.png")
+    with naming_path(path):
+        figure.savefig(path, dpi=200)
     return path
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -93,6 +94,11 @@ def _shown(row: StabilityRow) -> float:
     return LARGEST if error is None or not math.isfinite(error) else min(max(error, SMALLEST), LARGEST)
 
 
+def _filled(text: str, width: int) -> str:
+    """Each line of a text broken at so many characters."""
+    return "\n".join(textwrap.fill(line, width) for line in text.splitlines())
+
+
 def _map(report: StabilityReport) -> Figure:
     """A panel for each method: step against stiffness, coloured by energy error; × where it says nothing."""
     from matplotlib.colors import LogNorm
@@ -116,7 +122,7 @@ def _map(report: StabilityReport) -> Figure:
             (x.stable, x.value) for x in report.limits if x.label == label and x.stable is not None and x.unstable
         ]
         if limits:
-            ax.plot(*zip(*limits, strict=True), color="#D55E00", lw=1.4)
+            ax.plot(*zip(*limits, strict=True), color="#D55E00", lw=1.4, marker="o" if len(limits) == 1 else "", ms=4)
         ax.set_xscale("log")
         ax.set_yscale("log")
         _plain_ticks(ax.xaxis, [r.dt for r in report.rows if r.dt is not None])
@@ -127,6 +133,9 @@ def _map(report: StabilityReport) -> Figure:
     for i in range(len(labels), len(axes)):  # an empty place: the panel above it bears the labels
         axes[i].set_visible(False)
         axes[i - columns].tick_params(labelbottom=True)
+    if missing := report.without_limit() if report.limits else []:
+        note = "Line: the longest stable step.\n" + "\n".join(missing)
+        figure.supxlabel(_filled(note, int(16 * figure.get_figwidth())), fontsize=8, color=TEXT, ha="left", x=0.02)
     if image is not None:
         bar = figure.colorbar(image, ax=list(axes), shrink=0.9)
         bar.set_label("largest |energy error|, relative (×: unstable)", fontsize=9, color=TEXT)

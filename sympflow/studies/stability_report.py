@@ -130,9 +130,30 @@ class StabilityReport:
             for row in self.rows
             if row.reason
         ]
-        parts = [text_table(self._limit_columns()), ""] if self.limits else []
+        parts = [text_table(self._limit_columns()), *self.without_limit(), ""] if self.limits else []
         below = ["", "Notes", *dict.fromkeys(notes)] if notes else []
         return "\n".join([*parts, text_table(self._columns()), *below])
+
+    def without_limit(self) -> list[str]:
+        """For each method whose longest stable step is not found on some systems, where that is and why: sentences."""
+        found = {(x.system, x.label, x.dtype): x for x in self.limits}
+        why: dict[tuple[str, str], list[str]] = {}
+        for row in self.rows:
+            limit = found.get((row.system, row.label, row.dtype))
+            if limit is not None and limit.stable is not None and limit.unstable is not None:
+                continue
+            if limit is not None:
+                reason = f"{'stable: ' * (limit.stable is not None)}{limit.reached}" or "none of the steps is stable"
+            else:
+                reason = "an adaptive method" if row.dt is None else f"{row.status}: see the notes"
+            systems = why.setdefault((row.label, reason), [])
+            if row.system not in systems:
+                systems.append(row.system)
+        several = len(self.systems) > 1
+        return [
+            f"No limit of {label}{f' on {_listed(systems)}' if several else ''}: {reason}."
+            for (label, reason), systems in why.items()
+        ]
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the rows, every figure to full precision."""
@@ -153,7 +174,7 @@ class StabilityReport:
         if path is not None:
             from sympflow.studies.figure_style import save
 
-            save(figure, Path(path))
+            save(figure, path)
         return figure
 
     def _limit_columns(self) -> list[Column]:
@@ -192,3 +213,11 @@ class StabilityReport:
             Column("method", [r.label for r in rows], left=True),
             Column("dtype", [r.dtype if len(precisions) > 1 else "" for r in rows], left=True),
         ]
+
+
+def _listed(systems: list[str]) -> str:
+    """Names that begin alike, as of a family, once: "oscillator, ω = 1, 100"."""
+    first, _, _ = systems[0].rpartition(" = ")
+    if first and all(name.startswith(f"{first} = ") for name in systems):
+        return f"{first} = {', '.join(name.removeprefix(f'{first} = ') for name in systems)}"
+    return "; ".join(systems)

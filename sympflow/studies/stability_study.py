@@ -27,6 +27,8 @@ STEPS = tuple(2.0**k for k in range(-1, 7))
 FRACTIONS = (0.25, 0.5, 1.0)
 MOST_OUTPUTS, TANGENT_STEPS = 20_000, 256
 LIMIT_PRECISION = 1.002
+FEW_STARTS = 16  # up to so many, a compiled method runs one by one: the kernel for batches takes longer to compile
+ARRAYS_SLOWER = 200  # times, by which runs on arrays are shortened
 STABLE = ("stable", "bounded")
 
 
@@ -43,6 +45,7 @@ class Study:
     bound: float
     min_steps: int
     max_steps: int
+    say: Callable[[str], None] = lambda text: None  # what is being done, for a line of progress
 
     @property
     def has_steps(self) -> bool:
@@ -70,14 +73,24 @@ class Study:
         t0, t1 = self.t_span
         if h is None:
             return t0, t1
-        most = self.max_steps if self.dtype == "float64" else self.max_steps // 50  # array operations
-        length = min(max(abs(t1 - t0), h * self.min_steps), h * most)
+        length = min(max(abs(t1 - t0), h * self.min_steps), h * self.most_steps)
         return t0, t0 + math.copysign(length, t1 - t0)
 
-    def runs(self, integrator: Integrator, h: float | None, y0: np.ndarray) -> list[Solution]:
+    @property
+    def compiled(self) -> bool:
+        return self.candidate.integrator.compiles and self.dtype == "float64"
+
+    @property
+    def most_steps(self) -> int:
+        return self.max_steps if self.compiled else max(1, self.max_steps // ARRAYS_SLOWER)
+
+    def runs(
+        self, integrator: Integrator, h: float | None, y0: np.ndarray, span: tuple[float, float] | None = None
+    ) -> list[Solution]:
         """Solutions that hold every step, or equally many of them, of each state."""
-        span = self.span(h)
+        span = self.span(h) if span is None else span
         together = isinstance(integrator, FixedStep) and integrator.finds_events  # steps on a common grid
+        together &= not (self.compiled and len(y0) <= FEW_STARTS)
         width = y0.size if together else y0.shape[1]
         most = min(MOST_OUTPUTS, MAX_SAVED_VALUES // (2 * width))
         every = 1 if h is None else max(1, math.ceil(abs(span[1] - span[0]) / h / most))
@@ -90,9 +103,19 @@ class Study:
             ]
 
     def stable(self, h: float) -> tuple[bool, float]:
-        """Whether all runs with this step stay below the bound and in a flow's domain, and their largest error."""
+        """Whether all runs with this step stay below the bound and in a flow's domain, and their largest error.
+
+        Most unstable steps show in the first `min_steps` of them.
+        """
+        self.say(f"longest stable step: dt = {h:.6g}")
+        t0, t1 = self.span(h)
         try:
             integrator = self.with_step(h)
+            if abs(t1 - t0) > 4 * h * self.min_steps:
+                early = (t0, t0 + math.copysign(h * self.min_steps, t1 - t0))
+                error = _largest_error(self.runs(integrator, h, self.starts, early))
+                if not error <= self.bound:
+                    return False, error
             sols = self.runs(integrator, h, self.starts)
         except (ValueError, ArithmeticError):  # such as a step above Δt
             return False, math.inf
@@ -113,6 +136,7 @@ class Study:
 
     def row(self, h: float | None) -> StabilityRow:
         """Everything that is asked for at one step."""
+        self.say("" if h is None else f"dt = {h:.6g}")
         c, span = self.candidate, self.span(h)
         params = self.system.params
         row = StabilityRow(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 from sympflow.arrays import is_tensor
 from sympflow.solver import solve
 from sympflow.studies.candidates import candidates
+from sympflow.studies.comparison_report import title
 from sympflow.studies.stability_report import StabilityReport, StabilityRow, StepLimit
 from sympflow.studies.stability_study import Study
 from sympflow.system import HamiltonianSystem
@@ -60,12 +62,13 @@ def stability(
     bound : float
         A run whose energy error exceeds it counts as unstable, as one that becomes non-finite does.
     min_steps, max_steps : int
-        Steps of a run; where both cannot be, `max_steps` holds.
+        Steps of a run; where both cannot be, `max_steps` holds. Methods that run with array operations, and float32,
+        take at most `max_steps`/200.
     limits : bool
         Whether to find the longest stable step, by bisection between the longest stable and the shortest unstable one,
         to 0.2 %. If all are stable, longer ones are tried, and shorter ones if none is.
     progress : callable, optional
-        Called with a line of text when something begins.
+        Called with a line of text when something begins: a method, each of its steps, each trial for the longest one.
 
     Returns
     -------
@@ -109,13 +112,19 @@ def stability(
         starts = initial_states(one, y0)
         for candidate in candidates(methods):
             for dtype in dtypes:
-                study = Study(one, candidate, dtype, span, starts, tuple(metrics), bound, min_steps, max_steps)
-                (progress or (lambda text: None))(f"{one.name}: {candidate.label}, {dtype}")
+                say = partial(_say, progress, f"{title(one)}: {candidate.label}, {dtype}")
+                study = Study(one, candidate, dtype, span, starts, tuple(metrics), bound, min_steps, max_steps, say)
+                say("")
                 own = [study.row(h) for h in study.lengths(lengths)]
                 rows += own
                 if limits and study.has_steps and any(row.status != "not applicable" for row in own):
                     found.append(study.limit(own))
     return StabilityReport(family, tuple(metrics), float(bound), tuple(rows), tuple(found))
+
+
+def _say(progress: Callable[[str], None] | None, what: str, detail: str) -> None:
+    if progress is not None:
+        progress(f"{what}, {detail}" if detail else what)
 
 
 def initial_states(system: HamiltonianSystem, y0: ArrayLike | None) -> np.ndarray:

@@ -13,6 +13,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from sympflow.files import naming_path, writable
+
 
 @dataclass(frozen=True)
 class Column:
@@ -97,10 +99,10 @@ def _strict(x: Any) -> Any:
 
 
 def write_text(text: str, path: str | os.PathLike[str]) -> Path:
-    """Write a file whole or not at all, making its folder."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Write a file whole or not at all, making its folder; errors as `writable`."""
+    path = writable(path)
     partial = path.with_name(path.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    with naming_path(path):
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
     return path
