@@ -21,6 +21,7 @@ from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.shipped import choose
 from sympflow.integrators.checks import check_integrator
 from sympflow.integrators.logarithmic import LogSympFlow
+from sympflow.interop.scipy import as_scipy
 from sympflow.systems.kepler import kepler_ellipse
 from sympflow.time_transformation import lifted
 from sympflow.training.clock_fit import train_clock
@@ -315,3 +316,30 @@ def test_comparisons_and_sections_take_what_solve_takes():
     # q1 = 0 on the ellipse: cos E = e, upwards before the perihelion
     anomaly = 2 * np.pi * np.arange(1, 4) - np.arccos(0.6)
     np.testing.assert_allclose(section.t, anomaly - 0.6 * np.sin(anomaly), rtol=0, atol=1e-11)
+
+
+def test_the_name_that_a_run_in_another_time_reports_is_a_name_to_call_it_by():
+    kepler = systems.kepler()
+    by_flow = solve(kepler, "sympflow", (0.0, 5.0), flow="kepler-log-1")
+    assert by_flow.integrator.name == "log_sympflow"
+    assert get("log_sympflow") is type(by_flow.integrator)
+    for options in ({}, {"flow": "kepler-log-1"}):  # the flow that ships, with its shift
+        np.testing.assert_array_equal(solve(kepler, "log_sympflow", (0.0, 5.0), **options).y, by_flow.y)
+    with pytest.raises(ValueError, match=r"^`flow` is needed, for none in another time ships for 'henon_heiles'"):
+        solve(systems.henon_heiles(), "log_sympflow", (0, 1))
+    with pytest.raises(TypeError, match=r"^`flow` must be a SympFlow of the transformed system"):
+        solve(kepler, "log_sympflow", (0, 1), flow=3)
+    with pytest.raises(
+        TypeError, match=r"^`flow` runs in another time.* SciPy cannot drive: use solve\(\)"
+    ):
+        as_scipy("sympflow", kepler, flow="kepler-log-1")
+
+
+def test_a_tol_that_only_another_time_meets_says_what_that_needs():
+    kepler = systems.kepler()
+    where = r"^`tol` 1e-09 is met by no flow .* can run here .*kepler-log-1 meets it, .* NumPy arrays of float64"
+    for y0, dtype in ((torch.tensor(kepler.y0), None), (kepler.y0, "float32")):
+        with pytest.raises(ValueError, match=where):
+            solve(kepler, "sympflow", (0, 1), y0, dtype=dtype, tol=1e-9)
+    with pytest.raises(ValueError, match=where):
+        as_scipy("sympflow", kepler, tol=1e-9)

@@ -217,9 +217,14 @@ def choose(
     able = [f for f in own if _error(f) <= tol]
     if not able:
         there = ", ".join(f"{f.name} {_brief(f.energy_error)}" for f in own)
+        others = [f.name for f in shipped_flows(system, kind) if f not in own and _error(f) <= tol]
+        clock = (
+            f"{', '.join(others)} meets it, but runs in another time, which only solve() can, on NumPy arrays of "
+            "float64 and without `compensated`: pass these, or "
+        )
         raise ValueError(
-            f"`tol` {tol:g} is met by no flow that ships for {system.name!r} (relative energy errors: {there}): raise "
-            "it, or train a flow and pass flow=flow."
+            f"`tol` {tol:g} is met by no flow that ships for {system.name!r}{' and can run here' if others else ''} "
+            f"(relative energy errors: {there}): {clock if others else ''}raise it, or train a flow and pass flow=flow."
         )
     return able[0]
 

@@ -7,7 +7,7 @@ state before it, of the length σ that solves t(σ) = t, to rounding.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
@@ -214,9 +214,10 @@ class LogSympFlow(Logarithmic):
     dt : float, optional
         As for `Logarithmic`; the step in s that it means is at most the flow's Δ, which is the default.
     shift : float, optional
-        The one of the transformed system that the flow was trained on.
-    flow : SympFlow
-        Trained on, or primed with, the transformed system.
+        The one of the transformed system that the flow was trained on; a flow that ships knows it.
+    flow : SympFlow or str, optional
+        Trained on, or primed with, the transformed system; or the name of one that ships. `solve` takes by default
+        the one that ships for the system. ``solve(system, "sympflow", flow=...)`` comes here by itself.
     """
 
     flow: Any = field(default=None, repr=False)
@@ -224,6 +225,33 @@ class LogSympFlow(Logarithmic):
     name: ClassVar[str] = "log_sympflow"
     order: ClassVar[int | None] = None
     trained: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.flow, str):
+            from sympflow.flow.shipped import named
+
+            object.__setattr__(self, "flow", named(self.flow).load())
+        if self.flow is not None and getattr(self.flow, "kind", None) != "sympflow":
+            raise TypeError(
+                f"`flow` must be a SympFlow of the transformed system, or the name of one; got "
+                f"{type(self.flow).__name__}."
+            )
+
+    def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> LogSympFlow:
+        """With the flow that ships for the system unless one is given, and its shift."""
+        if self.flow is None:
+            from sympflow.flow.shipped import shipped_flows
+
+            found = [f for f in shipped_flows(system, "sympflow") if f.shift is not None]
+            if not found:
+                raise ValueError(
+                    f"`flow` is needed, for none in another time ships for {system.name!r}: train one on "
+                    "sympflow.time_transformed(system), or prime one with it, and pass it; or use 'log_leapfrog'."
+                )
+            return replace(self, flow=found[0].load(system), shift=found[0].shift if self.shift is None else self.shift)
+        origin = (getattr(self.flow, "recipe", None) or {}).get("transforms")
+        return self if self.shift is not None or origin is None else replace(self, shift=origin["shift"])
 
     def inner(self, system: HamiltonianSystem) -> FixedStep:
         from sympflow.integrators.sympflow import SympFlowIntegrator

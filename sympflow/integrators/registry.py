@@ -32,6 +32,7 @@ _BUILT_IN = {
     "log_blanes_moan4": "logarithmic:log_blanes_moan4",
     "log_kahan_li8": "logarithmic:log_kahan_li8",
 }
+_UNLISTED = {"log_sympflow": "logarithmic:LogSympFlow"}  # what "sympflow" is for a flow in another time
 _WITH_PARTS = (
     *("impulse", "mollified_impulse", "implicit_explicit"),
     *("linear_srkn6b", "linear_srkn11b", "linear_srkn14a", "linear_omelyan4"),
@@ -82,7 +83,7 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
         from sympflow.integrators.torchdiffeq_methods import torchdiffeq_method
 
         return torchdiffeq_method(method)
-    if method in _BUILT_IN:
+    if method in _BUILT_IN or method in _UNLISTED:
         return _built_in(method)
     if method in _registered:
         return _registered[method]
@@ -95,7 +96,7 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
 
 @cache
 def _built_in(method: str) -> type[Integrator]:
-    module, _, attribute = _BUILT_IN[method].partition(":")
+    module, _, attribute = (_BUILT_IN | _UNLISTED)[method].partition(":")
     return getattr(whole_import(f"sympflow.integrators.{module}"), attribute)
 
 
@@ -113,7 +114,7 @@ def register(name: str, integrator: type[Integrator]) -> None:
         raise TypeError(f"`name` must be a string, such as 'my_method'; got {type(name).__name__}.")
     if not name.strip():
         raise ValueError(f"`name` must not be empty; got {name!r}. Choose one, such as 'my_method'.")
-    if name in _NAMES:
+    if name in _NAMES or name in _UNLISTED:
         raise ValueError(f"`name` {name!r} is a built-in method, which cannot be replaced: choose another name.")
     if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
         raise TypeError(f"`integrator` must be a subclass of sympflow.integrators.base.Integrator; got {integrator!r}.")
@@ -164,7 +165,7 @@ def _made(method: Any, make: Callable[[], T]) -> T:
     try:
         return make()
     except (Exception, SystemExit) as error:
-        if not isinstance(method, str) or method in _NAMES or method in _registered:
+        if not isinstance(method, str) or method in _NAMES or method in _UNLISTED or method in _registered:
             raise
         plugin = f"the plug-in {_distribution(_plugins()[method])}"
         if isinstance(error, TypeError | ValueError):  # what its options were given, most likely

@@ -49,7 +49,8 @@ def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
     Raises
     ------
     TypeError
-        If the method chooses its own steps: the peer has such methods itself; or if its steps are not on a grid.
+        If the method chooses its own steps: the peer has such methods itself; or if its steps, or those of a flow, are
+        not on a grid.
     """
     from sympflow.integrators.registry import build
 
@@ -58,6 +59,11 @@ def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
         raise TypeError(
             f"`method` {integrator.name!r} is no fixed-step map, which is what can be handed to {peer}: use a "
             f"splitting method or a trained flow, or {peer}'s own method."
+        )
+    if (getattr(getattr(integrator, "flow", None), "recipe", None) or {}).get("transforms") is not None:
+        raise TypeError(
+            f"`flow` runs in another time, so that its steps are not equal in t, which {peer} cannot drive: use "
+            "solve(), or a flow in the system's own time (sympflow.shipped_flows() lists them, `shift` is None)."
         )
     if not integrator.on_grid:
         raise TypeError(
