@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import torch
 
 from sympflow.flow.coefficients import Coefficients, Entry
 from sympflow.flow.contents import Contents
@@ -50,6 +51,8 @@ class Tables:
         self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
         self.dt, self.processed = dt, outer > 0
         self.level = max(s.entries[1:].index(None) if None in s.entries[1:] else CURVATURE for s in substeps)
+        numbers = [c.table for c in columns_of(substeps)]
+        self.compilable = all(c.dtype == torch.float64 and c.device.type == "cpu" for c in numbers)
         self._coefficients = {id(c): c.table.detach().cpu().double().numpy() for c in columns_of(substeps)}
         exponents = columns_of(substeps)[0].exponents
         self._exponents = np.array(exponents, dtype=float)

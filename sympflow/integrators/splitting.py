@@ -36,6 +36,7 @@ class Splitting(FixedStep):
     scheme: ClassVar[Scheme]
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
+    saves_finite: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

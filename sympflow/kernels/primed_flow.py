@@ -33,9 +33,12 @@ class PrimedFlowKernel:
     """
 
     def __init__(self, flow: PrimedFlow, system: HamiltonianSystem, compensated: bool = False) -> None:
-        if str(flow.dtype) != "torch.float64" or flow.device.type != "cpu":
+        tables = flow.tables
+        if not tables.compilable:
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
-        self._tables, self._splitting, self._compensated = flow.tables, splitting_kernel(system), compensated
+        self._tables, self._splitting, self._compensated = tables, splitting_kernel(system), compensated
+        self.evaluations = tables.evaluations
+        self.saves_finite = not tables.processed  # what a processor makes of finite states may not be
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` times ψ̄_h, or for h < 0 the inverse of ψ̄_|h|: see `SplittingKernel.run`."""
