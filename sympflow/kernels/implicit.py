@@ -11,7 +11,7 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from sympflow.kernels.codegen import _KernelPrinter
-from sympflow.kernels.modules import OPTIONS, load_module, run_rows, template
+from sympflow.kernels.modules import load_algebra, run_rows
 from sympflow.symbolic import SymbolicHamiltonian, printable
 from sympflow.system import HamiltonianSystem
 
@@ -98,12 +98,7 @@ class ImplicitKernel:
 @lru_cache(maxsize=256)
 def _load(algebra: str, tableau: Tableau, compensated: bool) -> ModuleType:
     A, b = tableau
-    header = (
-        "import math\n\nfrom numba import njit\n\n"
-        f"OPTIONS = {OPTIONS | {'cache': True}}\nCOMPENSATED = {compensated}\nSTAGES = {len(b)}\nA = {A}\nB = {b}"
-    )
-    before = ["elementary"] if "fast_" in algebra else []
-    return load_module("\n\n\n".join([header, *map(template, before), algebra, template("implicit_loops")]))
+    return load_algebra(algebra, ["implicit_loops"], COMPENSATED=compensated, STAGES=len(b), A=A, B=b)
 
 
 def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:

@@ -16,12 +16,12 @@ from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
 
-__all__ = ["NEVER", "OPTIONS", "cache_folder", "load_module", "run_one", "run_rows", "template"]
+__all__ = ["NEVER", "OPTIONS", "cache_folder", "load_algebra", "load_module", "run_one", "run_rows", "template"]
 
 T = TypeVar("T")
 
@@ -52,6 +52,14 @@ def cache_folder() -> Path:
         if folder := os.environ.get(variable):
             return Path(folder) / "sympflow"
     return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "sympflow"
+
+
+def load_algebra(algebra: str, loops: Sequence[str] = (), **constants: Any) -> ModuleType:
+    """The module of a system's algebra: constants before it, and `elementary` where it calls that; after it `loops`."""
+    lines = [f"{name} = {value}" for name, value in {"OPTIONS": OPTIONS | {"cache": True}, **constants}.items()]
+    header = "import math\n\nfrom numba import njit\n\n" + "\n".join(lines)
+    before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
+    return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, loops)]))
 
 
 @cache

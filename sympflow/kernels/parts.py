@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.kernels.modules import NEVER, OPTIONS, load_module, run_one, run_rows, template
-from sympflow.kernels.parts_codegen import IDLE, PRODUCT, TURN_WIDTH, WITH_GRADIENT, parts_source
+from sympflow.kernels.modules import NEVER, load_algebra, run_one, run_rows
+from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
 from sympflow.parts import LINEAR, ExactParts, Map, PartFunctions
 from sympflow.shears import shears
 
@@ -172,12 +172,8 @@ class PartsKernel:
         if gradients and not self.parts.has_force_gradient:
             raise ValueError("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
         if (filters, gradients) not in self._variants:
-            options = f"OPTIONS = {OPTIONS | {'cache': True}}\nCOMPENSATED = False"
-            header = f"import math\n\nfrom numba import njit\n\n{options}"
             algebra = parts_source(self.parts, filters, gradients)
-            before = ["elementary"] if "fast_" in algebra or PRODUCT in algebra else []
-            texts = [header, *map(template, before), algebra, *map(template, ["aligned", "parts_loops"])]
-            module = load_module("\n\n\n".join(texts))
+            module = load_algebra(algebra, ["aligned", "parts_loops"], COMPENSATED=False)
             self._variants[filters, gradients] = _Loops(
                 module.rollout,
                 module.rollout_lanes,

@@ -10,7 +10,7 @@ import sympy as sp
 
 from sympflow.domain import Box, EnergySublevel
 from sympflow.kernels.codegen import printed
-from sympflow.kernels.modules import OPTIONS, load_module, template
+from sympflow.kernels.modules import load_algebra
 from sympflow.kernels.outputs import all_between
 from sympflow.symbolic import SymbolicHamiltonian, printable
 from sympflow.system import HamiltonianSystem
@@ -44,9 +44,7 @@ def _compiled(symbols: SymbolicHamiltonian) -> Callable[..., bool]:
         source = sublevel_source(symbols)
     except ValueError:  # a function in H has no compiled form
         return lambda states, limits: False
-    header = f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': True}}"
-    before = ["elementary"] if "fast_" in source else []
-    return load_module("\n\n\n".join([header, *map(template, before), source])).all_within
+    return load_algebra(source).all_within
 
 
 def sublevel_source(symbols: SymbolicHamiltonian) -> str:
