@@ -62,23 +62,45 @@ class CallableHamiltonian:
     def potential(self, q: Array) -> Array:
         assert self._potential is not None
         if self._gradient is not None:
-            return _checked(self._potential(q), q, "potential", ())
+            return _checked(self._protected(self._potential, "potential", q), q, "potential", ())
         return _with_torch(self._potential, q, "potential", ())
 
     def potential_gradient(self, q: Array) -> Array:
         if self._gradient is not None:
-            return _checked(self._gradient(q), q, "gradient", (self.ndof,))
+            return _checked(self._protected(self._gradient, "gradient", q), q, "gradient", (self.ndof,))
         assert self._potential is not None
         return _with_torch(_gradient_of(self._potential, "potential"), q, "potential", (self.ndof,))
+
+    def _protected(self, function: Callable[..., Any], name: str, *states: Array) -> Any:
+        """The user's function of arrays that it cannot write into, for they are the state of the run."""
+        if self.numba_functions is not None:
+            return function(*states)
+        refused = f"`{name}` writes into its argument, the state of the run: let it work on a copy"
+        if is_tensor(states[0]):
+            versions = [getattr(x, "_version", 0) for x in states]
+            value = function(*states)
+            if versions != [getattr(x, "_version", 0) for x in states]:
+                raise ValueError(f"{refused}, q.clone().")
+            return value
+        views = [x[...] for x in states]  # the flag is not that of the caller's array
+        for view in views:
+            view.flags.writeable = False
+        try:
+            return function(*views)
+        except ValueError as error:
+            if "read-only" not in str(error):
+                raise
+            raise ValueError(f"{refused}, q.copy() ({error}).") from error
 
     @property
     def hessian_vector(self) -> Callable[..., Array] | None:
         """The user's ∇²V(q)·v, if given."""
-        return self._hessian_vector
+        product = self._hessian_vector
+        return None if product is None else lambda q, v: self._protected(product, "hessian_vector", q, v)
 
     def potential_hessian(self, q: Array) -> Array:
         if self._hessian_vector is not None:
-            columns = [self._hessian_vector(q, e) for e in _basis(q)]
+            columns = [self._protected(self._hessian_vector, "hessian_vector", q, e) for e in _basis(q)]
             return stack([_checked(column, q, "hessian_vector", (self.ndof,)) for column in columns])
         if self._gradient is not None and not is_tensor(q):
             raise ValueError(
@@ -144,6 +166,7 @@ def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[in
     import torch
 
     tensor = x if is_tensor(x) else torch.from_numpy(np.ascontiguousarray(x))
+    version = tensor._version
     try:
         value = f(tensor)
     except (TypeError, RuntimeError, AttributeError, IndexError) as error:
@@ -153,6 +176,8 @@ def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[in
             f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({error}). Write it with torch functions of "
             "(..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
         ) from error
+    if tensor._version != version:
+        raise ValueError(f"`{name}` writes into its argument, the state of the run: let it work on a copy, q.clone().")
     value = _checked(value, tensor, name, tail)
     return value if is_tensor(x) else value.detach().numpy()
 

@@ -90,7 +90,7 @@ class Solution:
             return self.system.hamiltonian(self.states)
 
     def energy_error(self) -> np.ndarray:
-        """Relative energy error over time, (..., n); see `sympflow.energy_error`."""
+        """Relative energy error over time, (..., n); inf where H is beyond floats; see `sympflow.energy_error`."""
         from sympflow.metrics.energy import energy_error
 
         return energy_error(self)

@@ -30,7 +30,8 @@ class HamiltonianSystem:
     potential : callable, optional
         V(q), q of shape (..., d), returning (...). Then H = ½ pᵀM⁻¹p + V(q) is separable. Without `gradient`
         it must be written with torch functions, and is differentiated automatically. With Numba functions
-        (`potential`, `gradient` and `hessian_vector`) the system runs compiled.
+        (`potential`, `gradient` and `hessian_vector`) the system runs compiled. A function that writes into q is a
+        ValueError; of a Numba function that cannot be told, and it would corrupt the run: it may write into `out` only.
     hamiltonian : callable, optional
         H(q, p), written with torch functions, for a system that is not separable. Give this or `potential`.
     ndof : int

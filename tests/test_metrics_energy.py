@@ -131,3 +131,12 @@ def test_tensors_and_batches_give_arrays():
     assert energy_error(sol).shape == (3, 40)
     assert energy_error(sol).dtype == np.float64
     assert max_energy_error(sol).shape == energy_drift(sol).slope.shape == (3,)
+
+
+def test_the_error_is_infinite_where_the_energy_is_beyond_floats():
+    """H of a state of 1e160 overflows: inf − inf would be NaN, which says nothing."""
+    sol = solve(systems.harmonic_oscillator(), "verlet", (0, 1), [[1e160, 0.0], [1.0, 0.0]])
+    assert sol.status.tolist() == [0, 0]
+    assert np.isposinf(sol.energy_error()[0]).all()
+    assert np.isfinite(sol.energy_error()[1]).all()
+    np.testing.assert_array_equal(np.isinf(max_energy_error(sol)), [True, False])

@@ -289,3 +289,27 @@ def test_integer_powers_are_those_of_numpy(n):
     q = np.linspace(0.3, 2, 50)[:, None]
     V = HamiltonianSystem.from_sympy(f"p**2/2 + q**({n})").potential
     np.testing.assert_allclose(V(q), q[:, 0] ** n, rtol=abs(n) * np.finfo(float).eps)
+
+
+def doubling(q):
+    q *= 2
+    return q / 2
+
+
+@pytest.mark.parametrize("method", ["verlet", "rk45", "rk4", "dopri5"])
+def test_a_function_that_writes_into_the_state_is_refused(method):
+    """NumPy's arrays are read-only; a tensor's version tells."""
+    V = {"potential": lambda q: (q**2).sum(-1) / 2, "ndof": 1}
+    with pytest.raises(
+        ValueError, match=r"^`gradient` writes into its argument, the state of the run: let it work on a"
+    ):
+        solve(HamiltonianSystem(**V, gradient=doubling), method, (0, 1), [1.0, 0.0])
+    own = np.array([1.0, 0.0])
+    solve(HamiltonianSystem(**V, gradient=lambda q: q), method, (0, 1), own)
+    assert own.flags.writeable
+    writes = HamiltonianSystem(**V, gradient=lambda q: q, hessian_vector=lambda q, v: doubling(v))
+    with pytest.raises(ValueError, match=r"^`hessian_vector` writes into its argument"):
+        writes.hessian(own)
+    assert own.tolist() == [1.0, 0.0]
+    with pytest.raises(ValueError, match=r"^`potential` writes into its argument.*q\.clone\(\)"):
+        HamiltonianSystem(potential=lambda q: (doubling(q) ** 2).sum(-1), ndof=1).potential(own[:1])

@@ -20,6 +20,9 @@ MIN_BLOCKS = 20
 def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
     """H(y(t)) − H(y0), relative to `energy_scale(sol)`, at the times `sol.t`: (..., n), in float64, signed.
 
+    Where the state is finite and H of it is beyond floats, so that inf − inf would be NaN, the error is inf. NaN is
+    left where the state is: after the end of a trajectory in a batch.
+
     Parameters
     ----------
     sol : Solution
@@ -38,7 +41,10 @@ def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
     """
     check_solution(sol)
     with np.errstate(all="ignore"):
-        error = _energy(sol, sol.states) - _energy(sol, sol.y0)[..., None]
+        states = to_numpy(sol.states)
+        error = _energy(sol, states) - _energy(sol, sol.y0)[..., None]
+        if np.isnan(error).any():
+            error = np.where(np.isnan(error) & np.isfinite(states).all(-1), np.inf, error)
         if not relative:
             return error
         scale = energy_scale(sol)
@@ -48,7 +54,8 @@ def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
                 RuntimeWarning,
                 stacklevel=2,
             )
-        return error / np.where(absolute, 1.0, scale)[..., None]
+        compared = error / np.where(absolute, 1.0, scale)[..., None]
+        return np.where(np.isinf(error), error, compared)  # H(y0) may be infinite itself: inf/inf
 
 
 def energy_scale(sol: Solution) -> np.ndarray:
