@@ -55,6 +55,12 @@ def check_flow(flow: FlowMap, system: HamiltonianSystem, dt: float | None) -> No
 
 def _meant(system: HamiltonianSystem, given: dict[str, Any]) -> str:
     """The architecture that is meant where none is named."""
+    searched = [name for name in OF_SEARCHES if given[name] is not None]
+    if searched and not (system.separable and system.quadratic_kinetic):
+        raise ValueError(
+            f"`{searched[0]}` is of the search for primed flows by Gauss–Newton steps, which needs H = ½ pᵀM⁻¹p + V(q); "
+            f"{system.name!r} is of another form: leave it out for a network, or pass kind='primed', optimizer='bfgs'."
+        )
     if options_given(given, (*OF_PRIMED, *OF_SEARCHES)):
         return "primed"
     fits = system.separable and system.quadratic_kinetic and system.symbols is not None

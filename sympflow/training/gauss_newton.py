@@ -146,7 +146,8 @@ class GaussNewtonRun(SearchRun):
             return
         warnings.warn(
             f"The fit has a larger held-out error ({after:.1e}) than the flow that it started from ({before:.1e}), "
-            "which is returned: its data are too few, too far from Δt, or not of this system.",
+            "which is returned: its data are too few, too far from Δt, or not of this system; or H is singular in "
+            "`domain`, or nearly so: shrink that.",
             RuntimeWarning,
             stacklevel=5,
         )
