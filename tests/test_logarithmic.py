@@ -329,9 +329,7 @@ def test_the_name_that_a_run_in_another_time_reports_is_a_name_to_call_it_by():
         solve(systems.henon_heiles(), "log_sympflow", (0, 1))
     with pytest.raises(TypeError, match=r"^`flow` must be a SympFlow of the transformed system"):
         solve(kepler, "log_sympflow", (0, 1), flow=3)
-    with pytest.raises(
-        TypeError, match=r"^`flow` runs in another time.* SciPy cannot drive: use solve\(\)"
-    ):
+    with pytest.raises(TypeError, match=r"^`flow` runs in another time.* SciPy cannot drive: use solve\(\)"):
         as_scipy("sympflow", kepler, flow="kepler-log-1")
 
 
