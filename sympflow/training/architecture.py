@@ -58,7 +58,7 @@ def _meant(system: HamiltonianSystem, given: dict[str, Any]) -> str:
     searched = [name for name in OF_SEARCHES if given[name] is not None]
     if searched and not (system.separable and system.quadratic_kinetic):
         raise ValueError(
-            f"`{searched[0]}` is of the search for primed flows by Gauss–Newton steps, which needs H = ½ pᵀM⁻¹p + V(q); "
+            f"`{searched[0]}` is of the search for primed flows by Gauss–Newton, which needs H = ½ pᵀM⁻¹p + V(q); "
             f"{system.name!r} is of another form: leave it out for a network, or pass kind='primed', optimizer='bfgs'."
         )
     if options_given(given, (*OF_PRIMED, *OF_SEARCHES)):
