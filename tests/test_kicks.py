@@ -1,5 +1,6 @@
 """Kicks as generated code: every shape gives the same momenta; the costs by which one is chosen."""
 
+import itertools
 import math
 
 import numpy as np
@@ -42,8 +43,8 @@ def test_every_shape_gives_the_same_momenta(name, terms):
     shapes = list(_shapes(symbols, terms))
     rewritten = name != "kinks" and (name, terms) != ("roots", 3)  # that one is too long
     assert len(shapes) >= (3 if rewritten else 1)
-    for shape in shapes:
-        kick = _scheduled(symbols, shape, "s_")
+    for shape, common in itertools.product(shapes, (True, False)):
+        kick = _scheduled(symbols, shape, "s_", common)
         functions = dict(ELEMENTARY)
         lines = [*kick.coefficients, *kick.lines]
         exec(_function(symbols, "kick", "q, p, b, g, c", lines, kick.results), functions)

@@ -57,7 +57,8 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int) -> str:
     stored: list[str] = []
     for terms, name in enumerate(("kicked", "gradient_kicked", "curvature_kicked")[: level + 1], 1):
         numbers = ("b", "g", "c")[:terms]
-        tried = [_scheduled(symbols, shape, f"{name[0]}_") for shape in _shapes(symbols, terms)]
+        shapes = list(_shapes(symbols, terms))
+        tried = [_scheduled(symbols, s, f"{name[0]}_", common) for s in shapes for common in (True, False)]
         one = min(tried, key=lambda kick: (kick.cycles, kick.operations))
         many = min(tried, key=lambda kick: (kick.operations, kick.latency))
         used = [n for n in _names(one.coefficients) if any(_mentions(line, n) for line in [*one.lines, *one.results])]
@@ -90,18 +91,22 @@ def _function(
     return "\n    ".join([f"@njit(**OPTIONS, forceinline=True)\ndef {name}({arguments}):", *unpacked, *lines, returned])
 
 
-def _scheduled(symbols: SymbolicHamiltonian, shape: Sequence[sp.Expr], prefix: str) -> _Kick:
-    """The shape as code. Momenta are known before positions, whose drift waited for them."""
+def _scheduled(symbols: SymbolicHamiltonian, shape: Sequence[sp.Expr], prefix: str, common: bool = True) -> _Kick:
+    """The shape as code. Momenta are known before positions, whose drift waited for them.
+
+    Without `common` only whole factors and terms are shared, not products within products, which may be known later.
+    """
     known = {**dict.fromkeys(symbols.q, 0.0), **dict.fromkeys(symbols.p, -FUSED)}
     schedule = Schedule(known, printed, prefix, PRODUCT)
     numbers: dict[sp.Expr, sp.Symbol] = {}
     shape = [_numbered(f, {*symbols.q, *symbols.p}, numbers) for f in shape]
     for coefficient, symbol in numbers.items():  # as one: what is common to several would else be taken out of them
         schedule.define(symbol, coefficient)
-    shared, reduced = sp.cse(shape, symbols=sp.numbered_symbols("common_", real=True), list=True, order="none")
-    for symbol, expression in shared:
-        schedule.define(symbol, expression)
-    results = [schedule.value(f) for f in reduced]
+    if common:
+        shared, shape = sp.cse(shape, symbols=sp.numbered_symbols("common_", real=True), list=True, order="none")
+        for symbol, expression in shared:
+            schedule.define(symbol, expression)
+    results = [schedule.value(f) for f in shape]
     latency = max(time for time, _ in results)
     return _Kick(schedule.early, schedule.lines, [name for _, name in results], latency, schedule.operations)
 

@@ -24,7 +24,7 @@ from sympflow.systems import SYSTEMS
 from sympflow.training.clock_fit import energy_errors, train_clock
 from sympflow.training.trainer import train
 
-OF_A_GRADIENT, OF_A_PARAMETER = 0.6, 0.4  # forces
+OF_A_GRADIENT, OF_A_CURVATURE, OF_A_PARAMETER = 0.6, 0.4, 0.4  # forces
 OF_A_LOGARITHM = 2.0  # forces: a kick and a drift of the logarithmic Hamiltonian, a division in each
 CLOCK_SEED = 1_000_003  # of the held-out states of flows without a certificate
 HELD_OUT = 1000  # states of the certificate
@@ -45,6 +45,8 @@ class Rung:
     scheme : str, optional
         Of `stages` kicks, from which the search starts in place of equal leapfrog steps: one of a high order leads to
         valleys that random tables, most of whose numbers are positive, do not lie near.
+    curvature : bool
+        See `SympFlow.primed`.
     after : str, optional
         The name of the rung with a longer Δt, the same kicks and the same processor whose table, continued to this Δt,
         is where the search starts: deep valleys are found at a long Δt, and followed to a short one.
@@ -58,6 +60,7 @@ class Rung:
     restarts: int = 12
     scheme: str | None = None
     after: str | None = None
+    curvature: bool = False
     options: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -69,7 +72,7 @@ class Rung:
         """The flow, without a certificate; `longer` is that of the rung `after` which it comes."""
         before = time.process_time()
         first: dict[str, Any] = {"stages": self.stages} if self.scheme is None else {"scheme": self.scheme}
-        start = SympFlow.primed(system, **first, dt=self.dt, processor=self.processor)
+        start = SympFlow.primed(system, **first, dt=self.dt, processor=self.processor, curvature=self.curvature)
         if longer is not None:
             _restrict(start, longer)
         flow = train(system, flow=start, **{"restarts": self.restarts, **self.options, **options})
@@ -208,8 +211,9 @@ def certify(flow: SympFlow, system: HamiltonianSystem, t_end: float = 1000.0) ->
 def cost(flow: SympFlow) -> float:
     """What a unit of time costs in force evaluations, by count: a figure that no other load on the machine disturbs.
 
-    A force gradient counts as 0.6 of a force, as was measured in the compiled loops for polynomial potentials; exact
-    linear flows count nothing; a network's parameters as many forces as make up for its multiplications.
+    A force gradient counts as 0.6 of a force and a curvature term as 0.4, as was measured in the compiled loops for
+    polynomial potentials; exact linear flows count nothing; a network's parameters as many forces as make up for its
+    multiplications.
     """
     if isinstance(flow, SplitFlow):
         one, two = (flow.evaluations(n, 0, 0, "compiled") for n in (1, 2))
@@ -218,40 +222,35 @@ def cost(flow: SympFlow) -> float:
     if not isinstance(flow, PrimedFlow):
         return OF_A_PARAMETER * flow.n_parameters / flow.dt
     kernel = flow.kernel_scheme()
-    return (kernel.force_evaluations + OF_A_GRADIENT * kernel.hessian_evaluations) / flow.dt
+    more = OF_A_GRADIENT * kernel.hessian_evaluations + OF_A_CURVATURE * kernel.curvature_evaluations
+    return (kernel.force_evaluations + more) / flow.dt
 
 
 def ladders() -> dict[str, Ladder]:
     """The ladders, by the name of the scene."""
-    sizes: dict[str, tuple[tuple[float, ...], ...]] = {  # kicks, Δt and, if not 12, starts of the search
-        "henon-heiles": (
-            (1, 0.75),
-            (3, 1.2, 24),
-            (3, 1.0),
-            (3, 0.9, 16),
-            (3, 0.8),
-            (3, 0.6),
-            (3, 0.4),
-            (3, 0.3, 24),
+    rungs: dict[str, tuple[Rung | ClockRung, ...]] = {
+        "henon-heiles": (Rung(1, 0.75), *(Rung(3, dt, curvature=True) for dt in (1.6, 1.2, 1.0, 0.8, 0.6, 0.4))),
+        "pendulum": (Rung(2, 1.5), *(Rung(3, dt, curvature=True) for dt in (2.0, 1.5, 1.0, 0.8, 0.6, 0.4))),
+        "quartic": (
+            Rung(1, 0.5),
+            *(Rung(3, dt) for dt in (0.75, 0.6, 0.5, 0.4)),
+            Rung(6, 0.6, 8, 1, "srkn6b"),
+            *_continued(6, (0.6, 0.45, 0.3), 8, "srkn6b"),
         ),
-        "pendulum": ((2, 1.5), (3, 1.5), (3, 0.75), (3, 0.6), (3, 0.4), (3, 0.3, 24)),
-        "quartic": ((1, 0.5), (3, 0.75), (3, 0.6), (3, 0.5), (3, 0.4, 16)),
-        "kepler": ((2, 0.25), (2, 0.15), (3, 0.2), (3, 0.15), (3, 0.1), (3, 0.08), (3, 0.06), (3, 0.045), (3, 0.03)),
+        "kepler": (
+            *(Rung(2, dt) for dt in (0.25, 0.15)),
+            *(Rung(3, dt) for dt in (0.2, 0.15, 0.1, 0.08, 0.06, 0.045, 0.03)),
+            ClockRung(1.0),
+        ),
     }
     # d = 18: starts are dear, few and short, and the gain of more is small
     short = {"points": 40, "label_times": 5, "reference_states": 20, "steps": 200}
-    planets = tuple(Rung(3, dt, restarts=2, options=short) for dt in (300.0, 200.0, 100.0))
-    others: dict[str, tuple[Rung | ClockRung, ...]] = {
-        "quartic": (Rung(6, 0.6, 8, 1, "srkn6b"), *_continued(6, (0.6, 0.45, 0.3), 8, "srkn6b")),
-        "kepler": (ClockRung(1.0),),
-    }
-    return {
-        **{
-            scene.replace("-", "_"): Ladder(SYSTEMS[scene], (*(_rung(*each) for each in rungs), *others.get(scene, ())))
-            for scene, rungs in sizes.items()
-        },
-        "outer_solar_system": Ladder(SYSTEMS["outer-solar-system"], planets, 1e5 * YEAR, along_the_orbit, 100 * YEAR),
-    }
+    planets: tuple[Rung | ClockRung, ...] = tuple(
+        Rung(3, dt, restarts=2, options=short) for dt in (300.0, 200.0, 100.0)
+    )
+    made = {scene.replace("-", "_"): Ladder(SYSTEMS[scene], each) for scene, each in rungs.items()}
+    solar = Ladder(SYSTEMS["outer-solar-system"], planets, 1e5 * YEAR, along_the_orbit, 100 * YEAR)
+    return {**made, "outer_solar_system": solar}
 
 
 def along_the_orbit(system: HamiltonianSystem, n: int = 10, span: float = 1e5 * YEAR, seed: int = 0) -> np.ndarray:
@@ -262,10 +261,6 @@ def along_the_orbit(system: HamiltonianSystem, n: int = 10, span: float = 1e5 * 
     """
     t = np.sort(np.random.default_rng(seed).uniform(0, span, n))
     return solve(system, "kahan_li8", (0.0, float(t[-1])), dt=200.0, t_eval=t).states
-
-
-def _rung(stages: float, dt: float, starts: float = 12) -> Rung:
-    return Rung(int(stages), dt, restarts=int(starts))
 
 
 def _continued(
