@@ -222,8 +222,8 @@ def cost(flow: SympFlow) -> float:
     if not isinstance(flow, PrimedFlow):
         return OF_A_PARAMETER * flow.n_parameters / flow.dt
     kernel = flow.kernel_scheme()
-    more = OF_A_GRADIENT * kernel.hessian_evaluations + OF_A_CURVATURE * kernel.curvature_evaluations
-    return (kernel.force_evaluations + more) / flow.dt
+    beside = OF_A_GRADIENT * kernel.hessian_evaluations + OF_A_CURVATURE * kernel.curvature_evaluations
+    return (kernel.force_evaluations + beside) / flow.dt
 
 
 def ladders() -> dict[str, Ladder]:
