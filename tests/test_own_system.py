@@ -29,9 +29,7 @@ def test_own_system_in_a_minute(monkeypatch, capsys):
 
 def test_a_search_is_refused_for_a_kinetic_energy_that_it_does_not_fit():
     relativistic = HamiltonianSystem.from_sympy("sqrt(1+p**2)+q**2/2", domain=Box([-1, -1], [1, 1]), y0=[0.5, 0])
-    with pytest.raises(
-        ValueError, match=r"^`restarts` is of the search .*leave it out for a network, or pass"
-    ):
+    with pytest.raises(ValueError, match=r"^`restarts` is of the search .*leave it out for a network, or pass"):
         train(relativistic, restarts=2)
 
 

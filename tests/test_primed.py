@@ -50,6 +50,8 @@ FLOWS = {
     "processed": lambda: random_flow(HH, stages=2, processor=2, degree=4),
     "processed, kick first": lambda: random_flow(MASSES, scheme="verlet", processor=1, palindromic=False),
     "processed, no gradients": lambda: random_flow(RELATIVISTIC, scheme="mclachlan4", palindromic=False, processor=3),
+    "curvature": lambda: random_flow(HH, stages=2, degree=3, curvature=True),
+    "processed, with curvature": lambda: random_flow(MASSES, scheme="verlet", processor=1, curvature=True),
     "another dt": lambda: random_flow(HH, stages=2, dt=0.3, degree=1),
 }
 
@@ -270,6 +272,10 @@ def test_evaluations_are_counted():
     assert (stats["force_evaluations"], stats["hessian_evaluations"]) == (20, 20)
     stats = solve(HH, random_flow(HH, stages=3), (0.0, 10.0)).stats
     assert (stats["force_evaluations"], stats["hessian_evaluations"]) == (30, 30)
+    assert "curvature_evaluations" not in stats
+    for backend in ("compiled", "array"):
+        stats = solve(HH, random_flow(HH, stages=3, curvature=True), (0.0, 10.0), backend=backend).stats
+        assert stats["curvature_evaluations"] == 30
 
 
 def test_the_map_as_executed_is_symplectic(flow):
@@ -319,6 +325,9 @@ def test_another_system_is_refused(tmp_path):
         {"first": "jump"},
         {"palindromic": 1},
         {"force_gradient": None},
+        {"curvature": 1},
+        {"curvature": True},
+        {"curvature": True, "force_gradient": False},
         {"degree": 3},
     ],
 )
@@ -386,6 +395,12 @@ def test_systems_it_does_not_apply_to():
         SympFlow.primed(HamiltonianSystem.from_sympy("p**2*q**2/2 + q**2"))
     with pytest.raises(ValueError, match=r"^`force_gradient` needs"):
         SympFlow.primed(RELATIVISTIC, force_gradient=True)
+    without_symbols = HamiltonianSystem(potential=lambda q: (q**4).sum(-1), ndof=1)
+    for system, options in ((RELATIVISTIC, {}), (HH, {"force_gradient": False}), (without_symbols, {})):
+        with pytest.raises(ValueError, match=r"^`curvature` goes with force gradients of a symbolic system"):
+            SympFlow.primed(system, curvature=True, **options)
+    with pytest.raises(ValueError, match=r"^`system` .* has no curvature terms"):
+        without_symbols.curvature(np.ones(1))
     with pytest.raises(ValueError, match=r"^`scheme` 'srkn6b'|^`scheme` 'srkn11b' needs"):
         SympFlow.primed(RELATIVISTIC, scheme="srkn11b")
 
@@ -425,3 +440,17 @@ def test_flows_travel_to_other_processes():
     flow = random_flow(HH, stages=2, processor=2, dt=0.5)
     copied, x = pickle.loads(pickle.dumps(flow)), states(HH)
     assert torch.equal(copied(0.3, x), flow(0.3, x))
+
+
+@pytest.mark.parametrize("rows", [(), (3,)])
+def test_compensated_sums_with_curvature(rows):
+    """The same run but for rounding, and less of that: n steps and their inverses lead nearer to where it began."""
+    flow, y0 = "pendulum-primed-3-0.6", np.broadcast_to([1.1, 0.3], (*rows, 2))
+    misses = []
+    for compensated in (False, True):
+        method = get("sympflow")(flow=flow, compensated=compensated)
+        there = solve(PENDULUM, method, (0.0, 6000.0), y0, save_every=10000)
+        assert (there.stats["backend"], there.stats["curvature_evaluations"] > 30_000) == ("compiled", True)
+        back = solve(PENDULUM, method, (6000.0, 0.0), there.y[..., -1], save_every=10000)
+        misses.append(np.abs(back.y[..., -1] - y0).max())
+    assert 0 < misses[1] < misses[0] < 1e-9

@@ -108,6 +108,8 @@ class PrimedFlow(SympFlow):
             raise ValueError(
                 f"`degree` must be at least 2 with a processor, whose lowest power of t is t²; got {degree}."
             )
+        if curvature and not force_gradient:
+            raise ValueError("`curvature` goes with force gradients: leave it out.")
         self.degree, self.palindromic, self.processor = degree, palindromic, processor
         stride = 2 if palindromic else 1
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}

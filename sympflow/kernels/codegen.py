@@ -10,7 +10,7 @@ from sympy.printing.pycode import PythonCodePrinter
 
 from sympflow.symbolic import SymbolicHamiltonian, printable
 
-__all__ = ["algebra_source", "gradient_kick_source", "printed", "tuple_algebra"]
+__all__ = ["algebra_source", "curvature_kick_source", "gradient_kick_source", "printed", "tuple_algebra"]
 
 _MAX_POWER = 16  # integer powers up to this are written as products
 
@@ -136,6 +136,22 @@ def gradient_kick_source(symbols: SymbolicHamiltonian) -> str:
     results = [f"({', '.join(change)},)" for change in (own, other)]
     coupled = f"COUPLED = {any(term != '0.0' for term in other)}"
     return f"{coupled}\n\n\n" + _function("gradient_kick", "q, b, g, work", q, [*slope, *entries], results) + "\n"
+
+
+def curvature_kick_source(symbols: SymbolicHamiltonian) -> str:
+    """−b∇V + g ∇²V v − c ∇(½ v·∇²V v), v = M⁻¹∇V.
+
+    Raises
+    ------
+    ValueError
+        As `algebra_source`.
+    """
+    q, d, M = symbols.q, symbols.ndof, symbols.inverse_mass
+    slope = sp.Matrix([sp.diff(symbols.V, s) for s in q])
+    products = sp.hessian(symbols.V, q) * M * slope
+    bent = [sp.diff(symbols.W, s) for s in q]
+    results = [f"((g*{{{d + i}}} - b*{{{i}}}) - c*{{{2 * d + i}}})" for i in range(d)]
+    return _function("curvature_kick", "q, b, g, c, work", q, [*slope, *products, *bent], results) + "\n"
 
 
 def _function(

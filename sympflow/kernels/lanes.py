@@ -38,11 +38,12 @@ def gradient_lane(q, p, q_error, p_error, b, g, a):
 
 
 @njit(**OPTIONS, forceinline=True)
-def curvature_lane(q, p, b, g, c, a):
+def curvature_lane(q, p, q_error, p_error, b, g, c, a):
     if CURVATURES and SCHEDULED:
         p = curvature_kicked_lane(q, p, b, g, c)
-    q, _ = move(q, None, drift(p, a, None))
-    return q, p
+        q, q_error = move(q, q_error, drift(p, a, None))
+        return q, p, q_error, p_error
+    return curvature_stage(q, p, q_error, p_error, b, g, c, a, 0, None)
 
 
 @njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
@@ -51,7 +52,12 @@ def stage_lanes(Y, error, width, b, g, c, a):
     if CURVATURES and c != 0.0:
         for lane in range(width):
             q, p = unpack_lane(Y, lane)
-            q, p = curvature_lane(q, p, b, g, c, a)
+            if COMPENSATED:
+                q_error, p_error = unpack_lane(error, lane)
+                q, p, q_error, p_error = curvature_lane(q, p, q_error, p_error, b, g, c, a)
+                pack_lane(q_error, p_error, error, lane)
+            else:
+                q, p, _, _ = curvature_lane(q, p, None, None, b, g, c, a)
             pack_lane(q, p, Y, lane)
     elif FORCE_GRADIENTS and g != 0.0:
         for lane in range(width):
@@ -184,7 +190,7 @@ def step_lanes(kicks, drifts, gradients, curvatures, x, h, y, out):
                 fill_lanes(Y, width, C, curvatures[j], H5)
                 for lane in range(width):
                     q, p = unpack_lane(Y, lane)
-                    q, p = curvature_lane(q, p, Y[B, lane], Y[G, lane], Y[C, lane], Y[A, lane])
+                    q, p, _, _ = curvature_lane(q, p, None, None, Y[B, lane], Y[G, lane], Y[C, lane], Y[A, lane])
                     pack_lane(q, p, Y, lane)
             elif FORCE_GRADIENTS and np.any(gradients[j] != 0.0):
                 fill_lanes(Y, width, G, gradients[j], H3)

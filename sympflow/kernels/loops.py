@@ -2,10 +2,10 @@
 
 The algebra that comes before says what a state is: q and p are tuples held in registers (a symbolic system) or
 arrays changed in place (Numba functions). It defines ``unpack``, ``pack``, ``copy``, ``is_finite``, ``move``,
-``no_error``, ``kick``, ``gradient_kick``, ``drift`` and ``workspace``. A ``gradient_kick`` has two parts, which are
-added one after the other, the second only where `COUPLED`. Where `SCHEDULED`, ``kicked``, ``gradient_kicked`` and
-``curvature_kicked`` give the new p at once, in an order of operations that is fast, and stand for these;
-``fill_coefficients`` prepares them. Curvature terms there are only so.
+``no_error``, ``kick``, ``gradient_kick``, ``drift``, ``workspace``, and for a symbolic system ``curvature_kick``. A
+``gradient_kick`` has two parts, which are added one after the other, the second only where `COUPLED`. Where
+`SCHEDULED`, ``kicked``, ``gradient_kicked`` and ``curvature_kicked`` give the new p at once, in an order of operations
+that is fast, and stand for these; ``fill_coefficients`` prepares them.
 
 A run executes the table [opening, inner …, link, closing] of stages (kick, then drift). A step is the link (the
 first step, the opening) and the inner stages; consecutive steps share their common kick or drift in the link, and
@@ -37,7 +37,7 @@ def prepared(kicks, gradients, curvatures):
 def stage(q, p, q_error, p_error, b, g, c, a, j, work):
     """Kick by b (and g and c), then drift by a."""
     if CURVATURES and c != 0.0:
-        return curvature_stage(q, p, q_error, p_error, a, j, work)
+        return curvature_stage(q, p, q_error, p_error, b, g, c, a, j, work)
     if FORCE_GRADIENTS and g != 0.0:
         return gradient_stage(q, p, q_error, p_error, b, g, a, j, work)
     return plain_stage(q, p, q_error, p_error, b, a, j, work)
@@ -67,9 +67,11 @@ def gradient_stage(q, p, q_error, p_error, b, g, a, j, work):
 
 
 @njit(**OPTIONS, forceinline=True)
-def curvature_stage(q, p, q_error, p_error, a, j, work):
+def curvature_stage(q, p, q_error, p_error, b, g, c, a, j, work):
     if CURVATURES and SCHEDULED:
         p = curvature_kicked(q, p, work, j)
+    elif CURVATURES:
+        p, p_error = move(p, p_error, curvature_kick(q, b, g, c, work))
     q, q_error = move(q, q_error, drift(p, a, work))
     return q, p, q_error, p_error
 

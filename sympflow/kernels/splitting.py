@@ -79,11 +79,8 @@ class SplittingKernel:
                     "`scheme` has force gradients, which need a kinetic energy quadratic in p and, for a system of "
                     "Numba functions, `hessian_vector`: take a scheme without them, for instance 'kahan_li8'."
                 )
-            if level == CURVATURE and (compensated or not self._has_curvature):
-                raise ValueError(
-                    "`scheme` has curvature terms, which are compiled for symbolic systems, without `compensated` "
-                    "sums: leave that out, or use backend='array'."
-                )
+            if level == CURVATURE and not self._has_curvature:
+                raise ValueError("`scheme` has curvature terms, which need a symbolic system: take one without them.")
             self._variants[variant] = self._compile(*variant)
         return self._variants[variant]
 
@@ -246,11 +243,13 @@ def _header(level: int, compensated: bool, cache: bool, scheduled: bool) -> str:
 
 
 def _symbolic_loops(symbols: SymbolicHamiltonian, algebra: str, level: int, compensated: bool) -> _Loops:
-    from sympflow.kernels.codegen import gradient_kick_source
+    from sympflow.kernels.codegen import curvature_kick_source, gradient_kick_source
     from sympflow.kernels.kicks import kicks_source
 
     if not compensated:
         algebra = f"{algebra}\n\n{kicks_source(symbols, level)}"
+    elif level == CURVATURE:
+        algebra = f"{algebra}\n\n{gradient_kick_source(symbols)}\n\n{curvature_kick_source(symbols)}"
     elif level:
         algebra = f"{algebra}\n\n{gradient_kick_source(symbols)}"
     header = _header(level, compensated, cache=True, scheduled=not compensated)
