@@ -129,6 +129,7 @@ ABLATION = (
     Variant("a small processor", processor=3),
     Variant("a large processor", processor=9),
     Variant("not palindromic", flow=(("palindromic", False),)),
+    Variant("with curvature terms", flow=(("curvature", True),)),
     Variant("no force gradients", flow=(("force_gradient", False),)),
     Variant("no force gradients, twice the kicks", stages=6, flow=(("force_gradient", False),)),
     Variant("labels + matching", training=(("loss", "labels+matching"), ("restarts", 4), ("steps", 30))),

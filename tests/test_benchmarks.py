@@ -324,6 +324,13 @@ def test_the_race_of_planets_on_a_pendulum(monkeypatch):
             assert float(step.split()[0]) <= float(name.split()[3])
 
 
+def test_curvature_terms_come_nearer_at_the_same_step():
+    options = {"restarts": 1, "steps": 20, "points": 40, "reference_states": 10}
+    table = primed_ideas.curvature(20.0, ("pendulum",), **options)
+    without, with_it = (float(row.split("|")[4].split("/")[0]) for row in table.splitlines()[2:])
+    assert with_it < without / 3
+
+
 def test_a_network_on_top_of_a_primed_flow_starts_as_nothing_and_trains():
     system = henon_heiles()
     well = SympFlow.primed(system, 2, dt=0.5, processor=2).requires_grad_(False)
