@@ -36,7 +36,8 @@ from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
 from sympflow.flow.io import shipped
-from sympflow.integrators.linear_splitting import LinearSplitting, kernel_of, known_maps
+from sympflow.integrators.exact_maps import kernel_of, known_maps
+from sympflow.integrators.linear_splitting import LinearSplitting
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.kernels.parts import PartsKernel
 from sympflow.systems.fput import oscillatory_energies

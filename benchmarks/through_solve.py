@@ -32,7 +32,8 @@ import numpy as np
 
 from sympflow import HamiltonianSystem, Solution, solve, systems
 from sympflow.flow.io import shipped
-from sympflow.integrators.linear_splitting import LinearSplitting, kernel_of, known_maps
+from sympflow.integrators.exact_maps import kernel_of, known_maps
+from sympflow.integrators.linear_splitting import LinearSplitting
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.kernels.parts import PartsKernel
 from sympflow.kernels.splitting import splitting_kernel

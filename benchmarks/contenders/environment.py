@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import sys
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,12 @@ VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMB
 
 
 def pin_to_one_thread() -> None:
-    """Keep the process, and every thread that a library starts, on one core. Before the libraries are imported."""
+    """Keep the process, and every thread that a library starts, on one core. Before the libraries are imported.
+
+    Only where a command of this folder runs: tests that import one keep the cores that they have.
+    """
+    if Path(sys.argv[0]).resolve().parent != Path(__file__).resolve().parents[1]:
+        return
     for variable in VARIABLES:
         os.environ[variable] = "1"
     os.environ["JAX_PLATFORMS"] = "cpu"

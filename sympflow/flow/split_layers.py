@@ -78,7 +78,7 @@ class KeptMaps:
 
     def evaluations(self, *run: Any) -> dict[str, int]:
         """As `FixedStep.evaluations`."""
-        from sympflow.integrators.linear_splitting import map_evaluations
+        from sympflow.integrators.exact_maps import map_evaluations
 
         if run not in self._counts:
             if len(self._counts) >= MOST_KEPT:

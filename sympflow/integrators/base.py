@@ -24,8 +24,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
+from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.integrators.array_rollout import checked_state, rollout
 from sympflow.integrators.grid import EPS, Grid
+from sympflow.integrators.grid_failures import report_failures
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
@@ -189,7 +191,7 @@ class FixedStep(Integrator):
         y = saved if place is None else saved[place]
         extra = remainder.nonzero()[0]
         if extra.size:
-            y = self._shorter_steps(system, y, extra, remainder[extra], backend)
+            y = self.shorter_steps(system, y, extra, remainder[extra], backend)
         n_steps = min(last, int(finite.max() if finite.ndim else finite) + 1)
         end = len(save) if n_steps == last else int(save.searchsorted(n_steps, "right"))
         n_saved = end - int(save.searchsorted(0, "right") if end and save[0] <= 0 else 0)
@@ -202,9 +204,11 @@ class FixedStep(Integrator):
         }
         outcome = Outcome(t, y, 0, FINISHED, stats)
         if problem.dense_output:
+            from sympflow.integrators.grid_solution import GridSolution
+
             outcome.sol = GridSolution(self, system, grid, saved, backend)
         outcome.finite = backend == "compiled" and self.saves_finite and not extra.size
-        _report_failures(outcome, grid, finite, last, self.breakdown)
+        report_failures(outcome, grid, finite, last, self.breakdown)
         return outcome
 
     def _placed(self, problem: Problem, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
@@ -228,7 +232,7 @@ class FixedStep(Integrator):
         """`step` on the backend of the run that it belongs to."""
         return self.step(system, 0.0, y, h)
 
-    def _shorter_steps(
+    def shorter_steps(
         self, system: HamiltonianSystem, y: Array, extra: np.ndarray, h: np.ndarray, backend: str
     ) -> Array:
         """Replace the states y[extra] by those a step h later."""
@@ -285,133 +289,6 @@ def check_flag(name: str, value: Any) -> None:
         raise TypeError(f"`{name}` must be True or False; got {value!r}.")
 
 
-class GridSolution:
-    """Dense output of a fixed-step method: a shorter step from the last grid point before t.
-
-    Call it with a time or an array of times (n,); the result has shape (..., 2d) or (..., 2d, n).
-    """
-
-    def __init__(
-        self, integrator: FixedStep, system: HamiltonianSystem, grid: Grid, states: Array, backend: str
-    ) -> None:
-        self.integrator, self.system, self.grid = integrator, system, grid
-        self.states, self.backend = states, backend
-        self.t_min, self.t_max = sorted((grid.t0, grid.t1))
-
-    def __call__(self, t: float | np.ndarray) -> Array:
-        times = np.atleast_1d(np.asarray(t, dtype=float))
-        count, remainder = self.grid.locate(times)
-        y = self.states[count]
-        extra = np.flatnonzero(remainder)
-        if extra.size:
-            y = self.integrator._shorter_steps(self.system, y, extra, remainder[extra], self.backend)
-        y = y.movedim(0, -1) if is_tensor(y) else np.moveaxis(y, 0, -1)
-        return y[..., 0] if np.ndim(t) == 0 else y
-
-
-def rollout(
-    step: Callable[[int, Array], Array], y: Array, n_steps: int, save: np.ndarray, block: int = 64
-) -> tuple[Array, np.ndarray]:
-    """Apply `step(k, y)` n_steps times; the states at the counts `save`, and the last finite count of each trajectory.
-
-    Finiteness is tested once a block; a block that ends non-finite is run again to find where. The run stops when no
-    trajectory is finite any more; later states are NaN.
-    """
-    tensor = is_tensor(y)
-    out: Any = [] if tensor else np.full((len(save), *y.shape), np.nan, dtype=y.dtype)
-    wanted = save.tolist()
-    position = 0
-    finite = np.where(to_numpy(all_finite(y)), n_steps, -1)
-    if wanted and wanted[0] == 0:
-        out.append(y) if tensor else out.__setitem__(0, y)
-        position = 1
-    k = 0
-    with np.errstate(all="ignore"):
-        while k < n_steps and (finite == n_steps).any():
-            start, y_start = k, y
-            for k in range(start, min(start + block, n_steps)):
-                y = checked_state(step(k, y), y)
-                if position < len(wanted) and wanted[position] == k + 1:
-                    if tensor:
-                        out.append(y)
-                    else:
-                        out[position] = y
-                    position += 1
-            k += 1
-            failed = (finite == n_steps) & ~to_numpy(all_finite(y))
-            if failed.any():
-                z = y_start
-                for j in range(start, k):
-                    z = step(j, z)
-                    first = failed & (finite == n_steps) & ~to_numpy(all_finite(z))
-                    finite = np.where(first, j, finite)
-    if tensor:
-        out += [full_of_nan(y)] * (len(wanted) - len(out))
-        out = stack(out, axis=0) if out else y[None][:0]
-    return out, np.asarray(finite)
-
-
-def checked_state(y_next: Any, y: Array) -> Array:
-    """The result of a step from y, of the same kind, shape and dtype: a step may be that of a plug-in."""
-    shape = getattr(y_next, "shape", None)
-    if shape == y.shape and y_next.dtype == y.dtype and is_tensor(y_next) == is_tensor(y):
-        return y_next
-    what = "" if shape is None else f" of {y_next.dtype} and shape {tuple(shape)}"
-    raise TypeError(
-        f"`step` must return states as those that it is given, of {y.dtype} and shape {tuple(y.shape)}; got "
-        f"{type(y_next).__name__}{what}. Mend the integrator: check_integrator tests it."
-    )
-
-
-def _all_finite(y: Array, backend: str) -> bool:
-    """Whether an array is known to be finite all over, by the means of a run of that backend."""
-    if is_tensor(y):
-        return False
-    if backend != "compiled" or y.dtype != np.float64 or not (y.flags.c_contiguous or y.flags.f_contiguous):
-        return bool(np.isfinite(y).all())
-    from sympflow.kernels.outputs import all_finite
-
-    return all_finite(y)
-
-
 @cache
 def _field_names(cls: type) -> tuple[str, ...]:
     return tuple(f.name for f in fields(cls))
-
-
-def _report_failures(outcome: Outcome, grid: Grid, finite: np.ndarray, n_run: int, breakdown: tuple[str, str]) -> None:
-    """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there.
-
-    `stats["failed_at"]` is the time of the last finite state on the grid, in a batch an array with NaN for those that
-    reached their end.
-    """
-    what, remedy = breakdown
-    done = bool((finite >= n_run).all()) if finite.ndim else int(finite) >= n_run
-    outcome.finite = done and (outcome.finite or _all_finite(outcome.y, outcome.stats["backend"]))
-    if outcome.finite:
-        if finite.ndim:
-            outcome.status = np.zeros(finite.shape, dtype=int)
-        return
-    ok = to_numpy(all_finite(outcome.y))  # (n, ...): shorter steps may overflow too
-    if finite.ndim:
-        outcome.status = np.where((finite < n_run) | ~ok.all(0), -1, 0)
-        failed = np.argwhere(outcome.status)
-        if failed.size:
-            i = tuple(failed[0].tolist())
-            times = grid.t0 + np.minimum(finite, grid.n_steps) * grid.h
-            outcome.stats["failed_at"] = np.where(outcome.status < 0, times, np.nan)
-            outcome.message = (
-                f"{len(failed)} of {finite.size} trajectories failed, the first of them (index "
-                f"{', '.join(map(str, i))}) after t = {grid.time(int(finite[i])):.17g}. {what}. {remedy}."
-            )
-        return
-    if finite < n_run or not ok.all():
-        last = int(finite) if finite < n_run else int(grid.locate(outcome.t[~ok][:1])[0][0])
-        outcome.status = -1
-        outcome.stats["failed_at"] = grid.time(last)
-        outcome.message = (
-            f"{what} after t = {grid.time(last):.17g} (step {last + 1} of {grid.n_steps}). "
-            f"{remedy}, or end `t_span` earlier."
-        )
-        keep = int(np.argmin(ok)) if not ok.all() else len(ok)
-        outcome.t, outcome.y = outcome.t[:keep], outcome.y[:keep]

@@ -8,8 +8,9 @@ import numpy as np
 
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
 from sympflow.events import ENDED, EventSearch
-from sympflow.integrators.base import FINISHED, FixedStep, GridSolution, Outcome, Problem
+from sympflow.integrators.base import FINISHED, FixedStep, Outcome, Problem
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.grid_solution import GridSolution
 from sympflow.system import HamiltonianSystem
 
 FIRST_CHUNK, LAST_CHUNK = 8, 1024
@@ -44,7 +45,7 @@ def run_with_events(integrator: FixedStep, problem: Problem, search: EventSearch
         chosen = slice(delivered, due)
         y_due, extra = states[count[chosen] - k], np.flatnonzero(remainder[chosen])
         if extra.size:
-            y_due = integrator._shorter_steps(system, y_due, extra, remainder[chosen][extra], backend)
+            y_due = integrator.shorter_steps(system, y_due, extra, remainder[chosen][extra], backend)
         outputs.append(y_due)
         delivered = due
         if problem.dense_output:

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 
 from sympflow.arrays import Array, is_tensor
-from sympflow.integrators.base import FixedStep, Outcome, Problem, check_flag, rollout
+from sympflow.integrators.array_rollout import rollout
+from sympflow.integrators.base import FixedStep, Outcome, Problem, check_flag
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.integrators.linear_splitting import kernel_of
+from sympflow.integrators.exact_maps import kernel_of
 from sympflow.kernels.parts import PartsKernel
 from sympflow.parts import Map
 

@@ -15,7 +15,7 @@ import torch
 from sympflow.domain import Domain
 from sympflow.flow.columns import Column
 from sympflow.flow.split import SplitFlow
-from sympflow.integrators.linear_splitting import kernel_of
+from sympflow.integrators.exact_maps import kernel_of
 from sympflow.kernels.parts import PartsKernel
 from sympflow.parts import Map
 from sympflow.system import HamiltonianSystem
