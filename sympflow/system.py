@@ -259,21 +259,43 @@ class HamiltonianSystem:
         Raises
         ------
         ValueError
-            If the system has no symbols, or T is not ½ pᵀM⁻¹p.
+            If T is not ½ pᵀM⁻¹p.
         """
-        return self._with_curvature().curvature(q)
+        symbols = self._with_acceleration().symbols
+        if symbols is not None:
+            return symbols.curvature(q)
+        v = self.velocity(self.force(q))
+        return (v * self.hessian_vector(q, v)).sum(-1) / 2
 
     def curvature_gradient(self, q: Array) -> Array:
-        """The gradient of `curvature`, ∇²V M⁻¹∇²V v + ½ ∇³V(v, v): (..., d) to (..., d)."""
-        return self._with_curvature().curvature_gradient(q)
+        """The gradient of `curvature`, ∇²V M⁻¹∇²V v + ½ ∇³V(v, v): (..., d) to (..., d).
 
-    def _with_curvature(self) -> SymbolicHamiltonian:
-        if self.symbols is None or not self._separable().quadratic_kinetic:
+        Without symbols the third derivative is that of ∇²V v along v: of tensors by automatic differentiation, of
+        arrays and of Numba functions by a central difference.
+        """
+        symbols = self._with_acceleration().symbols
+        if symbols is not None:
+            return symbols.curvature_gradient(q)
+        v = -self.velocity(self.force(q))
+        return self.hessian_vector(q, self.velocity(self.hessian_vector(q, v))) + self._third_derivative(q, v) / 2
+
+    def _third_derivative(self, q: Array, v: Array) -> Array:
+        """∇³V(q)(v, v), for a system without symbols."""
+        if is_tensor(q) and self.numba_functions is None:
+            from sympflow.forward_mode import jvp
+
+            return jvp(lambda x: self.hessian_vector(x, v), q, v)[1]
+        size, length = (abs(x).amax(-1, True) if is_tensor(x) else abs(x).max(-1, keepdims=True) for x in (q, v))
+        h = 6e-6 * (size + (size == 0)) / (length + (length == 0))  # ε^⅓
+        return (self.hessian_vector(q + h * v, v) - self.hessian_vector(q - h * v, v)) / (2 * h)
+
+    def _with_acceleration(self) -> HamiltonianSystem:
+        if not self._separable().quadratic_kinetic:
             raise ValueError(
-                f"`system` {self.name!r} has no curvature terms, which take third derivatives of V and a kinetic "
-                "energy ½ pᵀM⁻¹p: define it with HamiltonianSystem.from_sympy, or leave them out."
+                f"`system` {self.name!r} has no curvature terms, which are for a kinetic energy ½ pᵀM⁻¹p: leave them "
+                "out."
             )
-        return self.symbols
+        return self
 
     def kinetic(self, p: Array) -> Array:
         """T(p): (..., d) to (...)."""

@@ -400,7 +400,7 @@ def test_systems_it_does_not_apply_to():
         with pytest.raises(ValueError, match=r"^`curvature` goes with force gradients of a symbolic system"):
             SympFlow.primed(system, curvature=True, **options)
     with pytest.raises(ValueError, match=r"^`system` .* has no curvature terms"):
-        without_symbols.curvature(np.ones(1))
+        RELATIVISTIC.curvature(np.ones(1))
     with pytest.raises(ValueError, match=r"^`scheme` 'srkn6b'|^`scheme` 'srkn11b' needs"):
         SympFlow.primed(RELATIVISTIC, scheme="srkn11b")
 

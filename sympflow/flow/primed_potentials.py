@@ -110,10 +110,12 @@ def _gradient_columns(U: Term, system: HamiltonianSystem, x: Tensor) -> Tensor:
 def _gradient_and_change(U: Term, system: HamiltonianSystem, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
     """∇U on columns (d, N), and its derivative along dx.
 
-    Numba functions end at ∇²V·v: the third derivative of V in a force gradient is then a central difference of it.
+    Numba functions end at ∇²V·v, and so do functions of a user in a curvature term: what lacks is a central difference.
     """
     gradient = partial(_gradient_columns, U, system)
-    if U is not FORCE_GRADIENT or system.numba_functions is None:
+    if U not in (FORCE_GRADIENT, CURVATURE) or system.symbols is not None:
+        return jvp(gradient, x, dx)
+    if U is FORCE_GRADIENT and system.numba_functions is None:
         return jvp(gradient, x, dx)
     size, length = (v.abs().amax(0) for v in (x, dx))
     h = torch.finfo(x.dtype).eps ** (1 / 3) * torch.where(size > 0, size, 1.0) / torch.where(length > 0, length, 1.0)

@@ -148,7 +148,7 @@ def _for_arrays(function: Callable[[Tensor], Tensor]) -> Callable[[Any], Any]:
         if isinstance(x, Tensor):
             return function(x)
         with torch.no_grad():
-            return function(torch.from_numpy(np.ascontiguousarray(x))).numpy()
+            return function(torch.from_numpy(np.array(x))).numpy()  # a copy: what is read only makes no tensor
 
     return either
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.integrators.schemes import Scheme
+from sympflow.integrators.schemes import CURVATURE, Scheme
 from sympflow.kernels.splitting import splitting_kernel
 from sympflow.system import HamiltonianSystem
 
@@ -36,6 +36,11 @@ class PrimedFlowKernel:
         tables = flow.tables
         if not tables.compilable:
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
+        if flow.tables.level == CURVATURE and system.symbols is None:
+            raise ValueError(
+                f"`system` {system.name!r} has no symbols, from which curvature terms are compiled: use "
+                "backend='array'."
+            )
         self._tables, self._splitting, self._compensated = tables, splitting_kernel(system), compensated
         self.evaluations = tables.evaluations
         self.saves_finite = not tables.processed  # what a processor makes of finite states may not be
