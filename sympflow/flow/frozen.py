@@ -11,7 +11,7 @@ import torch
 
 from sympflow.flow.coefficients import Coefficients, Entry
 from sympflow.flow.contents import Contents
-from sympflow.integrators.schemes import CURVATURE, Scheme
+from sympflow.integrators.scheme import CURVATURE, Scheme
 from sympflow.integrators.splitting import scheme_evaluations
 
 Kind = Literal["kick", "drift"]

@@ -4,7 +4,7 @@
     drift   V_m(t, p) = t a(τ) T(p)                                                         τ = t/Δt
 
 Frozen at any t such a flow is a splitting scheme, kicks b, force gradients γ, curvatures c and drifts a in the
-convention of `sympflow.integrators.schemes`: a SympFlow of this kind is a table of numbers that varies smoothly with t.
+convention of `sympflow.integrators.scheme`: a SympFlow of this kind is a table of numbers that varies smoothly with t.
 
 With a processor it is ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹, the kernel K and the processor χ being such tables: over many steps
 of Δt only K is executed, as the χ between two steps cancel.
@@ -35,7 +35,8 @@ from sympflow.flow.primed_potentials import (
     Term,
 )
 from sympflow.flow.sympflow import SympFlow
-from sympflow.integrators.schemes import SCHEMES, Scheme, compose
+from sympflow.integrators.scheme import Scheme
+from sympflow.integrators.schemes import SCHEMES, compose
 
 if TYPE_CHECKING:
     from sympflow.flow.potentials import Time

@@ -16,7 +16,7 @@ from sympflow.flow.scaling import Scaling
 if TYPE_CHECKING:
     from sympflow.flow.primed import PrimedFlow
     from sympflow.flow.split import SplitFlow
-    from sympflow.integrators.schemes import Scheme
+    from sympflow.integrators.scheme import Scheme
     from sympflow.system import HamiltonianSystem
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from sympflow.arrays import is_tensor
 from sympflow.decomposition import exact_parts, linear_and_rest
 from sympflow.integrators.exact_maps import MapsStepper
-from sympflow.integrators.schemes import SCHEMES, Scheme
+from sympflow.integrators.scheme import Scheme
+from sympflow.integrators.schemes import SCHEMES
 from sympflow.parts import LINEAR, ExactParts, Map, like
 from sympflow.system import HamiltonianSystem
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.integrators.schemes import CURVATURE, Scheme
+from sympflow.integrators.scheme import CURVATURE, Scheme
 from sympflow.kernels.splitting import splitting_kernel
 from sympflow.system import HamiltonianSystem
 

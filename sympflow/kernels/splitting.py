@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.integrators.schemes import CURVATURE, FORCE_GRADIENT, Scheme
+from sympflow.integrators.scheme import CURVATURE, FORCE_GRADIENT, Scheme
 from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
 from sympflow.system import HamiltonianSystem
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sympflow.integrators.schemes import CURVATURE, FORCE_GRADIENT
+from sympflow.integrators.scheme import CURVATURE, FORCE_GRADIENT
 from sympflow.system import HamiltonianSystem
 
 ALONG = 1e-4  # length of the difference, relative to q, that gives the third derivative of V along M⁻¹∇V
