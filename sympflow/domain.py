@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, to_numpy
+from sympflow.domain_arguments import check_number, checked_states, sample_count, vector
 
 if TYPE_CHECKING:
     from sympflow.tube import Tube
-
-
-_MOST_SAMPLES = 100_000_000
 
 
 @runtime_checkable
@@ -33,56 +31,6 @@ class Domain(Protocol):
         """A description that `domain_from_dict` turns back into the domain."""
 
 
-def floats(name: str, value: Any) -> np.ndarray:
-    """`value` as an array of floats, if it is one of real numbers."""
-    try:
-        array = np.array(value)
-    except ValueError:  # rows of different lengths
-        array = np.empty(0, dtype=object)
-    if array.dtype.kind not in "fiu":
-        raise TypeError(f"`{name}` must be made of real numbers; got {value!r}.")
-    return array.astype(float)
-
-
-def _number(name: str, value: Any) -> None:
-    if not isinstance(value, int | float | np.number) or isinstance(value, bool) or np.iscomplexobj(value):
-        raise TypeError(f"`{name}` must be a number; got {value!r}.")
-
-
-def _vector(name: str, value: ArrayLike) -> tuple[float, ...]:
-    array = floats(name, value)
-    if array.ndim != 1 or array.size == 0 or array.size % 2:
-        raise ValueError(f"`{name}` must have shape (2d,), one entry for each of [q, p]; got {array.shape}.")
-    if not np.isfinite(array).all():
-        raise ValueError(f"`{name}` must be finite; got {array.tolist()}.")
-    return tuple(array.tolist())
-
-
-def _states(x: ArrayLike, width: int) -> np.ndarray:
-    """`x`, checked to be numbers of shape (..., width)."""
-    try:
-        array = to_numpy(x)
-    except ValueError:  # rows of different lengths
-        array = np.empty(0, dtype=object)
-    if array.dtype.kind not in "fiu":
-        raise TypeError(f"`x` must be states of real numbers; got {x!r}: pass an array of shape (..., {width}).")
-    if array.ndim == 0 or array.shape[-1] != width:
-        raise ValueError(
-            f"`x` must have shape (..., {width}), states [q, p] of the domain; got {array.shape}: "
-            "put them on the last axis."
-        )
-    return array
-
-
-def _sample_count(n: int) -> int:
-    number = isinstance(n, int | float | np.number) and np.isfinite(n)
-    if not number or n < 1 or int(n) != n:
-        raise ValueError(f"`n` must be a positive integer; got {n!r}.")
-    if n > _MOST_SAMPLES:
-        raise ValueError(f"`n` must be at most {_MOST_SAMPLES:.0e}; got {n:.3g}: draw in parts, with several seeds.")
-    return int(n)
-
-
 @dataclass(frozen=True)
 class Ball:
     """The states within Euclidean distance `radius` of `center`.
@@ -97,8 +45,8 @@ class Ball:
     radius: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", _vector("center", self.center))
-        _number("radius", self.radius)
+        object.__setattr__(self, "center", vector("center", self.center))
+        check_number("radius", self.radius)
         if not 0 < self.radius < np.inf:
             raise ValueError(f"`radius` must be positive and finite; got {self.radius!r}.")
 
@@ -109,13 +57,13 @@ class Ball:
     def sample(self, n: int, seed: int = 0) -> np.ndarray:
         rng = np.random.default_rng(seed)
         center = np.asarray(self.center)
-        direction = rng.standard_normal((_sample_count(n), center.size))
+        direction = rng.standard_normal((sample_count(n), center.size))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return center + self.radius * direction * rng.random((n, 1)) ** (1 / center.size)
 
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
         center = np.asarray(self.center)
-        return np.linalg.norm(_states(x, center.size) - center, axis=-1) <= self.radius
+        return np.linalg.norm(checked_states(x, center.size) - center, axis=-1) <= self.radius
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": "Ball", **asdict(self)}
@@ -134,8 +82,8 @@ class Box:
     high: ArrayLike
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "low", _vector("low", self.low))
-        object.__setattr__(self, "high", _vector("high", self.high))
+        object.__setattr__(self, "low", vector("low", self.low))
+        object.__setattr__(self, "high", vector("high", self.high))
         if np.shape(self.low) != np.shape(self.high):
             raise ValueError(f"`high` must have the length of `low`; got {np.size(self.high)} and {np.size(self.low)}.")
         if not np.all(np.less(self.low, self.high)):
@@ -148,7 +96,7 @@ class Box:
     def sample(self, n: int, seed: int = 0) -> np.ndarray:
         rng = np.random.default_rng(seed)
         low, high = np.asarray(self.low), np.asarray(self.high)
-        return rng.uniform(low, high, (_sample_count(n), low.size))
+        return rng.uniform(low, high, (sample_count(n), low.size))
 
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +105,7 @@ class Box:
 
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
         low, high = self.bounds
-        x = _states(x, low.size)
+        x = checked_states(x, low.size)
         return ((x >= low) & (x <= high)).all(-1)
 
     def to_dict(self) -> dict[str, Any]:
@@ -193,13 +141,13 @@ class EnergySublevel:
     angular_momentum: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        _number("energy", self.energy)
+        check_number("energy", self.energy)
         if not np.isfinite(float(self.energy)):
             raise ValueError(f"`energy` must be finite; got {self.energy!r}.")
         if not isinstance(self.box, Box):
             raise TypeError(f"`box` must be a Box; got {type(self.box).__name__}.")
         if self.above is not None:
-            _number("above", self.above)
+            check_number("above", self.above)
         if self.above is not None and not self.above < self.energy:
             raise ValueError(f"`above` must be below `energy`; got {self.above!r} and {self.energy!r}.")
         if self.angular_momentum is None:
@@ -255,7 +203,7 @@ class EnergySublevel:
         return self.box.width
 
     def sample(self, n: int, seed: int = 0) -> np.ndarray:
-        _sample_count(n)
+        sample_count(n)
         rng = np.random.default_rng(seed)
         low, high = np.asarray(self.box.low), np.asarray(self.box.high)
         accepted: list[np.ndarray] = []
@@ -277,7 +225,7 @@ class EnergySublevel:
 
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
         low, high = self.bounds(slack)
-        x = _states(x, low.size)
+        x = checked_states(x, low.size)
         with np.errstate(all="ignore"):
             return ((x >= low) & (x <= high)).all(-1) & self._within(x, slack)
 

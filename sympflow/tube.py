@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array
-from sympflow.domain import _sample_count, _states, floats
+from sympflow.domain_arguments import checked_states, floats, sample_count
 
 _AT_ONCE = 2**20  # numbers in one block of distances
 
@@ -91,7 +91,7 @@ class Tube:
 
     def sample(self, n: int, seed: int = 0) -> np.ndarray:
         rng = np.random.default_rng(seed)
-        x = np.empty((_sample_count(n), np.shape(self.orbit)[1]))
+        x = np.empty((sample_count(n), np.shape(self.orbit)[1]))
         for indices, orbit, radius in self._parts():
             time = rng.random(n) * (len(orbit) - 1)
             k = time.astype(int)
@@ -103,7 +103,7 @@ class Tube:
         return x
 
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
-        x = _states(x, np.shape(self.orbit)[1])
+        x = checked_states(x, np.shape(self.orbit)[1])
         flat = x.reshape(-1, x.shape[-1]).astype(float)
         inside = np.isfinite(flat).all(1)
         for indices, orbit, radius in self._parts():
