@@ -27,7 +27,7 @@ import numpy as np
 
 import sympflow
 from sympflow import HamiltonianSystem, energy_drift, solve, systems
-from sympflow.flow.base import same_system
+from sympflow.fingerprints import same_system
 from sympflow.flow.shipped import ShippedFlow
 
 STEPS, OUTPUTS, BLOCKS = 1_000_000, 1000, 20

@@ -36,7 +36,7 @@ from contenders.primed_race import Measure, Row, Runner, fewest_steps, race, sch
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, time_transformed, train
-from sympflow.flow.base import same_system
+from sympflow.fingerprints import same_system
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.training.recipes import PrimedRecipe

@@ -1,4 +1,4 @@
-"""HamiltonianSystem: H, its structure, its derivatives, and the scene it is usually solved in."""
+"""HamiltonianSystem: H, from symbols or functions, with the scene it is usually solved in."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow import matrices
-from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
+from sympflow.arrays import Array
 from sympflow.domain import Domain, EnergySublevel
+from sympflow.fingerprints import fingerprint
+from sympflow.hamiltonian import Hamiltonian
 
 if TYPE_CHECKING:
     import sympy
 
     from sympflow.linear_part import LinearPart
-    from sympflow.symbolic import SymbolicHamiltonian
 
 MOST_DEGREES = 1_000_000
 
 
-class HamiltonianSystem:
+class HamiltonianSystem(Hamiltonian):
     """A Hamiltonian system x' = J∇H(x), x = [q, p], with H autonomous.
 
     Parameters
@@ -101,17 +102,16 @@ class HamiltonianSystem:
             )
         definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector)
         if definition.separable:
-            self._set(definition, matrices.inverse_mass(mass, int(ndof)), True)
+            super().__init__(name, definition, matrices.inverse_mass(mass, int(ndof)), True)
         elif mass is not None:
             raise TypeError("`mass` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         else:
-            self._set(definition, None, False)
-        if stiffness_matrix is not None and not definition.separable:
-            raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
-        self.stiffness_matrix: np.ndarray | None = (
-            None if stiffness_matrix is None else matrices.stiffness_matrix(stiffness_matrix, definition.ndof)
-        )
-        self._set_scene(name, {}, domain, y0, t_span, dt, energy_scale)
+            super().__init__(name, definition, None, False)
+        if stiffness_matrix is not None:
+            if not definition.separable:
+                raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
+            self.stiffness_matrix = matrices.stiffness_matrix(stiffness_matrix, definition.ndof)
+        self._set_scene({}, domain, y0, t_span, dt, energy_scale)
 
     @classmethod
     def from_sympy(
@@ -149,22 +149,13 @@ class HamiltonianSystem:
         self = cls.__new__(cls)
         M = symbols.inverse_mass
         inverse_mass = None if M is None else matrices.simplest(np.array(M.tolist(), dtype=float))
-        self._set(symbols, inverse_mass, M is not None)
-        self.symbols, self.stiffness_matrix = symbols, None
-        self._set_scene(name, dict(params or {}), domain, y0, t_span, dt, energy_scale)
+        Hamiltonian.__init__(self, name, symbols, inverse_mass, M is not None)
+        self.symbols = symbols
+        self._set_scene(dict(params or {}), domain, y0, t_span, dt, energy_scale)
         return self
-
-    def _set(self, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
-        self._definition = definition
-        self.symbols: SymbolicHamiltonian | None = None
-        self.ndof: int = definition.ndof
-        self.separable: bool = definition.separable
-        self.inverse_mass = inverse_mass
-        self.quadratic_kinetic = quadratic_kinetic
 
     def _set_scene(
         self,
-        name: str,
         params: dict[str, float],
         domain: Domain | None,
         y0: ArrayLike | None,
@@ -172,7 +163,7 @@ class HamiltonianSystem:
         dt: float,
         energy_scale: float | None,
     ) -> None:
-        self.name, self.params = name, params
+        self.params = params
         if not (isinstance(dt, int | float | np.number) and 0 < dt < 1e100):
             raise ValueError(f"`dt` must be positive and finite; got {dt!r}.")
         try:
@@ -192,145 +183,6 @@ class HamiltonianSystem:
         self.domain = domain.attach(self.hamiltonian) if isinstance(domain, EnergySublevel) else domain
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
-
-    # H and its derivatives ------------------------------------------------------------------------
-
-    def hamiltonian(self, y: Array) -> Array:
-        """H(y): (..., 2d) to (...)."""
-        if self.separable:
-            q, p = y[..., : self.ndof], y[..., self.ndof :]
-            return self.kinetic(p) + self.potential(q)
-        return self._definition.hamiltonian(y)
-
-    def gradient(self, y: Array) -> Array:
-        """∇H(y): (..., 2d) to (..., 2d)."""
-        if self.separable:
-            return concatenate([-self.force(y[..., : self.ndof]), self.velocity(y[..., self.ndof :])])
-        return self._definition.gradient(y)
-
-    def hessian(self, y: Array) -> Array:
-        """∇²H(y): (..., 2d) to (..., 2d, 2d)."""
-        if not self.separable:
-            return self._definition.hessian(y)
-        d = self.ndof
-        A, B = self.potential_hessian(y[..., :d]), self.kinetic_hessian(y[..., d:])
-        B = B + 0 * A
-        return concatenate([_rows(A, 0 * A), _rows(0 * B, B)]).swapaxes(-1, -2)
-
-    def vector_field(self, y: Array) -> Array:
-        """J∇H(y) = [∇_pH, −∇_qH]: (..., 2d) to (..., 2d)."""
-        d = self.ndof
-        if self.separable:
-            return concatenate([self.velocity(y[..., d:]), self.force(y[..., :d])])
-        g = self._definition.gradient(y)
-        return concatenate([g[..., d:], -g[..., :d]])
-
-    def __call__(self, t: float, y: Array) -> Array:
-        """The right-hand side fun(t, y) of `scipy.integrate.solve_ivp` and `torchdiffeq.odeint`."""
-        if y.shape[-1:] != (2 * self.ndof,):
-            raise ValueError(
-                f"`y` must have shape (..., {2 * self.ndof}), [q, p] on the last axis; got {tuple(y.shape)}. In "
-                "solve_ivp leave `vectorized` out, which asks for states in columns."
-            )
-        return self.vector_field(y)
-
-    # separable systems: V(q) and T(p) -------------------------------------------------------------
-
-    def potential(self, q: Array) -> Array:
-        """V(q): (..., d) to (...)."""
-        return self._separable()._definition.potential(q)
-
-    def force(self, q: Array) -> Array:
-        """−∇V(q): (..., d) to (..., d)."""
-        return -self._separable()._definition.potential_gradient(q)
-
-    def potential_hessian(self, q: Array) -> Array:
-        """∇²V(q): (..., d) to (..., d, d)."""
-        return self._separable()._definition.potential_hessian(q)
-
-    def hessian_vector(self, q: Array, v: Array) -> Array:
-        """∇²V(q)·v, by the function given for it if there is one: (..., d), (..., d) to (..., d)."""
-        product = getattr(self._separable()._definition, "hessian_vector", None)
-        return (self.potential_hessian(q) @ v[..., None])[..., 0] if product is None else product(q, v)
-
-    def curvature(self, q: Array) -> Array:
-        """½ v·∇²V(q) v, the curvature of V along the acceleration v = M⁻¹∇V(q): (..., d) to (...).
-
-        Raises
-        ------
-        ValueError
-            If T is not ½ pᵀM⁻¹p.
-        """
-        symbols = self._with_acceleration().symbols
-        if symbols is not None:
-            return symbols.curvature(q)
-        v = self.velocity(self.force(q))
-        return (v * self.hessian_vector(q, v)).sum(-1) / 2
-
-    def curvature_gradient(self, q: Array) -> Array:
-        """The gradient of `curvature`, ∇²V M⁻¹∇²V v + ½ ∇³V(v, v): (..., d) to (..., d).
-
-        Without symbols the third derivative is that of ∇²V v along v: of tensors by automatic differentiation, of
-        arrays and of Numba functions by a central difference.
-        """
-        symbols = self._with_acceleration().symbols
-        if symbols is not None:
-            return symbols.curvature_gradient(q)
-        v = -self.velocity(self.force(q))
-        return self.hessian_vector(q, self.velocity(self.hessian_vector(q, v))) + self._third_derivative(q, v) / 2
-
-    def _third_derivative(self, q: Array, v: Array) -> Array:
-        """∇³V(q)(v, v), for a system without symbols."""
-        if is_tensor(q) and self.numba_functions is None:
-            from sympflow.forward_mode import jvp
-
-            return jvp(lambda x: self.hessian_vector(x, v), q, v)[1]
-        size, length = (abs(x).amax(-1, True) if is_tensor(x) else abs(x).max(-1, keepdims=True) for x in (q, v))
-        h = 6e-6 * (size + (size == 0)) / (length + (length == 0))  # ε^⅓
-        return (self.hessian_vector(q + h * v, v) - self.hessian_vector(q - h * v, v)) / (2 * h)
-
-    def _with_acceleration(self) -> HamiltonianSystem:
-        if not self._separable().quadratic_kinetic:
-            raise ValueError(
-                f"`system` {self.name!r} has no curvature terms, which are for a kinetic energy ½ pᵀM⁻¹p: leave them "
-                "out."
-            )
-        return self
-
-    def kinetic(self, p: Array) -> Array:
-        """T(p): (..., d) to (...)."""
-        if self._separable().quadratic_kinetic:
-            return (p * self.velocity(p)).sum(-1) / 2
-        return self._definition.kinetic(p)
-
-    def velocity(self, p: Array) -> Array:
-        """∇T(p): (..., d) to (..., d)."""
-        if not self._separable().quadratic_kinetic:
-            return self._definition.kinetic_gradient(p)
-        if self.inverse_mass is None:
-            return p
-        M = _like(self.inverse_mass, p)
-        return p * M if M.ndim == 1 else p @ M
-
-    def kinetic_hessian(self, p: Array) -> Array:
-        """∇²T(p): (..., d) to (..., d, d); M⁻¹ of shape (d, d) when T is quadratic."""
-        if not self._separable().quadratic_kinetic:
-            return self._definition.kinetic_hessian(p)
-        M = np.ones(self.ndof) if self.inverse_mass is None else self.inverse_mass
-        return _like(np.diag(M) if M.ndim == 1 else M, p)
-
-    def _separable(self) -> HamiltonianSystem:
-        if not self.separable:
-            raise ValueError(
-                f"`system` {self.name!r} is not separable: H does not split into T(p) + V(q), so splitting methods do "
-                "not apply. Use a Runge–Kutta method or train a SympFlow."
-            )
-        return self
-
-    @property
-    def numba_functions(self) -> tuple[Any, Any, Any] | None:
-        """(potential, gradient, hessian_vector) if the system was given by Numba functions, else None."""
-        return getattr(self._definition, "numba_functions", None)
 
     # structure --------------------------------------------------------------------------------------
 
@@ -352,25 +204,9 @@ class HamiltonianSystem:
     @cached_property
     def fingerprint(self) -> tuple[float, ...]:
         """H at 8 fixed states less H at a ninth: what tells a trained flow whether this is its system."""
-        probes = np.random.Generator(np.random.PCG64(20260101)).random((9, 2 * self.ndof)) * 0.9 - 0.35
-        with np.errstate(all="ignore"):
-            H = to_numpy(self.hamiltonian(probes))
-        return tuple((H[1:] - H[0]).tolist())
+        return fingerprint(self)
 
     def __repr__(self) -> str:
         params = ", ".join(f"{k}={v:g}" for k, v in self.params.items())
         kind = "separable" if self.separable else "not separable"
         return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
-
-
-def _rows(left: Array, right: Array) -> Array:
-    return concatenate([left, right]).swapaxes(-1, -2)
-
-
-def _like(constant: np.ndarray, x: Array) -> Array:
-    """A constant array in the library, dtype and device of `x`."""
-    if is_tensor(x):
-        import torch
-
-        return torch.as_tensor(constant, dtype=x.dtype, device=x.device)
-    return constant.astype(x.dtype, copy=False)

@@ -10,6 +10,7 @@ import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor
 from sympflow.domain import Domain
+from sympflow.hamiltonian import Hamiltonian
 from sympflow.system import HamiltonianSystem
 
 LARGEST_SHIFT = 1e30
@@ -74,8 +75,8 @@ def time_transformed(
         transformed = HamiltonianSystem.from_sympy(_expression(system, c), name=f"log_{system.name}", energy_scale=1.0)
     else:
         transformed = HamiltonianSystem.__new__(HamiltonianSystem)
-        transformed._set(_Logarithmic(system, c), None, False)
-        transformed._set_scene(f"log_{system.name}", {}, None, None, (0.0, 100.0), 0.05, 1.0)
+        Hamiltonian.__init__(transformed, f"log_{system.name}", _Logarithmic(system, c), None, False)
+        transformed._set_scene({}, None, None, (0.0, 100.0), 0.05, 1.0)
     transformed.params = {**system.params, "shift": c}
     transformed.domain = domain
     if system.y0 is not None:

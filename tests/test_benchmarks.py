@@ -35,7 +35,7 @@ from contenders.prose import power
 from contenders.scene import Scene
 
 from sympflow import SympFlow, shipped_flows
-from sympflow.flow.base import same_system
+from sympflow.fingerprints import same_system
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.systems import henon_heiles, kepler, pendulum
 

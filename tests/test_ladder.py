@@ -10,8 +10,8 @@ import torch
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, get, load, max_energy_error, shipped_flows, solve, systems
+from sympflow.fingerprints import same_system
 from sympflow.flow import shipped as catalogue
-from sympflow.flow.base import same_system
 from sympflow.flow.shipped import ShippedFlow, choose
 from sympflow.integrators import sympflow as integrator
 from sympflow.solver import domain_of

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.linalg import expm
 
-from sympflow import HamiltonianSystem, SympFlow, solve
+from sympflow import HamiltonianSystem, SympFlow, solve, time_transformed
 from sympflow.decomposition import exact_parts
 from sympflow.linear_part import LinearPart
 from sympflow.parts import ExactParts, Map
@@ -73,6 +73,12 @@ def test_by_hand_it_is_the_same_as_read_off():
 def test_a_bad_stiffness_matrix_is_refused(matrix):
     with pytest.raises(ValueError, match=r"^`stiffness_matrix` must be finite, symmetric"):
         HamiltonianSystem(lambda q: (q**2).sum(-1), ndof=2, stiffness_matrix=matrix)
+
+
+def test_a_logarithmic_hamiltonian_of_functions_has_no_linear_part():
+    system = HamiltonianSystem(lambda q: -1 / (q**2).sum(-1) ** 0.5, ndof=2, y0=[1, 0, 0, 1])
+    with pytest.raises(ValueError, match=r"^`system` .* no linear part can be read"):
+        _ = time_transformed(system).linear_part
 
 
 def coupled(seed):

@@ -7,11 +7,11 @@ import os
 from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from sympflow.domain import Domain
+from sympflow.fingerprints import same_system
 from sympflow.flow.steps import whole_steps, whole_steps_of_each
 
 if TYPE_CHECKING:
@@ -344,14 +344,3 @@ class FlowMap(nn.Module):
     def __repr__(self) -> str:
         system = f" of {self.system_name}" if self.system_name else ""
         return f"<{type(self).__name__}{system}: ndof={self.ndof}, dt={self.dt:g}, {self.n_parameters} parameters>"
-
-
-def same_system(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
-    """Whether two fingerprints agree to nine digits of the largest."""
-    if a == b:
-        return True
-    u, v = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    if u.shape != v.shape:
-        return False
-    finite = u[np.isfinite(u)]
-    return np.allclose(u, v, rtol=0, atol=1e-9 * np.abs(finite).max(initial=0.0), equal_nan=True)

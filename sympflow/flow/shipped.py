@@ -17,6 +17,8 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sympflow.fingerprints import same_system
+
 if TYPE_CHECKING:
     from sympflow.system import HamiltonianSystem
 
@@ -183,8 +185,6 @@ def shipped_flows(system: HamiltonianSystem | None = None, kind: str | None = No
         raise ValueError(f"`kind` {kind!r} is unknown: choose 'sympflow' or 'mlp', or leave it out.")
     found = [f for f in _catalogue() if kind in (None, f.kind)]
     if system is not None:
-        from sympflow.flow.base import same_system
-
         found = [f for f in found if same_system(f.fingerprint, system.fingerprint)]
     return ShippedFlows(sorted(found, key=lambda f: (f.system, math.inf if f.cost is None else f.cost)))
 

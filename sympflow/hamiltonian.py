@@ -1,0 +1,197 @@
+"""Hamiltonian: H, its structure and its derivatives."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sympflow.arrays import Array, concatenate, is_tensor
+
+if TYPE_CHECKING:
+    from sympflow.symbolic import SymbolicHamiltonian
+
+
+class Hamiltonian:
+    """H(q, p), of d degrees of freedom, by a definition of it.
+
+    Parameters
+    ----------
+    name : str
+    definition : SymbolicHamiltonian or CallableHamiltonian, or like these
+        With `ndof` and `separable`; if that is True, with V and T, each with a gradient and a Hessian, T being needed
+        only where it is not quadratic; else with H and these of it.
+    inverse_mass : ndarray of shape (d,) or (d, d), optional
+        M⁻¹; the default is the identity.
+    quadratic_kinetic : bool
+        Whether T = ½ pᵀM⁻¹p.
+
+    Attributes
+    ----------
+    separable : bool
+        Whether H = T(p) + V(q).
+    symbols : SymbolicHamiltonian or None
+        The symbolic definition, if there is one.
+    stiffness_matrix : ndarray of shape (d, d) or None
+        A quadratic part ½ qᵀKq of V that was named, of a definition without symbols.
+    """
+
+    def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
+        self.name = name
+        self._definition = definition
+        self.symbols: SymbolicHamiltonian | None = None
+        self.ndof: int = definition.ndof
+        self.separable: bool = definition.separable
+        self.inverse_mass = inverse_mass
+        self.quadratic_kinetic = quadratic_kinetic
+        self.stiffness_matrix: np.ndarray | None = None
+
+    def hamiltonian(self, y: Array) -> Array:
+        """H(y): (..., 2d) to (...)."""
+        if self.separable:
+            q, p = y[..., : self.ndof], y[..., self.ndof :]
+            return self.kinetic(p) + self.potential(q)
+        return self._definition.hamiltonian(y)
+
+    def gradient(self, y: Array) -> Array:
+        """∇H(y): (..., 2d) to (..., 2d)."""
+        if self.separable:
+            return concatenate([-self.force(y[..., : self.ndof]), self.velocity(y[..., self.ndof :])])
+        return self._definition.gradient(y)
+
+    def hessian(self, y: Array) -> Array:
+        """∇²H(y): (..., 2d) to (..., 2d, 2d)."""
+        if not self.separable:
+            return self._definition.hessian(y)
+        d = self.ndof
+        A, B = self.potential_hessian(y[..., :d]), self.kinetic_hessian(y[..., d:])
+        B = B + 0 * A
+        return concatenate([_rows(A, 0 * A), _rows(0 * B, B)]).swapaxes(-1, -2)
+
+    def vector_field(self, y: Array) -> Array:
+        """J∇H(y) = [∇_pH, −∇_qH]: (..., 2d) to (..., 2d)."""
+        d = self.ndof
+        if self.separable:
+            return concatenate([self.velocity(y[..., d:]), self.force(y[..., :d])])
+        g = self._definition.gradient(y)
+        return concatenate([g[..., d:], -g[..., :d]])
+
+    def __call__(self, t: float, y: Array) -> Array:
+        """The right-hand side fun(t, y) of `scipy.integrate.solve_ivp` and `torchdiffeq.odeint`."""
+        if y.shape[-1:] != (2 * self.ndof,):
+            raise ValueError(
+                f"`y` must have shape (..., {2 * self.ndof}), [q, p] on the last axis; got {tuple(y.shape)}. In "
+                "solve_ivp leave `vectorized` out, which asks for states in columns."
+            )
+        return self.vector_field(y)
+
+    # separable systems: V(q) and T(p) -------------------------------------------------------------
+
+    def potential(self, q: Array) -> Array:
+        """V(q): (..., d) to (...)."""
+        return self._separable()._definition.potential(q)
+
+    def force(self, q: Array) -> Array:
+        """−∇V(q): (..., d) to (..., d)."""
+        return -self._separable()._definition.potential_gradient(q)
+
+    def potential_hessian(self, q: Array) -> Array:
+        """∇²V(q): (..., d) to (..., d, d)."""
+        return self._separable()._definition.potential_hessian(q)
+
+    def hessian_vector(self, q: Array, v: Array) -> Array:
+        """∇²V(q)·v, by the function given for it if there is one: (..., d), (..., d) to (..., d)."""
+        product = getattr(self._separable()._definition, "hessian_vector", None)
+        return (self.potential_hessian(q) @ v[..., None])[..., 0] if product is None else product(q, v)
+
+    def curvature(self, q: Array) -> Array:
+        """½ v·∇²V(q) v, the curvature of V along the acceleration v = M⁻¹∇V(q): (..., d) to (...).
+
+        Raises
+        ------
+        ValueError
+            If T is not ½ pᵀM⁻¹p.
+        """
+        symbols = self._with_acceleration().symbols
+        if symbols is not None:
+            return symbols.curvature(q)
+        v = self.velocity(self.force(q))
+        return (v * self.hessian_vector(q, v)).sum(-1) / 2
+
+    def curvature_gradient(self, q: Array) -> Array:
+        """The gradient of `curvature`, ∇²V M⁻¹∇²V v + ½ ∇³V(v, v): (..., d) to (..., d).
+
+        Without symbols the third derivative is that of ∇²V v along v: of tensors by automatic differentiation, of
+        arrays and of Numba functions by a central difference.
+        """
+        symbols = self._with_acceleration().symbols
+        if symbols is not None:
+            return symbols.curvature_gradient(q)
+        v = -self.velocity(self.force(q))
+        return self.hessian_vector(q, self.velocity(self.hessian_vector(q, v))) + self._third_derivative(q, v) / 2
+
+    def _third_derivative(self, q: Array, v: Array) -> Array:
+        """∇³V(q)(v, v), for a system without symbols."""
+        if is_tensor(q) and self.numba_functions is None:
+            from sympflow.forward_mode import jvp
+
+            return jvp(lambda x: self.hessian_vector(x, v), q, v)[1]
+        size, length = (abs(x).amax(-1, True) if is_tensor(x) else abs(x).max(-1, keepdims=True) for x in (q, v))
+        h = 6e-6 * (size + (size == 0)) / (length + (length == 0))  # ε^⅓
+        return (self.hessian_vector(q + h * v, v) - self.hessian_vector(q - h * v, v)) / (2 * h)
+
+    def _with_acceleration(self) -> Hamiltonian:
+        if not self._separable().quadratic_kinetic:
+            raise ValueError(
+                f"`system` {self.name!r} has no curvature terms, which are for a kinetic energy ½ pᵀM⁻¹p: leave them "
+                "out."
+            )
+        return self
+
+    def kinetic(self, p: Array) -> Array:
+        """T(p): (..., d) to (...)."""
+        if self._separable().quadratic_kinetic:
+            return (p * self.velocity(p)).sum(-1) / 2
+        return self._definition.kinetic(p)
+
+    def velocity(self, p: Array) -> Array:
+        """∇T(p): (..., d) to (..., d)."""
+        if not self._separable().quadratic_kinetic:
+            return self._definition.kinetic_gradient(p)
+        if self.inverse_mass is None:
+            return p
+        M = _like(self.inverse_mass, p)
+        return p * M if M.ndim == 1 else p @ M
+
+    def kinetic_hessian(self, p: Array) -> Array:
+        """∇²T(p): (..., d) to (..., d, d); M⁻¹ of shape (d, d) when T is quadratic."""
+        if not self._separable().quadratic_kinetic:
+            return self._definition.kinetic_hessian(p)
+        M = np.ones(self.ndof) if self.inverse_mass is None else self.inverse_mass
+        return _like(np.diag(M) if M.ndim == 1 else M, p)
+
+    def _separable(self) -> Hamiltonian:
+        if not self.separable:
+            raise ValueError(
+                f"`system` {self.name!r} is not separable: H does not split into T(p) + V(q), so splitting methods do "
+                "not apply. Use a Runge–Kutta method or train a SympFlow."
+            )
+        return self
+
+    @property
+    def numba_functions(self) -> tuple[Any, Any, Any] | None:
+        """(potential, gradient, hessian_vector) if the system was given by Numba functions, else None."""
+        return getattr(self._definition, "numba_functions", None)
+
+
+def _rows(left: Array, right: Array) -> Array:
+    return concatenate([left, right]).swapaxes(-1, -2)
+
+
+def _like(constant: np.ndarray, x: Array) -> Array:
+    """A constant array in the library, dtype and device of `x`."""
+    if is_tensor(x):
+        import torch
+
+        return torch.as_tensor(constant, dtype=x.dtype, device=x.device)
+    return constant.astype(x.dtype, copy=False)
