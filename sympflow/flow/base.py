@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from sympflow.domain import Domain
 from sympflow.fingerprints import same_system
+from sympflow.flow.arguments import bare_time, checked_time
 from sympflow.flow.steps import whole_steps, whole_steps_of_each
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ class FlowMap(nn.Module):
 
     def velocity(self, t: float | Tensor, x: Tensor) -> Tensor:
         """d/dt ψ̄_t(x), (..., 2d), for t ∈ [0, Δt], in closed form."""
-        t = self._bare_time(t, x)
+        t = bare_time(self, t, x)
         return self.psi_and_velocity(t, x)[1]
 
     # every t ------------------------------------------------------------------------------------------
@@ -127,7 +128,7 @@ class FlowMap(nn.Module):
         ValueError, TypeError
             If an argument has the wrong type, shape, dtype or device, or t is not finite.
         """
-        t = self._checked(t, x)
+        t = checked_time(self, t, x)
         if isinstance(t, float):
             return self._whole(whole_steps(abs(t), self.dt), t < 0, x)
         k, r, back, x = self._split(t, x)
@@ -137,7 +138,7 @@ class FlowMap(nn.Module):
 
     def inverse(self, t: float | Tensor, x: Tensor) -> Tensor:
         """The exact inverse of ψ_t, for every t: arguments as for the call."""
-        t = self._checked(t, x)
+        t = checked_time(self, t, x)
         if isinstance(t, float):
             return self._whole(whole_steps(abs(t), self.dt), t >= 0, x, remainder_first=True)
         k, r, back, x = self._split(t, x)
@@ -180,7 +181,7 @@ class FlowMap(nn.Module):
                 x = x.index_put((active,), step(r[active], x[active]))
         return x
 
-    # layout and checks ----------------------------------------------------------------------------------
+    # layout --------------------------------------------------------------------------------------------
 
     def _columns(self, t: float | Tensor, x: Tensor) -> tuple[float | Tensor, Tensor, torch.Size]:
         """States (..., 2d) as columns (2d, N), times to match, and the batch shape."""
@@ -194,57 +195,6 @@ class FlowMap(nn.Module):
     @staticmethod
     def _states(y: Tensor, batch: torch.Size) -> Tensor:
         return y.T.reshape(*batch, y.shape[0])
-
-    def _checked(self, t: Any, x: Any) -> float | Tensor:
-        """`t` as a finite float or tensor; `x` is a state for this flow, or an error."""
-        if not isinstance(x, Tensor):
-            raise TypeError(f"`x` must be a torch tensor, not {type(x).__name__}: use torch.as_tensor(x).")
-        if x.dtype != self.dtype:
-            raise TypeError(f"`x` is {x.dtype} but the flow is {self.dtype}: convert one, as by x.to({self.dtype}).")
-        if x.device != self.device:
-            raise ValueError(f"`x` is on {x.device} but the flow on {self.device}: move one, as by x.to(flow.device).")
-        if x.ndim == 0 or x.shape[-1] != 2 * self.ndof:
-            raise ValueError(
-                f"`x` must have shape (..., {2 * self.ndof}), states [q, p]; got {tuple(x.shape)}: "
-                "put them on the last axis."
-            )
-        if isinstance(t, Tensor) and (t.ndim or t.requires_grad):
-            if t.dtype == torch.bool or t.is_complex():
-                raise TypeError(f"`t` must be real times; got {t.dtype}: use a floating-point tensor.")
-            if t.device != x.device:
-                raise ValueError(f"`t` is on {t.device} but `x` on {x.device}: move one of them.")
-            if not torch.isfinite(t).all():
-                raise ValueError("`t` must be finite: remove its NaN and infinite entries.")
-            try:
-                torch.broadcast_shapes(t.shape, x.shape[:-1])
-            except RuntimeError:
-                raise ValueError(
-                    f"`t` of shape {tuple(t.shape)} does not broadcast against the batch shape "
-                    f"{tuple(x.shape[:-1])} of `x`: add axes, as by t[:, None]."
-                ) from None
-            return t
-        try:
-            value = float(t)
-        except (TypeError, ValueError):
-            raise TypeError(
-                f"`t` must be a number or a tensor of times; got {type(t).__name__}: pass seconds."
-            ) from None
-        if not math.isfinite(value):
-            raise ValueError(f"`t` must be finite; got {value}: pass a finite time.")
-        return value
-
-    def _bare_time(self, t: Any, x: Any) -> float | Tensor:
-        """`t`, checked to lie in [0, Δt]."""
-        t = self._checked(t, x)
-        low, high, slack = 0.0, 0.0, 1e-14
-        if isinstance(t, float):
-            low = high = t
-        elif t.numel():
-            low, high = float(t.detach().min()), float(t.detach().max())
-            slack = 1e-6 if t.dtype == torch.float32 else slack
-        if low < 0 or high > self.dt * (1 + slack):
-            raise ValueError(f"`t` must lie in [0, dt] = [0, {self.dt:g}]; got {low} to {high}: reduce it modulo dt.")
-        return t.to(x.dtype) if isinstance(t, Tensor) else t
 
     # what it is --------------------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.flow.activations import activation as activation_named
+from sympflow.flow.arguments import checked_time
 from sympflow.flow.base import FlowMap
 from sympflow.flow.placement import checked_device, checked_dtype
 from sympflow.flow.potentials import hidden_widths, outer
@@ -93,7 +94,7 @@ class MLPFlow(FlowMap):
 
     def forward(self, t: float | Tensor, x: Tensor) -> Tensor:
         """ψ_t(x) for t ≥ 0, extended beyond Δt as SympFlow is; for t < 0 a ValueError, for want of an inverse."""
-        checked = self._checked(t, x)
+        checked = checked_time(self, t, x)
         negative = checked < 0 if isinstance(checked, float) else bool((checked < 0).any())
         if negative:
             raise ValueError("`t` must not be negative: an MLPFlow has no exact inverse; use a SympFlow to go back.")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from sympflow.flow.arguments import bare_time
 from sympflow.flow.base import FlowMap
 from sympflow.flow.layers import Drift, Kick, Layer
 from sympflow.flow.potentials import MLPPotential
@@ -228,7 +229,7 @@ class SympFlow(FlowMap):
         The sum over the layers of ∂_tV at the point pulled back through the layers after it (the recursion of [1]_,
         section 2.2). It is defined up to a function of t alone.
         """
-        return self.hamiltonian_unchecked(self._bare_time(t, x), x)
+        return self.hamiltonian_unchecked(bare_time(self, t, x), x)
 
     def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor) -> Tensor:
         """`hamiltonian` without checks, for inner loops."""
