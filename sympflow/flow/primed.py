@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,7 +35,6 @@ from sympflow.flow.primed_potentials import (
 )
 from sympflow.flow.sympflow import SympFlow
 from sympflow.integrators.scheme import Scheme
-from sympflow.integrators.schemes import SCHEMES, compose
 
 if TYPE_CHECKING:
     from sympflow.flow.potentials import Time
@@ -171,37 +169,6 @@ class PrimedFlow(SympFlow):
             terms.append((CURVATURE, substep.curvature))
         return Kick(PrimedPotential(self.ndof, self._binding, terms))
 
-    @classmethod
-    def from_scheme(
-        cls,
-        system: HamiltonianSystem,
-        scheme: Scheme,
-        dt: float,
-        degree: int,
-        palindromic: bool,
-        force_gradient: bool,
-        processor: int = 0,
-        curvature: bool = False,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
-    ) -> PrimedFlow:
-        """The flow that is, at every t, the given scheme; its processor is the identity."""
-        if palindromic and not scheme.symmetric:
-            raise ValueError(f"`scheme` {scheme.name!r} is not symmetric: take another, or palindromic=False.")
-        if any(scheme.gradients) and not force_gradient:
-            raise ValueError(f"`force_gradient` is False but {scheme.name!r} has force gradients: leave it out.")
-        substeps = scheme.substeps
-        first: Kind = "kick" if substeps[0][0] == "kick" else "drift"
-        shape = (degree, palindromic, force_gradient, dt, system, processor, curvature, dtype, device)
-        flow = cls(system.ndof, first, len(substeps), *shape)
-        columns: Any = (flow.kicks, "kick", 1), (flow.drifts, "drift", 1), (flow.gradients, "kick", 2)
-        for column, kind, entry in (*columns, (flow.curvatures, "kick", 3)):
-            if column is not None:
-                table = np.zeros(tuple(column.offset.shape))
-                table[:, 0] = [float(substep[entry]) for substep in substeps if substep[0] == kind]
-                column.set(table)
-        return flow
-
     # the frozen tables --------------------------------------------------------------------------------------
 
     @property
@@ -307,48 +274,3 @@ def _substeps(sequence: Sequence[Kind], columns: Sequence[Coefficients | None], 
         of = [kicks, *more] if kind == "kick" else [drifts]
         made.append(Substep(kind, *[None if c is None else Entry(c, i // 2, sign) for c in of]))  # type: ignore[arg-type]
     return made
-
-
-def primed(
-    system: HamiltonianSystem,
-    stages: int | None,
-    dt: float,
-    palindromic: bool,
-    scheme: Scheme | str | None,
-    degree: int | None,
-    force_gradient: bool | None,
-    processor: int,
-    curvature: bool,
-    dtype: torch.dtype,
-    device: torch.device | str | None,
-) -> PrimedFlow:
-    """`SympFlow.primed`."""
-    if not system.separable:
-        raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
-    if force_gradient is None:
-        functions = system.numba_functions
-        force_gradient = system.quadratic_kinetic and (functions is None or functions[2] is not None)
-    elif force_gradient and not system.quadratic_kinetic:
-        raise ValueError("`force_gradient` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
-    if curvature and not (force_gradient and system.symbols is not None):
-        raise ValueError(
-            "`curvature` goes with force gradients of a symbolic system, H = ½ pᵀM⁻¹p + V(q): leave it out."
-        )
-    if degree is None:
-        degree = 5 if processor else 7
-    if scheme is None:
-        stages = 6 if stages is None else stages
-        if isinstance(stages, bool) or not isinstance(stages, int) or stages < 1:
-            raise ValueError(f"`stages` must be a positive integer, the number of kicks; got {stages!r}.")
-        scheme = compose("leapfrog", 2, (1 / stages,) * stages, "equal leapfrog steps")
-    elif stages is not None:
-        raise ValueError("`stages` and `scheme` were both given: leave out `stages`, the scheme has its own.")
-    if isinstance(scheme, str):
-        if scheme not in SCHEMES:
-            raise ValueError(f"`scheme` {scheme!r} is unknown: choose one of {', '.join(SCHEMES)}.")
-        scheme = SCHEMES[scheme]
-    if (scheme.nystrom or any(scheme.gradients)) and not system.quadratic_kinetic:
-        raise ValueError(f"`scheme` {scheme.name!r} needs a kinetic energy ½ pᵀM⁻¹p: take 'kahan_li8', for instance.")
-    return PrimedFlow.from_scheme(
-        system, scheme, dt, degree, palindromic, force_gradient, processor, curvature, dtype, device
-    )

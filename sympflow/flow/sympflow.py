@@ -166,7 +166,7 @@ class SympFlow(FlowMap):
         ValueError
             If the system is not separable, or an argument is not admissible.
         """
-        from sympflow.flow.primed import primed
+        from sympflow.flow.untrained_primed import primed
 
         shape = (stages, dt, palindromic, scheme, degree, force_gradient, processor, curvature)
         return primed(system, *shape, dtype, device)
@@ -216,7 +216,7 @@ class SympFlow(FlowMap):
         ValueError
             If the system has no such parts, or an argument is not admissible.
         """
-        from sympflow.flow.split import split
+        from sympflow.flow.untrained_split import split
 
         return split(system, stages, dt, terms, filters, force_gradient, parts, linear_outside, dtype, device)
 
