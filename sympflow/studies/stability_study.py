@@ -1,4 +1,4 @@
-"""One method on one system in one precision: its runs with a range of steps, what is measured, and its limit."""
+"""One method on one system in one precision: its runs with a range of steps, and what is measured."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sympflow.solver import domain_of, solve
 from sympflow.studies.candidates import Candidate
 from sympflow.studies.comparison_report import title
 from sympflow.studies.singularities import blow_up, failure_times
-from sympflow.studies.stability_report import StabilityRow, StepLimit
+from sympflow.studies.stability_report import StabilityRow
 from sympflow.system import HamiltonianSystem
 from sympflow.validation import MAX_SAVED_VALUES
 
@@ -26,7 +26,6 @@ STEPS = tuple(2.0**k for k in range(-1, 7))
 """Default steps of classical methods, times the system's; those of a trained flow are fractions of its Δt."""
 FRACTIONS = (0.25, 0.5, 1.0)
 MOST_OUTPUTS, TANGENT_STEPS = 20_000, 256
-LIMIT_PRECISION = 1.002
 FEW_STARTS = 16  # up to so many, a compiled method runs one by one: the kernel for batches takes longer to compile
 ARRAYS_SLOWER = 200  # times, by which runs on arrays are shortened
 STABLE = ("stable", "bounded")
@@ -240,65 +239,6 @@ class Study:
 
     def _typed(self, y: np.ndarray) -> np.ndarray:
         return y.astype(self.dtype)
-
-    def limit(self, rows: list[StabilityRow]) -> StepLimit:
-        """The longest stable step, from the rows and by bisection below the first unstable one."""
-        tried = [row for row in rows if row.dt is not None and row.status != "not applicable"]
-        ran = [(row.dt, row.status in STABLE) for row in tried if row.dt is not None]
-        first_bad = next((i for i, (_, good) in enumerate(ran) if not good), len(ran))
-        low = ran[first_bad - 1][0] if first_bad else None
-        high = ran[first_bad][0] if first_bad < len(ran) else None
-        reached = ""
-        if high is None and low is not None:
-            low, high, reached = self._longer(low)
-        elif low is None and any(row.singular for row in tried):
-            reached = "none: the solution is singular"  # no step helps
-        elif low is None and tried and all(row.status == "outside" for row in tried):
-            reached = "none: the solution leaves the flow's domain"
-        elif low is None and high is not None:
-            low, high = self._shorter(high)
-        error = None
-        while low is not None and high is not None and high / low > LIMIT_PRECISION:
-            middle = math.sqrt(low * high)
-            good, error_there = self.stable(middle)
-            low, high, error = (middle, high, error_there) if good else (low, middle, error)
-        if low is not None and error is None:
-            error = self.stable(low)[1]
-        c, params = self.candidate, self.system.params
-        return StepLimit(
-            title(self.system),
-            next(iter(params), None),
-            next(iter(params.values()), None),
-            c.method,
-            c.label,
-            self.dtype,
-            low,
-            high,
-            error,
-            reached,
-        )
-
-    def _longer(self, low: float) -> tuple[float, float | None, str]:
-        """Double a stable step until it is unstable, refused, or as long as the interval."""
-        longest = abs(self.t_span[1] - self.t_span[0])
-        if self.candidate.integrator.trained:
-            top = self.candidate.integrator.step_length(self.system)
-            if low >= top * (1 - 1e-12):
-                return low, None, "all up to the flow's Δt"
-            good, _ = self.stable(top)
-            return (top, None, "all up to the flow's Δt") if good else (low, top, "")
-        while low < longest:
-            if not self.stable(2 * low)[0]:
-                return low, 2 * low, ""
-            low = 2 * low
-        return low, None, "all up to the length of the interval"
-
-    def _shorter(self, high: float) -> tuple[float | None, float]:
-        for _ in range(12):
-            if self.stable(high / 2)[0]:
-                return high / 2, high
-            high = high / 2
-        return None, high
 
 
 def _largest_error(sols: list[Solution]) -> float:

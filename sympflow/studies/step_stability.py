@@ -16,6 +16,7 @@ from sympflow.studies.candidates import candidates
 from sympflow.studies.comparison_report import title
 from sympflow.studies.stability_report import StabilityReport, StabilityRow, StepLimit
 from sympflow.studies.stability_study import Study
+from sympflow.studies.step_limits import step_limit
 from sympflow.system import HamiltonianSystem
 from sympflow.validation import check_t_span, check_y0
 
@@ -118,7 +119,7 @@ def stability(
                 own = [study.row(h) for h in study.lengths(lengths)]
                 rows += own
                 if limits and study.has_steps and any(row.status != "not applicable" for row in own):
-                    found.append(study.limit(own))
+                    found.append(step_limit(study, own))
     return StabilityReport(family, tuple(metrics), float(bound), tuple(rows), tuple(found))
 
 
