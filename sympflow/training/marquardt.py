@@ -12,6 +12,7 @@ from torch import Tensor
 from sympflow.flow.base import FlowMap
 from sympflow.training.config import TrainingConfig
 from sympflow.training.losses import Objective
+from sympflow.training.weight_vector import put_weights, weight_vector
 
 MAX_PARAMETERS = 8000
 MAX_REJECTED = 20
@@ -81,7 +82,7 @@ class GaussNewton:
 
     def step(self, index: int, objective: Objective) -> float:
         """Take a step; the loss before it."""
-        x = torch.cat([w.detach().reshape(-1) for w in self.parameters])
+        x = weight_vector(self.parameters)
         r, J = objective.linearized()
         loss = float(r @ r)
         r, J = torch.cat([r, PULL**0.5 * x]), torch.cat([J, PULL**0.5 * torch.eye(len(x)).to(J)])
@@ -99,7 +100,7 @@ class GaussNewton:
             s = -solve(g)
             predicted = -float(s @ (G @ s + 2 * g))
             s = s + self._bend(objective, solve, x, s, r, J, D)
-            self._put(x + s)
+            put_weights(self.parameters, x + s)
             with torch.no_grad():
                 after = float(objective()) + PULL * float((x + s) @ (x + s))
             gain = (cost - after) / predicted if predicted > 0 and math.isfinite(after) else -1.0
@@ -111,7 +112,7 @@ class GaussNewton:
                     self.finished = "it has converged"
                 return loss
             self.damping, self.growth = self.damping * self.growth, self.growth * 2
-        self._put(x)
+        put_weights(self.parameters, x)
         self.damping, self.growth, self.finished = FIRST_DAMPING, 2.0, "no step lowers the loss"
         return loss
 
@@ -135,14 +136,9 @@ class GaussNewton:
         D: Tensor,
     ) -> Tensor:
         """The geodesic acceleration of [3]_, by which a step follows a curved valley; 0 where it would lead astray."""
-        self._put(x + PROBE * s)
+        put_weights(self.parameters, x + PROBE * s)
         probed = torch.cat([objective.residuals(), PULL**0.5 * (x + PROBE * s)])
         curvature = (probed - r - PROBE * (J @ s)) / PROBE**2
         bend = -solve(J.T @ curvature)
         small = 2 * torch.linalg.vector_norm(D * bend) <= CURVED * torch.linalg.vector_norm(D * s)
         return bend if small else torch.zeros_like(s)  # NaN is not small
-
-    @torch.no_grad()
-    def _put(self, x: Tensor) -> None:
-        for w, part in zip(self.parameters, x.split([w.numel() for w in self.parameters]), strict=True):
-            w.copy_(part.view_as(w))

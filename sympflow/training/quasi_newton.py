@@ -12,6 +12,7 @@ from torch import Tensor
 from sympflow.flow.base import FlowMap
 from sympflow.training.config import TrainingConfig
 from sympflow.training.line_search import Trial, strong_wolfe
+from sympflow.training.weight_vector import put_weights, weight_vector
 
 MAX_PARAMETERS = 8000
 ITERATIONS = 20
@@ -43,7 +44,7 @@ class QuasiNewton:
 
     def step(self, index: int, loss: Callable[[], Tensor]) -> float:
         """Iterate; the loss before the first iteration."""
-        x = torch.cat([w.detach().reshape(-1) for w in self.parameters])
+        x = weight_vector(self.parameters)
         value, g = self._evaluate(loss, x)
         first = value
         for _ in range(ITERATIONS if math.isfinite(first) else 0):
@@ -66,22 +67,17 @@ class QuasiNewton:
             if float(y @ s) > 0:
                 self._update(s, y, -found.length * float(s @ g))
             x, value, g = x + s, found.loss, found.gradient
-        self._put(x)
+        put_weights(self.parameters, x)
         return first
 
     def _evaluate(self, loss: Callable[[], Tensor], x: Tensor) -> tuple[float, Tensor]:
-        self._put(x)
+        put_weights(self.parameters, x)
         for w in self.parameters:
             w.grad = None
         value = loss()
         value.backward()
         gradients = [torch.zeros_like(w) if w.grad is None else w.grad for w in self.parameters]
         return float(value.detach()), torch.cat([g.reshape(-1) for g in gradients])
-
-    @torch.no_grad()
-    def _put(self, x: Tensor) -> None:
-        for w, part in zip(self.parameters, x.split([w.numel() for w in self.parameters]), strict=True):
-            w.copy_(part.view_as(w))
 
 
 class BFGS(QuasiNewton):

@@ -23,6 +23,7 @@ from sympflow.training.collocation import Stream, states, stream_seed
 from sympflow.training.labels import Labels
 from sympflow.training.levenberg_marquardt import Minimum, levenberg_marquardt
 from sympflow.training.search_config import SplitConfig
+from sympflow.training.weight_vector import put_weights
 
 DIFFERENCE = 1e-5  # of a coefficient, relative to its unit
 SPREAD = 0.3  # of random weights about those of equal steps
@@ -230,12 +231,9 @@ class SplitFit:
             blocks.append(block)
         return offsets, np.concatenate(blocks, axis=-1)
 
-    @torch.no_grad()
     def assign(self, theta: np.ndarray) -> None:
         """Put the parameters into the flow."""
-        for c in self.columns:
-            own, theta = theta[: c.free.numel()], theta[c.free.numel() :]
-            c.free.copy_(torch.as_tensor(own))
+        put_weights([c.free for c in self.columns], torch.as_tensor(theta))
 
     def errors(self) -> dict[str, float]:
         """‖ψ̄_t(x) − φ_H,t(x)‖ of held-out states, in the units of the modes."""

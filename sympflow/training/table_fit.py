@@ -15,6 +15,7 @@ from sympflow.training.labels import Labels
 from sympflow.training.levenberg_marquardt import Minimum, levenberg_marquardt
 from sympflow.training.losses import Objective
 from sympflow.training.table_jacobian import TableStep
+from sympflow.training.weight_vector import put_weights
 
 SPREAD = 0.25  # of random coefficients about those of equal steps
 WIDE_SPREAD = 2.0  # without force gradients, where an order above 2 needs negative ones
@@ -122,12 +123,6 @@ class TableFit(Fit):
         rows = rows.reshape(self.times, *rows.shape[1:-2], -1)
         return np.moveaxis(rows, -1, 1)
 
-    def minimize(self, theta: np.ndarray, iterations: int, stop: Callable[[], bool], thorough: bool = False) -> Minimum:
-        """Least squares from θ; a thorough one goes on where little is gained, as along a narrow curved valley."""
-        patience, gain = (20, 1e-3) if thorough else (10, 1e-2)
-        limits: dict[str, Any] = {"iterations": iterations, "patience": patience, "gain": gain, "stop": stop}
-        return levenberg_marquardt(self.residuals, self.linearized, theta, **limits)
-
 
 class Table:
     """A primed flow's parameters θ as one vector, and its table at any t as an affine function of them.
@@ -192,12 +187,9 @@ class Table:
     def parameters(self) -> np.ndarray:
         return np.concatenate([_array(c.free) for c in self.columns])
 
-    @torch.no_grad()
     def assign(self, theta: np.ndarray) -> None:
         """Put the parameters into the flow."""
-        for c in self.columns:
-            part, theta = theta[: c.free.numel()], theta[c.free.numel() :]
-            c.free.copy_(torch.as_tensor(part))
+        put_weights([c.free for c in self.columns], torch.as_tensor(theta))
 
     def random(self, rng: np.random.Generator) -> np.ndarray:
         """A frozen table about that of equal steps, with or without the force gradients of Takahashi and Imada."""
