@@ -10,7 +10,7 @@ from sympy.printing.pycode import PythonCodePrinter
 
 from sympflow.symbolic import SymbolicHamiltonian, printable
 
-__all__ = ["algebra_source", "curvature_kick_source", "gradient_kick_source", "printed", "tuple_algebra"]
+__all__ = ["algebra_source", "curvature_kick_source", "gradient_kick_source", "printed", "statements", "tuple_algebra"]
 
 _MAX_POWER = 16  # integer powers up to this are written as products
 
@@ -70,6 +70,20 @@ def printed(f: sp.Expr) -> str:
         raise ValueError(
             f"`system` has the term {f}, for which there is no compiled function: use backend='array'."
         ) from None
+
+
+def statements(targets: Sequence[str], expressions: Sequence[sp.Expr]) -> list[str]:
+    """``target = expression`` for each, after the common subexpressions s_0, s_1, … that they share.
+
+    Raises
+    ------
+    ValueError
+        As `printed`.
+    """
+    code = [printable(f) for f in expressions]
+    shared, reduced = sp.cse(code, symbols=sp.numbered_symbols("s_", real=True), list=True)
+    named = [(symbol.name, f) for symbol, f in shared]
+    return [f"{target} = {printed(f)}" for target, f in [*named, *zip(targets, reduced, strict=True)]]
 
 
 def _product(factor: str, power: int) -> str:
@@ -158,14 +172,10 @@ def _function(
     name: str, arguments: str, variables: Sequence[sp.Symbol], expressions: list[sp.Expr], results: list[str]
 ) -> str:
     """A jitted function that returns the tuple `results`, ``{n}`` in them standing for the n-th expression."""
-    expressions = [printable(f) for f in expressions]
-    shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("s_", real=True), list=True)
-    values = [sp.Symbol(f"v_{n}", real=True) for n in range(len(reduced))]
+    names = [f"v_{n}" for n in range(len(expressions))]
     lines = ["@njit(**OPTIONS)", f"def {name}({arguments}):"]
     lines.append(f"    {', '.join(s.name for s in variables)}, = {arguments[0]}")
-    for symbol, expression in [*shared, *zip(values, reduced, strict=True)]:
-        lines.append(f"    {symbol.name} = {printed(expression)}")
-    names = [value.name for value in values]
+    lines += [f"    {statement}" for statement in statements(names, expressions)]
     lines.append(f"    return ({''.join(result.format(*names) + ', ' for result in results)})")
     return "\n".join(lines)
 

@@ -8,11 +8,10 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import sympy as sp
-from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
-from sympflow.kernels.codegen import _KernelPrinter
+from sympflow.kernels.codegen import statements
 from sympflow.kernels.modules import load_algebra, run_rows
-from sympflow.symbolic import SymbolicHamiltonian, printable
+from sympflow.symbolic import SymbolicHamiltonian
 from sympflow.system import HamiltonianSystem
 
 __all__ = ["ImplicitKernel", "implicit_kernel"]
@@ -113,20 +112,10 @@ def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:
     slopes = [sp.diff(symbols.H, s) for s in variables]
     triangle = [(i, j) for i in range(len(variables)) for j in range(i, len(variables))]
     entries = {ij: sp.diff(slopes[ij[0]], variables[ij[1]]) for ij in triangle}
-    entries = {ij: printable(entry) for ij, entry in entries.items() if entry != 0}
+    entries = {ij: entry for ij, entry in entries.items() if entry != 0}
     targets = [f"g[{i}]" for i in range(len(variables))]
     targets += [f"S[{i}, {j}] = S[{j}, {i}]" if i != j else f"S[{i}, {i}]" for i, j in entries]
-    expressions = [*map(printable, slopes), *entries.values()]
-    shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("s_", real=True), list=True)
-    printer = _KernelPrinter({"fully_qualified_modules": True, "human": True})
     lines = [f"NDOF = {symbols.ndof}\n\n", "@njit(**OPTIONS)", "def gradient_and_hessian(y, g, S):"]
     lines += [f"    {s.name} = y[{i}]" for i, s in enumerate(variables)]
-    named = [(symbol.name, value) for symbol, value in shared]
-    for target, expression in [*named, *zip(targets, reduced, strict=True)]:
-        try:
-            lines.append(f"    {target} = {printer.doprint(expression)}")
-        except PrintMethodNotImplementedError:
-            raise ValueError(
-                f"`system` has the term {expression}, for which there is no compiled function: use backend='array'."
-            ) from None
+    lines += [f"    {statement}" for statement in statements(targets, [*slopes, *entries.values()])]
     return "\n".join(lines) + "\n"

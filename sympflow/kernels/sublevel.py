@@ -6,13 +6,12 @@ from collections.abc import Callable
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import sympy as sp
 
 from sympflow.domain import Box, EnergySublevel
-from sympflow.kernels.codegen import printed
+from sympflow.kernels.codegen import statements
 from sympflow.kernels.modules import load_algebra
 from sympflow.kernels.outputs import all_between
-from sympflow.symbolic import SymbolicHamiltonian, printable
+from sympflow.symbolic import SymbolicHamiltonian
 from sympflow.system import HamiltonianSystem
 
 __all__ = ["all_within"]
@@ -56,12 +55,10 @@ def sublevel_source(symbols: SymbolicHamiltonian) -> str:
         If a function in H has no counterpart in compiled code.
     """
     variables = symbols.q + symbols.p
-    shared, (H,) = sp.cse([printable(symbols.H)], symbols=sp.numbered_symbols("s_", real=True), list=True)
     n = len(variables)
     box = " & ".join(f"({v} >= low[{i}]) & ({v} <= high[{i}])" for i, v in enumerate(variables))
     lines = [f"{v} = x[{i}, n]" for i, v in enumerate(variables)]
-    lines += [f"{name} = {printed(f)}" for name, f in shared]
-    lines += [f"H = {printed(H)}", f"inside &= {box} & (H > low[{n}]) & (H < high[{n}])"]
+    lines += [*statements(["H"], [symbols.H]), f"inside &= {box} & (H > low[{n}]) & (H < high[{n}])"]
     if symbols.ndof == 2:
         lines += ["L = abs(q1*p2 - q2*p1)", "inside &= (L >= low[5]) & (L <= high[5])"]
     body = "\n        ".join(lines)
