@@ -153,9 +153,15 @@ def check_save_every(save_every: Any, times: np.ndarray | None) -> int:
         return 1
     if times is not None:
         raise ValueError("`save_every` and `t_eval` both choose the outputs: give one of them.")
-    if not isinstance(save_every, int | np.integer) or isinstance(save_every, bool) or save_every < 1:
-        raise ValueError(f"`save_every` must be a positive integer; got {save_every!r}.")
+    check_counts(save_every=save_every)
     return min(int(save_every), 2**53)
+
+
+def check_counts(**values: Any) -> None:
+    """Positive integers."""
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
 
 
 def check_events(y0: Array, events: Any, event_step: Any, duration: float) -> EventSearch | None:

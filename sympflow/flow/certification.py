@@ -28,11 +28,11 @@ def certificate(
     flow: FlowMap,
     system: HamiltonianSystem,
     *,
-    states: int = 2000,
-    times: int = 33,
-    held_out: int = 100,
-    t_end: float = 1000.0,
-    seed: int = 0,
+    states: int,
+    times: int,
+    held_out: int,
+    t_end: float,
+    seed: int,
 ) -> Certificate:
     """`FlowMap.certificate`."""
     from sympflow.flow.record import checksum

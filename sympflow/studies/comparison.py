@@ -24,7 +24,7 @@ from sympflow.studies.matching import tunable
 from sympflow.studies.measurements import MEASURES, Row, Run, largest, measure, note_backends
 from sympflow.system import HamiltonianSystem
 from sympflow.timing import interleaved
-from sympflow.validation import check_t_span, check_y0
+from sympflow.validation import check_counts, check_t_span, check_y0
 
 METRICS = tuple(MEASURES)
 MATCHES = ("time", "evaluations", "energy_error")
@@ -96,9 +96,7 @@ def compare(
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     asked = _check_metrics(metrics)
-    for name, value in (("n_outputs", n_outputs), ("repeats", repeats)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
+    check_counts(n_outputs=n_outputs, repeats=repeats)
     if match is not None and match not in MATCHES:
         raise ValueError(f"`match` must be one of {', '.join(map(repr, MATCHES))}, or None; got {match!r}.")
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)

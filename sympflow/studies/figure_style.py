@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,6 +73,18 @@ def frame(ax: Axes, points: np.ndarray, margin: float) -> None:
     (left, bottom), (right, top) = (low + high) / 2 - half, (low + high) / 2 + half
     ax.set_xlim(left, right)
     ax.set_ylim(bottom, top)
+
+
+def legend_above(figure: Figure, axes: Iterable[Axes], columns: int) -> None:
+    """One legend above all panels, of their labelled lines, in at most so many columns."""
+    handles = {h.get_label(): h for ax in axes for h in ax.lines if not str(h.get_label()).startswith("_")}
+    figure.legend(
+        handles=list(handles.values()),
+        loc="outside upper center",
+        ncols=min(len(handles), columns) or 1,
+        frameon=False,
+        fontsize=9,
+    )
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:

@@ -23,7 +23,7 @@ from sympflow.studies.precision_points import Point, break_even
 from sympflow.studies.precision_report import WorkPrecision
 from sympflow.system import HamiltonianSystem
 from sympflow.timing import interleaved
-from sympflow.validation import check_t_span, check_y0
+from sympflow.validation import check_counts, check_t_span, check_y0
 
 METHODS = ("verlet", "leapfrog", "blanes_moan4", "srkn11b", "kahan_li8", "rk45", "dop853", "sympflow", "mlp")
 TOLERANCES = tuple(10.0**-k for k in range(3, 13))
@@ -90,9 +90,7 @@ def work_precision(
     for name, values in (("steps", steps or [1.0]), ("tolerances", tolerances)):
         if not all(0 < x < math.inf for x in values):
             raise ValueError(f"`{name}` must be positive and finite; got {list(values)}.")
-    for name, value in (("n_outputs", n_outputs), ("repeats", repeats)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
+    check_counts(n_outputs=n_outputs, repeats=repeats)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     if t0 == t1:
         raise ValueError("`t_span` has length zero, so there is nothing to measure: choose a later end.")

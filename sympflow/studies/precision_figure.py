@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sympflow.studies.figure_style import dress, method_styles, new_figure
+from sympflow.studies.figure_style import dress, legend_above, method_styles, new_figure
 from sympflow.studies.precision_points import Point
 from sympflow.studies.precision_report import WorkPrecision
 
@@ -41,14 +41,7 @@ def precision_figure(report: WorkPrecision, measure: str = "energy_error") -> Fi
         row[0].set_title(
             f"{report.title}, T = {report.t_span[1] - report.t_span[0]:g}, {many}", loc="left", fontsize=10
         )
-    handles = {h.get_label(): h for ax in axes.flat for h in ax.lines if not str(h.get_label()).startswith("_")}
-    figure.legend(
-        handles=list(handles.values()),
-        loc="outside upper center",
-        ncols=min(len(handles), 7) or 1,
-        frameon=False,
-        fontsize=9,
-    )
+    legend_above(figure, axes.flat, 7)
     return figure
 
 

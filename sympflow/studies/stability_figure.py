@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.studies.figure_style import TEXT, dress, method_styles, new_figure
+from sympflow.studies.figure_style import TEXT, dress, legend_above, method_styles, new_figure
 from sympflow.studies.stability_report import StabilityReport, StabilityRow
 
 if TYPE_CHECKING:
@@ -56,14 +56,7 @@ def _steps(report: StabilityReport) -> Figure:
         _plain_ticks(ax.xaxis, [r.dt for r in rows if r.dt is not None])
         dress(ax, "step", "largest |energy error|, relative")
         ax.set_title(name, loc="left", fontsize=10, color=TEXT)
-    handles = {h.get_label(): h for ax in axes for h in ax.lines if not str(h.get_label()).startswith("_")}
-    figure.legend(
-        handles=list(handles.values()),
-        loc="outside upper center",
-        ncols=min(len(handles), 6) or 1,
-        frameon=False,
-        fontsize=9,
-    )
+    legend_above(figure, axes, 6)
     return figure
 
 

@@ -18,7 +18,7 @@ from sympflow.studies.stability_report import StabilityReport, StabilityRow, Ste
 from sympflow.studies.stability_study import Study
 from sympflow.studies.step_limits import step_limit
 from sympflow.system import HamiltonianSystem
-from sympflow.validation import check_t_span, check_y0
+from sympflow.validation import check_counts, check_t_span, check_y0
 
 DEFAULT = ("sympflow", "verlet", "leapfrog", "kahan_li8", "implicit_midpoint", "rk4", "rk45")
 METRICS = ("energy", "drift", "volume", "symplecticity", "domain")
@@ -92,9 +92,7 @@ def stability(
     unknown = [m for m in metrics if m not in METRICS]
     if isinstance(metrics, str) or unknown:
         raise ValueError(f"`metrics` must be a list of names from {', '.join(METRICS)}; got {metrics!r}.")
-    for name, count in (("min_steps", min_steps), ("max_steps", max_steps)):
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-            raise ValueError(f"`{name}` must be a positive integer; got {count!r}.")
+    check_counts(min_steps=min_steps, max_steps=max_steps)
     real = isinstance(bound, int | float | np.number) and not isinstance(bound, bool)
     if not real or np.iscomplexobj(bound) or not 0 < bound < math.inf:
         raise ValueError(f"`bound` must be positive and finite, a relative energy error; got {bound!r}.")
