@@ -9,7 +9,10 @@ import sympy as sp
 
 from sympflow import SympFlow, systems
 from sympflow.kernels.codegen import printed
-from sympflow.kernels.kicks import _function, _scheduled, _shapes
+from sympflow.kernels.kick_shapes import shapes
+from sympflow.kernels.kicks import _function, _scheduled
+from sympflow.kernels.nested import nested
+from sympflow.kernels.pipeline import Operation, cycles_per_turn
 from sympflow.kernels.primed_flow import PrimedFlowKernel
 from sympflow.kernels.scheduling import ADD, FUSED, MULTIPLY, Schedule
 from sympflow.system import HamiltonianSystem
@@ -40,10 +43,10 @@ def test_every_shape_gives_the_same_momenta(name, terms):
     system = SCENES[name]()
     symbols, d = system.symbols, system.ndof
     rng = np.random.default_rng(0)
-    shapes = list(_shapes(symbols, terms))
+    forms = list(shapes(symbols, terms))
     rewritten = name != "kinks" and (name, terms) != ("roots", 3)  # that one is too long
-    assert len(shapes) >= (3 if rewritten else 1)
-    for shape, common in itertools.product(shapes, (True, False)):
+    assert len(forms) >= (3 if rewritten else 1)
+    for shape, common in itertools.product(forms, (True, False)):
         kick = _scheduled(symbols, shape, "s_", common)
         functions = dict(ELEMENTARY)
         lines = [*kick.coefficients, *kick.lines]
@@ -99,6 +102,34 @@ def test_long_sums_and_powers_are_split():
     assert time < 7 * ADD
     time, _ = Schedule({names[0]: 0.0}, printed).value(names[0] ** 8)
     assert time == 3 * MULTIPLY
+
+
+def test_nested_forms_end_with_what_is_known_last():
+    x, y, p, a, b, c = sp.symbols("x y p a b c", real=True)
+    terms = [a * y, -b * y**2, b * x**2, c * x**2 * y, c * y**3]
+    form = nested(p, terms, {p: -FUSED, x: 0.0, y: 0.0})
+    assert sp.expand(form - sp.Add(p, *terms)) == 0
+    # p + x²(b + c y) + y(a + y(c y − b)): three levels, x² and p no later than these
+    time, _ = Schedule({p: -FUSED, x: 0.0, y: 0.0}, printed).value(form)
+    assert time == 3 * FUSED
+    late = nested(p, [a * x, b * y], {p: -FUSED, x: 50.0, y: 0.0})
+    assert Schedule({p: -FUSED, x: 50.0, y: 0.0}, printed).value(late)[0] == 50.0 + FUSED
+
+
+def test_a_loop_takes_its_slowest_circle():
+    """x waits for a chain of 4 + 3 cycles of its own, y only for the last value of x."""
+    chain = [Operation("a", ("x",), 4.0, "products"), Operation("b", ("a",), 3.0, "sums")]
+    assert cycles_per_turn(chain, {"x": "b"}) == 7.0
+    aside = [*chain, Operation("c", ("y", "x"), 4.0, "products")]
+    assert cycles_per_turn(aside, {"x": "b", "y": "c"}) == 7.0
+
+
+def test_a_loop_of_many_operations_waits_for_units():
+    """Two products start in each cycle: 20 that need nothing take ten."""
+    many = [Operation(f"a{i}", ("c",), 4.0, "products") for i in range(20)]
+    assert cycles_per_turn([*many, Operation("b", ("x", "a19"), 4.0, "products")], {"x": "b"}) == 10.5
+    divisions = [Operation(f"a{i}", (), 13.0, "divisions", 10) for i in range(4)]
+    assert cycles_per_turn([*divisions, Operation("b", ("x", "a3"), 3.0, "sums")], {"x": "b"}) == 20.0
 
 
 def test_the_flow_steps_every_row_by_its_own_time():

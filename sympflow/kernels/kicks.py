@@ -2,41 +2,39 @@
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import sympy as sp
 
 from sympflow.kernels.codegen import printed
-from sympflow.kernels.scheduling import FUSED, Schedule
-from sympflow.symbolic import SymbolicHamiltonian, printable
+from sympflow.kernels.kick_shapes import B, C, G, shapes
+from sympflow.kernels.pipeline import Operation, cycles_per_turn
+from sympflow.kernels.scheduling import FUSED, PRODUCTS, Schedule
+from sympflow.symbolic import SymbolicHamiltonian
 
 __all__ = ["kicks_source"]
 
 PRODUCT = "fused_multiply_add"  # of `elementary`
-MOST_OPERATIONS = 400  # of a kick whose shapes are tried: rewriting longer ones takes longer than it saves
-MOST_TERMS = 120  # of a sum multiplied out
-CROWDED = 0.4  # cycles by which each operation of a single trajectory delays the others, as measured
-B, G, C = sp.symbols("b g c", real=True)
-UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
-"""What holds one of these is taken as it is."""
+BEST, MOST_MIXED = 3, 2  # shapes that are mixed, and momenta up to which they are
+BEFORE = "before_"  # the name of a position before a drift begins with it
 
 
 @dataclass(frozen=True)
 class _Kick:
-    """One shape of a kick: the body of its function without the lines of its coefficients, and its costs."""
+    """One shape of a kick: the body of its function without the lines of its coefficients, and its costs.
+
+    These are the cycles from one kick of a single trajectory to the next, a drift between them, and the operations, in
+    units of an addition, that a batch pays.
+    """
 
     coefficients: list[str]
     lines: list[str]
     results: list[str]
-    latency: float
+    cycles: float
     operations: float
-
-    @property
-    def cycles(self) -> float:
-        """From one kick to the next of a single trajectory, a drift between them."""
-        return self.latency + CROWDED * self.operations
 
 
 def kicks_source(symbols: SymbolicHamiltonian, level: int) -> str:
@@ -57,10 +55,9 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int) -> str:
     stored: list[str] = []
     for terms, name in enumerate(("kicked", "gradient_kicked", "curvature_kicked")[: level + 1], 1):
         numbers = ("b", "g", "c")[:terms]
-        shapes = list(_shapes(symbols, terms))
-        tried = [_scheduled(symbols, s, f"{name[0]}_", common) for s in shapes for common in (True, False)]
+        tried = _tried(symbols, terms, f"{name[0]}_")
         one = min(tried, key=lambda kick: (kick.cycles, kick.operations))
-        many = min(tried, key=lambda kick: (kick.operations, kick.latency))
+        many = min(tried, key=lambda kick: (kick.operations, kick.cycles))
         used = [n for n in _names(one.coefficients) if any(_mentions(line, n) for line in [*one.lines, *one.results])]
         loads = [f"{n} = table[j, {len(stored) + i}]" for i, n in enumerate(used)]
         fill += one.coefficients
@@ -106,9 +103,40 @@ def _scheduled(symbols: SymbolicHamiltonian, shape: Sequence[sp.Expr], prefix: s
         shared, shape = sp.cse(shape, symbols=sp.numbered_symbols("common_", real=True), list=True, order="none")
         for symbol, expression in shared:
             schedule.define(symbol, expression)
-    results = [schedule.value(f) for f in shape]
-    latency = max(time for time, _ in results)
-    return _Kick(schedule.early, schedule.lines, [name for _, name in results], latency, schedule.operations)
+    results = [schedule.value(f)[1] for f in shape]
+    turn = [*_drift(symbols), *schedule.steps]
+    carried = {f"{BEFORE}{s}": s.name for s in symbols.q} | dict(zip((s.name for s in symbols.p), results, strict=True))
+    return _Kick(schedule.early, schedule.lines, results, cycles_per_turn(turn, carried), schedule.operations)
+
+
+def _drift(symbols: SymbolicHamiltonian) -> list[Operation]:
+    """The drift that comes before a kick."""
+    operations = []
+    for q, p in zip(symbols.q, symbols.p, strict=True):
+        velocity = sp.diff(symbols.T, p)
+        moving = [s.name for s in symbols.p if s == p or velocity.has(s)]
+        at = f"{BEFORE}{q}"
+        for i, moved in enumerate(moving, 1):
+            name = q.name if i == len(moving) else f"{BEFORE}{q}_{i}"
+            operations.append(Operation(name, (at, moved), FUSED, PRODUCTS))
+            at = name
+    return operations
+
+
+def _tried(symbols: SymbolicHamiltonian, terms: int, prefix: str) -> list[_Kick]:
+    """Every shape; and of the best, every choice of one for each momentum."""
+
+    def both(shape: Sequence[sp.Expr]) -> list[_Kick]:
+        return [_scheduled(symbols, shape, prefix, common) for common in (True, False)]
+
+    made = [(shape, both(shape)) for shape in shapes(symbols, terms)]
+    made.sort(key=lambda entry: min((kick.cycles, kick.operations) for kick in entry[1]))
+    kicks = [kick for _, each in made for kick in each]
+    best = [shape for shape, _ in made[:BEST]]
+    if 1 < symbols.ndof <= MOST_MIXED:
+        mixed = dict.fromkeys(itertools.product(*zip(*best, strict=True)))  # a set in order
+        kicks += [kick for shape in mixed if list(shape) not in best for kick in both(shape)]
+    return kicks
 
 
 def _numbered(f: sp.Expr, states: set[sp.Symbol], numbers: dict[sp.Expr, sp.Symbol]) -> sp.Expr:
@@ -123,101 +151,3 @@ def _numbered(f: sp.Expr, states: set[sp.Symbol], numbers: dict[sp.Expr, sp.Symb
                 symbol = numbers.setdefault(coefficient, sp.Symbol(f"number_{len(numbers)}", real=True))
                 f = sp.Mul(symbol, *[a for a in f.args if a.free_symbols & states], evaluate=False)
     return f.func(*[_numbered(a, states, numbers) for a in f.args], evaluate=False)
-
-
-def _shapes(symbols: SymbolicHamiltonian, terms: int) -> Iterator[list[sp.Expr]]:
-    """Ways to write the new momenta, equal but for rounding, of kicks with one term to three."""
-    q, p, d = symbols.q, symbols.p, symbols.ndof
-    slope = [sp.diff(symbols.V, s) for s in q]
-    if terms == 1:
-        yield [printable(p[i] - B * slope[i]) for i in range(d)]
-        changes = [-B * f for f in slope]
-    else:
-        M = symbols.inverse_mass
-        assert M is not None
-        velocity = [sp.Add(*[_number(M[j, k]) * slope[k] for k in range(d)]) for j in range(d)]
-        hessian = [[sp.diff(f, s) for s in q] for f in slope]
-        products = [_dot(row, velocity) for row in hessian]
-        changes = [-B * slope[i] + G * products[i] for i in range(d)]
-        if terms == 3:
-            again = [_dot([_number(M[j, k]) for k in range(d)], products) for j in range(d)]
-            bent = [_dot([_dot([sp.diff(h, s) for h in row], velocity) for row in hessian], velocity) for s in q]
-            changes = [f - C * (_dot(hessian[i], again) + bent[i] / 2) for i, f in enumerate(changes)]
-        yield [printable(p[i] + f) for i, f in enumerate(changes)]
-        W = [_dot(slope, velocity) / 2, _dot(velocity, products) / 2][: terms - 1]
-        if any(f.has(*UNTOUCHED) or sp.count_ops(f) > MOST_OPERATIONS for f in W):
-            return
-        W = [sp.factor(sp.powsimp(f)) for f in W]
-        changes = [
-            -B * slope[i] + sp.Add(*[c * sp.diff(f, q[i]) for c, f in zip((G, -C), W, strict=False)]) for i in range(d)
-        ]
-    if any(f.has(*UNTOUCHED) or sp.count_ops(f) > MOST_OPERATIONS for f in changes):
-        return
-    yield [printable(p[i] + f) for i, f in enumerate(changes)]
-    factored = [sp.factor(f) for f in changes]
-    yield [printable(p[i] + _collected(f, q)) for i, f in enumerate(factored)]
-    expanded = [_expanded(f, q) for f in changes]
-    if sum(len(f.args) for f in expanded) <= MOST_TERMS:
-        yield [printable(sp.Add(p[i], *sp.Add.make_args(f))) for i, f in enumerate(expanded)]
-        yield [printable(p[i] + _by_common_factors(f, q)) for i, f in enumerate(expanded)]
-
-
-def _dot(x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
-    return sp.Add(*[a * b for a, b in zip(x, y, strict=True)])
-
-
-def _number(value: float) -> sp.Expr:
-    return sp.Integer(int(value)) if value == int(value) else sp.Float(value)
-
-
-def _expanded(f: sp.Expr, q: Sequence[sp.Symbol]) -> sp.Expr:
-    """Σ coefficient(b, g, c) · product, what is divided by left as it is."""
-    kept: dict[sp.Expr, sp.Dummy] = {}
-
-    def keep(power: sp.Expr) -> sp.Expr:
-        return kept.setdefault(power, sp.Dummy(real=True))
-
-    f = f.replace(lambda e: e.is_Pow and e.base.is_Add and not (e.exp.is_Integer and e.exp > 0), keep)
-    back: dict[sp.Dummy, sp.Expr] = {}
-    for power, dummy in kept.items():  # inner powers come before those that hold them
-        back[dummy] = power.xreplace(back)
-    terms: dict[sp.Expr, sp.Expr] = {}
-    for term in sp.Add.make_args(sp.expand(f)):
-        coefficient, product = term.as_independent(*q, *back, as_Add=False)
-        terms[product] = terms.get(product, sp.S.Zero) + coefficient
-    return sp.Add(*[_times(c, product.xreplace(back)) for product, c in terms.items() if c != 0])
-
-
-def _times(coefficient: sp.Expr, product: sp.Expr) -> sp.Expr:
-    """Their product, a sum in the coefficient kept together."""
-    return (
-        sp.Mul(coefficient, *sp.Mul.make_args(product), evaluate=False) if coefficient.is_Add else coefficient * product
-    )
-
-
-def _collected(f: sp.Expr, q: Sequence[sp.Symbol]) -> sp.Expr:
-    """A product whose sums are written by their coefficients."""
-    return sp.Mul(
-        *[_expanded(factor, q) if factor.is_Add else factor for factor in sp.Mul.make_args(f)], evaluate=False
-    )
-
-
-def _by_common_factors(f: sp.Expr, q: Sequence[sp.Symbol]) -> sp.Expr:
-    """Horner's form: of the factors of the terms that most of them share, one after the other taken out."""
-    terms = sp.Add.make_args(f)
-    counts = {s: sum(term.has(s) and (term / s).is_polynomial(s) for term in terms) for s in q}
-    symbol = max(q, key=counts.__getitem__)
-    if counts[symbol] < 2:
-        return f
-    inside: list[sp.Expr] = []
-    outside: list[sp.Expr] = []
-    for term in terms:
-        divisible = term.has(symbol) and (term / symbol).is_polynomial(symbol)
-        (inside if divisible else outside).append(_divided(term, symbol) if divisible else term)
-    inner = _by_common_factors(sp.Add(*inside), q)
-    return sp.Add(sp.Mul(symbol, inner, evaluate=False), _by_common_factors(sp.Add(*outside), q) if outside else 0)
-
-
-def _divided(term: sp.Expr, symbol: sp.Symbol) -> sp.Expr:
-    coefficient, product = term.as_independent(symbol, as_Add=False)
-    return _times(coefficient, product / symbol) if coefficient.is_Add else coefficient * (product / symbol)

@@ -9,18 +9,24 @@ estimates both costs, by which the shapes that one expression may take are compa
 from __future__ import annotations
 
 import heapq
+import re
 from collections.abc import Callable, Iterable, Sequence
 
 import sympy as sp
 
+from sympflow.kernels.pipeline import Operation
+
 __all__ = ["Schedule"]
 
-ADD, MULTIPLY, FUSED = 2.0, 3.0, 4.0  # cycles from operands to result, on current x86-64 and AArch64 cores
+ADD, MULTIPLY, FUSED = 3.0, 3.0, 4.0  # cycles from operands to result, on current x86-64 and AArch64 cores
 DIVIDE, ROOT, FUNCTION, OTHER = 13.0, 17.0, 60.0, 80.0
 THROUGHPUT = {DIVIDE: 10.0, ROOT: 12.0, FUNCTION: 30.0, OTHER: 60.0}
 """What these cost in a batch, in units of an addition."""
+SUMS, PRODUCTS, DIVISIONS = "sums", "products", "divisions"  # units
 ALWAYS = -1000.0  # when constants are known
 MOST_CHAINS = 3  # sums are split into up to so many chains, added at their ends
+
+NAME = re.compile(r"[A-Za-z_]\w*")
 
 _Item = tuple[float, str]  # when a value is known, and its name or literal
 
@@ -46,6 +52,8 @@ class Schedule:
         The assignments: of what is known always, and of the rest.
     operations : float
         Of the rest, in a batch, in units of an addition.
+    steps : list of Operation
+        The rest, as `sympflow.kernels.pipeline` has it.
     """
 
     def __init__(
@@ -58,6 +66,7 @@ class Schedule:
         self.early: list[str] = []
         self.lines: list[str] = []
         self.operations = 0.0
+        self.steps: list[Operation] = []
         self.ready: dict[str, float] = {symbol.name: time for symbol, time in known.items()}
         self._printed, self._prefix = printed, prefix
         self._fused = "{2} + {0}*{1}" if fused is None else fused + "({0}, {1}, {2})"
@@ -105,11 +114,11 @@ class Schedule:
         n = int(sp.floor(exponent))
         factors: list[_Item] = []
         if exponent.q == 2:
-            factors.append(self._line(f"math.sqrt({x[1]})", x[0], ROOT))
+            factors.append(self._line(f"math.sqrt({x[1]})", x[0], ROOT, DIVISIONS))
         if n > 0:
             factors.append(self._whole_power(x, n))
         elif n < 0:
-            inverse = self._line(f"1.0/{x[1]}", x[0], DIVIDE)
+            inverse = self._line(f"1.0/{x[1]}", x[0], DIVIDE, DIVISIONS)
             factors.append(self._whole_power(inverse, -n))
         return self._product(factors) if factors else (ALWAYS, "1.0")
 
@@ -159,7 +168,7 @@ class Schedule:
                 elif len(item) == 1:
                     total = self._added(total, item[0])
                 elif item[0][1] == "-1.0":
-                    total = self._line(f"{total[1]} - {item[1][1]}", max(total[0], item[1][0]), ADD)
+                    total = self._line(f"{total[1]} - {item[1][1]}", max(total[0], item[1][0]), ADD, SUMS)
                 else:
                     text = self._fused.format(item[0][1], item[1][1], total[1])
                     total = self._line(text, max(total[0], time), FUSED)
@@ -170,16 +179,19 @@ class Schedule:
         return ends[0]
 
     def _added(self, a: _Item, b: _Item) -> _Item:
-        return self._line(f"{a[1]} + {b[1]}", max(a[0], b[0]), ADD)
+        return self._line(f"{a[1]} + {b[1]}", max(a[0], b[0]), ADD, SUMS)
 
-    def _line(self, text: str, start: float, latency: float) -> _Item:
+    def _line(self, text: str, start: float, latency: float, unit: str = PRODUCTS) -> _Item:
         if text not in self._names:
             name = f"{self._prefix}{len(self._names)}"
             (self.lines if start > ALWAYS else self.early).append(f"{name} = {text}")
             self._names[text] = name
             self.ready[name] = start + latency if start > ALWAYS else ALWAYS
             if start > ALWAYS:  # the compiler takes the rest out of loops over lanes
-                self.operations += THROUGHPUT.get(latency, 1.0)
+                occupied = THROUGHPUT.get(latency, 1.0)
+                self.operations += occupied
+                operands = tuple(x for x in NAME.findall(text) if x in self.ready)
+                self.steps.append(Operation(name, operands, latency, unit, int(occupied)))
         name = self._names[text]
         return self.ready[name], name
 
