@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,10 +22,13 @@ def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
     return tuple((H[1:] - H[0]).tolist())
 
 
-def same_system(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
+def same_system(a: Sequence[float], b: Sequence[float]) -> bool:
     """Whether two fingerprints agree to nine digits of the largest."""
-    if a == b:
-        return True
+    return a == b or _agree(tuple(a), tuple(b))
+
+
+@lru_cache(maxsize=256)
+def _agree(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
     u, v = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if u.shape != v.shape:
         return False

@@ -19,8 +19,11 @@ from sympflow import (
 )
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.shipped import choose
+from sympflow.integrators.base import Problem
 from sympflow.integrators.checks import check_integrator
 from sympflow.integrators.logarithmic import LogSympFlow
+from sympflow.integrators.physical_time import PhysicalRun
+from sympflow.integrators.timed_pass import timed_pass
 from sympflow.interop.scipy import as_scipy
 from sympflow.systems.kepler import kepler_ellipse
 from sympflow.time_transformation import lifted
@@ -135,6 +138,36 @@ def test_the_transformed_functions_are_the_derivatives_of_each_other():
     for name in ("hamiltonian", "gradient", "hessian"):
         np.testing.assert_allclose(getattr(plain, name)(x), getattr(symbolic, name)(x), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(symbolic.hamiltonian(symbolic.y0), 0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("method", ["log_leapfrog", "log_blanes_moan4", "clocked"])
+@pytest.mark.parametrize("t_end", [40.0, -40.0])
+def test_one_compiled_pass_makes_what_the_run_by_chunks_makes(method, t_end, clocked):
+    kepler = systems.kepler()
+    integrator = LogSympFlow(flow=clocked, shift=0.0, dt=0.3) if method == "clocked" else get(method)(dt=0.3)
+    many = kepler.domain.sample(
+        150, 2
+    )  # more than the lanes of a block, of energies that take different numbers of steps
+    few, dense = np.array([0.0, 0.0, t_end]), np.linspace(0.0, t_end, 301)
+    for y0, times in ((many[0], few), (many[0], dense), (many, few), (many[:70], dense[:50]), (many[:1], None)):
+        problem = Problem(kepler, 0.0, t_end, y0, times)
+        made, expected = timed_pass(integrator, problem), PhysicalRun(integrator, problem).outcome()
+        assert made.y.shape == expected.y.shape
+        np.testing.assert_array_equal(made.t, expected.t)
+        # rounding enters at each of about 140 steps, and moves the phase linearly in time
+        np.testing.assert_allclose(made.y, expected.y, rtol=0, atol=140**2 * 10 * EPS)
+        np.testing.assert_array_equal(made.status, expected.status)
+        if times is few:
+            assert made.stats["n_steps"] == expected.stats["n_steps"]
+
+
+def test_the_compiled_pass_leaves_to_the_run_by_chunks_what_does_not_end():
+    henon_heiles, integrator = systems.henon_heiles(), get("log_leapfrog")(dt=0.2, shift=1.0)
+    escaping, end = np.array([0.0, 0.0, 0.0, 0.7]), np.array([10.0])  # infinite at t = 5.45
+    for y0 in (escaping, np.stack([henon_heiles.y0, escaping])):
+        assert timed_pass(integrator, Problem(henon_heiles, 0.0, 10.0, y0, end)) is None
+        assert (np.asarray(solve(henon_heiles, integrator, (0, 10), y0, t_eval=end).status) < 0).sum() == 1
+    assert timed_pass(integrator, Problem(henon_heiles, 0.0, 10.0, henon_heiles.y0, end)) is not None
 
 
 def test_a_collision_ends_the_run_with_its_time():

@@ -19,12 +19,14 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.flow.base import FlowMap
+from sympflow.flow.contents import Contents
 from sympflow.flow.layers import Drift, Kick, Layer
 from sympflow.flow.placement import checked_device, checked_dtype
 from sympflow.flow.potentials import Potential, Time
 from sympflow.flow.primed_potentials import KINETIC, POTENTIAL, Binding, PrimedPotential
 from sympflow.flow.sympflow import SympFlow
 from sympflow.integrators.schemes import SCHEMES
+from sympflow.integrators.splitting import scheme_evaluations
 
 if TYPE_CHECKING:
     from sympflow.kernels.clocked_flow import ClockedFlowKernel
@@ -147,7 +149,8 @@ class ClockedFlow(SympFlow):
         self.clock = ClockPotential(ndof, terms, checked_dtype(dtype), checked_device(device))
         self._binding = Binding(system)
         self._kernel: ClockedFlowKernel | None = None
-        self._numbers: tuple[tuple[int, int], list[float]] | None = None
+        self._contents = Contents([self.clock._parameters])
+        self._numbers: tuple[bytes, tuple[float, ...]] | None = None
         maps: list[Layer] = []
         for kind, c, *_ in table.substeps:
             term = KINETIC if kind == "drift" else POTENTIAL
@@ -174,15 +177,19 @@ class ClockedFlow(SympFlow):
 
     def advance(self, s: Any, B: Any) -> Any:
         """By how much the clock puts the time forward in steps s, which may be negative, at B: numbers or arrays."""
-        numbers = self.clock.numbers
-        if self._numbers is None or self._numbers[0] != (numbers.data_ptr(), numbers._version):
-            values = numbers.detach().cpu().double().numpy()[::-1].tolist()
-            self._numbers = (numbers.data_ptr(), numbers._version), values
         square = s * s * B
         total = 0.0 * square
-        for c in self._numbers[1]:
+        for c in self.numbers():
             total = total * square + c
         return s * s * s * total
+
+    def numbers(self) -> tuple[float, ...]:
+        """The c_k that the clock has now, the last one first."""
+        snapshot = self._contents.snapshot()
+        if self._numbers is None or self._numbers[0] != snapshot:
+            values = self.clock.numbers.detach().cpu().double().numpy()[::-1].tolist()
+            self._numbers = snapshot, tuple(values)
+        return self._numbers[1]
 
     def kernel_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
         """The compiled loops of this flow."""
@@ -194,8 +201,6 @@ class ClockedFlow(SympFlow):
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Evaluations of the forces, as `FixedStep.evaluations`."""
-        from sympflow.integrators.splitting import scheme_evaluations
-
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
 
     @property

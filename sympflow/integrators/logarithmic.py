@@ -20,6 +20,7 @@ from sympflow.integrators.physical_time import PhysicalRun
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.integrators.splitting import splitting
 from sympflow.integrators.time_search import reach
+from sympflow.integrators.timed_pass import timed_pass
 from sympflow.system import HamiltonianSystem
 from sympflow.time_transformation import checked_shift, default_shift, lifted, projected, time_scale, time_transformed
 
@@ -136,7 +137,7 @@ class Logarithmic(FixedStep):
                 f"`y0` is a tensor, but method {self.name!r} finds its outputs by root-finding on NumPy arrays: pass "
                 "y0.numpy(), or solve time_transformed(system), which takes tensors."
             )
-        return PhysicalRun(self, problem).outcome()
+        return timed_pass(self, problem) or PhysicalRun(self, problem).outcome()
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         """The steps of the run, their physical lengths; in a batch one that has ended waits with length 0."""
@@ -187,7 +188,12 @@ class LogSplitting(Logarithmic):
         check_flag("compensated", self.compensated)
 
     def inner(self, system: HamiltonianSystem) -> FixedStep:
-        return splitting(self.scheme_name)(compensated=self.compensated)
+        return _inner(self.scheme_name, bool(self.compensated))
+
+
+@cache
+def _inner(scheme_name: str, compensated: bool) -> FixedStep:
+    return splitting(scheme_name)(compensated=compensated)
 
 
 @cache
@@ -225,6 +231,8 @@ class LogSympFlow(Logarithmic):
     name: ClassVar[str] = "log_sympflow"
     order: ClassVar[int | None] = None
     trained: ClassVar[bool] = True
+    within: ClassVar[FixedStep | None] = None
+    """Of one whose `inner` has been asked for: that."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -251,16 +259,25 @@ class LogSympFlow(Logarithmic):
                 )
             return replace(self, flow=found[0].load(system), shift=found[0].shift if self.shift is None else self.shift)
         origin = (getattr(self.flow, "recipe", None) or {}).get("transforms")
-        return self if self.shift is not None or origin is None else replace(self, shift=origin["shift"])
+        if self.shift is not None or origin is None:
+            return self
+        resolved = object.__new__(type(self))  # the fields have been checked
+        vars(resolved).update(vars(self), shift=checked_shift(origin["shift"]))
+        return resolved
 
     def inner(self, system: HamiltonianSystem) -> FixedStep:
-        from sympflow.integrators.sympflow import SympFlowIntegrator
-
+        if self.within is not None:
+            return self.within
         if self.flow is None:
             raise ValueError(
                 "`flow` is needed: train one on sympflow.time_transformed(system), or prime one with it, and pass it."
             )
-        return SympFlowIntegrator(flow=self.flow)
+        from sympflow.integrators.sympflow import SympFlowIntegrator
+
+        within = object.__new__(SympFlowIntegrator)  # the flow has been checked
+        vars(within).update(flow=self.flow, dt=None, tol=None, compensated=False)
+        object.__setattr__(self, "within", within)
+        return within
 
     def step_length(self, system: HamiltonianSystem) -> float:
         if self.dt is not None:

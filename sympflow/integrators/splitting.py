@@ -114,6 +114,15 @@ class Splitting(FixedStep):
         lengths = np.broadcast_to(h, y.shape[:-1]).reshape(-1)
         return splitting_kernel(system).step(self.scheme, lengths, rows).reshape(y.shape)
 
+    def reach_times(self, problem: Problem, h: float, stride: int, expected: float) -> Any:
+        """`kernels.timed.reach_times` of the times and states of the problem; None where it does not apply."""
+        if self.compensated or self._kernel(problem) is None or problem.system.symbols is None:
+            return None
+        from sympflow.kernels.timed import reach_times
+
+        assert problem.t_eval is not None
+        return reach_times(problem.system, self.scheme, h, problem.y0, problem.t_eval, stride, expected)
+
     def _kernel(self, problem: Problem) -> SplittingKernel | None:
         """The compiled loops for the problem, or None where it needs, or asks for, array operations."""
         system, y0 = problem.system, problem.y0

@@ -169,6 +169,13 @@ class FlowIntegrator(FixedStep):
         flow = self._flow_like(system, y0)
         return flow, _kernel(system, flow, y0, problem.backend)
 
+    def reach_times(self, problem: Problem, h: float, stride: int, expected: float) -> Any:
+        """`kernels.timed.reach_times` of the times and states of the problem; None where it does not apply."""
+        kernel = self._flow_and_kernel(problem)[1]
+        if not hasattr(kernel, "reach_times"):
+            return None
+        return kernel.reach_times(h, problem.y0, problem.t_eval, stride, expected)
+
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         if self.prepared is not None and hasattr(self.prepared[1], "evaluations"):
             return self.prepared[1].evaluations(n_steps, n_saved, n_extra, backend)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.kernels.splitting import splitting_kernel
+from sympflow.kernels.timed import reach_times
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
@@ -57,3 +58,9 @@ class ClockedFlowKernel:
         else:
             out[:, self.flow.ndof - 1] += self.flow.advance(np.asarray(h, dtype=np.float64), y[:, -1])
         return out
+
+    def reach_times(
+        self, h: float, y0: np.ndarray, times: np.ndarray, stride: int, expected: float
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """The states of rows of `y0` (N, 2d) at elapsed times: see `timed.reach_times`."""
+        return reach_times(self.system, self._scheme, h, y0, times, stride, expected, self.flow.numbers())

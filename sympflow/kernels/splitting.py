@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -114,7 +115,7 @@ class SplittingKernel:
         n_finite : int
             Index of the last step that ends in a finite state, `n_steps` if all do; the run stops there.
         """
-        table = _scaled_run_table(scheme, h)
+        table = scaled_run_table(scheme, h)
         loops = self._loops(scheme.level, compensated)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(save), 2 * self.ndof))
@@ -141,7 +142,7 @@ class SplittingKernel:
         n_finite : ndarray of int64, shape (N,)
         """
         loops = self._loops(scheme.level, compensated)
-        table = _scaled_run_table(scheme, h)
+        table = scaled_run_table(scheme, h)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(y0), len(save), 2 * self.ndof))
         n_finite = np.empty(len(y0), dtype=np.int64)
@@ -156,7 +157,7 @@ class SplittingKernel:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
         h = np.asarray(h, dtype=np.float64)
         h = h.repeat(len(y)) if h.ndim == 0 else h
-        return self.step_rows(_step_table(scheme), scheme.level, h, h, y)
+        return self.step_rows(step_table(scheme), scheme.level, h, h, y)
 
     def step_rows(self, table: _Table, level: int, x: np.ndarray, h: np.ndarray, y: np.ndarray) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
@@ -199,7 +200,7 @@ def _arrays(stages: list[_Stage]) -> _Table:
 
 
 @lru_cache(maxsize=256)
-def _step_table(scheme: Scheme) -> _Table:
+def step_table(scheme: Scheme) -> _Table:
     """The stages of one step by itself, for h = 1: (m, 1) each."""
     kicks, drifts, gradients, curvatures = _arrays(_stages(scheme))
     return kicks[:, None], drifts[:, None], gradients[:, None], curvatures[:, None]
@@ -219,7 +220,7 @@ def _run_table(scheme: Scheme) -> _Table:
 
 
 @lru_cache(maxsize=256)
-def _scaled_run_table(scheme: Scheme, h: float) -> _Table:
+def scaled_run_table(scheme: Scheme, h: float) -> _Table:
     """The table of a run whose steps are h."""
     kicks, drifts, gradients, curvatures = _run_table(scheme)
     return h * kicks, h * drifts, h**3 * gradients, h**5 * curvatures
@@ -243,6 +244,14 @@ def _header(level: int, compensated: bool, cache: bool, scheduled: bool) -> str:
 
 
 def _symbolic_loops(symbols: SymbolicHamiltonian, algebra: str, level: int, compensated: bool) -> _Loops:
+    loops = symbolic_module(symbols, algebra, level, compensated, ("loops", "aligned", "lanes"))
+    return _Loops(loops.rollout, loops.rollout_lanes, loops.step_lanes)
+
+
+def symbolic_module(
+    symbols: SymbolicHamiltonian, algebra: str, level: int, compensated: bool, after: Sequence[str]
+) -> ModuleType:
+    """The algebra of a symbolic system, the texts of loops `after` it, as a module."""
     from sympflow.kernels.codegen import curvature_kick_source, gradient_kick_source
     from sympflow.kernels.kicks import kicks_source
 
@@ -254,9 +263,7 @@ def _symbolic_loops(symbols: SymbolicHamiltonian, algebra: str, level: int, comp
         algebra = f"{algebra}\n\n{gradient_kick_source(symbols)}"
     header = _header(level, compensated, cache=True, scheduled=not compensated)
     before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
-    after = ["loops", "aligned", "lanes"]
-    loops = load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
-    return _Loops(loops.rollout, loops.rollout_lanes, loops.step_lanes)
+    return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
 
 
 _INVERSE_MASS_TIMES_V = {

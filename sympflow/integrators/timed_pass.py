@@ -1,0 +1,86 @@
+"""A run whose steps are equal in another time, made in one compiled pass where all goes well."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sympflow.integrators.base import FINISHED, Outcome, Problem
+from sympflow.integrators.grid import Grid
+
+if TYPE_CHECKING:
+    from sympflow.integrators.logarithmic import Logarithmic
+
+MOST_EXPECTED = 1e9  # steps, beyond which the run by chunks says whether they are too many
+LONGEST_STRIDE = 64  # steps from one look at the time to the next, where few outputs are wanted
+
+
+def timed_pass(integrator: Logarithmic, problem: Problem) -> Outcome | None:
+    """The outcome of a run, or None where there is no compiled pass for it or it did not reach its end.
+
+    None for dense output, for outputs at every step, and for whatever is an error: `PhysicalRun` says what it is.
+    """
+    system, y0, times = problem.system, problem.y0, problem.t_eval
+    length, dt = abs(problem.t1 - problem.t0), integrator.step_length(system)
+    if problem.dense_output or problem.backend == "array" or y0.dtype != np.float64 or system.symbols is None:
+        return None
+    far = max(abs(problem.t0), abs(problem.t1))
+    if not length or length > MOST_EXPECTED * dt or far + dt == far:
+        return None
+    if times is None:
+        if y0.ndim == 1:
+            return None
+        times = Grid(problem.t0, problem.t1, dt).outputs(None, problem.save_every)[0]
+    sign = 1.0 if problem.t1 > problem.t0 else -1.0
+    elapsed = sign * (times - problem.t0)
+    if not len(elapsed) or not elapsed[-1]:
+        return None
+    first = 0 if elapsed[0] else int(elapsed.searchsorted(0.0, "right"))
+
+    transformed, inner = integrator.transformed(system), integrator.inner(system)
+    reach_times = getattr(inner, "reach_times", None)
+    if reach_times is None:
+        return None
+    start = _lifted(problem, transformed.params["shift"])
+    if start is None:
+        return None
+    expected = float(elapsed[-1]) / dt
+    stride = int(min(max(1.0, (length / dt / (len(elapsed) + 1)) ** 0.5), LONGEST_STRIDE))
+    h = sign * integrator.new_step(system)
+    piece = Problem(transformed, 0.0, h, start, elapsed[first:], backend=problem.backend)
+    found = reach_times(piece, h, stride, expected)
+    if found is None:
+        return None
+    Y, counts = found
+    if first:
+        initial = y0.reshape(1, -1, y0.shape[-1])
+        Y = np.concatenate([np.broadcast_to(initial, (first, *initial.shape[1:])), Y])
+    if y0.ndim == 1:
+        n_steps, n_extra = counts[0].tolist()
+        status: Any = 0
+    else:
+        n_steps, n_extra = int(counts[:, 0].max()), int(counts[:, 1].sum())
+        status = np.zeros(y0.shape[:-1], dtype=int)
+    stats = {
+        "dt": dt,
+        "n_steps": n_steps,
+        **inner.evaluations(n_steps, n_steps, n_extra, "compiled"),
+        "backend": "compiled",
+    }
+    return Outcome(times, Y.reshape(len(times), *y0.shape), status, FINISHED, stats)
+
+
+def _lifted(problem: Problem, c: float) -> np.ndarray | None:
+    """States [q, t, p, B] (N, 2d + 2) with t = 0 and B = c − H; None unless c exceeds all V."""
+    system, rows = problem.system, problem.y0.reshape(-1, problem.y0.shape[-1])
+    d = system.ndof
+    q, p = rows[:, :d], rows[:, d:]
+    with np.errstate(all="ignore"):
+        V = system.potential(q)
+        B = c - (system.kinetic(p) + V)
+    if not (c > V).all():
+        return None
+    start = np.zeros((len(rows), 2 * d + 2))
+    start[:, :d], start[:, d + 1 : -1], start[:, -1] = q, p, B
+    return start

@@ -1,0 +1,110 @@
+"""Runs in the physical time of methods whose steps are equal in another, in one compiled pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from types import ModuleType
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from sympflow.integrators.schemes import Scheme
+from sympflow.kernels.codegen import algebra_source
+from sympflow.kernels.modules import run_one, run_rows
+from sympflow.kernels.splitting import scaled_run_table, step_table, symbolic_module
+from sympflow.symbolic import SymbolicHamiltonian
+from sympflow.system import HamiltonianSystem
+
+__all__ = ["reach_times"]
+
+FEWEST, MANY = 1000, 8.0  # steps after which a run is given up: these, and so many times the expected ones
+_LOOPS: WeakKeyDictionary[SymbolicHamiltonian, ModuleType] = WeakKeyDictionary()
+
+
+def reach_times(
+    system: HamiltonianSystem,
+    scheme: Scheme,
+    h: float,
+    y0: np.ndarray,
+    times: np.ndarray,
+    stride: int,
+    expected: float,
+    clock: Sequence[float] = (),
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The states at elapsed times of a scheme with equal steps on a logarithmic Hamiltonian, each by a shorter step.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        The transformed one, symbolic, with states [q, t, p, B].
+    scheme : Scheme
+        Without force gradients.
+    h : float
+        Step in the other time, negative to go back.
+    y0 : ndarray of shape (N, 2d + 2)
+        With t = 0.
+    times : ndarray of shape (n,)
+        Elapsed ones, increasing, positive for every sign of h.
+    stride : int
+        Steps between two looks at the time.
+    expected : float
+        Steps that a run takes, roughly; after many more it is given up.
+    clock : sequence of float
+        Of a trained clock: the numbers c_k of what it adds to t in a step s, Σ_k c_k s^(3+2k) B^k, the last one first.
+
+    Returns
+    -------
+    Y : ndarray of shape (n, N, 2d)
+        [q, p].
+    counts : ndarray of int64, shape (N, 2)
+        The steps taken, and those tried to meet the times.
+
+    None where a trajectory does not reach its times: because a state is not finite, time turns, or steps run out.
+    """
+    loops = _loops(system)
+    run, step = _tables(scheme, h)
+    n_rows = len(y0)
+    out = np.empty((len(times), n_rows, y0.shape[1] - 2))
+    counts = np.zeros((n_rows, 2), dtype=np.int64)
+    most_steps, work = int(FEWEST + MANY * expected), int(expected * run.shape[1] * system.ndof)
+    numbers = _numbers(tuple(clock))
+    if n_rows == 1:
+        reached = run_one(
+            lambda stop: loops.reach_times(run, step, h, numbers, y0, times, stride, most_steps, out, counts, stop),
+            work,
+        )
+        return (out, counts) if reached else None
+    done = []
+
+    def rows(i: slice, stop: np.ndarray) -> None:
+        done.append(
+            loops.reach_times_lanes(
+                run, step, h, numbers, y0, i.start, i.stop, times, stride, most_steps, out, counts, stop
+            )
+        )
+
+    run_rows(rows, n_rows, work, None)
+    return (out, counts) if all(done) else None
+
+
+def _loops(system: HamiltonianSystem) -> ModuleType:
+    symbols = system.symbols
+    assert symbols is not None
+    loops = _LOOPS.get(symbols)
+    if loops is None:
+        after = ("loops", "aligned", "lanes", "timed_loops")
+        loops = _LOOPS[symbols] = symbolic_module(symbols, algebra_source(symbols), 0, False, after)
+    return loops
+
+
+@lru_cache(maxsize=256)
+def _tables(scheme: Scheme, h: float) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers of a run of steps h, (4, m), and of one step for h = 1, kicks and drifts (2, m)."""
+    kicks, drifts, *_ = step_table(scheme)
+    return np.stack(scaled_run_table(scheme, h)), np.stack([kicks[:, 0], drifts[:, 0]])
+
+
+@lru_cache(maxsize=64)
+def _numbers(clock: tuple[float, ...]) -> np.ndarray:
+    return np.array(clock, dtype=float)
