@@ -25,6 +25,8 @@ SCENES = {
     "masses": lambda: HamiltonianSystem.from_sympy("p1**2 + p1*p2/3 + p2**2/5 + q1**4*q2**2 - q1*q2 + q2**6/7"),
     "one term": lambda: HamiltonianSystem.from_sympy("p**2/2 - q**4/4"),
     "roots": lambda: HamiltonianSystem.from_sympy("p**2/2 + sqrt(1 + q**2) - 1/(2 + q**2) + (3 + q)**1.5"),
+    "constant force": lambda: HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 + q1 - 2*q2 + q2**3", y0=[0.0] * 4),
+    "no force": lambda: HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 + q1**2", y0=[0.0] * 4),
     "kinks": lambda: HamiltonianSystem.from_sympy("p**2/2 + Abs(q)**3 + Piecewise((q**2, q > 0), (0, True))"),
 }
 ELEMENTARY = {

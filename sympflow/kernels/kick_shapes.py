@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import sympy as sp
@@ -57,11 +58,11 @@ def shapes(symbols: SymbolicHamiltonian, terms: int) -> Iterator[list[sp.Expr]]:
         yield [printable(sp.Add(p[i], *sp.Add.make_args(f))) for i, f in enumerate(expanded)]
         yield [printable(p[i] + _by_common_factors(f, q)) for i, f in enumerate(expanded)]
         if max(len(f.args) for f in expanded) <= MOST_NESTED:
-            for sums in (False, True):
-                yield [_nested(symbols, p[i], f, sums) for i, f in enumerate(expanded)]
+            for sums, last in itertools.product((False, True), repeat=2):
+                yield [_nested(symbols, p[i], f, sums, last) for i, f in enumerate(expanded)]
 
 
-def _nested(symbols: SymbolicHamiltonian, p: sp.Symbol, f: sp.Expr, sums: bool) -> sp.Expr:
+def _nested(symbols: SymbolicHamiltonian, p: sp.Symbol, f: sp.Expr, sums: bool, last: bool) -> sp.Expr:
     """p + f, an expanded sum, in the form that is known soonest; with `sums`, terms of one coefficient c as c·m·(Σ)."""
     groups: dict[sp.Expr, list[sp.Expr]] = {}
     for term in sp.Add.make_args(f):
@@ -88,7 +89,7 @@ def _nested(symbols: SymbolicHamiltonian, p: sp.Symbol, f: sp.Expr, sums: bool) 
     for letters, functions in groups.items():
         for number, function in map(sp.Expr.as_coeff_Mul, functions):
             terms.append(_times(number * letters, sp.Mul(*map(stand_in, sp.Mul.make_args(function)))))
-    return _put_back(nested(p, terms, {p: -FUSED, **times}), {symbol: f for f, symbol in stand_ins.items()})
+    return _put_back(nested(p, terms, {p: -FUSED, **times}, last), {symbol: f for f, symbol in stand_ins.items()})
 
 
 def _put_back(f: sp.Expr, back: dict[sp.Dummy, sp.Expr]) -> sp.Expr:

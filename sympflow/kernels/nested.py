@@ -13,7 +13,8 @@ from sympflow.kernels.scheduling import ALWAYS, FUSED, MULTIPLY
 
 __all__ = ["nested"]
 
-FEW_TERMS = 8
+FEW_TERMS = 8  # of which more ways to split them are tried
+MOST_FORMS = 1000  # of sums and parts of them; after so many the next ones are split in one way only
 
 _Powers = tuple[int, ...]
 _Term = tuple[_Powers, int]  # exponents, and which coefficient
@@ -28,7 +29,7 @@ class _Form(NamedTuple):
     split: tuple[_Powers, _Sum] | None = None
 
 
-def nested(first: sp.Symbol, terms: Iterable[sp.Expr], known: dict[sp.Symbol, float]) -> sp.Expr:
+def nested(first: sp.Symbol, terms: Iterable[sp.Expr], known: dict[sp.Symbol, float], last: bool = False) -> sp.Expr:
     """`first` + Σ `terms` as nested sums of products m·A + B, of all such forms the one that is known soonest.
 
     m is a product of arguments, A what is left of terms that it divides, B the other terms. Forms are compared by the
@@ -41,6 +42,8 @@ def nested(first: sp.Symbol, terms: Iterable[sp.Expr], known: dict[sp.Symbol, fl
         Products of a coefficient and powers of the arguments, whose exponents are positive integers.
     known : dict of Symbol to float
         When `first` and the arguments are known, in cycles; what is not in it is a coefficient, known always.
+    last : bool
+        Which of equally good forms: the first found, or the last. They share different products with other sums.
     """
     x = [symbol for symbol in known if symbol != first]
     coefficients: list[sp.Expr] = []
@@ -57,17 +60,19 @@ def nested(first: sp.Symbol, terms: Iterable[sp.Expr], known: dict[sp.Symbol, fl
     def best(terms: _Sum, with_first: bool) -> _Form:
         key = terms, with_first
         if key not in found:
-            found[key] = min(forms(terms, with_first), key=lambda form: form[:2])
+            tried = list(forms(terms, with_first))
+            found[key] = min(reversed(tried) if last else tried, key=lambda form: form[:2])
         return found[key]
 
     def forms(terms: _Sum, with_first: bool) -> Iterator[_Form]:
-        if not terms:
-            yield _Form(known[first], 0.0)
+        if not any(any(powers) for powers, _ in terms):
+            yield _Form(known[first] if with_first else ALWAYS, float(len(terms)))
         elif len(terms) == 1 and not with_first:
             ((powers, _),) = terms
             yield _Form(_product_known(times, powers, ALWAYS), sum(powers))
         else:
-            for m, inside in _splits(terms, few):
+            splits = _splits(terms, few)
+            for m, inside in splits if len(found) < MOST_FORMS else itertools.islice(splits, 1):
                 inner, outside = best(_divided(inside, m), False), terms - inside
                 ready = max(inner.time, _product_known(times, m))
                 operations = inner.operations + (1.0 if sum(m) == 1 else 1.5)  # a product of x may be shared
@@ -81,7 +86,8 @@ def nested(first: sp.Symbol, terms: Iterable[sp.Expr], known: dict[sp.Symbol, fl
     def built(terms: _Sum, with_first: bool) -> sp.Expr:
         split = best(terms, with_first).split
         if split is None:
-            return first if with_first else sp.Add(*(_times(coefficients[i], _monomial(x, n)) for n, i in terms))
+            values = [_times(coefficients[i], _monomial(x, n)) for n, i in sorted(terms)]
+            return sp.Add(*([first] if with_first else []), *values, evaluate=len(values) > 1)
         m, inside = split
         product = _times(built(_divided(inside, m), False), _monomial(x, m))
         if inside == terms and not with_first:
