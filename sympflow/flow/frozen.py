@@ -59,7 +59,8 @@ class Tables:
         self._even = exponents[1:2] != (1,)
         self._kept: dict[Any, Any] = {}
 
-    def _keep(self, key: Any, make: Callable[[], Any]) -> Any:
+    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
+        """What `make` gives, made once for each key."""
         if key not in self._kept:
             if len(self._kept) > MOST_KEPT:
                 self._kept.clear()
@@ -72,7 +73,7 @@ class Tables:
         def make() -> Scheme:
             return self.scheme(part, t).inverse() if back else self._frozen(part, t)
 
-        return self._keep((part, t, back), make)
+        return self.kept((part, t, back), make)
 
     def polynomials(self, back: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Kicks, drifts, gradients and curvatures (m, K) of the stages of ψ̄_t, or of its inverse.
@@ -90,7 +91,7 @@ class Tables:
             kicks, gradients, curvatures, drifts = (np.pad(c, ((0, 0), (0, max(0, 3 - c.shape[1])))) for c in columns)
             return kicks, drifts, gradients, curvatures
 
-        return self._keep(("polynomials", back), make)
+        return self.kept(("polynomials", back), make)
 
     def variable(self, t: np.ndarray) -> np.ndarray:
         """t/Δt, or its square where all polynomials are even.
@@ -117,7 +118,7 @@ class Tables:
                 counts.append(scheme_evaluations(self.scheme("primed processor", None), 0, 0, n, backend))
             return {name: sum(count[name] for count in counts) for name in counts[0]}
 
-        return dict(self._keep((n_steps, n_saved, n_extra, backend), make))
+        return dict(self.kept((n_steps, n_saved, n_extra, backend), make))
 
     def _frozen(self, part: str, t: float | None) -> Scheme:
         t = self.dt if t is None else float(t)

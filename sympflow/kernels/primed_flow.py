@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.integrators.scheme import CURVATURE, Scheme
-from sympflow.kernels.splitting import splitting_kernel
+from sympflow.kernels.splitting import splitting_kernel, step_table
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class PrimedFlowKernel:
         tables = flow.tables
         if not tables.compilable:
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
-        if flow.tables.level == CURVATURE and system.symbols is None:
+        if tables.level == CURVATURE and system.symbols is None:
             raise ValueError(
                 f"`system` {system.name!r} has no symbols, from which curvature terms are compiled: use "
                 "backend='array'."
@@ -67,6 +67,9 @@ class PrimedFlowKernel:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,); its numbers are polynomials in h."""
         h = np.asarray(h, dtype=np.float64)
         h = h.repeat(len(y)) if h.ndim == 0 else h
+        if len(h) == 1 and h[0] != 0:
+            back = bool(h[0] < 0)
+            return self._stepped(-h if back else h, y, back)
         forwards = h > 0
         if forwards.all():
             return self._stepped(h, y, False)
@@ -90,14 +93,22 @@ class PrimedFlowKernel:
         """χ_t⁻¹ of the rows of y."""
         if not self._tables.processed:
             return y
-        return self._splitting.step(self._tables.scheme("primed processor", t, back=True), t, y)
+        return self._processed(t, y, True)
 
     def _finished(self, t: float, y0: np.ndarray, Y: np.ndarray, save: np.ndarray) -> np.ndarray:
         """χ_t of the outputs Y (N, n, 2d); what is saved before the first step are the initial states themselves."""
         if not self._tables.processed:
             return Y
-        chi = self._tables.scheme("primed processor", t)
-        out = self._splitting.step(chi, t, Y.reshape(-1, Y.shape[-1])).reshape(Y.shape)
+        out = self._processed(t, Y.reshape(-1, Y.shape[-1]), False).reshape(Y.shape)
         if len(save) and save[0] == 0:
             out[:, np.asarray(save) == 0] = y0[:, None]
         return out
+
+    def _processed(self, t: float, y: np.ndarray, back: bool) -> np.ndarray:
+        """χ_t of the rows of y, or its inverse."""
+        tables = self._tables
+        numbers = tables.kept(
+            ("processor", t, back), lambda: step_table(tables.scheme("primed processor", t, back=back))
+        )
+        lengths = np.full(len(y), t)
+        return self._splitting.step_rows(numbers, tables.level, lengths, lengths, y)

@@ -24,18 +24,20 @@ def all_within(system: HamiltonianSystem, domain: Box | EnergySublevel, states: 
 
     False says nothing of a sublevel where the system cannot be compiled, or H of the domain is not its own.
     """
-    if states.dtype != np.float64 or states.shape[-1] != domain.width:
+    bounds = domain.bounds if isinstance(domain, Box) else domain.limits(slack)
+    width = len(bounds[0]) if isinstance(domain, Box) else len(bounds[0]) - 2
+    if states.dtype != np.float64 or states.shape[-1] != width:
         return False
     x = np.ascontiguousarray(states.reshape(-1, states.shape[-1]).T)  # loops along the states are vector instructions
     if isinstance(domain, Box):
-        return all_between(x, *domain.bounds)
+        return all_between(x, *bounds)
     symbols = system.symbols
     if symbols is None or domain.hamiltonian != system.hamiltonian:
         return False
     kernel = _KERNELS.get(symbols)
     if kernel is None:
         kernel = _KERNELS[symbols] = _compiled(symbols)
-    return kernel(x, *domain.limits(slack))
+    return kernel(x, *bounds)
 
 
 def _compiled(symbols: SymbolicHamiltonian) -> Callable[..., bool]:
