@@ -104,6 +104,8 @@ def _energy(system: HamiltonianSystem) -> float:
 
 def checked_shift(shift: Any) -> float:
     """The shift as a float; beside one of 1e16 times the energies these would be lost already."""
+    if type(shift) is float and abs(shift) <= LARGEST_SHIFT:
+        return shift
     real = isinstance(shift, int | float | np.number) and not isinstance(shift, bool) and not np.iscomplexobj(shift)
     if not (real and math.isfinite(shift)) or abs(shift) > LARGEST_SHIFT:
         raise ValueError(

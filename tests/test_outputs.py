@@ -14,12 +14,15 @@ def test_times_are_placed_as_by_arrays(t0, t1, dt):
     on = t0 + np.arange(grid.n_steps + 1) * grid.h
     t = np.sort(np.concatenate([on, np.nextafter(on[1:-1], t1), np.linspace(t0, t1, 57)]))
     t = t if t1 > t0 else t[::-1].copy()
-    count, remainder, distinct = place(t, grid.t0, grid.h, 4 * EPS)
+    remainder, count, position = place(t, grid.t0, grid.h, 4 * EPS)
     expected = grid.locate(t, bounded=False)
-    assert np.array_equal(count, expected[0])
+    assert (np.diff(count) > 0).all()
+    assert np.array_equal(count[position], expected[0])
     assert np.array_equal(remainder, expected[1])
-    assert not distinct
-    assert place(on, grid.t0, grid.h, 4 * EPS)[2]
+    remainder, count, position = place(on, grid.t0, grid.h, 4 * EPS)
+    assert np.array_equal(count, np.arange(len(on)))
+    assert position is None
+    assert not remainder.any()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 2.5])

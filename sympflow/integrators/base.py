@@ -222,8 +222,7 @@ class FixedStep(Integrator):
         if compiled and t is not None and len(t) > FEW and not problem.dense_output:
             from sympflow.kernels.outputs import place
 
-            count, remainder, new = place(t, grid.t0, grid.h, 4 * EPS)
-            return t, remainder, *((count, None) if new else distinct(count))
+            return t, *place(t, grid.t0, grid.h, 4 * EPS)
         t, count, remainder = grid.outputs(t, problem.save_every)
         save, position = (np.arange(grid.n_steps + 1), count) if problem.dense_output else distinct(count)
         return t, remainder, save, position

@@ -9,18 +9,21 @@ from numba import njit
 
 
 @njit(**OPTIONS)
-def place(t, t0, h, rounding, count, remainder):
-    """`Grid.locate` into `count` and `remainder`; whether all counts are distinct."""
-    distinct = True
+def place(t, t0, h, rounding, count, remainder, position):
+    """`Grid.locate` of ordered times: the distinct counts into `count`, where among them each is, and how many."""
+    distinct = 0
     for i in range(len(t)):
         x = (t[i] - t0) / h
         nearest = np.rint(x)
         if abs(x - nearest) <= rounding * (abs(nearest) + (abs(t[i]) + abs(t0)) / abs(h)):
-            count[i], remainder[i] = np.int64(nearest), 0.0
+            whole, remainder[i] = np.int64(nearest), 0.0
         else:
-            whole = math.floor(x)
-            count[i], remainder[i] = whole, t[i] - (t0 + whole * h)
-        distinct &= i == 0 or count[i] != count[i - 1]
+            whole = np.int64(math.floor(x))
+            remainder[i] = t[i] - (t0 + whole * h)
+        if distinct == 0 or whole != count[distinct - 1]:
+            count[distinct] = whole
+            distinct += 1
+        position[i] = distinct - 1
     return distinct
 
 

@@ -18,10 +18,15 @@ def _loops() -> ModuleType:
     return load_module(f"OPTIONS = {options}\n\n\n{template('output_loops')}")
 
 
-def place(t: np.ndarray, t0: float, h: float, rounding: float) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Counts (n,) and remainders (n,) of ordered times, as `Grid.locate`; and whether all counts are distinct."""
-    count, remainder = np.empty(len(t), dtype=np.int64), np.empty(len(t))
-    return count, remainder, _loops().place(t, t0, h, rounding, count, remainder)
+def place(t: np.ndarray, t0: float, h: float, rounding: float) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Remainders (n,) of ordered times, as `Grid.locate`, their distinct counts, and where among these each time is.
+
+    The last is None where all counts are distinct.
+    """
+    n = len(t)
+    count, position, remainder = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64), np.empty(n)
+    distinct = _loops().place(t, t0, h, rounding, count, remainder, position)
+    return remainder, count[:distinct], position if distinct < n else None
 
 
 def all_finite(y: np.ndarray) -> bool:

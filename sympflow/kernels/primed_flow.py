@@ -101,7 +101,7 @@ class PrimedFlowKernel:
             return Y
         out = self._processed(t, Y.reshape(-1, Y.shape[-1]), False).reshape(Y.shape)
         if len(save) and save[0] == 0:
-            out[:, np.asarray(save) == 0] = y0[:, None]
+            out[:, : int(np.searchsorted(save, 0, "right"))] = y0[:, None]
         return out
 
     def _processed(self, t: float, y: np.ndarray, back: bool) -> np.ndarray:
