@@ -93,6 +93,11 @@ class CallableHamiltonian:
             raise ValueError(f"{refused}, q.copy() ({error}).") from error
 
     @property
+    def differentiates_itself(self) -> bool:
+        """Whether all derivatives are automatic ones of a function that is written with torch."""
+        return self._gradient is None and self._hessian_vector is None
+
+    @property
     def hessian_vector(self) -> Callable[..., Array] | None:
         """The user's ∇²V(q)·v, if given."""
         product = self._hessian_vector

@@ -112,7 +112,7 @@ class Hamiltonian:
         ValueError
             If T is not ½ pᵀM⁻¹p.
         """
-        symbols = self._with_acceleration().symbols
+        symbols = self._with_acceleration(q).symbols
         if symbols is not None:
             return symbols.curvature(q)
         v = self.velocity(self.force(q))
@@ -121,30 +121,40 @@ class Hamiltonian:
     def curvature_gradient(self, q: Array) -> Array:
         """The gradient of `curvature`, ∇²V M⁻¹∇²V v + ½ ∇³V(v, v): (..., d) to (..., d).
 
-        Without symbols the third derivative is that of ∇²V v along v: of tensors by automatic differentiation, of
-        arrays and of Numba functions by a central difference.
+        Without symbols the third derivative is that of ∇²V v along v: by automatic differentiation of tensors, and of
+        arrays if V is all that was given; of Numba functions and of a user's gradient of arrays by a difference.
         """
-        symbols = self._with_acceleration().symbols
+        symbols = self._with_acceleration(q).symbols
         if symbols is not None:
             return symbols.curvature_gradient(q)
         v = -self.velocity(self.force(q))
-        return self.hessian_vector(q, self.velocity(self.hessian_vector(q, v))) + self._third_derivative(q, v) / 2
+        return self.hessian_vector(q, self.velocity(self.hessian_vector(q, v))) + self.third_derivative(q, v, v) / 2
 
-    def _third_derivative(self, q: Array, v: Array) -> Array:
-        """∇³V(q)(v, v), for a system without symbols."""
-        if is_tensor(q) and self.numba_functions is None:
+    def third_derivative(self, q: Array, v: Array, w: Array) -> Array:
+        """∇³V(q)(v, w), for a system without symbols: (..., d), each, to (..., d)."""
+        itself = getattr(self._definition, "differentiates_itself", False)
+        if self.numba_functions is None and (itself or is_tensor(q)):
+            import torch
+
             from sympflow.forward_mode import jvp
 
-            return jvp(lambda x: self.hessian_vector(x, v), q, v)[1]
-        size, length = (abs(x).amax(-1, True) if is_tensor(x) else abs(x).max(-1, keepdims=True) for x in (q, v))
-        h = 6e-6 * (size + (size == 0)) / (length + (length == 0))  # ε^⅓
-        return (self.hessian_vector(q + h * v, v) - self.hessian_vector(q - h * v, v)) / (2 * h)
+            x, along, other = (torch.as_tensor(each) for each in (q, v, w))
+            found = jvp(lambda z: self.hessian_vector(z, other), x, along)[1]
+            return found if is_tensor(q) else found.numpy()
+        from sympflow.third_derivatives import third_derivative
 
-    def _with_acceleration(self) -> Hamiltonian:
+        return third_derivative(self, q, v, w)
+
+    def _with_acceleration(self, q: Array) -> Hamiltonian:
         if not self._separable().quadratic_kinetic:
             raise ValueError(
                 f"`system` {self.name!r} has no curvature terms, which are for a kinetic energy ½ pᵀM⁻¹p: leave them "
                 "out."
+            )
+        if q.shape[-1:] != (self.ndof,):
+            raise ValueError(
+                f"`q` must have shape (..., {self.ndof}), positions on the last axis; got {tuple(q.shape)}: "
+                f"pass y[..., :{self.ndof}] of a state y."
             )
         return self
 

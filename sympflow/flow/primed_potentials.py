@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sympflow.flow.potentials import Potential, Time
 from sympflow.forward_mode import jvp
+from sympflow.third_derivatives import derivative, direction, length_of_change, step
 
 if TYPE_CHECKING:
     from sympflow.system import HamiltonianSystem
@@ -110,16 +111,20 @@ def _gradient_columns(U: Term, system: HamiltonianSystem, x: Tensor) -> Tensor:
 def _gradient_and_change(U: Term, system: HamiltonianSystem, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
     """∇U on columns (d, N), and its derivative along dx.
 
-    Numba functions end at ∇²V·v, and so do functions of a user in a curvature term: what lacks is a central difference.
+    Numba functions end at ∇²V·v: what lacks is a difference.
     """
     gradient = partial(_gradient_columns, U, system)
-    if U not in (FORCE_GRADIENT, CURVATURE) or system.symbols is not None:
+    if U not in (FORCE_GRADIENT, CURVATURE) or system.numba_functions is None:
         return jvp(gradient, x, dx)
-    if U is FORCE_GRADIENT and system.numba_functions is None:
-        return jvp(gradient, x, dx)
-    size, length = (v.abs().amax(0) for v in (x, dx))
-    h = torch.finfo(x.dtype).eps ** (1 / 3) * torch.where(size > 0, size, 1.0) / torch.where(length > 0, length, 1.0)
-    return gradient(x), (gradient(x + h * dx) - gradient(x - h * dx)) / (2 * h)
+    q, v = x.T, dx.T
+    if U is FORCE_GRADIENT:
+        a = system.velocity(system.force(q))
+        turn = system.hessian_vector(q, system.velocity(system.hessian_vector(q, v)))
+        change = system.third_derivative(q, v, a) - turn
+        return system.hessian_vector(q, a).T, change.T
+    along = direction(v)
+    h = step(q, length_of_change(system, q, along, along))
+    return gradient(x), (derivative(partial(U.gradient, system), q, along, h) * v.abs().amax(-1, True)).T
 
 
 class PrimedPotential(Potential):
