@@ -390,6 +390,37 @@ def test_bad_arguments_are_named(arguments, message):
         SympFlow.primed(HH, **arguments)
 
 
+@pytest.mark.parametrize("value", ["yes", 2, "x", 1.0])
+@pytest.mark.parametrize("flag", ["palindromic", "force_gradient", "curvature"])
+def test_flags_are_true_or_false(flag, value):
+    with pytest.raises(TypeError, match=rf"^`{flag}` must be True or False; got {value!r}"):
+        SympFlow.primed(HH, 3, **{flag: value})
+
+
+@pytest.mark.parametrize("make", [SympFlow.primed, SympFlow.split])
+def test_what_is_no_system_is_refused(make):
+    with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem; got NoneType: .*from_sympy"):
+        make(None, 3)
+
+
+def test_times_of_a_scheme():
+    flow = SympFlow.primed(HH, 3, dt=0.5)
+    for method in (flow.scheme, flow.kernel_scheme):
+        with pytest.raises(TypeError, match=r"^`t` must be a number in \(0, dt\] = \(0, 0.5\]; got 'a': leave it out"):
+            method("a")
+        with pytest.raises(ValueError, match=r"^`t` must lie in \(0, dt\] = \(0, 0.5\]; got 0.6: .* several steps"):
+            method(0.6)
+
+
+def test_options_of_primed_are_none_of_train():
+    with pytest.raises(
+        TypeError, match=r"^`curvature` is .*: pass flow=SympFlow.primed\(system, ..., curvature=True\)"
+    ):
+        train(HH, curvature=True)
+    with pytest.raises(TypeError, match=r"^`restart` is no option of train\(\): is `restarts` meant\?"):
+        train(HH, restart=2)
+
+
 def test_systems_it_does_not_apply_to():
     with pytest.raises(ValueError, match=r"^`system` .* not separable"):
         SympFlow.primed(HamiltonianSystem.from_sympy("p**2*q**2/2 + q**2"))
@@ -397,8 +428,10 @@ def test_systems_it_does_not_apply_to():
         SympFlow.primed(RELATIVISTIC, force_gradient=True)
     without_symbols = HamiltonianSystem(potential=lambda q: (q**4).sum(-1), ndof=1)
     for system, options in ((RELATIVISTIC, {}), (HH, {"force_gradient": False}), (without_symbols, {})):
-        with pytest.raises(ValueError, match=r"^`curvature` goes with force gradients of a symbolic system"):
+        with pytest.raises(ValueError, match=r"^`curvature` goes with force gradients of a symbolic system") as raised:
             SympFlow.primed(system, curvature=True, **options)
+        assert ("`force_gradient`" in str(raised.value)) == bool(options)
+        assert ("HamiltonianSystem.from_sympy" in str(raised.value)) == (system is without_symbols)
     with pytest.raises(ValueError, match=r"^`system` .* has no curvature terms"):
         RELATIVISTIC.curvature(np.ones(1))
     with pytest.raises(ValueError, match=r"^`scheme` 'srkn6b'|^`scheme` 'srkn11b' needs"):

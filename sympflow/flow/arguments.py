@@ -55,6 +55,17 @@ def checked_time(flow: FlowMap, t: Any, x: Any) -> float | Tensor:
     return value
 
 
+def check_system(system: Any) -> None:
+    """Raise unless `system` is a HamiltonianSystem."""
+    from sympflow.system import HamiltonianSystem
+
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(
+            f"`system` must be a HamiltonianSystem; got {type(system).__name__}: take a scene of sympflow.systems, or "
+            "define one with HamiltonianSystem.from_sympy."
+        )
+
+
 def bare_time(flow: FlowMap, t: Any, x: Any) -> float | Tensor:
     """`t`, checked to lie in [0, Δt]."""
     t = checked_time(flow, t, x)

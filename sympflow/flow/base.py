@@ -56,7 +56,7 @@ class FlowMap(nn.Module):
         if isinstance(ndof, bool) or not isinstance(ndof, int) or ndof < 1:
             raise ValueError(f"`ndof` must be a positive integer, the degrees of freedom; got {ndof!r}.")
         if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf:
-            raise ValueError(f"`dt` must be a positive finite number, the Δt of the flow; got {dt!r}.")
+            raise ValueError(f"`dt` must be a positive finite number, the Δt of the flow; got {dt!r}: 1.0 is usual.")
         if not MIN_DT <= dt <= MAX_DT:
             raise ValueError(
                 f"`dt` must lie between {MIN_DT:g} and {MAX_DT:g}; got {dt!r}: choose another unit of time."

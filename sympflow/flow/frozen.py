@@ -123,7 +123,9 @@ class Tables:
     def _frozen(self, part: str, t: float | None) -> Scheme:
         t = self.dt if t is None else float(t)
         if not 0 < t <= self.dt * (1 + 1e-12):
-            raise ValueError(f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t!r}.")
+            raise ValueError(
+                f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t!r}: longer times are several steps, of at most dt."
+            )
         powers = (t / self.dt) ** self._exponents
         values = {column: table @ powers for column, table in self._coefficients.items()}
         stages = _stages((s.kind, _numbers(s, values, 1)) for s in self._parts[part])

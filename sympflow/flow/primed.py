@@ -100,7 +100,8 @@ class PrimedFlow(SympFlow):
         for name, value, least in (("maps", maps, 1), ("degree", degree, 1), ("processor", processor, 0)):
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 kind = "positive" if least else "non-negative"
-                raise ValueError(f"`{name}` must be a {kind} integer; got {value!r}.")
+                remedy = "give 1 or more" if least else "0 is for none"
+                raise ValueError(f"`{name}` must be a {kind} integer; got {value!r}: {remedy}.")
         if maps < 2 or (palindromic and maps % 2 == 0):
             raise ValueError(f"`maps` must be at least 2, and odd for a palindrome; got {maps}: add a kick or a drift.")
         if processor and degree < 2:
@@ -181,17 +182,25 @@ class PrimedFlow(SympFlow):
 
         Its coefficients depend on t, and so it has no classical order.
         """
-        return self.tables.scheme("primed", t)
+        return self.tables.scheme("primed", self._time_of_scheme(t))
 
     def kernel_scheme(self, t: float | None = None) -> Scheme:
         """K_t, likewise: ψ̄_t where there is no processor."""
-        return self.tables.scheme("primed kernel", t)
+        return self.tables.scheme("primed kernel", self._time_of_scheme(t))
 
     def processor_scheme(self, t: float | None = None) -> Scheme:
         """χ_t, likewise."""
         if not self.processor:
             raise ValueError("`flow` has no processor: see its `scheme`.")
-        return self.tables.scheme("primed processor", t)
+        return self.tables.scheme("primed processor", self._time_of_scheme(t))
+
+    def _time_of_scheme(self, t: float | None) -> float | None:
+        try:
+            return None if t is None else float(t)
+        except (TypeError, ValueError):
+            raise TypeError(
+                f"`t` must be a number in (0, dt] = (0, {self.dt:g}]; got {t!r}: leave it out for dt."
+            ) from None
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Force and force-gradient evaluations of a run, as `FixedStep.evaluations`."""

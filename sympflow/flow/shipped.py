@@ -203,7 +203,9 @@ def choose(
         If there is none; the message lists those there are.
     """
     if tol is not None and not (isinstance(tol, Real) and not isinstance(tol, bool) and 0 < tol < math.inf):
-        raise ValueError(f"`tol` must be a positive number, a relative energy error; got {tol!r}.")
+        raise ValueError(
+            f"`tol` must be a positive number, a relative energy error; got {tol!r}: take 1e-6, for instance."
+        )
     own = ShippedFlows([f for f in shipped_flows(system, kind) if transformed or f.shift is None])
     if not own:
         there = ", ".join(f.name for f in shipped_flows(kind=kind))

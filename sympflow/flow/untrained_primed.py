@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from sympflow.flow.arguments import check_system
 from sympflow.flow.frozen import Kind
 from sympflow.flow.primed import PrimedFlow
+from sympflow.integrators.base import check_flag
 from sympflow.integrators.scheme import Scheme
 from sympflow.integrators.schemes import SCHEMES, compose
 
@@ -30,6 +32,10 @@ def primed(
     device: torch.device | str | None,
 ) -> PrimedFlow:
     """`SympFlow.primed`."""
+    check_system(system)
+    for name, flag in (("palindromic", palindromic), ("force_gradient", force_gradient), ("curvature", curvature)):
+        if name != "force_gradient" or flag is not None:
+            check_flag(name, flag)
     if not system.separable:
         raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
     if force_gradient is None:
@@ -38,15 +44,18 @@ def primed(
     elif force_gradient and not system.quadratic_kinetic:
         raise ValueError("`force_gradient` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
     if curvature and not (force_gradient and system.symbols is not None):
-        raise ValueError(
-            "`curvature` goes with force gradients of a symbolic system, H = ½ pᵀM⁻¹p + V(q): leave it out."
-        )
+        remedy = "leave it out"
+        if system.symbols is None:
+            remedy += ", or define the system with HamiltonianSystem.from_sympy"
+        elif system.quadratic_kinetic:
+            remedy = "leave out `force_gradient`, or `curvature`"
+        raise ValueError(f"`curvature` goes with force gradients of a symbolic system, H = ½ pᵀM⁻¹p + V(q): {remedy}.")
     if degree is None:
         degree = 5 if processor else 7
     if scheme is None:
         stages = 6 if stages is None else stages
         if isinstance(stages, bool) or not isinstance(stages, int) or stages < 1:
-            raise ValueError(f"`stages` must be a positive integer, the number of kicks; got {stages!r}.")
+            raise ValueError(f"`stages` must be a positive integer, the number of kicks; got {stages!r}: 3 is usual.")
         scheme = compose("leapfrog", 2, (1 / stages,) * stages, "equal leapfrog steps")
     elif stages is not None:
         raise ValueError("`stages` and `scheme` were both given: leave out `stages`, the scheme has its own.")

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from sympflow.decomposition import exact_parts
+from sympflow.flow.arguments import check_system
 from sympflow.flow.split import SplitFlow, class_kinds, part_kinds
+from sympflow.integrators.base import check_flag
 from sympflow.parts import LINEAR
 
 if TYPE_CHECKING:
@@ -28,8 +30,11 @@ def split(
     device: torch.device | str | None,
 ) -> SplitFlow:
     """`SympFlow.split`."""
+    check_system(system)
+    check_flag("filters", filters)
+    check_flag("linear_outside", linear_outside)
     if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= 1000:
-        raise ValueError(f"`stages` must be a positive integer, at most 1000; got {stages!r}.")
+        raise ValueError(f"`stages` must be a positive integer, at most 1000; got {stages!r}: 4 is usual.")
     parts = exact_parts(system, expressions)
     if force_gradient is None:
         force_gradient = parts.has_force_gradient

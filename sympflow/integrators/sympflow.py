@@ -305,7 +305,9 @@ class SympFlowIntegrator(FlowIntegrator):
         if self.tol is None:
             return
         if not isinstance(self.tol, Real) or isinstance(self.tol, bool) or not 0 < self.tol < math.inf:
-            raise ValueError(f"`tol` must be a positive number, a relative energy error; got {self.tol!r}.")
+            raise ValueError(
+                f"`tol` must be a positive number, a relative energy error; got {self.tol!r}: take 1e-6, for instance."
+            )
         for name in ("flow", "dt"):
             if getattr(self, name) is not None:
                 raise ValueError(f"`tol` chooses the flow and its Δt, but `{name}` is given: leave out one of them.")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
+import inspect
 import math
 from typing import Any
 
@@ -35,11 +37,29 @@ def domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
     return domain
 
 
+OF_PRIMED_ALONE = ("curvature", "palindromic", "scheme", "degree", "force_gradient")
+
+
+def refuse_unknown(options: dict[str, Any]) -> None:
+    """Raise if there are options that `train` does not have, with what may be meant."""
+    from sympflow.training.trainer import train
+
+    for name, value in options.items():
+        if name in OF_PRIMED_ALONE:
+            raise TypeError(
+                f"`{name}` is an option of SympFlow.primed: pass flow=SympFlow.primed(system, ..., {name}={value!r})."
+            )
+        known = [each for each in inspect.signature(train).parameters if each != "unknown"]
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"is `{close[0]}` meant?" if close else f"choose from {', '.join(known[1:])}."
+        raise TypeError(f"`{name}` is no option of train(): {hint}")
+
+
 def check_step_and_budget(dt: Any, time_budget: Any) -> None:
     if dt is not None and (isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf):
-        raise ValueError(f"`dt` must be a positive finite number; got {dt!r}.")
+        raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
     if time_budget is not None and not 0 < time_budget < math.inf:
-        raise ValueError(f"`time_budget` must be a positive number of seconds; got {time_budget!r}.")
+        raise ValueError(f"`time_budget` must be a positive number of seconds; got {time_budget!r}: leave it out.")
 
 
 def weights_of(

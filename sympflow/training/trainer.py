@@ -13,7 +13,7 @@ from sympflow.domain import Domain
 from sympflow.flow.base import FlowMap
 from sympflow.system import HamiltonianSystem
 from sympflow.training.architecture import check_flow, kind_of, new_primed
-from sympflow.training.arguments import check_step_and_budget, domain_for
+from sympflow.training.arguments import check_step_and_budget, domain_for, refuse_unknown
 from sympflow.training.recipes import BUDGET
 from sympflow.training.run import Path
 from sympflow.training.starts import start
@@ -59,6 +59,7 @@ def train(
     time_budget: float | None = None,
     progress: bool | None = None,
     callback: Callable[[int, dict[str, float]], None] | None = None,
+    **unknown: Any,
 ) -> Any:
     """Train a flow map of `system` on [0, dt]: with nothing else given, the best that is known for it.
 
@@ -128,11 +129,12 @@ def train(
     ValueError
         If the system has no domain and none is given, or an argument is not admissible.
     TypeError
-        If an option is not one of the optimizer's.
+        If an option is not one of the optimizer's, or of no training at all.
     FloatingPointError
         If the loss is not finite from the start.
     """
     given, begin = dict(locals()), time.perf_counter()
+    refuse_unknown(given.pop("unknown"))
     domain = domain_for(system, domain)
     check_step_and_budget(dt, time_budget)
     hurried = flow is None and time_budget is None and restarts is None and steps is None and resume is None
