@@ -43,7 +43,8 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int) -> str:
     ``kicked(q, p, table, j)``, from `level` 1 on ``gradient_kicked`` and from 2 on ``curvature_kicked``, are the
     fastest for one trajectory; what depends on b, g and c alone is in row j of the table, which ``fill_coefficients(b,
     g, c, row)`` computes. ``kicked_lane(q, p, b)``, ``gradient_kicked_lane(q, p, b, g)`` and
-    ``curvature_kicked_lane(q, p, b, g, c)`` have the fewest operations, for many trajectories at once.
+    ``curvature_kicked_lane(q, p, b, g, c)`` have the fewest operations, for many at once; ``drifted(q, p, a)``
+    is for both.
 
     Raises
     ------
@@ -69,7 +70,26 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int) -> str:
         functions.append(_function(symbols, f"{name}_lane", arguments, [*many.coefficients, *many.lines], many.results))
     rows = [*fill, *(f"row[{i}] = {name}" for i, name in enumerate([*stored, "b", "g", "c"]))]
     filled = "\n    ".join(["@njit(**OPTIONS)\ndef fill_coefficients(b, g, c, row):", *rows])
-    return "\n\n\n".join([f"N_COEFFICIENTS = {len(stored) + 3}", filled, *functions]) + "\n"
+    drifts = _drift_source(symbols)
+    return "\n\n\n".join([f"N_COEFFICIENTS = {len(stored) + 3}", filled, *functions, drifts]) + "\n"
+
+
+def _drift_source(symbols: SymbolicHamiltonian) -> str:
+    """``drifted(q, p, a)``, q + a M⁻¹p or q + a∇T, the products with a, for which no state waits, made first."""
+    M, d = symbols.inverse_mass, symbols.ndof
+    if M is None:
+        lines = ["v = drift(p, a, None)"]
+        moved = [f"{s} + v[{i}]" for i, s in enumerate(symbols.q)]
+    else:
+        lines, moved = [], []
+        for i in range(d):
+            at = symbols.q[i].name
+            for j in range(d):
+                if M[i, j] != 0:
+                    factor = "a" if M[i, j] == 1 else f"(a*{float(M[i, j])!r})"
+                    at = f"{PRODUCT}({factor}, {symbols.p[j]}, {at})"
+            moved.append(at)
+    return _function(symbols, "drifted", "q, p, a", lines, moved)
 
 
 def _names(assignments: Sequence[str]) -> list[str]:

@@ -4,8 +4,8 @@ The algebra that comes before says what a state is: q and p are tuples held in r
 arrays changed in place (Numba functions). It defines ``unpack``, ``pack``, ``copy``, ``is_finite``, ``move``,
 ``no_error``, ``kick``, ``gradient_kick``, ``drift``, ``workspace``, and for a symbolic system ``curvature_kick``. A
 ``gradient_kick`` has two parts, which are added one after the other, the second only where `COUPLED`. Where
-`SCHEDULED`, ``kicked``, ``gradient_kicked`` and ``curvature_kicked`` give the new p at once, in an order of operations
-that is fast, and stand for these; ``fill_coefficients`` prepares them.
+`SCHEDULED`, ``kicked``, ``gradient_kicked`` and ``curvature_kicked`` give the new p at once, and ``drifted`` the new q,
+in an order of operations that is fast, and stand for these; ``fill_coefficients`` prepares them.
 
 A run executes the table [opening, inner …, link, closing] of stages (kick, then drift). A step is the link (the
 first step, the opening) and the inner stages; consecutive steps share their common kick or drift in the link, and
@@ -33,7 +33,7 @@ def prepared(kicks, gradients, curvatures):
     return workspace()
 
 
-@njit(**OPTIONS)
+@njit(**OPTIONS, forceinline=True)
 def stage(q, p, q_error, p_error, b, g, c, a, j, work):
     """Kick by b (and g and c), then drift by a."""
     if CURVATURES and c != 0.0:
@@ -43,13 +43,26 @@ def stage(q, p, q_error, p_error, b, g, c, a, j, work):
     return plain_stage(q, p, q_error, p_error, b, a, j, work)
 
 
+@njit(**OPTIONS)
+def called_stage(q, p, q_error, p_error, b, g, c, a, j, work):
+    """`stage` where few are run. In the loops of a run it stands as it is: a call costs as much as a small kick."""
+    return stage(q, p, q_error, p_error, b, g, c, a, j, work)
+
+
+@njit(**OPTIONS, forceinline=True)
+def drift_by(q, p, q_error, a, work):
+    if SCHEDULED:
+        return drifted(q, p, a), q_error
+    return move(q, q_error, drift(p, a, work))
+
+
 @njit(**OPTIONS, forceinline=True)
 def plain_stage(q, p, q_error, p_error, b, a, j, work):
     if SCHEDULED:
         p = kicked(q, p, work, j)
     else:
         p, p_error = move(p, p_error, kick(q, b, work))
-    q, q_error = move(q, q_error, drift(p, a, work))
+    q, q_error = drift_by(q, p, q_error, a, work)
     return q, p, q_error, p_error
 
 
@@ -62,7 +75,7 @@ def gradient_stage(q, p, q_error, p_error, b, g, a, j, work):
         p, p_error = move(p, p_error, first)
         if COUPLED:
             p, p_error = move(p, p_error, second)
-    q, q_error = move(q, q_error, drift(p, a, work))
+    q, q_error = drift_by(q, p, q_error, a, work)
     return q, p, q_error, p_error
 
 
@@ -72,7 +85,7 @@ def curvature_stage(q, p, q_error, p_error, b, g, c, a, j, work):
         p = curvature_kicked(q, p, work, j)
     elif CURVATURES:
         p, p_error = move(p, p_error, curvature_kick(q, b, g, c, work))
-    q, q_error = move(q, q_error, drift(p, a, work))
+    q, q_error = drift_by(q, p, q_error, a, work)
     return q, p, q_error, p_error
 
 
@@ -80,7 +93,7 @@ def curvature_stage(q, p, q_error, p_error, b, g, c, a, j, work):
 def close(q, p, q_error, p_error, kicks, drifts, gradients, curvatures, work):
     """The end of a step, from the running state before its last stage, which is left as it is."""
     q, p, q_error, p_error = copy(q), copy(p), copy(q_error), copy(p_error)
-    q, p, _, _ = stage(
+    q, p, _, _ = called_stage(
         q, p, q_error, p_error, kicks[-1], gradients[-1], curvatures[-1], drifts[-1], len(kicks) - 1, work
     )
     return q, p
@@ -91,15 +104,13 @@ def first_non_finite(q, p, kicks, drifts, gradients, curvatures, first, n_steps,
     """The first of `n_steps` steps from a running state whose end is not finite; `n_steps` if none is."""
     link = len(kicks) - 2
     q_error, p_error = no_error(q), no_error(p)
+    j = first
     for n in range(1, n_steps):
-        q, p, q_error, p_error = stage(
-            q, p, q_error, p_error, kicks[first], gradients[first], curvatures[first], drifts[first], first, work
-        )
-        first = link
-        for j in range(1, link):
-            q, p, q_error, p_error = stage(
+        for _ in range(link):
+            q, p, q_error, p_error = called_stage(
                 q, p, q_error, p_error, kicks[j], gradients[j], curvatures[j], drifts[j], j, work
             )
+            j = j + 1 if j < link else 1
         end_q, end_p = close(q, p, q_error, p_error, kicks, drifts, gradients, curvatures, work)
         if not is_finite(end_q, end_p):
             return n
@@ -124,7 +135,7 @@ def rollout(kicks, drifts, gradients, curvatures, y0, n_steps, save, out, stop):
     work = prepared(kicks, gradients, curvatures)
     q, p = unpack(y0)
     q_error, p_error = no_error(q), no_error(p)
-    n = saved = first = 0
+    n = saved = j = 0
     while saved < len(save) and save[saved] <= 0:
         pack(q, p, out[saved])
         saved += 1
@@ -132,15 +143,11 @@ def rollout(kicks, drifts, gradients, curvatures, y0, n_steps, save, out, stop):
         block = min(CHECK_EVERY, n_steps - n)
         if saved < len(save):
             block = min(block, save[saved] - n)
-        start_q, start_p, begin = copy(q), copy(p), first
-        for _ in range(block):
-            b, g, c, a = kicks[first], gradients[first], curvatures[first], drifts[first]
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, c, a, first, work)
-            for j in range(1, link):
-                q, p, q_error, p_error = stage(
-                    q, p, q_error, p_error, kicks[j], gradients[j], curvatures[j], drifts[j], j, work
-                )
-            first = link
+        start_q, start_p, begin = copy(q), copy(p), j
+        for _ in range(block * link):
+            b, g, c, a = kicks[j], gradients[j], curvatures[j], drifts[j]
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, c, a, j, work)
+            j = j + 1 if j < link else 1
         end_q, end_p = close(q, p, q_error, p_error, kicks, drifts, gradients, curvatures, work)
         if not is_finite(end_q, end_p):
             fill_with_nan(out, saved)
@@ -180,5 +187,5 @@ def step_each(kicks, drifts, gradients, curvatures, x, h, y, out):
         for j in range(len(kicks)):
             b, a = h[i] * polynomial(kicks[j], x[i]), h[i] * polynomial(drifts[j], x[i])
             g, c = h[i] ** 3 * polynomial(gradients[j], x[i]), h[i] ** 5 * polynomial(curvatures[j], x[i])
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, c, a, j, work)
+            q, p, q_error, p_error = called_stage(q, p, q_error, p_error, b, g, c, a, j, work)
         pack(q, p, out[i])

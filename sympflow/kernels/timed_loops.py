@@ -99,7 +99,7 @@ def deliver(q, p, first, n, block, end, table, work, step, h, advance, clock, ta
     for k in range(1, block + 1):
         for j in range(link):
             row = first if j == 0 else j
-            q, p, q_error, p_error = stage(
+            q, p, q_error, p_error = called_stage(
                 q, p, q_error, p_error, kicks[row], gradients[row], curvatures[row], drifts[row], row, work
             )
         first = link
@@ -140,18 +140,14 @@ def reach_times(table, step, h, clock, y0, targets, stride, most_steps, out, cou
     q, p = unpack(y0[0])
     advance = clock_advance(clock, h, p[NDOF - 1])
     q_error, p_error = no_error(q), no_error(p)
-    n, saved, first, now = 0, 0, 0, 0.0
+    n, saved, j, now = 0, 0, 0, 0.0
     while saved < len(targets) and stop[0] == 0:
         block = min(stride, most_steps - n)
-        start_q, start_p, begin = q, p, first
-        for _ in range(block):
-            b, g, c, a = kicks[first], gradients[first], curvatures[first], drifts[first]
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, c, a, first, work)
-            for j in range(1, link):
-                q, p, q_error, p_error = stage(
-                    q, p, q_error, p_error, kicks[j], gradients[j], curvatures[j], drifts[j], j, work
-                )
-            first = link
+        start_q, start_p, begin = q, p, j
+        for _ in range(block * link):
+            b, g, c, a = kicks[j], gradients[j], curvatures[j], drifts[j]
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, c, a, j, work)
+            j = j + 1 if j < link else 1
         end_q, end_p = close(q, p, q_error, p_error, kicks, drifts, gradients, curvatures, work)
         then = sign * (end_q[NDOF - 1] + (n + block) * advance)
         if block <= 0 or not is_finite(end_q, end_p) or not then >= now:
@@ -174,7 +170,7 @@ def enter(Y, lane, row, table, work):
     q, p = unpack(row)
     q_error, p_error = no_error(q), no_error(p)
     for j in range(len(kicks) - 2):
-        q, p, q_error, p_error = stage(
+        q, p, q_error, p_error = called_stage(
             q, p, q_error, p_error, kicks[j], gradients[j], curvatures[j], drifts[j], j, work
         )
     pack_lane(q, p, Y, lane)
