@@ -196,6 +196,20 @@ def test_force_evaluations_on_arrays_are_bounded_before_a_singularity(method):
     assert batch.stats["n_steps"] <= most / stages
 
 
+@pytest.mark.parametrize("backend", ["array", "auto"])
+def test_states_of_an_infinite_energy(backend):
+    """V that overflows is refused; T that does is a run that fails at its start, whatever is asked of it."""
+    oscillator = systems.harmonic_oscillator()
+    for y0 in ([2e154, 0.0], [1e200, 1e200], [[1.0, 0.0], [1e308, 0.0]]):
+        with pytest.raises(ValueError, match=r"^`y0` has the energy inf: give a state of a finite one\."):
+            solve(oscillator, "log_leapfrog", (0.0, 0.2), y0=y0, backend=backend)
+    for asked in ({}, {"t_eval": [0.1, 0.2]}, {"dense_output": True}):
+        sol = solve(oscillator, "log_leapfrog", (0.0, 0.2), y0=[0.0, 2e154], backend=backend, **asked)
+        assert (sol.status, sol.stats["failed_at"]) == (-1, 0.0)
+    batch = solve(oscillator, "log_leapfrog", (0.0, 0.2), y0=[[1.0, 0.0], [0.0, 2e154]], backend=backend)
+    assert batch.status.tolist() == [0, -1]
+
+
 def test_bad_shifts_and_systems_are_refused():
     with pytest.raises(
         ValueError, match=r"^`shift` 0.1 does not exceed the potential at `y0`.*give one above the energy"

@@ -40,9 +40,13 @@ class PhysicalRun:
             self.start = lifted(self.system, rows, c)
         if (gap <= 0).any():
             i = int(np.argmax(gap <= 0))
+            with np.errstate(all="ignore"):
+                energy = float(self.system.hamiltonian(rows[i]))
+            if not np.isfinite(energy):
+                raise ValueError(f"`y0` has the energy {energy:g}: give a state of a finite one.")
             raise ValueError(
                 f"`shift` {c:g} does not exceed the potential at `y0`, {c - gap[i]:g}: give one above the energy "
-                f"{float(self.system.hamiltonian(rows[i])):g}, so that c − V stays positive."
+                f"{energy:g}, so that c − V stays positive."
             )
         self.length = abs(problem.t1 - problem.t0)
         self.sign = 1.0 if problem.t1 >= problem.t0 else -1.0
@@ -93,9 +97,11 @@ class PhysicalRun:
             self.n_steps += self.stride * last
             total += n * self.stride
             rows = np.arange(len(x))
-            self.failed_at[lost] = self.problem.t0 + self.sign * t[rows, last][lost]
+            elapsed = np.where(np.isnan(t[rows, last]), 0, t[rows, last])  # of a start that is not finite
+            self.failed_at[lost] = self.problem.t0 + self.sign * elapsed[lost]
             yield states, last
-            pace = np.nanmin(np.where(running, (t[rows, last] - t[:, 0]) / np.maximum(last, 1), np.nan)) / self.stride
+            paces = np.where(running, (t[rows, last] - t[:, 0]) / np.maximum(last, 1), np.nan)
+            pace = np.fmin.reduce(paces) / self.stride  # of those that are numbers, if any is
             running = running & ~passed.any(1) & ~lost
             x = states[rows, last]
             left = (self.length - t[rows, last][running]).max(initial=0.0)
