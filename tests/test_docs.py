@@ -13,7 +13,6 @@ from sympflow import shipped_flows
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-CUT_SHORT = {"restarts=4)": "restarts=1, steps=8, points=40)"}  # a search, where only that it runs is tested
 BLOCK = re.compile(r"(?:<!-- needs: (?P<needs>\w+) -->\n)?^```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -30,8 +29,6 @@ def test_the_code_on_a_page_runs(page, tmp_path):
             continue
         parts.append(f"# {page.name}, line {page.read_text(encoding='utf-8')[: block.start()].count(chr(10)) + 1}")
         parts.append(block["code"])
-        for shown, cut in CUT_SHORT.items():
-            parts[-1] = parts[-1].replace(shown, cut)
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(ROOT / "examples"), os.environ.get("PYTHONPATH", "")]),
         "MPLBACKEND": "agg",
