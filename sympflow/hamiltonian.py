@@ -89,15 +89,15 @@ class Hamiltonian:
 
     def potential(self, q: Array) -> Array:
         """V(q): (..., d) to (...)."""
-        return self._separable()._definition.potential(q)
+        return self._separable()._definition.potential(self._positions(q))
 
     def force(self, q: Array) -> Array:
         """−∇V(q): (..., d) to (..., d)."""
-        return -self._separable()._definition.potential_gradient(q)
+        return -self._separable()._definition.potential_gradient(self._positions(q))
 
     def potential_hessian(self, q: Array) -> Array:
         """∇²V(q): (..., d) to (..., d, d)."""
-        return self._separable()._definition.potential_hessian(q)
+        return self._separable()._definition.potential_hessian(self._positions(q))
 
     def hessian_vector(self, q: Array, v: Array) -> Array:
         """∇²V(q)·v, by the function given for it if there is one: (..., d), (..., d) to (..., d)."""
@@ -112,9 +112,9 @@ class Hamiltonian:
         ValueError
             If T is not ½ pᵀM⁻¹p.
         """
-        symbols = self._with_acceleration(q).symbols
+        symbols = self._with_acceleration().symbols
         if symbols is not None:
-            return symbols.curvature(q)
+            return symbols.curvature(self._positions(q))
         v = self.velocity(self.force(q))
         return (v * self.hessian_vector(q, v)).sum(-1) / 2
 
@@ -124,9 +124,9 @@ class Hamiltonian:
         Without symbols the third derivative is that of ∇²V v along v: by automatic differentiation of tensors, and of
         arrays if V is all that was given; of Numba functions and of a user's gradient of arrays by a difference.
         """
-        symbols = self._with_acceleration(q).symbols
+        symbols = self._with_acceleration().symbols
         if symbols is not None:
-            return symbols.curvature_gradient(q)
+            return symbols.curvature_gradient(self._positions(q))
         v = -self.velocity(self.force(q))
         return self.hessian_vector(q, self.velocity(self.hessian_vector(q, v))) + self.third_derivative(q, v, v) / 2
 
@@ -145,18 +145,21 @@ class Hamiltonian:
 
         return third_derivative(self, q, v, w)
 
-    def _with_acceleration(self, q: Array) -> Hamiltonian:
+    def _with_acceleration(self) -> Hamiltonian:
         if not self._separable().quadratic_kinetic:
             raise ValueError(
                 f"`system` {self.name!r} has no curvature terms, which are for a kinetic energy ½ pᵀM⁻¹p: leave them "
                 "out."
             )
+        return self
+
+    def _positions(self, q: Array) -> Array:
         if q.shape[-1:] != (self.ndof,):
             raise ValueError(
                 f"`q` must have shape (..., {self.ndof}), positions on the last axis; got {tuple(q.shape)}: "
                 f"pass y[..., :{self.ndof}] of a state y."
             )
-        return self
+        return q
 
     def kinetic(self, p: Array) -> Array:
         """T(p): (..., d) to (...)."""

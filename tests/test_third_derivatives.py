@@ -84,6 +84,8 @@ def test_the_velocity_of_a_flow_of_numba_functions(curvature, tmp_path):
 
 
 def test_positions_of_another_shape_are_refused():
-    for method in (systems.henon_heiles().curvature, systems.henon_heiles().curvature_gradient):
+    system = systems.henon_heiles()
+    functions = (system.potential, system.force, system.potential_hessian, system.curvature, system.curvature_gradient)
+    for method in functions:
         with pytest.raises(ValueError, match=r"^`q` must have shape \(\.\.\., 2\), .* got \(3,\)"):
             method(np.array([0.1, 0.2, 9.0]))
