@@ -19,6 +19,7 @@ if not BENCHMARKS.exists():
 sys.path.insert(0, str(BENCHMARKS))
 
 import drift
+import own_systems
 import peers
 import primed
 import primed_ideas
@@ -245,6 +246,13 @@ def test_a_tiny_race_of_primed_flows(tmp_path, monkeypatch):
 def test_a_tiny_ablation():
     lines = primed.run(arguments(ablation=True)).splitlines()
     assert [line.split(" | ")[0] for line in lines[2:]] == [f"| {v.name}" for v in primed.ABLATION[:3]]
+
+
+def test_own_systems_are_compared_with_schemes(capsys):
+    own_systems.main(["duffing", "--quick"])
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| duffing")]
+    assert "kahan_li8" in line
+    assert float(line.split(" | ")[-1].rstrip(" |")) > 0
 
 
 def test_whole_calls_are_timed_beside_their_loops(capsys):

@@ -1,0 +1,126 @@
+"""What `train(system)` with nothing else gives on systems that are not built in, beside splitting schemes.
+
+    python benchmarks/own_systems.py              all of them, each a minute of training and half a minute of comparison
+    python benchmarks/own_systems.py mass         one of them
+    python benchmarks/own_systems.py --quick      the same in miniature
+
+At the flow's own median energy error over 20 held-out states up to T = 1000, each scheme gets the longest step, to 2 %,
+that is as good; then all run to T = 1e5 through `solve`, in turn, on one thread: the least processor time of nine runs.
+"""
+
+# ruff: noqa: E402
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+
+from contenders.environment import pin_to_one_thread
+
+pin_to_one_thread()
+
+import numpy as np
+
+from sympflow import Box, EnergySublevel, HamiltonianSystem, get, max_energy_error, solve, train
+
+RIVALS = ("blanes_moan4", "omelyan4", "omelyan6", "chin4a", "srkn6b", "srkn11b", "srkn14a", "kahan_li8")
+
+
+def box(*widths: float) -> Box:
+    """|x_i| ≤ width_i."""
+    return Box([-w for w in widths], list(widths))
+
+
+SYSTEMS = {
+    "duffing": HamiltonianSystem.from_sympy(
+        "p**2/2 + q**2/2 + q**4/8", domain=EnergySublevel(1.0, box(1.3, 1.5)), y0=[1.0, 0.0]
+    ),
+    "morse": HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 + (1 - exp(-q1))**2 + (1 - exp(-q2))**2 + (1 - exp(-q1))*(1 - exp(-q2))/5",
+        domain=EnergySublevel(0.4, Box([-0.6, -0.6, -0.9, -0.9], [1.2, 1.2, 0.9, 0.9])),
+        y0=[0.3, -0.2, 0.2, 0.3],
+    ),
+    "mass": HamiltonianSystem.from_sympy(  # a full mass matrix, ∂⁴V ≠ 0
+        "p1**2/4 + p2**2 + 2*p1*p2/5 + (q1**2 + q2**2)/2 + 3*q1**2*q2/10 + (q1**4 + q2**4)/5",
+        domain=EnergySublevel(0.6, box(1.6, 1.6, 2.0, 1.2)),
+        y0=[0.3, 0.2, 0.1, 0.1],
+    ),
+    "singular": HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 + (q1**2 + q2**2)/2 + 1/(2*(q1 - q2)**2) + q1**4/20",
+        domain=EnergySublevel(2.0, Box([-2.3, -1.0, -2.0, -2.0], [1.0, 2.3, 2.0, 2.0])),
+        y0=[-0.7, 0.7, 0.1, 0.1],
+    ),
+    "three": HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2 + p3**2 + q1**2 + q2**2 + q3**2)/2 + (q1**2 + q3**2)*q2**2/2 + 3*q3*q1**2/10 + q3**4/10",
+        domain=EnergySublevel(0.5, box(1.3, 1.3, 1.3, 1.1, 1.1, 1.1)),
+        y0=[0.3, 0.2, 0.1, 0.1, 0.2, 0.3],
+    ),
+}
+
+
+def energy_error(system: HamiltonianSystem, method: object, states: np.ndarray, t_end: float) -> float:
+    """The largest relative energy error up to t_end, the median over the states."""
+    t = np.linspace(0.0, t_end, 501)
+    with np.errstate(all="ignore"):
+        errors = max_energy_error(solve(system, method, (0.0, t_end), y0=states, t_eval=t, on_domain_exit="ignore"))
+    return float(np.median(errors))
+
+
+def longest_step(system: HamiltonianSystem, name: str, target: float, states: np.ndarray, t_end: float) -> float:
+    """The longest step of a scheme with which its energy error is at most the target; 0 if that of 0.002 is not."""
+    short, long = 2e-3, 3.0
+    if not energy_error(system, get(name)(dt=short), states, t_end) <= target:
+        return 0.0
+    while long > 1.02 * short:
+        middle = (short * long) ** 0.5
+        good = energy_error(system, get(name)(dt=middle), states, t_end) <= target
+        short, long = (middle, long) if good else (short, middle)
+    return short
+
+
+def row(name: str, system: HamiltonianSystem, quick: bool) -> str:
+    """The line of a system in the table."""
+    start = time.process_time()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # the end of the time budget
+        flow = train(system, **({"restarts": 2, "steps": 10, "points": 40} if quick else {}))
+    trained = time.process_time() - start
+    assert system.domain is not None
+    states, t_end, far = system.domain.sample(20, 777), 10.0 if quick else 1000.0, 100.0 if quick else 1e5
+    target = energy_error(system, flow, states, t_end)
+    rivals = RIVALS[-2:] if quick else RIVALS
+    steps = {rival: step for rival in rivals if (step := longest_step(system, rival, target, states, t_end))}
+    methods = [flow, *(get(rival)(dt=step) for rival, step in steps.items())]
+    times = []
+    for _ in range(2 if quick else 10):
+        for method in methods:
+            begin = time.process_time()
+            solve(system, method, (0.0, far), y0=states[0], t_eval=[far], on_domain_exit="ignore")
+            times.append(time.process_time() - begin)
+    least = np.reshape(times, (-1, len(methods)))[1:].min(0)
+    ratios = dict(zip(steps, least[1:] / least[0], strict=True))
+    best = min(ratios, key=ratios.__getitem__)
+    return (
+        f"| {name} | {flow.dt:g} | {trained:.0f} s | {target:.1e} | {ratios[best]:.2f} {best} "
+        f"| {ratios['kahan_li8']:.2f} |"
+    )
+
+
+def main(given: list[str] | None = None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("systems", nargs="*", metavar="system", help=f"of {', '.join(SYSTEMS)}")
+    parser.add_argument("--quick", action="store_true", help="does it run?")
+    arguments = parser.parse_args(given)
+    unknown = set(arguments.systems) - set(SYSTEMS)
+    if unknown:
+        parser.error(f"no system {', '.join(sorted(unknown))}: choose of {', '.join(SYSTEMS)}")
+    print("| system | Δt | training | energy error, T = 1000 | best scheme takes | Kahan–Li 8 takes |")
+    print("|---|---|---|---|---|---|")
+    for name in arguments.systems or SYSTEMS:
+        print(row(name, SYSTEMS[name], arguments.quick), flush=True)
+
+
+if __name__ == "__main__":
+    main()
