@@ -258,7 +258,7 @@ def test_own_systems_are_compared_with_schemes(capsys):
 def test_whole_calls_are_timed_beside_their_loops(capsys):
     through_solve.main(["--quick"])
     lines = [line for line in capsys.readouterr().out.splitlines() if "times faster" in line]
-    assert len(lines) == 8
+    assert len(lines) == 9
     assert all(line.count(" ms") == 2 for line in lines)
     assert sum("loops" in line for line in lines) == 7  # no loops alone where outputs lie between steps
 

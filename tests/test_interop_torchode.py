@@ -33,7 +33,7 @@ CLASSICAL = [
 ]
 
 
-@pytest.mark.parametrize(("name", "dt"), [*((name, 0.1) for name in CLASSICAL), ("kahan_li8", 0.25), ("sympflow", 1.2)])
+@pytest.mark.parametrize(("name", "dt"), [*((name, 0.1) for name in CLASSICAL), ("kahan_li8", 0.25), ("sympflow", 1.0)])
 def test_each_sample_has_its_own_times(name, dt):
     register(name, HH)
     y0 = torch.tensor(HH.domain.sample(3, 0))
@@ -90,7 +90,7 @@ def test_bad_arguments_are_named():
         step_method(SympFlow(1), HH)
     flow = get("sympflow")().flow_for(HH)
     y0, t_eval = torch.tensor(HH.y0)[None], torch.tensor([0.0, 3.0], dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"^`dt0` must be at most the flow's Δt = 1.2"):
+    with pytest.raises(ValueError, match=r"^`dt0` must be at most the flow's Δt = 1"):
         run(step_method(flow, HH), y0, t_eval, 2.0)
     with pytest.raises(ValueError, match=r"^`y0` must have shape \(batch, 4\)"):
         run(step_method("verlet", HH), y0[:, :2], t_eval, 0.1)

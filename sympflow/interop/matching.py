@@ -19,7 +19,11 @@ def own_velocity(integrator: FixedStep, system: HamiltonianSystem | None, y: np.
         return system.vector_field(y)
     import torch
 
+    from sympflow.flow.primed import PrimedFlow
+
     flow = integrator.flow_for(system)  # type: ignore[attr-defined]
+    if isinstance(flow, PrimedFlow) and flow.system is not None:  # consistent: at t = 0 it is that of its system
+        return flow.system.vector_field(y)
     with torch.no_grad():
         return to_numpy(flow.velocity(0.0, torch.from_numpy(np.array(y)).to(flow.dtype)))
 
