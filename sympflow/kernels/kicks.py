@@ -18,6 +18,7 @@ from sympflow.symbolic import SymbolicHamiltonian
 __all__ = ["kicks_source"]
 
 PRODUCT = "fused_multiply_add"  # of `elementary`
+MOST_KEPT = 200  # sources
 BEST, MOST_MIXED = 3, 2  # shapes that are mixed, and momenta up to which they are
 BEFORE = "before_"  # the name of a position before a drift begins with it
 
@@ -51,6 +52,19 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int) -> str:
     ValueError
         If a function in H has no counterpart in compiled code.
     """
+    key = symbols.H, level
+    if key not in _SOURCES:
+        if len(_SOURCES) >= MOST_KEPT:
+            del _SOURCES[next(iter(_SOURCES))]
+        _SOURCES[key] = _source(symbols, level)
+    return _SOURCES[key]
+
+
+_SOURCES: dict[tuple[sp.Expr, int], str] = {}
+"""By H: systems are often made again, and the search takes a tenth of a second or more."""
+
+
+def _source(symbols: SymbolicHamiltonian, level: int) -> str:
     functions: list[str] = []
     fill: list[str] = []
     stored: list[str] = []
