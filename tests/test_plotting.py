@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from sympflow import compare, get, poincare_section, systems
-from sympflow.studies.comparison_figure import overview, save_comparison
+from sympflow.studies.comparison_figure import _annotate, overview, save_comparison
+from sympflow.studies.figure_style import new_figure
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +43,22 @@ def test_energy_panel_shows_the_running_maximum(report):
     bold = [line for line in ax.lines if line.get_linewidth() > 1]
     assert bold[0].get_ydata()[-1] == report.rows[0].energy_error
     assert (np.diff(bold[0].get_ydata()) >= 0).all()
+
+
+def test_labels_cover_neither_markers_nor_each_other():
+    """As in the demo: a long name right of two points that lie close together, another pair of these."""
+    names = ["leapfrog", "verlet", "sympflow:flow=henon_heiles-sympflow", "mlp", "rk45"]
+    points = list(zip([1.4e-4, 2.5e-4, 1.8e-3, 1.1e-1, 1.5e-1], [7e-2, 6e-2, 4e-3, 2.5e-1, 1.1], names, strict=True))
+    figure = new_figure(4.7, 3.6)
+    ax = figure.subplots()
+    ax.set(xscale="log", yscale="log", xlim=(3e-5, 1.0), ylim=(1e-12, 1e2))
+    _annotate(ax, points, {name: ("k", "o") for name in names})
+    figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in ax.texts]
+    assert [text.get_text() for text in ax.texts] == names
+    for i, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:i])
+        assert not any(box.contains(*ax.transData.transform((x, y))) for x, y, _ in points)
 
 
 def test_overview_has_a_row_for_each_system(report):

@@ -33,9 +33,10 @@ def primed(
 ) -> PrimedFlow:
     """`SympFlow.primed`."""
     check_system(system)
-    for name, flag in (("palindromic", palindromic), ("force_gradient", force_gradient), ("curvature", curvature)):
-        if name != "force_gradient" or flag is not None:
-            check_flag(name, flag)
+    check_flag("palindromic", palindromic)
+    check_flag("curvature", curvature)
+    if force_gradient is not None:
+        check_flag("force_gradient", force_gradient)
     if not system.separable:
         raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
     if force_gradient is None:

@@ -130,9 +130,8 @@ def reach_times(table, step, h, clock, y0, targets, stride, most_steps, out, cou
     """The states [q, p] of one trajectory from ``y0[0]`` at the elapsed times `targets`, into ``out[:, 0]``.
 
     `table` is that of a run of steps h (kicks, drifts, gradients and curvatures as rows), `step` that of a single step
-    for h = 1. The steps that were taken, and
-    those that were tried to meet the times, go into ``counts[0]``. Returns whether all are reached: it ends where a
-    state is not finite, where time turns, or after `most_steps`.
+    for h = 1. The steps that were taken, and those that were tried to meet the times, go into ``counts[0]``. Returns
+    whether all are reached: it ends where a state is not finite, where time turns, or after `most_steps`.
     """
     kicks, drifts, gradients, curvatures = table[0], table[1], table[2], table[3]
     sign, link = 1.0 if h > 0.0 else -1.0, len(kicks) - 2

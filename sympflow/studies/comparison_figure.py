@@ -220,18 +220,44 @@ def _widen(set_limits: Any, values: Sequence[float], share: float = 0.25) -> Non
 
 
 def _annotate(ax: Axes, points: Sequence[tuple[float, float, str]], styles: dict[str, tuple[str, str]]) -> None:
-    """A label beside each point; where two points nearly coincide the second label goes below."""
-    placed: list[np.ndarray] = []
-    for x, y, label in sorted(points):
-        at = ax.transAxes.inverted().transform(ax.transData.transform((x, y)))
-        crowded = sum(bool((np.abs(at - p) < (0.25, 0.12)).all()) for p in placed)
-        placed.append(at)
+    """A label beside each point: above, below, right or left of it, where it covers least of the others."""
+    box = ax.get_window_extent()
+    inches = np.array([box.width, box.height]) / ax.figure.dpi
+    place = ax.transData + ax.transAxes.inverted()
+    markers = [(at - 5.0, at + 5.0) for at in (place.transform((x, y)) * inches * 72 for x, y, _ in points)]
+    placed: list[tuple[np.ndarray, np.ndarray]] = []
+    for k in sorted(range(len(points)), key=lambda k: points[k]):
+        x, y, label = points[k]
+        size = np.array([LETTER * len(label), LINE])
+        centre = (markers[k][0] + markers[k][1]) / 2
+        choices = []
+        for dx, dy, align, shift in _BESIDE:
+            low = centre + np.array([dx - shift * size[0], dy])
+            taken = markers[:k] + markers[k + 1 :] + placed
+            outside = _area(low, low + size) - _overlap((low, low + size), (np.zeros(2), inches * 72))
+            choices.append((sum(_overlap((low, low + size), other) for other in taken) + outside, dx, dy, align, low))
+        _, dx, dy, align, low = min(choices, key=lambda choice: choice[0])
+        placed.append((low, low + size))
         ax.annotate(
             label,
             (x, y),
-            xytext=(0, -15 if crowded % 2 else 9),
+            xytext=(dx, dy),
             textcoords="offset points",
-            ha="center",
+            ha=align,
             fontsize=8,
             color=styles[label][0],
         )
+
+
+LETTER, LINE = 4.4, 9.0  # points that a letter of a label is wide, and high
+_BESIDE = ((0.0, 9.0, "center", 0.5), (0.0, -15.0, "center", 0.5), (8.0, -3.0, "left", 0.0), (-8.0, -3.0, "right", 1.0))
+"""Offsets of a label in points, its alignment, and the share of it that is left of there."""
+
+
+def _area(low: np.ndarray, high: np.ndarray) -> float:
+    return float(np.prod(np.maximum(high - low, 0.0)))
+
+
+def _overlap(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float:
+    """The area that two rectangles share, each its lower left and its upper right corner."""
+    return _area(np.maximum(one[0], other[0]), np.minimum(one[1], other[1]))
