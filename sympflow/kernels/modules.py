@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 
 import numba
 import numpy as np
+from numba.core.registry import CPUDispatcher
 
 __all__ = ["NEVER", "OPTIONS", "cache_folder", "load_algebra", "load_module", "run_one", "run_rows", "template"]
 
@@ -28,6 +29,7 @@ T = TypeVar("T")
 OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 """How kernels are compiled: 1/0 is inf, a·b + c may be fused; nothing else about rounding or NaN is relaxed."""
 
+_INNER = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # options of functions that only others call
 _BLOCK = 64  # rows that a thread takes at a time: the lanes of a block
 LONG = 100_000_000  # units of work from which a run can be interrupted
 NEVER = np.zeros(1, dtype=np.int64)
@@ -66,9 +68,10 @@ def load_algebra(algebra: str, loops: Sequence[str] = (), **constants: Any) -> M
 def load_module(source: str) -> ModuleType:
     """Import `source`, written once to `cache_folder` under a name made from its contents.
 
-    Where that folder cannot be written, a temporary one serves for the life of the process.
+    Where that folder cannot be written, a temporary one serves for the life of the process. Only what Python may call
+    is in the module that is returned: see `_callable_part`.
     """
-    versions = f"{numba.__version__} {sys.version}"
+    versions = f"{numba.__version__} {sys.version} {_INNER}"
     key = hashlib.sha256(f"{versions}\n{source}".encode()).hexdigest()[:24]
     name = f"sympflow_kernel_{key}"
     try:
@@ -81,7 +84,25 @@ def load_module(source: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # Numba looks a function's module up by name
     spec.loader.exec_module(module)
-    return module
+    return _callable_part(module)
+
+
+def _callable_part(module: ModuleType) -> ModuleType:
+    """The constants and those compiled functions that Python may call: "rollout", and what no other function names.
+
+    The others are compiled without an entry from Python, which for functions as small as these is a third of the time
+    that compilation takes. Such a function must not be called: so the part has none.
+    """
+    functions = {name: f for name, f in vars(module).items() if isinstance(f, CPUDispatcher)}
+    part = ModuleType(module.__name__)
+    vars(part).update({name: value for name, value in vars(module).items() if name not in functions})
+    inner = {name for f in functions.values() for name in f.py_func.__code__.co_names if name != f.__name__}
+    for name, f in functions.items():
+        if name in inner - {"rollout"}:
+            f.targetoptions.update(_INNER)
+        else:
+            setattr(part, name, f)
+    return part
 
 
 @cache
