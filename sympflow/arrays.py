@@ -16,7 +16,8 @@ Array = Any
 
 def is_tensor(x: object) -> bool:
     """Whether `x` is a torch tensor, decided without importing torch."""
-    return type(x).__module__.partition(".")[0] == "torch" and hasattr(x, "requires_grad")
+    kind = type(x)
+    return kind is not np.ndarray and kind.__module__.partition(".")[0] == "torch" and hasattr(x, "requires_grad")
 
 
 def concatenate(parts: Sequence[Array]) -> Array:

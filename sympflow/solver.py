@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
-from sympflow.domain import Box, Domain, EnergySublevel
+from sympflow.domain_exit import check_domain
 from sympflow.events import run_and_search
 from sympflow.integrators.base import Integrator, Outcome, Problem
 from sympflow.integrators.registry import build, check_applies, naming_plugin
@@ -18,7 +17,6 @@ from sympflow.solution import Solution
 from sympflow.system import HamiltonianSystem
 from sympflow.validation import check_events, check_memory, check_save_every, check_t_eval, check_t_span, check_y0
 
-_TRUE = np.array(True)
 BACKENDS = ("auto", "compiled", "array")
 
 
@@ -135,7 +133,7 @@ def solve(
 
         note_singularities(outcome, integrator, problem)
     if action != "ignore":
-        _check_domain(outcome, integrator, system, action)
+        check_domain(outcome, integrator, system, action)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
     return Solution(
         t=outcome.t,
@@ -153,38 +151,27 @@ def solve(
     )
 
 
-def domain_of(flow: Any, system: HamiltonianSystem) -> Domain | None:
-    """Ω of a flow, or else of its system, ready to be asked for states."""
-    domain = getattr(flow, "domain", None) or system.domain
-    if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
-        return system.domain if domain == system.domain else domain.attach(system.hamiltonian)
-    return domain
-
-
-def contained(domain: Domain, system: HamiltonianSystem, y: Array, slack: float, compiled: bool) -> np.ndarray:
-    """Whether the states y (..., 2d) are in the domain: (...), or () if all are and `compiled` code could tell."""
-    if compiled and isinstance(domain, Box | EnergySublevel):
-        from sympflow.kernels.sublevel import all_within
-
-        if all_within(system, domain, y, slack):
-            return _TRUE
-    return np.asarray(domain.contains(y, slack=slack))
-
-
 def _time_last(y: np.ndarray) -> np.ndarray:
     return y.T if y.ndim == 2 else np.moveaxis(y, 0, -1)
 
 
+def _fits(outcome: Outcome, y0: Array) -> bool:
+    """Whether status, t and y are what they must be."""
+    t, y, status = outcome.t, outcome.y, outcome.status
+    if type(t) is type(y) is np.ndarray and type(status) is int:
+        return t.ndim == 1 and y.shape == (t.size, *y0.shape)
+    count = np.shape(t)[:1]
+    shapes = np.shape(t) == count and tuple(np.shape(y)) == (*count, *y0.shape)
+    return shapes and np.asarray(status).dtype.kind in "iu"
+
+
 def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
     """Refuse what is no answer (of a plug-in), and flag states that are not finite, whatever the method says."""
-    what = type(outcome).__name__
-    if isinstance(outcome, Outcome):
-        status, shapes = np.asarray(outcome.status), (np.shape(outcome.t), tuple(np.shape(outcome.y)))
-        if status.dtype.kind in "iu" and shapes == (shapes[0][:1], (*shapes[0][:1], *y0.shape)):
-            what = ""
-        else:
-            what = f"status {outcome.status!r}, t and y of shapes {shapes[0]} and {shapes[1]}"
-    if what:
+    if not (isinstance(outcome, Outcome) and _fits(outcome, y0)):
+        what = type(outcome).__name__
+        if isinstance(outcome, Outcome):
+            shapes = f"{np.shape(outcome.t)} and {tuple(np.shape(outcome.y))}"
+            what = f"status {outcome.status!r}, t and y of shapes {shapes}"
         raise TypeError(
             f"`method` {integrator.name!r} must answer with an Outcome that has an integer status, t of shape (n,) and "
             f"y of shape (n, *y0.shape); got {what}. Mend its run(): check_integrator tests it."
@@ -204,56 +191,3 @@ def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
     outcome.status = np.where(bad, -1, outcome.status) if bad.ndim else -1
     if not bad.ndim:
         outcome.t, outcome.y = outcome.t[:first], outcome.y[:first]
-
-
-def _meaning(flow: Any) -> str:
-    """What is left of a trained flow outside its domain: a primed one still evaluates the system's own forces there."""
-    if flow is None or (hasattr(flow, "evaluations") and any(flow.evaluations(1, 1, 0, "array").values())):
-        return ""
-    return (
-        ", where its network was not trained: it stays finite, even past a singularity, and what it gives from that "
-        "time on means nothing. Start inside the domain, or use a classical method"
-    )
-
-
-def _check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:
-    """Note the first output outside the domain, or end the run there."""
-    flow = getattr(integrator, "flow_for", lambda system: None)(system)
-    domain = domain_of(flow, system)
-    if domain is None or not len(outcome.t):
-        return
-    slack = float(getattr(flow, "figures", {}).get("energy_error_max") or 0.0)
-    inside = contained(domain, system, outcome.y, slack, outcome.stats.get("backend") == "compiled")  # (n, ...)
-    if inside.all():
-        return
-    with np.errstate(invalid="ignore"):
-        inside = inside | ~to_numpy(all_finite(outcome.y))  # what has become non-finite is reported as that
-    if inside.all():
-        return
-    first = int(np.argmin(inside.reshape(len(inside), -1).all(1)))
-    t = float(outcome.t[first])
-    outcome.stats["domain_exit"] = t
-    which = ""
-    if inside.ndim > 1:
-        index = tuple(np.argwhere(~inside[first])[0].tolist())
-        count = int((~inside).any(0).sum())
-        which = f" (trajectory {', '.join(map(str, index))}, the first of {count})"
-    note = f"The state left the domain at t = {t:.17g}{which}"
-    if action == "warn":
-        held = "the figures" if getattr(flow, "certified", None) is None else "the figures and the certificate"
-        outcome.message += f" {note}: {held} of a trained flow do not hold there{_meaning(flow)}."
-        return
-    outcome.message = f"{note}. Start inside the domain, or pass on_domain_exit='warn'."
-    if inside.ndim == 1:
-        outcome.t, outcome.y = outcome.t[: first + 1], outcome.y[: first + 1]
-        outcome.status = -1
-        return
-    outside = np.logical_or.accumulate(~inside, axis=0)
-    after = np.concatenate([np.zeros_like(outside[:1]), outside[:-1]])  # the exit itself is kept
-    outcome.status = np.where(outside[-1], -1, outcome.status)
-    if is_tensor(outcome.y):
-        import torch
-
-        outcome.y = outcome.y.masked_fill(torch.as_tensor(after, device=outcome.y.device)[..., None], math.nan)
-    else:
-        outcome.y = np.where(after[..., None], np.nan, outcome.y).astype(outcome.y.dtype)

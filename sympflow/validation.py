@@ -17,13 +17,14 @@ MAX_ASKED_VALUES = 1_000_000_000
 """Of a batch, or of outputs that were asked for one by one: 8 GB."""
 MAX_EVENT_SAMPLES = 100_000_000
 _FLOAT64 = np.dtype(np.float64)
+_PLAIN = {float, int}
 FEWEST_TIMES = 8  # floating-point numbers that an interval must span
 
 
 def check_t_span(t_span: Any) -> tuple[float, float]:
     try:
-        if type(t_span) is tuple and len(t_span) == 2 and type(t_span[0]) is type(t_span[1]) is float:
-            t0, t1 = t_span
+        if type(t_span) is tuple and len(t_span) == 2 and {type(t_span[0]), type(t_span[1])} <= _PLAIN:
+            t0, t1 = float(t_span[0]), float(t_span[1])
         elif isinstance(t_span, str | bytes | set | frozenset | dict):
             raise TypeError(type(t_span).__name__)
         else:
@@ -77,7 +78,7 @@ def check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
         )
     if math.prod(y0.shape) == 0:
         raise ValueError(f"`y0` is an empty batch, of shape {tuple(y0.shape)}: pass at least one state.")
-    if not np.isfinite(to_numpy(y0) if is_tensor(y0) else y0).all():
+    if np.count_nonzero(np.isfinite(to_numpy(y0))) < math.prod(y0.shape):
         raise ValueError("`y0` must be finite; it holds NaN or infinity. Remove these states.")
     return y0
 
@@ -143,9 +144,11 @@ def check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
 def _proper(times: np.ndarray, t0: float, t1: float) -> bool:
     """Whether times lie between t0 and t1, in this order."""
     first, last = float(times[0]), float(times[-1])
-    if t0 <= t1:
-        return t0 <= first <= last <= t1 and bool((times[:-1] <= times[1:]).all())
-    return t0 >= first >= last >= t1 and bool((times[:-1] >= times[1:]).all())
+    if not (t0 <= first <= last <= t1 if t0 <= t1 else t0 >= first >= last >= t1):
+        return False
+    if len(times) == 1:
+        return True
+    return bool(((times[:-1] <= times[1:]) if t0 <= t1 else (times[:-1] >= times[1:])).all())
 
 
 def check_save_every(save_every: Any, times: np.ndarray | None) -> int:
@@ -195,11 +198,13 @@ def check_memory(integrator: Integrator, problem: Problem) -> None:
             f"`t_eval` asks for {problem.t_eval.size * size:.3g} values, more than {MAX_ASKED_VALUES:.0e}: choose "
             "fewer times, or solve in parts."
         )
+    if problem.t_eval is not None and not problem.dense_output:
+        return
     length = getattr(integrator, "step_length", lambda system: None)(problem.system)
     if length is None:
         return
     n_steps = abs(problem.t1 - problem.t0) / length
-    stored = n_steps if problem.dense_output else n_steps / problem.save_every if problem.t_eval is None else 0.0
+    stored = n_steps if problem.dense_output else n_steps / problem.save_every
     values = (stored + 1) * size
     if values > MAX_SAVED_VALUES:
         raise ValueError(

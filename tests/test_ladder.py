@@ -10,11 +10,11 @@ import torch
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, get, load, max_energy_error, shipped_flows, solve, systems
+from sympflow.domain_exit import domain_of
 from sympflow.fingerprints import same_system
 from sympflow.flow import shipped as catalogue
 from sympflow.flow.shipped import ShippedFlow, choose
-from sympflow.integrators import sympflow as integrator
-from sympflow.solver import domain_of
+from sympflow.integrators import flows
 from sympflow.training import ladder, pretrained
 from sympflow.training.clock_fit import clock_errors
 from sympflow.training.figures import one_step_errors
@@ -48,7 +48,7 @@ def three(folder, monkeypatch):
     """They are what ships."""
     files = tuple(ShippedFlow.of(path) for path in sorted(folder.glob("*.safetensors")))
     monkeypatch.setattr(catalogue, "_catalogue", lambda: files)
-    monkeypatch.setattr(integrator, "_SHIPPED", {})
+    monkeypatch.setattr(flows, "_KNOWN", {})
     return files
 
 

@@ -35,9 +35,9 @@ def certificate(
     seed: int,
 ) -> Certificate:
     """`FlowMap.certificate`."""
+    from sympflow.domain_exit import domain_of
     from sympflow.flow.record import checksum
     from sympflow.flow.sympflow import SympFlow
-    from sympflow.solver import domain_of
 
     if not isinstance(flow, SympFlow):
         raise TypeError(

@@ -34,6 +34,6 @@ class Contents:
         tensors = [w for d in self._tensors for w in d.values() if w is not None]
         addresses = [w.data_ptr() for w in tensors]
         if addresses != self._addresses or not self._shared:
-            self._views = [w.detach().cpu().numpy() for w in tensors]
+            self._views = [np.ascontiguousarray(w.detach().cpu().numpy()) for w in tensors]
             self._addresses, self._shared = addresses, all(w.device.type == "cpu" for w in tensors)
-        return b"".join([view.tobytes() for view in self._views])
+        return b"".join(self._views)  # type: ignore[arg-type]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -13,6 +13,9 @@ from sympflow.flow.coefficients import Coefficients, Entry
 from sympflow.flow.contents import Contents
 from sympflow.integrators.scheme import CURVATURE, Scheme
 from sympflow.integrators.splitting import scheme_evaluations
+
+if TYPE_CHECKING:
+    from sympflow.kernels.primed_flow import PrimedFlowKernel
 
 Kind = Literal["kick", "drift"]
 
@@ -46,6 +49,9 @@ class Tables:
         Δt.
     """
 
+    kernel: PrimedFlowKernel | None = None
+    """The compiled loops that were made of these last."""
+
     def __init__(self, substeps: Sequence[Substep], outer: int, dt: float) -> None:
         last = len(substeps) - outer
         self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
@@ -58,6 +64,9 @@ class Tables:
         self._exponents = np.array(exponents, dtype=float)
         self._even = exponents[1:2] != (1,)
         self._kept: dict[Any, Any] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "kernel"}
 
     def kept(self, key: Any, make: Callable[[], Any]) -> Any:
         """What `make` gives, made once for each key."""

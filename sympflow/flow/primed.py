@@ -207,10 +207,13 @@ class PrimedFlow(SympFlow):
         return self.tables.evaluations(n_steps, n_saved, n_extra, backend)
 
     def kernel_for(self, system: HamiltonianSystem) -> PrimedFlowKernel:
-        """The compiled loops of this flow."""
-        from sympflow.kernels.primed_flow import PrimedFlowKernel
+        """The compiled loops of this flow, the same while no number of it changes."""
+        tables = self.tables
+        if tables.kernel is None or tables.kernel.system is not system:
+            from sympflow.kernels.primed_flow import PrimedFlowKernel
 
-        return PrimedFlowKernel(self, system)
+            tables.kernel = PrimedFlowKernel(self, system)
+        return tables.kernel
 
     # kernel and processor as maps ---------------------------------------------------------------------------
 

@@ -75,6 +75,8 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
         from sympflow.integrators.splitting import splitting
 
         return splitting(method)
+    if method in _BUILT_IN or method in _UNLISTED:
+        return _built_in(method)
     if method in _WITH_PARTS:
         from sympflow.integrators.linear_splitting import maps_stepper
 
@@ -83,8 +85,6 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
         from sympflow.integrators.torchdiffeq_methods import torchdiffeq_method
 
         return torchdiffeq_method(method)
-    if method in _BUILT_IN or method in _UNLISTED:
-        return _built_in(method)
     if method in _registered:
         return _registered[method]
     if method in _plugins():
@@ -150,14 +150,15 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
         options = {"flow": method, **options}
         method = method.kind
     cls = get(method)
-    known = _made(method, cls.options)
+    own = isinstance(method, str) and method in _NAMES
+    known = cls.options() if own else _made(method, cls.options)
     unknown = [name for name in options if name not in known]
     if unknown:
         raise TypeError(
             f"`{unknown[0]}` is not an option of method {cls.name!r}, which takes {', '.join(known) or 'none'}: "
             f"{_INSTEAD.get(unknown[0], 'remove it or choose another method')}."
         )
-    return _made(method, lambda: cls(**options))
+    return cls(**options) if own else _made(method, lambda: cls(**options))
 
 
 def _made(method: Any, make: Callable[[], T]) -> T:
@@ -246,6 +247,9 @@ class naming_plugin:
 
 def check_applies(integrator: Integrator, system: HamiltonianSystem) -> None:
     """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named."""
+    if type(integrator) not in _loaded:
+        integrator.check(system)
+        return
     with naming_plugin(integrator, passes=(ValueError,)):
         integrator.check(system)
 

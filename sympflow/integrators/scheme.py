@@ -74,6 +74,14 @@ class Scheme:
                 f"{len(self.curvatures)}: pad with zeros."
             )
 
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Made once: tables are looked up by their scheme in every run."""
+        return hash((self.name, self.kicks, self.drifts, self.gradients, self.curvatures))
+
     @cached_property
     def substeps(self) -> tuple[tuple[str, float, float, float], ...]:
         """The maps really executed, ('kick', b, g, c) or ('drift', a, 0, 0): no zeros, like neighbours merged."""

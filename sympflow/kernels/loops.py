@@ -189,3 +189,21 @@ def step_each(kicks, drifts, gradients, curvatures, x, h, y, out):
             g, c = h[i] ** 3 * polynomial(gradients[j], x[i]), h[i] ** 5 * polynomial(curvatures[j], x[i])
             q, p, q_error, p_error = called_stage(q, p, q_error, p_error, b, g, c, a, j, work)
         pack(q, p, out[i])
+
+
+@njit(**OPTIONS)
+def map_each(numbers, more, y, out):
+    """Maps of fixed numbers, kicks, drifts and gradients as rows and `more` as curvatures, of every row of `y`."""
+    kicks, drifts, gradients = numbers[0], numbers[1], numbers[2]
+    work = prepared(kicks, gradients, more)
+    for i in range(y.shape[0]):
+        q, p = unpack(y[i])
+        q_error, p_error = no_error(q), no_error(p)
+        for j in range(len(kicks)):
+            q, p, q_error, p_error = called_stage(
+                q, p, q_error, p_error, kicks[j], gradients[j], more[j], drifts[j], j, work
+            )
+        pack(q, p, out[i])
+
+
+map_rows, rollout_rows = map_each, rollout_each

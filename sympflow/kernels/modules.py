@@ -30,6 +30,7 @@ OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 """How kernels are compiled: 1/0 is inf, a·b + c may be fused; nothing else about rounding or NaN is relaxed."""
 
 _INNER = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # options of functions that only others call
+_CALLED = {"rollout", "rollout_rows"}  # functions that others call, and Python as well
 _BLOCK = 64  # rows that a thread takes at a time: the lanes of a block
 LONG = 100_000_000  # units of work from which a run can be interrupted
 NEVER = np.zeros(1, dtype=np.int64)
@@ -88,7 +89,7 @@ def load_module(source: str) -> ModuleType:
 
 
 def _callable_part(module: ModuleType) -> ModuleType:
-    """The constants and those compiled functions that Python may call: "rollout", and what no other function names.
+    """The constants and those compiled functions that Python may call: of `_CALLED`, or what no other function names.
 
     The others are compiled without an entry from Python, which for functions as small as these is a third of the time
     that compilation takes. Such a function must not be called: so the part has none.
@@ -98,7 +99,7 @@ def _callable_part(module: ModuleType) -> ModuleType:
     vars(part).update({name: value for name, value in vars(module).items() if name not in functions})
     inner = {name for f in functions.values() for name in f.py_func.__code__.co_names if name != f.__name__}
     for name, f in functions.items():
-        if name in inner - {"rollout"}:
+        if name in inner - _CALLED:
             f.targetoptions.update(_INNER)
         else:
             setattr(part, name, f)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.integrators.scheme import CURVATURE, Scheme
-from sympflow.kernels.splitting import splitting_kernel, step_table
+from sympflow.kernels.modules import run_one, run_rows
+from sympflow.kernels.splitting import scaled_run_table, scaled_step_table, splitting_kernel
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
+    from sympflow.flow.frozen import Tables
     from sympflow.flow.primed import PrimedFlow
 
 __all__ = ["PrimedFlowKernel"]
@@ -32,6 +35,8 @@ class PrimedFlowKernel:
         Whether runs sum with Kahan's compensation.
     """
 
+    saves_finite = True
+
     def __init__(self, flow: PrimedFlow, system: HamiltonianSystem, compensated: bool = False) -> None:
         tables = flow.tables
         if not tables.compilable:
@@ -41,27 +46,42 @@ class PrimedFlowKernel:
                 f"`system` {system.name!r} has no symbols, from which curvature terms are compiled: use "
                 "backend='array'."
             )
+        self.system = system
         self._tables, self._splitting, self._compensated = tables, splitting_kernel(system), compensated
         self.evaluations = tables.evaluations
-        self.saves_finite = not tables.processed  # what a processor makes of finite states may not be
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """`n_steps` times ψ̄_h, or for h < 0 the inverse of ψ̄_|h|: see `SplittingKernel.run`."""
-        start = self._prepared(abs(h), y0[None])[0]
-        Y, n_finite = self._splitting.run(self._kernel(h), abs(h), start, n_steps, save, self._compensated)
-        return self._finished(abs(h), y0[None], Y[None], save)[0], n_finite
+        if not self._tables.processed:
+            return self._splitting.run(self._kernel(h), abs(h), y0, n_steps, save, self._compensated)
+        numbers = self._numbers(h)
+        rollout = self._loops().rollout_processed
+        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+        out = np.empty((len(save), len(y0)))
+        work = numbers.work(n_steps, len(save)) * len(y0) // 2
+        n_finite = run_one(lambda stop: rollout(*numbers.arrays, y0, n_steps, save, out, stop), work)
+        return out, n_finite
 
     def run_batch(
         self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """`run` for every row of `y0` (N, 2d): see `SplittingKernel.run_batch`."""
         if len(y0) == 1:
-            Y, n_finite = self.run(h, y0[0], n_steps, save)
-            return Y[None], np.array([n_finite])
-        start = self._prepared(abs(h), y0)
-        scheme = self._kernel(h)
-        Y, finite = self._splitting.run_batch(scheme, abs(h), start, n_steps, save, self._compensated, threads)
-        return self._finished(abs(h), y0, Y, save), finite
+            Y, last = self.run(h, y0[0], n_steps, save)
+            return Y[None], np.array([last])
+        if not self._tables.processed:
+            return self._splitting.run_batch(self._kernel(h), abs(h), y0, n_steps, save, self._compensated, threads)
+        numbers = self._numbers(h)
+        rollout = self._loops().rollout_processed_batch
+        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+        out = np.empty((len(y0), len(save), y0.shape[1]))
+        n_finite = np.empty(len(y0), dtype=np.int64)
+
+        def rows(i: slice, stop: np.ndarray) -> None:
+            rollout(*numbers.arrays, y0[i], n_steps, save, out[i], n_finite[i], stop)
+
+        run_rows(rows, len(y0), numbers.work(n_steps, len(save)) * y0.shape[1] // 2, threads)
+        return out, n_finite
 
     def step(self, h: ArrayLike, y: np.ndarray) -> np.ndarray:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,); its numbers are polynomials in h."""
@@ -89,26 +109,38 @@ class PrimedFlowKernel:
         """K_h, or for h < 0 its inverse."""
         return self._tables.scheme("primed kernel", abs(h), back=h < 0)
 
-    def _prepared(self, t: float, y: np.ndarray) -> np.ndarray:
-        """χ_t⁻¹ of the rows of y."""
-        if not self._tables.processed:
-            return y
-        return self._processed(t, y, True)
+    def _loops(self) -> Any:
+        """The compiled functions for the kicks of the flow."""
+        return self._splitting._loops(self._tables.level, self._compensated)
 
-    def _finished(self, t: float, y0: np.ndarray, Y: np.ndarray, save: np.ndarray) -> np.ndarray:
-        """χ_t of the outputs Y (N, n, 2d); what is saved before the first step are the initial states themselves."""
-        if not self._tables.processed:
-            return Y
-        out = self._processed(t, Y.reshape(-1, Y.shape[-1]), False).reshape(Y.shape)
-        if len(save) and save[0] == 0:
-            out[:, : int(np.searchsorted(save, 0, "right"))] = y0[:, None]
-        return out
+    def _numbers(self, h: float) -> _Processed:
+        """The numbers of a run of ψ̄_h with a processor."""
+        return self._tables.kept(("processed", h), lambda: _Processed.of(self._tables, h))
 
-    def _processed(self, t: float, y: np.ndarray, back: bool) -> np.ndarray:
-        """χ_t of the rows of y, or its inverse."""
-        tables = self._tables
-        numbers = tables.kept(
-            ("processor", t, back), lambda: step_table(tables.scheme("primed processor", t, back=back))
-        )
-        lengths = np.full(len(y), t)
-        return self._splitting.step_rows(numbers, tables.level, lengths, lengths, y)
+
+@dataclass(frozen=True)
+class _Processed:
+    """χ⁻¹, K and χ at one step length, as the loops have them.
+
+    Attributes
+    ----------
+    arrays
+        Of each of the three two arrays: kicks, drifts and gradients (3, m), and curvatures (m,). K has the table of a
+        run.
+    """
+
+    arrays: tuple[np.ndarray, ...]
+
+    @classmethod
+    def of(cls, tables: Tables, h: float) -> _Processed:
+        """Steps of |h|, or for h < 0 their inverse."""
+        t = abs(h)
+        kernel = tables.scheme("primed kernel", t, back=h < 0)
+        before, after = (tables.scheme("primed processor", t, back=back) for back in (True, False))
+        parts = scaled_step_table(before, t), scaled_run_table(kernel, t), scaled_step_table(after, t)
+        arrays = [a for *numbers, more in parts for a in (np.stack(numbers), more)]
+        return cls(tuple(arrays))
+
+    def work(self, n_steps: int, n_saved: int) -> int:
+        """Stages of a run."""
+        return n_steps * self.arrays[2].shape[1] + n_saved * self.arrays[4].shape[1]

@@ -222,7 +222,16 @@ def _run_table(scheme: Scheme) -> _Table:
 @lru_cache(maxsize=256)
 def scaled_run_table(scheme: Scheme, h: float) -> _Table:
     """The table of a run whose steps are h."""
-    kicks, drifts, gradients, curvatures = _run_table(scheme)
+    return _scaled(_run_table(scheme), h)
+
+
+def scaled_step_table(scheme: Scheme, h: float) -> _Table:
+    """The stages of one step h by itself, (m,) each."""
+    return _scaled(_arrays(_stages(scheme)), h)
+
+
+def _scaled(table: _Table, h: float) -> _Table:
+    kicks, drifts, gradients, curvatures = table
     return h * kicks, h * drifts, h**3 * gradients, h**5 * curvatures
 
 
@@ -232,6 +241,8 @@ class _Loops:
 
     rollout: Callable[..., int]
     rollout_batch: Callable[..., None]
+    rollout_processed: Callable[..., int]
+    rollout_processed_batch: Callable[..., None]
     step_rows: Callable[..., None]
 
 
@@ -244,8 +255,10 @@ def _header(level: int, compensated: bool, cache: bool, scheduled: bool) -> str:
 
 
 def _symbolic_loops(symbols: SymbolicHamiltonian, algebra: str, level: int, compensated: bool) -> _Loops:
-    loops = symbolic_module(symbols, algebra, level, compensated, ("loops", "aligned", "lanes"))
-    return _Loops(loops.rollout, loops.rollout_lanes, loops.step_lanes)
+    after = ("loops", "aligned", "lanes", "processed_loops")
+    loops = symbolic_module(symbols, algebra, level, compensated, after)
+    processed = loops.rollout_processed, loops.rollout_processed_rows
+    return _Loops(loops.rollout, loops.rollout_lanes, *processed, loops.step_lanes)
 
 
 def symbolic_module(
@@ -291,5 +304,6 @@ def _array_loops(
         "gradient": gradient,
         "hessian_vector": hessian_vector,
     }
-    exec("\n\n\n".join([header, mass, template("arrays"), template("loops")]), functions)
-    return _Loops(functions["rollout"], functions["rollout_each"], functions["step_each"])
+    exec("\n\n\n".join([header, mass, *map(template, ("arrays", "loops", "processed_loops"))]), functions)
+    names = ("rollout", "rollout_each", "rollout_processed", "rollout_processed_rows", "step_each")
+    return _Loops(*(functions[name] for name in names))

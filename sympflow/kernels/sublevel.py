@@ -22,22 +22,23 @@ _KERNELS: WeakKeyDictionary[SymbolicHamiltonian, Callable[..., bool]] = WeakKeyD
 def all_within(system: HamiltonianSystem, domain: Box | EnergySublevel, states: np.ndarray, slack: float) -> bool:
     """Whether every one of the states (..., 2d) is in the domain, as its `contains` with this slack.
 
-    False says nothing of a sublevel where the system cannot be compiled, or H of the domain is not its own.
+    A sublevel without an H is that of the system's. False says nothing of one with another H, or where the system
+    cannot be compiled.
     """
-    bounds = domain.bounds if isinstance(domain, Box) else domain.limits(slack)
-    width = len(bounds[0]) if isinstance(domain, Box) else len(bounds[0]) - 2
-    if states.dtype != np.float64 or states.shape[-1] != width:
+    low, high = domain.bounds if isinstance(domain, Box) else domain.limits(slack)
+    width = states.shape[-1]
+    if states.dtype != np.float64 or len(low) != (width if isinstance(domain, Box) else width + 2):
         return False
-    x = np.ascontiguousarray(states.reshape(-1, states.shape[-1]).T)  # loops along the states are vector instructions
+    x = np.ascontiguousarray(states.reshape(-1, width).T)  # loops along the states are vector instructions
     if isinstance(domain, Box):
-        return all_between(x, *bounds)
+        return all_between(x, low, high)
     symbols = system.symbols
-    if symbols is None or domain.hamiltonian != system.hamiltonian:
+    if symbols is None or (domain.hamiltonian is not None and domain.hamiltonian != system.hamiltonian):
         return False
     kernel = _KERNELS.get(symbols)
     if kernel is None:
         kernel = _KERNELS[symbols] = _compiled(symbols)
-    return kernel(x, *bounds)
+    return kernel(x, low, high)
 
 
 def _compiled(symbols: SymbolicHamiltonian) -> Callable[..., bool]:

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.domain_exit import domain_of
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.energy import energy_drift, max_energy_error
 from sympflow.metrics.symplectic import symplecticity_defect, volume_error
 from sympflow.solution import Solution
-from sympflow.solver import domain_of, solve
+from sympflow.solver import solve
 from sympflow.studies.candidates import Candidate
 from sympflow.studies.comparison_report import title
 from sympflow.studies.singularities import blow_up, failure_times
