@@ -94,30 +94,6 @@ def test_steps_are_counted_once():
     assert solve(HH, "verlet", (0.0, 10.03), dt=0.1).stats["n_steps"] == 101
 
 
-def test_numba_functions_run_compiled():
-    from numba import njit
-
-    @njit
-    def potential(q):
-        return (q[0] ** 4 + q[1] ** 4) / 4
-
-    @njit
-    def gradient(q, out):
-        out[:] = q**3
-
-    @njit
-    def hessian_vector(q, v, out):
-        out[:] = 3 * q**2 * v
-
-    numba = HamiltonianSystem(potential, gradient=gradient, hessian_vector=hessian_vector, ndof=2, mass=[1.0, 2.0])
-    symbolic = HamiltonianSystem.from_sympy("p1**2/2 + p2**2/4 + (q1**4 + q2**4)/4")
-    for method in ("verlet", "srkn11b", "omelyan4"):  # two loops: without and with force gradients
-        kwargs = {"t_span": (0.0, 5.0), "y0": [[1.0, 0.0, 0.0, 1.0], [0.5, 0.2, 0.1, 0.0]], "dt": 0.05}
-        compiled = solve(numba, method, backend="compiled", **kwargs)
-        np.testing.assert_allclose(compiled.y, solve(symbolic, method, backend="array", **kwargs).y, atol=1e-12)
-        np.testing.assert_allclose(compiled.y, solve(numba, method, backend="array", **kwargs).y, atol=1e-12)
-
-
 def test_compensated_summation_lowers_the_error_of_rounding():
     # Kahan-Li 8 at dt = 0.05 has no error of truncation above rounding: what is left in H is round-off
     kwargs = {"t_span": (0.0, 5000.0), "dt": 0.05, "t_eval": np.linspace(2500, 5000, 100)}

@@ -10,6 +10,7 @@ from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.kernels.mlp_flow import mlp_flow_kernel
+from sympflow.kernels.modules import OPTIONS, load_module, template
 
 ROUNDING = 2e-14  # a few dozen operations on numbers up to 10
 
@@ -82,17 +83,21 @@ def test_inverse_undoes_the_map(flow):
     assert np.abs(kernel.step(-0.8, kernel.step(0.8, y)) - y).max() < ROUNDING
 
 
-@pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_every_activation(activation):
-    flow = lively(SympFlow(1, pairs=1, hidden=(5,), activation=activation))
-    y0 = states(3, 1)
-    Y, _ = mlp_flow_kernel(flow).run_batch(1.0, y0, 3, np.array([3]))
-    assert np.abs(Y[:, 0] - torch_steps(flow, 1.0, y0, 3)[-1]).max() < ROUNDING
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_every_activation_and_its_slope(name):
+    """The functions that the loops are compiled with."""
+    header = f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': True}}"
+    compiled = load_module("\n\n\n".join([header, template("elementary"), template("activations")]))
+    x = torch.linspace(-30, 30, 401, dtype=torch.float64, requires_grad=True)
+    value = ACTIVATIONS[name].value(x)
+    (slope,) = torch.autograd.grad(value.sum(), x)
+    found = np.array([getattr(compiled, name)(a) for a in x.tolist()])
+    np.testing.assert_allclose(found, torch.stack([value, slope], -1).detach().numpy(), rtol=1e-14, atol=1e-14)
 
 
-@pytest.mark.parametrize("hidden", [(4, 7, 3), (20, 18)])
-def test_any_depth_and_widths(hidden):
-    flow = lively(SympFlow(2, pairs=1, hidden=hidden))
+@pytest.mark.parametrize(("hidden", "activation"), [((4, 7, 3), "logcosh"), ((20, 18), "sin")])
+def test_any_depth_and_widths(hidden, activation):
+    flow = lively(SympFlow(2, pairs=1, hidden=hidden, activation=activation))
     y0 = states(3, 2)
     Y, _ = mlp_flow_kernel(flow).run_batch(1.0, y0, 2, np.array([2]))
     assert np.abs(Y[:, 0] - torch_steps(flow, 1.0, y0, 2)[-1]).max() < ROUNDING

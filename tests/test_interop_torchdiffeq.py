@@ -20,6 +20,7 @@ OURS = [
     if issubclass(get(name), FixedStep) and get(name).on_grid and name not in (*FIXED, "sympflow", "mlp")
 ]
 METHODS = [*OURS, "sympflow"]
+KINDS = ["verlet", "leapfrog", "chin4a", "implicit_midpoint", "mollified_impulse", "linear_omelyan4", "strang_parts"]
 
 
 def flow(seed=0, **options):
@@ -62,8 +63,9 @@ class TestValues:
         torch.testing.assert_close(plain, graph.detach(), rtol=0, atol=200 * EPS)
 
 
-@pytest.mark.parametrize("method", OURS)
-@pytest.mark.parametrize("t", [(0.0, 0.25, 0.31), (0.2, -0.13, -0.39)])
+@pytest.mark.parametrize(
+    ("method", "t"), [*((name, (0.0, 0.25, 0.31)) for name in OURS), *((name, (0.2, -0.13, -0.39)) for name in KINDS)]
+)
 def test_gradients_to_y0_and_t(method, t):
     """At times between grid points, where ψ is smooth in t; a time on the grid has the slope of the step there."""
     y0 = torch.tensor(HH.domain.sample(2, 1), requires_grad=True)

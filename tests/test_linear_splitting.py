@@ -75,10 +75,11 @@ def test_three_parts_of_the_polar_spring_pendulum():
 def test_parts_given_by_the_user():
     system = spring_pendulum(1e4, coordinates="polar")
     parts = ("-g*q1*cos(q2)", "p2**2/(2*q1**2)", "p1**2/2 + k*(q1 - 1)**2/2")
-    detected = solve(system, "strang_parts", (0, 1), dt=0.05)
-    given = solve(system, "strang_parts", (0, 1), dt=0.05, parts=parts)
+    run = {"t_span": (0, 1), "dt": 0.05, "backend": "array"}
+    detected = solve(system, "strang_parts", **run)
+    given = solve(system, "strang_parts", parts=parts, **run)
     assert np.abs(given.y - detected.y).max() < 1e-13
-    other = solve(system, "strang_parts", (0, 1), dt=0.05, parts=parts[::-1])
+    other = solve(system, "strang_parts", parts=parts[::-1], **run)
     assert np.abs(other.y - detected.y).max() > 1e-8
 
 

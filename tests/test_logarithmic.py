@@ -20,7 +20,6 @@ from sympflow import (
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.shipped import choose
 from sympflow.integrators.base import Problem
-from sympflow.integrators.checks import check_integrator
 from sympflow.integrators.logarithmic import LogSympFlow
 from sympflow.integrators.physical_time import PhysicalRun
 from sympflow.integrators.timed_pass import timed_pass
@@ -31,6 +30,9 @@ from sympflow.training.clock_fit import train_clock
 
 METHODS = ("log_leapfrog", "log_blanes_moan4", "log_kahan_li8")
 EPS = np.finfo(float).eps
+
+# q'' = q³: from rest at 1 it is infinite at t = Γ(1/4)²/(4 √π)
+ESCAPE = HamiltonianSystem.from_sympy("p**2/2 - q**4/4", y0=[1.0, 0.0], dt=0.01)
 
 MASSES, PLACES = (3, 4, 5), ((1, 3), (-2, -1), (1, -1))
 PYTHAGOREAN = HamiltonianSystem.from_sympy(
@@ -44,12 +46,6 @@ PYTHAGOREAN = HamiltonianSystem.from_sympy(
     t_span=(0.0, 70.0),
     dt=1e-3,
 )
-
-
-@pytest.mark.parametrize("method", METHODS[:2])
-def test_the_contract_holds_for_the_kepler_problem(method):
-    names = check_integrator(get(method), systems.kepler(0.6))
-    assert {"the_order_is_the_slope", "symplecticity_as_declared", "the_inverse_undoes_the_step"} <= set(names)
 
 
 @pytest.mark.parametrize("e", [0.9, 0.99, 0.999])
@@ -162,12 +158,12 @@ def test_one_compiled_pass_makes_what_the_run_by_chunks_makes(method, t_end, clo
 
 
 def test_the_compiled_pass_leaves_to_the_run_by_chunks_what_does_not_end():
-    henon_heiles, integrator = systems.henon_heiles(), get("log_leapfrog")(dt=0.2, shift=1.0)
-    escaping, end = np.array([0.0, 0.0, 0.0, 0.7]), np.array([10.0])  # infinite at t = 5.45
-    for y0 in (escaping, np.stack([henon_heiles.y0, escaping])):
-        assert timed_pass(integrator, Problem(henon_heiles, 0.0, 10.0, y0, end)) is None
-        assert (np.asarray(solve(henon_heiles, integrator, (0, 10), y0, t_eval=end).status) < 0).sum() == 1
-    assert timed_pass(integrator, Problem(henon_heiles, 0.0, 10.0, henon_heiles.y0, end)) is not None
+    integrator, end = get("log_leapfrog")(dt=0.2, shift=1.0), np.array([10.0])
+    staying, escaping = np.array([1e-3, 0.0]), np.array([1.0, 0.0])
+    for y0 in (escaping, np.stack([staying, escaping])):
+        assert timed_pass(integrator, Problem(ESCAPE, 0.0, 10.0, y0, end)) is None
+        assert (np.asarray(solve(ESCAPE, integrator, (0, 10), y0, t_eval=end).status) < 0).sum() == 1
+    assert timed_pass(integrator, Problem(ESCAPE, 0.0, 10.0, staying, end)) is not None
 
 
 def test_a_collision_ends_the_run_with_its_time():
@@ -175,10 +171,11 @@ def test_a_collision_ends_the_run_with_its_time():
     sol = solve(kepler, "log_leapfrog", (0.0, 10.0), y0=[1.0, 0.0, 0.0, 0.0])  # falls into the centre
     assert sol.status in (0, -1)
     assert np.isfinite(sol.y).all()
-    escape = solve(systems.henon_heiles(), "log_leapfrog", (0.0, 10.0), y0=[0.0, 0.0, 0.0, 0.7], dt=0.2, shift=1.0)
+    escape = solve(ESCAPE, "log_leapfrog", (0.0, 10.0), y0=[1.0, 0.0], dt=0.2, shift=1.0)
     assert escape.status == -1
     assert "time hardly advances any more" in escape.message
-    assert escape.t[-1] <= escape.stats["failed_at"] < 5.450984210235402
+    assert escape.t[-1] <= escape.stats["failed_at"]
+    assert abs(escape.stats["failed_at"] - 1.854074677301372) < 0.2**2  # the order is 2
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -9,8 +9,7 @@ from sympflow import HamiltonianSystem, energy_drift, energy_error, max_energy_e
 from sympflow.metrics.energy import energy_scale
 
 
-@pytest.mark.parametrize("omega", [1.0, 1e3, 1e6])
-@pytest.mark.parametrize("z", [0.1, 0.9, 1.9])
+@pytest.mark.parametrize(("omega", "z"), [(1.0, 0.1), (1.0, 0.9), (1.0, 1.9), (1e6, 0.9)])
 def test_verlet_energy_error_on_the_oscillator_is_bounded_by_a_quarter_of_z_squared(omega, z):
     """Kick–drift–kick keeps p² + ω²q²(1 − z²/4), so from p = 0 the relative error is (z²/4)(q² − 1)."""
     dt = z / omega
@@ -79,7 +78,7 @@ def test_standard_error_of_the_drift_is_that_of_white_noise():
     n, T, sigma, runs = 4000, 10.0, 0.3, 400
     system = HamiltonianSystem.from_sympy("p**2/2 + q", energy_scale=1.0)
     noise = np.random.default_rng(0).normal(0, sigma, (runs, n))
-    sol = solve(system, "verlet", (0, T), np.zeros((runs, 2)), t_eval=np.linspace(0, T, n))
+    sol = solve(system, "verlet", (0, T), np.zeros((runs, 2)), t_eval=np.linspace(0, T, n), backend="array")
     drift = energy_drift(replace(sol, y=np.stack([noise, 0 * noise], axis=1)))
     expected = np.sqrt(12 / n) * sigma / T
     assert drift.slope.std() == pytest.approx(expected, rel=0.12)  # the deviation of 400 draws is known to 3.5 %

@@ -91,13 +91,14 @@ def test_compiled_and_array_runs_agree_and_files_keep_it(case, tmp_path):
     assert torch.equal(copy.deepcopy(flow)(t, x), flow(t, x))
 
 
+FAST = "(p1**2 + p2**2)/2 + 1e6*q1**2/2 + (q1 - q2)**4/4"  # an oscillator and a free particle
 MIXED = "(p1**2 + p2**2)/2 + (q1**2 + q2**2 + 3*(q1 - q2)**2)/2 + q1**4/4"
 
 
 @pytest.mark.parametrize(
     "make",
-    [double_well, henon_heiles, lambda: fput(omega=1000.0), lambda: HamiltonianSystem.from_sympy(MIXED)],
-    ids=["hyperbolic", "oscillators", "turns_far", "mixed_modes"],
+    [double_well, lambda: HamiltonianSystem.from_sympy(FAST), lambda: HamiltonianSystem.from_sympy(MIXED)],
+    ids=["hyperbolic", "turns_far", "mixed_modes"],
 )
 def test_compiled_steps_of_any_lengths_are_the_flow(make):
     """Lengths from nearly 0 to Δt, for which ωt is up to 300, that is known to its rounding, 3e-14; and back."""
