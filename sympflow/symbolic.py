@@ -66,6 +66,13 @@ class SymbolicHamiltonian:
         return M
 
     @cached_property
+    def force_gradient(self) -> sp.Expr:
+        """−½|∇V|²_{M⁻¹}."""
+        assert self.inverse_mass is not None
+        slope = sp.Matrix([sp.diff(self.V, s) for s in self.q])
+        return -(slope.T * self.inverse_mass * slope)[0] / 2
+
+    @cached_property
     def W(self) -> sp.Expr:
         """½ v·∇²V v with v = M⁻¹∇V."""
         assert self.inverse_mass is not None

@@ -74,7 +74,7 @@ def test_states_that_escape_have_no_labels():
 def test_a_table_step_is_the_splitting_step(name):
     scheme, h, y = sympflow.get(name).scheme, 0.2, HH.domain.sample(5, 0)
     sequence = [kind for kind, *_ in scheme.substeps]
-    c = [h * b for _, b, *_ in scheme.substeps] + [h**3 * g for kind, _, g, _ in scheme.substeps if kind == "kick"]
+    c = [h * b for _, b, *_ in scheme.substeps] + [h**3 * s.three for s in scheme.substeps if s.kind == "kick"]
     step = TableStep(HH, sequence, True)
     np.testing.assert_allclose(step(np.array(c)[:, None], y.T).T, get(name)().step(HH, 0.0, y, h), atol=1e-15)
 

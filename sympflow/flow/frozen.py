@@ -11,8 +11,9 @@ import torch
 
 from sympflow.flow.coefficients import Coefficients, Entry
 from sympflow.flow.contents import Contents
-from sympflow.integrators.scheme import CURVATURE, Scheme
+from sympflow.integrators.scheme import CURVATURE, POLYNOMIAL, Scheme
 from sympflow.integrators.splitting import scheme_evaluations
+from sympflow.monomials import Monomials
 
 if TYPE_CHECKING:
     from sympflow.kernels.primed_flow import PrimedFlowKernel
@@ -24,16 +25,18 @@ MOST_KEPT = 256  # a flow with a processor has five for each step length
 
 @dataclass(frozen=True)
 class Substep:
-    """A kick or a drift of the flow: its coefficient, and for a kick those of its force gradient and its curvature."""
+    """A kick or a drift of the flow: its coefficient.
+
+    And for a kick those of the other terms: force gradient, curvature; or of each monomial of a polynomial.
+    """
 
     kind: Kind
     weight: Entry
-    gradient: Entry | None = None
-    curvature: Entry | None = None
+    more: tuple[Entry, ...] = ()
 
     @property
-    def entries(self) -> tuple[Entry | None, Entry | None, Entry | None]:
-        return self.weight, self.gradient, self.curvature
+    def entries(self) -> tuple[Entry, ...]:
+        return self.weight, *self.more
 
 
 class Tables:
@@ -47,20 +50,23 @@ class Tables:
         How many of them χ has.
     dt : float
         Δt.
+    monomials
+        Of the polynomials of kicks, where they have them.
     """
 
     kernel: PrimedFlowKernel | None = None
     """The compiled loops that were made of these last."""
 
-    def __init__(self, substeps: Sequence[Substep], outer: int, dt: float) -> None:
+    def __init__(self, substeps: Sequence[Substep], outer: int, dt: float, monomials: Monomials = ()) -> None:
         last = len(substeps) - outer
         self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
         self.dt, self.processed = dt, outer > 0
-        self.level = max(s.entries[1:].index(None) if None in s.entries[1:] else CURVATURE for s in substeps)
+        self.monomials = monomials
+        self.level = POLYNOMIAL if monomials else max(len(s.more) for s in substeps)
         numbers = [c.table for c in columns_of(substeps)]
         self.compilable = all(c.dtype == torch.float64 and c.device.type == "cpu" for c in numbers)
-        self._coefficients = {id(c): c.table.detach().cpu().double().numpy() for c in columns_of(substeps)}
-        exponents = columns_of(substeps)[0].exponents
+        exponents = max((c.exponents for c in columns_of(substeps)), key=len)  # others end before
+        self._coefficients = {id(c): _padded(c, len(exponents)) for c in columns_of(substeps)}
         self._exponents = np.array(exponents, dtype=float)
         self._even = exponents[1:2] != (1,)
         self._kept: dict[Any, Any] = {}
@@ -87,18 +93,19 @@ class Tables:
     def polynomials(self, back: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Kicks, drifts, gradients and curvatures (m, K) of the stages of ψ̄_t, or of its inverse.
 
-        They are divided by t, t, t³ and t⁵.
-
-        They multiply the powers 0 … K−1 of `variable`; K is at least 3, by zeros if need be.
+        They are divided by t, t, t³ and t⁵. They multiply the powers 0 … K−1 of `variable`; K is at least 3, by zeros
+        if need be. In place of curvatures there may be polynomials (m, M, K), divided by t³.
         """
 
         def make() -> tuple[np.ndarray, ...]:
             parts, sign = self._parts["primed"], -1 if back else 1
             substeps = reversed(parts) if back else parts
-            stages = _stages((s.kind, _numbers(s, self._coefficients, sign)) for s in substeps)
-            columns = (np.array(column, dtype=float) for column in zip(*stages, strict=True))
-            kicks, gradients, curvatures, drifts = (np.pad(c, ((0, 0), (0, max(0, 3 - c.shape[1])))) for c in columns)
-            return kicks, drifts, gradients, curvatures
+            stages = self._stages((s.kind, _numbers(s, self._coefficients, sign)) for s in substeps)
+            numbers = np.array(stages, dtype=float)  # (m, columns, K)
+            numbers = np.pad(numbers, ((0, 0), (0, 0), (0, max(0, 3 - numbers.shape[2]))))
+            kicks, gradients, drifts = numbers[:, 0], numbers[:, 1], numbers[:, -1]
+            more = numbers[:, 3:-1] if self.monomials else numbers[:, 2]
+            return tuple(np.ascontiguousarray(c) for c in (kicks, drifts, gradients, more))
 
         return self.kept(("polynomials", back), make)
 
@@ -137,18 +144,43 @@ class Tables:
             )
         powers = (t / self.dt) ** self._exponents
         values = {column: table @ powers for column, table in self._coefficients.items()}
-        stages = _stages((s.kind, _numbers(s, values, 1)) for s in self._parts[part])
-        kicks, gradients, curvatures, drifts = (tuple(map(float, column)) for column in zip(*stages, strict=True))
+        stages = self._stages((s.kind, _numbers(s, values, 1)) for s in self._parts[part])
+        columns = [tuple(map(float, column)) for column in zip(*stages, strict=True)]
+        kicks, gradients, curvatures, drifts = *columns[:3], columns[-1]
         source = f"a primed SympFlow, Δt = {self.dt:g}, frozen at t = {t:g}"
-        more = (curvatures,) if self.level == CURVATURE else ()
-        return Scheme(part, None, kicks, drifts, gradients, source, self.level > 0, *more)
+        more: dict[str, Any] = {"curvatures": curvatures} if self.level == CURVATURE else {}
+        if self.monomials:
+            more = {"polynomials": tuple(zip(*columns[3:-1], strict=True)), "monomials": self.monomials}
+        return Scheme(part, None, kicks, drifts, gradients, source, self.level > 0, **more)
+
+    def _stages(self, substeps: Iterable[tuple[Kind, list[Any]]]) -> list[list[Any]]:
+        """[kick, gradient, curvature, polynomial …, drift] of the stages, neighbours of one kind merged."""
+        stages: list[list[Any]] = []
+        before = "drift"
+        width = 3 + len(self.monomials)
+        for kind, numbers in substeps:
+            zero = 0 * numbers[0]
+            if kind == "drift" and stages:
+                stages[-1][-1] = stages[-1][-1] + numbers[0]
+            elif kind == "drift":
+                stages.append([zero] * width + numbers)
+            else:
+                # Polynomials stand in place of force gradients and curvatures.
+                kick = [numbers[0], *([zero] * 2 if self.monomials else []), *numbers[1:]]
+                kick += [zero] * (width - len(kick))
+                if before == "kick" and stages:
+                    stages[-1][:-1] = [one + two for one, two in zip(stages[-1][:-1], kick, strict=True)]
+                else:
+                    stages.append([*kick, zero])
+            before = kind
+        return stages
 
 
 class KeptTables:
     """The `Tables` of a flow, made anew when one of its numbers has changed."""
 
-    def __init__(self, substeps: Sequence[Substep], outer: int, dt: float) -> None:
-        self._of = tuple(substeps), outer, dt
+    def __init__(self, substeps: Sequence[Substep], outer: int, dt: float, monomials: Monomials) -> None:
+        self._of = tuple(substeps), outer, dt, monomials
         self._contents = Contents(column._parameters for column in columns_of(substeps))
         self._known: tuple[bytes, Tables] | None = None
 
@@ -161,27 +193,15 @@ class KeptTables:
 
 def columns_of(substeps: Sequence[Substep]) -> list[Coefficients]:
     """The distinct columns that the substeps take their numbers from."""
-    entries = [entry for s in substeps for entry in s.entries if entry is not None]
+    entries = [entry for s in substeps for entry in s.entries]
     return list({id(entry.column): entry.column for entry in entries}.values())
 
 
+def _padded(column: Coefficients, n: int) -> np.ndarray:
+    table = column.table.detach().cpu().double().numpy()
+    return np.pad(table, ((0, 0), (0, n - table.shape[1])))
+
+
 def _numbers(s: Substep, values: dict[int, np.ndarray], sign: int) -> list[Any]:
-    """Coefficient, force gradient and curvature of a substep, out of those of the columns."""
-    zero = 0 * values[id(s.weight.column)][s.weight.row]
-    return [zero if e is None else sign * e.sign * values[id(e.column)][e.row] for e in s.entries]
-
-
-def _stages(substeps: Iterable[tuple[Kind, list[Any]]]) -> list[list[Any]]:
-    """[kick, gradient, curvature, drift] of the stages, neighbours of one kind merged."""
-    stages: list[list[Any]] = []
-    before = "drift"
-    for kind, numbers in substeps:
-        if kind == "drift" and stages:
-            stages[-1][-1] = stages[-1][-1] + numbers[0]
-        elif kind == "kick" and before == "kick" and stages:
-            stages[-1][:-1] = [one + two for one, two in zip(stages[-1][:-1], numbers, strict=True)]
-        else:
-            zero = 0 * numbers[0]
-            stages.append([*numbers, zero] if kind == "kick" else [zero, zero, zero, numbers[0]])
-        before = kind
-    return stages
+    """The coefficients of a substep, out of those of the columns."""
+    return [sign * e.sign * values[id(e.column)][e.row] for e in s.entries]

@@ -3,6 +3,8 @@
     kick    V_p(t, q) = t b(τ) V(q) − t³ γ(τ) ½|∇V(q)|²_{M⁻¹} + t⁵ c(τ) ½ v·∇²V(q) v,   v = M⁻¹∇V(q)
     drift   V_m(t, p) = t a(τ) T(p)                                                         τ = t/Δt
 
+In place of the last two terms a kick may have a trained polynomial, t³ Σ_m e_m(τ) q^m.
+
 Frozen at any t such a flow is a splitting scheme, kicks b, force gradients γ, curvatures c and drifts a in the
 convention of `sympflow.integrators.scheme`: a SympFlow of this kind is a table of numbers that varies smoothly with t.
 
@@ -12,12 +14,12 @@ of Δt only K is executed, as the χ between two steps cancel.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from sympflow.flow.base import FlowMap
 from sympflow.flow.coefficients import Coefficients, Entry
@@ -30,11 +32,13 @@ from sympflow.flow.primed_potentials import (
     KINETIC,
     POTENTIAL,
     Binding,
+    PolynomialTerm,
     PrimedPotential,
     Term,
 )
 from sympflow.flow.sympflow import SympFlow
 from sympflow.integrators.scheme import Scheme
+from sympflow.monomials import Monomials
 
 if TYPE_CHECKING:
     from sympflow.flow.potentials import Time
@@ -66,6 +70,8 @@ class PrimedFlow(SympFlow):
         Number C of pairs of χ, 2C + 1 maps; 0 for none.
     curvature : bool
         Whether kicks with force gradients have curvature terms too, for symbolic systems.
+    monomials : tuple of tuple of int
+        The exponents m of polynomials that stand in place of both, for symbolic systems; none for none.
     dtype, device
         Of the parameters.
 
@@ -75,8 +81,10 @@ class PrimedFlow(SympFlow):
         b and a of the kernel.
     gradients, curvatures : Coefficients or None
         γ and c, one for each kick.
-    processor_kicks, processor_drifts, processor_gradients, processor_curvatures : Coefficients or None
-        Those of χ.
+    polynomials : ModuleList of Coefficients, or None
+        e_m, one column for each monomial.
+    processor_kicks, processor_drifts, processor_gradients, processor_curvatures, processor_polynomials
+        Those of χ, or None.
     substeps : tuple of Substep
         What is executed, in this order: χ⁻¹, K, χ.
     """
@@ -93,6 +101,7 @@ class PrimedFlow(SympFlow):
         system: HamiltonianSystem | None = None,
         processor: int = 0,
         curvature: bool = False,
+        monomials: Monomials = (),
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
@@ -110,33 +119,37 @@ class PrimedFlow(SympFlow):
             )
         if curvature and not force_gradient:
             raise ValueError("`curvature` goes with force gradients: leave it out.")
-        self.degree, self.palindromic, self.processor = degree, palindromic, processor
-        stride = 2 if palindromic else 1
+        if monomials and force_gradient:
+            raise ValueError("`monomials` stand in place of force gradients: leave these out.")
+        self.degree, self.palindromic, self.processor, self.monomials = degree, palindromic, processor, monomials
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
         kernel, chi = _alternating(first, maps), _alternating(first, 2 * processor + 1 if processor else 0)
 
-        def columns(sequence: Sequence[Kind], mirrored: bool, total: float | None) -> list[Any]:
-            exponents = tuple(range(0, degree, stride))
-            wanted: list[tuple[Kind, int, bool]] = [("kick", 1, True), ("drift", 1, True)]
-            wanted += [("kick", 3, force_gradient), ("kick", 5, curvature)]
-            return [
-                Coefficients(
-                    sequence.count(kind), exponents, self.dt, power, mirrored, total if power == 1 else None, **like
-                )
-                if there
-                else None
-                for kind, power, there in wanted
-            ]
+        def column(sequence: Sequence[Kind], kind: Kind, power: int, mirrored: bool, total: float | None = None) -> Any:
+            # Degrees in t: t b(τ) has the given one, and so have polynomials, of which there are many.
+            exponents = tuple(range(0, max(degree - 2 * bool(monomials and power > 1), 1), 2 if palindromic else 1))
+            return Coefficients(sequence.count(kind), exponents, self.dt, power, mirrored, total, **like)
 
-        inside = columns(kernel, palindromic, 1.0)
-        outside: list[Any] = columns(chi, False, None) if processor else [None] * len(inside)
-        self.kicks, self.drifts, self.gradients, self.curvatures = inside
-        self.processor_kicks, self.processor_drifts, self.processor_gradients, self.processor_curvatures = outside
+        def columns(sequence: Sequence[Kind], mirrored: bool, total: float | None) -> tuple[Any, ...]:
+            if not sequence:
+                return (None,) * 5
+            return (
+                column(sequence, "kick", 1, mirrored, total),
+                column(sequence, "drift", 1, mirrored, total),
+                column(sequence, "kick", 3, mirrored) if force_gradient else None,
+                column(sequence, "kick", 5, mirrored) if curvature else None,
+                nn.ModuleList(column(sequence, "kick", 3, mirrored) for _ in monomials) if monomials else None,
+            )
+
+        inside, outside = columns(kernel, palindromic, 1.0), columns(chi, False, None)
+        self.kicks, self.drifts, self.gradients, self.curvatures, self.polynomials = inside
+        self.processor_kicks, self.processor_drifts, self.processor_gradients = outside[:3]
+        self.processor_curvatures, self.processor_polynomials = outside[3:]
         inner = _substeps(kernel, inside, 1)
         outer = {sign: _substeps(chi, outside, sign) for sign in (1, -1)}
         self.substeps: tuple[Substep, ...] = (*reversed(outer[-1]), *inner, *outer[1])
         self._n_outer = len(chi)
-        self._tables = KeptTables(self.substeps, self._n_outer, self.dt)
+        self._tables = KeptTables(self.substeps, self._n_outer, self.dt, monomials)
         self._binding = Binding(system)
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(self._layer(substep) for substep in self.substeps)  # type: ignore[assignment]
@@ -160,14 +173,22 @@ class PrimedFlow(SympFlow):
         """The kinds of the substeps."""
         return tuple(substep.kind for substep in self.substeps)
 
+    def columns(self) -> Iterator[tuple[str, Coefficients]]:
+        """The columns of its table by name; those of a polynomial, one for each monomial, as in "polynomials.0"."""
+        return ((name, column) for name, column in self.named_modules() if isinstance(column, Coefficients))
+
+    @property
+    def terms(self) -> int:
+        """How many terms a kick has beside V."""
+        return len(self.monomials) or sum(c is not None for c in (self.gradients, self.curvatures))
+
     def _layer(self, substep: Substep) -> Kick | Drift:
         if substep.kind == "drift":
             return Drift(PrimedPotential(self.ndof, self._binding, [(KINETIC, substep.weight)]))
         terms: list[tuple[Term, Entry]] = [(POTENTIAL, substep.weight)]
-        if substep.gradient is not None:
-            terms.append((FORCE_GRADIENT, substep.gradient))
-        if substep.curvature is not None:
-            terms.append((CURVATURE, substep.curvature))
+        if self.monomials:
+            return Kick(PrimedPotential(self.ndof, self._binding, terms, PolynomialTerm(self.monomials, substep.more)))
+        terms += zip((FORCE_GRADIENT, CURVATURE), substep.more, strict=False)
         return Kick(PrimedPotential(self.ndof, self._binding, terms))
 
     # the frozen tables --------------------------------------------------------------------------------------
@@ -270,6 +291,7 @@ class PrimedFlow(SympFlow):
                 "force_gradient": self.gradients is not None,
                 "processor": self.processor,
                 "curvature": self.curvatures is not None,
+                **({"monomials": [list(m) for m in self.monomials]} if self.monomials else {}),
             },
         }
 
@@ -279,10 +301,11 @@ def _alternating(first: Kind, n: int) -> tuple[Kind, ...]:
     return tuple(first if i % 2 == 0 else other for i in range(n))
 
 
-def _substeps(sequence: Sequence[Kind], columns: Sequence[Coefficients | None], sign: int) -> list[Substep]:
-    kicks, drifts, *more = columns
+def _substeps(sequence: Sequence[Kind], columns: Sequence[Any], sign: int) -> list[Substep]:
+    kicks, drifts, gradients, curvatures, polynomials = columns
+    more = [c for c in (gradients, curvatures) if c is not None] if polynomials is None else polynomials
     made = []
     for i, kind in enumerate(sequence):
-        of = [kicks, *more] if kind == "kick" else [drifts]
-        made.append(Substep(kind, *[None if c is None else Entry(c, i // 2, sign) for c in of]))  # type: ignore[arg-type]
+        one, *others = [kicks, *more] if kind == "kick" else [drifts]
+        made.append(Substep(kind, Entry(one, i // 2, sign), tuple(Entry(c, i // 2, sign) for c in others)))
     return made

@@ -1,4 +1,7 @@
-"""Potentials made of a system's own functions, V(q), T(p), −½|∇V|²_{M⁻¹} and ½v·∇²V v, times functions of t."""
+"""Potentials made of a system's own functions, V(q), T(p), −½|∇V|²_{M⁻¹} and ½v·∇²V v, times functions of t.
+
+And of polynomials in q, whose coefficients are functions of t.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from torch import Tensor
 
 from sympflow.flow.potentials import Potential, Time
 from sympflow.forward_mode import jvp
+from sympflow.monomials import Monomials, gradient, value
 from sympflow.third_derivatives import derivative, direction, length_of_change, step
 
 if TYPE_CHECKING:
@@ -127,8 +131,41 @@ def _gradient_and_change(U: Term, system: HamiltonianSystem, x: Tensor, dx: Tens
     return gradient(x), (derivative(partial(U.gradient, system), q, along, h) * v.abs().amax(-1, True)).T
 
 
+class PolynomialTerm:
+    """Σ_m e_m(t) q^m; positions are columns (d, N).
+
+    Parameters
+    ----------
+    monomials
+        The exponents m.
+    factors : sequence of Factor
+        e_m.
+    """
+
+    def __init__(self, monomials: Monomials, factors: Sequence[Factor]) -> None:
+        self.monomials, self._factors = monomials, tuple(factors)
+
+    def value(self, coefficients: Tensor, x: Tensor) -> Tensor:
+        return value(self.monomials, coefficients, x.T)
+
+    def gradient(self, coefficients: Tensor, x: Tensor) -> Tensor:
+        return gradient(self.monomials, coefficients, x.T).T
+
+    def at(self, t: Time, x: Tensor) -> Tensor:
+        """e(t): (M,), or (N, M) for times (N,)."""
+        return self._stacked([e.value(t) for e in self._factors], x)
+
+    def rate(self, t: Time, x: Tensor) -> Tensor:
+        """Its time derivative."""
+        return self._stacked([e.rate(t) for e in self._factors], x)
+
+    @staticmethod
+    def _stacked(values: Sequence[Time], x: Tensor) -> Tensor:
+        return torch.stack([torch.as_tensor(v, dtype=x.dtype, device=x.device) for v in values], dim=-1)
+
+
 class PrimedPotential(Potential):
-    """V(t, x) = Σ_j c_j(t) U_j(x), with U_j functions of the system and c_j(0) = 0.
+    """V(t, x) = Σ_j c_j(t) U_j(x), with U_j functions of the system and c_j(0) = 0, and perhaps a polynomial.
 
     Parameters
     ----------
@@ -136,29 +173,45 @@ class PrimedPotential(Potential):
     binding : Binding
     terms : sequence of (Term, Factor)
         U_j, and c_j, for instance an entry of a table.
+    polynomial : PolynomialTerm, optional
     """
 
-    def __init__(self, ndof: int, binding: Binding, terms: Sequence[tuple[Term, Factor]]) -> None:
+    def __init__(
+        self,
+        ndof: int,
+        binding: Binding,
+        terms: Sequence[tuple[Term, Factor]],
+        polynomial: PolynomialTerm | None = None,
+    ) -> None:
         super().__init__()
         self.ndof, self.binding = ndof, binding
-        self._terms = terms
+        self._terms, self._polynomial = terms, polynomial
 
     def impulse(self, t: Time, x: Tensor) -> Tensor:
         system = self.binding.system
-        return sum(c.value(t) * U.gradient(system, x.T).T for U, c in self._terms)  # type: ignore[return-value]
+        impulse = sum(c.value(t) * U.gradient(system, x.T).T for U, c in self._terms)
+        if self._polynomial is not None:
+            impulse = impulse + self._polynomial.gradient(self._polynomial.at(t, x), x)
+        return impulse  # type: ignore[return-value]
 
     def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
         system = self.binding.system
         rate = sum(c.rate(t) * U.value(system, x.T) for U, c in self._terms)
+        if self._polynomial is not None:
+            rate = rate + self._polynomial.value(self._polynomial.rate(t, x), x)
         return self.impulse(t, x), rate  # type: ignore[return-value]
 
     def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
         system = self.binding.system
         impulse = tangent = torch.zeros_like(x)
         for U, c in self._terms:
-            gradient, change = _gradient_and_change(U, system, x, dx)
-            impulse = impulse + c.value(t) * gradient
-            tangent = tangent + c.rate(t) * gradient + c.value(t) * change
+            slope, change = _gradient_and_change(U, system, x, dx)
+            impulse = impulse + c.value(t) * slope
+            tangent = tangent + c.rate(t) * slope + c.value(t) * change
+        if self._polynomial is not None:
+            slope, change = jvp(partial(self._polynomial.gradient, self._polynomial.at(t, x)), x, dx)
+            impulse = impulse + slope
+            tangent = tangent + self._polynomial.gradient(self._polynomial.rate(t, x), x) + change
         return impulse, tangent
 
     def to_dict(self) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
+from sympflow.monomials import MOST_MONOMIALS, Monomials
 
 MAX_LAYERS = 1000
 MAX_WIDTH = 4096
@@ -112,7 +113,22 @@ def _primed(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> PrimedFlow:
     if processor != 0 or isinstance(processor, bool):
         processor = _integer(processor, "processor", MAX_LAYERS)
     shape = (plan["first"], maps, degree, plan["palindromic"], plan["force_gradient"])
-    return PrimedFlow(ndof, *shape, dt, processor=processor, curvature=curvature, dtype=dtype)
+    more: dict[str, Any] = {"curvature": curvature, "monomials": _monomials(plan.get("monomials", []), ndof)}
+    return PrimedFlow(ndof, *shape, dt, processor=processor, **more, dtype=dtype)
+
+
+def _monomials(plan: Any, ndof: int) -> Monomials:
+    if not isinstance(plan, list) or len(plan) > MOST_MONOMIALS:
+        raise Refused(f"its monomials are not a list of at most {MOST_MONOMIALS}")
+    for m in plan:
+        if not isinstance(m, list) or len(m) != ndof:
+            raise Refused(f"its monomials do not have {ndof} exponents each")
+        if not all(isinstance(e, int) and not isinstance(e, bool) and 0 <= e <= MAX_DEGREE for e in m):
+            raise Refused(f"its monomials have exponents that are not integers from 0 to {MAX_DEGREE}")
+    monomials = tuple(tuple(m) for m in plan)
+    if len(set(monomials)) < len(monomials) or (0,) * ndof in monomials:
+        raise Refused("its monomials are not different ones that vary with q")
+    return monomials
 
 
 def _clocked(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> ClockedFlow:

@@ -128,6 +128,7 @@ class SympFlow(FlowMap):
         force_gradient: bool | None = None,
         processor: int = 0,
         curvature: bool = False,
+        polynomial: int | None = None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> PrimedFlow:
@@ -158,6 +159,10 @@ class SympFlow(FlowMap):
         curvature : bool
             Whether the kicks also have a term in ½ v·∇²V v, v = M⁻¹∇V, which takes third derivatives of V: for symbolic
             systems. A trained kick with it comes tens of times nearer, and takes 1.1 to 1.5 times as long.
+        polynomial : int, optional
+            In place of force gradients and curvatures every kick has a trained polynomial in q of this total degree,
+            t³ Σ_m e_m(t) q^m, of the monomials that are as even as V: for symbolic systems in few degrees of freedom.
+            For a polynomial V of degree n, 2n is a good one.
         dtype, device
             Of the parameters.
 
@@ -168,7 +173,7 @@ class SympFlow(FlowMap):
         """
         from sympflow.flow.untrained_primed import primed
 
-        shape = (stages, dt, palindromic, scheme, degree, force_gradient, processor, curvature)
+        shape = (stages, dt, palindromic, scheme, degree, force_gradient, processor, curvature, polynomial)
         return primed(system, *shape, dtype, device)
 
     @staticmethod

@@ -13,6 +13,7 @@ from sympflow.flow.primed import PrimedFlow
 from sympflow.integrators.base import check_flag
 from sympflow.integrators.scheme import Scheme
 from sympflow.integrators.schemes import SCHEMES, compose
+from sympflow.monomials import Monomials, monomials
 
 if TYPE_CHECKING:
     from sympflow.system import HamiltonianSystem
@@ -28,6 +29,7 @@ def primed(
     force_gradient: bool | None,
     processor: int,
     curvature: bool,
+    polynomial: int | None,
     dtype: torch.dtype,
     device: torch.device | str | None,
 ) -> PrimedFlow:
@@ -39,6 +41,9 @@ def primed(
         check_flag("force_gradient", force_gradient)
     if not system.separable:
         raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
+    of_kicks = _monomials(system, polynomial, force_gradient, curvature)
+    if of_kicks:
+        force_gradient = False
     if force_gradient is None:
         functions = system.numba_functions
         force_gradient = system.quadratic_kinetic and (functions is None or functions[2] is not None)
@@ -66,7 +71,26 @@ def primed(
         scheme = SCHEMES[scheme]
     if (scheme.nystrom or any(scheme.gradients)) and not system.quadratic_kinetic:
         raise ValueError(f"`scheme` {scheme.name!r} needs a kinetic energy ½ pᵀM⁻¹p: take 'kahan_li8', for instance.")
-    return _from_scheme(system, scheme, dt, degree, palindromic, force_gradient, processor, curvature, dtype, device)
+    extra = (processor, curvature, of_kicks, dtype, device)
+    return _from_scheme(system, scheme, dt, degree, palindromic, force_gradient, *extra)
+
+
+def _monomials(
+    system: HamiltonianSystem, polynomial: int | None, force_gradient: bool | None, curvature: bool
+) -> Monomials:
+    """Those that `polynomial` asks for."""
+    if polynomial is None:
+        return ()
+    if isinstance(polynomial, bool) or not isinstance(polynomial, int) or polynomial < 1:
+        raise ValueError(f"`polynomial` must be a positive integer, its degree; got {polynomial!r}: 8 is usual.")
+    if force_gradient or curvature:
+        raise ValueError("`polynomial` stands in place of `force_gradient` and `curvature`: leave these out.")
+    if system.symbols is None or not system.quadratic_kinetic:
+        raise ValueError(
+            "`polynomial` is for symbolic systems, H = ½ pᵀM⁻¹p + V(q): leave it out, or define the system with "
+            "HamiltonianSystem.from_sympy."
+        )
+    return monomials(system.symbols, polynomial)
 
 
 def _from_scheme(
@@ -78,22 +102,25 @@ def _from_scheme(
     force_gradient: bool,
     processor: int,
     curvature: bool,
+    of_kicks: Monomials,
     dtype: torch.dtype,
     device: torch.device | str | None,
 ) -> PrimedFlow:
     """The flow that is, at every t, the given scheme; its processor is the identity."""
     if palindromic and not scheme.symmetric:
         raise ValueError(f"`scheme` {scheme.name!r} is not symmetric: take another, or palindromic=False.")
+    if any(scheme.gradients) and of_kicks:
+        raise ValueError(f"`polynomial` stands in place of force gradients, as {scheme.name!r} has them: take another.")
     if any(scheme.gradients) and not force_gradient:
         raise ValueError(f"`force_gradient` is False but {scheme.name!r} has force gradients: leave it out.")
     substeps = scheme.substeps
     first: Kind = "kick" if substeps[0][0] == "kick" else "drift"
-    shape = (degree, palindromic, force_gradient, dt, system, processor, curvature, dtype, device)
+    shape = (degree, palindromic, force_gradient, dt, system, processor, curvature, of_kicks, dtype, device)
     flow = PrimedFlow(system.ndof, first, len(substeps), *shape)
-    columns: Any = (flow.kicks, "kick", 1), (flow.drifts, "drift", 1), (flow.gradients, "kick", 2)
-    for column, kind, entry in (*columns, (flow.curvatures, "kick", 3)):
+    columns: Any = (flow.kicks, "kick", "one"), (flow.drifts, "drift", "one"), (flow.gradients, "kick", "three")
+    for column, kind, number in (*columns, (flow.curvatures, "kick", "five")):
         if column is not None:
             table = np.zeros(tuple(column.offset.shape))
-            table[:, 0] = [float(substep[entry]) for substep in substeps if substep[0] == kind]
+            table[:, 0] = [float(getattr(substep, number)) for substep in substeps if substep.kind == kind]
             column.set(table)
     return flow

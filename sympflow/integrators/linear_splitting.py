@@ -48,7 +48,7 @@ class LinearSplitting(MapsStepper):
     def maps(self, parts: ExactParts, h: Any) -> list[Map]:
         filters = _sinc(parts, h) if self.mollified else None
         maps = []
-        for kind, c, c3, _ in self.scheme.substeps:
+        for kind, c, c3, *_ in self.scheme.substeps:
             if kind == "drift":
                 maps.append(Map(LINEAR, self._times(parts, c * h)))
             elif parts.rest:

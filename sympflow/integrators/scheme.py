@@ -14,6 +14,10 @@ It may further carry the next commutator that depends on q alone, the *curvature
 v = M⁻¹∇V (Blanes, Casas and Ros, Appl. Numer. Math. 39 (2001) 245):
 
     + c_i h⁴ ½ v·∇²V(q) v,       p −= c_i h⁵ (∇²V M⁻¹∇²V v + ½ ∇³V(v, v)).
+
+In place of these two a kick may carry a polynomial in q, which no order condition knows: trained flows have them.
+
+    + h² Σ_m e_im q^m,           p −= h³ Σ_m e_im ∇q^m.
 """
 
 from __future__ import annotations
@@ -21,10 +25,33 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, NamedTuple
 
-__all__ = ["CURVATURE", "FORCE_GRADIENT", "Scheme"]
+__all__ = ["CURVATURE", "FORCE_GRADIENT", "POLYNOMIAL", "Scheme", "Substep"]
 
-FORCE_GRADIENT, CURVATURE = 1, 2  # levels of a scheme, or of a flow: what its kicks have beside the force
+FORCE_GRADIENT, CURVATURE, POLYNOMIAL = 1, 2, 3  # levels of a scheme, or of a flow: what its kicks have beside V
+
+
+class Substep(NamedTuple):
+    """A kick by b, g, c and the coefficients e of a polynomial, or a drift by a = `one`."""
+
+    kind: str
+    one: float
+    three: float = 0.0
+    five: float = 0.0
+    polynomial: tuple[float, ...] = ()
+
+    @property
+    def idle(self) -> bool:
+        return not (self.one or self.three or self.five or any(self.polynomial))
+
+    def numbers(self) -> tuple[float, ...]:
+        return (self.one, self.three, self.five, *self.polynomial)
+
+    def merged(self, other: Substep) -> Substep:
+        """Both in turn, of one kind."""
+        e = tuple(map(float.__add__, self.polynomial, other.polynomial))
+        return Substep(self.kind, self.one + other.one, self.three + other.three, self.five + other.five, e)
 
 
 @dataclass(frozen=True)
@@ -41,6 +68,10 @@ class Scheme:
         Coefficients b, a and g of the stages in their order of execution; zeros cost nothing.
     curvatures : tuple of float
         Coefficients c, none for none.
+    polynomials : tuple of tuple of float
+        Coefficients e of each stage, none for none; then there are neither g nor c.
+    monomials : tuple of tuple of int
+        The exponents m of these.
     source : str
         Where the coefficients come from.
     nystrom : bool
@@ -61,6 +92,8 @@ class Scheme:
     source: str
     nystrom: bool = False
     curvatures: tuple[float, ...] = ()
+    polynomials: tuple[tuple[float, ...], ...] = ()
+    monomials: tuple[tuple[int, ...], ...] = ()
 
     def __post_init__(self) -> None:
         if not len(self.kicks) == len(self.drifts) == len(self.gradients) > 0:
@@ -73,6 +106,15 @@ class Scheme:
                 f"`curvatures` must have one coefficient per stage, {len(self.kicks)}, or none; got "
                 f"{len(self.curvatures)}: pad with zeros."
             )
+        if len(self.polynomials) not in (0, len(self.kicks)) or any(
+            len(e) != len(self.monomials) for e in self.polynomials
+        ):
+            raise ValueError(
+                f"`polynomials` must have {len(self.monomials)} coefficients per stage, one for each of `monomials`, "
+                "or there must be none: pad with zeros."
+            )
+        if self.polynomials and (any(self.gradients) or any(self.curvatures)):
+            raise ValueError("`polynomials` stand in place of `gradients` and `curvatures`: leave these out.")
 
     def __hash__(self) -> int:
         return self._hash
@@ -83,18 +125,16 @@ class Scheme:
         return hash((self.name, self.kicks, self.drifts, self.gradients, self.curvatures))
 
     @cached_property
-    def substeps(self) -> tuple[tuple[str, float, float, float], ...]:
-        """The maps really executed, ('kick', b, g, c) or ('drift', a, 0, 0): no zeros, like neighbours merged."""
-        merged: list[tuple[str, float, float, float]] = []
-        curvatures = self.curvatures or (0.0,) * len(self.kicks)
-        for b, g, c, a in zip(self.kicks, self.gradients, curvatures, self.drifts, strict=True):
-            for kind, one, three, five in (("kick", b, g, c), ("drift", a, 0.0, 0.0)):
-                if one == three == five == 0.0:
+    def substeps(self) -> tuple[Substep, ...]:
+        """The maps really executed: no zeros, like neighbours merged."""
+        merged: list[Substep] = []
+        n = len(self.kicks)
+        columns = self.curvatures or (0.0,) * n, self.polynomials or ((),) * n
+        for b, g, c, e, a in zip(self.kicks, self.gradients, *columns, self.drifts, strict=True):
+            for substep in (Substep("kick", b, g, c, e), Substep("drift", a)):
+                if substep.idle:
                     continue
-                if merged and merged[-1][0] == kind:
-                    _, before, before3, before5 = merged.pop()
-                    one, three, five = one + before, three + before3, five + before5  # noqa: PLW2901
-                merged.append((kind, one, three, five))
+                merged.append(merged.pop().merged(substep) if merged and merged[-1].kind == substep.kind else substep)
         return tuple(merged)
 
     @cached_property
@@ -102,7 +142,8 @@ class Scheme:
         """Whether the step is its own adjoint, Φ(−h) = Φ(h)⁻¹ (the coefficients read the same backwards)."""
         forwards, backwards = self.substeps, self.substeps[::-1]
         return len(forwards) > 0 and all(
-            one[0] == other[0] and sum(abs(a - b) for a, b in zip(one[1:], other[1:], strict=True)) < 1e-13
+            one.kind == other.kind
+            and sum(abs(a - b) for a, b in zip(one.numbers(), other.numbers(), strict=True)) < 1e-13
             for one, other in zip(forwards, backwards, strict=True)
         )
 
@@ -113,7 +154,9 @@ class Scheme:
 
     @cached_property
     def level(self) -> int:
-        """What the kicks have: 0 the force alone, `FORCE_GRADIENT`, or `CURVATURE` terms as well."""
+        """What the kicks have: 0 the force alone, `FORCE_GRADIENT`, or `CURVATURE` terms as well, or a `POLYNOMIAL`."""
+        if self.polynomials:
+            return POLYNOMIAL
         return CURVATURE if any(self.curvatures) else FORCE_GRADIENT if any(self.gradients) else 0
 
     @cached_property
@@ -133,19 +176,30 @@ class Scheme:
         return self._kicks_with(lambda g, c: c != 0.0)
 
     def _kicks_with(self, has: Callable[[float, float], bool]) -> int:
-        with_it = [has(g, c) for kind, _, g, c in self.substeps if kind == "kick"]
+        with_it = [has(s.three, s.five) for s in self.substeps if s.kind == "kick"]
         shared = self.first_same_as_last and self.substeps[0][0] == "kick"
         return sum(with_it[1:-1] if shared else with_it) + (shared and (with_it[0] or with_it[-1]))
 
     def inverse(self) -> Scheme:
         """The scheme Ψ with Ψ(h) ∘ Φ(h) = identity: the stages backwards, with opposite signs."""
-        columns = [
-            (0.0, *(-c for c in reversed(column))) for column in (self.kicks, self.gradients, self.curvatures) if column
-        ]
+        nothing: Any = [(0.0,), (0.0,), (0.0,), ((0.0,) * len(self.monomials),)]
+        columns: Any = self.kicks, self.gradients, self.curvatures, self.polynomials
+        # kick and drift change places: an idle kick comes before, an idle drift after, unless that was there already
+        kicks = [zero + tuple(map(_opposite, reversed(column))) for zero, column in zip(nothing, columns, strict=True)]
         drifts = (*(-a for a in reversed(self.drifts)), 0.0)
+        part = slice(None)
         if drifts[0] == 0.0:
-            columns, drifts = [column[1:] for column in columns], drifts[1:]
-        elif not any(column[-1] for column in columns):
-            columns, drifts = [column[:-1] for column in columns], drifts[:-1]
+            part = slice(1, None)
+        elif not any(_any(column[-1]) for column, was in zip(kicks, columns, strict=True) if was):
+            part = slice(-1)
+        b, g, c, e = (column[part] if was else () for column, was in zip(kicks, columns, strict=True))
         name, source = f"{self.name}⁻¹", f"the inverse of {self.name}"
-        return Scheme(name, self.order, columns[0], drifts, columns[1], source, self.nystrom, *columns[2:])
+        return Scheme(name, self.order, b, drifts[part], g, source, self.nystrom, c, e, self.monomials)
+
+
+def _any(number: Any) -> bool:
+    return any(number) if isinstance(number, tuple) else number != 0.0
+
+
+def _opposite(number: Any) -> Any:
+    return tuple(-e for e in number) if isinstance(number, tuple) else -number

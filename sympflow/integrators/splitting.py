@@ -10,7 +10,9 @@ import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
 from sympflow.integrators.base import FixedStep, Problem, check_flag
+from sympflow.integrators.scheme import Substep
 from sympflow.integrators.schemes import SCHEMES, Scheme
+from sympflow.monomials import Monomials, gradient
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
@@ -58,22 +60,22 @@ class Splitting(FixedStep):
         self.check(system)
         q, p = y[..., : system.ndof], y[..., system.ndof :]
         h = per_state(h, y)
-        for kind, c, c3, c5 in self.scheme.substeps:
-            if kind == "drift":
-                q = q + (c * h) * system.velocity(p)
+        for substep in self.scheme.substeps:
+            if substep.kind == "drift":
+                q = q + (substep.one * h) * system.velocity(p)
             else:
-                p = p + _kick(system, q, c * h, c3 * h**3 if c3 else 0.0, c5 * h**5 if c5 else 0.0)
+                p = p + _kick(system, q, substep, h, self.scheme.monomials)
         return concatenate([q, p])
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         self.check(system)
         q, p = y[..., : system.ndof], y[..., system.ndof :]
         h = per_state(h, y)
-        for kind, c, c3, c5 in reversed(self.scheme.substeps):
-            if kind == "drift":
-                q = q - (c * h) * system.velocity(p)
+        for substep in reversed(self.scheme.substeps):
+            if substep.kind == "drift":
+                q = q - (substep.one * h) * system.velocity(p)
             else:
-                p = p - _kick(system, q, c * h, c3 * h**3 if c3 else 0.0, c5 * h**5 if c5 else 0.0)
+                p = p - _kick(system, q, substep, h, self.scheme.monomials)
         return concatenate([q, p])
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
@@ -172,17 +174,19 @@ def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int,
 @lru_cache(maxsize=256)
 def _kicks(scheme: Scheme) -> tuple[tuple[bool, bool], ...]:
     """Whether each of its kicks has a Hessian, and a curvature term."""
-    return tuple((g != 0 or c != 0, c != 0) for kind, _, g, c in scheme.substeps if kind == "kick")
+    return tuple((s.three != 0 or s.five != 0, s.five != 0) for s in scheme.substeps if s.kind == "kick")
 
 
-def _kick(system: HamiltonianSystem, q: Array, c: Any, c3: Any, c5: Any) -> Array:
-    """c F(q) + c3 ∇²V M⁻¹∇V(q) − c5 ∇(½ v·∇²V v)(q), v = M⁻¹∇V, the last two only where the scheme has them."""
+def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials: Monomials) -> Array:
+    """What a kick adds to p, where the scheme has it the force gradient, the curvature or the polynomial too."""
     force = system.force(q)
-    change = c * force
-    if not (isinstance(c3, float) and c3 == 0.0):
-        change = change - c3 * system.hessian_vector(q, system.velocity(force))
-    if not (isinstance(c5, float) and c5 == 0.0):
-        change = change - c5 * system.curvature_gradient(q)
+    change = (kick.one * h) * force
+    if kick.three:
+        change = change - (kick.three * h**3) * system.hessian_vector(q, system.velocity(force))
+    if kick.five:
+        change = change - (kick.five * h**5) * system.curvature_gradient(q)
+    if kick.polynomial:
+        change = change - h**3 * gradient(monomials, kick.polynomial, q)
     return change
 
 

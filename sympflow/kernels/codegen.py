@@ -8,9 +8,19 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympy.printing.pycode import PythonCodePrinter
 
+from sympflow.monomials import Monomials
 from sympflow.symbolic import SymbolicHamiltonian, printable
 
-__all__ = ["algebra_source", "curvature_kick_source", "gradient_kick_source", "printed", "statements", "tuple_algebra"]
+__all__ = [
+    "algebra_source",
+    "coefficients_source",
+    "curvature_kick_source",
+    "gradient_kick_source",
+    "polynomial_kick_source",
+    "printed",
+    "statements",
+    "tuple_algebra",
+]
 
 _MAX_POWER = 16  # integer powers up to this are written as products
 
@@ -166,6 +176,45 @@ def curvature_kick_source(symbols: SymbolicHamiltonian) -> str:
     bent = [sp.diff(symbols.W, s) for s in q]
     results = [f"((g*{{{d + i}}} - b*{{{i}}}) - c*{{{2 * d + i}}})" for i in range(d)]
     return _function("curvature_kick", "q, b, g, c, work", q, [*slope, *products, *bent], results) + "\n"
+
+
+def polynomial_kick_source(symbols: SymbolicHamiltonian, monomials: Monomials) -> str:
+    """−b∇V − Σ_m c_m ∇q^m, c the coefficients of the polynomial.
+
+    Raises
+    ------
+    ValueError
+        As `algebra_source`.
+    """
+    q, d = symbols.q, symbols.ndof
+    products = [sp.Mul(*map(sp.Pow, q, m)) for m in monomials]
+    slopes = [sp.diff(symbols.V, s) for s in q]
+    places: list[list[str]] = [[f"-b*{{{i}}}"] for i in range(d)]
+    for i, s in enumerate(q):
+        for m, product in enumerate(products):
+            if (slope := sp.diff(product, s)) != 0:
+                places[i].append(f" - c[{m}]*{{{len(slopes)}}}")
+                slopes.append(slope)
+    return _function("polynomial_kick", "q, b, c, work", q, slopes, ["".join(terms) for terms in places]) + "\n"
+
+
+def coefficients_source(d: int, n: int) -> str:
+    """The number n of monomials that kicks have, and their coefficients as a tuple: out of an array, or of a lane."""
+
+    def each(pattern: str) -> str:
+        return "(" + "".join(pattern.format(m, 2 * d + 8 + m) + ", " for m in range(n)) + ")"
+
+    return f"""N_MONOMIALS = {n}
+
+
+@njit(**OPTIONS)
+def coefficients_of(c):
+    return {each("c[{0}]")}
+
+
+@njit(**OPTIONS)
+def lane_coefficients(Y, lane):
+    return {each("Y[{1}, lane]")}"""
 
 
 def _function(

@@ -10,9 +10,10 @@ import sympy as sp
 from sympflow.kernels.codegen import printed
 from sympflow.kernels.nested import nested
 from sympflow.kernels.scheduling import FUSED, Schedule
+from sympflow.monomials import Monomials
 from sympflow.symbolic import SymbolicHamiltonian, printable
 
-__all__ = ["B", "C", "G", "shapes"]
+__all__ = ["B", "C", "G", "polynomial_letters", "shapes"]
 
 MOST_OPERATIONS = 400  # of a kick whose shapes are tried: rewriting longer ones takes longer than it saves
 MOST_TERMS = 120  # of a sum multiplied out
@@ -22,11 +23,20 @@ UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
 """What holds one of these is taken as it is."""
 
 
-def shapes(symbols: SymbolicHamiltonian, terms: int) -> Iterator[list[sp.Expr]]:
-    """Ways to write the new momenta, equal but for rounding, of kicks with one term to three."""
+def polynomial_letters(monomials: Monomials) -> list[sp.Symbol]:
+    """e_0, e_1, …, the coefficients of the monomials."""
+    return [sp.Symbol(f"e_{m}", real=True) for m in range(len(monomials))]
+
+
+def shapes(symbols: SymbolicHamiltonian, terms: int, monomials: Monomials = ()) -> Iterator[list[sp.Expr]]:
+    """Ways to write the new momenta, equal but for rounding, of kicks with one term to three, or with a polynomial."""
     q, p, d = symbols.q, symbols.p, symbols.ndof
     slope = [sp.diff(symbols.V, s) for s in q]
-    if terms == 1:
+    if monomials:
+        letters = polynomial_letters(monomials)
+        P = sp.Add(*[e * sp.Mul(*map(sp.Pow, q, m)) for e, m in zip(letters, monomials, strict=True)])
+        changes = [-B * slope[i] - sp.diff(P, q[i]) for i in range(d)]
+    elif terms == 1:
         yield [printable(p[i] - B * slope[i]) for i in range(d)]
         changes = [-B * f for f in slope]
     else:

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import sympy as sp
 
 from sympflow.kernels.codegen import printed
-from sympflow.kernels.kick_shapes import B, C, G, shapes
+from sympflow.kernels.kick_shapes import polynomial_letters, shapes
 from sympflow.kernels.pipeline import Operation, cycles_per_turn
 from sympflow.kernels.scheduling import FUSED, PRODUCTS, Schedule
+from sympflow.monomials import Monomials
 from sympflow.symbolic import SymbolicHamiltonian
 
 __all__ = ["kicks_source"]
@@ -38,54 +39,59 @@ class _Kick:
     operations: float
 
 
-def kicks_source(symbols: SymbolicHamiltonian, level: int) -> str:
+def kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials = ()) -> str:
     """The new p after a kick, p − b∇V + g∇²V v − c∇(½ v·∇²V v), v = M⁻¹∇V, each in two shapes, equal but for rounding.
 
     ``kicked(q, p, table, j)``, from `level` 1 on ``gradient_kicked`` and from 2 on ``curvature_kicked``, are the
     fastest for one trajectory; what depends on b, g and c alone is in row j of the table, which ``fill_coefficients(b,
     g, c, row)`` computes. ``kicked_lane(q, p, b)``, ``gradient_kicked_lane(q, p, b, g)`` and
     ``curvature_kicked_lane(q, p, b, g, c)`` have the fewest operations, for many at once; ``drifted(q, p, a)``
-    is for both.
+    is for both. With monomials there are ``polynomial_kicked`` and ``polynomial_kicked_lane(q, p, b, c)`` alone, c
+    the coefficients of the polynomial.
 
     Raises
     ------
     ValueError
         If a function in H has no counterpart in compiled code.
     """
-    key = symbols.H, level
+    key = symbols.H, level, monomials
     if key not in _SOURCES:
         if len(_SOURCES) >= MOST_KEPT:
             del _SOURCES[next(iter(_SOURCES))]
-        _SOURCES[key] = _source(symbols, level)
+        _SOURCES[key] = _source(symbols, level, monomials)
     return _SOURCES[key]
 
 
-_SOURCES: dict[tuple[sp.Expr, int], str] = {}
+_SOURCES: dict[tuple[sp.Expr, int, Monomials], str] = {}
 """By H: systems are often made again, and the search takes a tenth of a second or more."""
 
 
-def _source(symbols: SymbolicHamiltonian, level: int) -> str:
+def _source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> str:
     functions: list[str] = []
     fill: list[str] = []
     stored: list[str] = []
-    for terms, name in enumerate(("kicked", "gradient_kicked", "curvature_kicked")[: level + 1], 1):
-        numbers = ("b", "g", "c")[:terms]
-        tried = _tried(symbols, terms, f"{name[0]}_")
+    letters = [e.name for e in polynomial_letters(monomials)]
+    unpacked = [f"{e} = c[{m}]" for m, e in enumerate(letters)]
+    kept = ["b", *letters] if monomials else ["b", "g", "c"]
+    names = ("kicked", "gradient_kicked", "curvature_kicked")[: level + 1] if not monomials else ("polynomial_kicked",)
+    for terms, name in enumerate(names, 1):
+        tried = _tried(symbols, terms, f"{name[0]}_", monomials)
         one = min(tried, key=lambda kick: (kick.cycles, kick.operations))
         many = min(tried, key=lambda kick: (kick.operations, kick.cycles))
         used = [n for n in _names(one.coefficients) if any(_mentions(line, n) for line in [*one.lines, *one.results])]
         loads = [f"{n} = table[j, {len(stored) + i}]" for i, n in enumerate(used)]
         fill += one.coefficients
         stored += used
-        taken = [v for v in numbers if any(_mentions(line, v) for line in [*one.lines, *one.results])]
-        loads += [f"{v} = table[j, -{3 - i}]" for i, v in enumerate(numbers) if v in taken]
+        taken = [v for v in kept if any(_mentions(line, v) for line in [*one.lines, *one.results])]
+        loads += [f"{v} = table[j, -{len(kept) - kept.index(v)}]" for v in taken]
         functions.append(_function(symbols, name, "q, p, table, j", [*loads, *one.lines], one.results))
-        arguments = ", ".join(("q", "p", *numbers))
-        functions.append(_function(symbols, f"{name}_lane", arguments, [*many.coefficients, *many.lines], many.results))
-    rows = [*fill, *(f"row[{i}] = {name}" for i, name in enumerate([*stored, "b", "g", "c"]))]
+        arguments = ", ".join(("q", "p", *(("b", "c") if monomials else kept[:terms])))
+        lines = [*unpacked, *many.coefficients, *many.lines]
+        functions.append(_function(symbols, f"{name}_lane", arguments, lines, many.results))
+    rows = [*unpacked, *fill, *(f"row[{i}] = {name}" for i, name in enumerate([*stored, *kept]))]
     filled = "\n    ".join(["@njit(**OPTIONS)\ndef fill_coefficients(b, g, c, row):", *rows])
     drifts = _drift_source(symbols)
-    return "\n\n\n".join([f"N_COEFFICIENTS = {len(stored) + 3}", filled, *functions, drifts]) + "\n"
+    return "\n\n\n".join([f"N_COEFFICIENTS = {len(stored) + len(kept)}", filled, *functions, drifts]) + "\n"
 
 
 def _drift_source(symbols: SymbolicHamiltonian) -> str:
@@ -130,7 +136,8 @@ def _scheduled(symbols: SymbolicHamiltonian, shape: Sequence[sp.Expr], prefix: s
     known = {**dict.fromkeys(symbols.q, 0.0), **dict.fromkeys(symbols.p, -FUSED)}
     schedule = Schedule(known, printed, prefix, PRODUCT)
     numbers: dict[sp.Expr, sp.Symbol] = {}
-    shape = [_numbered(f, {*symbols.q, *symbols.p}, numbers) for f in shape]
+    states = {*symbols.q, *symbols.p}
+    shape = [_numbered(f, states, numbers) for f in shape]
     for coefficient, symbol in numbers.items():  # as one: what is common to several would else be taken out of them
         schedule.define(symbol, coefficient)
     if common:
@@ -157,13 +164,13 @@ def _drift(symbols: SymbolicHamiltonian) -> list[Operation]:
     return operations
 
 
-def _tried(symbols: SymbolicHamiltonian, terms: int, prefix: str) -> list[_Kick]:
+def _tried(symbols: SymbolicHamiltonian, terms: int, prefix: str, monomials: Monomials) -> list[_Kick]:
     """Every shape; and of the best, every choice of one for each momentum."""
 
     def both(shape: Sequence[sp.Expr]) -> list[_Kick]:
         return [_scheduled(symbols, shape, prefix, common) for common in (True, False)]
 
-    made = [(shape, both(shape)) for shape in shapes(symbols, terms)]
+    made = [(shape, both(shape)) for shape in shapes(symbols, terms, monomials)]
     made.sort(key=lambda entry: min((kick.cycles, kick.operations) for kick in entry[1]))
     kicks = [kick for _, each in made for kick in each]
     best = [shape for shape, _ in made[:BEST]]
@@ -174,8 +181,8 @@ def _tried(symbols: SymbolicHamiltonian, terms: int, prefix: str) -> list[_Kick]
 
 
 def _numbered(f: sp.Expr, states: set[sp.Symbol], numbers: dict[sp.Expr, sp.Symbol]) -> sp.Expr:
-    """The expression with a symbol for the part of each product that depends on b, g and c alone."""
-    if not f.args or not f.free_symbols & {B, G, C}:
+    """The expression with a symbol for the part of each product that depends on b, g and c, or b and e, alone."""
+    if not f.args or not f.free_symbols - states:
         return f
     if f.is_Mul:
         fixed = [a for a in f.args if not a.free_symbols & states]

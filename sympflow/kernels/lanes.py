@@ -46,10 +46,30 @@ def curvature_lane(q, p, q_error, p_error, b, g, c, a):
     return curvature_stage(q, p, q_error, p_error, b, g, c, a, 0, None)
 
 
+@njit(**OPTIONS, forceinline=True)
+def polynomial_lane(q, p, q_error, p_error, b, c, a):
+    if POLYNOMIALS and SCHEDULED:
+        p = polynomial_kicked_lane(q, p, b, c)
+        q, q_error = move(q, q_error, drift(p, a, None))
+        return q, p, q_error, p_error
+    return polynomial_stage(q, p, q_error, p_error, b, c, a, 0, None)
+
+
 @njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
 def stage_lanes(Y, error, width, b, g, c, a):
     # Asked outside the loops: a loop with a branch in it, once it is long, is no longer made of vector instructions.
-    if CURVATURES and c != 0.0:
+    if POLYNOMIALS:
+        e = coefficients_of(c)
+        for lane in range(width):
+            q, p = unpack_lane(Y, lane)
+            if COMPENSATED:
+                q_error, p_error = unpack_lane(error, lane)
+                q, p, q_error, p_error = polynomial_lane(q, p, q_error, p_error, b, e, a)
+                pack_lane(q_error, p_error, error, lane)
+            else:
+                q, p, _, _ = polynomial_lane(q, p, None, None, b, e, a)
+            pack_lane(q, p, Y, lane)
+    elif CURVATURES and c != 0.0:
         for lane in range(width):
             q, p = unpack_lane(Y, lane)
             if COMPENSATED:
@@ -145,8 +165,8 @@ def rollout_lanes(kicks, drifts, gradients, curvatures, y0, n_steps, save, out, 
             n, saved, first = n + block, next_saved, link
 
 
-X, H, H3, H5, B, G, C, A = [
-    2 * NDOF + i for i in range(8)
+X, H, H3, H5, B, G, C, A, E = [
+    2 * NDOF + i for i in range(9)
 ]  # rows of what a stage needs, beside the states: see `step_lanes`
 
 
@@ -174,11 +194,12 @@ def fill_lanes(Y, width, row, coefficients, factor):
 
 @njit(**OPTIONS)
 def step_lanes(kicks, drifts, gradients, curvatures, x, h, y, out):
-    """`step_each`, `LANES` rows at a time.
+    """`step_each`, `LANES` rows at a time; where `POLYNOMIALS`, `curvatures` are (m, M, K).
 
     All numbers lie in one array: of several the compiler would have to find out that they do not overlap.
     """
-    Y = aligned_zeros((2 * NDOF + 8) * LANES).reshape((2 * NDOF + 8, LANES))
+    rows = 2 * NDOF + 8 + N_MONOMIALS
+    Y = aligned_zeros(rows * LANES).reshape((rows, LANES))
     for block_start in range(0, y.shape[0], LANES):
         count = min(LANES, y.shape[0] - block_start)
         width = (count + VECTOR - 1) // VECTOR * VECTOR
@@ -190,7 +211,15 @@ def step_lanes(kicks, drifts, gradients, curvatures, x, h, y, out):
         for j in range(len(kicks)):
             fill_lanes(Y, width, B, kicks[j], H)
             fill_lanes(Y, width, A, drifts[j], H)
-            if CURVATURES and np.any(curvatures[j] != 0.0):
+            if POLYNOMIALS:
+                for m in range(N_MONOMIALS):
+                    fill_lanes(Y, width, E + m, curvatures[j, m], H3)
+                for lane in range(width):
+                    q, p = unpack_lane(Y, lane)
+                    e = lane_coefficients(Y, lane)
+                    q, p, _, _ = polynomial_lane(q, p, None, None, Y[B, lane], e, Y[A, lane])
+                    pack_lane(q, p, Y, lane)
+            elif CURVATURES and np.any(curvatures[j] != 0.0):
                 fill_lanes(Y, width, G, gradients[j], H3)
                 fill_lanes(Y, width, C, curvatures[j], H5)
                 for lane in range(width):

@@ -10,8 +10,9 @@ in an order of operations that is fast, and stand for these; ``fill_coefficients
 A run executes the table [opening, inner …, link, closing] of stages (kick, then drift). A step is the link (the
 first step, the opening) and the inner stages; consecutive steps share their common kick or drift in the link, and
 an output is the closing stage applied to a copy, so that what is saved never changes the trajectory. The constants
-`FORCE_GRADIENTS`, `CURVATURES`, `COMPENSATED` and `SCHEDULED` are known when it is compiled: Numba leaves dead branches
-out.
+`FORCE_GRADIENTS`, `CURVATURES`, `POLYNOMIALS`, `COMPENSATED` and `SCHEDULED` are known when it is compiled: Numba
+leaves dead branches out. Where `POLYNOMIALS`, every kick has one: ``polynomial_kick``, or ``polynomial_kicked``; a row
+of `curvatures` then holds its coefficients, and c is that row.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -36,6 +37,8 @@ def prepared(kicks, gradients, curvatures):
 @njit(**OPTIONS, forceinline=True)
 def stage(q, p, q_error, p_error, b, g, c, a, j, work):
     """Kick by b (and g and c), then drift by a."""
+    if POLYNOMIALS:
+        return polynomial_stage(q, p, q_error, p_error, b, c, a, j, work)
     if CURVATURES and c != 0.0:
         return curvature_stage(q, p, q_error, p_error, b, g, c, a, j, work)
     if FORCE_GRADIENTS and g != 0.0:
@@ -85,6 +88,16 @@ def curvature_stage(q, p, q_error, p_error, b, g, c, a, j, work):
         p = curvature_kicked(q, p, work, j)
     elif CURVATURES:
         p, p_error = move(p, p_error, curvature_kick(q, b, g, c, work))
+    q, q_error = drift_by(q, p, q_error, a, work)
+    return q, p, q_error, p_error
+
+
+@njit(**OPTIONS, forceinline=True)
+def polynomial_stage(q, p, q_error, p_error, b, c, a, j, work):
+    if POLYNOMIALS and SCHEDULED:
+        p = polynomial_kicked(q, p, work, j)
+    elif POLYNOMIALS:
+        p, p_error = move(p, p_error, polynomial_kick(q, b, c, work))
     q, q_error = drift_by(q, p, q_error, a, work)
     return q, p, q_error, p_error
 

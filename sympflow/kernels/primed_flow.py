@@ -41,10 +41,10 @@ class PrimedFlowKernel:
         tables = flow.tables
         if not tables.compilable:
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
-        if tables.level == CURVATURE and system.symbols is None:
+        if tables.level >= CURVATURE and system.symbols is None:
             raise ValueError(
-                f"`system` {system.name!r} has no symbols, from which curvature terms are compiled: use "
-                "backend='array'."
+                f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled: "
+                "use backend='array'."
             )
         self.system = system
         self._tables, self._splitting, self._compensated = tables, splitting_kernel(system), compensated
@@ -103,7 +103,9 @@ class PrimedFlowKernel:
 
     def _stepped(self, t: np.ndarray, y: np.ndarray, back: bool) -> np.ndarray:
         tables = self._tables
-        return self._splitting.step_rows(tables.polynomials(back), tables.level, tables.variable(t), t, y)
+        return self._splitting.step_rows(
+            tables.polynomials(back), tables.level, tables.variable(t), t, y, tables.monomials
+        )
 
     def _kernel(self, h: float) -> Scheme:
         """K_h, or for h < 0 its inverse."""
@@ -111,7 +113,7 @@ class PrimedFlowKernel:
 
     def _loops(self) -> Any:
         """The compiled functions for the kicks of the flow."""
-        return self._splitting._loops(self._tables.level, self._compensated)
+        return self._splitting._loops(self._tables.level, self._compensated, self._tables.monomials)
 
     def _numbers(self, h: float) -> _Processed:
         """The numbers of a run of ψ̄_h with a processor."""
@@ -125,8 +127,8 @@ class _Processed:
     Attributes
     ----------
     arrays
-        Of each of the three two arrays: kicks, drifts and gradients (3, m), and curvatures (m,). K has the table of a
-        run.
+        Of each of the three two arrays: kicks, drifts and gradients (3, m), and curvatures (m,) or
+        polynomials (m, M). K has the table of a run.
     """
 
     arrays: tuple[np.ndarray, ...]

@@ -12,14 +12,15 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.integrators.scheme import CURVATURE, FORCE_GRADIENT, Scheme
+from sympflow.integrators.scheme import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
+from sympflow.monomials import Monomials
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from sympflow.symbolic import SymbolicHamiltonian
 
-__all__ = ["SplittingKernel", "splitting_kernel"]
+__all__ = ["SplittingKernel", "Table", "splitting_kernel"]
 
 
 def splitting_kernel(system: HamiltonianSystem) -> SplittingKernel:
@@ -70,18 +71,19 @@ class SplittingKernel:
                 "HamiltonianSystem.from_sympy or by Numba functions, or use backend='array'."
             )
         self._has_curvature = system.symbols is not None
-        self._variants: dict[tuple[int, bool], _Loops] = {}
+        self._variants: dict[tuple[int, bool, Monomials], _Loops] = {}
 
-    def _loops(self, level: int, compensated: bool) -> _Loops:
-        variant = (level, compensated)
+    def _loops(self, level: int, compensated: bool, monomials: Monomials = ()) -> _Loops:
+        variant = (level, compensated, monomials)
         if variant not in self._variants:
-            if level >= FORCE_GRADIENT and not self._has_force_gradient:
+            if level in (FORCE_GRADIENT, CURVATURE) and not self._has_force_gradient:
                 raise ValueError(
                     "`scheme` has force gradients, which need a kinetic energy quadratic in p and, for a system of "
                     "Numba functions, `hessian_vector`: take a scheme without them, for instance 'kahan_li8'."
                 )
-            if level == CURVATURE and not self._has_curvature:
-                raise ValueError("`scheme` has curvature terms, which need a symbolic system: take one without them.")
+            if level > FORCE_GRADIENT and not self._has_curvature:
+                what = "curvature terms" if level == CURVATURE else "polynomials"
+                raise ValueError(f"`scheme` has {what}, which need a symbolic system: take one without them.")
             self._variants[variant] = self._compile(*variant)
         return self._variants[variant]
 
@@ -116,7 +118,7 @@ class SplittingKernel:
             Index of the last step that ends in a finite state, `n_steps` if all do; the run stops there.
         """
         table = scaled_run_table(scheme, h)
-        loops = self._loops(scheme.level, compensated)
+        loops = self._loops(scheme.level, compensated, scheme.monomials)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(save), 2 * self.ndof))
         n_finite = run_one(
@@ -141,7 +143,7 @@ class SplittingKernel:
         Y : ndarray of shape (N, len(save), 2d)
         n_finite : ndarray of int64, shape (N,)
         """
-        loops = self._loops(scheme.level, compensated)
+        loops = self._loops(scheme.level, compensated, scheme.monomials)
         table = scaled_run_table(scheme, h)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(y0), len(save), 2 * self.ndof))
@@ -157,82 +159,85 @@ class SplittingKernel:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
         h = np.asarray(h, dtype=np.float64)
         h = h.repeat(len(y)) if h.ndim == 0 else h
-        return self.step_rows(step_table(scheme), scheme.level, h, h, y)
+        return self.step_rows(step_table(scheme), scheme.level, h, h, y, scheme.monomials)
 
-    def step_rows(self, table: _Table, level: int, x: np.ndarray, h: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def step_rows(
+        self, table: Table, level: int, x: np.ndarray, h: np.ndarray, y: np.ndarray, monomials: Monomials = ()
+    ) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
 
         Parameters
         ----------
         table : kicks, drifts, gradients, curvatures, ndarrays of shape (m, K)
             Of the stages, a kick and a drift each, for h = 1: those of row i are Σ_k kicks[:, k] x[i]^k. In a batch K
-            is 1 or at least 3.
-        level : int
-            What the kicks have: see `Scheme.level`.
+            is 1 or at least 3. In place of curvatures may stand polynomials, (m, M, K).
+        level, monomials
+            What the kicks have: see `Scheme`.
         """
         y = np.ascontiguousarray(y, dtype=np.float64)
         out = np.empty(y.shape)
         x, h = np.ascontiguousarray(x), np.ascontiguousarray(h)
-        self._loops(level, False).step_rows(*table, x, h, y, out)
+        self._loops(level, False, monomials).step_rows(*table, x, h, y, out)
         return out
 
 
-_Stage = tuple[float, float, float, float]  # kick b, gradient g, curvature c, drift a
-_Table = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # kicks, drifts, gradients, curvatures of the stages
+_Stage = tuple[float, float, Any, float]  # kick b, gradient g, curvature c or polynomial e (M,), drift a
+Table = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # kicks, drifts, gradients, curvatures of the stages
 
 
 def _stages(scheme: Scheme) -> list[_Stage]:
     """The scheme as kick-drift pairs without idle maps, except a zero kick in front or a zero drift at the end."""
     stages: list[_Stage] = []
-    for kind, one, three, five in scheme.substeps:
+    none = np.zeros(len(scheme.monomials)) if scheme.polynomials else 0.0
+    for kind, one, three, five, e in scheme.substeps:
         if kind == "kick":
-            stages.append((one, three, five, 0.0))
+            stages.append((one, three, np.array(e) if scheme.polynomials else five, 0.0))
         elif stages and stages[-1][-1] == 0.0:
             stages[-1] = (*stages[-1][:-1], one)
         else:
-            stages.append((0.0, 0.0, 0.0, one))
-    return stages or [(0.0, 0.0, 0.0, 0.0)]
+            stages.append((0.0, 0.0, none, one))
+    return stages or [(0.0, 0.0, none, 0.0)]
 
 
-def _arrays(stages: list[_Stage]) -> _Table:
+def _arrays(stages: list[_Stage]) -> Table:
     kicks, gradients, curvatures, drifts = (np.array(column) for column in zip(*stages, strict=True))
     return kicks, drifts, gradients, curvatures
 
 
 @lru_cache(maxsize=256)
-def step_table(scheme: Scheme) -> _Table:
-    """The stages of one step by itself, for h = 1: (m, 1) each."""
+def step_table(scheme: Scheme) -> Table:
+    """The stages of one step by itself, for h = 1: (m, 1) each, polynomials (m, M, 1)."""
     kicks, drifts, gradients, curvatures = _arrays(_stages(scheme))
-    return kicks[:, None], drifts[:, None], gradients[:, None], curvatures[:, None]
+    return kicks[:, None], drifts[:, None], gradients[:, None], curvatures[..., None]
 
 
-def _run_table(scheme: Scheme) -> _Table:
+def _run_table(scheme: Scheme) -> Table:
     """The table [opening, inner …, link, closing] of a run, for h = 1: see `loops`."""
     stages = _stages(scheme)
     (b0, g0, c0, a0), (b, g, c, a) = stages[0], stages[-1]
-    opening: _Stage = (0.0, 0.0, 0.0, 0.0)
+    opening: _Stage = (0.0, 0.0, 0.0 * c, 0.0)
     inner, link, closing = stages[:-1], stages[-1], stages[-1]
     if len(stages) > 1 and a == 0.0:  # kick … kick: the last kick and the next first stage are one
         opening, inner, link = stages[0], stages[1:-1], (b + b0, g + g0, c + c0, a0)
-    elif len(stages) > 1 and b0 == g0 == c0 == 0.0:  # drift … drift
+    elif len(stages) > 1 and b0 == g0 == 0.0 and not np.any(c0):  # drift … drift
         opening, inner, link = stages[0], stages[1:-1], (b, g, c, a + a0)
     return _arrays([opening, *inner, link, closing])
 
 
 @lru_cache(maxsize=256)
-def scaled_run_table(scheme: Scheme, h: float) -> _Table:
+def scaled_run_table(scheme: Scheme, h: float) -> Table:
     """The table of a run whose steps are h."""
-    return _scaled(_run_table(scheme), h)
+    return _scaled(_run_table(scheme), scheme, h)
 
 
-def scaled_step_table(scheme: Scheme, h: float) -> _Table:
-    """The stages of one step h by itself, (m,) each."""
-    return _scaled(_arrays(_stages(scheme)), h)
+def scaled_step_table(scheme: Scheme, h: float) -> Table:
+    """The stages of one step h by itself, (m,) each, polynomials (m, M)."""
+    return _scaled(_arrays(_stages(scheme)), scheme, h)
 
 
-def _scaled(table: _Table, h: float) -> _Table:
+def _scaled(table: Table, scheme: Scheme, h: float) -> Table:
     kicks, drifts, gradients, curvatures = table
-    return h * kicks, h * drifts, h**3 * gradients, h**5 * curvatures
+    return h * kicks, h * drifts, h**3 * gradients, h ** (3 if scheme.polynomials else 5) * curvatures
 
 
 @dataclass(frozen=True)
@@ -249,27 +254,42 @@ class _Loops:
 def _header(level: int, compensated: bool, cache: bool, scheduled: bool) -> str:
     return (
         f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': cache}}\n"
-        f"FORCE_GRADIENTS = {level >= FORCE_GRADIENT}\nCURVATURES = {level == CURVATURE}\n"
-        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}"
+        f"FORCE_GRADIENTS = {level in (FORCE_GRADIENT, CURVATURE)}\nCURVATURES = {level == CURVATURE}\n"
+        f"POLYNOMIALS = {level == POLYNOMIAL}\nCOMPENSATED = {compensated}\nSCHEDULED = {scheduled}"
     )
 
 
-def _symbolic_loops(symbols: SymbolicHamiltonian, algebra: str, level: int, compensated: bool) -> _Loops:
+def _symbolic_loops(
+    symbols: SymbolicHamiltonian, algebra: str, level: int, compensated: bool, monomials: Monomials
+) -> _Loops:
     after = ("loops", "aligned", "lanes", "processed_loops")
-    loops = symbolic_module(symbols, algebra, level, compensated, after)
+    loops = symbolic_module(symbols, algebra, level, compensated, after, monomials)
     processed = loops.rollout_processed, loops.rollout_processed_rows
     return _Loops(loops.rollout, loops.rollout_lanes, *processed, loops.step_lanes)
 
 
 def symbolic_module(
-    symbols: SymbolicHamiltonian, algebra: str, level: int, compensated: bool, after: Sequence[str]
+    symbols: SymbolicHamiltonian,
+    algebra: str,
+    level: int,
+    compensated: bool,
+    after: Sequence[str],
+    monomials: Monomials = (),
 ) -> ModuleType:
     """The algebra of a symbolic system, the texts of loops `after` it, as a module."""
-    from sympflow.kernels.codegen import curvature_kick_source, gradient_kick_source
+    from sympflow.kernels.codegen import (
+        coefficients_source,
+        curvature_kick_source,
+        gradient_kick_source,
+        polynomial_kick_source,
+    )
     from sympflow.kernels.kicks import kicks_source
 
+    algebra = f"{algebra}\n\n{coefficients_source(symbols.ndof, len(monomials))}"
     if not compensated:
-        algebra = f"{algebra}\n\n{kicks_source(symbols, level)}"
+        algebra = f"{algebra}\n\n{kicks_source(symbols, level, monomials)}"
+    elif level == POLYNOMIAL:
+        algebra = f"{algebra}\n\n{polynomial_kick_source(symbols, monomials)}"
     elif level == CURVATURE:
         algebra = f"{algebra}\n\n{gradient_kick_source(symbols)}\n\n{curvature_kick_source(symbols)}"
     elif level:
@@ -293,6 +313,7 @@ def _array_loops(
     inverse_mass: np.ndarray | None,
     level: int,
     compensated: bool,
+    monomials: Monomials,
 ) -> _Loops:
     """The loops around the user's Numba functions; compiled for this process only."""
     rows = _INVERSE_MASS_TIMES_V[0 if inverse_mass is None else inverse_mass.ndim]

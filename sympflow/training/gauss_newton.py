@@ -39,7 +39,8 @@ FROZEN_SHARE = 0.7  # of a time budget, that all work on frozen tables may use
 FRACTIONAL_TIMES = 50
 CLOSE = 1.1  # held-out errors that differ by less are the same for a warning
 FEWEST_POINTS, MOST_POINTS, COORDINATES = 40, 250, 1000
-FITTED_POINTS = 120  # that are enough for the polynomials: at each of several times
+FITTED_POINTS = 120  # that are enough for the polynomials in t: at each of several times
+RESIDUALS = 8  # at least, at Δt, for each number of the table; half as many for the polynomials in t
 
 
 @dataclass
@@ -73,12 +74,14 @@ class GaussNewtonRun(SearchRun):
         data: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> GaussNewtonRun:
         """A run for labels made on the spot, or for `data`: times (n,), states and where they go, (n, 2d)."""
-        step, table = TableStep(system, flow.sequence, flow.tables.level), Table(flow)
+        step, table = TableStep(system, flow.sequence, flow.tables.level, flow.monomials), Table(flow)
         unit = np.array(scaling.x)
         parts: list[tuple[float, Fit]] = []
         frozen = None
         if config.label_weight and data is None:
-            points = config.points or min(MOST_POINTS, max(FEWEST_POINTS, COORDINATES // system.ndof))
+            numbers = table.frozen(flow.dt)[1].shape[-1]
+            enough = math.ceil(RESIDUALS * numbers / (2 * system.ndof))
+            points = config.points or max(enough, min(MOST_POINTS, max(FEWEST_POINTS, COORDINATES // system.ndof)))
             x = states(domain, points, config.seed, Stream.RESIDUAL)
             t = flow.dt * np.arange(1, config.label_times + 1) / config.label_times
             labels = Labels.of(system, x, t)
@@ -86,7 +89,7 @@ class GaussNewtonRun(SearchRun):
                 raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
             frozen = TableFit(step, labels.at(-1), *table.frozen(flow.dt), unit, np.ones(1))
             weight = np.where(t < t[-1], 1.0, config.frozen_weight)
-            labels = labels.first(FITTED_POINTS)
+            labels = labels.first(max(FITTED_POINTS, enough // 2))
             parts.append((config.label_weight, TableFit(step, labels, *table.polynomial(t), unit, weight)))
         elif config.label_weight and data is not None:
             at_end = np.abs(data[0] - flow.dt) <= 1e-9 * flow.dt

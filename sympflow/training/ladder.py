@@ -13,7 +13,6 @@ import torch
 
 from sympflow.flow.certificate import upper_limit
 from sympflow.flow.clocked import ClockedFlow
-from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
@@ -22,9 +21,10 @@ from sympflow.solver import solve
 from sympflow.system import HamiltonianSystem
 from sympflow.systems import SYSTEMS
 from sympflow.training.clock_fit import energy_errors, train_clock
+from sympflow.training.table_fit import force_gradient_in
 from sympflow.training.trainer import train
 
-OF_A_GRADIENT, OF_A_CURVATURE, OF_A_PARAMETER = 0.3, 0.4, 0.4  # forces
+OF_A_GRADIENT, OF_A_CURVATURE, OF_A_MONOMIAL, OF_A_PARAMETER = 0.3, 0.4, 0.05, 0.4  # forces
 OF_A_LOGARITHM = 2.0  # forces: a kick and a drift of the logarithmic Hamiltonian, a division in each
 CLOCK_SEED = 1_000_003  # of the held-out states of flows without a certificate
 HELD_OUT = 1000  # states of the certificate
@@ -45,11 +45,12 @@ class Rung:
     scheme : str, optional
         Of `stages` kicks, from which the search starts in place of equal leapfrog steps: one of a high order leads to
         valleys that random tables, most of whose numbers are positive, do not lie near.
-    curvature : bool
+    curvature, polynomial : bool, int
         See `SympFlow.primed`.
     after : str, optional
-        The name of the rung with a longer Δt, the same kicks and the same processor whose table, continued to this Δt,
-        is where the search starts: deep valleys are found at a long Δt, and followed to a short one.
+        The name of the rung with the same kicks and the same processor whose table, continued to this Δt, is where the
+        search starts: deep valleys are found at a long Δt, and followed to a short one; and found without polynomials,
+        and followed with them.
     options : dict
         Other options of `train`.
     """
@@ -61,18 +62,20 @@ class Rung:
     scheme: str | None = None
     after: str | None = None
     curvature: bool = False
+    polynomial: int | None = None
     options: dict[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
         """Of its file, after that of the scene."""
-        return f"primed-{self.stages}-{self.dt:g}"
+        return f"{'primed' if self.polynomial is None else 'polynomial'}-{self.stages}-{self.dt:g}"
 
     def train(self, system: HamiltonianSystem, longer: PrimedFlow | None = None, **options: Any) -> PrimedFlow:
         """The flow, without a certificate; `longer` is that of the rung `after` which it comes."""
         before = time.process_time()
         first: dict[str, Any] = {"stages": self.stages} if self.scheme is None else {"scheme": self.scheme}
-        start = SympFlow.primed(system, **first, dt=self.dt, processor=self.processor, curvature=self.curvature)
+        first |= {"processor": self.processor, "curvature": self.curvature, "polynomial": self.polynomial}
+        start = SympFlow.primed(system, dt=self.dt, **first)
         if longer is not None:
             _restrict(start, longer)
         flow = train(system, flow=start, **{"restarts": self.restarts, **self.options, **options})
@@ -180,14 +183,26 @@ class Ladder:
 
 
 @torch.no_grad()
-def _restrict(flow: PrimedFlow, longer: PrimedFlow) -> None:
-    """Give a flow the numbers of one with a longer Δt and the same architecture: up to its own Δt the same map."""
-    for name, column in flow.named_children():
-        if isinstance(column, Coefficients):
-            same = longer.get_submodule(name)
-            assert isinstance(same, Coefficients)
-            powers = (flow.dt / longer.dt) ** np.array(same.exponents, dtype=float)
-            column.set(same.table.cpu().double().numpy() * powers)
+def _restrict(flow: PrimedFlow, other: PrimedFlow) -> None:
+    """Give a flow the numbers of another with as many kicks: those of a longer Δt as they are at its own.
+
+    Polynomials take over force gradients.
+    """
+    shorter = min(flow.dt / other.dt, 1.0)
+    mine, theirs = dict(flow.columns()), dict(other.columns())
+    for name, column in mine.items():
+        if name in theirs:
+            column.set(theirs[name].table.cpu().double().numpy() * shorter ** np.array(theirs[name].exponents, float))
+    if flow.polynomials is None or other.gradients is None:
+        return
+    e = force_gradient_in(flow)
+    for part in ("", "processor_"):
+        gradients = theirs[f"{part}gradients"]
+        table = gradients.table.cpu().double().numpy() * shorter ** np.array(gradients.exponents, float)
+        n = len(mine[f"{part}polynomials.0"].exponents)
+        table = np.column_stack([table[:, : n - 1], table[:, n - 1 :].sum(1)])  # at Δt the same
+        for m, e_m in enumerate(e):
+            mine[f"{part}polynomials.{m}"].set(e_m * table)
 
 
 def certify(flow: SympFlow, system: HamiltonianSystem, t_end: float = 1000.0) -> None:
@@ -211,9 +226,9 @@ def certify(flow: SympFlow, system: HamiltonianSystem, t_end: float = 1000.0) ->
 def cost(flow: SympFlow) -> float:
     """What a unit of time costs in force evaluations, by count: a figure that no other load on the machine disturbs.
 
-    A force gradient counts as 0.3 of a force and a curvature term as 0.4, as was measured in the compiled loops for
-    polynomial potentials; exact linear flows count nothing; a network's parameters as many forces as make up for its
-    multiplications.
+    A force gradient counts as 0.3 of a force, a curvature term as 0.4 and each monomial of a polynomial as 0.05, as was
+    measured in the compiled loops for polynomial potentials; exact linear flows count nothing; a network's parameters
+    as many forces as make up for its multiplications.
     """
     if isinstance(flow, SplitFlow):
         one, two = (flow.evaluations(n, 0, 0, "compiled") for n in (1, 2))
@@ -223,6 +238,7 @@ def cost(flow: SympFlow) -> float:
         return OF_A_PARAMETER * flow.n_parameters / flow.dt
     kernel = flow.kernel_scheme()
     beside = OF_A_GRADIENT * kernel.hessian_evaluations + OF_A_CURVATURE * kernel.curvature_evaluations
+    beside += OF_A_MONOMIAL * len(kernel.monomials) * kernel.force_evaluations
     return (kernel.force_evaluations + beside) / flow.dt
 
 

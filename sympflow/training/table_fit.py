@@ -11,6 +11,7 @@ import torch
 
 from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
+from sympflow.monomials import in_monomials
 from sympflow.training.labels import Labels
 from sympflow.training.levenberg_marquardt import Minimum, levenberg_marquardt
 from sympflow.training.losses import Objective
@@ -128,25 +129,26 @@ class Table:
     """A primed flow's parameters θ as one vector, and its table at any t as an affine function of them.
 
     The coefficients are those of `TableStep`: of each map in order, then the force gradients of the kicks, then their
-    curvatures. One of the processor stands in two places, χ and with the opposite sign χ⁻¹.
+    curvatures, or of each monomial in turn. One of the processor stands in two places, χ and with the opposite sign
+    χ⁻¹.
     """
 
     def __init__(self, flow: PrimedFlow) -> None:
         self.dt, self.flow = flow.dt, flow
         kicks = [i for i, kind in enumerate(flow.sequence) if kind == "kick"]
         n = len(flow.sequence)
-        self.n = n + flow.tables.level * len(kicks)
-        named = (flow.kicks, flow.drifts, flow.gradients, flow.curvatures)
-        outside = (flow.processor_kicks, flow.processor_drifts, flow.processor_gradients, flow.processor_curvatures)
+        self.n = n + flow.terms * len(kicks)
+        named = [flow.kicks, flow.drifts, flow.gradients, flow.curvatures, *(flow.polynomials or ())]
+        outside = [flow.processor_kicks, flow.processor_drifts, flow.processor_gradients, flow.processor_curvatures]
+        outside += flow.processor_polynomials or ()
         self.columns = [c for c in (*named, *outside) if c is not None]
         self._kernel = len([c for c in named if c is not None])
         self._places = [np.zeros((self.n, c.offset.shape[0])) for c in self.columns]
         index = {id(c): place for c, place in zip(self.columns, self._places, strict=True)}
         for i, substep in enumerate(flow.substeps):
             for term, entry in enumerate(substep.entries):
-                if entry is not None:
-                    row = n + (term - 1) * len(kicks) + kicks.index(i) if term else i
-                    index[id(entry.column)][row, entry.row] = entry.sign
+                row = n + (term - 1) * len(kicks) + kicks.index(i) if term else i
+                index[id(entry.column)][row, entry.row] = entry.sign
 
     def polynomial(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Offset (J, n) and design (J, n, f) of the coefficients at the times t by the flow's parameters."""
@@ -194,7 +196,7 @@ class Table:
     def random(self, rng: np.random.Generator) -> np.ndarray:
         """A frozen table about that of equal steps, with or without the force gradients of Takahashi and Imada."""
         flow = self.flow
-        spread = SPREAD if flow.gradients is not None else WIDE_SPREAD
+        spread = SPREAD if flow.terms else WIDE_SPREAD
         table, kicks = np.zeros(self.n), np.zeros(0)
         for c, place in zip(self.columns[:2], self._places[:2], strict=True):
             values = rng.normal(1, spread, c.offset.shape[0])
@@ -204,10 +206,23 @@ class Table:
             table += place @ values
         if flow.gradients is not None:
             table += self._places[2] @ (rng.choice([0.0, 1 / 12]) * np.abs(kicks) ** 3)
+        elif flow.polynomials is not None:
+            size = rng.choice([0.0, 1 / 12]) * np.abs(kicks) ** 3
+            for place, e in zip(self._places[2 : self._kernel], force_gradient_in(flow), strict=True):
+                table += place @ (size * e)
         for c, place in zip(self.columns[self._kernel :], self._places[self._kernel :], strict=True):
             if c.power == 1:
                 table += place @ rng.normal(0, PROCESSOR_SPREAD * self.dt, c.offset.shape[0])
         return table
+
+
+def force_gradient_in(flow: PrimedFlow) -> np.ndarray:
+    """−½|∇V|²_{M⁻¹} by the monomials of the flow's kicks (M,); 0 where it is no such polynomial."""
+    system = flow.system
+    assert system is not None
+    assert system.symbols is not None
+    e = in_monomials(system.symbols.force_gradient, system.symbols, flow.monomials)
+    return np.zeros(len(flow.monomials)) if e is None else e
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

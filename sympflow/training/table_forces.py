@@ -1,6 +1,6 @@
 """What a splitting step and its derivatives need of a system, and the Jacobians of these.
 
-F = −∇V, G = ∇²V v and C = −∇(½ v·∇²V v), with v = M⁻¹∇V.
+F = −∇V, G = ∇²V v and C = −∇(½ v·∇²V v), with v = M⁻¹∇V; or after F the −∇q^m of each monomial.
 
 Arrays are feature-major: q and F, G, C are (d, P), Jacobians (d, d, P).
 """
@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sympflow.integrators.scheme import CURVATURE, FORCE_GRADIENT
+from sympflow.monomials import Monomials
 from sympflow.system import HamiltonianSystem
 
 ALONG = 1e-4  # length of the difference, relative to q, that gives the third derivative of V along M⁻¹∇V
@@ -28,10 +29,10 @@ class Forces(Protocol):
         """These, and their Jacobians."""
 
 
-def forces_of(system: HamiltonianSystem, level: int) -> Forces:
+def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = ()) -> Forces:
     """The forces of a separable system with T = ½ pᵀM⁻¹p: from its symbols, its Numba functions, or its own arrays."""
     if system.symbols is not None:
-        return SymbolicForces(system.symbols, level)
+        return SymbolicForces(system.symbols, level, monomials)
     if system.numba_functions is not None and system.numba_functions[2] is not None:
         return NumbaForces(system, level)
     return CallableForces(system, level)
@@ -40,15 +41,17 @@ def forces_of(system: HamiltonianSystem, level: int) -> Forces:
 class SymbolicForces:
     """All derivatives in closed form, generated from the symbols."""
 
-    def __init__(self, symbols: Any, level: int) -> None:
+    def __init__(self, symbols: Any, level: int, monomials: Monomials) -> None:
         import sympy as sp
 
         slope = sp.Matrix([sp.diff(symbols.V, s) for s in symbols.q])
         terms = [-slope]
-        if level >= FORCE_GRADIENT:
+        if level in (FORCE_GRADIENT, CURVATURE):
             terms.append(sp.hessian(symbols.V, symbols.q) * symbols.inverse_mass * slope)
         if level == CURVATURE:
             terms.append(sp.Matrix([-sp.diff(symbols.W, s) for s in symbols.q]))
+        products = [sp.Mul(*map(sp.Pow, symbols.q, m)) for m in monomials]
+        terms += [sp.Matrix([-sp.diff(product, s) for s in symbols.q]) for product in products]
         values = [f for term in terms for f in term]
         self._d, self._n = symbols.ndof, len(terms)
         self._values = _generated(symbols.q, values)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sympflow.monomials import Monomials
 from sympflow.system import HamiltonianSystem
 from sympflow.training.table_forces import forces_of
 
@@ -22,10 +23,14 @@ class TableStep:
         Separable, with T = ½ pᵀM⁻¹p.
     sequence : sequence of "kick" or "drift"
     level : int
-        How many terms the kicks have beside the force: none, g, or g and c.
+        What the kicks have beside the force: nothing, g, g and c, or a polynomial.
+    monomials
+        Of the polynomial.
     """
 
-    def __init__(self, system: HamiltonianSystem, sequence: Sequence[str], level: int) -> None:
+    def __init__(
+        self, system: HamiltonianSystem, sequence: Sequence[str], level: int, monomials: Monomials = ()
+    ) -> None:
         if not system.quadratic_kinetic:
             raise ValueError(
                 f"`system` {system.name!r} must have a kinetic energy ½ pᵀM⁻¹p for its table to be fitted by "
@@ -33,17 +38,17 @@ class TableStep:
             )
         self.ndof, self.sequence = system.ndof, tuple(sequence)
         self._inverse_mass = system.kinetic_hessian(np.zeros(system.ndof))
-        self._forces = forces_of(system, level)
-        n = len(sequence)
+        self._forces = forces_of(system, level, monomials)
+        n, terms = len(sequence), len(monomials) or level
         kicks = [i for i in range(n) if sequence[i] == "kick"]
-        self.n_coefficients = n + level * len(kicks)
-        # where w, g and c stand among the coefficients
+        self.n_coefficients = n + terms * len(kicks)
+        # where w, g and c, or w and the polynomial's, stand among the coefficients
         self._places = {
-            kick: [kick, *(n + term * len(kicks) + j for term in range(level))] for j, kick in enumerate(kicks)
+            kick: [kick, *(n + term * len(kicks) + j for term in range(terms))] for j, kick in enumerate(kicks)
         }
 
     def __call__(self, c: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """The step: coefficients c in the order of the sequence, then the g of each kick, then the c of each."""
+        """The step: coefficients c in the order of the sequence, then of each further term those of the kicks."""
         q, p = y[: self.ndof], y[self.ndof :]
         for i, kind in enumerate(self.sequence):
             if kind == "drift":

@@ -1,0 +1,133 @@
+"""Polynomials in q, Σ_m c_m q^m: the monomials that suit a potential, values and gradients, for NumPy and torch."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sympflow.arrays import Array, is_tensor, stack
+
+if TYPE_CHECKING:
+    from sympflow.symbolic import SymbolicHamiltonian
+
+__all__ = ["MOST_MONOMIALS", "Monomials", "in_monomials", "monomials"]
+
+MOST_MONOMIALS = 60
+MOST_MIRRORED = 6  # coordinates of which all combinations of signs are tried
+
+Monomials = tuple[tuple[int, ...], ...]
+"""Exponents of q1 … qd, one tuple a monomial."""
+
+
+def monomials(symbols: SymbolicHamiltonian, degree: int) -> Monomials:
+    """Those up to a total degree that are unchanged by the changes of sign of coordinates that leave V unchanged.
+
+    Raises
+    ------
+    ValueError
+        If there are none, or too many.
+    """
+    d = symbols.ndof
+    mirrored = [signs for signs in _signs(d) if _is_even(symbols, signs)]
+    kept = []
+    if math.comb(d + degree, d) > 1000 * MOST_MONOMIALS:
+        raise ValueError(_too_many(degree, d))
+    for exponents in itertools.product(range(degree + 1), repeat=d):
+        if 1 <= sum(exponents) <= degree and all(_product(signs, exponents) == 1 for signs in mirrored):
+            kept.append(exponents)
+    if not kept:
+        raise ValueError(f"`polynomial` {degree!r} leaves no monomial that V is as even as: take a higher degree.")
+    if len(kept) > MOST_MONOMIALS:
+        raise ValueError(_too_many(degree, d))
+    return tuple(sorted(kept, key=lambda m: (sum(m), m)))
+
+
+def _too_many(degree: int, d: int) -> str:
+    return (
+        f"`polynomial` {degree!r} makes more than {MOST_MONOMIALS} monomials in {d} coordinates: take a lower degree."
+    )
+
+
+def _signs(d: int) -> Iterator[tuple[int, ...]]:
+    """Changes of sign of coordinates: all, or for many coordinates those of one of them and of all."""
+    if d <= MOST_MIRRORED:
+        yield from itertools.product((1, -1), repeat=d)
+        return
+    for i in range(d):
+        yield tuple(-1 if j == i else 1 for j in range(d))
+    yield (-1,) * d
+
+
+def _is_even(symbols: SymbolicHamiltonian, signs: Sequence[int]) -> bool:
+    import sympy as sp
+
+    assert symbols.V is not None
+    mirrored = symbols.V.xreplace({s: sign * s for s, sign in zip(symbols.q, signs, strict=True)})
+    return sp.expand(mirrored - symbols.V) == 0
+
+
+def _product(signs: Sequence[int], exponents: Sequence[int]) -> int:
+    return math.prod(sign**e for sign, e in zip(signs, exponents, strict=True))
+
+
+def in_monomials(f: Any, symbols: SymbolicHamiltonian, of: Monomials) -> np.ndarray | None:
+    """The coefficients (M,) of an expression in q that is such a polynomial, up to a constant; None if it is none."""
+    import sympy as sp
+
+    if not f.is_polynomial(*symbols.q):
+        return None
+    found = sp.Poly(f, *symbols.q).as_dict()
+    found.pop((0,) * symbols.ndof, None)
+    if not set(found) <= set(of):
+        return None
+    return np.array([float(found.get(m, 0)) for m in of])
+
+
+def value(of: Monomials, coefficients: Array, q: Array) -> Array:
+    """Σ_m c_m q^m for coefficients (…, M) and positions (…, d): (…)."""
+    exponents = np.array(of)
+    powers = _powers(q, int(exponents.max()))
+    terms = powers[0][..., exponents[:, 0]]
+    for j in range(1, exponents.shape[1]):
+        terms = terms * powers[j][..., exponents[:, j]]
+    return (_like(coefficients, q) * terms).sum(-1)
+
+
+def gradient(of: Monomials, coefficients: Array, q: Array) -> Array:
+    """The gradient of `value`: (…, d)."""
+    exponents = np.array(of)
+    powers = _powers(q, int(exponents.max()))
+    coefficients, columns = _like(coefficients, q), []
+    for i in range(exponents.shape[1]):
+        there = np.flatnonzero(exponents[:, i])
+        lowered = exponents[there]
+        factors = _like(lowered[:, i], q)
+        lowered[:, i] -= 1
+        terms = powers[0][..., lowered[:, 0]]
+        for j in range(1, exponents.shape[1]):
+            terms = terms * powers[j][..., lowered[:, j]]
+        columns.append((coefficients[..., there] * (factors * terms)).sum(-1))
+    return stack(columns)
+
+
+def _powers(q: Array, highest: int) -> list[Array]:
+    """1, q_j, q_j², … for each j: (…, highest + 1)."""
+    powers = []
+    for j in range(q.shape[-1]):
+        of_one = [q[..., j] * 0 + 1]
+        for _ in range(highest):
+            of_one.append(of_one[-1] * q[..., j])
+        powers.append(stack(of_one))
+    return powers
+
+
+def _like(numbers: Any, q: Array) -> Array:
+    if is_tensor(q):
+        import torch
+
+        return numbers if is_tensor(numbers) else torch.as_tensor(numbers, dtype=q.dtype, device=q.device)
+    return np.asarray(numbers, dtype=q.dtype)
