@@ -107,7 +107,7 @@ c, the option `shift`, must exceed V along the orbit, which any number above the
 
 ```python
 from sympflow import SympFlow, time_transformed
-from sympflow.integrators.logarithmic import LogSympFlow
+from sympflow.integrators.log_sympflow import LogSympFlow
 
 flow = SympFlow.primed(time_transformed(kepler), scheme="blanes_moan4", dt=0.02)  # untrained: the scheme itself
 sol = solve(kepler, LogSympFlow(flow=flow), (0.0, 20.0))

@@ -148,7 +148,8 @@ def _proper(times: np.ndarray, t0: float, t1: float) -> bool:
         return False
     if len(times) == 1:
         return True
-    return bool(((times[:-1] <= times[1:]) if t0 <= t1 else (times[:-1] >= times[1:])).all())
+    ordered = times[:-1] <= times[1:] if t0 <= t1 else times[:-1] >= times[1:]
+    return int(np.count_nonzero(ordered)) == len(times) - 1
 
 
 def check_save_every(save_every: Any, times: np.ndarray | None) -> int:

@@ -20,7 +20,7 @@ from sympflow import (
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.shipped import choose
 from sympflow.integrators.base import Problem
-from sympflow.integrators.logarithmic import LogSympFlow
+from sympflow.integrators.log_sympflow import LogSympFlow
 from sympflow.integrators.physical_time import PhysicalRun
 from sympflow.integrators.timed_pass import timed_pass
 from sympflow.interop.scipy import as_scipy
@@ -385,3 +385,14 @@ def test_a_tol_that_only_another_time_meets_says_what_that_needs():
             solve(kepler, "sympflow", (0, 1), y0, dtype=dtype, tol=1e-9)
     with pytest.raises(ValueError, match=where):
         as_scipy("sympflow", kepler, tol=1e-9)
+
+
+@pytest.mark.parametrize("dt", [None, 0.5])
+def test_dt_is_the_mean_physical_step_by_the_clock_of_the_flow(clocked, dt):
+    """Over whole periods: the orbit is followed exactly, in equal steps of the eccentric anomaly."""
+    t_end = 200 * np.pi
+    sol = solve(systems.kepler(), LogSympFlow(flow=clocked, dt=dt), (0.0, t_end), t_eval=[t_end])
+    assert abs(sol.stats["n_steps"] - t_end / sol.stats["dt"]) <= 1
+    assert dt in (None, sol.stats["dt"])
+    with pytest.raises(ValueError, match=r"^`dt` must be at most 0\.92"):  # 2 atan(1/2) of the anomaly
+        solve(systems.kepler(), LogSympFlow(flow=clocked, dt=0.95), (0.0, 1.0))

@@ -13,7 +13,7 @@ import numpy as np
 from sympflow import HamiltonianSystem, get, solve
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
-from sympflow.integrators.logarithmic import LogSympFlow
+from sympflow.integrators.log_sympflow import LogSympFlow
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.kernels.primed_flow import PrimedFlowKernel
 from sympflow.kernels.splitting import splitting_kernel

@@ -217,10 +217,14 @@ class SplitFlow(SympFlow):
         return parts.from_modes(*parts.apply(maps, *parts.to_modes(y.T))).T
 
     def kernel_for(self, system: HamiltonianSystem) -> SplitFlowKernel:
-        """The compiled loops of this flow."""
-        from sympflow.kernels.split_flow import SplitFlowKernel
+        """The compiled loops of this flow, the same while no number of it changes."""
+        flow = self.bound(system)
+        frozen = flow.frozen()
+        if frozen.kernel is None or frozen.kernel.parts is not flow.parts:
+            from sympflow.kernels.split_flow import SplitFlowKernel
 
-        return SplitFlowKernel(self.bound(system))
+            frozen.kernel = SplitFlowKernel(flow)
+        return frozen.kernel
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Evaluations of the slopes of parts, and of force gradients, as `FixedStep.evaluations`."""

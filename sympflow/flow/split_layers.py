@@ -17,6 +17,7 @@ from sympflow.parts import LINEAR, ExactParts, Map
 
 if TYPE_CHECKING:
     from sympflow.flow.split import SplitFlow
+    from sympflow.kernels.split_flow import SplitFlowKernel
     from sympflow.system import HamiltonianSystem
 
 MOST_KEPT = 64  # steps whose maps are kept
@@ -56,6 +57,9 @@ class KeptMaps:
         Whether the numbers are float64 on the CPU: asked once, as torch answers slowly.
     """
 
+    kernel: SplitFlowKernel | None = None
+    """The compiled loops that were made of these last."""
+
     def __init__(
         self, make: Callable[[np.ndarray], list[Map]], coefficients: list[Map], dt: float, like: Tensor
     ) -> None:
@@ -64,6 +68,9 @@ class KeptMaps:
         self.compilable = like.dtype == torch.float64 and like.device.type == "cpu"
         self._maps: dict[float, list[Map]] = {}
         self._counts: dict[tuple[int, int, int, str], dict[str, int]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "kernel"}
 
     def maps(self, t: float) -> list[Map]:
         if t not in self._maps:

@@ -1,4 +1,4 @@
-"""Splitting methods and trained flows on the logarithmic Hamiltonian, in the physical time.
+"""Splitting methods on the logarithmic Hamiltonian, in the physical time.
 
 The steps are equal in the new time s; the physical time t is a coordinate of the transformed system, whose value at
 the end of a step is what the method makes it. A state at a time that is asked for is a shorter step from the last
@@ -7,7 +7,7 @@ state before it, of the length σ that solves t(σ) = t, to rounding.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
@@ -209,86 +209,6 @@ def log_splitting(name: str) -> type[LogSplitting]:
         "__module__": __name__,
     }
     return dataclass(frozen=True)(type(name, (LogSplitting,), namespace))
-
-
-@dataclass(frozen=True)
-class LogSympFlow(Logarithmic):
-    """A SympFlow trained on `sympflow.time_transformed(system)`, in the physical time.
-
-    Parameters
-    ----------
-    dt : float, optional
-        As for `Logarithmic`; the step in s that it means is at most the flow's Δ, which is the default.
-    shift : float, optional
-        The one of the transformed system that the flow was trained on; a flow that ships knows it.
-    flow : SympFlow or str, optional
-        Trained on, or primed with, the transformed system; or the name of one that ships. `solve` takes by default
-        the one that ships for the system. ``solve(system, "sympflow", flow=...)`` comes here by itself.
-    """
-
-    flow: Any = field(default=None, repr=False)
-
-    name: ClassVar[str] = "log_sympflow"
-    order: ClassVar[int | None] = None
-    trained: ClassVar[bool] = True
-    within: ClassVar[FixedStep | None] = None
-    """Of one whose `inner` has been asked for: that."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if isinstance(self.flow, str):
-            from sympflow.flow.shipped import named
-
-            object.__setattr__(self, "flow", named(self.flow).load())
-        if self.flow is not None and getattr(self.flow, "kind", None) != "sympflow":
-            raise TypeError(
-                f"`flow` must be a SympFlow of the transformed system, or the name of one; got "
-                f"{type(self.flow).__name__}."
-            )
-
-    def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> LogSympFlow:
-        """With the flow that ships for the system unless one is given, and its shift."""
-        if self.flow is None:
-            from sympflow.flow.shipped import shipped_flows
-
-            found = [f for f in shipped_flows(system, "sympflow") if f.shift is not None]
-            if not found:
-                raise ValueError(
-                    f"`flow` is needed, for none in another time ships for {system.name!r}: train one on "
-                    "sympflow.time_transformed(system), or prime one with it, and pass it; or use 'log_leapfrog'."
-                )
-            return replace(self, flow=found[0].load(system), shift=found[0].shift if self.shift is None else self.shift)
-        origin = (getattr(self.flow, "recipe", None) or {}).get("transforms")
-        if self.shift is not None or origin is None:
-            return self
-        resolved = object.__new__(type(self))  # the fields have been checked
-        vars(resolved).update(vars(self), shift=checked_shift(origin["shift"]))
-        return resolved
-
-    def inner(self, system: HamiltonianSystem) -> FixedStep:
-        if self.within is not None:
-            return self.within
-        if self.flow is None:
-            raise ValueError(
-                "`flow` is needed: train one on sympflow.time_transformed(system), or prime one with it, and pass it."
-            )
-        from sympflow.integrators.sympflow import SympFlowIntegrator
-
-        within = object.__new__(SympFlowIntegrator)  # the flow has been checked
-        vars(within).update(flow=self.flow, dt=None, tol=None, compensated=False)
-        object.__setattr__(self, "within", within)
-        return within
-
-    def step_length(self, system: HamiltonianSystem) -> float:
-        if self.dt is not None:
-            return float(self.dt)
-        return float(self.flow.dt / time_scale(system, self.transformed(system).params["shift"]))
-
-    def check(self, system: HamiltonianSystem) -> None:
-        super().check(system)
-        if self.new_step(system) > self.flow.dt * (1 + 1e-12):
-            longest = self.flow.dt / time_scale(system, self.transformed(system).params["shift"])
-            raise ValueError(f"`dt` must be at most {longest:g}, where the step in s is the flow's Δ; got {self.dt:g}.")
 
 
 def __getattr__(name: str) -> type[LogSplitting]:

@@ -32,7 +32,7 @@ _BUILT_IN = {
     "log_blanes_moan4": "logarithmic:log_blanes_moan4",
     "log_kahan_li8": "logarithmic:log_kahan_li8",
 }
-_UNLISTED = {"log_sympflow": "logarithmic:LogSympFlow"}  # what "sympflow" is for a flow in another time
+_UNLISTED = {"log_sympflow": "log_sympflow:LogSympFlow"}  # what "sympflow" is for a flow in another time
 _WITH_PARTS = (
     *("impulse", "mollified_impulse", "implicit_explicit"),
     *("linear_srkn6b", "linear_srkn11b", "linear_srkn14a", "linear_omelyan4"),

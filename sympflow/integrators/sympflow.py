@@ -79,7 +79,7 @@ class SympFlowIntegrator(FlowIntegrator):
         trajectories = y0.size // y0.shape[-1]
         if trajectories * length * saved < SEARCH + SEARCH_OF_EACH * trajectories:
             return self
-        from sympflow.integrators.logarithmic import LogSympFlow
+        from sympflow.integrators.log_sympflow import LogSympFlow
 
         check_start(flow, system, y0, False)
         return LogSympFlow(flow=flow, shift=shift)
@@ -92,7 +92,7 @@ class SympFlowIntegrator(FlowIntegrator):
 
         if not same_system(origin["fingerprint"], system.fingerprint):
             return self
-        from sympflow.integrators.logarithmic import LogSympFlow
+        from sympflow.integrators.log_sympflow import LogSympFlow
 
         if self.compensated:
             raise ValueError("`compensated` sums are not for a flow in another time: leave it out.")

@@ -42,7 +42,9 @@ def timed_pass(integrator: Logarithmic, problem: Problem) -> Outcome | None:
     reach_times = getattr(inner, "reach_times", None)
     if reach_times is None:
         return None
-    start = _lifted(problem, transformed.params["shift"])
+    from sympflow.kernels.timed import lifted_rows
+
+    start = lifted_rows(system, y0.reshape(-1, y0.shape[-1]), transformed.params["shift"])
     if start is None:
         return None
     expected = float(elapsed[-1]) / dt
@@ -68,19 +70,4 @@ def timed_pass(integrator: Logarithmic, problem: Problem) -> Outcome | None:
         **inner.evaluations(n_steps, n_steps, n_extra, "compiled"),
         "backend": "compiled",
     }
-    return Outcome(times, Y.reshape(len(times), *y0.shape), status, FINISHED, stats)
-
-
-def _lifted(problem: Problem, c: float) -> np.ndarray | None:
-    """States [q, t, p, B] (N, 2d + 2) with t = 0 and B = c − H; None unless c exceeds all V."""
-    system, rows = problem.system, problem.y0.reshape(-1, problem.y0.shape[-1])
-    d = system.ndof
-    q, p = rows[:, :d], rows[:, d:]
-    with np.errstate(all="ignore"):
-        V = system.potential(q)
-        B = c - (system.kinetic(p) + V)
-    if not (c > V).all():
-        return None
-    start = np.zeros((len(rows), 2 * d + 2))
-    start[:, :d], start[:, d + 1 : -1], start[:, -1] = q, p, B
-    return start
+    return Outcome(times, Y.reshape(len(times), *y0.shape), status, FINISHED, stats, finite=True)

@@ -10,7 +10,21 @@ from numba import njit
 
 @njit(**OPTIONS)
 def place(t, t0, h, rounding, count, remainder, position):
-    """`Grid.locate` of ordered times: the distinct counts into `count`, where among them each is, and how many."""
+    """`Grid.locate` of ordered times: the distinct counts into `count`, where among them each is, and how many.
+
+    Where all counts are distinct, `position` may be left as it is.
+    """
+    on_grid = True
+    for i in range(len(t)):  # in most runs all are; a loop of vector instructions
+        x = (t[i] - t0) / h
+        nearest = np.rint(x)
+        on_grid &= abs(x - nearest) <= rounding * (abs(nearest) + (abs(t[i]) + abs(t0)) / abs(h))
+        count[i], remainder[i] = np.int64(nearest), 0.0
+    if on_grid:
+        for i in range(1, len(t)):
+            on_grid &= count[i] != count[i - 1]
+        if on_grid:
+            return len(t)
     distinct = 0
     for i in range(len(t)):
         x = (t[i] - t0) / h

@@ -33,8 +33,8 @@ class SplitFlowKernel:
         self._frozen = flow.frozen()
         if not self._frozen.compilable:
             raise ValueError(f"`flow` is {flow.dtype} on {flow.device}: compiled flows are float64 on the CPU.")
-        self.flow = flow
-        self._kernel: PartsKernel = kernel_of(flow.parts, PartsKernel)
+        self.parts, self._dt = flow.parts, flow.dt
+        self._kernel: PartsKernel = kernel_of(self.parts, PartsKernel)
         self._kernel.source()
         self.evaluations = self._frozen.evaluations
 
@@ -60,7 +60,7 @@ class SplitFlowKernel:
         h = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
         out = np.array(y, dtype=np.float64)
         for back, rows in ((False, h > 0), (True, h < 0)):
-            sequence, dt = self._frozen.coefficients(back), self.flow.dt
+            sequence, dt = self._frozen.coefficients(back), self._dt
             if rows.all():
                 return self._kernel.step_by_coefficients(sequence, dt, np.abs(h), y)
             if rows.any():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from types import ModuleType
 from weakref import WeakKeyDictionary
@@ -10,16 +10,17 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.integrators.schemes import Scheme
-from sympflow.kernels.codegen import algebra_source
-from sympflow.kernels.modules import run_one, run_rows
+from sympflow.kernels.codegen import algebra_source, statements
+from sympflow.kernels.modules import load_algebra, run_one, run_rows
 from sympflow.kernels.splitting import scaled_run_table, step_table, symbolic_module
 from sympflow.symbolic import SymbolicHamiltonian
 from sympflow.system import HamiltonianSystem
 
-__all__ = ["reach_times"]
+__all__ = ["lifted_rows", "reach_times"]
 
 FEWEST, MANY = 1000, 8.0  # steps after which a run is given up: these, and so many times the expected ones
 _LOOPS: WeakKeyDictionary[SymbolicHamiltonian, ModuleType] = WeakKeyDictionary()
+_LIFTS: WeakKeyDictionary[SymbolicHamiltonian, Callable[..., bool]] = WeakKeyDictionary()
 
 
 def reach_times(
@@ -86,6 +87,39 @@ def reach_times(
 
     run_rows(rows, n_rows, work, None)
     return (out, counts) if all(done) else None
+
+
+def lifted_rows(system: HamiltonianSystem, y: np.ndarray, c: float) -> np.ndarray | None:
+    """States [q, t, p, B] (N, 2d + 2) with t = 0 and B = c − H of rows of `y` (N, 2d) of a symbolic system.
+
+    None unless c exceeds V at all of them, or where H has no compiled form.
+    """
+    symbols = system.symbols
+    assert symbols is not None
+    lift = _LIFTS.get(symbols)
+    if lift is None:
+        lift = _LIFTS[symbols] = _compiled_lift(symbols)
+    out = np.empty((len(y), y.shape[1] + 2))
+    return out if lift(np.ascontiguousarray(y), c, out) else None
+
+
+def _compiled_lift(symbols: SymbolicHamiltonian) -> Callable[..., bool]:
+    d = symbols.ndof
+    try:
+        energies = statements(["V", "T"], [symbols.V, symbols.T])
+    except ValueError:  # a function in H has no compiled form
+        return lambda y, c, out: False
+    lines = [f"{v} = y[n, {i}]" for i, v in enumerate(symbols.q + symbols.p)]
+    lines += [*energies, "fine &= V < c", f"out[n, {d}], out[n, {2 * d + 1}] = 0.0, c - (T + V)"]
+    lines += [f"out[n, {i + (i >= d)}] = {v}" for i, v in enumerate(symbols.q + symbols.p)]
+    body = "\n        ".join(lines)
+    return load_algebra(f"""@njit(**OPTIONS)
+def lift(y, c, out):
+    fine = True
+    for n in range(y.shape[0]):
+        {body}
+    return fine
+""").lift
 
 
 def _loops(system: HamiltonianSystem) -> ModuleType:

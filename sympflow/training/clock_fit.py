@@ -15,7 +15,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from sympflow.flow.clocked import ClockedFlow
-from sympflow.integrators.logarithmic import LogSympFlow
+from sympflow.integrators.log_sympflow import LogSympFlow
 from sympflow.metrics.energy import max_energy_error
 from sympflow.solver import solve
 from sympflow.system import HamiltonianSystem
