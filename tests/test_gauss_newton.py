@@ -1,6 +1,7 @@
 """Gauss–Newton training: labels, derivatives of a table, the least-squares search, and the flows that come of it."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -146,8 +147,9 @@ def test_a_table_is_continued_to_all_times():
     np.testing.assert_allclose(table.continued(offset[0] + design[0] @ constant), constant, atol=1e-12)
 
 
+@cache
 def without_symbols(kind):
-    """Hénon–Heiles by a torch function, or by Numba functions."""
+    """Hénon–Heiles by a torch function, or by Numba functions; made once, for what is compiled belongs to it."""
     numba = pytest.importorskip("numba")
     if kind == "torch":
         return HamiltonianSystem(
