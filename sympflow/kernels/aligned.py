@@ -12,3 +12,11 @@ def aligned_zeros(n):
     buffer = np.zeros(n + 8)
     first = -(buffer.ctypes.data // 8) % 8
     return buffer[first : first + n]
+
+
+@njit(**OPTIONS)
+def copy_lanes(source, target):
+    """target[:] = source, of the same shape. So written, the text of its error takes Numba seconds to compile."""
+    for i in range(source.shape[0]):
+        for lane in range(source.shape[1]):
+            target[i, lane] = source[i, lane]

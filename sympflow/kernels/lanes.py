@@ -161,7 +161,7 @@ def rollout_lanes(kicks, drifts, gradients, curvatures, y0, n_steps, save, out, 
                 else:
                     for row in range(saved, next_saved):
                         pack(q, p, out[i, row])
-            start[:] = Y
+            copy_lanes(Y, start)
             n, saved, first = n + block, next_saved, link
 
 

@@ -184,7 +184,7 @@ def rollout_lanes(codes, table, y0, in_modes, n_steps, save, out, n_finite, stop
             saved += 1
         n_alive = count
         while n < n_steps and n_alive > 0 and stop[0] == 0:
-            start[:] = Z
+            copy_lanes(Z, start)
             begin = first
             block = min(CHECK_EVERY, n_steps - n)
             if saved < len(save):

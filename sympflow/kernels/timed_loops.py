@@ -210,7 +210,7 @@ def reach_times_lanes(table, step, h, clock, y0, begin, end, targets, stride, mo
         for lane in range(count, width):
             q, p = unpack_lane(Y, count - 1)
             pack_lane(q, p, Y, lane)
-        start[:] = Y
+        copy_lanes(Y, start)
         for _ in range(stride):
             stage_lanes(Y, error, width, kicks[link], gradients[link], curvatures[link], drifts[link])
             for j in range(1, link):
