@@ -48,6 +48,7 @@ class Hamiltonian:
 
     def hamiltonian(self, y: Array) -> Array:
         """H(y): (..., 2d) to (...)."""
+        self._check_width(y)
         if self.separable:
             q, p = y[..., : self.ndof], y[..., self.ndof :]
             return self.kinetic(p) + self.potential(q)
@@ -55,12 +56,14 @@ class Hamiltonian:
 
     def gradient(self, y: Array) -> Array:
         """∇H(y): (..., 2d) to (..., 2d)."""
+        self._check_width(y)
         if self.separable:
             return concatenate([-self.force(y[..., : self.ndof]), self.velocity(y[..., self.ndof :])])
         return self._definition.gradient(y)
 
     def hessian(self, y: Array) -> Array:
         """∇²H(y): (..., 2d) to (..., 2d, 2d)."""
+        self._check_width(y)
         if not self.separable:
             return self._definition.hessian(y)
         d = self.ndof
@@ -70,6 +73,7 @@ class Hamiltonian:
 
     def vector_field(self, y: Array) -> Array:
         """J∇H(y) = [∇_pH, −∇_qH]: (..., 2d) to (..., 2d)."""
+        self._check_width(y)
         d = self.ndof
         if self.separable:
             return concatenate([self.velocity(y[..., d:]), self.force(y[..., :d])])
@@ -78,12 +82,14 @@ class Hamiltonian:
 
     def __call__(self, t: float, y: Array) -> Array:
         """The right-hand side fun(t, y) of `scipy.integrate.solve_ivp` and `torchdiffeq.odeint`."""
+        return self.vector_field(y)
+
+    def _check_width(self, y: Array) -> None:
         if y.shape[-1:] != (2 * self.ndof,):
             raise ValueError(
                 f"`y` must have shape (..., {2 * self.ndof}), [q, p] on the last axis; got {tuple(y.shape)}. In "
                 "solve_ivp leave `vectorized` out, which asks for states in columns."
             )
-        return self.vector_field(y)
 
     # separable systems: V(q) and T(p) -------------------------------------------------------------
 

@@ -315,3 +315,10 @@ def test_a_function_that_writes_into_the_state_is_refused(method):
     assert own.tolist() == [1.0, 0.0]
     with pytest.raises(ValueError, match=r"^`potential` writes into its argument.*q\.clone\(\)"):
         HamiltonianSystem(potential=lambda q: (doubling(q) ** 2).sum(-1), ndof=1).potential(own[:1])
+
+
+@pytest.mark.parametrize("name", ["hamiltonian", "gradient", "hessian", "vector_field"])
+@pytest.mark.parametrize("width", [3, 5])
+def test_states_of_another_width_are_refused(name, width):
+    with pytest.raises(ValueError, match=r"^`y` must have shape \(\.\.\., 4\).* got \(2, " + str(width)):
+        getattr(systems.henon_heiles(), name)(np.zeros((2, width)))

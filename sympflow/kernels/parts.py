@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from sympflow.kernels.modules import NEVER, load_algebra, run_one, run_rows
-from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
+from sympflow.kernels.part_flows import TURN_WIDTH
+from sympflow.kernels.parts_codegen import IDLE, WITH_GRADIENT, parts_source
 from sympflow.parts import LINEAR, ExactParts, Map, PartFunctions
 from sympflow.shears import shears
 

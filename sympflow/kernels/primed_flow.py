@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from sympflow.integrators.scheme import CURVATURE, Scheme
 from sympflow.kernels.modules import run_one, run_rows
-from sympflow.kernels.splitting import scaled_run_table, scaled_step_table, splitting_kernel
+from sympflow.kernels.splitting import splitting_kernel
+from sympflow.kernels.tables import scaled_run_table, scaled_step_table
 from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ import numpy as np
 from sympflow.integrators.schemes import Scheme
 from sympflow.kernels.codegen import algebra_source, statements
 from sympflow.kernels.modules import load_algebra, run_one, run_rows
-from sympflow.kernels.splitting import scaled_run_table, step_table, symbolic_module
+from sympflow.kernels.splitting import symbolic_module
+from sympflow.kernels.tables import scaled_run_table, step_table
 from sympflow.symbolic import SymbolicHamiltonian
 from sympflow.system import HamiltonianSystem
 
