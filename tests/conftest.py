@@ -1,12 +1,9 @@
 """Fixtures shared by several test modules."""
 
-import gc
 import importlib.util
 from pathlib import Path
 
 import pytest
-
-gc.set_threshold(50_000, 20, 100)  # compilation makes many objects that live: a tenth of its time was spent on them
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
