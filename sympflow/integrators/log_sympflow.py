@@ -36,6 +36,8 @@ class LogSympFlow(Logarithmic):
     trained: ClassVar[bool] = True
     within: ClassVar[FixedStep | None] = None
     """Of one whose `inner` has been asked for: that."""
+    checked: ClassVar[tuple[HamiltonianSystem, float] | None] = None
+    """Of one that was checked: the system, and the step in s."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -48,6 +50,9 @@ class LogSympFlow(Logarithmic):
                 f"`flow` must be a SympFlow of the transformed system, or the name of one; got "
                 f"{type(self.flow).__name__}."
             )
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in ("within", "checked")}
 
     def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> LogSympFlow:
         """With the flow that ships for the system unless one is given, and its shift."""
@@ -86,13 +91,20 @@ class LogSympFlow(Logarithmic):
         return self._longest(system) if self.dt is None else float(self.dt)
 
     def new_step(self, system: HamiltonianSystem) -> float:
-        return float(self.flow.dt) if self.dt is None else step_of_length(float(self.dt), *self._pace(system))
+        if self.dt is None:
+            return float(self.flow.dt)
+        if self.checked is not None and self.checked[0] is system:
+            return self.checked[1]
+        return step_of_length(float(self.dt), *self._pace(system))
 
     def check(self, system: HamiltonianSystem) -> None:
         if self.flow is None:
             self.inner(system)  # says so
         self.flow.check_system(self.transformed(system))
-        if not self.new_step(system) <= self.flow.dt * (1 + 1e-12):
+        object.__setattr__(self, "checked", None)
+        h = self.new_step(system)
+        object.__setattr__(self, "checked", (system, h))
+        if not h <= self.flow.dt * (1 + 1e-12):
             longest = self._longest(system)
             raise ValueError(f"`dt` must be at most {longest:g}, where the step in s is the flow's Δ; got {self.dt:g}.")
 

@@ -39,7 +39,8 @@ def rollout_processed(before, more_before, run, more, after, more_after, y0, n_s
     n_finite = rollout(run[0], run[1], run[2], more, start[0], n_steps, save, out, stop)
     first = 0
     while first < len(save) and save[first] <= 0:
-        out[first] = y0
+        q, p = unpack(y0)
+        pack(q, p, out[first])
         first += 1
     map_rows(after, more_after, out[first:], out[first:])
     return up_to_finite(out, save, n_finite)
@@ -57,5 +58,6 @@ def rollout_processed_rows(before, more_before, run, more, after, more_after, y0
         for row in range(len(save)):
             if save[row] > 0:
                 break
-            out[i, row] = y0[i]
+            q, p = unpack(y0[i])
+            pack(q, p, out[i, row])
         n_finite[i] = up_to_finite(out[i], save, n_finite[i])

@@ -4,8 +4,8 @@ States are [q, t, p, B] of a logarithmic Hamiltonian, scheduled or not, without 
 positive: t is multiplied by the sign of the step. What a clock adds to t at each step, `advance`, is no part of the
 running state: it is constant, and added where a time is needed.
 
-A run looks at the time after each `stride` steps. If an output is due since, they are made again, one by one, and a
-last step is shortened until its time is the one that is wanted.
+A run looks at the time after each `stride` steps, a single one seldomer far from an output. If an output is due since,
+they are made again, one by one, and a last step is shortened until its time is the one that is wanted.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -17,6 +17,7 @@ from numba import njit
 
 EPS = 2.0**-52
 MOST_TRIALS = 80
+MOST_AT_ONCE = 1024  # steps between two looks
 CLOSE = 1e-3  # of the elapsed time, beyond which a residual means that no step leads to that time
 
 
@@ -141,7 +142,12 @@ def reach_times(table, step, h, clock, y0, targets, stride, most_steps, out, cou
     q_error, p_error = no_error(q), no_error(p)
     n, saved, j, now = 0, 0, 0, 0.0
     while saved < len(targets) and stop[0] == 0:
-        block = min(stride, most_steps - n)
+        block = stride
+        if (
+            now > 0.0
+        ):  # far from the next output, where it is looked at seldom: half of the steps left, by the pace so far
+            block = max(stride, min(MOST_AT_ONCE, int(0.5 * n * (targets[saved] - now) / now)))
+        block = min(block, most_steps - n)
         start_q, start_p, begin = q, p, j
         for _ in range(block * link):
             b, g, c, a = kicks[j], gradients[j], curvatures[j], drifts[j]
