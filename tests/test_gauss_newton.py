@@ -110,21 +110,29 @@ def test_derivatives_by_the_table(system, force_gradient, first):
         np.testing.assert_allclose(J[:, :, k].T, expected.numpy(), rtol=1e-12, atol=1e-13)
 
 
+FEW = TableConfig(points=5, label_times=3, frozen_weight=1.0, energy_weight=7.0)
+
+
+def errors_of(run, psi):
+    """What the fit's residuals are, of each coordinate and of the energy, for ψ̄ at labels (3, 5, 2) of the pendulum."""
+    y = run.whole._y.T.reshape(3, 5, 2)
+    spread = np.std(PENDULUM.hamiltonian(run.whole._x[:, :5].T))
+    energy = math.sqrt(7.0) / spread * (PENDULUM.gradient(y) * (psi - y)).sum(-1)
+    return np.concatenate([np.moveaxis(psi - y, -1, -2), energy[:, None]], axis=1).ravel() / math.sqrt(15)
+
+
 @pytest.mark.parametrize("palindromic", [True, False])
 def test_the_fits_derivatives(palindromic):
     """Residuals and Jacobian by the flow's parameters, against the flow itself."""
     flow = SympFlow.primed(PENDULUM, 2, degree=3, palindromic=palindromic, dt=0.8).requires_grad_(False)
-    run = GaussNewtonRun.start(
-        flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), TableConfig(points=5, label_times=3, frozen_weight=1.0)
-    )
+    run = GaussNewtonRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), FEW)
     table, labels_x = Table(flow), torch.as_tensor(run.whole._x[:, :5].T)
     theta = table.parameters() + 0.02 * np.random.default_rng(0).normal(size=flow.n_parameters)
     r, J = run.whole.linearized(theta)
     np.testing.assert_allclose(r, run.whole.residuals(theta), atol=1e-15)
     table.assign(theta)
     executed = torch.stack([flow.psi(float(t), labels_x) for t in 0.8 * np.arange(1, 4) / 3])
-    expected = np.moveaxis(executed.numpy() - run.whole._y.T.reshape(3, 5, 2), -1, -2) / math.sqrt(15)
-    np.testing.assert_allclose(r, expected.ravel(), atol=1e-15)
+    np.testing.assert_allclose(r, errors_of(run, executed.numpy()), atol=1e-15)
     e = 1e-6
     for i in range(len(theta)):
         d = e * np.eye(len(theta))[i]
@@ -257,17 +265,13 @@ def test_a_degenerate_direction_does_no_harm():
 
 def test_the_fits_derivatives_with_a_processor():
     flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=2, dt=0.8)
-    run = GaussNewtonRun.start(
-        flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), TableConfig(points=5, label_times=3, frozen_weight=1.0)
-    )
+    run = GaussNewtonRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), FEW)
     table = Table(flow)
     theta = table.parameters() + np.random.default_rng(0).normal(0, 0.05, flow.n_parameters)
     table.assign(theta)
     r, J = run.whole.linearized(theta)
     x, t = torch.as_tensor(run.whole._x[:, :5].T), torch.tensor([[0.8 / 3], [1.6 / 3], [0.8]], dtype=torch.float64)
-    predicted = flow.psi(t, x.expand(3, 5, 2)).detach().numpy().transpose(0, 2, 1)
-    labelled = run.whole._y.reshape(2, 3, 5).transpose(1, 0, 2)
-    np.testing.assert_allclose(r, ((predicted - labelled) / math.sqrt(15)).ravel(), atol=1e-14)
+    np.testing.assert_allclose(r, errors_of(run, flow.psi(t, x.expand(3, 5, 2)).detach().numpy()), atol=1e-14)
     e = 1e-6
     for i in range(len(theta)):
         d = e * np.eye(len(theta))[i]
@@ -368,9 +372,21 @@ def test_without_force_gradients_the_search_finds_negative_coefficients():
 def test_the_weight_at_dt_counts():
     def errors(weight):
         flow = SympFlow.primed(HH, 2, degree=1)  # one table for all t: a compromise
-        return train(HH, flow=flow, frozen_weight=weight, **QUICK).figures["one_step_error"]
+        return train(HH, flow=flow, frozen_weight=weight, energy_weight=0.0, **QUICK).figures["one_step_error"]
 
     assert errors(100.0) < errors(0.01)
+
+
+def test_the_weight_of_the_energy_counts():
+    """One long run for another: a lower energy error of the same states, a larger error of the state in one step."""
+    y, found = HH.domain.sample(50, 5), []
+    for weight in (0.0, 1000.0):
+        flow = train(HH, flow=SympFlow.primed(HH, 1, dt=1.0, processor=3), energy_weight=weight, **QUICK)
+        sol = sympflow.solve(HH, flow, (0.0, 200.0), y, on_domain_exit="ignore")
+        found.append((flow.figures["one_step_error"], np.median(sympflow.max_energy_error(sol))))
+    (state, energy), (other_state, other_energy) = found
+    assert other_energy < 0.9 * energy
+    assert state < other_state
 
 
 def test_by_default_it_makes_a_primed_flow():
@@ -457,6 +473,7 @@ def test_progress(capsys):
         ({"loss": "energy"}, ValueError, r"^`loss` 'energy' is unknown"),
         ({"residual_weight": 2.0}, TypeError, r"^`residual_weight` is not an option .* without a `loss`"),
         ({"frozen_weight": math.nan}, ValueError, r"^`frozen_weight` must be positive"),
+        ({"energy_weight": -1.0}, ValueError, r"^`energy_weight` must be finite and at least 0; got -1.0"),
         ({"label_times": 2.0}, ValueError, r"^`label_times` must be"),
         ({"seed": -1}, ValueError, r"^`seed` must be"),
         ({"flow": SympFlow(2)}, TypeError, r"^`restarts` is not an option of the .* of kind 'sympflow'"),

@@ -52,6 +52,8 @@ FLOWS = {
     "processed, no gradients": lambda: random_flow(RELATIVISTIC, scheme="mclachlan4", palindromic=False, processor=3),
     "curvature": lambda: random_flow(HH, stages=2, degree=3, curvature=True),
     "processed, with curvature": lambda: random_flow(MASSES, scheme="verlet", processor=1, curvature=True),
+    "polynomial": lambda: random_flow(HH, stages=2, degree=3, polynomial=4),
+    "processed, with polynomials": lambda: random_flow(MASSES, size=0.01, scheme="verlet", processor=1, polynomial=4),
     "another dt": lambda: random_flow(HH, stages=2, dt=0.3, degree=1),
 }
 
@@ -328,6 +330,13 @@ def test_another_system_is_refused(tmp_path):
         {"curvature": 1},
         {"curvature": True},
         {"curvature": True, "force_gradient": False},
+        {"monomials": [[0, 2]]},
+        {"monomials": [[0, 2]], "force_gradient": False},
+        {"monomials": [[0, 2, 1]], "force_gradient": False},
+        {"monomials": [[0, 0]], "force_gradient": False},
+        {"monomials": [[-1, 2]], "force_gradient": False},
+        {"monomials": [[0, 2]] * 61, "force_gradient": False},
+        {"monomials": 3},
         {"degree": 3},
     ],
 )
@@ -383,6 +392,11 @@ def test_it_trains_like_any_sympflow():
         ({"scheme": "chin4a", "force_gradient": False}, r"^`force_gradient` is False but 'chin4a'"),
         ({"dt": -1.0}, r"^`dt` must be a positive"),
         ({"processor": -1}, r"^`processor` must be a non-negative integer"),
+        ({"polynomial": 0}, r"^`polynomial` must be a positive integer, its degree; got 0"),
+        ({"polynomial": True}, r"^`polynomial` must be a positive integer, its degree; got True"),
+        ({"polynomial": 20}, r"^`polynomial` 20 makes more than 60 monomials in 2 coordinates: take a lower degree"),
+        ({"polynomial": 4, "curvature": True}, r"^`polynomial` stands in place of `force_gradient` and `curvature`"),
+        ({"polynomial": 4, "scheme": "chin4a"}, r"^`polynomial` stands in place of force gradients, as 'chin4a' has"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):

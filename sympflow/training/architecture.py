@@ -21,7 +21,7 @@ from sympflow.training.recipes import default_recipe
 KINDS = ("primed", "sympflow", "mlp")
 OF_NETWORKS = ("pairs", "hidden", "activation")
 OF_PRIMED = ("stages", "processor")
-OF_SEARCHES = ("restarts", "frozen_weight")
+OF_SEARCHES = ("restarts", "frozen_weight", "energy_weight")
 OF_LOSSES = ("residual_weight", "matching_weight", "label_weight", "matching_times")
 OF_GRADIENTS = ("learning_rate", "schedule", "clip")
 NOT_OF_SEARCHES = (*OF_GRADIENTS, "refresh", "validate_every", "validation_points", "checkpoint_every")

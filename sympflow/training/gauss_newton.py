@@ -1,8 +1,9 @@
 """Gauss–Newton training of primed flows: the numbers of a splitting table, fitted to the exact flow of a system.
 
 In three stages. First the table frozen at Δt, a dozen or two numbers, from many random starts, each followed for a
-few iterations: the cost has many local minima. Then the best of these to the end of their narrow valleys. Then the
-polynomials in t, from the best of these tables, to labels at several times in (0, Δt].
+few iterations: the cost has many local minima. Then the best of these to the end of their narrow valleys, at last with
+the weight of the energy, with which these are harder to find. Then the polynomials in t, from the best of these tables,
+to labels at several times in (0, Δt].
 
 Other losses (the residual of the flow, Hamiltonian matching) join in the last stage. Without labels there is that stage
 alone, from each start.
@@ -34,6 +35,7 @@ from sympflow.training.table_jacobian import TableStep
 
 FINALISTS = 4  # tables of the search that are followed to the end
 FITTED = 2  # tables from which the polynomials are fitted
+HOPELESS = 100.0  # times the cost of the best table at Δt: polynomials are not fitted from there
 SEARCH_STEPS = 60  # iterations from each start
 FROZEN_SHARE = 0.7  # of a time budget, that all work on frozen tables may use
 FRACTIONAL_TIMES = 50
@@ -52,6 +54,7 @@ class GaussNewtonRun(SearchRun):
     scaling: Scaling
     step: TableStep
     frozen: TableFit | None
+    weighted: TableFit | None
     whole: Fit
     held_out: Labels
     kept_start: bool = field(default=False, init=False)
@@ -77,7 +80,7 @@ class GaussNewtonRun(SearchRun):
         step, table = TableStep(system, flow.sequence, flow.tables.level, flow.monomials), Table(flow)
         unit = np.array(scaling.x)
         parts: list[tuple[float, Fit]] = []
-        frozen = None
+        frozen = weighted = None
         if config.label_weight and data is None:
             numbers = table.frozen(flow.dt)[1].shape[-1]
             enough = math.ceil(RESIDUALS * numbers / (2 * system.ndof))
@@ -87,10 +90,12 @@ class GaussNewtonRun(SearchRun):
             labels = Labels.of(system, x, t)
             if len(labels.x) == 0:
                 raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
-            frozen = TableFit(step, labels.at(-1), *table.frozen(flow.dt), unit, np.ones(1))
+            slope = energy_slope(system, labels, config.energy_weight)
+            frozen, weighted = _with_and_without(step, labels.at(-1), table.frozen(flow.dt), unit, slope)
             weight = np.where(t < t[-1], 1.0, config.frozen_weight)
-            labels = labels.first(max(FITTED_POINTS, enough // 2))
-            parts.append((config.label_weight, TableFit(step, labels, *table.polynomial(t), unit, weight)))
+            labels = labels.first(fewer := max(FITTED_POINTS, enough // 2))
+            slope = None if slope is None else slope[:, :fewer]
+            parts.append((config.label_weight, TableFit(step, labels, *table.polynomial(t), unit, weight, slope)))
         elif config.label_weight and data is not None:
             at_end = np.abs(data[0] - flow.dt) <= 1e-9 * flow.dt
             if not (at_end.any() or config.residual_weight or config.matching_weight):
@@ -101,7 +106,8 @@ class GaussNewtonRun(SearchRun):
                 )
             if 2 * system.ndof * at_end.sum() >= 2 * table.n:
                 labels = Labels(data[0][at_end][-1:], data[1][at_end], data[2][at_end][None])
-                frozen = TableFit(step, labels, *table.frozen(flow.dt), unit, np.ones(1))
+                slope = energy_slope(system, labels, config.energy_weight)
+                frozen, weighted = _with_and_without(step, labels, table.frozen(flow.dt), unit, slope)
         if config.residual_weight or config.matching_weight or data is not None:
             rest = config.label_weight if data is not None else 0.0
             loss = Loss(system, scaling, config.residual_weight, config.matching_weight, rest)
@@ -112,7 +118,7 @@ class GaussNewtonRun(SearchRun):
         t = flow.dt * (np.arange(FRACTIONAL_TIMES) + 0.5) / FRACTIONAL_TIMES
         held_out = Labels.of(system, x, np.append(t, flow.dt))
         whole = parts[0][1] if len(parts) == 1 else StackedFit(*parts)  # one weight changes nothing
-        return cls(flow, system, domain, config, scaling, step, frozen, whole, held_out)
+        return cls(flow, system, domain, config, scaling, step, frozen, weighted, whole, held_out)
 
     def next_minimum(self, stop: Stop) -> Minimum:
         steps = min(SEARCH_STEPS, self.config.steps)
@@ -125,8 +131,11 @@ class GaussNewtonRun(SearchRun):
     def complete(self, spent: Callable[..., bool]) -> None:
         finalists, frozen, steps = _distinct(self.minima)[:FINALISTS], self.frozen, self.config.steps
         if frozen is not None:
-            finalists = [frozen.minimize(m.x, steps, lambda: spent(FROZEN_SHARE), thorough=True) for m in finalists]
-        starts = [self.given, *(self._continued(m) for m in _distinct(finalists)[:FITTED])]
+            for fit in filter(None, (frozen, self.weighted)):
+                finalists = [fit.minimize(m.x, steps, lambda: spent(FROZEN_SHARE), thorough=True) for m in finalists]
+        starts = [self._continued(m) for m in _distinct(finalists)[:FITTED]]
+        if frozen is None or self._frozen_cost(self.given) < HOPELESS * min(m.cost for m in finalists):
+            starts.insert(0, self.given)
         fitted = [self.whole.minimize(theta, steps, spent, thorough=True) for theta in starts]
         best = min(fitted, key=lambda m: m.cost)
         if not math.isfinite(best.cost):
@@ -134,6 +143,15 @@ class GaussNewtonRun(SearchRun):
         self.table.assign(best.x)
         self._keep_better()
         self._record(best)
+
+    def _frozen_cost(self, theta: np.ndarray) -> float:
+        """What parameters cost at Δt; infinite if they lead to no finite states."""
+        fit = self.weighted or self.frozen
+        assert fit is not None
+        offset, design = self.table.polynomial(np.array([self.table.dt]))
+        x = np.linalg.lstsq(fit.design[0], offset[0] + design[0] @ theta, rcond=None)[0]
+        r = fit.residuals(x)
+        return float(r @ r) if np.isfinite(r).all() else math.inf
 
     def remarks(self) -> dict[str, Any]:
         return {"kept_start": True} if self.kept_start else {}
@@ -181,6 +199,22 @@ class GaussNewtonRun(SearchRun):
         }
         self.history.append(figures)
         return figures
+
+
+def energy_slope(system: HamiltonianSystem, labels: Labels, weight: float) -> np.ndarray | None:
+    """∇H at the labels (J, N, 2d), divided by the spread of H over Ω: `TableFit`; None if it is to count nothing."""
+    spread = float(np.std(system.hamiltonian(labels.x)))
+    if not (weight > 0 and 0 < spread < math.inf):
+        return None
+    return math.sqrt(weight) / spread * system.gradient(labels.y)
+
+
+def _with_and_without(
+    step: TableStep, labels: Labels, table: tuple[np.ndarray, np.ndarray], unit: np.ndarray, slope: np.ndarray | None
+) -> tuple[TableFit, TableFit | None]:
+    """The fit of a frozen table without a weight of the energy, by which valleys are found, and the one with it."""
+    first = TableFit(step, labels, *table, unit, np.ones(1))
+    return first, None if slope is None else TableFit(step, labels, *table, unit, np.ones(1), slope[-1:])
 
 
 def _distinct(minima: list[Minimum]) -> list[Minimum]:

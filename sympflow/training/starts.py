@@ -64,6 +64,7 @@ def _of_primed(system: HamiltonianSystem, domain: Domain, flow: PrimedFlow, give
         "restarts",
         "label_times",
         "frozen_weight",
+        "energy_weight",
         "matching_times",
         "seed",
         "reference_states",
@@ -79,7 +80,7 @@ def _of_primed(system: HamiltonianSystem, domain: Domain, flow: PrimedFlow, give
 def _of_split(system: HamiltonianSystem, domain: Domain, flow: SplitFlow, given: dict[str, Any]) -> SplitRun:
     if given["loss"] not in (None, "labels"):
         raise ValueError(f"`loss` {given['loss']!r} is not one that Gauss–Newton fits split flows by: use 'labels'.")
-    others = (*NOT_OF_SEARCHES, *OF_LOSSES, "data")
+    others = (*NOT_OF_SEARCHES, *OF_LOSSES, "data", "energy_weight")
     refuse_options(given, others, "optimizer 'gauss-newton' for split flows")
     names = ("points", "steps", "restarts", "label_times", "frozen_weight", "seed", "reference_states")
     return SplitRun.start(flow, system, domain, SplitConfig(**_chosen(given, names)))

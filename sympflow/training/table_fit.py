@@ -84,6 +84,8 @@ class TableFit(Fit):
     unit : (2d,)
         Residuals are divided by it.
     weight : (J,)
+    slope : (J, N, 2d), optional
+        Of the energy, in such units that an error δ counts by slope·δ besides.
     """
 
     def __init__(
@@ -94,13 +96,16 @@ class TableFit(Fit):
         design: np.ndarray,
         unit: np.ndarray,
         weight: np.ndarray,
+        slope: np.ndarray | None = None,
     ) -> None:
         self.step, self.offset, self.design = step, offset, design
         self.times, self.count = len(labels.t), len(labels.x)
         self._x = np.tile(labels.x.T, (1, self.times))
         self._y = np.ascontiguousarray(labels.y.reshape(-1, labels.x.shape[1]).T)
         # The sum of squares is a mean over states and times.
-        self._scale = np.repeat(weight, self.count) / unit[:, None] / math.sqrt(self.times * self.count)
+        each = np.repeat(weight, self.count) / math.sqrt(self.times * self.count)
+        self._scale = each / unit[:, None]
+        self._slope = None if slope is None else each * slope.reshape(-1, slope.shape[-1]).T
 
     def coefficients(self, theta: np.ndarray) -> np.ndarray:
         """(n, P), P = J N."""
@@ -109,18 +114,25 @@ class TableFit(Fit):
     def residuals(self, theta: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
             y = self.step(self.coefficients(theta), self._x)
-            return self._rows((y - self._y) * self._scale).ravel()
+            return self._rows(self._errors(y - self._y)).ravel()
 
     def linearized(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         y, J = self.step.with_jacobian(self.coefficients(theta), self._x)
-        by_table = self._rows(J * self._scale)  # (J, 2d N, n)
+        by_table = self._rows(self._errors(J))  # (J, (2d + 1) N, n)
         J = (by_table @ self.design).reshape(-1, self.design.shape[-1])
-        return self._rows((y - self._y) * self._scale).ravel(), J
+        return self._rows(self._errors(y - self._y)).ravel(), J
+
+    def _errors(self, change: np.ndarray) -> np.ndarray:
+        """Of each coordinate, and of the energy: (..., 2d + 1, P)."""
+        scaled = change * self._scale
+        if self._slope is None:
+            return scaled
+        return np.concatenate([scaled, (change * self._slope).sum(-2, keepdims=True)], axis=-2)
 
     def _rows(self, values: np.ndarray) -> np.ndarray:
-        """(..., 2d, P) with times first: (J, 2d N, ...)."""
+        """(..., 2d + 1, P) with times first: (J, (2d + 1) N, ...)."""
         split = values.reshape(*values.shape[:-1], self.times, self.count)
-        rows = np.moveaxis(split, -2, 0)  # (J, ..., 2d, N)
+        rows = np.moveaxis(split, -2, 0)  # (J, ..., 2d + 1, N)
         rows = rows.reshape(self.times, *rows.shape[1:-2], -1)
         return np.moveaxis(rows, -1, 1)
 

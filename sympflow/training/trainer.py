@@ -53,6 +53,7 @@ def train(
     restarts: int | None = None,
     label_times: int | None = None,
     frozen_weight: float | None = None,
+    energy_weight: float | None = None,
     checkpoint: Path | None = None,
     checkpoint_every: int | None = None,
     resume: Path | None = None,
@@ -104,6 +105,9 @@ def train(
     restarts, label_times, frozen_weight
         Of "gauss-newton" on a primed or a split flow, which takes of those above `steps`, `points`, `seed` and
         `reference_states`: see `search_config`. `label_times` counts for a network's `label_weight` too.
+    energy_weight : float, optional
+        Of "gauss-newton" on a primed flow: how much an error in the energy counts beside those of the coordinates. 10
+        by default; 1000 for runs of which only the energy matters, 0 for none.
     checkpoint : path, optional
         Write the state of the run there every `checkpoint_every` steps, atomically.
     resume : path, optional

@@ -1,0 +1,130 @@
+"""Kicks with a polynomial in q: its monomials, their derivatives, and tables that carry it."""
+
+import numpy as np
+import pytest
+import sympy as sp
+import torch
+
+import sympflow
+from sympflow import HamiltonianSystem, SympFlow, systems, train
+from sympflow.integrators.scheme import Scheme
+from sympflow.integrators.splitting import Splitting
+from sympflow.kernels.splitting import splitting_kernel
+from sympflow.monomials import gradient, in_monomials, monomials, value
+from sympflow.training.ladder import Rung
+
+EPS = np.finfo(float).eps
+HH, QUARTIC = systems.henon_heiles(), systems.quartic()
+MONOMIALS = ((2, 0), (1, 1), (0, 3), (2, 3))
+
+
+def of(V):
+    return HamiltonianSystem.from_sympy(f"(p1**2 + p2**2)/2 + {V}").symbols
+
+
+@pytest.mark.parametrize(
+    ("V", "degree", "expected"),
+    [
+        ("q1**4 + q2**4 + q1**2", 4, {(0, 2), (2, 0), (0, 4), (2, 2), (4, 0)}),
+        ("q1**2*q2 - q2**3", 3, {(0, 1), (0, 2), (2, 0), (0, 3), (2, 1)}),
+        ("q1**4 + q1*q2**3", 2, {(0, 2), (1, 1), (2, 0)}),  # even only in both together
+        ("cos(q1) + q2", 2, {(0, 1), (0, 2), (2, 0)}),
+    ],
+)
+def test_monomials_are_as_even_as_the_potential(V, degree, expected):
+    assert set(monomials(of(V), degree)) == expected
+
+
+def test_no_monomial_is_left():
+    with pytest.raises(
+        ValueError, match="`polynomial` 1 leaves no monomial that V is as even as: take a higher degree"
+    ):
+        SympFlow.primed(QUARTIC, 2, polynomial=1)
+
+
+def test_a_system_without_symbols_has_no_polynomial():
+    plain = HamiltonianSystem(lambda q: (q**2).sum(-1) / 2, ndof=1)
+    with pytest.raises(ValueError, match=r"^`polynomial` is for symbolic systems"):
+        SympFlow.primed(plain, 2, polynomial=4)
+
+
+def test_the_force_gradient_of_a_polynomial_is_one():
+    q = np.random.default_rng(0).normal(size=(5, 2))
+    symbols, of_kicks = QUARTIC.symbols, monomials(QUARTIC.symbols, 6)
+    e = in_monomials(symbols.force_gradient, symbols, of_kicks)
+    expected = -(QUARTIC.force(q) ** 2).sum(-1) / 2
+    np.testing.assert_allclose(value(of_kicks, e, q), expected, rtol=64 * EPS)
+    assert in_monomials(symbols.force_gradient, symbols, monomials(symbols, 4)) is None
+    assert in_monomials(sp.cos(symbols.q[0]), symbols, of_kicks) is None
+
+
+@pytest.mark.parametrize("each", [False, True], ids=["one polynomial", "one for each state"])
+def test_values_and_gradients(each):
+    """Those of torch by its own differentiation; of NumPy the same."""
+    rng = np.random.default_rng(1)
+    q, c = rng.normal(size=(6, 2)), rng.normal(size=(6, 4) if each else 4)
+    x, t = torch.tensor(q, requires_grad=True), torch.tensor(c)
+    written = sum(t[..., m] * x[:, 0] ** a * x[:, 1] ** b for m, (a, b) in enumerate(MONOMIALS))
+    (slope,) = torch.autograd.grad(written.sum(), x)
+    for numbers, at in ((c, q), (t, torch.tensor(q))):
+        np.testing.assert_allclose(np.asarray(value(MONOMIALS, numbers, at)), written.detach(), rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(np.asarray(gradient(MONOMIALS, numbers, at)), slope, rtol=1e-13, atol=1e-14)
+
+
+def scheme(seed=0, last=0.3):
+    e = 0.1 * np.random.default_rng(seed).normal(size=(2, len(MONOMIALS)))
+    stages = (tuple(e[0]), tuple(e[1]), tuple(e[0]))
+    return Scheme("s", None, (0.3, 0.4, last), (0.5, 0.5, 0.0), (0.0,) * 3, "a test", True, (), stages, MONOMIALS)
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+@pytest.mark.parametrize("last", [0.3, 0.2])
+def test_compiled_runs_are_the_steps_of_arrays(last, compensated):
+    table = scheme(last=last)
+
+    class Stepper(Splitting):
+        name, scheme = "s", table
+
+    kernel, stepper, y = splitting_kernel(HH), Stepper(), HH.domain.sample(11, 0)
+    expected = [y]
+    for _ in range(3):
+        expected.append(stepper.step(HH, 0.0, expected[-1], 0.2))
+    save = np.array([0, 1, 3])
+    expected = np.stack([expected[n] for n in save], axis=1)
+    many, _ = kernel.run_batch(table, 0.2, y, 3, save, compensated)
+    one, _ = kernel.run(table, 0.2, y[4], 3, save, compensated)
+    np.testing.assert_allclose(many, expected, atol=16 * EPS)
+    np.testing.assert_allclose(one, expected[4], atol=16 * EPS)
+    h = np.linspace(-0.2, 0.3, 11)
+    there = kernel.step(table, h, y)
+    np.testing.assert_allclose(there, stepper.step(HH, 0.0, y, h), atol=16 * EPS)
+    np.testing.assert_allclose(kernel.step(table.inverse(), h, there), y, atol=16 * EPS)
+    np.testing.assert_allclose(stepper.inverse(HH, 0.0, there, h), y, atol=16 * EPS)
+    assert table.symmetric == (last == 0.3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"monomials": MONOMIALS[:3]}, "`polynomials` must have 3 coefficients per stage"),
+        ({"polynomials": ((0.0,) * 4,)}, "`polynomials` must have 4 coefficients per stage"),
+        ({"gradients": (0.1, 0.0, 0.0)}, "`polynomials` stand in place of `gradients`"),
+    ],
+)
+def test_tables_that_do_not_fit_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Scheme(**(vars(scheme()) | changes))
+
+
+def test_a_rung_takes_over_the_force_gradients():
+    """Where a polynomial holds ½|∇V|², the search begins at the table without one; and comes nearer than that."""
+    options = {"restarts": 1, "points": 60, "label_times": 2, "reference_states": 50}
+    before = train(QUARTIC, flow=SympFlow.primed(QUARTIC, 3, dt=0.5, processor=2), **{**options, "restarts": 3})
+    start, after = Rung(3, 0.5, 2, 1, polynomial=6, after="primed-3-0.5"), {}
+    flow = start.train(QUARTIC, before, steps=1, callback=lambda n, figures: after.update(figures), **options)
+    assert flow.monomials == monomials(QUARTIC.symbols, 6)
+    assert after["one_step_error"] < before.figures["one_step_error"]
+    assert flow.kernel_scheme().symmetric
+    sol = sympflow.solve(QUARTIC, flow, (0.0, 3.3), QUARTIC.domain.sample(4, 1))
+    assert sol.stats["backend"] == "compiled"
+    assert sympflow.symplecticity_defect(sol).max() < 1e-12
