@@ -14,12 +14,12 @@ of Δt only K is executed, as the χ between two steps cancel.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from sympflow.flow.base import FlowMap
 from sympflow.flow.coefficients import Coefficients, Entry
@@ -36,6 +36,7 @@ from sympflow.flow.primed_potentials import (
     PrimedPotential,
     Term,
 )
+from sympflow.flow.sequences import Terms, alternating, columns_of, substeps_of
 from sympflow.flow.sympflow import SympFlow
 from sympflow.integrators.scheme import Scheme
 from sympflow.monomials import Monomials
@@ -123,30 +124,15 @@ class PrimedFlow(SympFlow):
             raise ValueError("`monomials` stand in place of force gradients: leave these out.")
         self.degree, self.palindromic, self.processor, self.monomials = degree, palindromic, processor, monomials
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
-        kernel, chi = _alternating(first, maps), _alternating(first, 2 * processor + 1 if processor else 0)
-
-        def column(sequence: Sequence[Kind], kind: Kind, power: int, mirrored: bool, total: float | None = None) -> Any:
-            # Degrees in t: t b(τ) has the given one, and so have polynomials, of which there are many.
-            exponents = tuple(range(0, max(degree - 2 * bool(monomials and power > 1), 1), 2 if palindromic else 1))
-            return Coefficients(sequence.count(kind), exponents, self.dt, power, mirrored, total, **like)
-
-        def columns(sequence: Sequence[Kind], mirrored: bool, total: float | None) -> tuple[Any, ...]:
-            if not sequence:
-                return (None,) * 5
-            return (
-                column(sequence, "kick", 1, mirrored, total),
-                column(sequence, "drift", 1, mirrored, total),
-                column(sequence, "kick", 3, mirrored) if force_gradient else None,
-                column(sequence, "kick", 5, mirrored) if curvature else None,
-                nn.ModuleList(column(sequence, "kick", 3, mirrored) for _ in monomials) if monomials else None,
-            )
-
-        inside, outside = columns(kernel, palindromic, 1.0), columns(chi, False, None)
+        kernel, chi = alternating(first, maps), alternating(first, 2 * processor + 1 if processor else 0)
+        stride, terms = 2 if palindromic else 1, Terms(force_gradient, curvature, len(monomials))
+        inside = columns_of(kernel, degree, stride, self.dt, palindromic, 1.0, terms, **like)
+        outside = columns_of(chi, degree, stride, self.dt, False, None, terms, **like)
         self.kicks, self.drifts, self.gradients, self.curvatures, self.polynomials = inside
         self.processor_kicks, self.processor_drifts, self.processor_gradients = outside[:3]
         self.processor_curvatures, self.processor_polynomials = outside[3:]
-        inner = _substeps(kernel, inside, 1)
-        outer = {sign: _substeps(chi, outside, sign) for sign in (1, -1)}
+        inner = substeps_of(kernel, inside, 1)
+        outer = {sign: substeps_of(chi, outside, sign) for sign in (1, -1)}
         self.substeps: tuple[Substep, ...] = (*reversed(outer[-1]), *inner, *outer[1])
         self._n_outer = len(chi)
         self._tables = KeptTables(self.substeps, self._n_outer, self.dt, monomials)
@@ -294,18 +280,3 @@ class PrimedFlow(SympFlow):
                 **({"monomials": [list(m) for m in self.monomials]} if self.monomials else {}),
             },
         }
-
-
-def _alternating(first: Kind, n: int) -> tuple[Kind, ...]:
-    other: Kind = "drift" if first == "kick" else "kick"
-    return tuple(first if i % 2 == 0 else other for i in range(n))
-
-
-def _substeps(sequence: Sequence[Kind], columns: Sequence[Any], sign: int) -> list[Substep]:
-    kicks, drifts, gradients, curvatures, polynomials = columns
-    more = [c for c in (gradients, curvatures) if c is not None] if polynomials is None else polynomials
-    made = []
-    for i, kind in enumerate(sequence):
-        one, *others = [kicks, *more] if kind == "kick" else [drifts]
-        made.append(Substep(kind, Entry(one, i // 2, sign), tuple(Entry(c, i // 2, sign) for c in others)))
-    return made

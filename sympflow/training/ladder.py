@@ -248,9 +248,13 @@ def ladders() -> dict[str, Ladder]:
         "henon-heiles": (
             # Of six seeds the one whose energy error over a long time is the lowest: the fit looks at single steps.
             Rung(1, 0.82, options={"seed": 4, "energy_weight": 1000.0}),
-            *(Rung(3, dt, curvature=True) for dt in (1.8, 1.6, 1.0, 0.8, 0.6, 0.4)),
+            *(Rung(3, dt, curvature=True) for dt in (1.6, 1.4, 1.0, 0.8, 0.6, 0.4)),
         ),
-        "pendulum": (Rung(2, 1.5), *(Rung(3, dt, curvature=True) for dt in (2.0, 1.5, 1.0, 0.8, 0.6, 0.4))),
+        "pendulum": (
+            Rung(2, 1.5, options=plain),
+            *(Rung(3, dt, curvature=True, options=plain) for dt in (2.0, 1.5)),
+            *(Rung(3, dt, curvature=True) for dt in (1.0, 0.8, 0.6, 0.4)),
+        ),
         "quartic": (
             Rung(1, 0.5),
             *(Rung(3, dt) for dt in (0.75, 0.6, 0.5, 0.4)),
