@@ -136,6 +136,7 @@ ABLATION = (
     Variant("labels + residual", training=(("loss", "labels+residual"), ("restarts", 4), ("steps", 30))),
     Variant("residual", training=(("loss", "residual"), ("restarts", 4), ("steps", 30))),
     Variant("residual + matching", training=(("loss", "residual+matching"), ("restarts", 4), ("steps", 30))),
+    Variant("energy not weighted", training=(("energy_weight", 0.0),)),
     Variant("Δt weighted 10 times", training=(("frozen_weight", 10.0),)),
 )
 

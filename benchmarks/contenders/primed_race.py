@@ -50,6 +50,7 @@ class Runner:
             return cls._through_solve(name, flow.scheme.force_evaluations, system, partial(LogSympFlow, flow=flow))
         kernel, scheme = PrimedFlowKernel(flow, system), flow.kernel_scheme()
         name = f"Δt = {flow.dt:g}, {scheme.force_evaluations} + {flow.processor}"
+        name += f", degree {max(map(sum, flow.monomials))}" if flow.monomials else ""
         many = partial(kernel.run_batch, threads=1)
         return cls(name, scheme.force_evaluations, scheme.hessian_evaluations, kernel.run, many, flow.dt)
 

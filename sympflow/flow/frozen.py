@@ -65,8 +65,8 @@ class Tables:
         self.level = POLYNOMIAL if monomials else max(len(s.more) for s in substeps)
         numbers = [c.table for c in columns_of(substeps)]
         self.compilable = all(c.dtype == torch.float64 and c.device.type == "cpu" for c in numbers)
-        exponents = max((c.exponents for c in columns_of(substeps)), key=len)  # others end before
-        self._coefficients = {id(c): _padded(c, len(exponents)) for c in columns_of(substeps)}
+        exponents = columns_of(substeps)[0].exponents
+        self._coefficients = {id(c): c.table.detach().cpu().double().numpy() for c in columns_of(substeps)}
         self._exponents = np.array(exponents, dtype=float)
         self._even = exponents[1:2] != (1,)
         self._kept: dict[Any, Any] = {}
@@ -195,11 +195,6 @@ def columns_of(substeps: Sequence[Substep]) -> list[Coefficients]:
     """The distinct columns that the substeps take their numbers from."""
     entries = [entry for s in substeps for entry in s.entries]
     return list({id(entry.column): entry.column for entry in entries}.values())
-
-
-def _padded(column: Coefficients, n: int) -> np.ndarray:
-    table = column.table.detach().cpu().double().numpy()
-    return np.pad(table, ((0, 0), (0, n - table.shape[1])))
 
 
 def _numbers(s: Substep, values: dict[int, np.ndarray], sign: int) -> list[Any]:

@@ -42,9 +42,7 @@ def columns_of(
     """Untrained columns of the numbers of a sequence: polynomials in t of that degree, the powers `stride` apart."""
 
     def column(kind: Kind, power: int, total: float | None = None) -> Coefficients:
-        # Degrees in t: t b(τ) has the given one, and so have the coefficients of monomials, of which there are many.
-        exponents = tuple(range(0, max(degree - (2 if terms.monomials and power > 1 else 0), 1), stride))
-        return Coefficients(sequence.count(kind), exponents, dt, power, mirrored, total, **like)
+        return Coefficients(sequence.count(kind), tuple(range(0, degree, stride)), dt, power, mirrored, total, **like)
 
     if not sequence:
         return Columns()

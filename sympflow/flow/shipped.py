@@ -42,6 +42,8 @@ class ShippedFlow:
         Number of kicks in a step of a primed flow, two of which in a row are one; None for a network.
     processor : int
         Number of pairs of its processor.
+    polynomial : int
+        Degree of the polynomials of its kicks, 0 for none.
     cost : float or None
         Of a unit of time, in force evaluations: see `sympflow.training.ladder.cost`. Outputs are not counted.
     energy_error : float or None
@@ -63,6 +65,7 @@ class ShippedFlow:
     dt: float
     stages: int | None
     processor: int
+    polynomial: int
     cost: float | None
     energy_error: float | None
     t_end: float | None
@@ -87,6 +90,7 @@ class ShippedFlow:
             dt=record["dt"] if origin is None else figures["step"],
             stages=None if plan is None else plan["maps"] // 2,
             processor=0 if plan is None else plan.get("processor", 0),
+            polynomial=0 if plan is None else max(map(sum, plan.get("monomials", ())), default=0),
             cost=figures.get("cost"),
             energy_error=figures.get("energy_error_95"),
             t_end=figures.get("t_end"),
@@ -126,6 +130,7 @@ class ShippedFlows(Sequence[ShippedFlow]):
         for f in self._flows:
             architecture = f.kind if f.stages is None else f"primed, {f.stages} kicks"
             architecture = architecture if f.shift is None else "logarithmic, with a clock"
+            architecture += f" of degree {f.polynomial}" if f.polynomial else ""
             architecture += f", processor {f.processor}" if f.processor else ""
             until = "" if f.t_end is None else f" (T = {f.t_end:g})"
             yield (

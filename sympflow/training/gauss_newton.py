@@ -42,7 +42,7 @@ FRACTIONAL_TIMES = 50
 CLOSE = 1.1  # held-out errors that differ by less are the same for a warning
 FEWEST_POINTS, MOST_POINTS, COORDINATES = 40, 250, 1000
 FITTED_POINTS = 120  # that are enough for the polynomials in t: at each of several times
-RESIDUALS = 8  # at least, at Δt, for each number of the table; half as many for the polynomials in t
+RESIDUALS = 10  # at least, at Δt, for each number of the table; half as many for the polynomials in t
 
 
 @dataclass

@@ -26,7 +26,8 @@ KINDS = (*networks.KINDS, "primed", "split")
 
 
 def path(name: str, kind: str, folder: Path | None = None) -> Path:
-    """The file of a scene's flow, in the package if no folder is given; a primed one's kind is primed-STAGES-DT."""
+    """The file of a scene's flow, in the package if no folder is given; the kind of a
+    rung of a ladder is its name."""
     folder = Path(str(resources.files("sympflow"))) / "pretrained" if folder is None else folder
     return folder / f"{name}-{kind}.safetensors"
 
@@ -43,7 +44,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("scenes", nargs="*", metavar="scene", help=f"of {', '.join(scenes())}; all if none is named")
     parser.add_argument("--kind", choices=KINDS, help="one architecture only")
-    parser.add_argument("--rung", help="one rung only of a ladder of primed flows: primed-STAGES-DT")
+    parser.add_argument("--rung", help="one rung only of a ladder of primed flows, for instance primed-3-0.08")
     parser.add_argument("--out", type=Path, help="folder to write to (default: the package)")
     parser.add_argument("--measure", action="store_true", help="only measure the files that are there")
     parser.add_argument("--keep", action="store_true", help="with --measure: put the figures into the files")
@@ -51,6 +52,9 @@ def main(arguments: list[str] | None = None) -> None:
     unknown = sorted(set(options.scenes) - set(scenes()))
     if unknown:
         parser.error(f"unknown scene {', '.join(unknown)}: choose from {', '.join(scenes())}")
+    rungs = [rung.name for ladder in ladders().values() for rung in ladder.rungs]
+    if options.rung is not None and options.rung not in rungs:
+        parser.error(f"unknown rung {options.rung}: choose from {', '.join(dict.fromkeys(rungs))}")
     torch.set_num_threads(1)  # the arrays are small, and one thread is reproducible
     kinds = (options.kind,) if options.kind else ("primed",) if options.rung else KINDS
     for name in options.scenes or scenes():
