@@ -116,8 +116,9 @@ def henon_heiles(quick: bool) -> Iterator[Pair]:
     yield pair("T = 1e3, the end", 20.0 if quick else 1e3)
     yield pair("T = 1e4, the end", 20.0 if quick else 1e4)
     yield pair("T = 1e5, the end", 20.0 if quick else 1e5)
-    yield pair("T = 1e3, 1000 outputs", 20.0 if quick else 1e3, outputs=20 if quick else 1000)
-    yield pair("the same between all steps", 20.0 if quick else 1e3, outputs=19 if quick else 999)
+    outputs = 20 if quick else 1000
+    yield pair(f"T = {outputs * step:g}, {outputs} outputs", outputs * step, outputs=outputs)
+    yield pair("T = 1e3, as many between steps", 20.0 if quick else 1e3, outputs=outputs - 1)
     yield pair(f"T = 1e3, {len(many)} trajectories", 20.0 if quick else 1e3, many)
 
 

@@ -266,8 +266,8 @@ def ladders() -> dict[str, Ladder]:
                     ("primed-6-0.6", 0.75),
                     ("polynomial-6-0.75", 1.0),
                     ("polynomial-6-1", 1.4),
-                    ("polynomial-6-0.75", 0.5),
-                    ("polynomial-6-0.5", 0.35),
+                    ("polynomial-6-0.75", 0.45),
+                    ("polynomial-6-0.45", 0.3),
                 )
             ),
         ),
