@@ -260,6 +260,7 @@ def ladders() -> dict[str, Ladder]:
             *(Rung(3, dt) for dt in (0.75, 0.6, 0.5, 0.4)),
             # Deep valleys are found without polynomials.
             Rung(6, 0.6, 8, 1, "srkn6b", options=plain),
+            Rung(6, 0.45, 8, 1, "srkn6b", "primed-6-0.6", options=plain),
             *(
                 Rung(6, dt, 8, 1, "srkn6b", after, polynomial=6, options=followed)
                 for after, dt in (
