@@ -57,7 +57,7 @@ class Path:
         """The states after the steps `count`: compiled where nothing is to be differentiated."""
         save, n_steps = np.unique(count), int(count.max(initial=0))
         y0: Tensor | np.ndarray = self.y0
-        plain = not (self.eager or self._differentiable()) and self.y0.device.type == "cpu"
+        plain = self._plain()
         if plain:
             y0 = self.y0.detach().numpy()
         problem = Problem(self.system, 0.0, n_steps * self.h, y0)
@@ -68,8 +68,17 @@ class Path:
         return states[torch.as_tensor(np.searchsorted(save, count), device=self.y0.device)]
 
     def _step(self, y: Tensor, h: float | Tensor) -> Tensor:
+        """A step of length h, by NumPy (a flow's: compiled) where nothing is to be differentiated."""
+        moving = y.requires_grad or (isinstance(h, Tensor) and h.requires_grad)
         with naming_plugin(self.integrator):
-            return self.integrator.step(self.system, 0.0, y, h)
+            if moving or not self._plain():
+                return self.integrator.step(self.system, 0.0, y, h)
+            length = h.numpy() if isinstance(h, Tensor) else h
+            stepped = self.integrator.step(self.system, 0.0, y.numpy(), length)
+        return torch.from_numpy(np.ascontiguousarray(stepped))
+
+    def _plain(self) -> bool:
+        return not (self.eager or self._differentiable()) and self.y0.device.type == "cpu"
 
     def _differentiable(self) -> bool:
         return torch.is_grad_enabled() and (self.y0.requires_grad or self._learns())
