@@ -1,11 +1,15 @@
-"""Ways on from a primed flow: curvature terms, training on an orbit's tube, a small network on top.
+"""Ways on from a primed flow: other kicks, a weight of the energy, an orbit's tube, a small network on top.
 
-    python benchmarks/primed_ideas.py             all three: a quarter of an hour on one core
+    python benchmarks/primed_ideas.py             all of them: twenty minutes on one core
     python benchmarks/primed_ideas.py --quick     tiny fits
     python benchmarks/primed_ideas.py --idea tube
 
 *Curvature.* The same flow fitted with and without curvature terms, on four systems; the cost is the processor time of a
 compiled step, of Δt each.
+
+*Polynomials.* The same, for polynomials in place of force gradients; the search begins at the flow that has these.
+
+*Energy.* The same flow fitted with several weights of the energy.
 
 *Tube.* On Hénon–Heiles, a flow of 3 kicks, a processor of 6 and Δt = 1 is fitted to the tube of radius 0.03 around one
 orbit in place of the whole well, for three orbits, and its largest energy error over T = 1000 along that orbit stands
@@ -38,8 +42,9 @@ from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.primed import PrimedFlow
 from sympflow.training.figures import one_step_errors
+from sympflow.training.ladder import Rung
 
-IDEAS = ("curvature", "tube", "network")
+IDEAS = ("curvature", "polynomial", "energy", "tube", "network")
 DT, STAGES, PROCESSOR = 1.0, 3, 6
 RADIUS, T_END = 0.03, 1000.0
 ORBITS = {
@@ -54,6 +59,13 @@ CURVATURE = {  # kicks, processor, Δt and, if it is not leapfrog, the scheme to
     "quartic, from srkn6b": (6, 8, 0.6, "srkn6b"),
     "kepler": (3, 6, 0.15, None),
 }
+POLYNOMIALS = {  # kicks, processor, Δt, the scheme to start from, and the degree
+    "quartic": (3, 6, 0.6, None, 6),
+    "quartic, from srkn6b": (6, 8, 0.6, "srkn6b", 6),
+    "henon_heiles": (3, 6, 1.0, None, 4),
+}
+WEIGHTS = (0.0, 10.0, 1000.0)
+WEIGHTED = {"henon_heiles": (3, 6, 1.0), "pendulum": (3, 6, 1.0), "quartic": (3, 6, 0.6)}  # kicks, processor, Δt
 HELD_OUT, SEED = 100, 20_261_121
 FULL = {"restarts": 8}
 QUICK = {"restarts": 1, "steps": 5, "points": 40, "reference_states": 10}
@@ -80,18 +92,53 @@ def curvature(t_end: float, scenes: Any, **options: Any) -> str:
     for name in scenes:
         stages, processor, dt, scheme = CURVATURE[name]
         system = getattr(systems, name.partition(",")[0])()
-        x = system.domain.sample(20, SEED)
         for terms in (False, True):
             first = {"stages": stages} if scheme is None else {"scheme": scheme}
             start = SympFlow.primed(system, **first, dt=dt, processor=processor, curvature=terms)
             flow = train(system, flow=start, progress=False, **options)
-            f = flow.figures
-            lines.append(
-                f"| {name} | {dt:g}, {stages} + {processor} | {'yes' if terms else 'no'} | {f['one_step_error']:.1e} / "
-                f"{f['fractional_error']:.1e} | {energy_error(system, flow, x, t_end):.1e} | "
-                f"{microseconds(system, flow):.4f} |"
-            )
-            print(lines[-1], flush=True)
+            lines.append(row(system, flow, t_end, name, f"{dt:g}, {stages} + {processor}", "yes" if terms else "no"))
+    return "\n".join(lines)
+
+
+def row(system: HamiltonianSystem, flow: PrimedFlow, t_end: float, *cells: str) -> str:
+    """A line of a table, which is printed: the cells, then how near the flow comes, and what a step costs."""
+    f, error = flow.figures, energy_error(system, flow, system.domain.sample(20, SEED), t_end)  # type: ignore[union-attr]
+    found = f"{f['one_step_error']:.1e} / {f['fractional_error']:.1e} | {error:.1e} | {microseconds(system, flow):.4f}"
+    print(line := f"| {' | '.join(cells)} | {found} |", flush=True)
+    return line
+
+
+def polynomial(t_end: float, scenes: Any, **options: Any) -> str:
+    """What polynomials in place of force gradients bring, and what they cost."""
+    lines = [
+        "| system | Δt, kicks + processor | kicks | error at Δt / at fractional t | energy error | µs a step |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name in scenes:
+        stages, processor, dt, scheme, degree = POLYNOMIALS[name]
+        system = getattr(systems, name.partition(",")[0])()
+        shape = f"{dt:g}, {stages} + {processor}"
+        before = None
+        for kind in (None, degree):
+            rung = Rung(stages, dt, processor, options.get("restarts", 1), scheme, polynomial=kind)
+            before = rung.train(system, before, progress=False, **options)
+            lines.append(row(system, before, t_end, name, shape, f"degree {kind}" if kind else "force gradients"))
+    return "\n".join(lines)
+
+
+def energy(t_end: float, scenes: Any, **options: Any) -> str:
+    """What a weight of the energy brings."""
+    lines = [
+        "| system | Δt, kicks + processor | weight | error at Δt / at fractional t | energy error | µs a step |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name in scenes:
+        stages, processor, dt = WEIGHTED[name]
+        system = getattr(systems, name)()
+        for weight in WEIGHTS:
+            start = SympFlow.primed(system, stages, dt=dt, processor=processor)
+            flow = train(system, flow=start, progress=False, energy_weight=weight, **options)
+            lines.append(row(system, flow, t_end, name, f"{dt:g}, {stages} + {processor}", f"{weight:g}"))
     return "\n".join(lines)
 
 
@@ -161,8 +208,12 @@ def run(ideas: list[str], quick: bool) -> str:
     tables = []
     if "curvature" in ideas:
         tables.append(curvature(t_end, ("pendulum",) if quick else CURVATURE, **options))
+    if "polynomial" in ideas:
+        tables.append(polynomial(t_end, ("quartic",) if quick else POLYNOMIALS, **options))
+    if "energy" in ideas:
+        tables.append(energy(t_end, ("pendulum",) if quick else WEIGHTED, **options))
     if not {"tube", "network"} & set(ideas):
-        return tables[0]
+        return "\n\n".join(tables)
     well = fitted(system, **options)
     if "tube" in ideas:
         tables.append(tube(system, well, t_end, **options))

@@ -143,9 +143,7 @@ def reach_times(table, step, h, clock, y0, targets, stride, most_steps, out, cou
     n, saved, j, now = 0, 0, 0, 0.0
     while saved < len(targets) and stop[0] == 0:
         block = stride
-        if (
-            now > 0.0
-        ):  # far from the next output, where it is looked at seldom: half of the steps left, by the pace so far
+        if now > 0.0:  # far from the next output: half of the steps left, by the pace so far
             block = max(stride, min(MOST_AT_ONCE, int(0.5 * n * (targets[saved] - now) / now)))
         block = min(block, most_steps - n)
         start_q, start_p, begin = q, p, j

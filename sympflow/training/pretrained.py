@@ -26,8 +26,7 @@ KINDS = (*networks.KINDS, "primed", "split")
 
 
 def path(name: str, kind: str, folder: Path | None = None) -> Path:
-    """The file of a scene's flow, in the package if no folder is given; the kind of a
-    rung of a ladder is its name."""
+    """The file of a scene's flow, in the package if no folder is given; the kind of a rung is its name."""
     folder = Path(str(resources.files("sympflow"))) / "pretrained" if folder is None else folder
     return folder / f"{name}-{kind}.safetensors"
 

@@ -64,8 +64,8 @@ class TableConfig(SearchConfig):
         By default 250, and fewer for more than 4 degrees of freedom; `label_times` are equidistant.
     energy_weight : float
         Of the labels' errors in the energy, (∇H·δ)² in units of the spread of H over Ω, besides those of the
-        coordinates: as an error of the state grows with time and one of the energy does not, 10 halves the one that
-        long runs have, at no cost for the state; more brings more for the energy alone.
+        coordinates. It is the energy that long runs keep; more than 10 is for those of which only that matters. Where
+        `data` are handed in it counts in the search for the table at Δt alone.
     label_weight, residual_weight, matching_weight : float
         Weights of the labels, of ‖d/dt ψ̄_t(x) − J∇H‖² and of (𝓗 − H − c(t))²; 0 leaves a loss out.
     loss_points, matching_times : int
