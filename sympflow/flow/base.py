@@ -215,6 +215,9 @@ class FlowMap(nn.Module):
 
     def check_system(self, system: HamiltonianSystem) -> None:
         """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
+        mine = self.fingerprint
+        if mine is not None and system.ndof == self.ndof and same_system(mine, system.fingerprint):
+            return
         origin = self.recipe.get("transforms")
         if origin is not None and same_system(origin["fingerprint"], system.fingerprint):
             raise ValueError(
@@ -226,7 +229,7 @@ class FlowMap(nn.Module):
                 f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: "
                 "pass the flow of this system, or train one with sympflow.train(system)."
             )
-        if self.fingerprint is not None and not same_system(self.fingerprint, system.fingerprint):
+        if mine is not None:
             raise ValueError(
                 f"`system` {system.name!r} is not the one that this flow was trained for ({self.system_name!r}, or its "
                 "parameters differ): pass the flow of this system, or train one with sympflow.train(system)."

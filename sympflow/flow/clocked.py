@@ -185,11 +185,11 @@ class ClockedFlow(SympFlow):
 
     def numbers(self) -> tuple[float, ...]:
         """The c_k that the clock has now, the last one first."""
-        snapshot = self._contents.snapshot()
-        if self._numbers is None or self._numbers[0] != snapshot:
+        snapshot, known = self._contents.snapshot(), self._numbers
+        if known is None or known[0] != snapshot:
             values = self.clock.numbers.detach().cpu().double().numpy()[::-1].tolist()
-            self._numbers = snapshot, tuple(values)
-        return self._numbers[1]
+            known = self._numbers = snapshot, tuple(values)
+        return known[1]
 
     def kernel_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
         """The compiled loops of this flow."""

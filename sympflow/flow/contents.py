@@ -31,9 +31,9 @@ class Contents:
 
     def snapshot(self) -> bytes:
         """Equal to an earlier one as long as no number has changed."""
-        tensors = [w for d in self._tensors for w in d.values() if w is not None]
-        addresses = [w.data_ptr() for w in tensors]
+        addresses = [w.data_ptr() for d in self._tensors for w in d.values() if w is not None]
         if addresses != self._addresses or not self._shared:
+            tensors = [w for d in self._tensors for w in d.values() if w is not None]
             self._views = [np.ascontiguousarray(w.detach().cpu().numpy()) for w in tensors]
             self._addresses, self._shared = addresses, all(w.device.type == "cpu" for w in tensors)
         return b"".join(self._views)  # type: ignore[arg-type]

@@ -130,7 +130,7 @@ class FlowIntegrator(FixedStep):
             flow, kernel = self.prepared
         else:
             flow = self._flow_like(system, y)
-            kernel = _kernel(system, flow, y, "array" if backend == "torch" else backend)
+            kernel = kernel_of(system, flow, y, "array" if backend == "torch" else backend)
         if kernel is None:
             return _apply(flow, y, h)
         if y.ndim == 2 and np.shape(h) == (len(y),):
@@ -161,18 +161,11 @@ class FlowIntegrator(FixedStep):
         system, y0 = problem.system, problem.y0
         flow = self.flow_for(system)
         if type(y0) is np.ndarray and y0.dtype == np.float64:  # a kernel says itself what flow it is for
-            kernel = _kernel(system, flow, y0, problem.backend)
+            kernel = kernel_of(system, flow, y0, problem.backend)
             if kernel is not None:
                 return flow, kernel
         flow = self._flow_like(system, y0)
-        return flow, _kernel(system, flow, y0, problem.backend)
-
-    def reach_times(self, problem: Problem, h: float, stride: int, expected: float) -> Any:
-        """`kernels.timed.reach_times` of the times and states of the problem; None where it does not apply."""
-        kernel = self._flow_and_kernel(problem)[1]
-        if not hasattr(kernel, "reach_times"):
-            return None
-        return kernel.reach_times(h, problem.y0, problem.t_eval, stride, expected)
+        return flow, kernel_of(system, flow, y0, problem.backend)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         if self.prepared is not None and hasattr(self.prepared[1], "evaluations"):
@@ -235,7 +228,7 @@ def _apply(function: Any, y: Array, h: float | Array) -> Array:
         return function(length, torch.from_numpy(np.ascontiguousarray(y))).numpy()
 
 
-def _kernel(system: HamiltonianSystem, flow: Any, y: Array, backend: str) -> MLPFlowKernel | PrimedFlowKernel | None:
+def kernel_of(system: HamiltonianSystem, flow: Any, y: Array, backend: str) -> MLPFlowKernel | PrimedFlowKernel | None:
     """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
     if backend == "array":
         return None

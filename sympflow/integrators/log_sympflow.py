@@ -5,12 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
+import numpy as np
+
 from sympflow.arrays import Array
 from sympflow.integrators.base import FixedStep
+from sympflow.integrators.flows import kernel_of
 from sympflow.integrators.logarithmic import Logarithmic
+from sympflow.integrators.sympflow import SympFlowIntegrator
 from sympflow.integrators.time_search import physical_length, step_of_length
 from sympflow.system import HamiltonianSystem
-from sympflow.time_transformation import checked_shift, time_scale
+from sympflow.time_transformation import checked_shift, default_shift, time_scale
+
+Lengths = tuple[HamiltonianSystem, float, float, tuple[float, ...]]
 
 
 @dataclass(frozen=True)
@@ -23,7 +29,7 @@ class LogSympFlow(Logarithmic):
         As for `Logarithmic`, by the flow's own clock where it has one; the step in s that it means is at most the
         flow's Δ, which is the default.
     shift : float, optional
-        The one of the transformed system that the flow was trained on; a flow that ships knows it.
+        The one of the transformed system that the flow was trained on, which a flow that ships knows.
     flow : SympFlow or str, optional
         Trained on, or primed with, the transformed system; or the name of one that ships. `solve` takes by default
         the one that ships for the system. ``solve(system, "sympflow", flow=...)`` comes here by itself.
@@ -36,42 +42,41 @@ class LogSympFlow(Logarithmic):
     trained: ClassVar[bool] = True
     within: ClassVar[FixedStep | None] = None
     """Of one whose `inner` has been asked for: that."""
-    checked: ClassVar[tuple[HamiltonianSystem, float] | None] = None
-    """Of one that was checked: the system, and the step in s."""
+    checked: ClassVar[Lengths | None] = None
+    """Of one that was checked: what it found."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(self.flow, str):
+        flow = self.flow
+        if isinstance(flow, str):
             from sympflow.flow.shipped import named
 
-            object.__setattr__(self, "flow", named(self.flow).load())
-        if self.flow is not None and getattr(self.flow, "kind", None) != "sympflow":
+            self.__dict__["flow"] = flow = named(flow).load()
+        if flow is None:
+            return
+        if getattr(flow, "kind", None) != "sympflow":
             raise TypeError(
-                f"`flow` must be a SympFlow of the transformed system, or the name of one; got "
-                f"{type(self.flow).__name__}."
+                f"`flow` must be a SympFlow of the transformed system, or the name of one; got {type(flow).__name__}."
             )
+        if self.shift is None and (origin := (flow.recipe or {}).get("transforms")) is not None:
+            self.__dict__["shift"] = checked_shift(origin["shift"])
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name not in ("within", "checked")}
 
     def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> LogSympFlow:
         """With the flow that ships for the system unless one is given, and its shift."""
-        if self.flow is None:
-            from sympflow.flow.shipped import shipped_flows
-
-            found = [f for f in shipped_flows(system, "sympflow") if f.shift is not None]
-            if not found:
-                raise ValueError(
-                    f"`flow` is needed, for none in another time ships for {system.name!r}: train one on "
-                    "sympflow.time_transformed(system), or prime one with it, and pass it; or use 'log_leapfrog'."
-                )
-            return replace(self, flow=found[0].load(system), shift=found[0].shift if self.shift is None else self.shift)
-        origin = (getattr(self.flow, "recipe", None) or {}).get("transforms")
-        if self.shift is not None or origin is None:
+        if self.flow is not None:
             return self
-        resolved = object.__new__(type(self))  # the fields have been checked
-        vars(resolved).update(vars(self), shift=checked_shift(origin["shift"]))
-        return resolved
+        from sympflow.flow.shipped import shipped_flows
+
+        found = [f for f in shipped_flows(system, "sympflow") if f.shift is not None]
+        if not found:
+            raise ValueError(
+                f"`flow` is needed, for none in another time ships for {system.name!r}: train one on "
+                "sympflow.time_transformed(system), or prime one with it, and pass it; or use 'log_leapfrog'."
+            )
+        return replace(self, flow=found[0].load(system), shift=found[0].shift if self.shift is None else self.shift)
 
     def inner(self, system: HamiltonianSystem) -> FixedStep:
         if self.within is not None:
@@ -80,38 +85,59 @@ class LogSympFlow(Logarithmic):
             raise ValueError(
                 "`flow` is needed: train one on sympflow.time_transformed(system), or prime one with it, and pass it."
             )
-        from sympflow.integrators.sympflow import SympFlowIntegrator
-
         within = object.__new__(SympFlowIntegrator)  # the flow has been checked
-        vars(within).update(flow=self.flow, dt=None, tol=None, compensated=False)
-        object.__setattr__(self, "within", within)
+        within.__dict__.update(flow=self.flow, dt=None, tol=None, compensated=False)
+        self.__dict__["within"] = within
         return within
 
+    def reach_times(
+        self,
+        transformed: HamiltonianSystem,
+        h: float,
+        start: np.ndarray,
+        times: np.ndarray,
+        stride: int,
+        expected: float,
+        backend: str,
+    ) -> Any:
+        kernel = kernel_of(transformed, self.flow.bound(transformed), start, backend)
+        reach_times = getattr(kernel, "reach_times", None)
+        if reach_times is None:
+            return None
+        return reach_times(h, start, times, stride, expected, None if self.checked is None else self.checked[3])
+
+    def compiled_evaluations(self, system: HamiltonianSystem, n_steps: int, n_extra: int) -> dict[str, int]:
+        return self.flow.evaluations(n_steps, n_steps, n_extra, "compiled")
+
     def step_length(self, system: HamiltonianSystem) -> float:
-        return self._longest(system) if self.dt is None else float(self.dt)
+        return self._lengths(system)[1]
 
     def new_step(self, system: HamiltonianSystem) -> float:
-        if self.dt is None:
-            return float(self.flow.dt)
-        if self.checked is not None and self.checked[0] is system:
-            return self.checked[1]
-        return step_of_length(float(self.dt), *self._pace(system))
+        return self._lengths(system)[2]
 
     def check(self, system: HamiltonianSystem) -> None:
-        if self.flow is None:
+        flow = self.flow
+        if flow is None:
             self.inner(system)  # says so
-        self.flow.check_system(self.transformed(system))
-        object.__setattr__(self, "checked", None)
-        h = self.new_step(system)
-        object.__setattr__(self, "checked", (system, h))
-        if not h <= self.flow.dt * (1 + 1e-12):
-            longest = self._longest(system)
+        flow.check_system(self.transformed(system))
+        self.__dict__["checked"] = checked = self._found(system)
+        if not checked[2] <= flow.dt * (1 + 1e-12):
+            longest = replace(self, dt=None)._found(system)[1]
             raise ValueError(f"`dt` must be at most {longest:g}, where the step in s is the flow's Δ; got {self.dt:g}.")
 
-    def _longest(self, system: HamiltonianSystem) -> float:
-        return physical_length(float(self.flow.dt), *self._pace(system))
+    def _lengths(self, system: HamiltonianSystem) -> Lengths:
+        checked = self.checked
+        return checked if checked is not None and checked[0] is system else self._found(system)
 
-    def _pace(self, system: HamiltonianSystem) -> tuple[float, tuple[float, ...]]:
-        """ds/dt where the kinetic energy is B, and the numbers of the clock, if there is one and B is known."""
-        scale = time_scale(system, self.transformed(system).params["shift"])
-        return scale, self.flow.numbers() if system.y0 is not None and hasattr(self.flow, "numbers") else ()
+    def _found(self, system: HamiltonianSystem) -> Lengths:
+        """The system, the physical length of a step, its length in s, and the numbers of the clock, if there is one.
+
+        Where the kinetic energy is B, ds/dt is the scale. Without y0 no B is known, by which the clock advances.
+        """
+        flow, shift, dt = self.flow, self.shift, self.dt
+        scale = time_scale(system, default_shift(system) if shift is None else shift)
+        numbers = flow.numbers() if hasattr(flow, "numbers") else ()
+        clock = () if system.y0 is None else numbers
+        if dt is None:
+            return system, physical_length(flow.dt, scale, clock), flow.dt, numbers
+        return system, float(dt), step_of_length(float(dt), scale, clock), numbers

@@ -139,6 +139,24 @@ class Logarithmic(FixedStep):
             )
         return timed_pass(self, problem) or PhysicalRun(self, problem).outcome()
 
+    def reach_times(
+        self,
+        transformed: HamiltonianSystem,
+        h: float,
+        start: np.ndarray,
+        times: np.ndarray,
+        stride: int,
+        expected: float,
+        backend: str,
+    ) -> Any:
+        """`kernels.timed.reach_times` of the method; None where it has no such loops."""
+        found = getattr(self.inner(transformed), "reach_times", None)
+        return None if found is None else found(transformed, h, start, times, stride, expected, backend)
+
+    def compiled_evaluations(self, system: HamiltonianSystem, n_steps: int, n_extra: int) -> dict[str, int]:
+        """Evaluations of the forces in `reach_times`, n_extra of whose steps were shorter ones."""
+        return self.inner(system).evaluations(n_steps, n_steps, n_extra, "compiled")
+
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         """The steps of the run, their physical lengths; in a batch one that has ended waits with length 0."""
         run = PhysicalRun(self, Problem(system, *t_span, y0))

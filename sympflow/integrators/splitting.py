@@ -96,7 +96,7 @@ class Splitting(FixedStep):
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         self.check(problem.system)
-        kernel = self._kernel(problem)
+        kernel = self._kernel(problem.system, problem.y0, problem.backend)
         if kernel is None:
             return super().rollout(problem, h, n_steps, save)
         y0 = problem.y0
@@ -116,20 +116,27 @@ class Splitting(FixedStep):
         lengths = np.broadcast_to(h, y.shape[:-1]).reshape(-1)
         return splitting_kernel(system).step(self.scheme, lengths, rows).reshape(y.shape)
 
-    def reach_times(self, problem: Problem, h: float, stride: int, expected: float) -> Any:
-        """`kernels.timed.reach_times` of the times and states of the problem; None where it does not apply."""
-        if self.compensated or self._kernel(problem) is None or problem.system.symbols is None:
+    def reach_times(
+        self,
+        system: HamiltonianSystem,
+        h: float,
+        y0: np.ndarray,
+        times: np.ndarray,
+        stride: int,
+        expected: float,
+        backend: str,
+    ) -> Any:
+        """`kernels.timed.reach_times` of the scheme; None where it does not apply."""
+        if self.compensated or system.symbols is None or self._kernel(system, y0, backend) is None:
             return None
         from sympflow.kernels.timed import reach_times
 
-        assert problem.t_eval is not None
-        return reach_times(problem.system, self.scheme, h, problem.y0, problem.t_eval, stride, expected)
+        return reach_times(system, self.scheme, h, y0, times, stride, expected)
 
-    def _kernel(self, problem: Problem) -> SplittingKernel | None:
-        """The compiled loops for the problem, or None where it needs, or asks for, array operations."""
-        system, y0 = problem.system, problem.y0
+    def _kernel(self, system: HamiltonianSystem, y0: Array, backend: str) -> SplittingKernel | None:
+        """The compiled loops for such states, or None where these need, or the call asks for, array operations."""
         reason = None
-        if problem.backend == "array":
+        if backend == "array":
             reason = "`backend` is 'array': choose 'auto'."
         elif is_tensor(y0):
             reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
@@ -144,7 +151,7 @@ class Splitting(FixedStep):
                 return splitting_kernel(system)
             except ValueError as error:  # H holds a function that has no compiled form
                 reason = str(error)
-        if problem.backend == "compiled":
+        if backend == "compiled":
             raise ValueError(f"`backend` 'compiled' does not apply. {reason}")
         if self.compensated:
             raise ValueError(f"`compensated` sums need compiled loops. {reason}")

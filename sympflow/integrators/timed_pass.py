@@ -38,10 +38,7 @@ def timed_pass(integrator: Logarithmic, problem: Problem) -> Outcome | None:
         return None
     first = 0 if elapsed[0] else int(elapsed.searchsorted(0.0, "right"))
 
-    transformed, inner = integrator.transformed(system), integrator.inner(system)
-    reach_times = getattr(inner, "reach_times", None)
-    if reach_times is None:
-        return None
+    transformed = integrator.transformed(system)
     from sympflow.kernels.timed import lifted_rows
 
     start = lifted_rows(system, y0.reshape(-1, y0.shape[-1]), transformed.params["shift"])
@@ -50,8 +47,7 @@ def timed_pass(integrator: Logarithmic, problem: Problem) -> Outcome | None:
     expected = float(elapsed[-1]) / dt
     stride = int(min(max(1.0, (length / dt / (len(elapsed) + 1)) ** 0.5), LONGEST_STRIDE))
     h = sign * integrator.new_step(system)
-    piece = Problem(transformed, 0.0, h, start, elapsed[first:], backend=problem.backend)
-    found = reach_times(piece, h, stride, expected)
+    found = integrator.reach_times(transformed, h, start, elapsed[first:], stride, expected, problem.backend)
     if found is None:
         return None
     Y, counts = found
@@ -67,7 +63,7 @@ def timed_pass(integrator: Logarithmic, problem: Problem) -> Outcome | None:
     stats = {
         "dt": dt,
         "n_steps": n_steps,
-        **inner.evaluations(n_steps, n_steps, n_extra, "compiled"),
+        **integrator.compiled_evaluations(system, n_steps, n_extra),
         "backend": "compiled",
     }
     return Outcome(times, Y.reshape(len(times), *y0.shape), status, FINISHED, stats, finite=True)

@@ -60,7 +60,17 @@ class ClockedFlowKernel:
         return out
 
     def reach_times(
-        self, h: float, y0: np.ndarray, times: np.ndarray, stride: int, expected: float
+        self,
+        h: float,
+        y0: np.ndarray,
+        times: np.ndarray,
+        stride: int,
+        expected: float,
+        numbers: tuple[float, ...] | None = None,
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The states of rows of `y0` (N, 2d) at elapsed times: see `timed.reach_times`."""
-        return reach_times(self.system, self._scheme, h, y0, times, stride, expected, self.flow.numbers())
+        """The states of rows of `y0` (N, 2d) at elapsed times: see `timed.reach_times`.
+
+        `numbers` are those of the clock, if they have been asked for.
+        """
+        numbers = self.flow.numbers() if numbers is None else numbers
+        return reach_times(self.system, self._scheme, h, y0, times, stride, expected, numbers)
