@@ -1,8 +1,9 @@
 """Many trajectories at once: their states side by side, so that one instruction moves several of them.
 
 Source text, pasted after the tuple algebra of a symbolic system, `loops` and `aligned`. A block holds `LANES`
-trajectories, component first, as an array (2d, LANES) that stays in the first-level cache; the compiler turns the loop
-over the lanes of a stage into vector instructions. Lanes never mix: one that overflows leaves the others as they are.
+trajectories, in a run `MANY_LANES`, component first, as an array (2d, LANES) that stays in the first-level cache; the
+compiler turns the loop over the lanes of a stage into vector instructions. Lanes never mix: one that overflows leaves
+the others as they are.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -11,12 +12,13 @@ import numpy as np
 from numba import njit
 
 LANES = 64
+MANY_LANES = max(LANES, min(256, 512 // NDOF // LANES * LANES))  # the more, the less goes for the start of a stage
 VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
 
 
 @njit(**OPTIONS)
 def empty_lanes():
-    return aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
+    return aligned_zeros(2 * NDOF * MANY_LANES).reshape((2 * NDOF, MANY_LANES))
 
 
 @njit(**OPTIONS, forceinline=True)
@@ -112,12 +114,12 @@ def close_lane(Y, error, lane, kicks, drifts, gradients, curvatures, work):
 
 @njit(**OPTIONS)
 def rollout_lanes(kicks, drifts, gradients, curvatures, y0, n_steps, save, out, n_finite, stop):
-    """`rollout` of every row of `y0` (N, 2d), `LANES` at a time; outputs as in `rollout_each`."""
+    """`rollout` of every row of `y0` (N, 2d), `MANY_LANES` at a time; outputs as in `rollout_each`."""
     link = len(kicks) - 2
     work = prepared(kicks, gradients, curvatures)
     Y, start, error = empty_lanes(), empty_lanes(), empty_lanes()
-    for block_start in range(0, y0.shape[0], LANES):
-        count = min(LANES, y0.shape[0] - block_start)
+    for block_start in range(0, y0.shape[0], MANY_LANES):
+        count = min(MANY_LANES, y0.shape[0] - block_start)
         width = (count + VECTOR - 1) // VECTOR * VECTOR
         for lane in range(width):
             i = block_start + min(lane, count - 1)
@@ -244,11 +246,11 @@ def step_lanes(kicks, drifts, gradients, curvatures, x, h, y, out):
 
 @njit(**OPTIONS)
 def map_lanes(numbers, more, y, out):
-    """`map_each`, `LANES` rows at a time."""
+    """`map_each`, `MANY_LANES` rows at a time."""
     kicks, drifts, gradients = numbers[0], numbers[1], numbers[2]
     Y, error = empty_lanes(), empty_lanes()
-    for block_start in range(0, y.shape[0], LANES):
-        count = min(LANES, y.shape[0] - block_start)
+    for block_start in range(0, y.shape[0], MANY_LANES):
+        count = min(MANY_LANES, y.shape[0] - block_start)
         width = (count + VECTOR - 1) // VECTOR * VECTOR
         error[:] = 0.0
         for lane in range(width):

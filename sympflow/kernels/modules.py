@@ -31,7 +31,7 @@ OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 
 _INNER = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # options of functions that only others call
 _CALLED = {"rollout", "rollout_rows"}  # functions that others call, and Python as well
-_BLOCK = 64  # rows that a thread takes at a time: the lanes of a block
+_BLOCK = 64  # a thread takes a multiple of so many rows
 LONG = 100_000_000  # units of work from which a run can be interrupted
 NEVER = np.zeros(1, dtype=np.int64)
 """The `stop` of what is not."""
