@@ -129,6 +129,7 @@ class SympFlow(FlowMap):
         processor: int = 0,
         curvature: bool = False,
         polynomial: int | None = None,
+        first: str = "drift",
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> PrimedFlow:
@@ -142,7 +143,7 @@ class SympFlow(FlowMap):
         system : HamiltonianSystem
             Separable.
         stages : int, optional
-            Number of kicks, 6 by default: the flow starts as so many equal leapfrog steps.
+            Number of kicks, 6 by default: the flow starts as so many equal leapfrog steps, or Verlet's: see `first`.
         dt : float
             Δt.
         palindromic : bool
@@ -162,7 +163,10 @@ class SympFlow(FlowMap):
         polynomial : int, optional
             In place of force gradients and curvatures every kick has a trained polynomial in q of this total degree,
             t³ Σ_m e_m(t) q^m, of the monomials that are as even as V: for symbolic systems in few degrees of freedom.
-            For a polynomial V of degree n, 2n is a good one.
+            For a polynomial V of degree n, 2n − 2 is a good one.
+        first : {"drift", "kick"}
+            What equal steps begin and end with. A kick that ends a step and begins the next is one: with an even number
+            of kicks, where each has a polynomial or a curvature, "kick" gives a palindrome more numbers at no cost.
         dtype, device
             Of the parameters.
 
@@ -173,7 +177,7 @@ class SympFlow(FlowMap):
         """
         from sympflow.flow.untrained_primed import primed
 
-        shape = (stages, dt, palindromic, scheme, degree, force_gradient, processor, curvature, polynomial)
+        shape = (stages, dt, palindromic, scheme, degree, force_gradient, processor, curvature, polynomial, first)
         return primed(system, *shape, dtype, device)
 
     @staticmethod

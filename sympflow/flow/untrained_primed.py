@@ -30,6 +30,7 @@ def primed(
     processor: int,
     curvature: bool,
     polynomial: int | None,
+    first: str,
     dtype: torch.dtype,
     device: torch.device | str | None,
 ) -> PrimedFlow:
@@ -62,9 +63,10 @@ def primed(
         stages = 6 if stages is None else stages
         if isinstance(stages, bool) or not isinstance(stages, int) or stages < 1:
             raise ValueError(f"`stages` must be a positive integer, the number of kicks; got {stages!r}: 3 is usual.")
-        scheme = compose("leapfrog", 2, (1 / stages,) * stages, "equal leapfrog steps")
-    elif stages is not None:
-        raise ValueError("`stages` and `scheme` were both given: leave out `stages`, the scheme has its own.")
+        scheme = _equal_steps(stages, first)
+    elif stages is not None or first != "drift":
+        given = "stages" if stages is not None else "first"
+        raise ValueError(f"`{given}` and `scheme` were both given: leave out `{given}`, the scheme has its own.")
     if isinstance(scheme, str):
         if scheme not in SCHEMES:
             raise ValueError(f"`scheme` {scheme!r} is unknown: choose one of {', '.join(SCHEMES)}.")
@@ -75,6 +77,15 @@ def primed(
     return _from_scheme(system, scheme, dt, degree, palindromic, force_gradient, *extra)
 
 
+def _equal_steps(n: int, first: str) -> Scheme:
+    if first == "drift":
+        return compose("leapfrog", 2, (1 / n,) * n, "equal leapfrog steps")
+    if first != "kick":
+        raise ValueError(f"`first` must be 'drift' or 'kick', which a step begins with; got {first!r}.")
+    kicks = 0.5 / n, *(1 / n,) * (n - 1), 0.5 / n
+    return Scheme("verlet", 2, kicks, (*(1 / n,) * n, 0.0), (0.0,) * (n + 1), "equal Verlet steps")
+
+
 def _monomials(
     system: HamiltonianSystem, polynomial: int | None, force_gradient: bool | None, curvature: bool
 ) -> Monomials:
@@ -82,7 +93,7 @@ def _monomials(
     if polynomial is None:
         return ()
     if isinstance(polynomial, bool) or not isinstance(polynomial, int) or polynomial < 1:
-        raise ValueError(f"`polynomial` must be a positive integer, its degree; got {polynomial!r}: 8 is usual.")
+        raise ValueError(f"`polynomial` must be a positive integer, its degree; got {polynomial!r}: 6 is usual.")
     if force_gradient or curvature:
         raise ValueError("`polynomial` stands in place of `force_gradient` and `curvature`: leave these out.")
     if system.symbols is None or not system.quadratic_kinetic:

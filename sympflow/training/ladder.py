@@ -44,7 +44,7 @@ class Rung:
     scheme : str, optional
         Of `stages` kicks, from which the search starts in place of equal leapfrog steps: one of a high order leads to
         valleys that random tables, most of whose numbers are positive, do not lie near.
-    curvature, polynomial : bool, int
+    curvature, polynomial, first : bool, int, str
         See `SympFlow.primed`.
     after : str, optional
         The name of the rung with the same kicks and the same processor whose table, continued to this Δt, is where the
@@ -62,6 +62,7 @@ class Rung:
     after: str | None = None
     curvature: bool = False
     polynomial: int | None = None
+    first: str = "drift"
     options: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -72,9 +73,11 @@ class Rung:
     def train(self, system: HamiltonianSystem, longer: PrimedFlow | None = None, **options: Any) -> PrimedFlow:
         """The flow, without a certificate; `longer` is that of the rung `after` which it comes."""
         before = time.process_time()
-        first: dict[str, Any] = {"stages": self.stages} if self.scheme is None else {"scheme": self.scheme}
-        first |= {"processor": self.processor, "curvature": self.curvature, "polynomial": self.polynomial}
-        start = SympFlow.primed(system, dt=self.dt, **first)
+        shape: dict[str, Any] = {"stages": self.stages, "first": self.first}
+        if self.scheme is not None:
+            shape = {"scheme": self.scheme}
+        shape |= {"processor": self.processor, "curvature": self.curvature, "polynomial": self.polynomial}
+        start = SympFlow.primed(system, dt=self.dt, **shape)
         if longer is not None:
             _restrict(start, longer)
         flow = train(system, flow=start, **{"restarts": self.restarts, **self.options, **options})
