@@ -83,6 +83,17 @@ def test_stages_are_equal_leapfrog_steps():
     assert flow.scheme().force_evaluations == 5
 
 
+def test_steps_that_begin_with_a_kick_are_verlets():
+    """Half of the first and the last kick belong to each step, and a palindrome of four kicks has three numbers."""
+    system = systems.quartic()
+    flow = SympFlow.primed(system, 4, dt=0.4, first="kick", curvature=True)
+    y0 = system.domain.sample(5, seed=0)
+    expected = solve(system, "verlet", (0, 0.4), y0, dt=0.1).y[..., -1]
+    np.testing.assert_allclose(flow(0.4, torch.tensor(y0)).detach().numpy(), expected, atol=8 * EPS)
+    assert flow.kernel_scheme().force_evaluations == 4
+    assert flow.curvatures.free.numel() == 3 * len(flow.curvatures.exponents)
+
+
 def test_velocity_is_the_time_derivative(flow):
     x = states(flow.system)
     t = flow.dt * torch.linspace(0.0, 1.0, len(x), dtype=torch.float64)
@@ -388,6 +399,8 @@ def test_it_trains_like_any_sympflow():
         ({"stages": 0}, r"^`stages` must be a positive integer"),
         ({"stages": 3, "scheme": "verlet"}, r"^`stages` and `scheme` were both given"),
         ({"scheme": "rk4"}, r"^`scheme` 'rk4' is unknown"),
+        ({"first": "p"}, r"^`first` must be 'drift' or 'kick', which a step begins with; got 'p'"),
+        ({"scheme": "verlet", "first": "kick"}, r"^`first` and `scheme` were both given: leave out `first`"),
         ({"degree": 0}, r"^`degree` must be a positive integer"),
         ({"scheme": "chin4a", "force_gradient": False}, r"^`force_gradient` is False but 'chin4a'"),
         ({"dt": -1.0}, r"^`dt` must be a positive"),
