@@ -16,7 +16,8 @@ from sympflow.flow.scaling import Scaling
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
 from sympflow.system import HamiltonianSystem
-from sympflow.training.recipes import default_recipe
+from sympflow.training import checkpoint as checkpoints
+from sympflow.training.recipes import BUDGET, PrimedRecipe, default_recipe
 
 KINDS = ("primed", "sympflow", "mlp")
 OF_NETWORKS = ("pairs", "hidden", "activation")
@@ -24,6 +25,7 @@ OF_PRIMED = ("stages", "processor")
 OF_SEARCHES = ("restarts", "frozen_weight", "energy_weight")
 OF_LOSSES = ("residual_weight", "matching_weight", "label_weight", "matching_times")
 OF_GRADIENTS = ("learning_rate", "schedule", "clip")
+OF_FITS = ("steps", "points", "restarts", "label_times", "frozen_weight", "energy_weight", "loss", "data", *OF_LOSSES)
 NOT_OF_SEARCHES = (*OF_GRADIENTS, "refresh", "validate_every", "validation_points", "checkpoint_every")
 
 
@@ -69,16 +71,20 @@ def _meant(system: HamiltonianSystem, given: dict[str, Any]) -> str:
     return "primed" if fits and not wants_network else "sympflow"
 
 
-def new_primed(
-    system: HamiltonianSystem,
-    domain: Domain,
-    dt: float | None,
-    stages: int | None,
-    processor: int | None,
-    dtype: torch.dtype | None,
-    device: torch.device | str | None,
-) -> PrimedFlow:
-    """A new primed flow: what is not given is as `default_recipe` has it, Δt in proportion to the kicks."""
+def new_primed(system: HamiltonianSystem, domain: Domain, given: dict[str, Any]) -> PrimedFlow:
+    """A new primed flow; `given` are the arguments of `train`.
+
+    Where these say nothing of the flow and its fit, it is one that `chosen_recipe` finds by trials, or that of the run
+    to go on with. Else what is not given is as `default_recipe` has it, Δt in proportion to the kicks.
+    """
+    dt, stages, processor, dtype = given["dt"], given["stages"], given["processor"], given["dtype"]
+    dtype = torch.float64 if dtype is None else dtype
+    if _untold(system, given):
+        from sympflow.training.trials import chosen_recipe
+
+        resume = given["resume"]
+        recipe = chosen_recipe(system, domain) if resume is None else _recipe_of_run(system, domain, resume)
+        return recipe.flow(system)
     if system.separable and (dt is None or stages is None or processor is None):
         recipe = default_recipe(system, domain, dt)
         if dt is None:
@@ -90,9 +96,29 @@ def new_primed(
         stages,
         dt=1.0 if dt is None else float(dt),
         processor=0 if processor is None else processor,
-        dtype=torch.float64 if dtype is None else dtype,
-        device=device,
+        dtype=dtype,
+        device=given["device"],
     )
+
+
+def _untold(system: HamiltonianSystem, given: dict[str, Any]) -> bool:
+    """Whether nothing is said of a new flow and its fit, trials apply to the system, and there is time for them."""
+    from sympflow.training.trials import MOST_NDOF
+
+    fits = system.separable and system.quadratic_kinetic and system.symbols is not None and system.ndof <= MOST_NDOF
+    hurried = given["time_budget"] is not None and given["time_budget"] < BUDGET
+    if not fits or hurried or given["optimizer"] not in (None, "gauss-newton"):
+        return False
+    return not options_given(given, ("dt", *OF_PRIMED, *OF_FITS, "dtype", "device"))
+
+
+def _recipe_of_run(system: HamiltonianSystem, domain: Domain, path: Any) -> PrimedRecipe:
+    """The recipe of the flow in a checkpoint; if it is none of those that are tried, the first of these."""
+    from sympflow.training.trials import tried_recipes
+
+    recipes, theirs = tried_recipes(system, domain), checkpoints.read(path)["architecture"]
+    mine = (checkpoints.identity(recipe.flow(system), system, {})["architecture"] for recipe in recipes)
+    return next((recipe for recipe, one in zip(recipes, mine, strict=True) if one == theirs), recipes[0])
 
 
 def new_network(system: HamiltonianSystem, kind: str, dt: float, scaling: Scaling, given: dict[str, Any]) -> FlowMap:

@@ -42,6 +42,8 @@ class PrimedRecipe:
         Starts of the search, and its seed.
     time_budget : float, optional
         Seconds after which the fit ends with the best so far.
+    curvature : bool
+        Whether kicks have curvature terms.
     """
 
     dt: float
@@ -52,6 +54,7 @@ class PrimedRecipe:
     restarts: int = 24
     seed: int = 0
     time_budget: float | None = None
+    curvature: bool = False
 
     def flow(self, system: HamiltonianSystem) -> PrimedFlow:
         """The flow to start from."""
@@ -64,6 +67,7 @@ class PrimedRecipe:
             processor=self.processor,
             degree=self.degree,
             force_gradient=self.force_gradient,
+            curvature=self.curvature,
         )
 
     def options(self) -> dict[str, Any]:
@@ -76,7 +80,9 @@ class PrimedRecipe:
         }
 
 
-def default_recipe(system: HamiltonianSystem, domain: Domain | None = None, dt: float | None = None) -> PrimedRecipe:
+def default_recipe(
+    system: HamiltonianSystem, domain: Domain | None = None, dt: float | None = None, phase: float = PHASE
+) -> PrimedRecipe:
     """Three kicks and a processor of six, with Δt such that ω Δt is about 1; for a given Δt as many kicks as it needs.
 
     ω is the fastest frequency of the linearized motion, √ of the largest eigenvalue of M⁻¹∇²V, that 99 % of the states
@@ -91,10 +97,12 @@ def default_recipe(system: HamiltonianSystem, domain: Domain | None = None, dt: 
         Ω; the default is that of the system.
     dt : float, optional
         Δt.
+    phase : float
+        Another ω Δt, where no Δt is given.
     """
     omega = frequency(system, system.domain if domain is None else domain)
     if dt is None:
-        return PrimedRecipe(dt=_rounded(PHASE / omega), time_budget=BUDGET)
+        return PrimedRecipe(dt=_rounded(phase / omega), time_budget=BUDGET)
     stages = min(max(2, math.ceil(omega * dt / KICK_PHASE - 1e-9)), MOST_STAGES)
     return PrimedRecipe(dt=float(dt), stages=stages, time_budget=BUDGET)
 

@@ -65,16 +65,18 @@ def train(
     """Train a flow map of `system` on [0, dt]: with nothing else given, the best that is known for it.
 
     For a separable symbolic system with T = ½ pᵀM⁻¹p that is a primed flow (`SympFlow.primed`), whose few numbers are
-    fitted to the exact flow in seconds. For any other it is a SympFlow with MLP potentials, symplectic for every H,
-    trained by Adam on its residual and by Hamiltonian matching, without data. A flow of any kind, one made by
-    `SympFlow.primed` or `SympFlow.split` among them, is trained further as `flow`.
+    fitted to the exact flow in seconds. In up to three degrees of freedom short trials choose its Δt, and whether its
+    kicks have curvature terms (`sympflow.training.trials`), unless an option says something of the flow or its fit. For
+    any other system it is a SympFlow with MLP potentials, symplectic for every H, trained by Adam on its residual and
+    by Hamiltonian matching, without data. A flow of any kind, one made by `SympFlow.primed` or `SympFlow.split` among
+    them, is trained further as `flow`.
 
     Parameters
     ----------
     system : HamiltonianSystem
     dt : float, optional
         Δt, the longest time of the map; the default is that of `flow`, for a new primed flow what suits the system's
-        frequencies on Ω (see `sympflow.training.recipes`), else 1.
+        frequencies on Ω (see `sympflow.training.recipes`) and gains most in trials, else 1.
     kind : {"primed", "sympflow", "mlp"}, optional
         The architecture: a SympFlow primed with the system's V and T; one with MLP potentials; or the unconstrained
         baseline with as many parameters as the SympFlow that `pairs` and `hidden` describe. The default is "primed"
@@ -146,7 +148,7 @@ def train(
     if flow is not None:
         check_flow(flow, system, dt)
     elif kind == "primed":
-        flow = new_primed(system, domain, dt, stages, processor, dtype, device)
+        flow = new_primed(system, domain, given)
     run = start(system, domain, kind, flow, given)
     if resume is not None:
         run.load(resume)

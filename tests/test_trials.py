@@ -1,0 +1,123 @@
+"""Which flow `train` fits to a system of which nothing else is said: what its kicks cost, and short trials."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sympflow import SympFlow, max_energy_error, solve, systems, train
+from sympflow.kernels.kick_cost import kick_cycles
+from sympflow.training import checkpoint as checkpoints
+from sympflow.training import trials
+from sympflow.training.gauss_newton import GaussNewtonRun
+from sympflow.training.recipes import default_recipe
+
+HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
+QUICK = {"STARTS": 2, "STEPS": 20, "FINAL_STEPS": 20, "POINTS": 40, "LENGTH": 50}
+
+
+@pytest.mark.parametrize("system", [HH, PENDULUM, systems.quartic()], ids=lambda s: s.name)
+def test_each_term_makes_a_kick_dearer(system):
+    cycles = [kick_cycles(system.symbols, level) for level in range(3)]
+    assert 0 < cycles[0] < cycles[1] < cycles[2]
+
+
+def law(monkeypatch, error):
+    """Trials whose errors are those of a law, error(ω Δt, curvature)."""
+    omega = 1.0 / default_recipe(HH).dt
+    monkeypatch.setattr(trials, "trial_error", lambda recipe, *_: error(recipe.dt * omega, recipe.curvature))
+    return trials.chosen_recipe(HH, HH.domain)
+
+
+def test_the_order_of_the_error_decides_between_short_and_long_steps(monkeypatch):
+    """Work e^(1/8) is Δt⁻¹ e^(1/8): an error of order 8 gains as much at every Δt, a lower one at the longest."""
+    first, *_, last = trials.tried_recipes(HH, HH.domain, curvature=False)
+    assert first.dt < last.dt
+    assert law(monkeypatch, lambda x, c: 1e-9 * x**4) == last
+    assert law(monkeypatch, lambda x, c: 1e-9 * x**12) == first
+
+
+def test_a_long_step_that_misses_the_goal_is_not_taken(monkeypatch):
+    first, *_ = trials.tried_recipes(HH, HH.domain, curvature=False)
+    assert law(monkeypatch, lambda x, c: 9e-6 if x == 1.0 else 1.1e-5) == first
+
+
+def test_curvature_is_taken_where_its_error_is_worth_its_cycles(monkeypatch):
+    """Kicks that are r times dearer must make the error r⁸ times less."""
+    plain, bent = (kick_cycles(HH.symbols, level) for level in (1, 2))
+    needed = (bent / plain) ** trials.ORDER
+    for gain, taken in ((1.1 * needed, True), (0.9 * needed, False)):
+        chosen = law(monkeypatch, lambda x, c, gain=gain: 1e-9 * x**12 / (gain if c else 1.0))
+        assert chosen.curvature is taken
+
+
+def test_the_error_of_a_trial_is_that_of_its_orbits(monkeypatch):
+    """A whole fit of the same flow is as near, or nearer by what a longer search finds."""
+    for name, value in QUICK.items():
+        monkeypatch.setattr(trials, name, value)
+    recipe = replace(default_recipe(PENDULUM), stages=2, processor=2)
+    error = trials.trial_error(recipe, PENDULUM, PENDULUM.domain)
+    assert error == trials.trial_error(recipe, PENDULUM, PENDULUM.domain)
+    options = {"restarts": 2, "steps": 20, "points": 40, "label_times": 2, "reference_states": 1, "progress": False}
+    flow = train(PENDULUM, flow=recipe.flow(PENDULUM), **options)
+    y0, t_span = PENDULUM.domain.sample(20, 1), (0, trials.LENGTH * recipe.dt)
+    sol = solve(PENDULUM, flow, t_span, y0=y0, on_domain_exit="ignore", backend="array")
+    assert 0.1 < error / np.median(max_energy_error(sol)) < 10
+
+
+def test_a_domain_without_solutions_has_no_trial(monkeypatch):
+    def start(*_):
+        raise ValueError("`domain` holds no states whose solution exists up to `dt`")
+
+    monkeypatch.setattr(GaussNewtonRun, "start", start)
+    assert trials.trial_error(default_recipe(HH), HH, HH.domain) == np.inf
+    assert trials.chosen_recipe(HH, HH.domain) == default_recipe(HH)
+
+
+class Started(Exception):
+    pass
+
+
+def test_only_where_nothing_is_said_there_are_trials(monkeypatch, tmp_path):
+    made = []
+
+    def chosen(system, domain):
+        made.append(system)
+        return replace(default_recipe(system), dt=1.25, curvature=True)
+
+    def start(self, *_):
+        raise Started(self.flow)
+
+    def flow_of(**options):
+        with pytest.raises(Started) as started:
+            train(HH, progress=False, **options)
+        return started.value.args[0]
+
+    monkeypatch.setattr(trials, "chosen_recipe", chosen)
+    monkeypatch.setattr(GaussNewtonRun, "go", start)
+    flow = flow_of(seed=3)
+    assert (flow.dt, flow.curvatures is not None, made) == (1.25, True, [HH])
+    for options in ({"dt": 1.0}, {"restarts": 2}, {"points": 60}, {"time_budget": 5.0}, {"stages": 2}):
+        assert flow_of(**options).curvatures is None
+    assert made == [HH]
+
+
+def test_a_run_is_resumed_without_trials(monkeypatch, tmp_path):
+    """The checkpoint says which of the flows that are tried it is of."""
+    path, recipe = tmp_path / "run.ckpt", trials.tried_recipes(HH, HH.domain)[-1]
+    assert recipe.curvature
+    monkeypatch.setattr(trials, "chosen_recipe", lambda *_: recipe)
+
+    def kill(*_):
+        raise Started
+
+    with pytest.raises(Started):
+        train(HH, checkpoint=path, callback=kill, progress=False)
+    assert checkpoints.read(path)["step"] == 0
+    monkeypatch.setattr(trials, "chosen_recipe", None)
+    monkeypatch.setattr(GaussNewtonRun, "complete", lambda self, spent: kill())
+    monkeypatch.setattr(GaussNewtonRun, "SEARCH_SHARE", 0.0)
+    with pytest.raises(Started):
+        train(HH, resume=path, time_budget=100.0, progress=False)
+    with pytest.raises(ValueError, match="`resume` is a run with another architecture"):
+        train(HH, flow=SympFlow.primed(HH, 4), resume=path, progress=False)
