@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import qr, solve_triangular
+import torch
+from scipy.linalg import solve_triangular
 
 MAX_REJECTED = 30
 PROBE = 0.1  # share of a step over which the residuals' curvature is measured
@@ -73,7 +74,7 @@ def levenberg_marquardt(
         if stop():
             return Minimum(x, cost, iteration, "it was stopped")
         r, J = linearized(x)
-        R = qr(np.column_stack([J, r]), mode="r", overwrite_a=True, check_finite=False)[0]
+        R = _qr(np.column_stack([J, r]), "r")[1]
         R, projected = R[: len(x), : len(x)], R[: len(x), -1]
         scale = np.maximum(scale, np.linalg.norm(R, axis=0))
         D = np.where(scale > 0, scale, 1.0)
@@ -108,7 +109,7 @@ class _Damped:
     """v → the s that minimizes ‖R s − v‖² + ‖D s‖², for several v."""
 
     def __init__(self, R: np.ndarray, D: np.ndarray) -> None:
-        Q, self._R = qr(np.concatenate([R, np.diag(D)]), mode="economic", check_finite=False)
+        Q, self._R = _qr(np.concatenate([R, np.diag(D)]), "reduced")
         self._Q = Q[: len(R)]
 
     def __call__(self, v: np.ndarray) -> np.ndarray:
@@ -119,3 +120,14 @@ class _Damped:
         return solve_triangular(
             self._R, solve_triangular(self._R, w, trans="T", check_finite=False), check_finite=False
         )
+
+
+def _qr(A: np.ndarray, mode: str) -> tuple[np.ndarray, np.ndarray]:
+    """Q and R, on one thread: where others are at work too, several wait for each other a hundred times as long."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        Q, R = torch.linalg.qr(torch.from_numpy(A), mode=mode)
+    finally:
+        torch.set_num_threads(threads)
+    return Q.numpy(), R.numpy()
