@@ -261,18 +261,12 @@ def ladders() -> dict[str, Ladder]:
         "quartic": (
             Rung(1, 0.5),
             *(Rung(3, dt) for dt in (0.75, 0.6, 0.5, 0.4)),
-            # Deep valleys are found without polynomials.
-            Rung(6, 0.6, 8, 1, "srkn6b", options=plain),
-            Rung(6, 0.45, 8, 1, "srkn6b", "primed-6-0.6", options=plain),
+            # Beside the first for the energy, those for the state; round times are whole numbers of their Δt.
+            Rung(8, 1.0, 8, 40, polynomial=6, first="kick", options={**followed, "steps": 400, "seed": 1}),
+            Rung(6, 1.0, 8, 24, polynomial=6, first="kick", options=followed | plain),
             *(
-                Rung(6, dt, 8, 1, "srkn6b", after, polynomial=6, options=followed)
-                for after, dt in (
-                    ("primed-6-0.6", 0.75),
-                    ("polynomial-6-0.75", 1.0),
-                    ("polynomial-6-1", 1.4),
-                    ("polynomial-6-0.75", 0.45),
-                    ("polynomial-6-0.45", 0.3),
-                )
+                Rung(8, dt, 8, 1, None, f"polynomial-8-{after:g}", polynomial=6, first="kick", options=followed | plain)
+                for after, dt in ((1.0, 1.25), (1.25, 2.0), (1.0, 0.625), (0.625, 0.5))
             ),
         ),
         "kepler": (
