@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sympflow import SympFlow, max_energy_error, solve, systems, train
-from sympflow.kernels.kick_cost import kick_cycles
+from sympflow.kernels.kicks import kick_cycles
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.gauss_newton import GaussNewtonRun

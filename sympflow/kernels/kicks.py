@@ -16,7 +16,7 @@ from sympflow.kernels.scheduling import FUSED, PRODUCTS, Schedule
 from sympflow.monomials import Monomials
 from sympflow.symbolic import SymbolicHamiltonian
 
-__all__ = ["kicks_source"]
+__all__ = ["kick_cycles", "kicks_source"]
 
 PRODUCT = "fused_multiply_add"  # of `elementary`
 MOST_KEPT = 200  # sources
@@ -60,6 +60,27 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials 
             del _SOURCES[next(iter(_SOURCES))]
         _SOURCES[key] = _source(symbols, level, monomials)
     return _SOURCES[key]
+
+
+def kick_cycles(symbols: SymbolicHamiltonian, level: int) -> float:
+    """Cycles of a kick and the drift before it in a single trajectory, as its terms are first written down.
+
+    That is not the fastest way to write them, for which the compiler looks much longer (`kicks_source`); but
+    kicks of one system with more or fewer terms compare alike.
+
+    Parameters
+    ----------
+    symbols : SymbolicHamiltonian
+    level : int
+        0 for the force alone, 1 with a force gradient, 2 with a curvature term too.
+
+    Raises
+    ------
+    ValueError
+        If a function in H has no counterpart in compiled code.
+    """
+    shape = next(iter(shapes(symbols, level + 1)))
+    return min(_scheduled(symbols, shape, "kick_", common).cycles for common in (True, False))
 
 
 _SOURCES: dict[tuple[sp.Expr, int, Monomials], str] = {}

@@ -40,7 +40,7 @@ def chosen_recipe(system: HamiltonianSystem, domain: Domain) -> PrimedRecipe:
         Separable, symbolic, T = ½ pᵀM⁻¹p.
     domain : Domain
     """
-    from sympflow.kernels.kick_cost import kick_cycles
+    from sympflow.kernels.kicks import kick_cycles
 
     assert system.symbols is not None
     recipes = tried_recipes(system, domain, curvature=False)
