@@ -24,26 +24,60 @@ Monomials = tuple[tuple[int, ...], ...]
 
 
 def monomials(symbols: SymbolicHamiltonian, degree: int) -> Monomials:
-    """Those up to a total degree that are unchanged by the changes of sign of coordinates that leave V unchanged.
+    """Those up to a total degree that a kick of a trained flow can make use of, H being ½ pᵀM⁻¹p + V(q).
+
+    The flows that kicks and drifts compose to are, by the formula of Baker, Campbell and Hausdorff, those of T, V and
+    their commutators. Of these the ones that are potentials again are V, |∇V|²_{M⁻¹}, and whatever products ∇fᵀM⁻¹∇g of
+    such f and g make further (McLachlan & Quispel, Splitting methods, Acta Numerica 11, 2002, section 4). Where V is a
+    polynomial, these are the monomials in them. Else they are those that are unchanged by the changes of sign of
+    coordinates that leave V unchanged.
 
     Raises
     ------
     ValueError
         If there are none, or too many.
     """
+    assert symbols.V is not None
     d = symbols.ndof
-    mirrored = [signs for signs in _signs(d) if _is_even(symbols, signs)]
-    kept = []
     if math.comb(d + degree, d) > 1000 * MOST_MONOMIALS:
         raise ValueError(_too_many(degree, d))
-    for exponents in itertools.product(range(degree + 1), repeat=d):
-        if 1 <= sum(exponents) <= degree and all(_product(signs, exponents) == 1 for signs in mirrored):
-            kept.append(exponents)
+    kept = _generated(symbols, degree) if symbols.V.is_polynomial(*symbols.q) else _as_even(symbols, degree)
     if not kept:
-        raise ValueError(f"`polynomial` {degree!r} leaves no monomial that V is as even as: take a higher degree.")
+        raise ValueError(f"`polynomial` {degree!r} leaves no monomial of those that suit V: take a higher degree.")
     if len(kept) > MOST_MONOMIALS:
         raise ValueError(_too_many(degree, d))
     return tuple(sorted(kept, key=lambda m: (sum(m), m)))
+
+
+def _generated(symbols: SymbolicHamiltonian, degree: int) -> set[tuple[int, ...]]:
+    """Those of V, and of products ∇fᵀM⁻¹∇g, until there are no more up to the degree, or too many."""
+    import sympy as sp
+
+    M = symbols.inverse_mass
+    assert M is not None
+    d = symbols.ndof
+    pairs = [(i, j) for i in range(d) for j in range(d) if M[i, j] != 0]
+    of_v = {m for m in sp.Poly(symbols.V, *symbols.q).monoms() if any(m)}
+    found, new = set(of_v), set(of_v)
+    while new and len({m for m in found if sum(m) <= degree}) <= MOST_MONOMIALS:
+        products = set()
+        for f, g in itertools.product(new, found):
+            products |= {_product(f, g, i, j) for i, j in pairs if f[i] and g[j]}
+        new = {m for m in products if 1 <= sum(m) <= max(degree, 1)} - found
+        found |= new
+    return {m for m in found if sum(m) <= degree}
+
+
+def _product(f: Sequence[int], g: Sequence[int], i: int, j: int) -> tuple[int, ...]:
+    """The exponents of ∂ᵢf ∂ⱼg."""
+    return tuple(a + b - (k == i) - (k == j) for k, (a, b) in enumerate(zip(f, g, strict=True)))
+
+
+def _as_even(symbols: SymbolicHamiltonian, degree: int) -> list[tuple[int, ...]]:
+    """Those that are as even as V."""
+    mirrored = [signs for signs in _signs(symbols.ndof) if _is_even(symbols, signs)]
+    all_of_them = itertools.product(range(degree + 1), repeat=symbols.ndof)
+    return [m for m in all_of_them if 1 <= sum(m) <= degree and all(_sign(signs, m) == 1 for signs in mirrored)]
 
 
 def _too_many(degree: int, d: int) -> str:
@@ -70,7 +104,7 @@ def _is_even(symbols: SymbolicHamiltonian, signs: Sequence[int]) -> bool:
     return sp.expand(mirrored - symbols.V) == 0
 
 
-def _product(signs: Sequence[int], exponents: Sequence[int]) -> int:
+def _sign(signs: Sequence[int], exponents: Sequence[int]) -> int:
     return math.prod(sign**e for sign, e in zip(signs, exponents, strict=True))
 
 

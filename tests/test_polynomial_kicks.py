@@ -25,19 +25,59 @@ def of(V):
 @pytest.mark.parametrize(
     ("V", "degree", "expected"),
     [
-        ("q1**4 + q2**4 + q1**2", 4, {(0, 2), (2, 0), (0, 4), (2, 2), (4, 0)}),
-        ("q1**2*q2 - q2**3", 3, {(0, 1), (0, 2), (2, 0), (0, 3), (2, 1)}),
-        ("q1**4 + q1*q2**3", 2, {(0, 2), (1, 1), (2, 0)}),  # even only in both together
         ("cos(q1) + q2", 2, {(0, 1), (0, 2), (2, 0)}),
+        ("cos(q1)*cos(q2)", 3, {(0, 2), (2, 0)}),
     ],
 )
-def test_monomials_are_as_even_as_the_potential(V, degree, expected):
+def test_monomials_are_as_even_as_a_potential_that_is_no_polynomial(V, degree, expected):
     assert set(monomials(of(V), degree)) == expected
+
+
+@pytest.mark.parametrize(
+    ("V", "degree", "expected"),
+    [
+        ("q1**4 + q2**4 + q1**2", 6, {(2, 0), (4, 0), (0, 4), (6, 0), (0, 6)}),  # the coordinates do not mix
+        ("q1**2*q2 - q2**3", 3, {(0, 3), (2, 1)}),
+        ("q1**2*q2 - q2**3", 4, {(0, 3), (2, 1), (0, 4), (2, 2), (4, 0)}),
+        ("q1**4 + q1*q2**3", 4, {(4, 0), (1, 3)}),
+        ("3*q1 + q2**2", 4, {(1, 0), (0, 2)}),  # a constant, the product of the gradients of q1, is no monomial
+        ("q1**4", 3, None),
+    ],
+)
+def test_monomials_are_those_that_commutators_make(V, degree, expected):
+    if expected is None:
+        with pytest.raises(ValueError, match=f"`polynomial` {degree} leaves no monomial of those that suit V"):
+            monomials(of(V), degree)
+        return
+    assert set(monomials(of(V), degree)) == expected
+
+
+def test_a_mass_matrix_mixes_coordinates():
+    """∇fᵀM⁻¹∇g of q1² and q2² is 4 (M⁻¹)₁₂ q1 q2."""
+    mixed = HamiltonianSystem.from_sympy("p1**2 + p2**2 + p1*p2/3 + q1**2 + 2*q2**2").symbols
+    assert set(monomials(mixed, 2)) == {(2, 0), (0, 2), (1, 1)}
+    assert set(monomials(of("q1**2 + 2*q2**2"), 2)) == {(2, 0), (0, 2)}
+
+
+@pytest.mark.parametrize("system", [HH, QUARTIC], ids=["henon_heiles", "quartic"])
+def test_monomials_hold_what_the_formula_of_baker_campbell_and_hausdorff_has(system):
+    """The force gradient, the curvature, and the next products of gradients."""
+    symbols = system.symbols
+    q, V = symbols.q, symbols.V
+
+    def product(f, g):
+        return sp.expand(sum(sp.diff(f, x) * sp.diff(g, x) for x in q))
+
+    second = product(V, V)
+    third = product(V, second)
+    for f in (V, second, third, product(second, second), product(V, third)):
+        degree = sp.Poly(f, *q).total_degree()
+        assert in_monomials(f, symbols, monomials(symbols, degree)) is not None
 
 
 def test_no_monomial_is_left():
     with pytest.raises(
-        ValueError, match="`polynomial` 1 leaves no monomial that V is as even as: take a higher degree"
+        ValueError, match="`polynomial` 1 leaves no monomial of those that suit V: take a higher degree"
     ):
         SympFlow.primed(QUARTIC, 2, polynomial=1)
 

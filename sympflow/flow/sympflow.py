@@ -162,8 +162,9 @@ class SympFlow(FlowMap):
             systems. A trained kick with it comes tens of times nearer, and takes 1.1 to 1.5 times as long.
         polynomial : int, optional
             In place of force gradients and curvatures every kick has a trained polynomial in q of this total degree,
-            t³ Σ_m e_m(t) q^m, of the monomials that are as even as V: for symbolic systems in few degrees of freedom.
-            For a polynomial V of degree n, 2n − 2 is a good one.
+            t³ Σ_m e_m(t) q^m: for symbolic systems in few degrees of freedom. Its monomials are those of V and of what
+            products of gradients make from it, ∇VᵀM⁻¹∇V first, where V is a polynomial, else those as even as V. For a
+            polynomial V of degree n, 2n − 2 is a good one.
         first : {"drift", "kick"}
             What equal steps begin and end with. A kick that ends a step and begins the next is one: with an even number
             of kicks, where each has a polynomial or a curvature, "kick" gives a palindrome more numbers at no cost.
