@@ -24,6 +24,7 @@ class Minimum:
     reason: str
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of trials that go too far; what is not finite is rejected
 def levenberg_marquardt(
     residuals: Callable[[np.ndarray], np.ndarray],
     linearized: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
@@ -66,7 +67,7 @@ def levenberg_marquardt(
        minimization, arXiv:1201.5885 (2012).
     """
     r = residuals(x)
-    cost = _squared(r)
+    cost = float(r @ r)
     if not np.isfinite(cost):
         return Minimum(x, np.inf, 0, "the residuals are not finite at the start")
     costs, scale, growth = [cost], np.zeros(len(x)), 2.0
@@ -89,7 +90,7 @@ def levenberg_marquardt(
                 bend = np.zeros_like(step)
             trial = x + step + bend
             r_trial = residuals(trial)
-            cost_trial = _squared(r_trial)
+            cost_trial = float(r_trial @ r_trial)
             ratio = (cost - cost_trial) / predicted if predicted > 0 else -1.0
             if np.isfinite(cost_trial) and ratio > 0:
                 damping = max(damping * max(1 / 5, 1 - (2 * min(ratio, 1.0) - 1) ** 3), 1e-20)
@@ -103,12 +104,6 @@ def levenberg_marquardt(
         if len(costs) > patience and cost > (1 - gain) * costs[-1 - patience]:
             return Minimum(x, cost, iteration + 1, "it has converged")
     return Minimum(x, cost, iterations, "the iterations were used up")
-
-
-def _squared(r: np.ndarray) -> float:
-    """‖r‖²; inf or NaN, without a warning, of a trial that went too far."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(r @ r)
 
 
 class _Damped:
