@@ -149,9 +149,9 @@ class GaussNewtonRun(SearchRun):
         fit = self.weighted or self.frozen
         assert fit is not None
         offset, design = self.table.polynomial(np.array([self.table.dt]))
-        x = np.linalg.lstsq(fit.design[0], offset[0] + design[0] @ theta, rcond=None)[0]
-        r = fit.residuals(x)
-        return float(r @ r) if np.isfinite(r).all() else math.inf
+        r = fit.residuals(self.table.frozen_parameters(offset[0] + design[0] @ theta))
+        with np.errstate(over="ignore"):
+            return float(r @ r) if np.isfinite(r).all() else math.inf
 
     def remarks(self) -> dict[str, Any]:
         return {"kept_start": True} if self.kept_start else {}
@@ -184,7 +184,7 @@ class GaussNewtonRun(SearchRun):
             )
         if self.frozen is None:
             return table.continued(coefficients) if restart else given
-        return np.linalg.lstsq(self.frozen.design[0], coefficients, rcond=None)[0]
+        return table.frozen_parameters(coefficients)
 
     def _continued(self, minimum: Minimum) -> np.ndarray:
         """The parameters that a minimum of the search gives."""

@@ -116,6 +116,7 @@ class TableFit(Fit):
             y = self.step(self.coefficients(theta), self._x)
             return self._rows(self._errors(y - self._y)).ravel()
 
+    @np.errstate(all="ignore")  # as in the residuals: what is not finite is rejected
     def linearized(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         y, J = self.step.with_jacobian(self.coefficients(theta), self._x)
         by_table = self._rows(self._errors(J))  # (J, (2d + 1) N, n)
@@ -168,11 +169,28 @@ class Table:
 
     def frozen(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """The same for a table at one time that is bound by nothing but the palindrome."""
-        columns = [
+        return self._assembled(self._unbound(), np.array([t]))
+
+    def frozen_parameters(self, coefficients: np.ndarray) -> np.ndarray:
+        """The parameters of `frozen` at Δt by which the table is the given one (n,), or nearest to it.
+
+        Each column by itself and in powers of τ: beside Δt, coefficients in Δt⁵ are lost in rounding in SI units.
+        """
+        return np.concatenate(
+            [
+                np.linalg.lstsq(
+                    _array(c.basis)[:, 0], self._column(coefficients, place) / self.dt**c.power, rcond=None
+                )[0]
+                for c, place in zip(self._unbound(), self._places, strict=True)
+            ]
+        )
+
+    def _unbound(self) -> list[Coefficients]:
+        """The columns of `frozen`."""
+        return [
             Coefficients(c.offset.shape[0], (0,), self.dt, c.power, self.flow.palindromic and j < self._kernel)
             for j, c in enumerate(self.columns)
         ]
-        return self._assembled(columns, np.array([t]))
 
     def _assembled(self, columns: list[Coefficients], t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         offset, blocks = np.zeros((len(t), self.n)), []
