@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -53,6 +54,11 @@ def checked_time(flow: FlowMap, t: Any, x: Any) -> float | Tensor:
     if not math.isfinite(value):
         raise ValueError(f"`t` must be finite; got {value}: pass a finite time.")
     return value
+
+
+def plain(value: Any) -> Any:
+    """A number of NumPy's or torch's as one of Python's, which JSON takes as well; anything else as it is."""
+    return value.item() if isinstance(value, (np.generic, np.ndarray, Tensor)) and value.ndim == 0 else value
 
 
 def check_system(system: Any) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from sympflow.domain import Domain
 from sympflow.fingerprints import same_system
-from sympflow.flow.arguments import bare_time, checked_time
+from sympflow.flow.arguments import bare_time, check_system, checked_time, plain
 from sympflow.flow.steps import whole_steps, whole_steps_of_each
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ class FlowMap(nn.Module):
 
     def __init__(self, ndof: int, dt: float) -> None:
         super().__init__()
+        ndof, dt = plain(ndof), plain(dt)
         if isinstance(ndof, bool) or not isinstance(ndof, int) or ndof < 1:
             raise ValueError(f"`ndof` must be a positive integer, the degrees of freedom; got {ndof!r}.")
         if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf:
@@ -215,24 +216,24 @@ class FlowMap(nn.Module):
 
     def check_system(self, system: HamiltonianSystem) -> None:
         """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
-        mine = self.fingerprint
+        check_system(system)
+        mine, origin = self.fingerprint, self.recipe.get("transforms")
         if mine is not None and system.ndof == self.ndof and same_system(mine, system.fingerprint):
             return
-        origin = self.recipe.get("transforms")
         if origin is not None and same_system(origin["fingerprint"], system.fingerprint):
             raise ValueError(
                 f"`system` {system.name!r} is the one of this flow, but in another time: pass time_transformed(system, "
                 f"{origin['shift']:g}) here; solve(system, 'sympflow', flow=flow) runs it in the physical time."
             )
+        remedy = "pass the flow of this system, or train one with sympflow.train(system)."
         if system.ndof != self.ndof:
             raise ValueError(
-                f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: "
-                "pass the flow of this system, or train one with sympflow.train(system)."
+                f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: {remedy}"
             )
         if mine is not None:
             raise ValueError(
                 f"`system` {system.name!r} is not the one that this flow was trained for ({self.system_name!r}, or its "
-                "parameters differ): pass the flow of this system, or train one with sympflow.train(system)."
+                f"parameters differ): {remedy}"
             )
 
     def bound(self, system: HamiltonianSystem) -> FlowMap:

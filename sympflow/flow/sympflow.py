@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from sympflow.flow.arguments import bare_time
+from sympflow.flow.arguments import bare_time, plain
 from sympflow.flow.base import FlowMap
 from sympflow.flow.layers import Drift, Kick, Layer
 from sympflow.flow.potentials import MLPPotential
@@ -72,6 +72,7 @@ class SympFlow(FlowMap):
         scale: Scaling | None = None,
     ) -> None:
         super().__init__(ndof, dt)
+        ndof, pairs, dt, seed = self.ndof, plain(pairs), self.dt, plain(seed)
         if isinstance(pairs, bool) or not isinstance(pairs, int) or pairs < 1:
             raise ValueError(f"`pairs` must be a positive integer, the number of kick–drift pairs; got {pairs!r}.")
         scale = Scaling.unit(ndof, dt) if scale is None else scale
@@ -179,7 +180,7 @@ class SympFlow(FlowMap):
         from sympflow.flow.untrained_primed import primed
 
         shape = (stages, dt, palindromic, scheme, degree, force_gradient, processor, curvature, polynomial, first)
-        return primed(system, *shape, dtype, device)
+        return primed(system, *map(plain, shape), dtype, device)  # type: ignore[call-arg]
 
     @staticmethod
     def split(
@@ -228,7 +229,8 @@ class SympFlow(FlowMap):
         """
         from sympflow.flow.untrained_split import split
 
-        return split(system, stages, dt, terms, filters, force_gradient, parts, linear_outside, dtype, device)
+        numbers = plain(stages), plain(dt), plain(terms)
+        return split(system, *numbers, filters, force_gradient, parts, linear_outside, dtype, device)
 
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.ndof, "layers": [layer.to_dict() for layer in self.layers]}  # type: ignore[operator]

@@ -71,6 +71,10 @@ def primed(
         if scheme not in SCHEMES:
             raise ValueError(f"`scheme` {scheme!r} is unknown: choose one of {', '.join(SCHEMES)}.")
         scheme = SCHEMES[scheme]
+    if not isinstance(scheme, Scheme):
+        raise TypeError(
+            f"`scheme` must be a Scheme or the name of one; got {scheme!r}: choose one of {', '.join(SCHEMES)}."
+        )
     if (scheme.nystrom or any(scheme.gradients)) and not system.quadratic_kinetic:
         raise ValueError(f"`scheme` {scheme.name!r} needs a kinetic energy ½ pᵀM⁻¹p: take 'kahan_li8', for instance.")
     extra = (processor, curvature, of_kicks, dtype, device)

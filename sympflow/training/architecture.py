@@ -46,7 +46,25 @@ def kind_of(system: HamiltonianSystem, given: dict[str, Any]) -> str:
     for name in OF_NETWORKS if kind == "primed" else OF_PRIMED:
         if given[name] is not None:
             raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
+    if kind == "primed":
+        _check_primable(system, given)
     return kind
+
+
+def _check_primable(system: HamiltonianSystem, given: dict[str, Any]) -> None:
+    """Raise if a new primed flow of the system cannot be made, or not be fitted by its optimizer."""
+    named = " and ".join(f"`{name}`" for name in ("kind", *OF_PRIMED, *OF_SEARCHES) if given[name] is not None)
+    needs = f"{named} asks for a flow primed with V and T"
+    if not system.separable:
+        raise ValueError(
+            f"{needs}, but the system {system.name!r} has one function H, not known as T(p) + V(q): leave out {named} "
+            "for a network, or define the system with HamiltonianSystem.from_sympy."
+        )
+    if not system.quadratic_kinetic and given["optimizer"] in (None, "gauss-newton"):
+        raise ValueError(
+            f"{needs}, whose table Gauss–Newton fits only where T = ½ pᵀM⁻¹p, as it is not in the system "
+            f"{system.name!r}: leave out {named} for a network, or pass optimizer='bfgs'."
+        )
 
 
 def check_flow(flow: FlowMap, system: HamiltonianSystem, dt: float | None) -> None:
@@ -74,17 +92,21 @@ def _meant(system: HamiltonianSystem, given: dict[str, Any]) -> str:
 def new_primed(system: HamiltonianSystem, domain: Domain, given: dict[str, Any]) -> PrimedFlow:
     """A new primed flow; `given` are the arguments of `train`.
 
-    Where these say nothing of the flow and its fit, it is one that `chosen_recipe` finds by trials, or that of the run
-    to go on with. Else what is not given is as `default_recipe` has it, Δt in proportion to the kicks.
+    Where these say nothing of the flow and its fit, it is one that `chosen_recipe` finds by trials; of a run to go on
+    with, that one's, if it is one of those that are tried. Else what is not given is as `default_recipe` has it, Δt in
+    proportion to the kicks.
     """
     dt, stages, processor, dtype = given["dt"], given["stages"], given["processor"], given["dtype"]
     dtype = torch.float64 if dtype is None else dtype
-    if _untold(system, given):
+    untold = not options_given(given, ("dt", *OF_PRIMED, "dtype", "device"))
+    if given["resume"] is not None and untold and _tried(system):
+        recipe = _recipe_of_run(system, domain, given["resume"])
+        if recipe is not None:
+            return recipe.flow(system)
+    elif untold and _tried(system) and _fit_is_untold(given):
         from sympflow.training.trials import chosen_recipe
 
-        resume = given["resume"]
-        recipe = chosen_recipe(system, domain) if resume is None else _recipe_of_run(system, domain, resume)
-        return recipe.flow(system)
+        return chosen_recipe(system, domain).flow(system)
     if system.separable and (dt is None or stages is None or processor is None):
         recipe = default_recipe(system, domain, dt)
         if dt is None:
@@ -101,24 +123,26 @@ def new_primed(system: HamiltonianSystem, domain: Domain, given: dict[str, Any])
     )
 
 
-def _untold(system: HamiltonianSystem, given: dict[str, Any]) -> bool:
-    """Whether nothing is said of a new flow and its fit, trials apply to the system, and there is time for them."""
+def _tried(system: HamiltonianSystem) -> bool:
+    """Whether trials apply to the system."""
     from sympflow.training.trials import MOST_NDOF
 
-    fits = system.separable and system.quadratic_kinetic and system.symbols is not None and system.ndof <= MOST_NDOF
+    return system.separable and system.quadratic_kinetic and system.symbols is not None and system.ndof <= MOST_NDOF
+
+
+def _fit_is_untold(given: dict[str, Any]) -> bool:
+    """Whether nothing is said of the fit of a new flow, and there is time for trials."""
     hurried = given["time_budget"] is not None and given["time_budget"] < BUDGET
-    if not fits or hurried or given["optimizer"] not in (None, "gauss-newton"):
-        return False
-    return not options_given(given, ("dt", *OF_PRIMED, *OF_FITS, "dtype", "device"))
+    return not (hurried or given["optimizer"] not in (None, "gauss-newton") or options_given(given, OF_FITS))
 
 
-def _recipe_of_run(system: HamiltonianSystem, domain: Domain, path: Any) -> PrimedRecipe:
-    """The recipe of the flow in a checkpoint; if it is none of those that are tried, the first of these."""
+def _recipe_of_run(system: HamiltonianSystem, domain: Domain, path: Any) -> PrimedRecipe | None:
+    """The recipe of the flow in a checkpoint, if it is one of those that are tried."""
     from sympflow.training.trials import tried_recipes
 
     recipes, theirs = tried_recipes(system, domain), checkpoints.read(path)["architecture"]
     mine = (checkpoints.identity(recipe.flow(system), system, {})["architecture"] for recipe in recipes)
-    return next((recipe for recipe, one in zip(recipes, mine, strict=True) if one == theirs), recipes[0])
+    return next((recipe for recipe, one in zip(recipes, mine, strict=True) if one == theirs), None)
 
 
 def new_network(system: HamiltonianSystem, kind: str, dt: float, scaling: Scaling, given: dict[str, Any]) -> FlowMap:

@@ -6,13 +6,16 @@ import difflib
 import hashlib
 import inspect
 import math
+import os
 from typing import Any
 
 import numpy as np
 
 from sympflow.arrays import to_numpy
 from sympflow.domain import Domain, EnergySublevel
+from sympflow.flow.sympflow import SympFlow
 from sympflow.system import HamiltonianSystem
+from sympflow.training.choices import is_number
 from sympflow.training.run import Labelled
 
 
@@ -37,29 +40,33 @@ def domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
     return domain
 
 
-OF_PRIMED_ALONE = ("curvature", "palindromic", "scheme", "degree", "force_gradient")
-
-
 def refuse_unknown(options: dict[str, Any]) -> None:
     """Raise if there are options that `train` does not have, with what may be meant."""
     from sympflow.training.trainer import train
 
+    known = [each for each in inspect.signature(train).parameters if each != "unknown"]
     for name, value in options.items():
-        if name in OF_PRIMED_ALONE:
-            raise TypeError(
-                f"`{name}` is an option of SympFlow.primed: pass flow=SympFlow.primed(system, ..., {name}={value!r})."
-            )
-        known = [each for each in inspect.signature(train).parameters if each != "unknown"]
+        for maker in (SympFlow.primed, SympFlow.split):
+            if name in inspect.signature(maker).parameters:
+                by = maker.__qualname__
+                raise TypeError(f"`{name}` is an option of {by}: pass flow={by}(system, ..., {name}={value!r}).")
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"is `{close[0]}` meant?" if close else f"choose from {', '.join(known[1:])}."
         raise TypeError(f"`{name}` is no option of train(): {hint}")
 
 
-def check_step_and_budget(dt: Any, time_budget: Any) -> None:
-    if dt is not None and (isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf):
+def check_surroundings(given: dict[str, Any]) -> None:
+    """Those of the arguments of `train` that say for how long, from where and to where, and its Δt."""
+    dt, time_budget, callback = given["dt"], given["time_budget"], given["callback"]
+    if dt is not None and not (is_number(dt) and 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
-    if time_budget is not None and not 0 < time_budget < math.inf:
+    if time_budget is not None and not (is_number(time_budget) and 0 < time_budget < math.inf):
         raise ValueError(f"`time_budget` must be a positive number of seconds; got {time_budget!r}: leave it out.")
+    if callback is not None and not callable(callback):
+        raise TypeError(f"`callback` must be a function of the step and the figures; got {callback!r}: leave it out.")
+    for name in ("checkpoint", "resume"):
+        if given[name] is not None and not isinstance(given[name], (str, os.PathLike)):
+            raise TypeError(f"`{name}` must be the path of a file; got {given[name]!r}: pass a string or leave it out.")
 
 
 def weights_of(

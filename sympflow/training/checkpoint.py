@@ -55,7 +55,10 @@ def read_same(path: str | os.PathLike[str], mine: dict[str, Any]) -> dict[str, A
         raise ValueError(f"`resume` is a run with another {', '.join(differing)}: pass the same arguments as then.")
     for name in ("architecture", "fingerprint"):
         if state[name] != mine[name]:
-            raise ValueError(f"`resume` is a run with another {name}: pass the same system and flow as then.")
+            raise ValueError(
+                f"`resume` is a run with another {name}: pass the same system, and the same arguments of "
+                "the flow, as then."
+            )
     return state
 
 

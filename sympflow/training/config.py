@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from sympflow.training.choices import check_counts, check_positive, check_seed, check_weights
+from sympflow.training.choices import check_counts, check_positive, check_seed, check_weights, to_plain_numbers
 
 DEFAULTS: dict[str, dict[str, Any]] = {
     "adam": {"steps": 20_000, "points": 700, "refresh": 1, "validate_every": 500, "checkpoint_every": 1000},
@@ -79,6 +79,7 @@ class TrainingConfig:
     checkpoint_every: int = 1000
 
     def __post_init__(self) -> None:
+        to_plain_numbers(self)
         for name, value, known in (
             ("optimizer", self.optimizer, OPTIMIZERS),
             ("schedule", self.schedule, SCHEDULES),

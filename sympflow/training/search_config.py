@@ -6,7 +6,14 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from sympflow.training.choices import check_counts, check_positive, check_seed, check_weights
+from sympflow.training.choices import (
+    check_counts,
+    check_positive,
+    check_seed,
+    check_weights,
+    is_number,
+    to_plain_numbers,
+)
 
 
 @dataclass(frozen=True)
@@ -39,6 +46,7 @@ class SearchConfig:
     reference_states: int = 100
 
     def __post_init__(self) -> None:
+        to_plain_numbers(self)
         counts = ("points", "label_times", "restarts", "steps", "reference_states")
         check_counts(**{name: getattr(self, name) for name in counts})
         check_seed(self.seed)
@@ -85,7 +93,7 @@ class TableConfig(SearchConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_counts(loss_points=self.loss_points, matching_times=self.matching_times)
-        if not 0 <= self.energy_weight < math.inf:
+        if not (is_number(self.energy_weight) and 0 <= self.energy_weight < math.inf):
             raise ValueError(
                 f"`energy_weight` must be finite and at least 0; got {self.energy_weight!r}: 0 leaves the energy out."
             )

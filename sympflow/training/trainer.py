@@ -10,10 +10,11 @@ import torch
 from numpy.typing import ArrayLike
 
 from sympflow.domain import Domain
+from sympflow.flow.arguments import check_system, plain
 from sympflow.flow.base import FlowMap
 from sympflow.system import HamiltonianSystem
 from sympflow.training.architecture import check_flow, kind_of, new_primed
-from sympflow.training.arguments import check_step_and_budget, domain_for, refuse_unknown
+from sympflow.training.arguments import check_surroundings, domain_for, refuse_unknown
 from sympflow.training.recipes import BUDGET
 from sympflow.training.run import Path
 from sympflow.training.starts import start
@@ -139,10 +140,12 @@ def train(
     FloatingPointError
         If the loss is not finite from the start.
     """
-    given, begin = dict(locals()), time.perf_counter()
+    given, begin = {name: plain(value) for name, value in locals().items()}, time.perf_counter()
     refuse_unknown(given.pop("unknown"))
+    check_system(system)
+    check_surroundings(given)
+    dt, time_budget = given["dt"], given["time_budget"]
     domain = domain_for(system, domain)
-    check_step_and_budget(dt, time_budget)
     hurried = flow is None and time_budget is None and restarts is None and steps is None and resume is None
     kind = kind_of(system, given)
     if flow is not None:
