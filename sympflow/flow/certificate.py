@@ -76,8 +76,8 @@ class Certificate:
     one_step_error : Quantiles
         ‖ψ̄_Δt(x) − φ_H,Δt(x)‖ at the held-out states, φ by DOP853 at 1e-12.
     energy_error, relative_energy_error : Quantiles
-        Over the held-out states, the largest |H(ψ_t x) − H(x)| at the steps up to T, or up to where the orbit leaves Ω;
-        relative to the system's `energy_scale`, else to |H(x)|.
+        Over the held-out states, the largest |H(ψ_t x) − H(x)| up to T, or up to where the orbit leaves Ω, at the steps
+        and at one time between every two; relative to the system's `energy_scale`, else to |H(x)|.
     left : int
         Number of orbits that left Ω before T.
     weights : str

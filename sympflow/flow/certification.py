@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 SAVED_VALUES = 1_000_000  # of a piece of the measured runs, which are never held whole
 WORST = 16  # states of a time from which the largest rate is searched
 OFFSPRING, ROUNDS = 16, 16  # new states of each, and how often
+GOLDEN = (math.sqrt(5) - 1) / 2
 FIRST_STEP, SHRINK = 0.2, 0.65  # how far these are, in standard deviations of Ω, and how much nearer each time
 
 
@@ -162,24 +163,29 @@ def _one_step_error(flow: SympFlow, system: HamiltonianSystem, x: np.ndarray) ->
 def _energy_errors(
     flow: SympFlow, system: HamiltonianSystem, domain: Domain, x: np.ndarray, t_end: float
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """The largest |H − H0| of each orbit at the steps in Ω up to t_end, the same relative, how many left Ω."""
+    """The largest |H − H0| of each orbit in Ω up to t_end, the same relative, how many left Ω.
+
+    Looked at are all steps, and between every two of them one time at another fraction of Δt: there an output is a
+    shorter step, whose error is its own.
+    """
     from sympflow.solver import solve
 
     steps = int(t_end / flow.dt * (1 + 1e-12))
-    piece = max(1, min(steps, SAVED_VALUES // x.size))
+    piece = max(1, min(steps, SAVED_VALUES // (2 * x.size)))
     y = x.astype(str(flow.dtype).removeprefix("torch."))
     precision: dict[str, Any] = {"dtype": str(y.dtype)} if flow.device.type == "cpu" else {}
     H0 = system.hamiltonian(y).astype(float)
     largest, inside, done = np.zeros(len(x)), np.full(len(x), True), 0
     while done < steps and inside.any():
         n = min(piece, steps - done)
+        times = flow.dt * _steps_and_between(done, n)
         state = torch.as_tensor(y, device=flow.device) if flow.device.type != "cpu" else y
         with torch.no_grad(), np.errstate(all="ignore"):
-            run = solve(system, flow, (0.0, n * flow.dt), state, on_domain_exit="ignore", **precision)
-            orbit = np.moveaxis(torch.as_tensor(run.y).cpu().numpy(), -1, 0)  # (n + 1, N, 2d)
+            run = solve(system, flow, (0.0, times[-1]), state, t_eval=times, on_domain_exit="ignore", **precision)
+            orbit = np.moveaxis(torch.as_tensor(run.y).cpu().numpy(), -1, 0)  # (2n + 1, N, 2d)
             error = np.abs(system.hamiltonian(orbit) - H0)
             stays = np.logical_and.accumulate(domain.contains(orbit), axis=0) & inside
-        # a step taken in Ω counts, even if it ends outside
+        # what was reached from Ω counts, even if it ends outside
         counted = np.concatenate([inside[None], stays[:-1]])
         error = np.where(np.isnan(error), math.inf, error)
         largest = np.maximum(largest, np.where(counted, error, 0.0).max(0))
@@ -188,6 +194,12 @@ def _energy_errors(
     scale = np.abs(H0) if system.energy_scale is None else np.full_like(H0, system.energy_scale)
     relative = largest / np.where(scale > 0, scale, 1.0)
     return largest, relative, int((~inside).sum())
+
+
+def _steps_and_between(done: int, n: int) -> np.ndarray:
+    """0, 1, …, n, and one number between every two, in units of Δt: (2n + 1,). The fractions fill (0, 1) evenly."""
+    k = np.arange(n)
+    return np.append(np.stack([k, k + (done + k + 1) * GOLDEN % 1], axis=1).ravel(), n)
 
 
 def _seed(seed: int, stream: int) -> int:
