@@ -10,7 +10,9 @@ from sympflow.kernels.kicks import kick_cycles
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.gauss_newton import GaussNewtonRun
+from sympflow.training.levenberg_marquardt import Minimum
 from sympflow.training.recipes import default_recipe
+from sympflow.training.table_fit import TableFit
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
 QUICK = {"STARTS": 2, "STEPS": 20, "FINAL_STEPS": 20, "POINTS": 40, "LENGTH": 50}
@@ -40,6 +42,24 @@ def test_the_order_of_the_error_decides_between_short_and_long_steps(monkeypatch
 def test_a_long_step_that_misses_the_goal_is_not_taken(monkeypatch):
     first, *_ = trials.tried_recipes(HH, HH.domain, curvature=False)
     assert law(monkeypatch, lambda x, c: 9e-6 if x == 1.0 else 1.1e-5) == first
+
+
+def test_where_all_miss_the_goal_the_least_error_is_taken(monkeypatch):
+    """Of errors that are alike the longest step's; curvature terms where they alone meet the goal."""
+    first, *_, last = trials.tried_recipes(HH, HH.domain, curvature=False)
+    assert law(monkeypatch, lambda x, c: 1e-3 if x == 1.0 else 2.1e-3) == first
+    assert law(monkeypatch, lambda x, c: 1e-3 if x == 1.0 else 1.9e-3) == last
+    assert law(monkeypatch, lambda x, c: 1e-6 if c else 1.0) == replace(last, curvature=True)
+    assert law(monkeypatch, lambda x, c: np.inf) == first
+
+
+def test_a_map_that_keeps_the_energy_alone_is_no_candidate(monkeypatch):
+    """The identity keeps it exactly, and misses all of what a step moves a state."""
+    monkeypatch.setattr(TableFit, "coefficients", lambda self, theta: np.zeros((self.design.shape[1], 1)))
+    monkeypatch.setattr(TableFit, "minimize", lambda self, theta, *_, **__: Minimum(theta, 0.0, 0, ""))
+    assert trials.trial_error(default_recipe(PENDULUM), PENDULUM, PENDULUM.domain) == np.inf
+    monkeypatch.setattr(trials, "USELESS", 1.1)
+    assert trials.trial_error(default_recipe(PENDULUM), PENDULUM, PENDULUM.domain) == 0.0
 
 
 def test_curvature_is_taken_where_its_error_is_worth_its_cycles(monkeypatch):

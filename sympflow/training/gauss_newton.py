@@ -7,6 +7,9 @@ to labels at several times in (0, Δt].
 
 Other losses (the residual of the flow, Hamiltonian matching) join in the last stage. Without labels there is that stage
 alone, from each start.
+
+A flow that misses a tenth of what a step moves a state, or more, in the mean over held-out states and in units of the
+spread of each coordinate over Ω, comes with a warning.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ from sympflow.training.levenberg_marquardt import Minimum
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.search import SearchRun, Stop
 from sympflow.training.search_config import TableConfig
+from sympflow.training.table_errors import differences, distance, errors, shares_missed, warn_of_useless_flow
 from sympflow.training.table_fit import Fit, LossFit, StackedFit, Table, TableFit
 from sympflow.training.table_jacobian import TableStep
 
@@ -64,7 +68,7 @@ class GaussNewtonRun(SearchRun):
     def __post_init__(self) -> None:
         self.table = Table(self.flow)
         self.given = self.table.parameters()
-        self.at_start = errors(self.flow, self.step, self.held_out)
+        self.at_start = self._differences()
 
     @classmethod
     def start(
@@ -143,6 +147,8 @@ class GaussNewtonRun(SearchRun):
         self.table.assign(best.x)
         self._keep_better()
         self._record(best)
+        shares = shares_missed(self._differences()[-1], self.held_out, np.array(self.scaling.x))
+        warn_of_useless_flow(shares, self.flow.dt, stacklevel=4)
 
     def _frozen_cost(self, theta: np.ndarray) -> float:
         """What parameters cost at Δt; infinite if they lead to no finite states."""
@@ -158,7 +164,8 @@ class GaussNewtonRun(SearchRun):
 
     def _keep_better(self) -> None:
         """Go back to where the run began if that is nearer to the exact flow at the held-out states."""
-        before, after = (_distance(e) for e in (self.at_start, errors(self.flow, self.step, self.held_out)))
+        unit = np.array(self.scaling.x)
+        before, after = (distance(e, unit) for e in (self.at_start, self._differences()))
         if after <= before or not math.isfinite(before):
             return
         self.table.assign(self.given)
@@ -166,9 +173,9 @@ class GaussNewtonRun(SearchRun):
         if after < CLOSE * before:  # as when a fit is fitted again
             return
         warnings.warn(
-            f"The fit has a larger held-out error ({after:.1e}) than the flow that it started from ({before:.1e}), "
-            "which is returned: its data are too few, too far from Δt, or not of this system; or H is singular in "
-            "`domain`, or nearly so: shrink that.",
+            f"The fit has a larger held-out error ({after:.1e}, in units of the spread of `domain`) than the flow that "
+            f"it started from ({before:.1e}), which is returned: its data are too few, too far from Δt, or not of this "
+            "system; or H is singular in `domain`, or nearly so: shrink that.",
             RuntimeWarning,
             stacklevel=5,
         )
@@ -190,12 +197,16 @@ class GaussNewtonRun(SearchRun):
         """The parameters that a minimum of the search gives."""
         return minimum.x if self.frozen is None else self.table.continued(self.frozen.design[0] @ minimum.x)
 
+    def _differences(self) -> np.ndarray:
+        """From the exact flow, at the held-out states and times."""
+        return differences(self.flow, self.step, self.held_out)
+
     def _record(self, minimum: Minimum) -> dict[str, float]:
         figures = {
             "step": len(self.minima),
             "loss": minimum.cost,
             "iterations": minimum.iterations,
-            **errors(self.flow, self.step, self.held_out),
+            **errors(self._differences()),
         }
         self.history.append(figures)
         return figures
@@ -228,24 +239,3 @@ def _distinct(minima: list[Minimum]) -> list[Minimum]:
 
 def _tensors(data: tuple[np.ndarray, ...] | None) -> Any:
     return None if data is None else tuple(torch.as_tensor(a, dtype=torch.float64) for a in data)
-
-
-def _distance(figures: dict[str, float]) -> float:
-    """Of a flow from the exact one, at Δt and before it; infinite if anything is not a number."""
-    both = figures["one_step_error"] + figures["fractional_error"]
-    return both if math.isfinite(both) else math.inf
-
-
-def errors(flow: PrimedFlow, step: TableStep, labels: Labels) -> dict[str, float]:
-    """‖ψ̄_t(x) − φ_H,t(x)‖ at the labels: mean, median and largest at Δt, the last time; mean before it."""
-    table = Table(flow)
-    offset, design = table.polynomial(labels.t)
-    coefficients = offset + design @ table.parameters()
-    psi = np.stack([step(c[:, None], labels.x.T).T for c in coefficients])
-    error = np.linalg.norm(psi - labels.y, axis=-1)
-    return {
-        "one_step_error": float(error[-1].mean()),
-        "one_step_error_median": float(np.median(error[-1])),
-        "one_step_error_max": float(error[-1].max()),
-        "fractional_error": float(error[:-1].mean()),
-    }
