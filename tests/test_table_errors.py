@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from sympflow import Box, HamiltonianSystem, SympFlow, systems, train
+from sympflow.flow.scaling import Scaling
+from sympflow.training.gauss_newton import GaussNewtonRun
 from sympflow.training.labels import Labels
-from sympflow.training.levenberg_marquardt import Minimum
-from sympflow.training.table_errors import USELESS, shares_missed
-from sympflow.training.table_fit import TableFit
+from sympflow.training.search_config import TableConfig
+from sympflow.training.table_errors import USELESS, differences, distance, shares_missed
 
 PENDULUM = systems.pendulum()
 FEW = {"restarts": 1, "steps": 8, "points": 40, "reference_states": 20, "progress": False}
@@ -47,12 +48,16 @@ def test_a_flow_that_follows_a_step_comes_without_one():
     assert USELESS == 0.1  # as the documentation says
 
 
-def test_fits_far_from_any_flow_end_without_the_warnings_of_numpy(monkeypatch):
-    """Energies of 1e160, whose squares overflow: what is not finite is rejected, and only the remark remains."""
-    system = HamiltonianSystem.from_sympy("p**2/2 + exp(q**2)", domain=Box([-20, -1], [20, 1]))
-    monkeypatch.setattr(TableFit, "minimize", lambda self, theta, *_, **__: Minimum(theta, 1.0, 0, ""))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        flow = SympFlow.primed(system, 3, dt=1e-3, processor=2)
-        train(system, flow=flow, **FEW)
-    assert [w.category for w in caught] == [UserWarning]
+def test_numbers_that_overflow_are_not_finite_without_the_warnings_of_numpy():
+    """Trials of a search may be anything: forces of a quartic potential beyond 1e308, and the squares of others."""
+    system = HamiltonianSystem.from_sympy("p**2/2 + q**4/4", domain=Box([-1, -1], [1, 1]))
+    flow = SympFlow.primed(system, 3, dt=1.0, processor=2).requires_grad_(False)
+    run = GaussNewtonRun.start(flow, system, system.domain, Scaling.unit(1), TableConfig(points=5, reference_states=5))
+    for size in (1e30, 1e100, 1e200):
+        run.table.assign(size * np.random.default_rng(0).normal(size=flow.n_parameters))
+        theta = run.table.parameters()
+        assert run._frozen_cost(theta) == np.inf
+        assert not np.isfinite(run.whole.linearized(theta)[1]).all()
+        difference = differences(flow, run.step, run.held_out)
+        assert distance(difference, np.ones(2)) == np.inf
+        assert shares_missed(difference[-1], run.held_out, np.ones(2)) == (np.inf, np.inf)
