@@ -47,12 +47,12 @@ def test_what_is_of_another_type_is_named(arguments, error, message):
 
 
 def test_what_is_no_system_or_scheme_is_named(tmp_path):
-    with pytest.raises(TypeError, match="^`system` must be a HamiltonianSystem; got str"):
+    with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem; got str"):
         train("p**2/2")
     SympFlow.primed(PENDULUM, 2).save(tmp_path / "flow.safetensors")
-    with pytest.raises(TypeError, match="^`system` must be a HamiltonianSystem; got str"):
+    with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem; got str"):
         sympflow.load(tmp_path / "flow.safetensors", system="pendulum")
-    with pytest.raises(TypeError, match="^`scheme` must be a Scheme or the name of one; got 3: choose one of"):
+    with pytest.raises(TypeError, match=r"^`scheme` must be a Scheme or the name of one; got 3: choose one of"):
         SympFlow.primed(PENDULUM, scheme=3)
 
 
@@ -115,7 +115,21 @@ def test_a_run_of_trials_is_resumed_whatever_else_is_said_now(monkeypatch, tmp_p
     for options in ({}, {"time_budget": 30.0}, {"time_budget": 30.0, "loss": "labels"}, {"time_budget": 90.0}):
         with pytest.raises(Started):
             train(HH, resume=path, progress=False, **options)
-    with pytest.raises(ValueError, match="^`resume` is a run with another restarts"):
+    with pytest.raises(ValueError, match=r"^`resume` is a run with another restarts"):
         train(HH, resume=path, restarts=3, progress=False)
-    with pytest.raises(ValueError, match="^`resume` is a run with another architecture: .* same arguments of the flow"):
+    with pytest.raises(ValueError, match=r"^`resume` is a run with another architecture: .* arguments of the flow"):
         train(HH, stages=2, resume=path, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"seed": -1}, ValueError, r"^`seed` must be a non-negative integer; got -1"),
+        ({"reference_states": 0}, ValueError, r"^`reference_states` must be a positive integer; got 0"),
+        ({"kind": "primed", "clip": 2.0}, TypeError, r"^`clip` is not an option of the optimizer 'gauss-newton'"),
+    ],
+)
+def test_options_are_checked_before_trials(monkeypatch, arguments, error, message):
+    monkeypatch.setattr(trials, "chosen_recipe", None)
+    with pytest.raises(error, match=message):
+        train(HH, **arguments)

@@ -101,7 +101,7 @@ class Started(Exception):
 def test_only_where_nothing_is_said_there_are_trials(monkeypatch, tmp_path):
     made = []
 
-    def chosen(system, domain):
+    def chosen(system, domain, watch):
         made.append(system)
         return replace(default_recipe(system), dt=1.25, curvature=True)
 

@@ -17,7 +17,9 @@ from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
 from sympflow.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
+from sympflow.training.interruption import Interruption
 from sympflow.training.recipes import BUDGET, PrimedRecipe, default_recipe
+from sympflow.training.watch import Watch
 
 KINDS = ("primed", "sympflow", "mlp")
 OF_NETWORKS = ("pairs", "hidden", "activation")
@@ -89,8 +91,10 @@ def _meant(system: HamiltonianSystem, given: dict[str, Any]) -> str:
     return "primed" if fits and not wants_network else "sympflow"
 
 
-def new_primed(system: HamiltonianSystem, domain: Domain, given: dict[str, Any]) -> PrimedFlow:
-    """A new primed flow; `given` are the arguments of `train`.
+def new_primed(
+    system: HamiltonianSystem, domain: Domain, given: dict[str, Any], interruption: Interruption
+) -> tuple[PrimedFlow, PrimedFlow | None]:
+    """A new primed flow, and the one that was fitted in a trial if there were any; `given` are `train`'s arguments.
 
     Where these say nothing of the flow and its fit, it is one that `chosen_recipe` finds by trials; of a run to go on
     with, that one's, if it is one of those that are tried. Else what is not given is as `default_recipe` has it, Δt in
@@ -102,25 +106,22 @@ def new_primed(system: HamiltonianSystem, domain: Domain, given: dict[str, Any])
     if given["resume"] is not None and untold and _tried(system):
         recipe = _recipe_of_run(system, domain, given["resume"])
         if recipe is not None:
-            return recipe.flow(system)
+            return recipe.flow(system), None
     elif untold and _tried(system) and _fit_is_untold(given):
         from sympflow.training.trials import chosen_recipe
 
-        return chosen_recipe(system, domain).flow(system)
+        watch = Watch(interruption, given["progress"])
+        recipe = chosen_recipe(system, domain, watch)
+        return recipe.flow(system), watch.flows.get(recipe)
     if system.separable and (dt is None or stages is None or processor is None):
         recipe = default_recipe(system, domain, dt)
         if dt is None:
             dt = recipe.dt if stages is None else float(f"{recipe.dt * stages / recipe.stages:.3g}")
         stages = recipe.stages if stages is None else stages
         processor = recipe.processor if processor is None else processor
-    return SympFlow.primed(
-        system,
-        stages,
-        dt=1.0 if dt is None else float(dt),
-        processor=0 if processor is None else processor,
-        dtype=dtype,
-        device=given["device"],
-    )
+    dt, processor = 1.0 if dt is None else float(dt), 0 if processor is None else processor
+    flow = SympFlow.primed(system, stages, dt=dt, processor=processor, dtype=dtype, device=given["device"])
+    return flow, None
 
 
 def _tried(system: HamiltonianSystem) -> bool:

@@ -138,7 +138,7 @@ class GaussNewtonRun(SearchRun):
             for fit in filter(None, (frozen, self.weighted)):
                 finalists = [fit.minimize(m.x, steps, lambda: spent(FROZEN_SHARE), thorough=True) for m in finalists]
         starts = [self._continued(m) for m in _distinct(finalists)[:FITTED]]
-        if frozen is None or self._frozen_cost(self.given) < HOPELESS * min(m.cost for m in finalists):
+        if not finalists or frozen is None or self._frozen_cost(self.given) < HOPELESS * min(m.cost for m in finalists):
             starts.insert(0, self.given)
         fitted = [self.whole.minimize(theta, steps, spent, thorough=True) for theta in starts]
         best = min(fitted, key=lambda m: m.cost)
@@ -163,14 +163,18 @@ class GaussNewtonRun(SearchRun):
         return {"kept_start": True} if self.kept_start else {}
 
     def _keep_better(self) -> None:
-        """Go back to where the run began if that is nearer to the exact flow at the held-out states."""
+        """Go back to where the run began, or to `tried`, if that is nearer to the exact flow at the held-out states."""
+        interrupted = self.interruption.asked
+        if interrupted and isinstance(self.tried, PrimedFlow):
+            self.given = Table(self.tried).parameters()
+            self.at_start = differences(self.tried, self.step, self.held_out)
         unit = np.array(self.scaling.x)
         before, after = (distance(e, unit) for e in (self.at_start, self._differences()))
         if after <= before or not math.isfinite(before):
             return
         self.table.assign(self.given)
         self.kept_start = True
-        if after < CLOSE * before:  # as when a fit is fitted again
+        if interrupted or after < CLOSE * before:  # as when a fit is fitted again
             return
         warnings.warn(
             f"The fit has a larger held-out error ({after:.1e}, in units of the spread of `domain`) than the flow that "

@@ -11,6 +11,7 @@ from scipy.linalg import solve_triangular
 
 MAX_REJECTED = 30
 PROBE = 0.1  # share of a step over which the residuals' curvature is measured
+STOPPED = "it was stopped"
 CURVED = 0.75  # largest ratio of the second-order correction to the step
 
 
@@ -73,7 +74,7 @@ def levenberg_marquardt(
     costs, scale, growth = [cost], np.zeros(len(x)), 2.0
     for iteration in range(iterations):
         if stop():
-            return Minimum(x, cost, iteration, "it was stopped")
+            return Minimum(x, cost, iteration, STOPPED)
         r, J = linearized(x)
         R = _qr(np.column_stack([J, r]), "r")[1]
         R, projected = R[: len(x), : len(x)], R[: len(x), -1]

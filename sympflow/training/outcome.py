@@ -13,11 +13,13 @@ from sympflow.flow.scaling import Scaling
 from sympflow.system import HamiltonianSystem
 
 OUT_OF_TIME = "the time budget was used up"
+INTERRUPTED = "it was interrupted"
 
 
 def warn_of_early_end(reason: str, done: int, planned: int, unit: str) -> None:
+    when = f"after {done} of {planned} {unit}" if done < planned else f"in its last fits, after all {planned} {unit},"
     warnings.warn(
-        f"Training ended after {done} of {planned} {unit} because {reason}. The best state so far is returned.",
+        f"Training ended {when} because {reason}. The best state so far is returned.",
         RuntimeWarning,
         stacklevel=4,
     )

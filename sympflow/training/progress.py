@@ -21,6 +21,9 @@ class Silent:
     def validated(self, step: int, figures: dict[str, float]) -> None:
         pass
 
+    def tries(self, done: int, what: str) -> None:
+        pass
+
 
 class Lines(Silent):
     """One line for each validation: the fallback where rich is not installed."""
@@ -30,6 +33,9 @@ class Lines(Silent):
 
     def validated(self, step: int, figures: dict[str, float]) -> None:
         print(f"{self.label} {step}/{self.total}  {_text(figures)}", file=sys.stderr, flush=True)
+
+    def tries(self, done: int, what: str) -> None:
+        print(f"{self.label} {done}/{self.total}  {what}", file=sys.stderr, flush=True)
 
 
 class Bar(Silent):
@@ -64,6 +70,9 @@ class Bar(Silent):
     def validated(self, step: int, figures: dict[str, float]) -> None:
         self.figures = _text(figures)
         self.bar.update(self.task, completed=step, figures=self.figures)
+
+    def tries(self, done: int, what: str) -> None:
+        self.bar.update(self.task, completed=done, figures=what)
 
 
 def progress(show: bool | None, total: int, label: str, start: int = 0) -> Any:

@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -22,7 +22,7 @@ from sympflow.training.config import TrainingConfig
 from sympflow.training.labels import Labels
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.optimizers import optimizer as make_optimizer
-from sympflow.training.outcome import OUT_OF_TIME, recorded, warn_of_early_end
+from sympflow.training.outcome import INTERRUPTED, OUT_OF_TIME, recorded, warn_of_early_end
 from sympflow.training.progress import progress as make_progress
 from sympflow.training.validation import Validation
 
@@ -46,7 +46,6 @@ class Run:
     validation: Validation
     source: PointSource
     optimizer: Any
-    searches: ClassVar[bool] = False
     step: int = 0
     seconds: float = 0.0
     best: dict[str, Tensor] = field(default_factory=dict)
@@ -122,7 +121,7 @@ class Run:
                     if spent:
                         return OUT_OF_TIME
         except KeyboardInterrupt:
-            return "it was interrupted"
+            return INTERRUPTED
         return None
 
     def _finished(self) -> str | None:

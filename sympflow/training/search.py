@@ -18,8 +18,9 @@ from sympflow.flow.base import FlowMap
 from sympflow.flow.scaling import Scaling
 from sympflow.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
-from sympflow.training.levenberg_marquardt import Minimum
-from sympflow.training.outcome import OUT_OF_TIME, recorded, warn_of_early_end
+from sympflow.training.interruption import Interruption
+from sympflow.training.levenberg_marquardt import STOPPED, Minimum
+from sympflow.training.outcome import INTERRUPTED, OUT_OF_TIME, recorded, warn_of_early_end
 from sympflow.training.progress import progress as make_progress
 from sympflow.training.search_config import SearchConfig
 
@@ -36,7 +37,14 @@ class SearchRun(ABC):
     1. `next_minimum(stop)`: follow the next start, of number len(minima).
     2. `found(minimum)`: note it; its figures.
     3. `complete(spent)`: make the flow of the minima, and its last entry in `history`. `spent(share)` says whether this
-       share of the time is used up.
+       share of the time is used up, or the run is to end at once; it may be called again after an interruption.
+
+    Attributes
+    ----------
+    interruption : Interruption
+        Which asks the run to end.
+    tried : FlowMap or None
+        A flow like this one that is there already, which the result of an interrupted run is to be no worse than.
     """
 
     flow: FlowMap
@@ -47,9 +55,10 @@ class SearchRun(ABC):
     minima: list[Minimum] = field(default_factory=list, kw_only=True)
     history: list[dict[str, float]] = field(default_factory=list, kw_only=True)
     seconds: float = field(default=0.0, kw_only=True)
+    interruption: Interruption = field(default_factory=Interruption, kw_only=True)
+    tried: FlowMap | None = field(default=None, kw_only=True)
 
     SEARCH_SHARE: ClassVar[float] = 1.0  # of a time budget
-    searches: ClassVar[bool] = True
 
     @abstractmethod
     def next_minimum(self, stop: Stop) -> Minimum:
@@ -75,11 +84,15 @@ class SearchRun(ABC):
         callback: Callback | None,
     ) -> str | None:
         """Run to the end; why it ended early, if it did. The flow is then the best that was found."""
-        begin, before, reason = time.perf_counter(), self.seconds, None
+        begin, before, interruption, cut = time.perf_counter(), self.seconds, self.interruption, False
 
         def spent(share: float = 1.0) -> bool:
-            self.seconds = before + time.perf_counter() - begin
-            return time_budget is not None and time.perf_counter() - begin > share * time_budget
+            nonlocal cut
+            passed = time.perf_counter() - begin
+            self.seconds = before + passed
+            over = interruption.asked or (time_budget is not None and passed > share * time_budget)
+            cut = cut or over
+            return over
 
         def search_is_spent() -> bool:
             return spent(self.SEARCH_SHARE)
@@ -88,6 +101,7 @@ class SearchRun(ABC):
         try:
             if checkpoint is not None and not self.minima:  # a first search may be long
                 self.save(checkpoint)
+            interruption.armed = True
             with make_progress(progress, planned, label, len(self.minima)) as bar:
                 while len(self.minima) < planned and not search_is_spent():
                     minimum = self.next_minimum(search_is_spent)
@@ -97,15 +111,24 @@ class SearchRun(ABC):
                     bar.validated(len(self.minima), figures)
                     if callback is not None:
                         callback(len(self.minima), dict(figures))
-                    if checkpoint is not None:
+                    if checkpoint is not None and minimum.reason != STOPPED:  # it is followed to its end another time
                         self.save(checkpoint)
-        except KeyboardInterrupt:
-            reason = "it was interrupted"
-        if len(self.minima) < planned and reason is None:
-            reason = OUT_OF_TIME
-        self.complete(spent)
-        spent()
-        return reason
+        except KeyboardInterrupt:  # of the callback, a handler of the program's own, or a second one
+            interruption.asked = True
+        try:
+            try:
+                self.complete(spent)
+            except KeyboardInterrupt:
+                if interruption.asked:
+                    raise
+                interruption.asked = True
+                self.complete(spent)  # at once: all that is left to do is to take the best
+        except FloatingPointError:
+            if interruption.asked:  # before there was anything
+                raise KeyboardInterrupt from None
+            raise
+        self.seconds = before + time.perf_counter() - begin
+        return INTERRUPTED if interruption.asked else OUT_OF_TIME if cut else None
 
     def finish(self, reason: str | None, expected: bool = False) -> Any:
         """The flow with its record; an expected end is only recorded."""

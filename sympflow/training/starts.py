@@ -25,7 +25,7 @@ from sympflow.training.arguments import digest, labels_of, weights_of
 from sympflow.training.collocation import Stream, states
 from sympflow.training.config import TrainingConfig
 from sympflow.training.gauss_newton import GaussNewtonRun
-from sympflow.training.run import Run
+from sympflow.training.run import Labelled, Run
 from sympflow.training.search_config import SplitConfig, TableConfig
 from sympflow.training.split_run import SplitRun
 
@@ -52,28 +52,28 @@ def start(
     return _of_gradients(system, domain, kind, flow, optimizer, given)
 
 
-def _of_primed(system: HamiltonianSystem, domain: Domain, flow: PrimedFlow, given: dict[str, Any]) -> GaussNewtonRun:
+def check_fit(given: dict[str, Any]) -> None:
+    """Raise if the fit of a new primed flow cannot be as the arguments of `train` say."""
+    if given["optimizer"] in (None, "gauss-newton"):
+        _table_config(given, None)
+
+
+def _table_config(given: dict[str, Any], handed: Labelled | None) -> TableConfig:
     what, loss = "optimizer 'gauss-newton' for primed flows", given["loss"]
     refuse_options(given, NOT_OF_SEARCHES, what)
     if loss is None:
         refuse_options(given, OF_LOSSES, f"{what} without a `loss`")
-    handed = None if given["data"] is None else labels_of(given["data"], system, flow.dt)
-    names = (
-        "points",
-        "steps",
-        "restarts",
-        "label_times",
-        "frozen_weight",
-        "energy_weight",
-        "matching_times",
-        "seed",
-        "reference_states",
-    )
-    config = TableConfig(
-        **_chosen(given, names),
+    names = ("points", "steps", "restarts", "label_times", "frozen_weight", "energy_weight", "matching_times")
+    return TableConfig(
+        **_chosen(given, (*names, "seed", "reference_states")),
         **_weights("labels" if loss is None else loss, given),
         data=None if handed is None else digest(handed),
     )
+
+
+def _of_primed(system: HamiltonianSystem, domain: Domain, flow: PrimedFlow, given: dict[str, Any]) -> GaussNewtonRun:
+    handed = None if given["data"] is None else labels_of(given["data"], system, flow.dt)
+    config = _table_config(given, handed)
     return GaussNewtonRun.start(flow, system, domain, _scaling(domain, flow.dt, config.seed), config, handed)
 
 

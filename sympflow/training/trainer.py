@@ -15,9 +15,11 @@ from sympflow.flow.base import FlowMap
 from sympflow.system import HamiltonianSystem
 from sympflow.training.architecture import check_flow, kind_of, new_primed
 from sympflow.training.arguments import check_surroundings, domain_for, refuse_unknown
+from sympflow.training.interruption import Interruption
 from sympflow.training.recipes import BUDGET
 from sympflow.training.run import Path
-from sympflow.training.starts import start
+from sympflow.training.search import SearchRun
+from sympflow.training.starts import check_fit, start
 
 
 def train(
@@ -112,13 +114,15 @@ def train(
         Of "gauss-newton" on a primed flow: how much an error in the energy counts beside those of the coordinates. 10
         by default; 1000 for runs of which only the energy matters, 0 for none.
     checkpoint : path, optional
-        Write the state of the run there every `checkpoint_every` steps, atomically.
+        Write the state of the run there every `checkpoint_every` steps, atomically; of a primed flow after each start
+        of the search, and first as soon as there is a run: of one that is killed in the trials nothing is kept.
     resume : path, optional
         Go on from this checkpoint, given the same arguments otherwise; the weights end bit-identical to those of a
         run that was not interrupted.
     time_budget : float, optional
-        Stop after so many seconds. The default for a new primed flow is 60, unless `restarts`, `steps` or `resume` is
-        given: the search then takes fewer starts than it might, which the recipe records; else there is none.
+        Stop after so many seconds, trials and labels among them. The default for a new primed flow is 60, unless
+        `restarts`, `steps` or `resume` is given: the search then takes fewer starts than it might, which the recipe
+        records; else there is none.
     progress : bool, optional
         Show a progress bar; the default is on a terminal only.
     callback : callable, optional
@@ -129,7 +133,8 @@ def train(
     SympFlow or MLPFlow
         In its best state by the held-out loss, its parameters without gradient; `recipe` and `figures` tell how it
         was made and what it achieves, `history` the held-out figures over the run. Ctrl-C, a used-up budget and a
-        loss that is not finite also end the run with the best state so far; the last two and the first warn.
+        loss that is not finite also end the run with the best state so far, and a warning. Ctrl-C does so within
+        seconds, once there is a state to return: in the trials from the end of the first. A second one raises.
 
     Raises
     ------
@@ -139,6 +144,8 @@ def train(
         If an option is not one of the optimizer's, or of no training at all.
     FloatingPointError
         If the loss is not finite from the start.
+    KeyboardInterrupt
+        On Ctrl-C before there is anything to return, or twice.
     """
     given, begin = {name: plain(value) for name, value in locals().items()}, time.perf_counter()
     refuse_unknown(given.pop("unknown"))
@@ -148,14 +155,22 @@ def train(
     domain = domain_for(system, domain)
     hurried = flow is None and time_budget is None and restarts is None and steps is None and resume is None
     kind = kind_of(system, given)
-    if flow is not None:
-        check_flow(flow, system, dt)
-    elif kind == "primed":
-        flow = new_primed(system, domain, given)
-    run = start(system, domain, kind, flow, given)
-    if resume is not None:
-        run.load(resume)
-    hurried = hurried and run.searches
-    if hurried:  # labels and their compilation are part of the minute
-        time_budget = max(BUDGET - (time.perf_counter() - begin), 1.0)
-    return run.finish(run.go(checkpoint, time_budget, progress, callback), expected=hurried)
+    with Interruption() as interruption:
+        tried = None
+        if flow is not None:
+            check_flow(flow, system, dt)
+        elif kind == "primed":
+            check_fit(given)
+            flow, tried = new_primed(system, domain, given, interruption)
+        run = start(system, domain, kind, flow, given)
+        if resume is not None:
+            run.load(resume)
+        if isinstance(run, SearchRun):
+            run.interruption, run.tried = interruption, tried
+        hurried = hurried and isinstance(run, SearchRun)
+        passed = time.perf_counter() - begin  # trials, labels and their compilation
+        run.seconds += passed
+        if (seconds := BUDGET if hurried else time_budget) is not None:
+            time_budget = max(seconds - passed, min(seconds, 1.0))
+        reason = run.go(checkpoint, time_budget, progress, callback)
+    return run.finish(reason, expected=hurried)

@@ -16,6 +16,7 @@ from sympflow.training.gauss_newton import GaussNewtonRun
 from sympflow.training.recipes import PHASE, PrimedRecipe, default_recipe
 from sympflow.training.search_config import TableConfig
 from sympflow.training.table_errors import USELESS, shares_missed
+from sympflow.training.watch import Watch
 
 PHASES = (PHASE, 1.25, 1.5)  # ω Δt of the flows that are tried
 STARTS, STEPS, FINAL_STEPS, POINTS = 6, 40, 160, 80  # of a trial's search, and what follows the best start
@@ -27,7 +28,7 @@ GOAL = 1e-5  # the energy error of a trial that a default flow shall not exceed,
 ALIKE = 2.0  # energy errors above that which differ by no more are the same
 
 
-def chosen_recipe(system: HamiltonianSystem, domain: Domain) -> PrimedRecipe:
+def chosen_recipe(system: HamiltonianSystem, domain: Domain, watch: Watch | None = None) -> PrimedRecipe:
     """The recipe of the flow that gains most: that of `default_recipe`, or one with a longer Δt or curvature terms.
 
     Of each the table at Δt is fitted for a few seconds, and followed along held-out orbits. Where its energy error is
@@ -41,6 +42,8 @@ def chosen_recipe(system: HamiltonianSystem, domain: Domain) -> PrimedRecipe:
     system : HamiltonianSystem
         Separable, symbolic, T = ½ pᵀM⁻¹p.
     domain : Domain
+    watch : Watch, optional
+        It shows the trials, keeps their flows, and may end them: then it is the best so far.
     """
     from sympflow.kernels.kicks import kick_cycles
 
@@ -50,8 +53,7 @@ def chosen_recipe(system: HamiltonianSystem, domain: Domain) -> PrimedRecipe:
         cycles = [kick_cycles(system.symbols, level) for level in (FORCE_GRADIENT, CURVATURE)]
     except ValueError:  # H has no compiled form
         return recipes[0]
-
-    errors = {recipe: trial_error(recipe, system, domain) for recipe in recipes}
+    watch, errors = Watch() if watch is None else watch, dict[PrimedRecipe, float]()
 
     def best(tried: list[PrimedRecipe]) -> PrimedRecipe:
         least = min(errors[recipe] for recipe in tried)
@@ -61,12 +63,20 @@ def chosen_recipe(system: HamiltonianSystem, domain: Domain) -> PrimedRecipe:
         }
         return min(work, key=work.__getitem__)
 
-    plain = best(recipes)
-    if cycles[1] > DEAREST * cycles[0]:
-        return plain
-    bent = replace(plain, curvature=True)
-    errors[bent] = trial_error(bent, system, domain)
-    return best([plain, bent])
+    bends = cycles[1] <= DEAREST * cycles[0]
+    with watch.bar(len(recipes) + bends, f"{system.name} trials") as bar:
+
+        def tried(recipe: PrimedRecipe) -> bool:
+            bar.tries(len(errors), f"Δt = {recipe.dt:g}{', with curvature terms' * recipe.curvature}")
+            error = trial_error(recipe, system, domain, watch)
+            if not watch.stopped():
+                errors[recipe] = error
+                watch.arm()
+            return recipe in errors
+
+        plain = best([recipe for recipe in recipes if not watch.stopped() and tried(recipe)])
+        bent = replace(plain, curvature=True)
+        return best([plain, bent]) if bends and not watch.stopped() and tried(bent) else plain
 
 
 def tried_recipes(system: HamiltonianSystem, domain: Domain, curvature: bool = True) -> list[PrimedRecipe]:
@@ -75,12 +85,13 @@ def tried_recipes(system: HamiltonianSystem, domain: Domain, curvature: bool = T
     return plain + [replace(recipe, curvature=True) for recipe in plain if curvature]
 
 
-def trial_error(recipe: PrimedRecipe, system: HamiltonianSystem, domain: Domain) -> float:
+def trial_error(recipe: PrimedRecipe, system: HamiltonianSystem, domain: Domain, watch: Watch | None = None) -> float:
     """The relative energy error of a short fit of the flow at its Δt, the median over held-out orbits.
 
     Infinite if there are no orbits, or the fit leads nowhere: where in the median it misses a tenth of what a step
     moves a state. The energy alone would be kept best by the identity.
     """
+    watch = Watch() if watch is None else watch
     config = TableConfig(
         points=POINTS, label_times=1, restarts=STARTS, steps=STEPS, reference_states=ORBITS, seed=recipe.seed
     )
@@ -92,10 +103,10 @@ def trial_error(recipe: PrimedRecipe, system: HamiltonianSystem, domain: Domain)
     fit = run.frozen
     assert fit is not None
     for _ in range(STARTS):
-        run.minima.append(run.next_minimum(lambda: False))
+        run.minima.append(run.next_minimum(watch.stopped))
     best = min(run.minima, key=lambda m: m.cost)
     for final in filter(None, (fit, run.weighted)):
-        best = final.minimize(best.x, FINAL_STEPS, lambda: False, thorough=True)
+        best = final.minimize(best.x, FINAL_STEPS, watch.stopped, thorough=True)
     table = fit.coefficients(best.x)[:, :1]
     y = states(domain, ORBITS, recipe.seed, Stream.REFERENCE)
     H, worst, y = system.hamiltonian(y), np.zeros(len(y)), y.T
@@ -108,4 +119,8 @@ def trial_error(recipe: PrimedRecipe, system: HamiltonianSystem, domain: Domain)
             y = run.step(table, y)
             worst = np.maximum(worst, np.abs(system.hamiltonian(y.T) - H))
         worst /= np.abs(H) if system.energy_scale is None else system.energy_scale
-    return float(np.median(np.where(np.isnan(worst), np.inf, worst)))
+    error = float(np.median(np.where(np.isnan(worst), np.inf, worst)))
+    if math.isfinite(error) and not watch.stopped():
+        run.table.assign(run.table.continued(table[:, 0]))
+        watch.flows[recipe] = run.flow
+    return error

@@ -1,0 +1,264 @@
+"""How a search for a primed flow ends early: Ctrl-C, at any moment, and a time budget, which counts all of it."""
+
+import os
+import signal
+import sys
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import SympFlow, systems, train
+from sympflow.training import checkpoint as checkpoints
+from sympflow.training import trainer, trials
+from sympflow.training.gauss_newton import GaussNewtonRun
+from sympflow.training.interruption import Interruption
+from sympflow.training.levenberg_marquardt import STOPPED, Minimum
+from sympflow.training.recipes import default_recipe
+from sympflow.training.table_fit import TableFit
+from sympflow.training.validation import reference_step
+from sympflow.training.watch import Watch
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends the process there")
+PENDULUM = systems.pendulum()
+FLOW = SympFlow.primed(PENDULUM, 2, dt=0.5, processor=2)
+QUICK = {"restarts": 4, "steps": 30, "points": 40, "reference_states": 10, "label_times": 2, "progress": False}
+SHORT = {"STARTS": 2, "STEPS": 10, "FINAL_STEPS": 10, "POINTS": 20, "LENGTH": 10}
+
+
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.fixture(autouse=True)
+def _as_in_a_terminal():
+    """A job in the background inherits that SIGINT is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    signal.signal(signal.SIGINT, before)
+
+
+def then(monkeypatch, owner, name, act, at=0):
+    """Ctrl-C, or what else `act` does, as a function is called for the time of number `at`."""
+    whole, calls = getattr(owner, name), []
+
+    def changed(*arguments, **options):
+        calls.append(name)
+        if len(calls) == at + 1:
+            act()
+        return whole(*arguments, **options)
+
+    monkeypatch.setattr(owner, name, changed)
+    return calls
+
+
+def error_of(flow):
+    """At other states than those of the figures."""
+    x = PENDULUM.domain.sample(50, 3)
+    exact = reference_step(PENDULUM, x, flow.dt, 1e-12)
+    return np.linalg.norm(flow(flow.dt, torch.as_tensor(x)).detach().numpy() - exact, axis=-1).mean()
+
+
+def one_step_error(flow):
+    return flow.figures["one_step_error"]
+
+
+def test_the_first_asks_and_the_second_raises():
+    with Interruption() as interruption:
+        with pytest.raises(KeyboardInterrupt):  # there is nothing yet
+            interrupt()
+        interruption.armed = True
+        interrupt()
+        assert interruption.asked
+        with pytest.raises(KeyboardInterrupt):
+            interrupt()
+
+
+def test_a_handler_of_the_programs_own_is_left():
+    noted = []
+
+    def handler(*_):
+        noted.append(True)
+
+    signal.signal(signal.SIGINT, handler)
+    with Interruption() as interruption:
+        interruption.armed = True
+        interrupt()
+        assert (noted, interruption.asked) == ([True], False)
+    assert signal.signal(signal.SIGINT, signal.default_int_handler) is handler
+
+
+def test_in_another_thread_nothing_is_installed():
+    handlers = []
+
+    def run():
+        with Interruption():
+            handlers.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert handlers == [signal.default_int_handler]
+
+
+@pytest.mark.parametrize("start", [0, 2])
+def test_in_the_search_the_best_so_far_is_returned(monkeypatch, tmp_path, start):
+    """The start that is cut short counts, but is followed to its end when the run is resumed."""
+    path, whole = tmp_path / "run.ckpt", train(PENDULUM, flow=FLOW, **QUICK)
+    with monkeypatch.context() as patch:
+        then(patch, GaussNewtonRun, "next_minimum", interrupt, at=start)
+        steps = then(patch, TableFit, "linearized", lambda: None)
+        with pytest.warns(
+            RuntimeWarning, match=rf"after {start + 1} of 4 starts because it was interrupted\. The best"
+        ):
+            flow = train(PENDULUM, flow=FLOW, checkpoint=path, **QUICK)
+    assert len(steps) <= start * QUICK["steps"]
+    assert flow.recipe["stages"][-1]["ended_early"] == "it was interrupted"
+    if start == 0:
+        assert error_of(flow) == pytest.approx(error_of(FLOW), rel=1e-9)
+    else:
+        assert error_of(flow) < 0.1 * error_of(FLOW)
+    assert checkpoints.read(path)["step"] == start
+    resumed = train(PENDULUM, flow=FLOW, resume=path, **QUICK)
+    assert all(torch.equal(v, resumed.state_dict()[k]) for k, v in whole.state_dict().items())
+
+
+def test_in_the_last_fits_what_they_have_is_returned(monkeypatch):
+    fits = then(monkeypatch, TableFit, "minimize", interrupt, at=QUICK["restarts"] + 1)
+    with pytest.warns(RuntimeWarning, match=r"in its last fits, after all 4 starts, because it was interrupted\."):
+        flow = train(PENDULUM, flow=FLOW, **QUICK)
+    assert len(fits) > QUICK["restarts"] + 2  # those after it end at once
+    assert one_step_error(flow) < 1e-3
+
+
+def test_an_exception_in_the_last_fits_ends_them_too(monkeypatch):
+    """As where the program has a handler of its own."""
+
+    def raise_it():
+        raise KeyboardInterrupt
+
+    then(monkeypatch, TableFit, "minimize", raise_it, at=QUICK["restarts"] + 1)
+    with pytest.warns(RuntimeWarning, match="because it was interrupted"):
+        assert one_step_error(train(PENDULUM, flow=FLOW, **QUICK)) < 1e-3
+
+
+def test_a_second_one_raises_and_the_checkpoint_stays(monkeypatch, tmp_path):
+    path = tmp_path / "run.ckpt"
+
+    def twice():
+        interrupt()
+        interrupt()
+
+    then(monkeypatch, GaussNewtonRun, "complete", twice)
+    with pytest.raises(KeyboardInterrupt):
+        train(PENDULUM, flow=FLOW, checkpoint=path, **QUICK)
+    assert checkpoints.read(path)["step"] == QUICK["restarts"]
+
+
+def test_before_there_is_anything_it_raises(monkeypatch):
+    then(monkeypatch, GaussNewtonRun, "start", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        train(PENDULUM, flow=FLOW, **QUICK)
+
+
+def test_where_no_residuals_are_finite_it_raises(monkeypatch):
+    """Not that the domain be made smaller: nobody knows."""
+    monkeypatch.setattr(TableFit, "minimize", lambda self, theta, *_, **__: Minimum(theta, np.inf, 0, STOPPED))
+    then(monkeypatch, GaussNewtonRun, "next_minimum", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        train(PENDULUM, flow=FLOW, **QUICK)
+
+
+def short_trials(monkeypatch):
+    for name, value in SHORT.items():
+        monkeypatch.setattr(trials, name, value)
+    first, *_ = recipes = [replace(default_recipe(PENDULUM, phase=x), stages=2, processor=2) for x in (0.8, 1.0, 1.25)]
+    monkeypatch.setattr(trials, "tried_recipes", lambda *_, **__: recipes)
+    return first
+
+
+@pytest.mark.parametrize("where", ["next trial", "labels", "search"])
+def test_once_a_trial_is_done_its_flow_is_there(monkeypatch, where):
+    """The result is the flow that the trial fitted: a start that was cut short found nothing that is nearer."""
+    recipe, watch = short_trials(monkeypatch), Watch()
+    trials.trial_error(recipe, PENDULUM, PENDULUM.domain, watch)
+    if where == "next trial":
+        then(monkeypatch, trials, "trial_error", interrupt, at=1)
+    else:
+        monkeypatch.setattr(trials, "tried_recipes", lambda *_, **__: [recipe])
+        monkeypatch.setattr(trials, "DEAREST", 0.0)
+        name = {"labels": "start", "search": "next_minimum"}[where]
+        then(monkeypatch, GaussNewtonRun, name, interrupt, at=1 if where == "labels" else SHORT["STARTS"])
+    with pytest.warns(RuntimeWarning, match=r"after [01] of 24 starts because it was interrupted"):
+        flow = train(PENDULUM, reference_states=10, progress=False)
+    assert flow.dt == recipe.dt
+    for name, value in watch.flows[recipe].state_dict().items():
+        torch.testing.assert_close(flow.state_dict()[name], value, rtol=0, atol=1e-12)
+
+
+def test_before_a_trial_is_done_it_raises(monkeypatch):
+    short_trials(monkeypatch)
+    then(monkeypatch, trials, "trial_error", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        train(PENDULUM, progress=False)
+
+
+def test_trials_say_what_they_try(monkeypatch, capsys):
+    short_trials(monkeypatch)
+    monkeypatch.setattr("sympflow.training.progress.Bar", lambda *_: (_ for _ in ()).throw(ImportError()))
+    then(monkeypatch, GaussNewtonRun, "go", interrupt)
+    with pytest.warns(RuntimeWarning, match="it was interrupted"):
+        train(PENDULUM, reference_states=5, progress=True)
+    said = capsys.readouterr().err
+    for recipe in trials.tried_recipes():
+        assert f"Δt = {recipe.dt:g}" in said
+    assert "pendulum trials" in said
+    assert ", with curvature terms" in said
+
+
+class Clock:
+    """Time that passes only where it is told to."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def perf_counter(self):
+        return self.now
+
+
+def test_a_budget_and_the_training_time_count_the_trials(monkeypatch):
+    clock, seen = Clock(), {}
+    monkeypatch.setattr(trainer, "time", clock)
+
+    def chosen(system, domain, watch):
+        clock.now += 25.0
+        return default_recipe(system)
+
+    def go(self, _, budget, *__):
+        seen.update(budget=budget, seconds=self.seconds)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trials, "chosen_recipe", chosen)
+    monkeypatch.setattr(GaussNewtonRun, "go", go)
+    for options, whole in (({"time_budget": 70.0}, 70.0), ({}, trainer.BUDGET)):
+        clock.now = 0.0
+        with pytest.raises(KeyboardInterrupt):
+            train(PENDULUM, progress=False, **options)
+        assert seen == {"budget": whole - 25.0, "seconds": 25.0}
+
+
+def test_a_budget_that_cuts_the_last_fits_is_reported(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr("sympflow.training.search.time", clock)
+
+    def pass_by():
+        clock.now += 100.0
+
+    then(monkeypatch, GaussNewtonRun, "complete", pass_by)
+    with pytest.warns(RuntimeWarning, match=r"in its last fits, after all 4 starts, because the time budget was used"):
+        flow = train(PENDULUM, flow=FLOW, time_budget=50.0, **QUICK)
+    assert flow.recipe["stages"][-1]["ended_early"] == "the time budget was used up"
+    assert flow.figures["training_seconds"] >= 100.0
