@@ -136,6 +136,12 @@ def train(
         loss that is not finite also end the run with the best state so far, and a warning. Ctrl-C does so within
         seconds, once there is a state to return: in the trials from the end of the first. A second one raises.
 
+    Warns
+    -----
+    UserWarning
+        If a primed flow is far from the exact one: where its error in one step of Δt is, in the mean over held-out
+        states, a tenth or more of what the step moves a state, coordinates in units of their spread over Ω.
+
     Raises
     ------
     ValueError
