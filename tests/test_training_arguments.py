@@ -46,6 +46,13 @@ def test_what_is_of_another_type_is_named(arguments, error, message):
         train(PENDULUM, **arguments)
 
 
+def test_where_no_checkpoint_can_be_written_is_said_at_once(tmp_path):
+    (tmp_path / "file").touch()
+    for path in (tmp_path, tmp_path / "file" / "run.ckpt"):
+        with pytest.raises(ValueError, match=r"^`checkpoint` .* cannot be written \(.*\): name a file that can be"):
+            train(PENDULUM, checkpoint=path)
+
+
 def test_what_is_no_system_or_scheme_is_named(tmp_path):
     with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem; got str"):
         train("p**2/2")
@@ -60,7 +67,7 @@ def test_numbers_may_be_numpys(tmp_path):
     """They are recorded as Python's, so that a checkpoint of such a run can be compared with one of another."""
     flow = SympFlow.primed(PENDULUM, np.int64(2), dt=np.float32(0.5), processor=np.int32(1))
     assert (flow.dt, flow.architecture()) == (0.5, SympFlow.primed(PENDULUM, 2, dt=0.5, processor=1).architecture())
-    assert SympFlow(np.int64(1), pairs=np.int64(2), dt=np.float32(0.5)).dt == 0.5
+    assert SympFlow(np.int64(1), pairs=np.int64(2), hidden=(np.int64(3), 4), dt=np.float32(0.5)).dt == 0.5
     config = TableConfig(points=np.int64(30), restarts=np.int64(1), steps=np.int64(2), energy_weight=np.float32(10))
     assert config.to_dict() == TableConfig(points=30, restarts=1, steps=2).to_dict()
     plain = {"dt": 0.5, "stages": 2, "points": 30, "restarts": 1, "steps": 2, "reference_states": 5}

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.flow.activations import activation as activation_named
+from sympflow.flow.arguments import plain
 from sympflow.flow.placement import checked_device, checked_dtype
 
 Time = float | Tensor
@@ -242,7 +243,7 @@ def outer(k: Tensor, t: Time) -> Tensor:
 
 def hidden_widths(hidden: Sequence[int]) -> tuple[int, ...]:
     """`hidden`, checked."""
-    widths = tuple(hidden) if isinstance(hidden, Sequence) else ()
+    widths = tuple(map(plain, hidden)) if isinstance(hidden, Sequence) else ()
     if not widths or any(isinstance(h, bool) or not isinstance(h, int) or h < 1 for h in widths):
         raise ValueError(f"`hidden` must be the widths of one or more hidden layers, such as (10, 10); got {hidden!r}.")
     return widths

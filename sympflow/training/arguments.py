@@ -15,6 +15,7 @@ from sympflow.arrays import to_numpy
 from sympflow.domain import Domain, EnergySublevel
 from sympflow.flow.sympflow import SympFlow
 from sympflow.system import HamiltonianSystem
+from sympflow.training.checkpoint import check_writable
 from sympflow.training.choices import is_number
 from sympflow.training.run import Labelled
 
@@ -67,6 +68,8 @@ def check_surroundings(given: dict[str, Any]) -> None:
     for name in ("checkpoint", "resume"):
         if given[name] is not None and not isinstance(given[name], (str, os.PathLike)):
             raise TypeError(f"`{name}` must be the path of a file; got {given[name]!r}: pass a string or leave it out.")
+    if given["checkpoint"] is not None:
+        check_writable(given["checkpoint"])
 
 
 def weights_of(

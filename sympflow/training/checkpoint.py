@@ -62,6 +62,21 @@ def read_same(path: str | os.PathLike[str], mine: dict[str, Any]) -> dict[str, A
     return state
 
 
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Raise ValueError where no checkpoint can be written; the folder is made."""
+    path, why = Path(path), None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        why = error.strerror or type(error).__name__
+    if path.is_dir():
+        why = "it is a folder"
+    elif why is None and not os.access(path.parent, os.W_OK):
+        why = "its folder is not to be written to"
+    if why is not None:
+        raise ValueError(f"`checkpoint` {str(path)!r} cannot be written ({why}): name a file that can be.")
+
+
 def write(path: str | os.PathLike[str], state: dict[str, Any]) -> None:
     """Write `state` to a new file beside `path`, then put it in place in one step."""
     path = Path(path)
