@@ -89,6 +89,15 @@ def test_a_sum_begins_with_what_is_known_first():
     assert schedule.operations == 1
 
 
+@pytest.mark.parametrize(("aside", "operations"), [(True, 1), (False, 2)])
+def test_sums_cost_a_batch_nothing_where_they_have_units_of_their_own(monkeypatch, aside, operations):
+    monkeypatch.setattr("sympflow.kernels.scheduling.SUMS_ASIDE", aside)
+    x, y = sp.symbols("x y", real=True)
+    schedule = Schedule({x: 0.0, y: 0.0}, printed)
+    schedule.value(x * (x + y))
+    assert schedule.operations == operations
+
+
 def test_coefficients_wait_for_nothing():
     x, b, g = sp.symbols("x b g", real=True)
     schedule = Schedule({x: 0.0}, printed)

@@ -36,6 +36,8 @@ def shapes(symbols: SymbolicHamiltonian, terms: int, monomials: Monomials = ()) 
         letters = polynomial_letters(monomials)
         P = sp.Add(*[e * sp.Mul(*map(sp.Pow, q, m)) for e, m in zip(letters, monomials, strict=True)])
         changes = [-B * slope[i] - sp.diff(P, q[i]) for i in range(d)]
+        if d == 2 and (symbols.V + P).is_polynomial(*q):
+            yield from _with_products_of_both(symbols, -B * symbols.V - P)
     elif terms == 1:
         yield [printable(p[i] - B * slope[i]) for i in range(d)]
         changes = [-B * f for f in slope]
@@ -70,6 +72,35 @@ def shapes(symbols: SymbolicHamiltonian, terms: int, monomials: Monomials = ()) 
         if max(len(f.args) for f in expanded) <= MOST_NESTED:
             for sums, last in itertools.product((False, True), repeat=2):
                 yield [_nested(symbols, p[i], f, sums, last) for i, f in enumerate(expanded)]
+
+
+def _with_products_of_both(symbols: SymbolicHamiltonian, W: sp.Expr) -> Iterator[list[sp.Expr]]:
+    """p + ∇W, W a polynomial in two coordinates, by what the derivatives of its mixed terms share.
+
+    With these terms (q1 q2)^m (L + X1 + X2 + …), of letters L and X ∝ q^k, ∂W/∂q_i has (q1 q2)^m/q_i times
+    m L + Σ (m + k_i) X: the products X serve both momenta, and for the rest there are sums.
+    """
+    terms = sp.Poly(W, *symbols.q).terms()
+    mixed = {powers: c for powers, c in terms if all(powers)}
+    least = {min(powers) for powers in zip(*mixed, strict=True)}
+    if len(least) != 1:
+        return
+    m = least.pop()
+    rest = {
+        (a - m, b - m): _times(m * c, sp.Mul(*map(sp.Pow, symbols.q, (a - m, b - m)))) for (a, b), c in mixed.items()
+    }
+    L = sp.Add(*rest.values(), evaluate=False)
+    shape = []
+    for i, (q, other, p) in enumerate(zip(symbols.q, reversed(symbols.q), symbols.p, strict=True)):
+        pure = [(powers[i], c) for powers, c in terms if powers[i] and not powers[1 - i]]
+        if any(n < m for n, _ in pure):
+            return
+        more = [x if k[i] == m else sp.Mul(sp.Rational(k[i], m), x, evaluate=False) for k, x in rest.items() if k[i]]
+        both = sp.Mul(other**m, sp.Add(L, *more, evaluate=False), evaluate=False)
+        alone = _by_common_factors(sp.Add(*[_times(n * c, q ** (n - m)) for n, c in pure]), [q]) if pure else None
+        sums = both if alone is None else sp.Add(alone, both, evaluate=False)
+        shape.append(sp.Add(p, sp.Mul(q ** (m - 1), sums, evaluate=False), evaluate=False))
+    yield shape
 
 
 def _nested(symbols: SymbolicHamiltonian, p: sp.Symbol, f: sp.Expr, sums: bool, last: bool) -> sp.Expr:

@@ -1,7 +1,8 @@
 """Expressions as straight-line code in an order that suits the machine: short chains for one trajectory.
 
 A single trajectory waits for its longest chain of operations that need each other's results, not for their number; a
-batch, whose lanes fill the machine, for their number. `Schedule` writes sums and products, which SymPy holds without
+batch, whose lanes fill the machine, for their number; on machines that add on units of their own, for the number of
+multiplications. `Schedule` writes sums and products, which SymPy holds without
 an order, so that what is known early is used early, sums of products as multiplications fused with additions; it
 estimates both costs, by which the shapes that one expression may take are compared.
 """
@@ -12,6 +13,7 @@ import heapq
 import re
 from collections.abc import Callable, Iterable, Sequence
 
+import llvmlite.binding
 import sympy as sp
 
 from sympflow.kernels.pipeline import Operation
@@ -23,6 +25,8 @@ DIVIDE, ROOT, FUNCTION, OTHER = 13.0, 17.0, 60.0, 80.0
 THROUGHPUT = {DIVIDE: 10.0, ROOT: 12.0, FUNCTION: 30.0, OTHER: 60.0}
 """What these cost in a batch, in units of an addition."""
 SUMS, PRODUCTS, DIVISIONS = "sums", "products", "divisions"  # units
+SUMS_ASIDE = llvmlite.binding.get_host_cpu_name().startswith("znver")
+"""Whether additions have units of their own, so that beside as many multiplications they cost nothing: AMD's Zen."""
 ALWAYS = -1000.0  # when constants are known
 MOST_CHAINS = 3  # sums are split into up to so many chains, added at their ends
 
@@ -51,7 +55,7 @@ class Schedule:
     early, lines : list of str
         The assignments: of what is known always, and of the rest.
     operations : float
-        Of the rest, in a batch, in units of an addition.
+        Of the rest, in a batch, in units of an addition; see `SUMS_ASIDE`.
     steps : list of Operation
         The rest, as `sympflow.kernels.pipeline` has it.
     """
@@ -65,13 +69,17 @@ class Schedule:
     ) -> None:
         self.early: list[str] = []
         self.lines: list[str] = []
-        self.operations = 0.0
+        self._occupied = {SUMS: 0.0, PRODUCTS: 0.0}
         self.steps: list[Operation] = []
         self.ready: dict[str, float] = {symbol.name: time for symbol, time in known.items()}
         self._printed, self._prefix = printed, prefix
         self._fused = "{2} + {0}*{1}" if fused is None else fused + "({0}, {1}, {2})"
         self._names: dict[str, str] = {}
         self._values: dict[sp.Expr, _Item] = {}
+
+    @property
+    def operations(self) -> float:
+        return max(self._occupied.values()) if SUMS_ASIDE else sum(self._occupied.values())
 
     def define(self, symbol: sp.Symbol, expression: sp.Expr) -> None:
         """Let the symbol, of a common subexpression, stand for the value of the expression."""
@@ -189,7 +197,7 @@ class Schedule:
             self.ready[name] = start + latency if start > ALWAYS else ALWAYS
             if start > ALWAYS:  # the compiler takes the rest out of loops over lanes
                 occupied = THROUGHPUT.get(latency, 1.0)
-                self.operations += occupied
+                self._occupied[SUMS if unit == SUMS else PRODUCTS] += occupied
                 operands = tuple(x for x in NAME.findall(text) if x in self.ready)
                 self.steps.append(Operation(name, operands, latency, unit, int(occupied)))
         name = self._names[text]
