@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from watchdog import watched
@@ -203,6 +203,7 @@ def test_solve_takes_or_refuses_anything(method, argument, value):
 @pytest.mark.parametrize("option", OPTIONS)
 @settings(max_examples=40, deadline=None)
 @given(value=anything)
+@example(value=4.5e61)  # a dt whose cube a float can hold, and whose fifth power it can not
 def test_options_are_taken_or_refused(option, value):
     for method in ("verlet", "rk45", "dopri5", "explicit_adams", "sympflow"):
         if option in get(method).options():

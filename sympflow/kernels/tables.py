@@ -67,4 +67,11 @@ def scaled_step_table(scheme: Scheme, h: float) -> Table:
 
 def _scaled(table: Table, scheme: Scheme, h: float) -> Table:
     kicks, drifts, gradients, curvatures = table
-    return h * kicks, h * drifts, h**3 * gradients, h ** (3 if scheme.polynomials else 5) * curvatures
+    last = 3 if scheme.polynomials else 5
+    return h * kicks, h * drifts, _times_power(gradients, h, 3), _times_power(curvatures, h, last)
+
+
+def _times_power(numbers: np.ndarray, h: float, n: int) -> np.ndarray:
+    """hⁿ times numbers, of which those that are 0 stay 0 even where hⁿ is beyond what a float can hold."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.where(numbers == 0, 0.0, np.float64(h) ** n * numbers)
