@@ -28,7 +28,7 @@ def monomials(symbols: SymbolicHamiltonian, degree: int) -> Monomials:
 
     The flows that kicks and drifts compose to are, by the formula of Baker, Campbell and Hausdorff, those of T, V and
     their commutators. Of these the ones that are potentials again are V, |∇V|²_{M⁻¹}, and whatever products ∇fᵀM⁻¹∇g of
-    such f and g make further (McLachlan & Quispel, Splitting methods, Acta Numerica 11, 2002, section 4). Where V is a
+    such f and g make further (the first of them: Blanes, Casas & Ros, Appl. Numer. Math. 39 (2001) 245). Where V is a
     polynomial, these are the monomials in them. Else they are those that are unchanged by the changes of sign of
     coordinates that leave V unchanged.
 
@@ -63,7 +63,7 @@ def _generated(symbols: SymbolicHamiltonian, degree: int) -> set[tuple[int, ...]
         products = set()
         for f, g in itertools.product(new, found):
             products |= {_product(f, g, i, j) for i, j in pairs if f[i] and g[j]}
-        new = {m for m in products if 1 <= sum(m) <= max(degree, 1)} - found
+        new = {m for m in products if 1 <= sum(m) <= degree} - found
         found |= new
     return {m for m in found if sum(m) <= degree}
 

@@ -77,8 +77,8 @@ def shapes(symbols: SymbolicHamiltonian, terms: int, monomials: Monomials = ()) 
 def _with_products_of_both(symbols: SymbolicHamiltonian, W: sp.Expr) -> Iterator[list[sp.Expr]]:
     """p + ∇W, W a polynomial in two coordinates, by what the derivatives of its mixed terms share.
 
-    With these terms (q1 q2)^m (L + X1 + X2 + …), of letters L and X ∝ q^k, ∂W/∂q_i has (q1 q2)^m/q_i times
-    m L + Σ (m + k_i) X: the products X serve both momenta, and for the rest there are sums.
+    Let these terms be (q1 q2)^m/m Σ X with X ∝ q1^k1 q2^k2. Of them ∂W/∂q_i has (q1 q2)^m/q_i (Σ X + Σ k_i/m X): the
+    products X serve both momenta, and where k_i = m the rest is sums.
     """
     terms = sp.Poly(W, *symbols.q).terms()
     mixed = {powers: c for powers, c in terms if all(powers)}
