@@ -286,7 +286,7 @@ def test_the_command(tmp_path):
 
 
 def test_the_words_of_the_page_hold_a_place_for_every_table():
-    folder = Path(__file__).parent.parent / "benchmarks"
+    folder = Path(__file__).parents[2] / "benchmarks"
     specification = importlib.util.spec_from_file_location("stability_words", folder / "stability_words.py")
     words = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(words)

@@ -115,7 +115,7 @@ def test_every_scene_is_on_the_command_line(name):
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_every_scene_is_documented(name):
-    docs = Path(__file__).parent.parent / "docs"
+    docs = Path(__file__).parents[2] / "docs"
     assert f"| `{name}` |" in (docs / "systems.md").read_text(encoding="utf-8")
     assert f"::: sympflow.systems.{SYSTEMS[name].__name__}\n" in (docs / "reference" / "systems.md").read_text(
         encoding="utf-8"

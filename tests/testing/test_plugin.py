@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("hatchling", reason="the plug-in is built with hatchling: pip install hatchling")
 
-PLUGIN = Path(__file__).parent.parent / "examples" / "plugin"
+PLUGIN = Path(__file__).parents[2] / "examples" / "plugin"
 
 
 def run(*arguments, path):
