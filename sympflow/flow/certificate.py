@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sympflow.domain import Domain
-from sympflow.system import HamiltonianSystem
-from sympflow.training.validation import reference_step
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.exact_flow import reference_step
 
 QUANTILE, CONFIDENCE = 0.95, 0.99  # of the energy errors, and that its limit is one
 SAVED_VALUES = 1_000_000  # of a piece of the measured runs, which are never held whole

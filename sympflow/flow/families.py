@@ -10,7 +10,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from sympflow.imports import whole_import
+from sympflow.lazy import whole_import
 
 FAMILIES = {
     "sympflow": "sympflow.flow.sympflow:SympFlow",

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.arguments import check_system, plain
-from sympflow.domain import Domain, EnergySublevel
-from sympflow.fingerprints import same_system
+from sympflow.hamiltonian.domain import Domain, EnergySublevel
+from sympflow.hamiltonian.fingerprint import same_system
 from sympflow.flow.certificate import Certificate, certify
 from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 MAX_STEPS = 10_000_000  # of one call
 
