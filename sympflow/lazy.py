@@ -16,6 +16,7 @@ FORMER = {
     "domain": "hamiltonian.domain",
     "expression": "hamiltonian.expression",
     "files": "arguments",
+    "flow.base": "flow.flow_map",
     "imports": "lazy",
     "integrators.checks": "testing.checks",
     "integrators.scheme": "schemes",

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.hamiltonian.exact_flow import reference_step
 
 QUANTILE, CONFIDENCE = 0.95, 0.99  # of the energy errors, and that its limit is one
 SAVED_VALUES = 1_000_000  # of a piece of the measured runs, which are never held whole
@@ -317,6 +316,8 @@ def _array(values: Tensor) -> np.ndarray:
 
 
 def _one_step_error(flow: _Flow, system: HamiltonianSystem, x: np.ndarray) -> Quantiles:
+    from sympflow.hamiltonian.exact_flow import reference_step
+
     with torch.no_grad():
         y = flow.psi(flow.dt, torch.as_tensor(x, dtype=flow.dtype, device=flow.device)).cpu().double().numpy()
     return Quantiles.of(np.linalg.norm(y - reference_step(system, x, flow.dt), axis=-1))

@@ -24,12 +24,12 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
 import sympflow
-from sympflow.hamiltonian.domain import Domain, domain_from_dict
 from sympflow.arguments import naming_path, writable
 from sympflow.flow.certificate import Certificate
 from sympflow.flow.families import KINDS, family_of
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.weights import checked_device, checksum
+from sympflow.hamiltonian.domain import Domain, domain_from_dict
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 FORMAT = 1

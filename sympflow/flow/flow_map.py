@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sympflow.arguments import check_system, plain
-from sympflow.hamiltonian.domain import Domain, EnergySublevel
-from sympflow.hamiltonian.fingerprint import same_system
+from sympflow.arguments import plain
 from sympflow.flow.certificate import Certificate, certify
 from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
+from sympflow.hamiltonian.domain import Domain, EnergySublevel
+from sympflow.hamiltonian.fingerprint import same_system
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 MAX_STEPS = 10_000_000  # of one call
@@ -34,6 +34,15 @@ class Origin:
     def is_of(self, system: HamiltonianSystem) -> bool:
         """Return True for that system, which is recognised by its H."""
         return same_system(self.fingerprint, system.fingerprint)
+
+
+def check_system(system: Any) -> None:
+    """Raise TypeError unless `system` is a HamiltonianSystem."""
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(
+            f"`system` must be a HamiltonianSystem; got {type(system).__name__}: take a scene of sympflow.systems, or "
+            "define one with HamiltonianSystem.from_sympy."
+        )
 
 
 class FlowMap(nn.Module):
@@ -489,7 +498,9 @@ class FlowMap(nn.Module):
         try:
             value = float(t)
         except (TypeError, ValueError):
-            raise TypeError(f"`t` must be a number or a tensor of times; got {type(t).__name__}: pass seconds.") from None
+            raise TypeError(
+                f"`t` must be a number or a tensor of times; got {type(t).__name__}: pass seconds."
+            ) from None
         if not math.isfinite(value):
             raise ValueError(f"`t` must be finite; got {value}: pass a finite time.")
         return value
@@ -513,7 +524,9 @@ class FlowMap(nn.Module):
 
 
 def whole_steps(t: float, dt: float) -> tuple[int, float]:
-    """Return k = ⌊t/Δt⌋ and r = t − kΔt ∈ [0, Δt) for t ≥ 0, counting a multiple of Δt up to rounding as one: 0.3/0.1 is 3.
+    """Return k = ⌊t/Δt⌋ and r = t − kΔt ∈ [0, Δt) for t ≥ 0.
+
+    k is an integer count, robust to rounding: a multiple of Δt up to rounding counts as one, 0.3/0.1 is 3.
 
     Raises
     ------

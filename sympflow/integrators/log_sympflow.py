@@ -136,7 +136,7 @@ class LogSympFlow(Logarithmic):
         """
         flow, shift, dt = self.flow, self.shift, self.dt
         scale = time_scale(system, default_shift(system) if shift is None else shift)
-        numbers = flow.numbers() if hasattr(flow, "numbers") else ()
+        numbers = flow.clock_numbers()
         clock = () if system.y0 is None else numbers
         if dt is None:
             return system, physical_length(flow.dt, scale, clock), flow.dt, numbers

@@ -89,7 +89,7 @@ class SympFlowIntegrator(FlowIntegrator):
         origin = (self.flow.recipe or {}).get("transforms")
         if origin is None:
             return self
-        from sympflow.flow.base import same_system
+        from sympflow.hamiltonian.fingerprint import same_system
 
         if not same_system(origin["fingerprint"], system.fingerprint):
             return self
