@@ -36,9 +36,9 @@ from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
 from sympflow.flow.io import shipped
-from sympflow.integrators.exact_maps import kernel_of, known_maps
-from sympflow.integrators.linear_splitting import LinearSplitting
-from sympflow.kernels.parts import PartsKernel
+from sympflow.integrators.compositions import known_maps
+from sympflow.integrators.splitting import LinearSplitting
+from sympflow.kernels.parts import PartsKernel, kernel_of
 from sympflow.schemes import SCHEMES
 from sympflow.systems.chains import oscillatory_energies
 

@@ -32,9 +32,9 @@ import numpy as np
 
 from sympflow import HamiltonianSystem, Solution, solve, systems
 from sympflow.flow.io import shipped
-from sympflow.integrators.exact_maps import kernel_of, known_maps
-from sympflow.integrators.linear_splitting import LinearSplitting
-from sympflow.kernels.parts import PartsKernel
+from sympflow.integrators.compositions import known_maps
+from sympflow.integrators.splitting import LinearSplitting
+from sympflow.kernels.parts import PartsKernel, kernel_of
 from sympflow.kernels.splitting import splitting_kernel
 from sympflow.schemes import SCHEMES
 

@@ -13,7 +13,7 @@ import numpy as np
 from sympflow import HamiltonianSystem, get, solve
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
-from sympflow.integrators.log_sympflow import LogSympFlow
+from sympflow.integrators.flows import LogSympFlow
 from sympflow.kernels.primed_flow import PrimedFlowKernel
 from sympflow.kernels.splitting import splitting_kernel
 from sympflow.metrics.reference import reference

@@ -6,7 +6,6 @@ walks the grid, finds what is not finite, places the outputs and looks for event
 
 from __future__ import annotations
 
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol
@@ -128,16 +127,14 @@ class Stepper:
         True if the states that `rollout` saves up to the last finite one are known to be finite.
     """
 
-    compiled: ClassVar[bool] = False
+    compiled: bool = False
     saves_finite: bool = False
 
     def __init__(self, integrator: FixedStep, problem: Problem) -> None:
         self.integrator, self.system, self.asked = integrator, problem.system, problem.backend
         self.backend = "torch" if is_tensor(problem.y0) else "numpy"
 
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0
-    ) -> tuple[Array, np.ndarray]:
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
         """Return the states (len(save), ..., 2d) after the steps `save` (sorted counts in 0 … n_steps) of length h.
 
         Also the index of the last finite state of each trajectory, of shape y0.shape[:-1].
@@ -167,9 +164,7 @@ class Loops(Protocol):
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
         """States (len(save), 2d) of one trajectory, and the index of the last finite one."""
 
-    def run_batch(
-        self, h: float, rows: np.ndarray, n_steps: int, save: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def run_batch(self, h: float, rows: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States (N, len(save), 2d) of trajectories from the rows (N, 2d), and of each the last finite index."""
 
     def step(self, h: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -179,15 +174,13 @@ class Loops(Protocol):
 class KernelStepper(Stepper):
     """A run in compiled loops."""
 
-    compiled: ClassVar[bool] = True
+    compiled: bool = True
 
     def __init__(self, integrator: FixedStep, problem: Problem, loops: Loops) -> None:
         self.integrator, self.system, self.asked = integrator, problem.system, problem.backend
         self.loops, self.backend, self.saves_finite = loops, "compiled", loops.saves_finite
 
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0
-    ) -> tuple[Array, np.ndarray]:
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
         if y0.ndim == 1:
             states, last = self.loops.run(h, y0, n_steps, save)
             return states, np.asarray(last)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -365,9 +365,7 @@ class PhysicalRun:
         single = problem.y0.ndim == 1
         times = problem.t_eval
         if times is None and not single:  # the trajectories take different steps: report on a common grid
-            times = Grid(problem.t0, problem.t1, self.clock.dt).outputs(
-                None, problem.save_every
-            )[0]
+            times = Grid(problem.t0, problem.t1, self.clock.dt).outputs(None, problem.save_every)[0]
         N = len(self.start)
         wanted = np.empty(0) if times is None else (times - problem.t0).astype(self.start.dtype)
         out = np.full((len(wanted), N, 2 * self.d), np.nan, dtype=self.start.dtype)

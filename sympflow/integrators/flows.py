@@ -180,9 +180,7 @@ class FlowStepper(Stepper):
         super().__init__(integrator, problem)
         self.flow, self.backend = flow, "torch"
 
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0
-    ) -> tuple[Array, np.ndarray]:
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
         if not is_tensor(y0):
             with torch.no_grad():
                 states, finite = self.rollout(torch.from_numpy(np.ascontiguousarray(y0)), h, n_steps, save)
@@ -439,9 +437,7 @@ class LogSympFlow(FixedStep):
                 return None
             return kernel.reach_times(h, start, times, stride, expected, numbers)
 
-        return LogarithmicClock(
-            self.name, system, transformed, inner, dt, new_step, flow.evaluations, reach_times
-        )
+        return LogarithmicClock(self.name, system, transformed, inner, dt, new_step, flow.evaluations, reach_times)
 
     def step_length(self, system: HamiltonianSystem) -> float:
         return self.on_clock(system).dt

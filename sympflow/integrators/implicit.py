@@ -91,7 +91,7 @@ class Gauss(FixedStep):
         return y + sum(b * K[..., i, :] for i, b in enumerate(self.tableau[1]))
 
     def _stages(self, system: HamiltonianSystem, y: Array, h: Any) -> tuple[Array, int]:
-        """The K (..., s, 2d) of a step, NaN for states whose step was not solved; and the iterations, over all states."""
+        """The K (..., s, 2d) of a step, NaN where the step was not solved; and the iterations, over all states."""
         if is_tensor(y):
             return self._tensor_stages(system, y, h)
         A = np.array(self.tableau[0], dtype=y.dtype)
@@ -144,9 +144,7 @@ class GaussStepper(Stepper):
         if kernel is not None:
             self.backend = "compiled"
 
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0
-    ) -> tuple[Array, np.ndarray]:
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
         if self.kernel is None:
             return rollout(lambda k, y: self.shorter(y, h), y0, n_steps, save)
         rows = y0.reshape(-1, y0.shape[-1])

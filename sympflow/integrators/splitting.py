@@ -123,7 +123,7 @@ class Splitting(FixedStep):
             return None
         if self.splitting != "kinetic":
             raise ValueError(
-                f"`clock` 'logarithmic' needs the splitting 'kinetic', in which log(T + B) − log(c − V) has exact flows; "
+                f"`clock` 'logarithmic' needs the splitting 'kinetic', as log(T + B) − log(c − V) has exact flows; "
                 f"method {self.name!r} has {self.splitting!r}: leave one of them out."
             )
         transformed = transformed_system(system, self.shift)
@@ -198,9 +198,7 @@ class ArrayComposition(Stepper):
         super().__init__(integrator, problem)
         self.composition = composition
 
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0
-    ) -> tuple[Array, np.ndarray]:
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
         return self.composition.rollout(y0, h, n_steps, save)
 
     def shorter(self, y: Array, h: Any) -> Array:

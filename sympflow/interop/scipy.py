@@ -131,7 +131,8 @@ class FlowSolver(OdeSolver):
                 f"`system` is needed for method {integrator.name!r}: as_scipy({integrator.name!r}, system), or pass a "
                 "HamiltonianSystem as `fun`."
             )
-        size = 2 * (self._solved or self._flow()).ndof
+        flow = self._flow()
+        size = 2 * (self._solved if flow is None else flow).ndof
         if self.n != size:
             raise ValueError(f"`y0` must have length {size}, [q, p]; got {self.n}.")
         if not np.isfinite(self.y).all():

@@ -72,5 +72,5 @@ class ClockedFlowKernel:
 
         `numbers` are those of the clock, if they have been asked for.
         """
-        numbers = self.flow.numbers() if numbers is None else numbers
+        numbers = self.flow.clock_numbers() if numbers is None else numbers
         return reach_times(self.system, self._scheme, h, y0, times, stride, expected, numbers)

@@ -72,7 +72,7 @@ class MLPFlowKernel:
     """
 
     def __init__(self, flow: SympFlow) -> None:
-        from sympflow.flow.contents import Contents
+        from sympflow.flow.weights import Contents
 
         self.ndof = flow.ndof
         self._architecture, self._weights = _freeze(flow)

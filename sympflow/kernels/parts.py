@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from sympflow.kernels.modules import NEVER, load_algebra, run_one, run_rows
 from sympflow.kernels.part_flows import TURN_WIDTH
 from sympflow.kernels.parts_codegen import IDLE, WITH_GRADIENT, parts_source
 
-__all__ = ["PartsKernel"]
+__all__ = ["PartsKernel", "kernel_of"]
 
 ONE = np.ones(1, dtype=np.int64)
 KNOWN_TABLES = 64  # run tables that are kept: those of the steps in use
@@ -240,3 +241,13 @@ def merge(one: Map, other: Map) -> Map | None:
 
 def _same(a: Any, b: Any) -> bool:
     return (a is None and b is None) or (a is not None and b is not None and np.array_equal(a, b))
+
+
+_KERNELS: WeakKeyDictionary[ExactParts, Any] = WeakKeyDictionary()
+
+
+def kernel_of(parts: ExactParts, make: Callable[[ExactParts], Any]) -> Any:
+    """The compiled loops of the parts, made once."""
+    if parts not in _KERNELS:
+        _KERNELS[parts] = make(parts)
+    return _KERNELS[parts]

@@ -15,8 +15,7 @@ from sympflow.kernels.tables import scaled_run_table, scaled_step_table
 from sympflow.schemes import CURVATURE, Scheme
 
 if TYPE_CHECKING:
-    from sympflow.flow.frozen import Tables
-    from sympflow.flow.primed import PrimedFlow
+    from sympflow.flow.primed import PrimedFlow, Tables
 
 __all__ = ["PrimedFlowKernel"]
 
