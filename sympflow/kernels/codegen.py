@@ -13,7 +13,6 @@ from sympflow.symbolic import SymbolicHamiltonian, printable
 
 __all__ = [
     "algebra_source",
-    "coefficients_source",
     "curvature_kick_source",
     "gradient_kick_source",
     "polynomial_kick_source",
@@ -196,25 +195,6 @@ def polynomial_kick_source(symbols: SymbolicHamiltonian, monomials: Monomials) -
                 places[i].append(f" - c[{m}]*{{{len(slopes)}}}")
                 slopes.append(slope)
     return _function("polynomial_kick", "q, b, c, work", q, slopes, ["".join(terms) for terms in places]) + "\n"
-
-
-def coefficients_source(d: int, n: int) -> str:
-    """The number n of monomials that kicks have, and their coefficients as a tuple: out of an array, or of a lane."""
-
-    def each(pattern: str) -> str:
-        return "(" + "".join(pattern.format(m, 2 * d + 8 + m) + ", " for m in range(n)) + ")"
-
-    return f"""N_MONOMIALS = {n}
-
-
-@njit(**OPTIONS)
-def coefficients_of(c):
-    return {each("c[{0}]")}
-
-
-@njit(**OPTIONS)
-def lane_coefficients(Y, lane):
-    return {each("Y[{1}, lane]")}"""
 
 
 def _function(

@@ -13,6 +13,7 @@ from sympflow.kernels.codegen import printed
 from sympflow.kernels.kick_shapes import polynomial_letters, shapes
 from sympflow.kernels.pipeline import Operation, cycles_per_turn
 from sympflow.kernels.scheduling import FUSED, PRODUCTS, Schedule
+from sympflow.kernels.stages import kicks_of
 from sympflow.monomials import Monomials
 from sympflow.symbolic import SymbolicHamiltonian
 
@@ -43,8 +44,8 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials 
     """The new p after a kick, p − b∇V + g∇²V v − c∇(½ v·∇²V v), v = M⁻¹∇V, each in two shapes, equal but for rounding.
 
     ``kicked(q, p, table, j)``, from `level` 1 on ``gradient_kicked`` and from 2 on ``curvature_kicked``, are the
-    fastest for one trajectory; what depends on b, g and c alone is in row j of the table, which ``fill_coefficients(b,
-    g, c, row)`` computes. ``kicked_lane(q, p, b)``, ``gradient_kicked_lane(q, p, b, g)`` and
+    fastest for one trajectory; what depends on b, g and c alone is in row j of the table, which ``fill_coefficients(numbers,
+    row)`` computes. ``kicked_lane(q, p, b)``, ``gradient_kicked_lane(q, p, b, g)`` and
     ``curvature_kicked_lane(q, p, b, g, c)`` have the fewest operations, for many at once; ``drifted(q, p, a)``
     is for both. With monomials there are ``polynomial_kicked`` and ``polynomial_kicked_lane(q, p, b, c)`` alone, c
     the coefficients of the polynomial.
@@ -93,9 +94,10 @@ def _source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> s
     stored: list[str] = []
     letters = [e.name for e in polynomial_letters(monomials)]
     unpacked = [f"{e} = c[{m}]" for m, e in enumerate(letters)]
-    kept = ["b", *letters] if monomials else ["b", "g", "c"]
-    names = ("kicked", "gradient_kicked", "curvature_kicked")[: level + 1] if not monomials else ("polynomial_kicked",)
-    for terms, name in enumerate(names, 1):
+    kinds = kicks_of(level, len(monomials))
+    kept = list(kinds[0].numbers)
+    for kick in reversed(kinds):
+        name, terms = kick.name, len(kick.numbers)
         tried = _tried(symbols, terms, f"{name[0]}_", monomials)
         one = min(tried, key=lambda kick: (kick.cycles, kick.operations))
         many = min(tried, key=lambda kick: (kick.operations, kick.cycles))
@@ -109,8 +111,9 @@ def _source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> s
         arguments = ", ".join(("q", "p", *(("b", "c") if monomials else kept[:terms])))
         lines = [*unpacked, *many.coefficients, *many.lines]
         functions.append(_function(symbols, f"{name}_lane", arguments, lines, many.results))
-    rows = [*unpacked, *fill, *(f"row[{i}] = {name}" for i, name in enumerate([*stored, *kept]))]
-    filled = "\n    ".join(["@njit(**OPTIONS)\ndef fill_coefficients(b, g, c, row):", *rows])
+    given = f"{', '.join(kept)}, = numbers"
+    rows = [given, *fill, *(f"row[{i}] = {name}" for i, name in enumerate([*stored, *kept]))]
+    filled = "\n    ".join(["@njit(**OPTIONS)\ndef fill_coefficients(numbers, row):", *rows])
     drifts = _drift_source(symbols)
     return "\n\n\n".join([f"N_COEFFICIENTS = {len(stored) + len(kept)}", filled, *functions, drifts]) + "\n"
 

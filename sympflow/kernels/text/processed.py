@@ -1,6 +1,6 @@
 """Runs in other coordinates, χ ∘ Kⁿ ∘ χ⁻¹. Source text, pasted after `loops`, and after `lanes` where these are.
 
-χ⁻¹ and χ are fixed numbers, see `map_each`; those of K are the table of a run, see `loops`, in the same two arrays.
+The tables of χ⁻¹ and χ are those of single maps, see `map_each`, that of K is that of a run.
 χ⁻¹ is executed once, and χ for each output.
 """
 # ruff: noqa: F821
@@ -32,28 +32,28 @@ def up_to_finite(out, save, n_finite):
 
 
 @njit(**OPTIONS)
-def rollout_processed(before, more_before, run, more, after, more_after, y0, n_steps, save, out, stop):
+def rollout_processed(before, run, after, y0, n_steps, save, out, stop):
     """`rollout` from `y0` (2d,) in other coordinates, `before` into them and `after` out of them."""
     start = np.empty((1, len(y0)))
-    map_rows(before, more_before, y0.reshape((1, len(y0))), start)
-    n_finite = rollout(run[0], run[1], run[2], more, start[0], n_steps, save, out, stop)
+    map_rows(before, y0.reshape((1, len(y0))), start)
+    n_finite = rollout(run, start[0], n_steps, save, out, stop)
     first = 0
     while first < len(save) and save[first] <= 0:
         q, p = unpack(y0)
         pack(q, p, out[first])
         first += 1
-    map_rows(after, more_after, out[first:], out[first:])
+    map_rows(after, out[first:], out[first:])
     return up_to_finite(out, save, n_finite)
 
 
 @njit(**OPTIONS)
-def rollout_processed_rows(before, more_before, run, more, after, more_after, y0, n_steps, save, out, n_finite, stop):
+def rollout_processed_rows(before, run, after, y0, n_steps, save, out, n_finite, stop):
     """The same of every row of `y0` (N, 2d)."""
     start = np.empty(y0.shape)
-    map_rows(before, more_before, y0, start)
-    rollout_rows(run[0], run[1], run[2], more, start, n_steps, save, out, n_finite, stop)
+    map_rows(before, y0, start)
+    rollout_rows(run, start, n_steps, save, out, n_finite, stop)
     outputs = out.reshape((-1, y0.shape[1]))
-    map_rows(after, more_after, outputs, outputs)
+    map_rows(after, outputs, outputs)
     for i in range(len(y0)):
         for row in range(len(save)):
             if save[row] > 0:

@@ -10,7 +10,7 @@ import numpy as np
 from sympflow.domain import Box, EnergySublevel
 from sympflow.kernels.codegen import statements
 from sympflow.kernels.modules import load_algebra
-from sympflow.kernels.outputs import all_between
+from sympflow.kernels.output_loops import all_between
 from sympflow.symbolic import SymbolicHamiltonian
 from sympflow.system import HamiltonianSystem
 
