@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from sympflow.kernels.codegen import statements
 from sympflow.kernels.modules import load_algebra, run_rows
 from sympflow.kernels.protocol import Run, Steps
-from sympflow.symbolic import SymbolicHamiltonian
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 __all__ = ["ImplicitKernel", "implicit_kernel"]
 

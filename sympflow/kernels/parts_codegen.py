@@ -11,8 +11,8 @@ import sympy as sp
 
 from sympflow.kernels.codegen import printed, tuple_algebra
 from sympflow.kernels.scheduling import FUSED, Schedule
-from sympflow.parts import LINEAR, ExactParts, PartFunctions
-from sympflow.symbolic import printable
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions
+from sympflow.hamiltonian.symbolic import printable
 
 __all__ = ["IDLE", "TURN_WIDTH", "WITH_GRADIENT", "parts_source"]
 

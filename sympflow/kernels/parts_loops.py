@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from sympflow.kernels.modules import NEVER, load_algebra, run_one, run_rows
 from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
 from sympflow.kernels.protocol import Run, Steps
-from sympflow.parts import LINEAR, ExactParts, Map, PartFunctions
-from sympflow.shears import shears
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions
+from sympflow.hamiltonian.parts import shears
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 

@@ -12,15 +12,15 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.integrators.scheme import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
 from sympflow.kernels.protocol import Run, Steps
 from sympflow.kernels.stages import StageTable, kicks_of, lanes_source, run_table, stages_source, step_table
-from sympflow.monomials import Monomials
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:
-    from sympflow.symbolic import SymbolicHamiltonian
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 __all__ = ["SplittingKernel", "SplittingLoops", "compilable", "splitting_loops", "symbolic_module"]
 

@@ -8,7 +8,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from sympflow.integrators.scheme import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 
 __all__ = [
     "Kick",
