@@ -32,10 +32,10 @@ import numpy as np
 
 from sympflow import HamiltonianSystem, Solution, solve, systems
 from sympflow.flow.io import shipped
-from sympflow.integrators.exact_maps import kernel_of, known_maps
+from sympflow.integrators.exact_maps import known_maps
 from sympflow.integrators.linear_splitting import LinearSplitting
-from sympflow.kernels.parts import PartsKernel
-from sympflow.kernels.splitting import splitting_kernel
+from sympflow.kernels.parts_loops import parts_loops
+from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES
 
 DT = 0.625  # of srkn11b
@@ -91,7 +91,7 @@ def henon_heiles(quick: bool) -> Iterator[Pair]:
     errors = [median_energy_error(system, run, 20.0 if quick else 1000.0) for run in (flow, scheme)]
     print(f"\nHénon–Heiles: energy error of the flow {errors[0]:.1e}, of srkn11b {errors[1]:.1e}\n")
     kernel = shipped(system, tol=1e-6).kernel_for(system)
-    splitting, step = splitting_kernel(system), flow((0, 1)).stats["dt"]
+    splitting, step = splitting_loops(system), flow((0, 1)).stats["dt"]
     many = system.domain.sample(8 if quick else 1000, 3)  # type: ignore[union-attr]
 
     def pair(name: str, t_end: float, y0: np.ndarray | None = None, outputs: int = 1) -> Pair:
@@ -137,7 +137,7 @@ def fput(omega: float, quick: bool) -> Iterator[Pair]:
     print(f"\nFPUT, ω = {omega:g}: energy error of the flow {errors[0]:.1e}, of linear chin4a {errors[1]:.1e}\n")
     kernel = flow.kernel_for(system)
     parts = method.parts_of(system)
-    untrained = partial(kernel_of(parts, PartsKernel).run, lambda h: known_maps(method, parts, float(h)))
+    untrained = parts_loops(parts).kernel(lambda h: known_maps(method, parts, float(h))).run
     loops = (
         partial(kernel.run, flow.dt, system.y0, m, saves[0]),
         partial(untrained, t_end / n, system.y0, n, saves[1]),

@@ -33,7 +33,7 @@ def surely_within(flow: Any, system: HamiltonianSystem, y: np.ndarray, slack: fl
 
 @cache
 def _compiled() -> Callable[..., bool]:
-    from sympflow.kernels.sublevel import all_within
+    from sympflow.kernels.sublevel_loops import all_within
 
     return all_within
 

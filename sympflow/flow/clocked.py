@@ -29,7 +29,7 @@ from sympflow.schemes import SCHEMES, scheme_evaluations
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.kernels.clocked_flow import ClockedFlowKernel
+    from sympflow.kernels.flow_loops import ClockedFlowKernel
 
 
 class ClockPotential(Potential):
@@ -193,9 +193,10 @@ class ClockedFlow(SympFlow):
     def kernel_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
         """The compiled loops of this flow."""
         if self._kernel is None or self._kernel.system is not system:
-            from sympflow.kernels.clocked_flow import ClockedFlowKernel
+            from sympflow.kernels.flow_loops import ClockedFlowKernel, check_placement
 
-            self._kernel = ClockedFlowKernel(self, system)
+            check_placement(self.dtype, self.device)
+            self._kernel = ClockedFlowKernel(self.scheme, system, self.advance, self.numbers)
         return self._kernel
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
 
 from sympflow.flow.coefficients import Coefficients, Entry
 from sympflow.flow.contents import Contents
 from sympflow.hamiltonian.monomials import Monomials
+from sympflow.kernels.stages import StageTable
 from sympflow.schemes import CURVATURE, POLYNOMIAL, Scheme, scheme_evaluations
 
 if TYPE_CHECKING:
-    from sympflow.kernels.primed_flow import PrimedFlowKernel
+    from sympflow.kernels.flow_loops import PrimedFlowKernel
 
 Kind = Literal["kick", "drift"]
 
@@ -51,6 +51,11 @@ class Tables:
         Δt.
     monomials
         Of the polynomials of kicks, where they have them.
+
+    Attributes
+    ----------
+    placements : set of tuple
+        The dtypes and devices of the numbers.
     """
 
     kernel: PrimedFlowKernel | None = None
@@ -63,7 +68,7 @@ class Tables:
         self.monomials = monomials
         self.level = POLYNOMIAL if monomials else max(len(s.more) for s in substeps)
         numbers = [c.table for c in columns_of(substeps)]
-        self.compilable = all(c.dtype == torch.float64 and c.device.type == "cpu" for c in numbers)
+        self.placements = {(c.dtype, c.device) for c in numbers}
         exponents = columns_of(substeps)[0].exponents
         self._coefficients = {id(c): c.table.detach().cpu().double().numpy() for c in columns_of(substeps)}
         self._exponents = np.array(exponents, dtype=float)
@@ -89,22 +94,21 @@ class Tables:
 
         return self.kept((part, t, back), make)
 
-    def polynomials(self, back: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Kicks, drifts, gradients and curvatures (m, K) of the stages of ψ̄_t, or of its inverse.
+    def polynomials(self, back: bool) -> StageTable:
+        """The stages of ψ̄_t or of its inverse for all t, as coefficients of polynomials (m, K).
 
-        They are divided by t, t, t³ and t⁵. They multiply the powers 0 … K−1 of `variable`; K is at least 3, by zeros
-        if need be. In place of curvatures there may be polynomials (m, M, K), divided by t³.
+        Kicks and drifts are divided by t, gradients and polynomials in q by t³, curvatures by t⁵. They multiply the
+        powers 0 … K−1 of `variable`; K is at least 3, by zeros if need be.
         """
 
-        def make() -> tuple[np.ndarray, ...]:
+        def make() -> StageTable:
             parts, sign = self._parts["primed"], -1 if back else 1
             substeps = reversed(parts) if back else parts
             stages = self._stages((s.kind, _numbers(s, self._coefficients, sign)) for s in substeps)
             numbers = np.array(stages, dtype=float)  # (m, columns, K)
             numbers = np.pad(numbers, ((0, 0), (0, 0), (0, max(0, 3 - numbers.shape[2]))))
-            kicks, gradients, drifts = numbers[:, 0], numbers[:, 1], numbers[:, -1]
-            more = numbers[:, 3:-1] if self.monomials else numbers[:, 2]
-            return tuple(np.ascontiguousarray(c) for c in (kicks, drifts, gradients, more))
+            kicks, gradients, curvatures = (numbers[:, i] for i in range(3))
+            return StageTable(self.level, kicks, numbers[:, -1], gradients, curvatures, numbers[:, 3:-1])
 
         return self.kept(("polynomials", back), make)
 

@@ -44,7 +44,7 @@ from sympflow.schemes import Scheme
 if TYPE_CHECKING:
     from sympflow.flow.potentials import Time
     from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.kernels.primed_flow import PrimedFlowKernel
+    from sympflow.kernels.flow_loops import PrimedFlowKernel
 
 
 class PrimedFlow(SympFlow):
@@ -217,9 +217,11 @@ class PrimedFlow(SympFlow):
         """The compiled loops of this flow, the same while no number of it changes."""
         tables = self.tables
         if tables.kernel is None or tables.kernel.system is not system:
-            from sympflow.kernels.primed_flow import PrimedFlowKernel
+            from sympflow.kernels.flow_loops import PrimedFlowKernel, check_placement
 
-            tables.kernel = PrimedFlowKernel(self, system)
+            for placement in tables.placements:
+                check_placement(*placement)
+            tables.kernel = PrimedFlowKernel(tables, system)
         return tables.kernel
 
     # kernel and processor as maps ---------------------------------------------------------------------------

@@ -30,7 +30,7 @@ from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.kernels.split_flow import SplitFlowKernel
+    from sympflow.kernels.flow_loops import SplitFlowKernel
 
 FILTERED = ("oscillator", "hyperbolic")
 """The kinds of modes that filters act on; others pass."""
@@ -220,9 +220,10 @@ class SplitFlow(SympFlow):
         flow = self.bound(system)
         frozen = flow.frozen()
         if frozen.kernel is None or frozen.kernel.parts is not flow.parts:
-            from sympflow.kernels.split_flow import SplitFlowKernel
+            from sympflow.kernels.flow_loops import SplitFlowKernel, check_placement
 
-            frozen.kernel = SplitFlowKernel(flow)
+            check_placement(*frozen.placement)
+            frozen.kernel = SplitFlowKernel(frozen, flow.parts, flow.dt)
         return frozen.kernel
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:

@@ -17,7 +17,7 @@ from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts
 if TYPE_CHECKING:
     from sympflow.flow.split import SplitFlow
     from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.kernels.split_flow import SplitFlowKernel
+    from sympflow.kernels.flow_loops import SplitFlowKernel
 
 MOST_KEPT = 64  # steps whose maps are kept
 
@@ -52,8 +52,8 @@ class KeptMaps:
 
     Attributes
     ----------
-    compilable : bool
-        Whether the numbers are float64 on the CPU: asked once, as torch answers slowly.
+    placement : tuple
+        Dtype and device of the numbers.
     """
 
     kernel: SplitFlowKernel | None = None
@@ -64,7 +64,7 @@ class KeptMaps:
     ) -> None:
         self._make, self._dt = make, dt
         self._coefficients = coefficients, [m.inverse() for m in reversed(coefficients)]
-        self.compilable = like.dtype == torch.float64 and like.device.type == "cpu"
+        self.placement = like.dtype, like.device
         self._maps: dict[float, list[Map]] = {}
         self._counts: dict[tuple[int, int, int, str], dict[str, int]] = {}
 

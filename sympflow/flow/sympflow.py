@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 from sympflow.arguments import plain
 from sympflow.flow.arguments import bare_time
 from sympflow.flow.base import FlowMap
+from sympflow.flow.contents import Contents
 from sympflow.flow.layers import Drift, Kick, Layer
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from sympflow.flow.primed import PrimedFlow
     from sympflow.flow.split import SplitFlow
     from sympflow.hamiltonian.system import HamiltonianSystem
+    from sympflow.kernels.network_loops import NetworkLayer
     from sympflow.schemes import Scheme
 
 
@@ -233,6 +236,23 @@ class SympFlow(FlowMap):
         numbers = plain(stages), plain(dt), plain(terms)
         return split(system, *numbers, filters, force_gradient, parts, linear_outside, dtype, device)
 
+    def kernel_for(self, system: HamiltonianSystem | None = None) -> Any:
+        """The compiled loops of this flow, whatever the system, made anew when its weights have changed.
+
+        Raises
+        ------
+        ValueError
+            If the flow cannot be compiled, with the reason.
+        """
+        known = _KERNELS.get(self)
+        if known is None or known[0].snapshot() != known[1]:
+            from sympflow.kernels.network_loops import MLPFlowKernel
+
+            kernel = MLPFlowKernel(self.ndof, _network(self))
+            contents = Contents(d for m in self.modules() for d in (m._parameters, m._buffers))
+            known = _KERNELS[self] = contents, contents.snapshot(), kernel
+        return known[2]
+
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.ndof, "layers": [layer.to_dict() for layer in self.layers]}  # type: ignore[operator]
 
@@ -272,3 +292,26 @@ class SympFlow(FlowMap):
         for layer in self.layers:
             q, p, dq, dp = layer.tangent(t, q, p, dq, dp)  # type: ignore[operator]
         return torch.cat([q, p]), torch.cat([dq, dp])
+
+
+_KERNELS: WeakKeyDictionary[SympFlow, tuple[Contents, bytes, Any]] = WeakKeyDictionary()
+"""The compiled loops of flows, and the contents of the flow for which they were made."""
+
+
+def _network(flow: SympFlow) -> list[NetworkLayer]:
+    """The weights of the layers of a flow of kicks and drifts with MLP potentials."""
+    from sympflow.kernels.flow_loops import check_placement
+    from sympflow.kernels.network_loops import NetworkLayer
+
+    if not all(isinstance(n, Kick | Drift) and isinstance(n.potential, MLPPotential) for n in flow.layers):
+        raise ValueError("`flow` has layers other than kicks and drifts with MLP potentials: use backend='array'.")
+    check_placement(flow.dtype, flow.device)
+    layers = []
+    for layer in flow.layers:
+        V: Any = layer.potential
+        K, k, biases, weights, w = V.folded()
+        arrays = [[one.detach().numpy() for one in each] for each in ((K, k, w), biases, weights)]
+        layers.append(
+            NetworkLayer(layer.kind == "kick", V.activation, arrays[0][0], arrays[0][1], *arrays[1:], arrays[0][2])
+        )
+    return layers

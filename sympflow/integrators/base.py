@@ -219,7 +219,7 @@ class FixedStep(Integrator):
         compiled = self.compiles and problem.backend != "array" and type(y0) is np.ndarray and y0.dtype == np.float64
         compiled = compiled and (system.symbols is not None or system.numba_functions is not None)
         if compiled and t is not None and len(t) > FEW and not problem.dense_output:
-            from sympflow.kernels.outputs import place
+            from sympflow.kernels.output_loops import place
 
             return t, *place(t, grid.t0, grid.h, 4 * EPS)
         t, count, remainder = grid.outputs(t, problem.save_every)

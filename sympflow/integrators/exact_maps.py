@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Self
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -17,9 +16,9 @@ from sympflow.integrators.array_rollout import rollout
 from sympflow.integrators.base import FixedStep, Outcome, Problem
 
 if TYPE_CHECKING:
-    from sympflow.kernels.parts import PartsKernel
+    from sympflow.kernels.parts_loops import PartsLoops
 
-__all__ = ["MapsStepper", "kernel_of", "known_maps"]
+__all__ = ["MapsStepper", "known_maps"]
 
 
 class MapsStepper(FixedStep):
@@ -63,31 +62,32 @@ class MapsStepper(FixedStep):
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         parts, y0 = self.parts_of(problem.system), problem.y0
-        kernel = parts_kernel(parts, problem)
-        if kernel is None:
+        loops = compiled_loops(parts, problem)
+        if loops is None:
             states, finite = rollout_in_modes(parts, self.maps(parts, h), y0, n_steps, save)
             return states, finite, "torch" if is_tensor(y0) else "numpy"
 
         def maps(length: np.ndarray) -> Sequence[Map]:
             return known_maps(self, parts, float(length))
 
+        kernel = loops.kernel(maps)
         if y0.ndim == 1:
-            states, last = kernel.run(maps, h, y0, n_steps, save)
+            states, last, _ = kernel.run(h, y0, n_steps, save)
             return states, np.asarray(last), "compiled"
         rows = y0.reshape(-1, y0.shape[-1])
-        states, finite = kernel.run_batch(maps, h, rows, n_steps, save)
+        states, finite, _ = kernel.run_batch(h, rows, n_steps, save)
         return states.swapaxes(0, 1).reshape(len(save), *y0.shape), finite.reshape(y0.shape[:-1]), "compiled"
 
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
         if backend != "compiled":
             return self.step(system, 0.0, y, h)
-        from sympflow.kernels.parts import PartsKernel
+        from sympflow.kernels.parts_loops import parts_loops
 
         parts = self.parts_of(system)
         rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
         lengths = np.broadcast_to(h, y.shape[:-1]).reshape(-1)
-        kernel = kernel_of(parts, PartsKernel)
-        return kernel.step(lambda length: self.maps(parts, length), lengths, rows).reshape(y.shape)
+        kernel = parts_loops(parts).kernel(lambda length: self.maps(parts, length))
+        return kernel.step(lengths, rows).states.reshape(y.shape)
 
 
 @lru_cache(maxsize=64)
@@ -96,17 +96,7 @@ def known_maps(method: MapsStepper, parts: ExactParts, h: float) -> Sequence[Map
     return method.maps(parts, h)
 
 
-_KERNELS: WeakKeyDictionary[ExactParts, Any] = WeakKeyDictionary()
-
-
-def kernel_of(parts: ExactParts, make: Callable[[ExactParts], Any]) -> Any:
-    """The compiled loops of the parts, made once."""
-    if parts not in _KERNELS:
-        _KERNELS[parts] = make(parts)
-    return _KERNELS[parts]
-
-
-def parts_kernel(parts: ExactParts, problem: Problem) -> PartsKernel | None:
+def compiled_loops(parts: ExactParts, problem: Problem) -> PartsLoops | None:
     """The compiled loops for a problem, or None where it needs, or asks for, array operations."""
     y0 = problem.y0
     try:
@@ -116,11 +106,9 @@ def parts_kernel(parts: ExactParts, problem: Problem) -> PartsKernel | None:
             raise ValueError("`y0` is a tensor: pass a NumPy array, or use backend='array'.")
         if y0.dtype != np.float64:
             raise ValueError(f"`y0` is {y0.dtype}: use float64, or backend='array'.")
-        from sympflow.kernels.parts import PartsKernel
+        from sympflow.kernels.parts_loops import parts_loops
 
-        kernel = kernel_of(parts, PartsKernel)
-        kernel.source()
-        return kernel
+        return parts_loops(parts)
     except ValueError as reason:
         if problem.backend == "compiled":
             raise ValueError(f"`backend` 'compiled' does not apply. {reason}") from None

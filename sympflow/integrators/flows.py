@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from sympflow.flow.mlp import MLPFlow
     from sympflow.flow.primed import PrimedFlow
     from sympflow.flow.sympflow import SympFlow
-    from sympflow.kernels.mlp_flow import MLPFlowKernel
-    from sympflow.kernels.primed_flow import PrimedFlowKernel
+    from sympflow.kernels.protocol import Kernel
 
 T = TypeVar("T")
 
@@ -134,10 +133,10 @@ class FlowIntegrator(FixedStep):
         if kernel is None:
             return _apply(flow, y, h)
         if y.ndim == 2 and np.shape(h) == (len(y),):
-            return kernel.step(h, y)
+            return kernel.step(h, y).states
         rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
         lengths = np.broadcast_to(h, y.shape[:-1]).reshape(-1)
-        return kernel.step(lengths, rows).reshape(y.shape)
+        return kernel.step(lengths, rows).states.reshape(y.shape)
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         return _apply(self._flow_like(system, y).inverse, y, h)
@@ -149,7 +148,7 @@ class FlowIntegrator(FixedStep):
     def run(self, problem: Problem) -> Outcome:
         flow, kernel = prepared = self._flow_and_kernel(problem)
         chosen = object.__new__(type(self))  # with this flow from here on; the fields have been checked
-        finite = getattr(kernel, "saves_finite", False)
+        finite = kernel is not None and kernel.saves_finite
         vars(chosen).update(vars(self), flow=flow, prepared=prepared, saves_finite=finite)
         if self._tolerance is not None:
             check_start(flow, problem.system, problem.y0, kernel is not None)
@@ -168,8 +167,6 @@ class FlowIntegrator(FixedStep):
         return flow, kernel_of(system, flow, y0, problem.backend)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        if self.prepared is not None and hasattr(self.prepared[1], "evaluations"):
-            return self.prepared[1].evaluations(n_steps, n_saved, n_extra, backend)
         if not hasattr(self.flow, "evaluations"):  # an MLP flow evaluates no forces
             return super().evaluations(n_steps, n_saved, n_extra, backend)
         return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
@@ -179,10 +176,10 @@ class FlowIntegrator(FixedStep):
         flow, kernel = self._flow_and_kernel(problem) if self.prepared is None else self.prepared
         if kernel is not None:
             if y0.ndim == 1:
-                states, last = kernel.run(h, y0, n_steps, save)
+                states, last, _ = kernel.run(h, y0, n_steps, save)
                 return states, np.asarray(last), "compiled"
             rows = y0.reshape(-1, y0.shape[-1])
-            states, finite = kernel.run_batch(h, rows, n_steps, save)
+            states, finite, _ = kernel.run_batch(h, rows, n_steps, save)
             states = states.swapaxes(0, 1).reshape(len(save), *y0.shape)
             return states, np.asarray(finite).reshape(y0.shape[:-1]), "compiled"
         if isinstance(y0, torch.Tensor) and hasattr(flow, "processor") and flow.processor:
@@ -228,7 +225,7 @@ def _apply(function: Any, y: Array, h: float | Array) -> Array:
         return function(length, torch.from_numpy(np.ascontiguousarray(y))).numpy()
 
 
-def kernel_of(system: HamiltonianSystem, flow: Any, y: Array, backend: str) -> MLPFlowKernel | PrimedFlowKernel | None:
+def kernel_of(system: HamiltonianSystem, flow: Any, y: Array, backend: str) -> Kernel | None:
     """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
     if backend == "array":
         return None
@@ -237,11 +234,7 @@ def kernel_of(system: HamiltonianSystem, flow: Any, y: Array, backend: str) -> M
             raise ValueError("`y0` is a tensor: pass a NumPy array, or use backend='array'.")
         if flow.kind != "sympflow":
             raise ValueError("`method` 'mlp' has no compiled form: use backend='array'.")
-        if hasattr(flow, "kernel_for"):
-            return flow.kernel_for(system)
-        from sympflow.kernels.mlp_flow import mlp_flow_kernel
-
-        return mlp_flow_kernel(flow)
+        return flow.kernel_for(system)
     except ValueError as reason:
         if backend == "compiled":
             raise ValueError(f"`backend` 'compiled' does not apply. {reason}") from None

@@ -59,6 +59,6 @@ def _all_finite(y: Array, backend: str) -> bool:
         return False
     if backend != "compiled" or y.dtype != np.float64 or not (y.flags.c_contiguous or y.flags.f_contiguous):
         return bool(np.isfinite(y).all())
-    from sympflow.kernels.outputs import all_finite
+    from sympflow.kernels.output_loops import all_finite
 
     return all_finite(y)

@@ -15,7 +15,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Outcome, Problem
 
 if TYPE_CHECKING:
-    from sympflow.kernels.implicit import ImplicitKernel, Tableau
+    from sympflow.kernels.implicit_loops import ImplicitKernel, Tableau
 
 MOST_ITERATIONS = 50
 
@@ -99,7 +99,7 @@ class Gauss(FixedStep):
             return super().rollout(problem, h, n_steps, save)
         y0 = problem.y0
         rows = y0.reshape(-1, y0.shape[-1])
-        states, finite, iterations = kernel.run_batch(h, rows, n_steps, save, self.compensated)
+        states, finite, iterations = kernel.run_batch(h, rows, n_steps, save)
         self._count(iterations)
         states = states.swapaxes(0, 1).reshape(len(save), *y0.shape)
         return states, finite.reshape(y0.shape[:-1]), "compiled"
@@ -107,7 +107,7 @@ class Gauss(FixedStep):
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
         if backend != "compiled":
             return self.step(system, 0.0, y, h)
-        from sympflow.kernels.implicit import implicit_kernel
+        from sympflow.kernels.implicit_loops import implicit_kernel
 
         rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
         out, iterations = implicit_kernel(system, self.tableau).step(np.broadcast_to(h, y.shape[:-1]).reshape(-1), rows)
@@ -124,10 +124,10 @@ class Gauss(FixedStep):
         elif y0.dtype != np.float64:
             reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
         if reason is None:
-            from sympflow.kernels.implicit import implicit_kernel
+            from sympflow.kernels.implicit_loops import implicit_kernel
 
             try:
-                return implicit_kernel(problem.system, self.tableau)
+                return implicit_kernel(problem.system, self.tableau, self.compensated)
             except ValueError as error:
                 reason = str(error)
         if problem.backend == "compiled":

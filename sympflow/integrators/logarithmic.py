@@ -157,7 +157,7 @@ class Logarithmic(FixedStep):
         expected: float,
         backend: str,
     ) -> Any:
-        """`kernels.timed.reach_times` of the method; None where it has no such loops."""
+        """`timed_loops.reach_times` of the method; None where it has no such loops."""
         found = getattr(self.inner(transformed), "reach_times", None)
         return None if found is None else found(transformed, h, start, times, stride, expected, backend)
 

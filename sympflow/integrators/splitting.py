@@ -16,7 +16,7 @@ from sympflow.integrators.base import FixedStep, Problem
 from sympflow.schemes import SCHEMES, Scheme, Substep, scheme_evaluations
 
 if TYPE_CHECKING:
-    from sympflow.kernels.splitting import SplittingKernel
+    from sympflow.kernels.splitting_loops import SplittingKernel
 
 
 @dataclass(frozen=True)
@@ -101,20 +101,20 @@ class Splitting(FixedStep):
             return super().rollout(problem, h, n_steps, save)
         y0 = problem.y0
         if y0.ndim == 1:
-            states, last = kernel.run(self.scheme, h, y0, n_steps, save, self.compensated)
+            states, last, _ = kernel.run(h, y0, n_steps, save)
             return states, np.asarray(last), "compiled"
         rows = y0.reshape(-1, y0.shape[-1])
-        states, finite = kernel.run_batch(self.scheme, h, rows, n_steps, save, self.compensated)
+        states, finite, _ = kernel.run_batch(h, rows, n_steps, save)
         return states.swapaxes(0, 1).reshape(len(save), *y0.shape), finite.reshape(y0.shape[:-1]), "compiled"
 
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
         if backend != "compiled":
             return self.step(system, 0.0, y, h)
-        from sympflow.kernels.splitting import splitting_kernel
+        from sympflow.kernels.splitting_loops import splitting_loops
 
         rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
         lengths = np.broadcast_to(h, y.shape[:-1]).reshape(-1)
-        return splitting_kernel(system).step(self.scheme, lengths, rows).reshape(y.shape)
+        return splitting_loops(system).kernel(self.scheme).step(lengths, rows).states.reshape(y.shape)
 
     def reach_times(
         self,
@@ -126,10 +126,10 @@ class Splitting(FixedStep):
         expected: float,
         backend: str,
     ) -> Any:
-        """`kernels.timed.reach_times` of the scheme; None where it does not apply."""
+        """`timed_loops.reach_times` of the scheme; None where it does not apply."""
         if self.compensated or system.symbols is None or self._kernel(system, y0, backend) is None:
             return None
-        from sympflow.kernels.timed import reach_times
+        from sympflow.kernels.timed_loops import reach_times
 
         return reach_times(system, self.scheme, h, y0, times, stride, expected)
 
@@ -142,15 +142,12 @@ class Splitting(FixedStep):
             reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
         elif y0.dtype != np.float64:
             reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
-        elif system.symbols is None and system.numba_functions is None:
-            reason = f"`system` {system.name!r} is given by plain functions: use backend='array'."
-        if reason is None:
-            from sympflow.kernels.splitting import splitting_kernel
+        else:
+            from sympflow.kernels.splitting_loops import compilable, splitting_loops
 
-            try:
-                return splitting_kernel(system)
-            except ValueError as error:  # H holds a function that has no compiled form
-                reason = str(error)
+            reason = compilable(system)
+            if reason is None:
+                return splitting_loops(system).kernel(self.scheme, self.compensated)
         if backend == "compiled":
             raise ValueError(f"`backend` 'compiled' does not apply. {reason}")
         if self.compensated:

@@ -108,9 +108,9 @@ class SympFlowIntegrator(FlowIntegrator):
                 "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave "
                 "it out, or take a flow of SympFlow.primed."
             )
-        from sympflow.kernels.primed_flow import PrimedFlowKernel
+        from sympflow.kernels.flow_loops import PrimedFlowKernel
 
-        return flow, PrimedFlowKernel(flow, problem.system, compensated=True)
+        return flow, PrimedFlowKernel(flow.tables, problem.system, compensated=True)
 
 
 def _in_another_time(system: HamiltonianSystem, kind: str, tol: float) -> tuple[Any, float, float] | None:

@@ -39,7 +39,7 @@ def timed_pass(integrator: Logarithmic, problem: Problem) -> Outcome | None:
     first = 0 if elapsed[0] else int(elapsed.searchsorted(0.0, "right"))
 
     transformed = integrator.transformed(system)
-    from sympflow.kernels.timed import lifted_rows
+    from sympflow.kernels.timed_loops import lifted_rows
 
     start = lifted_rows(system, y0.reshape(-1, y0.shape[-1]), transformed.params["shift"])
     if start is None:

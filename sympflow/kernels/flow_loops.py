@@ -8,16 +8,16 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.schemes import CURVATURE, Scheme
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.parts import ExactParts, Map
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import run_one, run_rows
 from sympflow.kernels.parts_loops import parts_loops
 from sympflow.kernels.protocol import Run, Steps
 from sympflow.kernels.splitting_loops import LoopFunctions, SplittingKernel, splitting_loops
 from sympflow.kernels.stages import StageTable, run_table, single_table
 from sympflow.kernels.timed_loops import reach_times
-from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.parts import ExactParts, Map
-from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.schemes import CURVATURE, Scheme
 
 __all__ = [
     "ClockedFlowKernel",

@@ -10,11 +10,11 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import statements
 from sympflow.kernels.modules import load_algebra, run_rows
 from sympflow.kernels.protocol import Run, Steps
-from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.hamiltonian.system import HamiltonianSystem
 
 __all__ = ["ImplicitKernel", "implicit_kernel"]
 

@@ -116,9 +116,7 @@ class MLPFlowKernel:
                 out[rows] = self._rollout(steps[rows], y[rows], 1, np.array([1]), None).states[:, 0]
         return Steps(out)
 
-    def _rollout(
-        self, h: ArrayLike, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None
-    ) -> Run:
+    def _rollout(self, h: ArrayLike, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None) -> Run:
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         steps = np.full(len(y0), h, dtype=np.float64)
         backwards, t = bool((steps < 0).any()), np.abs(steps)

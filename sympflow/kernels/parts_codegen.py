@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import sympy as sp
 
-from sympflow.kernels.codegen import printed, tuple_algebra
-from sympflow.kernels.scheduling import FUSED, Schedule
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions
 from sympflow.hamiltonian.symbolic import printable
+from sympflow.kernels.codegen import printed, tuple_algebra
+from sympflow.kernels.scheduling import FUSED, Schedule
 
 __all__ = ["IDLE", "TURN_WIDTH", "WITH_GRADIENT", "parts_source"]
 

@@ -10,11 +10,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
 from sympflow.kernels.modules import NEVER, load_algebra, run_one, run_rows
 from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
 from sympflow.kernels.protocol import Run, Steps
-from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions
-from sympflow.hamiltonian.parts import shears
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 

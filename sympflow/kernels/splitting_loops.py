@@ -12,12 +12,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
 from sympflow.kernels.protocol import Run, Steps
 from sympflow.kernels.stages import StageTable, kicks_of, lanes_source, run_table, stages_source, step_table
-from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
@@ -161,9 +161,7 @@ class SplittingKernel:
         )
         return Run(out, n_finite)
 
-    def run_batch(
-        self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None
-    ) -> Run:
+    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         functions = self._functions()
         table = run_table(self.scheme, h).packed

@@ -130,7 +130,9 @@ def run_table(scheme: Scheme, h: float) -> StageTable:
     """The table [opening, inner …, link, closing] of a run whose steps are h: see `text/loops.py`."""
     stages = _stages(scheme)
     first, last = stages[0], stages[-1]
-    opening = replace(first, kick=0.0, gradient=0.0, curvature=0.0, drift=0.0, polynomial=(0.0,) * len(first.polynomial))
+    opening = replace(
+        first, kick=0.0, gradient=0.0, curvature=0.0, drift=0.0, polynomial=(0.0,) * len(first.polynomial)
+    )
     inner, link = stages[:-1], last
     if len(stages) > 1 and last.drift == 0.0:  # kick … kick: the last kick and the next first stage are one
         opening, inner, link = first, stages[1:-1], replace(last.kicked_by(first), drift=first.drift)
@@ -245,7 +247,11 @@ def lanes_source(kinds: Sequence[Kick], scheduled: bool) -> str:
     def together(kick: Kick) -> list[str]:
         taken = [] if scheduled else ["q_error, p_error = unpack_lane(error, lane)"]
         stored = [] if scheduled else ["pack_lane(q_error, p_error, error, lane)"]
-        moved = "q, _ = move(q, None, drift(p, a, None))" if scheduled else "q, q_error = move(q, q_error, drift(p, a, None))"
+        moved = (
+            "q, _ = move(q, None, drift(p, a, None))"
+            if scheduled
+            else "q, q_error = move(q, q_error, drift(p, a, None))"
+        )
         return _over_lanes([*taken, *kick.application(scheduled, lane=True), moved, *stored])
 
     def each(kick: Kick) -> list[str]:

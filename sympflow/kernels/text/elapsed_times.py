@@ -103,9 +103,7 @@ def deliver(q, p, first, n, block, end, table, work, step, h, advance, clock, ta
         while saved < len(targets) and targets[saved] <= end and (targets[saved] <= after or k == block):
             at_q, at_p = after_q, after_p
             if targets[saved] != after:
-                at_q, at_p, trials = step_to(
-                    before_q, before_p, before, after, targets[saved], h, step, clock
-                )
+                at_q, at_p, trials = step_to(before_q, before_p, before, after, targets[saved], h, step, clock)
                 tried += abs(trials)
                 if trials < 0:
                     return -1, tried, n
@@ -162,9 +160,7 @@ def enter(Y, lane, row, table, work):
     q, p = unpack(row)
     q_error, p_error = no_error(q), no_error(p)
     for j in range(table.shape[1] - 2):
-        q, p, q_error, p_error = called_stage(
-            q, p, q_error, p_error, numbers_of(table, j), table[0, j], j, work
-        )
+        q, p, q_error, p_error = called_stage(q, p, q_error, p_error, numbers_of(table, j), table[0, j], j, work)
     pack_lane(q, p, Y, lane)
 
 

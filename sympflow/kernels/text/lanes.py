@@ -10,7 +10,6 @@ instructions.
 # ruff: noqa: F821
 # mypy: ignore-errors
 
-import numpy as np
 from numba import njit
 
 LANES = 64
