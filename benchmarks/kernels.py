@@ -134,7 +134,7 @@ def start_up_rows() -> list[Row]:
 
 def flow_rows(repeats: int) -> list[Row]:
     flow, y0 = SympFlow(2, pairs=5), henon_heiles().y0
-    kernel, batch = flow.kernel_for(), np.tile(y0, (1000, 1))
+    kernel, batch = flow.kernel_for(henon_heiles()), np.tile(y0, (1000, 1))
     x, t = torch.as_tensor(y0)[None].requires_grad_(), torch.ones(1, dtype=torch.float64)
     n, m = 1000, 20
     calls: list[Call] = [

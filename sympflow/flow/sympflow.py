@@ -236,7 +236,7 @@ class SympFlow(FlowMap):
         numbers = plain(stages), plain(dt), plain(terms)
         return split(system, *numbers, filters, force_gradient, parts, linear_outside, dtype, device)
 
-    def kernel_for(self, system: HamiltonianSystem | None = None) -> Any:
+    def kernel_for(self, system: HamiltonianSystem) -> Any:
         """The compiled loops of this flow, whatever the system, made anew when its weights have changed.
 
         Raises

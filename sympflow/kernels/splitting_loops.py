@@ -206,7 +206,7 @@ def _header(compensated: bool, cache: bool, scheduled: bool) -> str:
 def _symbolic_loops(
     symbols: SymbolicHamiltonian, algebra: str, level: int, compensated: bool, monomials: Monomials
 ) -> LoopFunctions:
-    after = ("loops", "aligned", "lanes", "processed")
+    after = ("loops", "aligned", "lanes")
     loops = symbolic_module(symbols, algebra, level, compensated, after, monomials)
     processed = loops.rollout_processed, loops.rollout_processed_rows
     return LoopFunctions(loops.rollout, loops.rollout_lanes, *processed, loops.step_lanes)
@@ -267,7 +267,7 @@ def _array_loops(
         "gradient": gradient,
         "hessian_vector": hessian_vector,
     }
-    texts = map(template, ("array_states", "loops", "processed"))
+    texts = map(template, ("array_states", "loops"))
     exec("\n\n\n".join([header, mass, stages, *texts]), functions)
     names = ("rollout", "rollout_each", "rollout_processed", "rollout_processed_rows", "step_each")
     return LoopFunctions(*(functions[name] for name in names))

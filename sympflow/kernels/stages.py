@@ -46,18 +46,21 @@ class StageTable:
     @cached_property
     def packed(self) -> np.ndarray:
         """The numbers that loops read, as rows of one array (1 + n, m) or (1 + n, m, K): a, then those of the kicks."""
-        columns = {"b": self.kicks, "g": self.gradients, "c": self.curvatures}
-        kinds = kicks_of(self.level, self.polynomials.shape[1])
-        numbers = [columns.get(name) for name in kinds[0].numbers]
-        if self.level == POLYNOMIAL:
-            numbers[1:] = self.polynomials.swapaxes(0, 1)
-        return np.ascontiguousarray(np.stack([self.drifts, *numbers]))
+        of_kicks = [self.kicks, *self.polynomials.swapaxes(0, 1)]
+        if self.level != POLYNOMIAL:
+            of_kicks = [self.kicks, self.gradients, self.curvatures][: 1 + self.level]
+        return np.ascontiguousarray(np.stack([self.drifts, *of_kicks]))
 
     def scaled(self, h: float) -> StageTable:
         """The numbers of steps h, of those for h = 1."""
-        powers = {"kicks": h * self.kicks, "drifts": h * self.drifts, "gradients": _times_power(self.gradients, h, 3)}
-        powers["curvatures"] = _times_power(self.curvatures, h, 5)
-        return replace(self, polynomials=_times_power(self.polynomials, h, 3), **powers)
+        return StageTable(
+            self.level,
+            h * self.kicks,
+            h * self.drifts,
+            _times_power(self.gradients, h, 3),
+            _times_power(self.curvatures, h, 5),
+            _times_power(self.polynomials, h, 3),
+        )
 
 
 def _times_power(numbers: np.ndarray, h: float, n: int) -> np.ndarray:
@@ -108,16 +111,17 @@ def _stages(scheme: Scheme) -> list[_Stage]:
 
 def _table(scheme: Scheme, stages: Sequence[_Stage]) -> StageTable:
     columns = zip(*((s.kick, s.drift, s.gradient, s.curvature) for s in stages), strict=True)
+    kicks, drifts, gradients, curvatures = (np.array(column, dtype=float) for column in columns)
     polynomials = np.array([s.polynomial for s in stages], dtype=float)
-    return StageTable(scheme.level, *(np.array(column, dtype=float) for column in columns), polynomials)
+    return StageTable(scheme.level, kicks, drifts, gradients, curvatures, polynomials)
 
 
 @lru_cache(maxsize=256)
 def step_table(scheme: Scheme) -> StageTable:
     """The stages of one step by itself, for h = 1, as constant polynomials (m, 1)."""
     table = _table(scheme, _stages(scheme))
-    columns = (table.kicks, table.drifts, table.gradients, table.curvatures, table.polynomials)
-    return StageTable(table.level, *(column[..., None] for column in columns))
+    kicks, drifts, gradients = (column[..., None] for column in (table.kicks, table.drifts, table.gradients))
+    return StageTable(table.level, kicks, drifts, gradients, table.curvatures[..., None], table.polynomials[..., None])
 
 
 def single_table(scheme: Scheme, h: float) -> StageTable:
@@ -151,13 +155,13 @@ class Kick:
     Attributes
     ----------
     name : str
-        Its function where kicks are scheduled: ``name(q, p, work, j)``, and for lanes ``name_lane(q, p, numbers …)``.
+        Its function where kicks are scheduled: ``name(q, p, work, j)``, and for lanes ``name_lane(q, p, numbers)``.
     numbers : tuple of str
         Its numbers, the rows 1, 2, … of a table. A kick applies where the last one is not 0, else one with fewer.
     powers : tuple of int
         The powers of the step length with which they grow.
     unscheduled : tuple of str
-        The lines of one application where kicks are not scheduled, for `{numbers}` and a workspace `{work}`.
+        The lines of one application where kicks are not scheduled, with a workspace `{work}`.
     """
 
     name: str
@@ -167,17 +171,13 @@ class Kick:
 
     def application(self, scheduled: bool, lane: bool) -> list[str]:
         """The lines that change p once, of a single trajectory or of a lane; q is left as it is."""
-        numbers = [f"numbers[{i}]" for i in range(len(self.numbers))]
-        if self.name == "polynomial_kicked":  # its coefficients are one argument
-            numbers[1:] = [f"({', '.join(numbers[1:])},)"]
-        given = ", ".join(numbers)
         if scheduled:
-            return [f"p = {self.name}_lane(q, p, {given})" if lane else f"p = {self.name}(q, p, work, j)"]
-        return [line.format(numbers=given, work="None" if lane else "work") for line in self.unscheduled]
+            return [f"p = {self.name}_lane(q, p, numbers)" if lane else f"p = {self.name}(q, p, work, j)"]
+        return [line.format(work="None" if lane else "work") for line in self.unscheduled]
 
 
 def _added(change: str) -> tuple[str, ...]:
-    return (f"p, p_error = move(p, p_error, {change}(q, {{numbers}}, {{work}}))",)
+    return (f"p, p_error = move(p, p_error, {change}(q, numbers, {{work}}))",)
 
 
 PLAIN = Kick("kicked", ("b",), (1,), _added("kick"))
@@ -186,7 +186,7 @@ GRADIENT = Kick(
     ("b", "g"),
     (1, 3),
     (
-        "first, second = gradient_kick(q, {numbers}, {work})",
+        "first, second = gradient_kick(q, numbers, {work})",
         "p, p_error = move(p, p_error, first)",
         "if COUPLED:",
         "    p, p_error = move(p, p_error, second)",
@@ -240,28 +240,24 @@ def stage(q, p, q_error, p_error, numbers, a, j, work):
 def lanes_source(kinds: Sequence[Kick], scheduled: bool) -> str:
     """The functions of the text `lanes` that depend on the kinds of kick; not scheduled, sums are compensated.
 
-    ``stage_lanes`` is a kick and a drift of all lanes by the same numbers, ``stage_each`` of each lane by its own, those
-    of column j of a table.
+    ``stage_lanes`` is a kick and a drift of all lanes by the same numbers, ``stage_each`` of each lane by its own, by
+    column j of a table.
     """
 
     def together(kick: Kick) -> list[str]:
-        taken = [] if scheduled else ["q_error, p_error = unpack_lane(error, lane)"]
-        stored = [] if scheduled else ["pack_lane(q_error, p_error, error, lane)"]
-        moved = (
-            "q, _ = move(q, None, drift(p, a, None))"
-            if scheduled
-            else "q, q_error = move(q, q_error, drift(p, a, None))"
-        )
-        return _over_lanes([*taken, *kick.application(scheduled, lane=True), moved, *stored])
+        kicked = kick.application(scheduled, lane=True)
+        if scheduled:
+            return _over_lanes([*kicked, "q, _ = move(q, None, drift(p, a, None))"])
+        drifted = "q, q_error = move(q, q_error, drift(p, a, None))"
+        taken, stored = "q_error, p_error = unpack_lane(error, lane)", "pack_lane(q_error, p_error, error, lane)"
+        return _over_lanes([taken, *kicked, drifted, stored])
 
     def each(kick: Kick) -> list[str]:
-        steps = {1: "H", 3: "H3", 5: "H5"}
-        filled = [
-            f"fill_lanes(Y, width, NUMBERS + {i}, table[{i + 1}, j], {steps[n]})" for i, n in enumerate(kick.powers)
-        ]
-        numbers = "".join(f"Y[NUMBERS + {i}, lane], " for i in range(len(kick.numbers)))
-        moved = "q, _ = move(q, None, drift(p, Y[A, lane], None))"
-        return [*filled, *_over_lanes([f"numbers = ({numbers})", *kick.application(True, lane=True), moved])]
+        steps, places = {1: "H", 3: "H3", 5: "H5"}, range(len(kick.numbers))
+        filled = [f"fill_lanes(Y, width, NUMBERS + {i}, table[{i + 1}, j], {steps[kick.powers[i]]})" for i in places]
+        numbers = "".join(f"Y[NUMBERS + {i}, lane], " for i in places)
+        drifted = "q, _ = move(q, None, drift(p, Y[A, lane], None))"
+        return [*filled, *_over_lanes([f"numbers = ({numbers})", *kick.application(True, lane=True), drifted])]
 
     # Kinds are told apart outside the loops: a loop with a branch in it, once it is long, is no longer made of vector
     # instructions.
@@ -287,10 +283,10 @@ def _over_lanes(lines: Sequence[str]) -> list[str]:
 
 
 def _cases(kinds: Sequence[Kick], condition: str, bodies: Sequence[list[str]]) -> str:
-    """The body of the first kind whose condition holds; the last one has none."""
-    lines = list(bodies[0]) if len(kinds) == 1 else []
-    for i, (kick, body) in enumerate(zip(kinds, bodies, strict=True) if len(kinds) > 1 else ()):
+    """The body of the first kind whose condition holds, else that of the last one."""
+    lines: list[str] = []
+    for kick, body in zip(kinds[:-1], bodies, strict=False):
         n = len(kick.numbers)
-        test = f"{'elif' if i else 'if'} {condition.format(n - 1, n)}:"
-        lines += ["else:" if i == len(kinds) - 1 else test, *(f"    {line}" for line in body)]
+        lines += [f"{'elif' if lines else 'if'} {condition.format(n - 1, n)}:", *(f"    {line}" for line in body)]
+    lines += ["else:", *(f"    {line}" for line in bodies[-1])] if lines else bodies[-1]
     return "\n    ".join(lines)

@@ -1,7 +1,7 @@
 """Runs of equal steps in another time, up to physical times. Source text, pasted after `lanes`.
 
-States are [q, t, p, B] of a logarithmic Hamiltonian; kicks are scheduled ones without force gradients. Elapsed times are
-positive: t is multiplied by the sign of the step. What a clock adds to t at each step, `advance`, is no part of the
+States are [q, t, p, B] of a logarithmic Hamiltonian; kicks are scheduled, and have no force gradients. Elapsed times
+are positive: t is multiplied by the sign of the step. What a clock adds to t at each step, `advance`, is no part of the
 running state: it is constant, and added where a time is needed.
 
 A run looks at the time after each `stride` steps, a single one seldomer far from an output. If an output is due since,
@@ -36,9 +36,9 @@ def short_step(q, p, step, sigma):
     """A step of length sigma by the table for h = 1."""
     last = step.shape[1] - 1
     for j in range(last):
-        p = kicked_lane(q, p, sigma * step[1, j])
+        p = kicked_lane(q, p, (sigma * step[1, j],))
         q = plus(q, drift(p, sigma * step[0, j], None))
-    p = kicked_lane(q, p, sigma * step[1, last])
+    p = kicked_lane(q, p, (sigma * step[1, last],))
     if step[0, last] != 0.0:  # else a kick alone: the time, for which there are many trials, does not wait for it
         q = plus(q, drift(p, sigma * step[0, last], None))
     return q, p
@@ -121,8 +121,9 @@ def deliver(q, p, first, n, block, end, table, work, step, h, advance, clock, ta
 def reach_times(table, step, h, clock, y0, targets, stride, most_steps, out, counts, stop):
     """The states [q, p] of one trajectory from ``y0[0]`` at the elapsed times `targets`, into ``out[:, 0]``.
 
-    `table` is that of a run of steps h, `step` that of a single step for h = 1. The steps that were taken, and those that were tried to meet the times, go into ``counts[0]``. Returns
-    whether all are reached: it ends where a state is not finite, where time turns, or after `most_steps`.
+    `table` is that of a run of steps h, `step` that of a single step for h = 1. The steps that were taken, and those
+    that were tried to meet the times, go into ``counts[0]``. Returns True if all times are reached: a run ends where a
+    state is not finite, where time turns, or after `most_steps`.
     """
     sign, link = 1.0 if h > 0.0 else -1.0, table.shape[1] - 2
     work = prepared(table)

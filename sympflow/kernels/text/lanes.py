@@ -1,11 +1,10 @@
 """Many trajectories at once: their states side by side, so that one instruction moves several of them.
 
-Source text, pasted after the tuple algebra of a symbolic system, its kicks, `loops` and `aligned`. A block holds `LANES`
-trajectories, in a run `MANY_LANES`, component first, as an array (2d, LANES) that stays in the first-level cache; the
-compiler turns the loop over the lanes of a stage into vector instructions. Lanes never mix: one that overflows leaves
-the others as they are. `sympflow.kernels.stages` writes ``stage_lanes`` and ``stage_each``, a kick and a drift of all
-lanes: in its loops a kick stands alone, for a loop with a branch in it, once it is long, is no longer made of vector
-instructions.
+Source text, pasted after the tuple algebra of a symbolic system, its kicks, `loops` and `aligned`. A block holds
+`LANES` trajectories, in a run `MANY_LANES`, component first, as an array (2d, LANES) that stays in the first-level
+cache; the compiler turns the loop over the lanes of a stage into vector instructions. Lanes never mix: one that
+overflows leaves the others as they are. `sympflow.kernels.stages` writes ``stage_lanes`` and ``stage_each``, a kick and
+a drift of all lanes.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
