@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import ENDED, FINISHED, Integrator, Outcome, Problem, Steps
 from sympflow.integrators.grid import EPS, Grid
+
+if TYPE_CHECKING:
+    from sympflow.kernels.protocol import Kernel
 
 __all__ = [
     "FINISHED",
@@ -156,44 +159,34 @@ class Stepper:
         return {}
 
 
-class Loops(Protocol):
-    """Compiled loops of a method, bound to a system and to its numbers."""
-
-    saves_finite: bool
-
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
-        """States (len(save), 2d) of one trajectory, and the index of the last finite one."""
-
-    def run_batch(self, h: float, rows: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """States (N, len(save), 2d) of trajectories from the rows (N, 2d), and of each the last finite index."""
-
-    def step(self, h: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """States (N, 2d) a step of the lengths h (N,) after the rows."""
-
-
 class KernelStepper(Stepper):
     """A run in compiled loops."""
 
-    compiled: bool = True
+    compiled = True
 
-    def __init__(self, integrator: FixedStep, problem: Problem, loops: Loops) -> None:
+    def __init__(self, integrator: FixedStep, problem: Problem, kernel: Kernel) -> None:
         self.integrator, self.system, self.asked = integrator, problem.system, problem.backend
-        self.loops, self.backend, self.saves_finite = loops, "compiled", loops.saves_finite
+        self.kernel, self.backend, self.saves_finite = kernel, "compiled", kernel.saves_finite
+        self.iterations = 0
 
     def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
         if y0.ndim == 1:
-            states, last = self.loops.run(h, y0, n_steps, save)
+            states, last, iterations = self.kernel.run(h, y0, n_steps, save)
+            self.iterations += iterations
             return states, np.asarray(last)
         rows = y0.reshape(-1, y0.shape[-1])
-        states, finite = self.loops.run_batch(h, rows, n_steps, save)
+        states, finite, iterations = self.kernel.run_batch(h, rows, n_steps, save)
+        self.iterations += iterations
         return states.swapaxes(0, 1).reshape(len(save), *y0.shape), np.asarray(finite).reshape(y0.shape[:-1])
 
     def shorter(self, y: Array, h: Any) -> Array:
         if y.ndim == 2 and np.shape(h) == (len(y),):
-            return self.loops.step(h, y)
-        rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
-        lengths = np.broadcast_to(h, y.shape[:-1]).reshape(-1)
-        return self.loops.step(lengths, rows).reshape(y.shape)
+            states, iterations = self.kernel.step(h, y)
+        else:
+            rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
+            states, iterations = self.kernel.step(np.broadcast_to(h, y.shape[:-1]).reshape(-1), rows)
+        self.iterations += iterations
+        return states.reshape(y.shape)
 
 
 def compiled_loops(
@@ -364,7 +357,7 @@ class GridRun:
         problem, grid = self.problem, self.grid
         t = problem.t_eval
         if self.stepper.compiled and t is not None and len(t) > FEW and not problem.dense_output:
-            from sympflow.kernels.outputs import place
+            from sympflow.kernels.output_loops import place
 
             return t, *place(t, grid.t0, grid.h, 4 * EPS)
         t, count, remainder = grid.outputs(t, problem.save_every)
@@ -556,7 +549,7 @@ def _all_finite(y: Array, compiled: bool) -> bool:
         return False
     if not compiled or y.dtype != np.float64 or not (y.flags.c_contiguous or y.flags.f_contiguous):
         return bool(np.isfinite(y).all())
-    from sympflow.kernels.outputs import all_finite
+    from sympflow.kernels.output_loops import all_finite
 
     return all_finite(y)
 

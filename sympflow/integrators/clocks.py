@@ -536,7 +536,7 @@ def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:
     first = 0 if elapsed[0] else int(elapsed.searchsorted(0.0, "right"))
 
     transformed = clock.transformed
-    from sympflow.kernels.timed import lifted_rows
+    from sympflow.kernels.timed_loops import lifted_rows
 
     start = lifted_rows(system, y0.reshape(-1, y0.shape[-1]), transformed.params["shift"])
     if start is None:

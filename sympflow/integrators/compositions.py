@@ -18,12 +18,11 @@ from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
 from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, like, linear_and_rest, map_evaluations
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import Loops, rollout
+from sympflow.integrators.base import rollout
 from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, scheme_evaluations
 
 if TYPE_CHECKING:
-    from sympflow.kernels.parts import PartsKernel
-    from sympflow.kernels.splitting import SplittingKernel
+    from sympflow.kernels.protocol import Kernel
 
 _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, ExactParts]] = WeakKeyDictionary()
 
@@ -71,7 +70,7 @@ class Composition(ABC):
         return rollout(lambda k, y: self.step(y, h), y0, n_steps, save)
 
     @abstractmethod
-    def loops(self, compensated: bool) -> Loops:
+    def kernel(self, compensated: bool) -> Kernel:
         """The compiled loops; a ValueError says why there are none."""
 
     @abstractmethod
@@ -137,10 +136,10 @@ class KineticPotential(Composition):
                 p = p + c * h * system.force(q)
         return np.concatenate([q, p], axis=-1), A
 
-    def loops(self, compensated: bool) -> SchemeLoops:
-        from sympflow.kernels.splitting import splitting_kernel
+    def kernel(self, compensated: bool) -> Kernel:
+        from sympflow.kernels.splitting_loops import splitting_loops
 
-        return SchemeLoops(splitting_kernel(self.system), self.scheme, compensated)
+        return splitting_loops(self.system).kernel(self.scheme, compensated)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
@@ -157,24 +156,6 @@ def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials:
     if kick.polynomial:
         change = change - h**3 * gradient(monomials, kick.polynomial, q)
     return change
-
-
-class SchemeLoops:
-    """The splitting loops of a system, bound to a scheme."""
-
-    saves_finite = True
-
-    def __init__(self, kernel: SplittingKernel, scheme: Scheme, compensated: bool) -> None:
-        self.kernel, self.scheme, self.compensated = kernel, scheme, compensated
-
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
-        return self.kernel.run(self.scheme, h, y0, n_steps, save, self.compensated)
-
-    def run_batch(self, h: float, rows: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self.kernel.run_batch(self.scheme, h, rows, n_steps, save, self.compensated)
-
-    def step(self, h: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        return self.kernel.step(self.scheme, h, rows)
 
 
 # exact flows of parts ------------------------------------------------------------------------------
@@ -210,12 +191,10 @@ class ExactMaps(Composition):
     def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray]:
         return rollout_in_modes(self.parts, self.maps(h), y0, n_steps, save)
 
-    def loops(self, compensated: bool) -> MapsLoops:
-        from sympflow.kernels.parts import PartsKernel, kernel_of
+    def kernel(self, compensated: bool) -> Kernel:
+        from sympflow.kernels.parts_loops import parts_loops
 
-        kernel = kernel_of(self.parts, PartsKernel)
-        kernel.source()
-        return MapsLoops(kernel, self)
+        return parts_loops(self.parts).kernel(lambda h: known_maps(self, float(h)) if h.ndim == 0 else self.maps(h))
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return map_evaluations(known_maps(self, 1.0), n_steps, n_saved, n_extra, backend)
@@ -225,27 +204,6 @@ class ExactMaps(Composition):
 def known_maps(composition: ExactMaps, h: float) -> Sequence[Map]:
     """The maps of a step, the same object for the same step, whose table the kernel then knows."""
     return composition.maps(h)
-
-
-class MapsLoops:
-    """The loops of exact flows, bound to a composition of them."""
-
-    saves_finite = True
-
-    def __init__(self, kernel: PartsKernel, composition: ExactMaps) -> None:
-        self.kernel, self.composition = kernel, composition
-
-    def _maps(self, length: Any) -> Sequence[Map]:
-        return known_maps(self.composition, float(length))
-
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, int]:
-        return self.kernel.run(self._maps, h, y0, n_steps, save)
-
-    def run_batch(self, h: float, rows: np.ndarray, n_steps: int, save: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self.kernel.run_batch(self._maps, h, rows, n_steps, save)
-
-    def step(self, h: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        return self.kernel.step(self.composition.maps, h, rows)
 
 
 def rollout_in_modes(

@@ -28,7 +28,7 @@ def _surely_within(flow: FlowMap | None, system: HamiltonianSystem, y: np.ndarra
 
 @cache
 def _compiled() -> Callable[..., bool]:
-    from sympflow.kernels.sublevel import all_within
+    from sympflow.kernels.sublevel_loops import all_within
 
     return all_within
 

@@ -11,10 +11,10 @@ import numpy as np
 from sympflow.arguments import check_flag
 from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, Problem, Stepper, compiled_loops, rollout
+from sympflow.integrators.base import FixedStep, KernelStepper, Problem, Stepper, compiled_loops, rollout
 
 if TYPE_CHECKING:
-    from sympflow.kernels.implicit import ImplicitKernel, Tableau
+    from sympflow.kernels.implicit_loops import ImplicitKernel, Tableau
 
 MOST_ITERATIONS = 50
 _SOURCE = "E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration, 2nd ed. (Springer 2006), II.1.3, VI.4"
@@ -79,13 +79,16 @@ class Gauss(FixedStep):
         dK = _solved(M, (h[..., None, None] * D).reshape(*y.shape[:-1], s * n, n)).reshape(*y.shape[:-1], s, n, n)
         return self._advanced(y, K), np.eye(n, dtype=y.dtype) + np.einsum("i,...ijk->...jk", b, dK)
 
-    def stepper(self, problem: Problem) -> GaussStepper:
-        from sympflow.kernels.implicit import implicit_kernel
+    def stepper(self, problem: Problem) -> CompiledGauss | ArrayGauss:
+        from sympflow.kernels.implicit_loops import implicit_kernel
 
         kernel = compiled_loops(
-            lambda: implicit_kernel(problem.system, self.tableau), problem.y0, problem.backend, self.compensated
+            lambda: implicit_kernel(problem.system, self.tableau, bool(self.compensated)),
+            problem.y0,
+            problem.backend,
+            self.compensated,
         )
-        return GaussStepper(self, problem, kernel)
+        return ArrayGauss(self, problem) if kernel is None else CompiledGauss(self, problem, kernel)
 
     def _advanced(self, y: Array, K: Array) -> Array:
         return y + sum(b * K[..., i, :] for i, b in enumerate(self.tableau[1]))
@@ -134,33 +137,11 @@ class Gauss(FixedStep):
         return K, iterations
 
 
-class GaussStepper(Stepper):
-    """One run of a Gauss method, with the count of Newton's iterations."""
+class _Counts:
+    """Counts of a run of a Gauss method: Newton's iterations, each with the force and the Hessian at every stage."""
 
-    def __init__(self, integrator: Gauss, problem: Problem, kernel: ImplicitKernel | None) -> None:
-        super().__init__(integrator, problem)
-        self.gauss, self.kernel, self.iterations = integrator, kernel, 0
-        self.compiled = kernel is not None
-        if kernel is not None:
-            self.backend = "compiled"
-
-    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
-        if self.kernel is None:
-            return rollout(lambda k, y: self.shorter(y, h), y0, n_steps, save)
-        rows = y0.reshape(-1, y0.shape[-1])
-        states, finite, iterations = self.kernel.run_batch(h, rows, n_steps, save, self.gauss.compensated)
-        self.iterations += iterations
-        return states.swapaxes(0, 1).reshape(len(save), *y0.shape), finite.reshape(y0.shape[:-1])
-
-    def shorter(self, y: Array, h: Any) -> Array:
-        if self.kernel is None:
-            y_next, iterations = self.gauss.counted_step(self.system, y, h)
-        else:
-            rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
-            out, iterations = self.kernel.step(np.broadcast_to(h, y.shape[:-1]).reshape(-1), rows)
-            y_next = out.reshape(y.shape)
-        self.iterations += iterations
-        return y_next
+    gauss: Gauss
+    iterations: int
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         n = self.iterations * len(self.gauss.tableau[1])
@@ -168,6 +149,30 @@ class GaussStepper(Stepper):
 
     def more_stats(self) -> dict[str, int]:
         return {"newton_iterations": self.iterations}
+
+
+class CompiledGauss(_Counts, KernelStepper):
+    """A run of a Gauss method in compiled loops."""
+
+    def __init__(self, gauss: Gauss, problem: Problem, kernel: ImplicitKernel) -> None:
+        super().__init__(gauss, problem, kernel)
+        self.gauss = gauss
+
+
+class ArrayGauss(_Counts, Stepper):
+    """A run of a Gauss method by array operations."""
+
+    def __init__(self, gauss: Gauss, problem: Problem) -> None:
+        super().__init__(gauss, problem)
+        self.gauss, self.iterations = gauss, 0
+
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
+        return rollout(lambda k, y: self.shorter(y, h), y0, n_steps, save)
+
+    def shorter(self, y: Array, h: Any) -> Array:
+        y_next, iterations = self.gauss.counted_step(self.system, y, h)
+        self.iterations += iterations
+        return y_next
 
 
 def _equations(system: HamiltonianSystem, y: Array, K: Array, h: Any, A: Array) -> tuple[Array, Array]:

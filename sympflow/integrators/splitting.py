@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -12,12 +12,15 @@ from sympflow.arguments import check_flag
 from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
-from sympflow.integrators.base import FixedStep, KernelStepper, Loops, Stepper, compiled_loops
+from sympflow.integrators.base import FixedStep, KernelStepper, Stepper, compiled_loops
 from sympflow.integrators.clocks import BREAKDOWN, LogarithmicClock, scale_of, transformed_system
 from sympflow.integrators.compositions import SPLITTINGS, Composition
 from sympflow.integrators.contract import Outcome, Problem, Steps
 from sympflow.integrators.methods import TRIPLES
 from sympflow.schemes import SCHEMES, Scheme
+
+if TYPE_CHECKING:
+    from sympflow.kernels.protocol import Kernel
 
 CLOCKS = ("physical", "logarithmic")
 """The clocks by the name that the option `clock` takes."""
@@ -140,9 +143,9 @@ class Splitting(FixedStep):
             backend: str,
         ) -> Any:
             no_loops = self.compensated or transformed.symbols is None
-            if no_loops or compiled_loops(lambda: inner.composed(transformed).loops(False), start, backend) is None:
+            if no_loops or compiled_loops(lambda: inner.composed(transformed).kernel(False), start, backend) is None:
                 return None
-            from sympflow.kernels.timed import reach_times
+            from sympflow.kernels.timed_loops import reach_times
 
             return reach_times(transformed, self.scheme, h, start, times, stride, expected)
 
@@ -175,12 +178,12 @@ class Splitting(FixedStep):
 
     def stepper(self, problem: Problem) -> Stepper:
         composition = self.composed(problem.system)
-        loops = compiled_loops(
-            lambda: composition.loops(bool(self.compensated)), problem.y0, problem.backend, self.compensated
+        kernel = compiled_loops(
+            lambda: composition.kernel(bool(self.compensated)), problem.y0, problem.backend, self.compensated
         )
-        if loops is None:
+        if kernel is None:
             return ArrayComposition(self, problem, composition)
-        return CompiledComposition(self, problem, composition, loops)
+        return CompiledComposition(self, problem, composition, kernel)
 
     def run(self, problem: Problem) -> Outcome:
         clock = self.on_clock(problem.system)
@@ -211,8 +214,8 @@ class ArrayComposition(Stepper):
 class CompiledComposition(KernelStepper):
     """A run of a composition in compiled loops."""
 
-    def __init__(self, integrator: FixedStep, problem: Problem, composition: Composition, loops: Loops) -> None:
-        super().__init__(integrator, problem, loops)
+    def __init__(self, integrator: FixedStep, problem: Problem, composition: Composition, kernel: Kernel) -> None:
+        super().__init__(integrator, problem, kernel)
         self.composition = composition
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:

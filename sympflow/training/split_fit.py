@@ -12,12 +12,12 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from sympflow.flow.coefficients import Column
+from sympflow.flow.columns import Column
 from sympflow.flow.split import SplitFlow
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.parts import Map
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.parts import PartsKernel, kernel_of
+from sympflow.kernels.parts_loops import parts_loops
 from sympflow.training.collocation import Stream, states, stream_seed
 from sympflow.training.labels import Labels
 from sympflow.training.levenberg_marquardt import Minimum, levenberg_marquardt
@@ -42,8 +42,7 @@ class SplitFit:
 
     def __init__(self, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, config: SplitConfig) -> None:
         self.flow, self.config, self.parts = flow, config, flow.parts
-        self.kernel: PartsKernel = kernel_of(self.parts, PartsKernel)
-        self.kernel.source()
+        self.loops = parts_loops(self.parts)
         self.columns = flow.columns()
         ends = np.cumsum([(c.n + 1) // 2 for c in self.columns])
         self.slices = [slice(int(end) - (c.n + 1) // 2, int(end)) for c, end in zip(self.columns, ends, strict=True)]
@@ -92,7 +91,7 @@ class SplitFit:
 
     def residuals(self, u: np.ndarray, j: int) -> np.ndarray:
         with np.errstate(all="ignore"):
-            error = (self.kernel.step_modes(self.maps(u), self.z) - self.labels[j]) / self.unit
+            error = (self.loops.step_modes(self.maps(u), self.z) - self.labels[j]) / self.unit
         return error.ravel() / math.sqrt(len(self.z))
 
     def jacobian(self, u: np.ndarray, j: int) -> np.ndarray:
@@ -240,7 +239,7 @@ class SplitFit:
         error = np.array(
             [
                 np.linalg.norm(
-                    (self.kernel.step_modes(self.flow.numpy_maps(np.array(s)), z) - self._modes(y)) / self.unit, axis=-1
+                    (self.loops.step_modes(self.flow.numpy_maps(np.array(s)), z) - self._modes(y)) / self.unit, axis=-1
                 )
                 for s, y in zip(t, self.held_out.y, strict=True)
             ]

@@ -68,16 +68,17 @@ COUPLED = True
 
 
 @njit(**OPTIONS)
-def kick(q, b, work):
+def kick(q, numbers, work):
     slope = work[0]
     gradient(q, slope)
     for i in range(NDOF):
-        slope[i] *= -b
+        slope[i] *= -numbers[0]
     return slope
 
 
 @njit(**OPTIONS)
-def gradient_kick(q, b, g, work):
+def gradient_kick(q, numbers, work):
+    b, g = numbers
     slope, velocity, product = work
     gradient(q, slope)
     apply_inverse_mass(slope, velocity)

@@ -12,7 +12,7 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import statements
 from sympflow.kernels.modules import load_algebra
-from sympflow.kernels.outputs import all_between
+from sympflow.kernels.output_loops import all_between
 
 __all__ = ["all_within"]
 
