@@ -20,7 +20,7 @@ from sympflow.metrics.energy import max_energy_error
 from sympflow.solver import solve
 from sympflow.system import HamiltonianSystem
 from sympflow.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
-from sympflow.training.collocation import Stream, states
+from sympflow.training.points import Stream, states
 
 TOLERANCE = 1e-13
 NEWTON_STEPS = 5  # to the nearest point of an orbit
