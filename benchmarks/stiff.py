@@ -35,7 +35,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
-from sympflow.flow.io import shipped
+from sympflow.flow.shipped import shipped
 from sympflow.integrators.compositions import known_maps
 from sympflow.integrators.splitting import LinearSplitting
 from sympflow.kernels.parts_loops import parts_loops

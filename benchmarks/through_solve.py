@@ -31,7 +31,7 @@ pin_to_one_thread()
 import numpy as np
 
 from sympflow import HamiltonianSystem, Solution, solve, systems
-from sympflow.flow.io import shipped
+from sympflow.flow.shipped import shipped
 from sympflow.integrators.compositions import known_maps
 from sympflow.integrators.splitting import LinearSplitting
 from sympflow.kernels.parts_loops import parts_loops

@@ -143,7 +143,7 @@ def methods(words: str) -> list[Any]:
 def method(word: str) -> Any:
     """One method: a name, with options or without, such as ``sympflow:flow=pendulum-sympflow``, or a flow's file."""
     if word.endswith(".safetensors"):
-        from sympflow.flow.io import load
+        from sympflow.flow.files import load
 
         return Path(word).stem, load(word)
     name, *pairs = word.split(":")
