@@ -101,8 +101,7 @@ def solve(
     integrator = build(method, options)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
-    if hasattr(integrator, "resolved"):  # which integrator a method is may depend on what it is asked for
-        integrator = integrator.resolved(system, y_start, abs(t1 - t0))
+    integrator = integrator.resolved(system, y_start, abs(t1 - t0))  # it may depend on what is asked for
     check_applies(integrator, system)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
     every = check_save_every(save_every, times)

@@ -17,7 +17,7 @@ An integrator is a frozen dataclass whose fields are its options (`dt`, `rtol`, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -32,6 +32,7 @@ from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from sympflow.events import EventSearch
+    from sympflow.integrators.schemes import Scheme
 
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
 """Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
@@ -83,6 +84,12 @@ class Integrator:
     trained: ClassVar[bool] = False
     compiles: ClassVar[bool] = False
     finds_events: ClassVar[bool] = False
+    one_by_one: ClassVar[bool] = False
+    """Whether the trajectories of a batch are run one after another, at the cost of as many single runs."""
+    scheme: ClassVar[Scheme | None] = None
+    """The scheme of a splitting method."""
+    source: ClassVar[str] = ""
+    """The citation, or a line on the method, as lists of methods print it."""
     tangent_holds: ClassVar[str] = ""
     """What `tangent` holds fixed though a step from a neighbouring state would change it; "" for nothing."""
 
@@ -93,6 +100,19 @@ class Integrator:
 
     def check(self, system: HamiltonianSystem) -> None:
         """Raise a ValueError with the reason if the method does not apply to the system."""
+
+    def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> Integrator:
+        """The integrator that runs on the system from y0 over an interval of that length; most often this one."""
+        return self
+
+    def flow_for(self, system: HamiltonianSystem) -> Any:
+        """The trained flow in the physical time that runs on the system; None if there is none."""
+        return None
+
+    def figures(self, system: HamiltonianSystem) -> Mapping[str, Any]:
+        """The figures of the trained flow that runs on the system, such as `training_seconds`; {} without a flow."""
+        flow = self.flow_for(system)
+        return {} if flow is None else flow.figures
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         """One step of signed length h from the states y (..., 2d)."""

@@ -249,6 +249,9 @@ class ImplicitMidpoint(Gauss):
     """
 
     name: ClassVar[str] = "implicit_midpoint"
+    source: ClassVar[str] = (
+        "The implicit midpoint rule, y₁ = y + h f((y + y₁)/2): order 2, symplectic, symmetric, A-stable."
+    )
     order: ClassVar[int | None] = 2
     tableau: ClassVar[Tableau] = (((0.5,),), (1.0,))
 
@@ -271,5 +274,6 @@ class GaussLegendre4(Gauss):
     """
 
     name: ClassVar[str] = "gauss_legendre4"
+    source: ClassVar[str] = "The Gauss–Legendre method of two stages: order 4, symplectic, symmetric, A-stable."
     order: ClassVar[int | None] = 4
     tableau: ClassVar[Tableau] = (((0.25, 0.5 - _A21), (_A21, 0.25)), (0.5, 0.5))

@@ -203,11 +203,11 @@ def maps_stepper(name: str) -> type[MapsStepper]:
     if name in LINEAR_SPLITTINGS:
         namespace: dict[str, Any] = dict(LINEAR_SPLITTINGS[name])
         base: type[MapsStepper] = LinearSplitting
-        order, source = namespace["scheme"].order, namespace.pop("source")
+        order, source = namespace["scheme"].order, namespace["source"]
     else:
         base = PartsSplitting
         order, weights, source = PARTS_SPLITTINGS[name]
-        namespace = {"weights": weights}
+        namespace = {"weights": weights, "source": f"{name}: order {order}, {source}"}
     namespace |= {
         "name": name,
         "order": order,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -40,6 +41,7 @@ class LogSympFlow(Logarithmic):
     name: ClassVar[str] = "log_sympflow"
     order: ClassVar[int | None] = None
     trained: ClassVar[bool] = True
+    source: ClassVar[str] = "A SympFlow trained on `sympflow.time_transformed(system)`, in the physical time."
     within: ClassVar[FixedStep | None] = None
     """Of one whose `inner` has been asked for: that."""
     checked: ClassVar[Lengths | None] = None
@@ -77,6 +79,9 @@ class LogSympFlow(Logarithmic):
                 "sympflow.time_transformed(system), or prime one with it, and pass it; or use 'log_leapfrog'."
             )
         return replace(self, flow=found[0].load(system), shift=found[0].shift if self.shift is None else self.shift)
+
+    def figures(self, system: HamiltonianSystem) -> Mapping[str, Any]:
+        return {} if self.flow is None else self.flow.figures
 
     def inner(self, system: HamiltonianSystem) -> FixedStep:
         if self.within is not None:

@@ -218,12 +218,16 @@ def _inner(scheme_name: str, compensated: bool) -> FixedStep:
 def log_splitting(name: str) -> type[LogSplitting]:
     """The integrator class "log_<scheme>"."""
     scheme = SCHEMES[name.removeprefix("log_")]
+    source = (
+        f"{name}: {scheme.name} on the logarithmic Hamiltonian, order {scheme.order}; Mikkola and Tanikawa (1999), "
+        "Preto and Tremaine (1999)."
+    )
     namespace = {
         "name": name,
         "order": scheme.order,
         "scheme_name": scheme.name,
-        "__doc__": f"{name}: {scheme.name} on the logarithmic Hamiltonian, order {scheme.order}; Mikkola and Tanikawa "
-        f"(1999), Preto and Tremaine (1999).\n\n{LogSplitting.__doc__}",
+        "source": source,
+        "__doc__": f"{source}\n\n{LogSplitting.__doc__}",
         "__module__": __name__,
     }
     return dataclass(frozen=True)(type(name, (LogSplitting,), namespace))

@@ -212,6 +212,7 @@ def splitting(name: str) -> type[Splitting]:
         "name": name,
         "order": scheme.order,
         "scheme": scheme,
+        "source": scheme.source,
         "__doc__": f"{name}: order {scheme.order}, {scheme.source}\n\n{Splitting.__doc__}",
         "__module__": __name__,
     }

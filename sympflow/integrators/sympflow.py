@@ -47,6 +47,7 @@ class SympFlowIntegrator(FlowIntegrator):
     compensated: bool = False
 
     name: ClassVar[str] = "sympflow"
+    source: ClassVar[str] = "A trained SympFlow: symplectic for every step length, with an exact inverse."
     symplectic: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -135,6 +136,9 @@ class MLPIntegrator(FlowIntegrator):
     """
 
     name: ClassVar[str] = "mlp"
+    source: ClassVar[str] = (
+        "The paper's baseline: an unconstrained neural flow map. Not symplectic; no inverse, so no backward time."
+    )
     symplectic: ClassVar[bool] = False
 
     def run(self, problem: Problem) -> Outcome:
