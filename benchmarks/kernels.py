@@ -34,8 +34,8 @@ from sympflow.flow.sympflow import SympFlow
 from sympflow.integrators.schemes import SCHEMES
 from sympflow.kernels.mlp_flow import mlp_flow_kernel
 from sympflow.kernels.splitting import splitting_kernel
+from sympflow.studies.attempts import interleaved
 from sympflow.systems import henon_heiles
-from sympflow.timing import interleaved
 
 H = 0.05
 TRAJECTORIES = 1024  # whole blocks, for the hand-written loops have no others

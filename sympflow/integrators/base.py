@@ -98,6 +98,11 @@ class Integrator:
         """The names of the options that this method takes."""
         return _field_names(cls)  # type: ignore[arg-type]
 
+    @classmethod
+    def summary(cls) -> str:
+        """The `source`, or the first line of the docstring of a method that gives none."""
+        return cls.source or (cls.__doc__ or "").partition("\n")[0]
+
     def check(self, system: HamiltonianSystem) -> None:
         """Raise a ValueError with the reason if the method does not apply to the system."""
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sympflow import solve, systems
-from sympflow.commands.arguments import scenes
+from sympflow.commands.words import scenes
 from sympflow.domain import domain_from_dict
 from sympflow.systems import SYSTEMS
 
