@@ -14,8 +14,8 @@ from sympflow.arrays import Array, to_numpy
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
+    from sympflow.hamiltonian.system import HamiltonianSystem
     from sympflow.integrators.base import Integrator
-    from sympflow.system import HamiltonianSystem
 
 SMALLEST_SCALE = 1e-12
 """|H(y0)| below which an energy error is absolute, unless the system declares its `energy_scale`."""

@@ -12,8 +12,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
-from sympflow.system import HamiltonianSystem
 from sympflow.systems import SYSTEMS, harmonic_oscillator
 
 Systems = Annotated[

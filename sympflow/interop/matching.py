@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from sympflow.arrays import to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
-from sympflow.system import HamiltonianSystem
 
 
 def own_velocity(integrator: FixedStep, system: HamiltonianSystem | None, y: np.ndarray) -> np.ndarray:
@@ -21,7 +21,7 @@ def own_velocity(integrator: FixedStep, system: HamiltonianSystem | None, y: np.
 
     from sympflow.flow.primed import PrimedFlow
 
-    flow = integrator.flow_for(system)  # type: ignore[attr-defined]
+    flow = integrator.flow_for(system)  # type: ignore[arg-type]
     if isinstance(flow, PrimedFlow) and flow.system is not None:  # consistent: at t = 0 it is that of its system
         return flow.system.vector_field(y)
     with torch.no_grad():

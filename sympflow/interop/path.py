@@ -10,10 +10,10 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
-from sympflow.system import HamiltonianSystem
 
 MAX_EVENT_STEPS = 1_000_000
 _EPS = 4 * float(np.finfo(float).eps)
@@ -85,7 +85,7 @@ class Path:
 
     def _learns(self) -> bool:
         """Whether the flow has weights that require gradients."""
-        flow = self.integrator.flow_for(self.system) if self.integrator.trained else None  # type: ignore[attr-defined]
+        flow = self.integrator.flow_for(self.system)
         return flow is not None and any(w.requires_grad for w in flow.parameters())
 
     def first_zero(self, g: Callable[[Tensor, Tensor], Tensor]) -> Tensor:

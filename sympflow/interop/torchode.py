@@ -22,10 +22,10 @@ try:
 except ImportError as error:  # pragma: no cover
     raise ImportError("sympflow.interop.torchode needs torchode: pip install torchode.") from error
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.registry import check_applies, naming_plugin
 from sympflow.interop.matching import fixed_step
-from sympflow.system import HamiltonianSystem
 
 
 def register(name: str, system: HamiltonianSystem, method: Any = None, **options: Any) -> None:
@@ -77,7 +77,7 @@ class SymplecticStep(SingleStepMethod):
         super().__init__()
         self.integrator, self.system = integrator, system
         # the longest step that a flow was trained for; the state's own module, so that its weights are parameters
-        self.flow = integrator.flow_for(system) if integrator.trained else None  # type: ignore[attr-defined]
+        self.flow = integrator.flow_for(system)
 
     def init(self, term: Any, problem: Any, f0: Tensor | None, *, stats: dict[str, Any], args: Any) -> Tensor:
         """The state of the method: the end of each sample."""

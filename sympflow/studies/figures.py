@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from sympflow.arrays import to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.solution import Solution
 from sympflow.solver import solve
@@ -27,7 +28,6 @@ from sympflow.studies.figure_style import (
     new_figure,
     save,
 )
-from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

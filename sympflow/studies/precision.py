@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.arguments import check_counts, check_t_span
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.metrics.energy import failed
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
-from sympflow.solver import solve
+from sympflow.solver import check_y0, solve
 from sympflow.studies import attempts
 from sympflow.studies.attempts import Attempt, Candidate, Row, candidates, interleaved, tolerance_of
 from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table, title
-from sympflow.system import HamiltonianSystem
-from sympflow.validation import check_counts, check_t_span, check_y0
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.files import naming_path, writable
+from sympflow.arguments import naming_path, writable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from sympflow.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
 _GREEK = {"omega": "ω", "mu": "μ", "epsilon": "ε", "alpha": "α", "beta": "β"}
 _NAMES = {"henon_heiles": "Hénon–Heiles"}

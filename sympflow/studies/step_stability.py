@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.arguments import MAX_SAVED_VALUES, check_counts, check_t_span
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.domain_exit import domain_of
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.energy import max_energy_error
 from sympflow.metrics.symplectic import symplecticity_defect, volume_error
 from sympflow.solution import Solution
-from sympflow.solver import solve
+from sympflow.solver import check_y0, solve
 from sympflow.studies import attempts
 from sympflow.studies.attempts import REFUSALS, Attempt, Candidate, Metric, Row, candidates
 from sympflow.studies.reports import Column, Report, described, number, plain, records, text_table, title
-from sympflow.system import HamiltonianSystem
-from sympflow.validation import MAX_SAVED_VALUES, check_counts, check_t_span, check_y0
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,6 +43,7 @@ MOST_OUTPUTS, TANGENT_STEPS, FEWEST_FOR_DRIFT = 20_000, 256, 40
 FEW_STARTS = 16  # up to so many, a compiled method runs one by one: the kernel for batches takes longer to compile
 ARRAYS_SLOWER = 200  # times, by which runs on arrays are shortened
 TAIL = 20  # steps before a blow-up whose growth is looked at
+StabilityRow = Row  # the name that its rows had before those of all studies were of one kind
 
 
 def stability(
