@@ -39,6 +39,7 @@ class _Scipy(RungeKutta):
 
     solver: ClassVar[Any]
     finds_events: ClassVar[bool] = True
+    one_by_one: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -214,6 +215,7 @@ class RK45(_Scipy):
 
     name: ClassVar[str] = "rk45"
     order: ClassVar[int | None] = 5
+    source: ClassVar[str] = "Dormand–Prince 5(4), SciPy's `RK45`: the paper's ODE45, at the default tolerances."
     solver: ClassVar[Any] = ScipyRK45
     A: ClassVar[np.ndarray] = ScipyRK45.A
     B: ClassVar[np.ndarray] = ScipyRK45.B
@@ -231,6 +233,7 @@ class DOP853(_Scipy):
 
     name: ClassVar[str] = "dop853"
     order: ClassVar[int | None] = 8
+    source: ClassVar[str] = "Dormand–Prince 8(5,3), SciPy's `DOP853`."
     solver: ClassVar[Any] = ScipyDOP853
     A: ClassVar[np.ndarray] = ScipyDOP853.A
     B: ClassVar[np.ndarray] = ScipyDOP853.B

@@ -485,9 +485,11 @@ class _Nodes(Trace):
 def torchdiffeq_method(name: str) -> type[Integrator]:
     """The integrator class of torchdiffeq's solver of that name."""
     if name in MULTISTEP:
-        return _named(name, Adams, {"order": MULTISTEP[name], "__doc__": f"torchdiffeq's `{name}`: {Adams.__doc__}"})
+        doc = f"torchdiffeq's `{name}`: {Adams.__doc__}"
+        return _named(name, Adams, {"order": MULTISTEP[name], "source": doc.partition("\n")[0], "__doc__": doc})
     tableau = (ADAPTIVE | FIXED)[name]
     base: type[Integrator] = Adaptive if name in ADAPTIVE else FixedGrid
+    source = f"torchdiffeq's `{name}`, order {tableau.order}: {tableau.source}"
     return _named(
         name,
         base,
@@ -496,7 +498,8 @@ def torchdiffeq_method(name: str) -> type[Integrator]:
             "tableau": tableau,
             "A": tableau.A,
             "B": tableau.B,
-            "__doc__": f"torchdiffeq's `{name}`, order {tableau.order}: {tableau.source}\n\n{base.__doc__}",
+            "source": source,
+            "__doc__": f"{source}\n\n{base.__doc__}",
         },
     )
 

@@ -88,7 +88,6 @@ class SplitFit:
     def __init__(self, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, options: SplitOptions) -> None:
         self.flow, self.options, self.parts = flow, options, flow.parts
         self.kernel = parts_loops(self.parts)
-        self.kernel.source()
         self.columns = flow.columns()
         ends = np.cumsum([(c.n + 1) // 2 for c in self.columns])
         self.slices = [slice(int(end) - (c.n + 1) // 2, int(end)) for c, end in zip(self.columns, ends, strict=True)]

@@ -1,4 +1,4 @@
-"""What the commands share: reports of errors and progress, and the files that they write."""
+"""The console: errors as one line, progress, tables, and the files that commands write."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from sympflow.commands.arguments import Scene
-from sympflow.studies.tables import Column, text_table
+from sympflow.commands.words import Scene
+from sympflow.studies.reports import Column, text_table
 
 out = Console(soft_wrap=True, highlight=False)
 err = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -110,9 +110,9 @@ def write_comparisons(
     comparisons: list[Any], found: list[Scene], folder: Path, say: Callable[[str], None]
 ) -> list[Path]:
     """For each system its CSV, JSON and figures; for several also one CSV and one figure of all."""
-    from sympflow.studies.comparison_figure import overview, save_comparison
     from sympflow.studies.figure_style import save
-    from sympflow.studies.tables import write_csv
+    from sympflow.studies.figures import overview, save_comparison
+    from sympflow.studies.reports import write_csv
 
     written: list[Path] = []
     for comparison, scene in zip(comparisons, found, strict=True):
@@ -123,5 +123,6 @@ def write_comparisons(
     if drawable:
         written.append(save(overview(drawable), folder / "comparison.png"))
     if len(comparisons) > 1:
-        written.append(write_csv([row for c in comparisons for row in c.rows], folder / "comparison.csv"))
+        rows = [row for c in comparisons for row in c.rows]
+        written.append(write_csv(rows, folder / "comparison.csv", comparisons[0].columns))
     return written

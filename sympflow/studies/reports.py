@@ -1,4 +1,4 @@
-"""Rows of measurements as text, CSV and JSON."""
+"""Reports: rows of measurements as text, CSV, JSON and a figure, the same for every study."""
 
 from __future__ import annotations
 
@@ -8,12 +8,74 @@ import json
 import math
 import os
 import unicodedata
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
 
 from sympflow.arguments import naming_path, writable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from sympflow.hamiltonian.system import HamiltonianSystem
+
+_GREEK = {"omega": "ω", "mu": "μ", "epsilon": "ε", "alpha": "α", "beta": "β"}
+_NAMES = {"henon_heiles": "Hénon–Heiles"}
+
+
+class Report(ABC):
+    """The result of a study. A subclass has `rows`, and says what its settings, table and figure are."""
+
+    columns: ClassVar[tuple[str, ...]]
+    """The fields of the rows that files hold, in this order."""
+
+    if TYPE_CHECKING:  # a field of some reports, a property of others
+
+        @property
+        def rows(self) -> tuple[Any, ...]:
+            """The measurements, dataclasses of one kind."""
+
+    @abstractmethod
+    def table(self) -> str:
+        """The rows as text."""
+
+    @abstractmethod
+    def settings(self) -> dict[str, Any]:
+        """The problem and what was asked, in JSON's types."""
+
+    @abstractmethod
+    def figure(self) -> Figure:
+        """The rows as a matplotlib figure."""
+
+    def to_csv(self, path: str | os.PathLike[str]) -> Path:
+        """Write the rows to a CSV file, every figure to full precision."""
+        return write_csv(self.rows, path, self.columns)
+
+    def to_json(self, path: str | os.PathLike[str]) -> Path:
+        """Write the rows and the settings to a JSON file."""
+        return write_json(self.to_dict(), path)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings, and the rows as dictionaries."""
+        return {**self.settings(), "rows": records(self.rows, self.columns)}
+
+
+def title(system: HamiltonianSystem) -> str:
+    """The name and parameters of a system, as they are printed."""
+    params = ", ".join(f"{_GREEK.get(k, k)} = {v:g}" for k, v in system.params.items())
+    return _NAMES.get(system.name, system.name.replace("_", " ")) + (f", {params}" if params else "")
+
+
+def described(system: HamiltonianSystem) -> dict[str, Any]:
+    """A system in the settings of a report."""
+    return {"name": system.name, "params": system.params}
+
+
+# text -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -67,14 +129,17 @@ def seconds(x: float | None) -> str:
     return f"{x * 1e9:.3g} ns"
 
 
-def write_csv(rows: Sequence[Any], path: str | os.PathLike[str]) -> Path:
+# files ------------------------------------------------------------------------------------------------------------
+
+
+def write_csv(rows: Sequence[Any], path: str | os.PathLike[str], columns: Sequence[str] | None = None) -> Path:
     """Write dataclass rows to a CSV file: one line for each, None as an empty cell, numbers to full precision."""
     text = io.StringIO()
-    names = [f.name for f in fields(rows[0])]
+    names = [f.name for f in fields(rows[0])] if columns is None else list(columns)
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(names)
-    for row in rows:
-        writer.writerow(["" if getattr(row, n) is None else getattr(row, n) for n in names])
+    for row in records(rows, names):
+        writer.writerow(["" if value is None else value for value in row.values()])
     return write_text(text.getvalue(), path)
 
 
@@ -83,9 +148,9 @@ def write_json(content: dict[str, Any], path: str | os.PathLike[str]) -> Path:
     return write_text(json.dumps(_strict(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n", path)
 
 
-def records(rows: Sequence[Any]) -> list[dict[str, Any]]:
-    """Dataclass rows as dictionaries."""
-    return [asdict(row) for row in rows]
+def records(rows: Sequence[Any], columns: Sequence[str]) -> list[dict[str, Any]]:
+    """Rows as dictionaries of these fields."""
+    return [{name: getattr(row, name) for name in columns} for row in rows]
 
 
 def _strict(x: Any) -> Any:
@@ -93,6 +158,8 @@ def _strict(x: Any) -> Any:
         return {str(k): _strict(v) for k, v in x.items()}
     if isinstance(x, list | tuple):
         return [_strict(v) for v in x]
+    if isinstance(x, np.generic | np.ndarray):
+        return _strict(x.tolist())
     if isinstance(x, float) and not math.isfinite(x):
         return str(float(x))
     return x

@@ -1,4 +1,4 @@
-"""What the words of a command line mean: scenes with parameters, methods with options, states."""
+"""The words of a command line: scenes with parameters, methods with options, states; and options of many commands."""
 
 from __future__ import annotations
 
@@ -7,13 +7,23 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.systems import SYSTEMS, harmonic_oscillator
+
+Systems = Annotated[
+    list[str],
+    typer.Argument(metavar="SYSTEM...", help="See `sympflow systems`; parameters as --omega 100 or name:omega=100."),
+]
+TEnd = Annotated[float | None, typer.Option(help="End of the interval, which starts at 0. Default: the system's.")]
+State = Annotated[str | None, typer.Option("--y0", help="Initial state q,p: 0.3,-0.3,0.3,0.15. Default: the system's.")]
+Step = Annotated[float | None, typer.Option(help="Step of fixed-step methods. Default: the system's, the flow's Δt.")]
+Backend = Annotated[str, typer.Option(help="auto, compiled or array.")]
 
 
 def _stiff_oscillator(omega: float = 100.0) -> HamiltonianSystem:

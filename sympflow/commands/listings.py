@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from sympflow.commands.arguments import SCENES, one_scene, parameters, shown
-from sympflow.commands.output import print_table, reporting
+from sympflow.commands.console import print_table, reporting
+from sympflow.commands.words import SCENES, one_scene, parameters, shown
 
 
 def systems() -> None:
@@ -64,11 +64,12 @@ def methods() -> None:
             except ImportError as error:
                 rows.append((name, "", "", "", "", str(error)))
                 continue
-            scheme = getattr(cls, "scheme", None)
+            scheme = cls.scheme
             forces = "" if scheme is None else str(scheme.force_evaluations)
             if scheme is not None and scheme.hessian_evaluations:
                 forces += f" + {scheme.hessian_evaluations} Hessian"
-            source = scheme.source if scheme is not None else (cls.__doc__ or "").partition("\n")[0]
             order = "trained" if cls.trained else str(cls.order or "–")
-            rows.append((name, order, "yes" if cls.symplectic else "no", forces, ", ".join(cls.options()), source))
+            rows.append(
+                (name, order, "yes" if cls.symplectic else "no", forces, ", ".join(cls.options()), cls.summary())
+            )
         print_table(("name", "order", "symplectic", "forces a step", "options", "source"), rows)
