@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from sympflow.flow.columns import Column
+from sympflow.flow.coefficients import Column
 from sympflow.flow.split import SplitFlow
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.parts import Map
