@@ -10,17 +10,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sympflow.domain import Domain
 from sympflow.flow.base import FlowMap
 from sympflow.flow.scaling import Scaling
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.exact_flow import reference_step
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.optimizers import Optimizer, optimizer
 from sympflow.training.options import LossOptions
 from sympflow.training.points import BLOCK, Labelled, Labels, Points, PointSource, Stream, parted, states
 from sympflow.training.runs import INTERRUPTED, OUT_OF_TIME, Advance, Run
 from sympflow.training.session import Session
-from sympflow.training.validation import reference_step
 
 
 class Validation:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import torch
 from numpy.typing import ArrayLike
 
-from sympflow.flow.arguments import plain
+from sympflow.arguments import plain
 
 KINDS = ("primed", "sympflow", "mlp")
 SCHEDULES = ("one-cycle", "cosine", "constant")

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from sympflow.arrays import to_numpy
-from sympflow.domain import Domain
-from sympflow.system import HamiltonianSystem
-from sympflow.training.validation import reference_step
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.exact_flow import reference_step
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 BLOCK = 32  # steps drawn at once: a rejection-sampled domain then costs little
 LABEL_TOLERANCE = 1e-13

@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from sympflow.domain import Domain
 from sympflow.flow.base import FlowMap
 from sympflow.flow.scaling import Scaling
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.least_squares import STOPPED, Minimum, Stop
 from sympflow.training.options import LossOptions, SearchOptions

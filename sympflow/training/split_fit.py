@@ -16,13 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from sympflow.domain import Domain
 from sympflow.flow.columns import Column
 from sympflow.flow.split import SplitFlow
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.parts import Map
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.exact_maps import kernel_of
 from sympflow.kernels.parts import PartsKernel
-from sympflow.parts import Map
-from sympflow.system import HamiltonianSystem
 from sympflow.training.least_squares import Minimum, Stop, levenberg_marquardt, put_weights
 from sympflow.training.options import SplitOptions
 from sympflow.training.points import Labels, Stream, states, stream_seed

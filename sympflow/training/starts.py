@@ -9,14 +9,14 @@ from typing import ClassVar, Protocol
 import numpy as np
 import torch
 
-from sympflow.domain import Domain
 from sympflow.flow.base import FlowMap
 from sympflow.flow.mlp import MLPFlow, matching_widths
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.options import NewFlow
 from sympflow.training.points import Stream, states
 from sympflow.training.table_fit import take_over

@@ -22,12 +22,12 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from sympflow.domain import Domain
 from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
-from sympflow.monomials import in_monomials
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.monomials import in_monomials
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.least_squares import Minimum, Stop, levenberg_marquardt, put_weights
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.options import TableOptions

@@ -12,13 +12,14 @@ from typing import Any
 import torch
 from numpy.typing import ArrayLike
 
-from sympflow.domain import Domain, EnergySublevel
-from sympflow.flow.arguments import check_system, plain
+from sympflow.arguments import plain
+from sympflow.flow.arguments import check_system
 from sympflow.flow.base import FlowMap
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain, EnergySublevel
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.network_fit import LossRun

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sympflow.domain import Domain
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
-from sympflow.integrators.scheme import CURVATURE, FORCE_GRADIENT
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 from sympflow.training.options import TableOptions
 from sympflow.training.points import Stream, states
 from sympflow.training.session import Session

@@ -8,7 +8,7 @@ import pytest
 from sympflow import solve
 from sympflow.flow.io import shipped
 from sympflow.systems import fput
-from sympflow.training.stiff import PHASES
+from sympflow.training.shipped.judges import PHASES
 
 
 @pytest.mark.parametrize("omega", [50.0, 1000.0])

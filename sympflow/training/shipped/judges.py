@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from sympflow.domain import Domain
 from sympflow.flow.base import FlowMap
 from sympflow.flow.certificate import upper_limit
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.exact_flow import reference_step
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.energy import max_energy_error
 from sympflow.solver import solve
-from sympflow.system import HamiltonianSystem
 from sympflow.training.clock_fit import energy_errors
 from sympflow.training.points import Labels
-from sympflow.training.validation import reference_step
 
 FRACTIONAL_TIMES = 50
 HELD_OUT = 1000  # states of the certificate

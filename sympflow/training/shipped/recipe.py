@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from sympflow.domain import Domain
 from sympflow.flow.base import FlowMap
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.options import NewFit, NewFlow
 from sympflow.training.session import Session
 from sympflow.training.starts import Start

@@ -14,10 +14,10 @@ from functools import partial
 
 import numpy as np
 
-from sympflow.domain import Box, Domain, EnergySublevel
 from sympflow.flow.base import FlowMap
+from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.solver import solve
-from sympflow.system import HamiltonianSystem
 from sympflow.systems import SYSTEMS, fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum
 from sympflow.training.clock_fit import train_clock
 from sympflow.training.options import NewFit

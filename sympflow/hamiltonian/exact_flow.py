@@ -1,11 +1,11 @@
-"""The exact flow of a system at a time, by a tight reference."""
+"""The exact flow φ_H,t of a system, to a tight tolerance."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 
 def reference_step(system: HamiltonianSystem, x: np.ndarray, t: float, rtol: float = 1e-12) -> np.ndarray:
