@@ -39,29 +39,30 @@ from sympflow import HamiltonianSystem, SympFlow, systems, time_transformed, tra
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.hamiltonian.fingerprint import same_system
-from sympflow.training.recipes import PrimedRecipe
+from sympflow.training.starts import Primed
 
 TARGETS = (1e-4, 1e-6, 1e-8)
 SHIPPED = Path(sympflow.__file__).parent / "pretrained"
 MEASURES = {"energy": 1000.0, "state": 100.0}
 FLOWS = {
     "henon_heiles": (
-        PrimedRecipe(1.1, 2), PrimedRecipe(0.65, 2), PrimedRecipe(0.9, 3), PrimedRecipe(0.55, 3, restarts=48),
+        (Primed(1.1, 2), 24), (Primed(0.65, 2), 24), (Primed(0.9, 3), 24), (Primed(0.55, 3), 48),
     ),
     "pendulum": (
-        PrimedRecipe(0.8, 1), PrimedRecipe(1.2, 2, 4), PrimedRecipe(0.5, 2), PrimedRecipe(0.5, 3, restarts=48),
+        (Primed(0.8, 1), 24), (Primed(1.2, 2, 4), 24), (Primed(0.5, 2), 24), (Primed(0.5, 3), 48),
     ),
-    "quartic": (PrimedRecipe(0.8, 2), PrimedRecipe(0.5, 3), PrimedRecipe(0.3, 3, restarts=48)),
-    "kepler": (PrimedRecipe(0.15, 2), PrimedRecipe(0.1, 3), PrimedRecipe(0.045, 3, restarts=48)),
+    "quartic": ((Primed(0.8, 2), 24), (Primed(0.5, 3), 24), (Primed(0.3, 3), 48)),
+    "kepler": ((Primed(0.15, 2), 24), (Primed(0.1, 3), 24), (Primed(0.045, 3), 48)),
 }  # fmt: skip
+"""Starts of trainings, and how many tables their searches begin from."""
 
 
-def fitted(system: HamiltonianSystem, recipe: PrimedRecipe, folder: Path, **options: Any) -> PrimedFlow:
-    """The flow of a recipe, from the folder if it is there."""
-    path = folder / f"{system.name}-{recipe.dt:g}-{recipe.stages}-{recipe.processor}.safetensors"
+def fitted(system: HamiltonianSystem, start: Primed, tables: int, folder: Path, **options: Any) -> PrimedFlow:
+    """The flow that comes of a start, from the folder if it is there."""
+    path = folder / f"{system.name}-{start.dt:g}-{start.stages}-{start.processor}.safetensors"
     if path.exists():
         return sympflow.load(path, system=system)
-    flow = train(system, flow=recipe.flow(system), progress=False, **(recipe.options() | options))
+    flow = train(system, flow=start.flow(system), progress=False, **({"restarts": tables} | options))
     folder.mkdir(parents=True, exist_ok=True)
     flow.save(path)
     return flow
@@ -196,7 +197,9 @@ def run(options: argparse.Namespace) -> str:
     for name in options.system or FLOWS:
         system = getattr(systems, name)()
         if options.fit:
-            flows = [fitted(system, r, options.flows, **quick) for r in FLOWS[name][: 1 if options.quick else None]]
+            flows = [
+                fitted(system, *row, options.flows, **quick) for row in FLOWS[name][: 1 if options.quick else None]
+            ]
         else:
             flows = stored(system, options.flows)
         if not flows:

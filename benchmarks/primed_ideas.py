@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from typing import Any
 
 from contenders.environment import pin_to_one_thread
@@ -42,8 +43,8 @@ from sympflow import HamiltonianSystem, SympFlow, Tube, max_energy_error, solve,
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.primed import PrimedFlow
-from sympflow.training.figures import one_step_errors
-from sympflow.training.ladder import Rung
+from sympflow.training.shipped.judges import one_step_errors
+from sympflow.training.starts import Primed
 
 IDEAS = ("curvature", "polynomial", "energy", "tube", "network")
 DT, STAGES, PROCESSOR = 1.0, 3, 6
@@ -119,12 +120,16 @@ def polynomial(t_end: float, scenes: Any, **options: Any) -> str:
         stages, processor, dt, first, degree = POLYNOMIALS[name]
         system = getattr(systems, name.partition(",")[0])()
         shape = f"{dt:g}, {stages} + {processor}"
-        plain = Rung(stages, dt, processor, first=first).train(system, progress=False, **options)
-        rung = Rung(stages, dt, processor, polynomial=degree, first=first)
+        start = Primed(dt, stages, processor, first=first)
+        fit: dict[str, Any] = {"restarts": 12, "progress": False, **options}
+        plain = train(system, flow=start.flow(system), **fit)
+        bent = replace(start, polynomial=degree)
         kinds = {
             "force gradients": plain,
-            f"degree {degree}, from these": rung.train(system, plain, progress=False, **(options | {"restarts": 1})),
-            f"degree {degree}": rung.train(system, progress=False, **options),
+            f"degree {degree}, from these": train(
+                system, flow=bent.flow(system, earlier=plain), **(fit | {"restarts": 1})
+            ),
+            f"degree {degree}": train(system, flow=bent.flow(system), **fit),
         }
         lines += [row(system, flow, t_end, name, shape, kind) for kind, flow in kinds.items()]
     return "\n".join(lines)
