@@ -310,8 +310,7 @@ def _network(flow: SympFlow) -> list[NetworkLayer]:
     for layer in flow.layers:
         V: Any = layer.potential
         K, k, biases, weights, w = V.folded()
-        arrays = [[one.detach().numpy() for one in each] for each in ((K, k, w), biases, weights)]
-        layers.append(
-            NetworkLayer(layer.kind == "kick", V.activation, arrays[0][0], arrays[0][1], *arrays[1:], arrays[0][2])
-        )
+        b, W = ([one.detach().numpy() for one in each] for each in (biases, weights))
+        K, k, w = (one.detach().numpy() for one in (K, k, w))
+        layers.append(NetworkLayer(layer.kind == "kick", V.activation, K, k, b, W, w))
     return layers
