@@ -28,7 +28,7 @@ import stability_words as words
 
 import sympflow
 from sympflow import HamiltonianSystem, energy_growth, get, max_energy_error, solve, stability, systems
-from sympflow.integrators.log_sympflow import LogSympFlow
+from sympflow.integrators.flows import LogSympFlow
 from sympflow.studies.stability_report import StabilityReport, StabilityRow
 from sympflow.systems.chains import oscillatory_energies
 

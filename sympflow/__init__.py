@@ -25,7 +25,7 @@ _HOME = {
     "register": "integrators.registry",
     "SympFlow": "flow.sympflow",
     "MLPFlow": "flow.mlp",
-    "load": "flow.io",
+    "load": "flow.files",
     "shipped_flows": "flow.shipped",
     "train": "training.trainer",
     "compare": "studies.comparison",
@@ -49,7 +49,7 @@ __all__ = ["__version__", *_HOME, *_MODULES]  # noqa: PLE0604
 if TYPE_CHECKING:
     from sympflow import interop as interop
     from sympflow import systems as systems
-    from sympflow.flow.io import load as load
+    from sympflow.flow.files import load as load
     from sympflow.flow.mlp import MLPFlow as MLPFlow
     from sympflow.flow.shipped import shipped_flows as shipped_flows
     from sympflow.flow.sympflow import SympFlow as SympFlow

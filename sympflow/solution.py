@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
     from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.integrators.base import Integrator
+    from sympflow.integrators.contract import Integrator
 
 
 @dataclass

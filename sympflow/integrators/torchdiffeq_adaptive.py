@@ -10,7 +10,7 @@ import numpy as np
 
 from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import Problem, Steps
+from sympflow.integrators.contract import Problem, Steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.interpolants import Interpolant, quartic
 from sympflow.integrators.runge_kutta import RungeKutta, weighted

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.arrays import stack, to_numpy
-from sympflow.integrators.base import FINISHED, Outcome, Problem
+from sympflow.integrators.contract import FINISHED, Outcome, Problem
 from sympflow.integrators.interpolants import Batch
 
 if TYPE_CHECKING:

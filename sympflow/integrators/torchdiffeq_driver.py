@@ -9,9 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arrays import Array, full_of_nan, is_tensor, stack
-from sympflow.events import ENDED
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FINISHED, Integrator, Outcome, Problem
+from sympflow.integrators.contract import ENDED, FINISHED, Integrator, Outcome, Problem
 from sympflow.integrators.interpolants import Interpolant, Piecewise
 from sympflow.integrators.runge_kutta import hopeless
 from sympflow.integrators.torchdiffeq_batches import run_in_parts

@@ -11,12 +11,9 @@ import numpy as np
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
 from sympflow.integrators.base import FixedStep, Integrator, Problem
 from sympflow.integrators.runge_kutta import ExplicitStep
-from sympflow.integrators.tableaux import ADAPTIVE, FIXED, Tableau
+from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
 from sympflow.integrators.torchdiffeq_adams import Adams
 from sympflow.integrators.torchdiffeq_adaptive import Adaptive
-
-MULTISTEP = {"explicit_adams": 3, "implicit_adams": 4}
-"""Orders with `max_order` 4, the default: Adams–Bashforth then uses three slopes, Adams–Moulton four."""
 
 
 @cache

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import MAX_SAVED_VALUES
-from sympflow.domain_exit import domain_of
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.energy import energy_drift, max_energy_error
@@ -223,11 +222,11 @@ class Study:
 
     def _exit(self, integrator: Integrator, sols: list[Solution]) -> float | None:
         """When the first trajectory leaves the domain of the flow, or of the system."""
-        flow = getattr(integrator, "flow_for", lambda system: None)(self.system)
-        domain = domain_of(flow, self.system)
+        flow = integrator.flow_for(self.system)
+        domain = self.system.domain if flow is None else flow.domain_for(self.system)
         if domain is None:
             return None
-        slack = float(getattr(flow, "figures", {}).get("energy_error_max") or 0.0)
+        slack = 0.0 if flow is None else float(flow.figures.get("energy_error_max") or 0.0)
         times = []
         for sol in sols:
             thin = max(1, len(sol.t) // 2000)

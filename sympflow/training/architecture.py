@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.mlp import MLPFlow, matching_widths
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
-from sympflow.integrators.log_sympflow import LogSympFlow
+from sympflow.integrators.flows import LogSympFlow
 from sympflow.metrics.energy import max_energy_error
 from sympflow.solver import solve
 from sympflow.training.collocation import Stream, states

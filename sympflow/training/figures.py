@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.labels import Labels

@@ -145,7 +145,7 @@ class Ladder:
                 if after is not None and after not in there:
                     if made is None:
                         raise ValueError(f"`rung` {rung!r} starts from {after!r}: make that first, or all of them.")
-                    there[after] = made(after).bound(system)  # type: ignore[assignment]
+                    there[after] = made(after).bound(system)
                 longer = None if after is None else there[after]
                 assert longer is None or isinstance(longer, PrimedFlow)
                 flow = each.train(system, longer, **options)

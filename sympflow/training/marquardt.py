@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap
 from sympflow.training.config import TrainingConfig
 from sympflow.training.losses import Objective
 from sympflow.training.weight_vector import put_weights, weight_vector

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap
 from sympflow.training.config import TrainingConfig
 from sympflow.training.marquardt import GaussNewton
 from sympflow.training.quasi_newton import BFGS, LBFGS

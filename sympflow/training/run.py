@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.scaling import Scaling
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem

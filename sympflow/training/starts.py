@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.split import SplitFlow

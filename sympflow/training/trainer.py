@@ -10,8 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import plain
-from sympflow.flow.arguments import check_system
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap, check_system
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.architecture import check_flow, kind_of, new_primed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.collocation import Points

@@ -12,9 +12,9 @@ from sympflow.flow.io import KEY, load, save
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.potentials import MLPPotential
-from sympflow.flow.record import checksum
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
+from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.domain import Ball, Box
 from sympflow.systems import harmonic_oscillator, henon_heiles
 

@@ -21,9 +21,8 @@ from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.shipped import choose
 from sympflow.hamiltonian.time_transformation import lifted
 from sympflow.integrators.base import Problem
-from sympflow.integrators.log_sympflow import LogSympFlow
-from sympflow.integrators.physical_time import PhysicalRun
-from sympflow.integrators.timed_pass import timed_pass
+from sympflow.integrators.clocks import PhysicalRun, timed_pass
+from sympflow.integrators.flows import LogSympFlow
 from sympflow.interop.scipy import as_scipy
 from sympflow.systems.celestial import kepler_ellipse
 from sympflow.testing.checks import check_integrator

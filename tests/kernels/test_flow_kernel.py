@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from sympflow.flow.activations import ACTIVATIONS
 from sympflow.flow.layers import Drift, Kick
-from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.potentials import ACTIVATIONS, MLPPotential
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.kernels.modules import OPTIONS, load_module, template

@@ -1,31 +1,26 @@
-"""Whether a solution stays in the domain Ω of a flow or of its system, and what is said where it does not."""
+"""Exits of a solution from the domain Ω of a flow or of its system, and what is said of them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import Integrator, Outcome
+from sympflow.integrators.contract import Integrator, Outcome
+
+if TYPE_CHECKING:
+    from sympflow.flow.flow_map import FlowMap
 
 
-def domain_of(flow: Any, system: HamiltonianSystem) -> Domain | None:
-    """Ω of a flow, or else of its system, ready to be asked for states."""
-    domain = getattr(flow, "domain", None) or system.domain
-    if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
-        return system.domain if domain == system.domain else domain.attach(system.hamiltonian)
-    return domain
-
-
-def surely_within(flow: Any, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:
-    """Whether all states y (..., 2d) are in the domain of the flow and compiled code can tell; no more than that."""
-    domain = getattr(flow, "domain", None) or system.domain
+def _surely_within(flow: FlowMap | None, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:
+    """True if all states y (..., 2d) are in the domain of the flow and compiled code can tell."""
+    domain = (None if flow is None else flow.domain) or system.domain
     if type(domain) is not EnergySublevel and type(domain) is not Box:
         return False
     return _compiled()(system, domain, y, slack)
@@ -38,7 +33,11 @@ def _compiled() -> Callable[..., bool]:
     return all_within
 
 
-def check_start(flow: Any, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:
+def _domain(flow: FlowMap | None, system: HamiltonianSystem) -> Domain | None:
+    return system.domain if flow is None else flow.domain_for(system)
+
+
+def check_start(flow: FlowMap, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:
     """A flow that is taken for its accuracy must start where its accuracy was measured.
 
     Raises
@@ -46,9 +45,9 @@ def check_start(flow: Any, system: HamiltonianSystem, y0: Array, compiled: bool)
     ValueError
         If a state of y0 is not in the domain of the flow.
     """
-    if compiled and surely_within(flow, system, y0, 0.0):
+    if compiled and _surely_within(flow, system, y0, 0.0):
         return
-    domain = domain_of(flow, system)
+    domain = _domain(flow, system)
     if domain is None:
         return
     inside = np.asarray(domain.contains(y0))
@@ -60,9 +59,9 @@ def check_start(flow: Any, system: HamiltonianSystem, y0: Array, compiled: bool)
         )
 
 
-def _meaning(flow: Any) -> str:
-    """What is left of a trained flow outside its domain: a primed one still evaluates the system's own forces there."""
-    if flow is None or (hasattr(flow, "evaluations") and any(flow.evaluations(1, 1, 0, "array").values())):
+def _meaning(flow: FlowMap | None) -> str:
+    """The worth of a trained flow outside its domain: a primed one still evaluates the system's own forces there."""
+    if flow is None or any(flow.evaluations(1, 1, 0, "array").values()):
         return ""
     return (
         ", where its network was not trained: it stays finite, even past a singularity, and what it gives from that "
@@ -72,11 +71,11 @@ def _meaning(flow: Any) -> str:
 
 def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:
     """Note the first output outside the domain, or end the run there."""
-    flow = getattr(integrator, "flow_for", lambda system: None)(system)
-    slack = float(getattr(flow, "figures", {}).get("energy_error_max") or 0.0)
-    if outcome.stats.get("backend") == "compiled" and surely_within(flow, system, outcome.y, slack):
+    flow = integrator.flow_for(system)
+    slack = 0.0 if flow is None else float(flow.figures.get("energy_error_max") or 0.0)
+    if outcome.stats.get("backend") == "compiled" and _surely_within(flow, system, outcome.y, slack):
         return
-    domain = domain_of(flow, system)
+    domain = _domain(flow, system)
     if domain is None or not len(outcome.t):
         return
     inside = np.asarray(domain.contains(outcome.y, slack=slack))  # (n, ...)
@@ -96,7 +95,7 @@ def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSy
         which = f" (trajectory {', '.join(map(str, index))}, the first of {count})"
     note = f"The state left the domain at t = {t:.17g}{which}"
     if action == "warn":
-        held = "the figures" if getattr(flow, "certified", None) is None else "the figures and the certificate"
+        held = "the figures" if flow is None or flow.certified is None else "the figures and the certificate"
         outcome.message += f" {note}: {held} of a trained flow do not hold there{_meaning(flow)}."
         return
     outcome.message = f"{note}. Start inside the domain, or pass on_domain_exit='warn'."

@@ -1,4 +1,4 @@
-"""When the solution of a run that could not go on becomes infinite, if it does."""
+"""The time at which the solution of a run that could not go on becomes infinite, if it does."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.integrate import DOP853
 
 from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, Integrator, Outcome, Problem
+from sympflow.integrators.contract import Integrator, Outcome, Problem
 
 TAIL = 200  # steps before the end of a run, at least, from which the solution is followed
 AHEAD = 4  # steps beyond the end: an implicit method gives up before a singularity
@@ -57,7 +57,7 @@ def note_singularities(outcome: Outcome, integrator: Integrator, problem: Proble
             f" The solution{which} itself becomes infinite, at about t = {times[i]:.10g}: no step leads beyond that; "
             "end `t_span` before."
         )
-    elif passed[first] and isinstance(integrator, FixedStep) and integrator.on_grid:
+    elif passed[first] and integrator.on_grid:
         outcome.message += " The solution itself goes on there: it takes shorter steps."
 
 
@@ -67,7 +67,7 @@ def _followed(
     """For the trajectories `rows` the time of the singularity, NaN for none, and whether the solution goes on."""
     system, sign = problem.system, 1.0 if problem.t1 >= problem.t0 else -1.0
     y0 = to_numpy(problem.y0).reshape(-1, 2 * system.ndof)[rows].astype(float)
-    on_grid = isinstance(integrator, FixedStep) and integrator.on_grid
+    on_grid = integrator.on_grid
     n_steps = max(1, outcome.stats.get("n_steps", 0) if problem.y0.ndim == 1 else outcome.stats["n_steps"] / len(rows))
     h = np.maximum(np.abs(failed_at - problem.t0) / n_steps, 1e-300)
     if "dt" in outcome.stats:
