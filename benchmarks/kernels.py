@@ -33,8 +33,8 @@ import sympflow
 from sympflow.flow.sympflow import SympFlow
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES
+from sympflow.studies.attempts import interleaved
 from sympflow.systems import henon_heiles
-from sympflow.timing import interleaved
 
 H = 0.05
 TRAJECTORIES = 1024  # whole blocks, for the hand-written loops have no others

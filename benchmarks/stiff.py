@@ -33,11 +33,11 @@ pin_to_one_thread()
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from sympflow.integrators.exact_maps import known_maps
-from sympflow.integrators.linear_splitting import LinearSplitting
 
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
-from sympflow.flow.io import shipped
+from sympflow.flow.shipped import shipped
+from sympflow.integrators.compositions import known_maps
+from sympflow.integrators.splitting import LinearSplitting
 from sympflow.kernels.parts_loops import parts_loops
 from sympflow.schemes import SCHEMES
 from sympflow.systems.chains import oscillatory_energies

@@ -29,11 +29,11 @@ from contenders.environment import pin_to_one_thread
 pin_to_one_thread()
 
 import numpy as np
-from sympflow.integrators.exact_maps import known_maps
-from sympflow.integrators.linear_splitting import LinearSplitting
 
 from sympflow import HamiltonianSystem, Solution, solve, systems
-from sympflow.flow.io import shipped
+from sympflow.flow.shipped import shipped
+from sympflow.integrators.compositions import known_maps
+from sympflow.integrators.splitting import LinearSplitting
 from sympflow.kernels.parts_loops import parts_loops
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES

@@ -9,11 +9,11 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from sympflow.integrators.log_sympflow import LogSympFlow
 
 from sympflow import HamiltonianSystem, get, solve
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
+from sympflow.integrators.flows import LogSympFlow
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.metrics.reference import reference
 from sympflow.schemes import SCHEMES

@@ -183,7 +183,7 @@ class ClockedFlow(SympFlow):
         return self._numbers.current(lambda: tuple(self.clock.numbers.detach().cpu().double().numpy()[::-1].tolist()))
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Any:
-        from sympflow.kernels.clocked_flow import ClockedFlowKernel
+        from sympflow.kernels.flow_loops import ClockedFlowKernel
 
         if compensated:
             raise ValueError(UNCOMPENSATED)

@@ -583,7 +583,7 @@ class PrimedFlow(SympFlow):
         return self.tables.evaluations(n_steps, n_saved, n_extra, backend)
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Any:
-        from sympflow.kernels.primed_flow import PrimedFlowKernel
+        from sympflow.kernels.flow_loops import PrimedFlowKernel
 
         tables = self.tables
         if compensated:

@@ -381,7 +381,7 @@ class SplitFlow(SympFlow):
         return parts.from_modes(*parts.apply(maps, *parts.to_modes(y.T))).T
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Any:
-        from sympflow.kernels.split_flow import SplitFlowKernel
+        from sympflow.kernels.flow_loops import SplitFlowKernel
 
         if compensated:
             raise ValueError(UNCOMPENSATED)

@@ -292,7 +292,7 @@ class SympFlow(FlowMap):
         return self._kernel.current(self._compiled)
 
     def _compiled(self) -> Any:
-        from sympflow.kernels.mlp_flow import MLPFlowKernel
+        from sympflow.kernels.network_loops import MLPFlowKernel
 
         return MLPFlowKernel(self)
 

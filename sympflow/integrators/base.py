@@ -29,6 +29,7 @@ __all__ = [
     "KernelStepper",
     "Outcome",
     "Problem",
+    "Recorder",
     "Stepper",
     "Steps",
     "checked_state",
@@ -560,6 +561,49 @@ def _join(parts: Sequence[Array]) -> Array:
 
         return torch.cat(list(parts))
     return np.concatenate(parts)
+
+
+# runs whose steps the method chooses -----------------------------------------------------------------
+
+
+class Recorder:
+    """The outputs and events of a run whose steps the method chooses, taken from its steps one by one.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of a single trajectory, or of a batch that shares its steps.
+    times : ndarray of shape (n,)
+        The outputs that are wanted within the steps; none where every step is one.
+    """
+
+    def __init__(self, problem: Problem, times: np.ndarray) -> None:
+        self.search, self.wanted = problem.events, times.tolist()
+        self.sign = 1 if problem.t1 >= problem.t0 else -1
+        self.outputs: list[Array] = [problem.y0 for t in self.wanted if t == problem.t0]
+
+    @property
+    def end(self) -> tuple[float, Array] | None:
+        """The time and state of the event that ended the run, if one did."""
+        return None if self.search is None else self.search.end
+
+    def take(self, t_old: float, y_old: Array, t: float, y: Any, dense: Callable[[float], Array]) -> tuple[float, Any]:
+        """Take a step; return its end, or the event within it that ends the run.
+
+        `y` is the state at t, where it is known; `dense` gives the states within the step.
+        """
+        if self.search is not None:
+            y = dense(t) if y is None else y
+            t, y = self.search.step(t_old, y_old, t, y, dense) or (t, y)
+        while (n := len(self.outputs)) < len(self.wanted) and (self.wanted[n] - t) * self.sign <= 0:
+            s = self.wanted[n]
+            self.outputs.append(dense(s) if y is None or s != t else y)
+        return t, y
+
+    def empty(self, t: float, y: Array) -> None:
+        """Look for events in an interval of length zero."""
+        if self.search is not None:
+            self.search.step(t, y, t, y, lambda s: y)
 
 
 # events of integrators that do not look for them themselves ------------------------------------------

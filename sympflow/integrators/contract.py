@@ -19,7 +19,7 @@ duties 1 to 3 only. Whatever a run changes, such as its kernel and its counts, b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -32,6 +32,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
+    from sympflow.schemes import Scheme
 
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
 """Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
@@ -76,10 +77,14 @@ class Integrator:
     order: ClassVar[int | None]
     symplectic: ClassVar[bool]
     trained: ClassVar[bool] = False
+    scheme: ClassVar[Scheme | None] = None
+    """The scheme of a splitting method."""
     source: ClassVar[str] = ""
-    """Authors, year and place of publication, for tables of methods."""
+    """The citation, or a line on the method, as lists of methods print it."""
     compiles: ClassVar[bool] = False
     finds_events: ClassVar[bool] = False
+    one_by_one: ClassVar[bool] = False
+    """True if the trajectories of a batch are run one after another, at the cost of as many single runs."""
     on_grid: ClassVar[bool] = False
     """True if the steps are those of the grid t0 + k·dt, as a peer that drives them presumes."""
     in_another_time: ClassVar[bool] = False
@@ -91,6 +96,11 @@ class Integrator:
     def options(cls) -> tuple[str, ...]:
         """The names of the options that this method takes."""
         return _field_names(cls)  # type: ignore[arg-type]
+
+    @classmethod
+    def summary(cls) -> str:
+        """Return the `source`, or the first line of the docstring of a method that gives none."""
+        return cls.source or (cls.__doc__ or "").partition("\n")[0]
 
     def check(self, system: HamiltonianSystem) -> None:
         """Raise a ValueError with the reason if the method does not apply to the system."""
@@ -105,8 +115,13 @@ class Integrator:
         return None
 
     def flow_for(self, system: HamiltonianSystem) -> FlowMap | None:
-        """Return the trained flow that is used for a system; None for classical methods."""
+        """Return the trained flow that is used for a system, one in the system's own time; None if there is none."""
         return None
+
+    def figures(self, system: HamiltonianSystem) -> Mapping[str, Any]:
+        """Return the figures of the trained flow that runs, such as `training_seconds`; {} without a flow."""
+        flow = self.flow_for(system)
+        return {} if flow is None else flow.figures
 
     def step_length(self, system: HamiltonianSystem) -> float | None:
         """Return the step that is used for a system; None where the method chooses its steps."""

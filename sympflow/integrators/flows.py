@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import Any, ClassVar, TypeVar
@@ -34,10 +34,6 @@ T = TypeVar("T")
 
 SEARCH, SEARCH_OF_EACH = 50_000, 2_000
 """Forces that take as long as finding the outputs of a run, or of each trajectory in a batch, by their times."""
-_SOURCE = (
-    "P. Canizares, D. Murari, C.-B. Schönlieb, F. Sherry, Z. Shumaylov, Hamiltonian matching for symplectic neural "
-    "integrators (2024)"
-)
 _KNOWN: dict[tuple[Any, ...], Any] = {}
 
 
@@ -70,7 +66,6 @@ class FlowIntegrator(FixedStep):
     order: ClassVar[int | None] = None
     trained: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
-    source: ClassVar[str] = _SOURCE
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -246,6 +241,7 @@ class SympFlowIntegrator(FlowIntegrator):
     compensated: bool = False
 
     name: ClassVar[str] = "sympflow"
+    source: ClassVar[str] = "A trained SympFlow: symplectic for every step length, with an exact inverse."
     symplectic: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -331,6 +327,9 @@ class MLPIntegrator(FlowIntegrator):
     """
 
     name: ClassVar[str] = "mlp"
+    source: ClassVar[str] = (
+        "The paper's baseline: an unconstrained neural flow map. Not symplectic; no inverse, so no backward time."
+    )
     symplectic: ClassVar[bool] = False
 
     def run(self, problem: Problem) -> Outcome:
@@ -368,7 +367,7 @@ class LogSympFlow(FixedStep):
     symplectic: ClassVar[bool] = True
     trained: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
-    source: ClassVar[str] = _SOURCE
+    source: ClassVar[str] = "A SympFlow trained on `sympflow.time_transformed(system)`, in the physical time."
     finds_events: ClassVar[bool] = False  # they are sought on the dense output
     on_grid: ClassVar[bool] = False
     in_another_time: ClassVar[bool] = True
@@ -438,6 +437,9 @@ class LogSympFlow(FixedStep):
             return kernel.reach_times(h, start, times, stride, expected, numbers)
 
         return LogarithmicClock(self.name, system, transformed, inner, dt, new_step, flow.evaluations, reach_times)
+
+    def figures(self, system: HamiltonianSystem) -> Mapping[str, Any]:
+        return {} if self.flow is None else self.flow.figures
 
     def step_length(self, system: HamiltonianSystem) -> float:
         return self.on_clock(system).dt

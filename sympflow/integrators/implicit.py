@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from sympflow.kernels.implicit_loops import ImplicitKernel, Tableau
 
 MOST_ITERATIONS = 50
-_SOURCE = "E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration, 2nd ed. (Springer 2006), II.1.3, VI.4"
 
 
 @dataclass(frozen=True)
@@ -236,8 +235,10 @@ class ImplicitMidpoint(Gauss):
     """
 
     name: ClassVar[str] = "implicit_midpoint"
+    source: ClassVar[str] = (
+        "The implicit midpoint rule, y₁ = y + h f((y + y₁)/2): order 2, symplectic, symmetric, A-stable."
+    )
     order: ClassVar[int | None] = 2
-    source: ClassVar[str] = _SOURCE
     tableau: ClassVar[Tableau] = (((0.5,),), (1.0,))
 
 
@@ -259,6 +260,6 @@ class GaussLegendre4(Gauss):
     """
 
     name: ClassVar[str] = "gauss_legendre4"
+    source: ClassVar[str] = "The Gauss–Legendre method of two stages: order 4, symplectic, symmetric, A-stable."
     order: ClassVar[int | None] = 4
-    source: ClassVar[str] = _SOURCE
     tableau: ClassVar[Tableau] = (((0.25, 0.5 - _A21), (_A21, 0.25)), (0.5, 0.5))

@@ -20,7 +20,7 @@ from sympflow.hamiltonian.time_transformation import default_shift, lifted, proj
 from sympflow.integrators.flows import LogSympFlow
 from sympflow.metrics.energy import max_energy_error
 from sympflow.solver import solve
-from sympflow.training.collocation import Stream, states
+from sympflow.training.points import Stream, states
 
 TOLERANCE = 1e-13
 NEWTON_STEPS = 5  # to the nearest point of an orbit

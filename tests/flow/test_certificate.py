@@ -12,8 +12,8 @@ from safetensors.torch import load_file, save_file
 import sympflow
 from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, solve, systems
 from sympflow.flow.certificate import Certificate, Quantiles, upper_limit
-from sympflow.flow.io import KEY, load, shipped
-from sympflow.flow.shipped import named
+from sympflow.flow.files import KEY, load
+from sympflow.flow.shipped import named, shipped
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 QUICK = {"states": 300, "times": 9, "held_out": 20, "t_end": 100.0}
