@@ -19,6 +19,7 @@ from torch import Tensor
 
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.protocol import Kernel
 
 QUANTILE, CONFIDENCE = 0.95, 0.99  # of the energy errors, and that its limit is one
 SAVED_VALUES = 1_000_000  # of a piece of the measured runs, which are never held whole
@@ -207,7 +208,7 @@ class _Flow(Protocol):
 
     def finish(self, t: Any, x: Tensor) -> Tensor: ...
 
-    def kernel_for(self, system: HamiltonianSystem) -> Any: ...
+    def kernel_for(self, system: HamiltonianSystem) -> Kernel: ...
 
 
 def certify(
@@ -375,9 +376,9 @@ def _orbit(flow: _Flow, system: HamiltonianSystem, y: np.ndarray, done: int, n: 
         orbit[::2] = tensors.cpu().numpy()
         orbit[1::2] = flow(torch.from_numpy(lengths).to(flow.device), tensors[:-1]).cpu().numpy()
         return orbit
-    orbit[::2] = kernel.run_batch(flow.dt, y, n, np.arange(n + 1))[0].swapaxes(0, 1)
+    orbit[::2] = kernel.run_batch(flow.dt, y, n, np.arange(n + 1)).states.swapaxes(0, 1)
     rows = orbit[:-1:2].reshape(-1, y.shape[1])
-    orbit[1::2] = kernel.step(lengths.ravel(), rows).reshape(n, *y.shape)
+    orbit[1::2] = kernel.step(lengths.ravel(), rows).states.reshape(n, *y.shape)
     return orbit
 
 

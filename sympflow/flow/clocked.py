@@ -13,7 +13,7 @@ with the c_k trained, orbit and time are exact but for what the series leaves ou
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -24,9 +24,12 @@ from sympflow.flow.layers import Drift, Kick, Layer
 from sympflow.flow.potentials import Potential, Time
 from sympflow.flow.primed_potentials import KINETIC, POTENTIAL, Binding, PrimedPotential
 from sympflow.flow.sympflow import UNCOMPENSATED, SympFlow
-from sympflow.flow.weights import Kept, checked_device, checked_dtype
+from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, scheme_evaluations
+
+if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.kernels.flow_loops import ClockedFlowKernel
 
 
 class ClockPotential(Potential):
@@ -144,7 +147,7 @@ class ClockedFlow(SympFlow):
         self.scheme = table
         self.clock = ClockPotential(ndof, terms, checked_dtype(dtype), checked_device(device))
         self._binding = Binding(system)
-        self._loops: Any = None  # compiled, of the system that was asked for last
+        self._loops: ClockedFlowKernel | None = None  # compiled, of the system that was asked for last
         self._numbers: Kept[tuple[float, ...]] = Kept([self.clock._parameters])
         maps: list[Layer] = []
         for kind, c, *_ in table.substeps:
@@ -182,13 +185,14 @@ class ClockedFlow(SympFlow):
         """Return the c_k that the clock has now, the last one first."""
         return self._numbers.current(lambda: tuple(self.clock.numbers.detach().cpu().double().numpy()[::-1].tolist()))
 
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Any:
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> ClockedFlowKernel:
         from sympflow.kernels.flow_loops import ClockedFlowKernel
 
         if compensated:
             raise ValueError(UNCOMPENSATED)
+        check_compilable(self.dtype, self.device)
         if self._loops is None or self._loops.system is not system:
-            self._loops = ClockedFlowKernel(self, system)
+            self._loops = ClockedFlowKernel(self.scheme, system, self.advance, self.clock_numbers)
         return self._loops
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:

@@ -19,6 +19,7 @@ from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import same_system
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.protocol import Kernel
 
 MAX_STEPS = 10_000_000  # of one call
 
@@ -253,10 +254,8 @@ class FlowMap(nn.Module):
         """χ_t(x), unchecked: the output of such a run."""
         return x
 
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Any:
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         """Return the compiled loops of the flow with its present weights, the same while these do not change.
-
-        They have `run`, `run_batch` and `step`, see `sympflow.kernels`.
 
         Parameters
         ----------

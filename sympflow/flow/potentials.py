@@ -12,15 +12,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from sympflow.arguments import plain
 from sympflow.flow.weights import checked_device, checked_dtype
 
+if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.kernels.network_loops import NetworkLayer
+
 Time = float | Tensor
+
+NO_NETWORK = "`flow` has layers other than kicks and drifts with MLP potentials: use backend='array'."
 
 
 class Activation:
@@ -149,6 +155,10 @@ class Potential(nn.Module):
     def to_dict(self) -> dict[str, Any]:
         raise NotImplementedError
 
+    def network(self, is_kick: bool) -> NetworkLayer:
+        """Return the weights of a kick or drift of it for compiled loops; ValueError if there are none."""
+        raise ValueError(NO_NETWORK)
+
 
 class MLPPotential(Potential):
     """V(t, x) = c · N(t/τ, x/s), N a multilayer perceptron of any depth whose input is x with t appended.
@@ -240,6 +250,16 @@ class MLPPotential(Potential):
         """The weights (K/s, k/τ, [b_l], [W_l], c·w): V(t, x) = c·w · σ(… σ((K/s) x + (k/τ) t + b_1) …)."""
         K, k, w = self.weight_x / self.scale, self.weight_t / self.tau, self.gain * self.weight_out
         return K, k, list(self.biases), list(self.weights), w
+
+    def network(self, is_kick: bool) -> NetworkLayer:
+        from sympflow.kernels.network_loops import NetworkLayer
+
+        K, k, b, W, w = self.folded()
+
+        def array(weight: Tensor) -> np.ndarray:
+            return weight.detach().cpu().numpy()
+
+        return NetworkLayer(is_kick, self.activation, array(K), array(k), [*map(array, b)], [*map(array, W)], array(w))
 
     # V and its derivatives at one time ---------------------------------------------------------------
 

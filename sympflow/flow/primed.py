@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -40,12 +40,16 @@ from sympflow.flow.primed_potentials import (
     Term,
 )
 from sympflow.flow.sympflow import SympFlow
-from sympflow.flow.weights import Kept, checked_device, checked_dtype, compilable
+from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.monomials import MOST_MONOMIALS, Monomials, monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE as CURVATURE_LEVEL
 from sympflow.schemes import POLYNOMIAL as POLYNOMIAL_LEVEL
 from sympflow.schemes import SCHEMES, Scheme, compose, scheme_evaluations
+
+if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.kernels.flow_loops import PrimedFlowKernel
+    from sympflow.kernels.stages import StageTable
 
 Kind = Literal["kick", "drift"]
 
@@ -245,11 +249,11 @@ class Tables:
         last = len(substeps) - outer
         self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
         self.dt, self.processed = dt, outer > 0
-        self.kernel: Any = None  # the compiled loops that were made of these last
+        self.kernel: PrimedFlowKernel | None = None  # the compiled loops that were made of these last
         self.monomials = monomials
         self.level = POLYNOMIAL_LEVEL if monomials else max(len(s.more) for s in substeps)
         numbers = [c.table for c in columns_of(substeps)]
-        self.compilable = all(compilable(c) for c in numbers)
+        self.placements = {(c.dtype, c.device) for c in numbers}
         exponents = columns_of(substeps)[0].exponents
         self._coefficients = {id(c): c.table.detach().cpu().double().numpy() for c in columns_of(substeps)}
         self._exponents = np.array(exponents, dtype=float)
@@ -272,22 +276,23 @@ class Tables:
 
         return self.kept((part, t, back), make)
 
-    def polynomials(self, back: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Kicks, drifts, gradients and curvatures (m, K) of the stages of ψ̄_t, or of its inverse.
+    def polynomials(self, back: bool) -> StageTable:
+        """The stages of ψ̄_t or of its inverse for all t, as coefficients of polynomials (m, K).
 
-        They are divided by t, t, t³ and t⁵. They multiply the powers 0 … K−1 of `variable`; K is at least 3, by zeros
-        if need be. In place of curvatures there may be polynomials (m, M, K), divided by t³.
+        Kicks and drifts are divided by t, gradients and polynomials in q by t³, curvatures by t⁵. They multiply the
+        powers 0 … K−1 of `variable`; K is at least 3, by zeros if need be.
         """
 
-        def make() -> tuple[np.ndarray, ...]:
+        from sympflow.kernels.stages import StageTable
+
+        def make() -> StageTable:
             parts, sign = self._parts["primed"], -1 if back else 1
             substeps = reversed(parts) if back else parts
             stages = self._stages((s.kind, _numbers(s, self._coefficients, sign)) for s in substeps)
             numbers = np.array(stages, dtype=float)  # (m, columns, K)
             numbers = np.pad(numbers, ((0, 0), (0, 0), (0, max(0, 3 - numbers.shape[2]))))
-            kicks, gradients, drifts = numbers[:, 0], numbers[:, 1], numbers[:, -1]
-            more = numbers[:, 3:-1] if self.monomials else numbers[:, 2]
-            return tuple(np.ascontiguousarray(c) for c in (kicks, drifts, gradients, more))
+            kicks, gradients, curvatures = (numbers[:, i] for i in range(3))
+            return StageTable(self.level, kicks, numbers[:, -1], gradients, curvatures, numbers[:, 3:-1])
 
         return self.kept(("polynomials", back), make)
 
@@ -582,14 +587,16 @@ class PrimedFlow(SympFlow):
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return self.tables.evaluations(n_steps, n_saved, n_extra, backend)
 
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Any:
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> PrimedFlowKernel:
         from sympflow.kernels.flow_loops import PrimedFlowKernel
 
         tables = self.tables
+        for placement in tables.placements:
+            check_compilable(*placement)
         if compensated:
-            return PrimedFlowKernel(self, system, compensated=True)
+            return PrimedFlowKernel(tables, system, compensated=True)
         if tables.kernel is None or tables.kernel.system is not system:
-            tables.kernel = PrimedFlowKernel(self, system)
+            tables.kernel = PrimedFlowKernel(tables, system)
         return tables.kernel
 
     # kernel and processor as maps ---------------------------------------------------------------------------

@@ -12,7 +12,7 @@ are the untrained cases. Frozen at any t the flow is a list of maps, and runs in
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -26,10 +26,13 @@ from sympflow.flow.flow_map import FlowMap, check_system
 from sympflow.flow.layers import Layer
 from sympflow.flow.potentials import Time
 from sympflow.flow.sympflow import UNCOMPENSATED, SympFlow
-from sympflow.flow.weights import Kept, checked_device, checked_dtype, compilable
+from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.expression import Unreadable, read
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, map_evaluations
 from sympflow.hamiltonian.system import HamiltonianSystem
+
+if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.kernels.flow_loops import SplitFlowKernel
 
 MOST_KEPT = 64  # steps whose maps are kept
 KINDS_OF_MODES = ("oscillator", "hyperbolic", "free", "idle")
@@ -67,17 +70,17 @@ class KeptMaps:
 
     Attributes
     ----------
-    compilable : bool
-        True for numbers that are float64 on the CPU: asked once, as torch answers slowly.
+    placement : tuple
+        Dtype and device of the numbers: asked once, as torch answers slowly.
     """
 
     def __init__(
         self, make: Callable[[np.ndarray], list[Map]], coefficients: list[Map], dt: float, like: Tensor
     ) -> None:
         self._make, self._dt = make, dt
-        self.kernel: Any = None  # the compiled loops that were made of these last
+        self.kernel: SplitFlowKernel | None = None  # the compiled loops that were made of these last
         self._coefficients = coefficients, [m.inverse() for m in reversed(coefficients)]
-        self.compilable = compilable(like)
+        self.placement = like.dtype, like.device
         self._maps: dict[float, list[Map]] = {}
         self._counts: dict[tuple[int, int, int, str], dict[str, int]] = {}
 
@@ -380,15 +383,16 @@ class SplitFlow(SympFlow):
         parts = self.parts
         return parts.from_modes(*parts.apply(maps, *parts.to_modes(y.T))).T
 
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Any:
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> SplitFlowKernel:
         from sympflow.kernels.flow_loops import SplitFlowKernel
 
         if compensated:
             raise ValueError(UNCOMPENSATED)
         flow = self.bound(system)
         frozen = flow.frozen()
+        check_compilable(*frozen.placement)
         if frozen.kernel is None or frozen.kernel.parts is not flow.parts:
-            frozen.kernel = SplitFlowKernel(flow)
+            frozen.kernel = SplitFlowKernel(frozen, flow.parts, flow.dt)
         return frozen.kernel
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -21,9 +21,13 @@ from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.layers import LAYERS, Drift, Kick, Layer
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
-from sympflow.flow.weights import Kept
+from sympflow.flow.weights import Kept, check_compilable
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.protocol import Kernel
 from sympflow.schemes import Scheme
+
+if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.kernels.network_loops import MLPFlowKernel
 
 UNCOMPENSATED = (
     "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave it out, or take a "
@@ -69,7 +73,7 @@ class SympFlow(FlowMap):
 
     kind = "sympflow"
     symplectic = True
-    _kernel: Kept[Any] | None = None
+    _network: Kept[Any] | None = None
 
     def __init__(
         self,
@@ -284,17 +288,19 @@ class SympFlow(FlowMap):
             dt,
         )
 
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Any:
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         if compensated:
             raise ValueError(UNCOMPENSATED)
-        if self._kernel is None:
-            self._kernel = Kept(d for m in self.modules() for d in (m._parameters, m._buffers))
-        return self._kernel.current(self._compiled)
+        if self._network is None:
+            self._network = Kept(d for m in self.modules() for d in (m._parameters, m._buffers))
+        return self._network.current(self._compiled)
 
-    def _compiled(self) -> Any:
+    def _compiled(self) -> MLPFlowKernel:
         from sympflow.kernels.network_loops import MLPFlowKernel
 
-        return MLPFlowKernel(self)
+        networks = [layer.network() for layer in self.layers]  # type: ignore[operator]
+        check_compilable(self.dtype, self.device)
+        return MLPFlowKernel(self.ndof, networks)
 
     def hamiltonian(self, t: float | Tensor, x: Tensor) -> Tensor:
         """𝓗(ψ̄)(t, x), (...), for t ∈ [0, Δt]: the Hamiltonian of which ψ̄_t is the exact flow.

@@ -58,9 +58,10 @@ def checked_device(device: Any) -> torch.device | None:
     return there
 
 
-def compilable(weight: Tensor) -> bool:
-    """Return True for float64 on the CPU, which compiled loops need."""
-    return weight.dtype == torch.float64 and weight.device.type == "cpu"
+def check_compilable(dtype: torch.dtype, device: torch.device) -> None:
+    """Raise a ValueError unless the numbers of a flow are float64 on the CPU, which compiled loops need."""
+    if dtype != torch.float64 or device.type != "cpu":
+        raise ValueError(f"`flow` is {dtype} on {device}: compiled flows are float64 on the CPU.")
 
 
 def checksum(tensors: Mapping[str, Tensor]) -> str:

@@ -25,14 +25,7 @@ __all__ = [
     "PrimedFlowKernel",
     "SplitFlowKernel",
     "TableSource",
-    "check_placement",
 ]
-
-
-def check_placement(dtype: object, device: object) -> None:
-    """Raise a ValueError unless the numbers of a flow are float64 on the CPU."""
-    if str(dtype) != "torch.float64" or str(device) != "cpu":
-        raise ValueError(f"`flow` is {dtype} on {device}: compiled flows are float64 on the CPU.")
 
 
 class TableSource(Protocol):

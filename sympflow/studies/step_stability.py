@@ -18,7 +18,6 @@ from sympflow.arguments import MAX_SAVED_VALUES, check_counts, check_t_span
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
-from sympflow.integrators.domain_exit import domain_of
 from sympflow.metrics.energy import max_energy_error
 from sympflow.metrics.symplectic import symplecticity_defect, volume_error
 from sympflow.solution import Solution
@@ -330,7 +329,7 @@ def domain_exit(sols: Sequence[Solution]) -> float | None:
     """The time at which the first trajectory leaves the domain of the flow, or of the system."""
     system = sols[0].system
     flow = sols[0].integrator.flow_for(system)
-    domain = domain_of(flow, system)
+    domain = system.domain if flow is None else flow.domain_for(system)
     if domain is None:
         return None
     slack = 0.0 if flow is None else float(flow.figures.get("energy_error_max") or 0.0)
