@@ -37,9 +37,9 @@ from measuring.race import MOST_FORCES, Measure, Row, Runner, fewest_steps, race
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, time_transformed, train
-from sympflow.fingerprints import same_system
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
+from sympflow.hamiltonian.fingerprint import same_system
 from sympflow.training.recipes import PrimedRecipe
 
 TARGETS = (1e-4, 1e-6, 1e-8)

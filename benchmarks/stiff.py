@@ -34,8 +34,8 @@ from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
 from sympflow.flow.io import shipped
-from sympflow.integrators.schemes import SCHEMES
-from sympflow.systems.fput import oscillatory_energies
+from sympflow.schemes import SCHEMES
+from sympflow.systems import oscillatory_energies
 
 T_END, INSTANTS = 200.0, 1000
 DENSE = 20_000  # instants at which I is compared: it oscillates fast, and a thousand miss its largest values

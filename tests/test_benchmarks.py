@@ -44,8 +44,8 @@ from measuring import fragments
 from measuring import race as at_equal_error
 
 from sympflow import SympFlow, shipped_flows
-from sympflow.fingerprints import same_system
-from sympflow.integrators.schemes import SCHEMES
+from sympflow.hamiltonian.fingerprint import same_system
+from sympflow.schemes import SCHEMES
 from sympflow.systems import henon_heiles, kepler, pendulum
 
 TINY = Scene(t_end=20.0, n_instants=20, trajectories=70)  # more than a block of the hand-written loops, and not two

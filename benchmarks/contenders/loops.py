@@ -15,7 +15,7 @@ import torch
 from numba import njit
 
 from contenders.contender import Contender, Scene, whole_steps
-from sympflow.integrators.schemes import SCHEMES
+from sympflow.schemes import SCHEMES
 
 OPTIONS = {"error_model": "numpy", "fastmath": {"contract"}}
 LANES = 64

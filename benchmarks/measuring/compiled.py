@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from sympflow import HamiltonianSystem
-from sympflow.integrators.schemes import SCHEMES
 from sympflow.kernels.splitting import splitting_kernel
+from sympflow.schemes import SCHEMES
 
 # What belongs to flows and to linear parts is imported where it is used: the start-up of a scheme, which kernels.py
 # times, imports neither.
