@@ -134,6 +134,19 @@ def test_quoted_figures_stand_in_their_fragments(page):
             assert stands_in(figure, figures(table)), f"{page.name} quotes {figure}, which is not in {fragment}"
 
 
+def test_the_diagrams_are_those_of_the_package():
+    diagrams = runpy.run_path(str(ROOT / "docs" / "diagrams.py"))
+    for name in ("rooms", "solve"):
+        drawn = (ROOT / "docs" / "figures" / f"{name}.svg").read_text(encoding="utf-8")
+        assert drawn == diagrams[name](), f"python docs/diagrams.py draws another {name}.svg"
+    rooms = [room for row, _ in diagrams["ROOMS"] for room in row]
+    package = ROOT / "sympflow"
+    for room in rooms:
+        assert (package / room / "__init__.py").exists() or (package / f"{room}.py").exists(), room
+    for folder in package.glob("*/__init__.py"):
+        assert folder.parent.name in rooms, folder.parent.name
+
+
 def test_every_fragment_is_included_and_says_where_it_is_from():
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     for fragment in MEASURED.glob("*.md"):
