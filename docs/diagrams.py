@@ -101,7 +101,7 @@ def rooms() -> str:
 def solve() -> str:
     """The way of y0 through `solve`."""
     parts, y, left = [], float(MARGIN), 324.0
-    for i, (name, word, lines) in enumerate(SOLVE):
+    for i, (name, _, lines) in enumerate(SOLVE):
         height = 20 + LINE * len(lines)
         parts.append(box(MARGIN, y, left, height))
         parts.append(text(MARGIN + 12, y + height / 2 + 5, name, 14, INK, "600"))

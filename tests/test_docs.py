@@ -88,7 +88,7 @@ def test_the_site_builds_without_warnings(tmp_path):
 
 # figures ----------------------------------------------------------------------------------------------
 
-QUOTES = re.compile(r"<!-- quotes (?P<fragment>[\w-]+): (?P<figures>[^>]+?) -->")
+QUOTES = re.compile(r"^(?!    ).*?<!-- quotes (?P<fragment>[\w-]+): (?P<figures>[^>]+?) -->", re.MULTILINE)
 FIGURE = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[-+−]?\d+)?")
 
 
