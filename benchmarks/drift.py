@@ -134,7 +134,7 @@ def main() -> None:
     steps = QUICK_STEPS if options.quick else options.steps
     found = run(steps, options.system or (["pendulum"] if options.quick else None))
     print(f"\n{sum(d.passed for d in found)} of {len(found)} flows show no drift over {steps:,} steps.")
-    fragments.write(options.out, "drift", failures(found), "drift.py")
+    fragments.write(options.out, "drift", failures(found))
 
 
 if __name__ == "__main__":

@@ -188,7 +188,7 @@ def main() -> None:
         for row in result["solve_ivp"]
     ]
     titles = ("solver", "a step, of SciPy's RK45", "with a state within the step")
-    fragments.write(arguments.out, "interop-steps", fragments.table(titles, steps), "interop.py")
+    fragments.write(arguments.out, "interop-steps", fragments.table(titles, steps))
     ratios = [
         (
             row["method"],
@@ -199,7 +199,7 @@ def main() -> None:
         for row in rows
     ]
     titles = ("method", "error", "times faster", "with gradients")
-    fragments.write(arguments.out, "interop-odeint", fragments.table(titles, ratios), "interop.py")
+    fragments.write(arguments.out, "interop-odeint", fragments.table(titles, ratios))
     found = result["zeros_of_cos"]
     print(f"\n{found['found']} zeros of cos t found, the worst wrong by {found['error']:.1e}")
     if arguments.json:

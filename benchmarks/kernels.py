@@ -177,9 +177,7 @@ def main() -> None:
         print(*rows, sep="\n")
         found += rows
     cells = [(r.what, f"{r.measured:.3g} {r.unit}", r.verdict, r.note) for r in found]
-    fragments.write(
-        options.out, "kernels", fragments.table(("what", "measured", "limit", "in detail"), cells), "kernels.py"
-    )
+    fragments.write(options.out, "kernels", fragments.table(("what", "measured", "limit", "in detail"), cells))
 
 
 if __name__ == "__main__":

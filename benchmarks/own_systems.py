@@ -126,7 +126,7 @@ def main(given: list[str] | None = None) -> None:
     for name in arguments.systems or SYSTEMS:
         lines.append(row(name, SYSTEMS[name], arguments.quick))
         print(lines[-1], flush=True)
-    fragments.write(arguments.out, "own-systems", "\n".join(lines), "own_systems.py")
+    fragments.write(arguments.out, "own-systems", "\n".join(lines))
 
 
 if __name__ == "__main__":

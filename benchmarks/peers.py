@@ -52,7 +52,7 @@ def main() -> None:
     figure = arguments.out.parent / "figures" / "work_precision_peers.png"
     tables.draw(results, figure)
     for name, body in tables.fragments(results).items():
-        fragments.write(arguments.out, name, body, "peers.py")
+        fragments.write(arguments.out, name, body)
 
 
 def run(arguments: argparse.Namespace) -> Results:

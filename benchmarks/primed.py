@@ -212,8 +212,7 @@ def run(options: argparse.Namespace) -> str:
     if options.ablation:
         system = getattr(systems, (options.system or ["henon_heiles"])[0])()
         found = ablation(system, 0.6, ABLATION[:3] if options.quick else ABLATION, **quick)
-        limit = f" --fit-seconds {options.fit_seconds:g}" if options.fit_seconds else ""
-        fragments.write(options.out, "primed-ablation", found, f"primed.py --ablation{limit}")
+        fragments.write(options.out, "primed-ablation", found)
         return found
     rows: list[Row] = []
     for name in options.system or FLOWS:
@@ -236,7 +235,7 @@ def run(options: argparse.Namespace) -> str:
                 print(table([row]).splitlines()[-1], flush=True)
     if options.json:
         options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
-    fragments.write(options.out, "primed-race", fragment(rows), "primed.py")
+    fragments.write(options.out, "primed-race", fragment(rows))
     return "\n" + table(rows)
 
 

@@ -239,7 +239,7 @@ def main() -> None:
     torch.set_num_threads(1)
     for idea, table in run(options.idea or list(IDEAS), options.quick).items():
         print("\n" + table)
-        fragments.write(options.out, f"ideas-{idea}", table, f"primed_ideas.py --idea {idea}")
+        fragments.write(options.out, f"ideas-{idea}", table, f"--idea {idea}")
 
 
 if __name__ == "__main__":

@@ -150,7 +150,7 @@ def main() -> None:
     years = options.years or (1e3 if options.quick else 1e5)
     found = run(years, options.target, options.repeats, QUICK if options.quick else None)
     print("\n" + found)
-    fragments.write(options.out, "solar-system", found, "solar_system.py")
+    fragments.write(options.out, "solar-system", found)
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ def main() -> None:
             start = time.perf_counter()
             for name, body in SECTIONS[section](figures).items():
                 print(f"\n{name}\n\n{body}", flush=True)
-                write(arguments.out, f"stability-{name}", body, f"stability.py --only {section}")
+                write(arguments.out, f"stability-{name}", body, f"--only {section}")
             print(f"\n{section}: {time.perf_counter() - start:.0f} s", flush=True)
 
 

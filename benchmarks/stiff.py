@@ -302,7 +302,7 @@ def main() -> None:
     for section, measure in measured:
         for name, body in measure().items():
             print(f"\n{name}\n\n{body}", flush=True)
-            fragments.write(options.out, name, body, f"stiff.py --only {section}")
+            fragments.write(options.out, name, body, f"--only {section}")
 
 
 if __name__ == "__main__":

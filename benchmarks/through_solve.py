@@ -154,7 +154,7 @@ def main(arguments: list[str] | None = None) -> None:
     for omega in TURN:
         rows += report(f"FPUT, ω = {omega:g}", fput(omega, options.quick), options.quick)
     titles = ("call", "flow, ms", "scheme, ms", "times faster", "loops alone")
-    fragments.write(options.out, "through-solve", fragments.table(titles, rows), "through_solve.py")
+    fragments.write(options.out, "through-solve", fragments.table(titles, rows))
 
 
 if __name__ == "__main__":

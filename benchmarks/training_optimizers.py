@@ -145,10 +145,7 @@ def main() -> None:
     scenes = options.scene or ["harmonic_oscillator", "henon_heiles"]
     found = run(seconds, scenes, options.kind or ["sympflow", "mlp"], options.optimizer or list(OPTIMIZERS))
     print("\n" + found)
-    kinds = "".join(f" --kind {kind}" for kind in options.kind or [])
-    fragments.write(
-        options.out, "training-optimizers", found, f"training_optimizers.py{kinds} --seconds {options.seconds:g}"
-    )
+    fragments.write(options.out, "training-optimizers", found)
 
 
 if __name__ == "__main__":

@@ -129,7 +129,7 @@ def main() -> None:
             rows.append((system.name, name, f"{1e3 * seconds:.2f}", f"{ratio:.1f}"))
             print(f"{system.name:<22}{name:<34}{1e3 * seconds:>10.2f}{ratio:>14.1f}")
     titles = ("system", "way", "ms a step", "times slower")
-    fragments.write(options.out, "training-step", fragments.table(titles, rows), "training_step.py")
+    fragments.write(options.out, "training-step", fragments.table(titles, rows))
 
 
 if __name__ == "__main__":

@@ -227,14 +227,16 @@ def test_a_tiny_run_fills_the_fragments_and_survives_json(tmp_path):
     assert (tmp_path / "figure.png").stat().st_size > 0
 
 
-def test_a_fragment_says_where_it_is_from(tmp_path):
-    fragments.write(tmp_path / "measured", "one", fragments.table(["a", "b"], [[1, 2]]), "drift.py --quick")
+def test_a_fragment_says_where_it_is_from(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["benchmarks/drift.py", "--quick", "--out", "docs/measured", "--steps", "9"])
+    fragments.write(tmp_path / "measured", "one", fragments.table(["a", "b"], [[1, 2]]))
     table, source = (tmp_path / "measured" / "one.md").read_text(encoding="utf-8").strip().split("\n\n")
     assert table == "| a | b |\n| --- | --- |\n| 1 | 2 |"
     assert re.fullmatch(
-        r"<small>`python benchmarks/drift.py --quick` · .+ · commit .+ · \d{4}-\d\d-\d\d</small>", source
+        r"<small>`python benchmarks/drift.py --quick --steps 9` · .+ · commit .+ · \d{4}-\d\d-\d\d</small>", source
     )
-    fragments.write(None, "two", "", "")  # printed only
+    assert fragments.command_line("--only kepler").endswith("drift.py --quick --steps 9 --only kepler")
+    fragments.write(None, "two", "")  # printed only
 
 
 def test_every_fragment_has_a_command_that_writes_it():

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import math
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 from measuring import machine
 
 FOLDER = "docs/measured"
+FILES = ("--out", "--json", "--results")
 
 
 def add_out(parser: argparse.ArgumentParser) -> None:
@@ -23,8 +25,8 @@ def add_out(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, help=f"folder of the fragments, {FOLDER} for the pages; none without it")
 
 
-def write(folder: Path | None, name: str, body: str, command: str) -> None:
-    """Write a fragment: `body`, measured by `python benchmarks/{command}`, into `folder`, if there is one.
+def write(folder: Path | None, name: str, body: str, section: str = "") -> None:
+    """Write a fragment into `folder`, if there is one.
 
     Parameters
     ----------
@@ -32,13 +34,24 @@ def write(folder: Path | None, name: str, body: str, command: str) -> None:
         Of the file, without its ending.
     body : str
         Markdown, a table as a rule. Headings belong to the page.
+    section : str
+        Options that measure this fragment alone, for a command that measures several.
     """
     if folder is None:
         return
     folder.mkdir(parents=True, exist_ok=True)
     today = datetime.date.today().isoformat()
-    text = with_source(body, f"python benchmarks/{command}", machine.in_words(), machine.commit(), today)
+    text = with_source(body, command_line(section), machine.in_words(), machine.commit(), today)
     (folder / f"{name}.md").write_text(text, encoding="utf-8")
+
+
+def command_line(section: str = "") -> str:
+    """The command that runs, without the files that it writes; with `section` where it runs several."""
+    script, *given = sys.argv
+    words = [word for before, word in zip(["", *given], given, strict=False) if not {before, word} & set(FILES)]
+    if section and section.split()[0] not in words:
+        words.append(section)
+    return " ".join(["python", f"benchmarks/{Path(script).name}", *words])
 
 
 def with_source(body: str, command: str, machine_in_words: str, commit: str, date: str) -> str:
