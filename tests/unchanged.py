@@ -49,6 +49,7 @@ import torch
 import torchdiffeq
 from numba import njit
 from scipy.integrate import solve_ivp
+from sympflow.integrators.checks import check_integrator
 from sympflow.integrators.scheme import Scheme
 from sympflow.integrators.schemes import SCHEMES
 from torch import Tensor, nn, tensor
@@ -80,7 +81,6 @@ from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import MLPPotential, Potential
 from sympflow.flow.scaling import Scaling
 from sympflow.integrators.base import FixedStep, Integrator, Outcome
-from sympflow.integrators.checks import check_integrator
 from sympflow.interop.scipy import as_scipy
 from sympflow.interop.systems import from_hamiltonian, from_module
 from sympflow.interop.torchdiffeq import odeint, odeint_adjoint, odeint_event
