@@ -27,8 +27,8 @@ import numpy as np
 
 import sympflow
 from sympflow import HamiltonianSystem, energy_drift, solve, systems
-from sympflow.fingerprints import same_system
 from sympflow.flow.shipped import ShippedFlow
+from sympflow.hamiltonian.fingerprint import same_system
 
 STEPS, OUTPUTS, BLOCKS = 1_000_000, 1000, 20
 QUICK_STEPS = 20_000

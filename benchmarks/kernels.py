@@ -31,9 +31,9 @@ from training_step import autodiff_map, published_value
 
 import sympflow
 from sympflow.flow.sympflow import SympFlow
-from sympflow.integrators.schemes import SCHEMES
 from sympflow.kernels.mlp_flow import mlp_flow_kernel
 from sympflow.kernels.splitting import splitting_kernel
+from sympflow.schemes import SCHEMES
 from sympflow.systems import henon_heiles
 from sympflow.timing import interleaved
 

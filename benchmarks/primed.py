@@ -36,9 +36,9 @@ from contenders.primed_race import Measure, Row, Runner, fewest_steps, race, sch
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, time_transformed, train
-from sympflow.fingerprints import same_system
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
+from sympflow.hamiltonian.fingerprint import same_system
 from sympflow.training.recipes import PrimedRecipe
 
 TARGETS = (1e-4, 1e-6, 1e-8)

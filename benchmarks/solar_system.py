@@ -30,7 +30,7 @@ from contenders.primed_race import MOST_FORCES, SHORTEST, fewest_steps
 import sympflow
 from sympflow import HamiltonianSystem, Solution, solve
 from sympflow.flow.primed import PrimedFlow
-from sympflow.integrators.schemes import SCHEMES
+from sympflow.schemes import SCHEMES
 from sympflow.systems import outer_solar_system
 
 YEAR = 365.25  # days

@@ -30,7 +30,7 @@ import sympflow
 from sympflow import HamiltonianSystem, energy_growth, get, max_energy_error, solve, stability, systems
 from sympflow.integrators.log_sympflow import LogSympFlow
 from sympflow.studies.stability_report import StabilityReport, StabilityRow
-from sympflow.systems.fput import oscillatory_energies
+from sympflow.systems.chains import oscillatory_energies
 
 CLASSICAL = ("verlet", "leapfrog", "blanes_moan4", "srkn11b", "kahan_li8", "implicit_midpoint", "gauss_legendre4")
 LINEAR = ("impulse", "mollified_impulse", "implicit_explicit", "linear_srkn14a")

@@ -38,9 +38,9 @@ from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
 from sympflow.flow.io import shipped
 from sympflow.integrators.exact_maps import kernel_of, known_maps
 from sympflow.integrators.linear_splitting import LinearSplitting
-from sympflow.integrators.schemes import SCHEMES
 from sympflow.kernels.parts import PartsKernel
-from sympflow.systems.fput import oscillatory_energies
+from sympflow.schemes import SCHEMES
+from sympflow.systems.chains import oscillatory_energies
 
 T_END, INSTANTS = 200.0, 1000
 DENSE = 20_000  # instants at which I is compared: it oscillates fast, and a thousand miss its largest values

@@ -34,9 +34,9 @@ from sympflow import HamiltonianSystem, Solution, solve, systems
 from sympflow.flow.io import shipped
 from sympflow.integrators.exact_maps import kernel_of, known_maps
 from sympflow.integrators.linear_splitting import LinearSplitting
-from sympflow.integrators.schemes import SCHEMES
 from sympflow.kernels.parts import PartsKernel
 from sympflow.kernels.splitting import splitting_kernel
+from sympflow.schemes import SCHEMES
 
 DT = 0.625  # of srkn11b
 TURN = {50.0: 1.43, 1000.0: 3.28}  # dt ω of chin4a, at which its energy error is below 1e-4

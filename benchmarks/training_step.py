@@ -25,7 +25,7 @@ from sympflow.flow.layers import Kick
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.systems import harmonic_oscillator, henon_heiles
 from sympflow.training.collocation import Points, PointSource
 from sympflow.training.losses import Loss

@@ -3,18 +3,21 @@
 The public names are loaded when first used (PEP 562): importing sympflow loads neither torch, SciPy nor matplotlib.
 """
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from sympflow.lazy import FORMER_PATHS, whole_import
 
 __version__ = "0.1.0"
 
 _HOME = {
-    "HamiltonianSystem": "system",
-    "Ball": "domain",
-    "Box": "domain",
-    "EnergySublevel": "domain",
-    "Tube": "tube",
-    "time_transformed": "time_transformation",
+    "HamiltonianSystem": "hamiltonian.system",
+    "Ball": "hamiltonian.domain",
+    "Box": "hamiltonian.domain",
+    "EnergySublevel": "hamiltonian.domain",
+    "Tube": "hamiltonian.domain",
+    "time_transformed": "hamiltonian.time_transformation",
     "solve": "solver",
     "Solution": "solution",
     "get": "integrators.registry",
@@ -46,13 +49,16 @@ __all__ = ["__version__", *_HOME, *_MODULES]  # noqa: PLE0604
 if TYPE_CHECKING:
     from sympflow import interop as interop
     from sympflow import systems as systems
-    from sympflow.domain import Ball as Ball
-    from sympflow.domain import Box as Box
-    from sympflow.domain import EnergySublevel as EnergySublevel
     from sympflow.flow.io import load as load
     from sympflow.flow.mlp import MLPFlow as MLPFlow
     from sympflow.flow.shipped import shipped_flows as shipped_flows
     from sympflow.flow.sympflow import SympFlow as SympFlow
+    from sympflow.hamiltonian.domain import Ball as Ball
+    from sympflow.hamiltonian.domain import Box as Box
+    from sympflow.hamiltonian.domain import EnergySublevel as EnergySublevel
+    from sympflow.hamiltonian.domain import Tube as Tube
+    from sympflow.hamiltonian.system import HamiltonianSystem as HamiltonianSystem
+    from sympflow.hamiltonian.time_transformation import time_transformed as time_transformed
     from sympflow.integrators.registry import available as available
     from sympflow.integrators.registry import get as get
     from sympflow.integrators.registry import register as register
@@ -71,10 +77,11 @@ if TYPE_CHECKING:
     from sympflow.studies.poincare import poincare_section as poincare_section
     from sympflow.studies.precision import work_precision as work_precision
     from sympflow.studies.step_stability import stability as stability
-    from sympflow.system import HamiltonianSystem as HamiltonianSystem
-    from sympflow.time_transformation import time_transformed as time_transformed
     from sympflow.training.trainer import train as train
-    from sympflow.tube import Tube as Tube
+
+
+if FORMER_PATHS not in sys.meta_path:
+    sys.meta_path.append(FORMER_PATHS)
 
 
 def __getattr__(name: str) -> Any:
@@ -82,8 +89,6 @@ def __getattr__(name: str) -> Any:
         return import_module(f"sympflow.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'sympflow' has no attribute {name!r}")
-    from sympflow.imports import whole_import
-
     value = getattr(whole_import(f"sympflow.{_HOME[name]}"), name)
     globals()[name] = value
     return value

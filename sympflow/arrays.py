@@ -5,7 +5,9 @@ Dispatch is on the type of the argument, so that NumPy calls never import torch.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -81,3 +83,23 @@ def full_of_nan(y: Array) -> Array:
 
         return torch.full_like(y, np.nan, requires_grad=False)
     return np.full_like(y, np.nan)
+
+
+def jvp(f: Callable[[Array], Array], x: Array, v: Array) -> tuple[Array, Array]:
+    """Return f(x) and its derivative at the tensor x along v, by torch, without the warnings that its set-up gives."""
+    import torch
+
+    _set_up()
+    y, dy = torch.func.jvp(f, (x,), (v,))[:2]
+    return y, dy
+
+
+@cache
+def _set_up() -> None:
+    """The first forward-mode derivative of a process makes torch import modules that warn of its own deprecations."""
+    import torch
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        x = torch.zeros(1)
+        torch.func.jvp(torch.sin, (x,), (x,))

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
-from sympflow.domain import Box, Domain, EnergySublevel
+from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator, Outcome
-from sympflow.system import HamiltonianSystem
 
 
 def domain_of(flow: Any, system: HamiltonianSystem) -> Domain | None:

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from sympflow.arrays import Array, to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator, Outcome, Problem
-from sympflow.system import HamiltonianSystem
 
 TAIL = 200  # steps before the end of a run, at least, from which the solution is followed
 AHEAD = 4  # steps beyond the end: an implicit method gives up before a singularity

@@ -13,8 +13,8 @@ from sympflow.arrays import Array, to_numpy
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
+    from sympflow.hamiltonian.system import HamiltonianSystem
     from sympflow.integrators.base import Integrator
-    from sympflow.system import HamiltonianSystem
 
 
 @dataclass

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.arguments import MAX_ASKED_VALUES, MAX_SAVED_VALUES, check_save_every, check_t_eval, check_t_span
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
 from sympflow.domain_exit import check_domain
-from sympflow.events import run_and_search
+from sympflow.events import EventSearch, parse, run_and_search
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator, Outcome, Problem
 from sympflow.integrators.registry import build, check_applies, naming_plugin
 from sympflow.solution import Solution
-from sympflow.system import HamiltonianSystem
-from sympflow.validation import check_events, check_memory, check_save_every, check_t_eval, check_t_span, check_y0
 
 BACKENDS = ("auto", "compiled", "array")
+MAX_EVENT_SAMPLES = 100_000_000
+_FLOAT64 = np.dtype(np.float64)
 
 
 def solve(
@@ -191,3 +194,110 @@ def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
     outcome.status = np.where(bad, -1, outcome.status) if bad.ndim else -1
     if not bad.ndim:
         outcome.t, outcome.y = outcome.t[:first], outcome.y[:first]
+
+
+def check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
+    if y0 is None:
+        raise ValueError(f"`y0` is needed: the system {system.name!r} has no default initial state.")
+    size = 2 * system.ndof
+    if is_tensor(y0):
+        if dtype is not None:
+            raise TypeError("`dtype` is for NumPy states: convert the tensor `y0` instead.")
+        if str(y0.dtype) not in ("torch.float32", "torch.float64"):
+            raise TypeError(
+                f"`y0` must be a real floating-point tensor of 32 or 64 bits; got {y0.dtype}. Use y0.double()."
+            )
+        if str(y0.layout) != "torch.strided" or y0.device.type == "meta":
+            raise TypeError(
+                f"`y0` must be a dense tensor with values; got {y0.layout} on {y0.device}. Use y0.to_dense()."
+            )
+    else:
+        y0 = _as_floats(y0, _check_dtype(dtype))
+    if y0.ndim == 0 or y0.shape[-1] != size:
+        raise ValueError(
+            f"`y0` must have shape (..., {size}) for {system.name!r}, [q, p] with {system.ndof} each; got "
+            f"{tuple(y0.shape)}."
+        )
+    if math.prod(y0.shape) == 0:
+        raise ValueError(f"`y0` is an empty batch, of shape {tuple(y0.shape)}: pass at least one state.")
+    if np.count_nonzero(np.isfinite(to_numpy(y0))) < math.prod(y0.shape):
+        raise ValueError("`y0` must be finite; it holds NaN or infinity. Remove these states.")
+    return y0
+
+
+def _as_floats(y0: Any, dtype: np.dtype) -> np.ndarray:
+    if type(y0) is np.ndarray and y0.dtype == dtype and y0.size <= MAX_ASKED_VALUES:
+        return y0.copy()
+    try:
+        array = np.asarray(y0)
+        if not np.issubdtype(array.dtype, np.number):
+            raise TypeError(f"dtype {array.dtype}")
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"`y0` must be an array of numbers; got {error}. Pass numbers of shape (..., 2d).") from error
+    if np.ma.is_masked(y0):
+        raise ValueError("`y0` has masked entries: fill them, or leave these states out.")
+    if np.iscomplexobj(array):
+        raise TypeError("`y0` must be real; got complex numbers. Use y0.real if the imaginary part is zero.")
+    if array.size > MAX_ASKED_VALUES:
+        raise ValueError(f"`y0` has {array.size:.3g} numbers, more than {MAX_ASKED_VALUES:.0e}: solve in parts.")
+    with np.errstate(over="ignore"):  # what is infinite in float32 is refused as such
+        return array.astype(dtype)
+
+
+def _check_dtype(dtype: Any) -> np.dtype:
+    if dtype is None:
+        return _FLOAT64
+    try:
+        chosen = np.dtype(dtype)
+    except Exception:  # NumPy raises errors of many kinds
+        chosen = np.dtype(object)
+    if chosen not in (np.float32, np.float64):
+        raise ValueError(f"`dtype` must be 'float32' or 'float64'; got {dtype!r}.")
+    return chosen
+
+
+def check_events(y0: Array, events: Any, event_step: Any, duration: float) -> EventSearch | None:
+    parsed = parse(events)
+    if not parsed:
+        if event_step is not None:
+            raise ValueError("`event_step` samples events, but there are none: pass `events`, or leave it out.")
+        return None if events is None else EventSearch(())
+    if y0.ndim != 1:
+        raise ValueError(
+            f"`events` are found along one trajectory, but `y0` is a batch of shape {tuple(y0.shape)}: solve one state "
+            "at a time, or use poincare_section, which takes batches."
+        )
+    if event_step is None:
+        return EventSearch(parsed)
+    if not (isinstance(event_step, int | float | np.number) and event_step > 0):
+        raise ValueError(f"`event_step` must be a positive number, a time; got {event_step!r}.")
+    if duration > MAX_EVENT_SAMPLES * event_step:
+        raise ValueError(
+            f"`event_step` {event_step:g} would take more than {MAX_EVENT_SAMPLES:.0e} samples over a time of "
+            f"{duration:g}: increase it."
+        )
+    return EventSearch(parsed, float(event_step))
+
+
+def check_memory(integrator: Integrator, problem: Problem) -> None:
+    """Refuse runs whose outputs would fill the memory."""
+    size = math.prod(problem.y0.shape)
+    if problem.t_eval is not None and problem.t_eval.size * size > MAX_ASKED_VALUES:
+        raise ValueError(
+            f"`t_eval` asks for {problem.t_eval.size * size:.3g} values, more than {MAX_ASKED_VALUES:.0e}: choose "
+            "fewer times, or solve in parts."
+        )
+    if problem.t_eval is not None and not problem.dense_output:
+        return
+    length = getattr(integrator, "step_length", lambda system: None)(problem.system)
+    if length is None:
+        return
+    n_steps = abs(problem.t1 - problem.t0) / length
+    stored = n_steps if problem.dense_output else n_steps / problem.save_every
+    values = (stored + 1) * size
+    if values > MAX_SAVED_VALUES:
+        raise ValueError(
+            f"`t_eval` is not given, so {values:.3g} values ({values * 8 / 2**30:.3g} GiB) would be stored, more than "
+            f"{MAX_SAVED_VALUES:.0e}: choose the times with `t_eval`, or thin them with `save_every`"
+            f"{', or leave dense_output out' if problem.dense_output else ''}."
+        )

@@ -36,8 +36,8 @@ from contenders.prose import power
 from contenders.scene import Scene
 
 from sympflow import SympFlow, shipped_flows
-from sympflow.fingerprints import same_system
-from sympflow.integrators.schemes import SCHEMES
+from sympflow.hamiltonian.fingerprint import same_system
+from sympflow.schemes import SCHEMES
 from sympflow.systems import henon_heiles, kepler, pendulum
 
 TINY = Scene(t_end=20.0, n_instants=20, trajectories=70)  # more than a block of the hand-written loops, and not two

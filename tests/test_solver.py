@@ -10,7 +10,7 @@ import torch
 import sympflow
 from sympflow import Box, HamiltonianSystem, get, solve, systems
 from sympflow.integrators.grid import Grid
-from sympflow.integrators.schemes import SCHEMES
+from sympflow.schemes import SCHEMES
 
 HH = systems.henon_heiles()
 PENDULUM = systems.pendulum()

@@ -73,7 +73,6 @@ from sympflow import (
 from sympflow.arrays import concatenate
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import MLPPotential, Potential
-
 from sympflow.integrators.base import FixedStep, Integrator, Outcome
 
 try:

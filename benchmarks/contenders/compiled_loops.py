@@ -13,7 +13,7 @@ from numba import njit
 
 from contenders.contender import Contender, whole_steps
 from contenders.scene import Scene
-from sympflow.integrators.schemes import SCHEMES
+from sympflow.schemes import SCHEMES
 
 OPTIONS = {"error_model": "numpy", "fastmath": {"contract"}}
 LANES = 64

@@ -9,7 +9,7 @@ import heyoka as hy
 import numpy as np
 import sympy as sp
 
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 WIDTH = 2 * hy.recommended_simd_size()  # as in heyoka_taylor
 

@@ -9,7 +9,7 @@ import numpy as np
 import sympflow
 from contenders.contender import Contender, Outputs, Work, whole_steps
 from contenders.scene import Scene
-from sympflow.integrators.schemes import SCHEMES
+from sympflow.schemes import SCHEMES
 
 GUESSES = {  # method: steps for energy errors of 1e-3, 1e-6, 1e-9 and 1e-12 over T = 1000
     "verlet": (12_500, 395_000, 12_500_000),

@@ -14,10 +14,10 @@ from sympflow import HamiltonianSystem, get, solve
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.integrators.log_sympflow import LogSympFlow
-from sympflow.integrators.schemes import SCHEMES
 from sympflow.kernels.primed_flow import PrimedFlowKernel
 from sympflow.kernels.splitting import splitting_kernel
 from sympflow.metrics.reference import reference
+from sympflow.schemes import SCHEMES
 
 INSTANTS = 1000
 HELD_OUT, HELD_OUT_SEED = 20, 20_261_121  # a seed that no training uses

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.reference import reference
-from sympflow.system import HamiltonianSystem
 from sympflow.systems import henon_heiles
 
 SAMPLE = 64

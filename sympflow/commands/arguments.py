@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
-from sympflow.system import HamiltonianSystem
 from sympflow.systems import SYSTEMS, harmonic_oscillator
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -56,14 +55,9 @@ def checked_time(flow: FlowMap, t: Any, x: Any) -> float | Tensor:
     return value
 
 
-def plain(value: Any) -> Any:
-    """A number of NumPy's or torch's as one of Python's, which JSON takes as well; anything else as it is."""
-    return value.item() if isinstance(value, (np.generic, np.ndarray, Tensor)) and value.ndim == 0 else value
-
-
 def check_system(system: Any) -> None:
     """Raise unless `system` is a HamiltonianSystem."""
-    from sympflow.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(

@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from sympflow.domain import Domain
-from sympflow.fingerprints import same_system
-from sympflow.flow.arguments import bare_time, check_system, checked_time, plain
+from sympflow.arguments import plain
+from sympflow.flow.arguments import bare_time, check_system, checked_time
 from sympflow.flow.steps import whole_steps, whole_steps_of_each
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.fingerprint import same_system
 
 if TYPE_CHECKING:
     from sympflow.flow.certificate import Certificate
-    from sympflow.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
 MIN_DT, MAX_DT = 1e-18, 1e18  # were they seconds, from an attosecond to more than the age of the universe
 

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from sympflow.domain import Domain
 from sympflow.flow.certificate import Certificate, Quantiles, upper_limit
+from sympflow.hamiltonian.domain import Domain
 
 if TYPE_CHECKING:
     from sympflow.flow.base import FlowMap
     from sympflow.flow.sympflow import SympFlow
-    from sympflow.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
 SAVED_VALUES = 1_000_000  # of a piece of the measured runs, which are never held whole
 WORST = 16  # states of a time from which the largest rate is searched
@@ -153,7 +153,7 @@ def _array(values: torch.Tensor) -> np.ndarray:
 
 
 def _one_step_error(flow: SympFlow, system: HamiltonianSystem, x: np.ndarray) -> Quantiles:
-    from sympflow.training.validation import reference_step
+    from sympflow.hamiltonian.exact_flow import reference_step
 
     with torch.no_grad():
         y = flow.psi(flow.dt, torch.as_tensor(x, dtype=flow.dtype, device=flow.device)).cpu().double().numpy()

@@ -25,12 +25,11 @@ from sympflow.flow.placement import checked_device, checked_dtype
 from sympflow.flow.potentials import Potential, Time
 from sympflow.flow.primed_potentials import KINETIC, POTENTIAL, Binding, PrimedPotential
 from sympflow.flow.sympflow import SympFlow
-from sympflow.integrators.schemes import SCHEMES
-from sympflow.integrators.splitting import scheme_evaluations
+from sympflow.schemes import SCHEMES, scheme_evaluations
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.system import HamiltonianSystem
     from sympflow.kernels.clocked_flow import ClockedFlowKernel
-    from sympflow.system import HamiltonianSystem
 
 
 class ClockPotential(Potential):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from sympflow.domain import Domain, domain_from_dict
 from sympflow.flow.base import FlowMap
 from sympflow.flow.certificate import Certificate
 from sympflow.flow.record import Refused
 from sympflow.flow.scaling import Scaling
+from sympflow.hamiltonian.domain import Domain, domain_from_dict
 
 FIELDS = ("version", "domain", "system", "fingerprint", "recipe", "figures")
 FINGERPRINT_LENGTH = 8

@@ -11,9 +11,8 @@ import torch
 
 from sympflow.flow.coefficients import Coefficients, Entry
 from sympflow.flow.contents import Contents
-from sympflow.integrators.scheme import CURVATURE, POLYNOMIAL, Scheme
-from sympflow.integrators.splitting import scheme_evaluations
-from sympflow.monomials import Monomials
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.schemes import CURVATURE, POLYNOMIAL, Scheme, scheme_evaluations
 
 if TYPE_CHECKING:
     from sympflow.kernels.primed_flow import PrimedFlowKernel

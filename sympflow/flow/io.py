@@ -20,7 +20,7 @@ import torch
 from safetensors.torch import save as save_tensors
 
 import sympflow
-from sympflow.files import naming_path, writable
+from sympflow.arguments import naming_path, writable
 from sympflow.flow.base import FlowMap
 from sympflow.flow.description import check, describe
 from sympflow.flow.placement import checked_device
@@ -28,7 +28,7 @@ from sympflow.flow.record import Refused, build, checksum, dtype_of, fill, parse
 from sympflow.flow.shipped import choose
 
 if TYPE_CHECKING:
-    from sympflow.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
 FORMAT = 1
 KEY = "sympflow"

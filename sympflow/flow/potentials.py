@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from sympflow.arguments import plain
 from sympflow.flow.activations import activation as activation_named
-from sympflow.flow.arguments import plain
 from sympflow.flow.placement import checked_device, checked_dtype
 
 Time = float | Tensor

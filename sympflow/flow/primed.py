@@ -38,13 +38,13 @@ from sympflow.flow.primed_potentials import (
 )
 from sympflow.flow.sequences import Terms, alternating, columns_of, substeps_of
 from sympflow.flow.sympflow import SympFlow
-from sympflow.integrators.scheme import Scheme
-from sympflow.monomials import Monomials
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.schemes import Scheme
 
 if TYPE_CHECKING:
     from sympflow.flow.potentials import Time
+    from sympflow.hamiltonian.system import HamiltonianSystem
     from sympflow.kernels.primed_flow import PrimedFlowKernel
-    from sympflow.system import HamiltonianSystem
 
 
 class PrimedFlow(SympFlow):

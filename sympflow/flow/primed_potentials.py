@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 from torch import Tensor
 
+from sympflow.arrays import jvp
 from sympflow.flow.potentials import Potential, Time
-from sympflow.forward_mode import jvp
-from sympflow.monomials import Monomials, gradient, value
-from sympflow.third_derivatives import derivative, direction, length_of_change, step
+from sympflow.hamiltonian.hamiltonian import derivative, direction, length_of_change, step
+from sympflow.hamiltonian.monomials import Monomials, gradient, value
 
 if TYPE_CHECKING:
-    from sympflow.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
 
 class Binding:

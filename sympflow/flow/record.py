@@ -18,7 +18,7 @@ from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
-from sympflow.monomials import MOST_MONOMIALS, Monomials
+from sympflow.hamiltonian.monomials import MOST_MONOMIALS, Monomials
 
 MAX_LAYERS = 1000
 MAX_WIDTH = 4096
@@ -160,7 +160,7 @@ def _split(ndof: int, plan: Any, dt: float, dtype: torch.dtype) -> SplitFlow:
     if expressions is not None and not (isinstance(expressions, list) and all(isinstance(e, str) for e in expressions)):
         raise Refused("its parts are not a list of expressions")
     if expressions is not None:
-        from sympflow.expression import Unreadable, read
+        from sympflow.hamiltonian.expression import Unreadable, read
 
         if len(expressions) > len(plan["kinds"]) + 1:
             raise Refused("it has more parts than kinds of them")

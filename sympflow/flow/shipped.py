@@ -17,10 +17,10 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sympflow.fingerprints import same_system
+from sympflow.hamiltonian.fingerprint import same_system
 
 if TYPE_CHECKING:
-    from sympflow.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
 DEFAULT_TOL = 1e-6
 """What the default flow of a system reaches, if one does."""
@@ -108,7 +108,7 @@ class ShippedFlow:
 
         if system is None or self.shift is None:
             return load(self.path, system=system)
-        from sympflow.time_transformation import time_transformed
+        from sympflow.hamiltonian.time_transformation import time_transformed
 
         return load(self.path, system=time_transformed(system, self.shift))
 
@@ -182,7 +182,7 @@ def shipped_flows(system: HamiltonianSystem | None = None, kind: str | None = No
     --------
     >>> sympflow.shipped_flows(sympflow.systems.pendulum())
     """
-    from sympflow.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
     if system is not None and not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {system!r}: leave it out for all flows.")

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sympflow.decomposition import exact_parts
+from sympflow.arrays import jvp
 from sympflow.flow.base import FlowMap
 from sympflow.flow.columns import Column
 from sympflow.flow.contents import Contents
@@ -26,12 +26,11 @@ from sympflow.flow.placement import checked_device, checked_dtype
 from sympflow.flow.potentials import Time
 from sympflow.flow.split_layers import KeptMaps, PartsBinding, SplitLayer
 from sympflow.flow.sympflow import SympFlow
-from sympflow.forward_mode import jvp
-from sympflow.parts import LINEAR, ExactParts, Map
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.system import HamiltonianSystem
     from sympflow.kernels.split_flow import SplitFlowKernel
-    from sympflow.system import HamiltonianSystem
 
 FILTERED = ("oscillator", "hyperbolic")
 """The kinds of modes that filters act on; others pass."""

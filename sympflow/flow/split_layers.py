@@ -9,16 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sympflow.decomposition import exact_parts
+from sympflow.arrays import jvp
 from sympflow.flow.layers import Layer
 from sympflow.flow.potentials import Time
-from sympflow.forward_mode import jvp
-from sympflow.parts import LINEAR, ExactParts, Map
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts
 
 if TYPE_CHECKING:
     from sympflow.flow.split import SplitFlow
+    from sympflow.hamiltonian.system import HamiltonianSystem
     from sympflow.kernels.split_flow import SplitFlowKernel
-    from sympflow.system import HamiltonianSystem
 
 MOST_KEPT = 64  # steps whose maps are kept
 
@@ -85,7 +84,7 @@ class KeptMaps:
 
     def evaluations(self, *run: Any) -> dict[str, int]:
         """As `FixedStep.evaluations`."""
-        from sympflow.integrators.exact_maps import map_evaluations
+        from sympflow.hamiltonian.parts import map_evaluations
 
         if run not in self._counts:
             if len(self._counts) >= MOST_KEPT:
@@ -119,7 +118,7 @@ class SplitLayer(Layer):
             return torch.cat(self(t + s, q + s * dq, p + s * dp))
 
         x, dx = jvp(along, q.new_zeros(()), q.new_ones(()))
-        return (*x.chunk(2), *dx.chunk(2))  # type: ignore[return-value]
+        return (*x.chunk(2), *dx.chunk(2))
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         q, p = self.inverse(t, q, p)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from sympflow.flow.arguments import bare_time, plain
+from sympflow.arguments import plain
+from sympflow.flow.arguments import bare_time
 from sympflow.flow.base import FlowMap
 from sympflow.flow.layers import Drift, Kick, Layer
 from sympflow.flow.potentials import MLPPotential
@@ -17,8 +18,8 @@ from sympflow.flow.scaling import Scaling
 if TYPE_CHECKING:
     from sympflow.flow.primed import PrimedFlow
     from sympflow.flow.split import SplitFlow
-    from sympflow.integrators.scheme import Scheme
-    from sympflow.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem
+    from sympflow.schemes import Scheme
 
 
 class SympFlow(FlowMap):

@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from sympflow.arguments import check_flag
 from sympflow.flow.arguments import check_system
 from sympflow.flow.frozen import Kind
 from sympflow.flow.primed import PrimedFlow
-from sympflow.integrators.base import check_flag
-from sympflow.integrators.scheme import Scheme
-from sympflow.integrators.schemes import SCHEMES, compose
-from sympflow.monomials import Monomials, monomials
+from sympflow.hamiltonian.monomials import Monomials, monomials
+from sympflow.schemes import SCHEMES, Scheme, compose
 
 if TYPE_CHECKING:
-    from sympflow.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
 
 def primed(

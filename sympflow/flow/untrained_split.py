@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from sympflow.decomposition import exact_parts
+from sympflow.arguments import check_flag
 from sympflow.flow.arguments import check_system
 from sympflow.flow.split import SplitFlow, class_kinds, part_kinds
-from sympflow.integrators.base import check_flag
-from sympflow.parts import LINEAR
+from sympflow.hamiltonian.parts import LINEAR, exact_parts
 
 if TYPE_CHECKING:
-    from sympflow.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
 
 def split(

@@ -24,11 +24,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
+from sympflow.arguments import check_dt
 from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.array_rollout import checked_state, rollout
 from sympflow.integrators.grid import EPS, Grid
 from sympflow.integrators.grid_failures import report_failures
-from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from sympflow.events import EventSearch
@@ -68,8 +69,6 @@ class Outcome:
 
 FEW = 8
 """Outputs that are placed on the grid by NumPy: a compiled pass is worth its loading for more."""
-LONGEST_STEP = 1e100
-"""Beyond it the powers of dt in a step are no floating-point numbers."""
 
 FINISHED = "The solver successfully reached the end of the integration interval."
 
@@ -106,7 +105,7 @@ class Integrator:
         """The step from y (..., 2d) and its Jacobian A (..., 2d, 2d), by forward-mode differentiation of `step`."""
         import torch
 
-        from sympflow.forward_mode import jvp
+        from sympflow.arrays import jvp
 
         def step(x: torch.Tensor) -> torch.Tensor:
             return self.step(system, t, x, torch.as_tensor(h, dtype=x.dtype))
@@ -276,19 +275,6 @@ def distinct(count: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     new[0] = True
     np.not_equal(count[1:], count[:-1], out=new[1:])
     return (count, None) if new.all() else (count[new], np.cumsum(new) - 1)
-
-
-def check_dt(dt: Any) -> None:
-    """Raise unless `dt` is None or a step length."""
-    number = isinstance(dt, int | float | np.number) and not isinstance(dt, bool)
-    if dt is not None and not (number and 0 < dt <= LONGEST_STEP):
-        raise ValueError(f"`dt` must be a positive and finite number, at most {LONGEST_STEP:g}; got {dt!r}.")
-
-
-def check_flag(name: str, value: Any) -> None:
-    """Raise unless the option `name` is True or False."""
-    if not isinstance(value, bool | np.bool_):
-        raise TypeError(f"`{name}` must be True or False; got {value!r}.")
 
 
 @cache

@@ -11,15 +11,15 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor
+from sympflow.hamiltonian.parts import ExactParts, Map, map_evaluations
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.array_rollout import rollout
 from sympflow.integrators.base import FixedStep, Outcome, Problem
-from sympflow.parts import LINEAR, ExactParts, Map
-from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from sympflow.kernels.parts import PartsKernel
 
-__all__ = ["MapsStepper", "kernel_of", "known_maps", "map_evaluations"]
+__all__ = ["MapsStepper", "kernel_of", "known_maps"]
 
 
 class MapsStepper(FixedStep):
@@ -152,17 +152,3 @@ def concatenate_first(y0: Array, states: Array) -> Array:
 
         return torch.cat([y0[None], states[1:]])
     return np.concatenate([y0[None], states[1:]])
-
-
-def map_evaluations(maps: Sequence[Map], n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-    """Evaluations of slopes and force gradients, as `FixedStep.evaluations`; linear flows cost none."""
-    counts = [sum(m.part != LINEAR for m in maps), sum(_has_gradient(m) for m in maps)]
-    counts = [count * (n_steps + n_extra) for count in counts]
-    if backend == "compiled" and len(maps) > 1 and maps[0].part == maps[-1].part:
-        last = maps[-1].part != LINEAR, _has_gradient(maps[-1])  # it is the next step's first one
-        counts = [count - (n_steps - n_saved) * one for count, one in zip(counts, last, strict=True)]
-    return {"force_evaluations": int(counts[0]), "hessian_evaluations": int(counts[1])}
-
-
-def _has_gradient(m: Map) -> bool:
-    return m.gradient != 0.0 if isinstance(m.gradient, float) else bool(np.any(m.gradient))

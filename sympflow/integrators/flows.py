@@ -12,9 +12,9 @@ import torch
 
 from sympflow.arrays import Array, is_tensor
 from sympflow.domain_exit import check_start
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.array_rollout import rollout
 from sympflow.integrators.base import FixedStep, Outcome, Problem
-from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from sympflow.flow.mlp import MLPFlow

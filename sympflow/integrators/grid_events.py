@@ -8,10 +8,10 @@ import numpy as np
 
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
 from sympflow.events import ENDED, EventSearch
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FINISHED, FixedStep, Outcome, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.grid_solution import GridSolution
-from sympflow.system import HamiltonianSystem
 
 FIRST_CHUNK, LAST_CHUNK = 8, 1024
 MOST_SAMPLES = 65536  # in a chunk

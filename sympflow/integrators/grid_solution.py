@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sympflow.arrays import Array, is_tensor
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.grid import Grid
-from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from sympflow.integrators.base import FixedStep

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
+from sympflow.arguments import check_flag
 from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
-from sympflow.integrators.base import FixedStep, Outcome, Problem, check_flag
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import FixedStep, Outcome, Problem
 
 if TYPE_CHECKING:
     from sympflow.kernels.implicit import ImplicitKernel, Tableau

@@ -10,12 +10,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arrays import is_tensor
-from sympflow.decomposition import exact_parts, linear_and_rest
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, like, linear_and_rest
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.exact_maps import MapsStepper
-from sympflow.integrators.scheme import Scheme
-from sympflow.integrators.schemes import SCHEMES
-from sympflow.parts import LINEAR, ExactParts, Map, like
-from sympflow.system import HamiltonianSystem
+from sympflow.schemes import SCHEMES, Scheme
 
 _LINEAR_AND_REST: WeakKeyDictionary[HamiltonianSystem, ExactParts] = WeakKeyDictionary()
 

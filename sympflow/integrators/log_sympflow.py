@@ -8,13 +8,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arrays import Array
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.time_transformation import checked_shift, default_shift, time_scale
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.flows import kernel_of
 from sympflow.integrators.logarithmic import Logarithmic
 from sympflow.integrators.sympflow import SympFlowIntegrator
 from sympflow.integrators.time_search import physical_length, step_of_length
-from sympflow.system import HamiltonianSystem
-from sympflow.time_transformation import checked_shift, default_shift, time_scale
 
 Lengths = tuple[HamiltonianSystem, float, float, tuple[float, ...]]
 

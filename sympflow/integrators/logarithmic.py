@@ -14,15 +14,23 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sympflow.arguments import check_flag
 from sympflow.arrays import Array, is_tensor, to_numpy
-from sympflow.integrators.base import FixedStep, Outcome, Problem, Steps, check_flag
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.time_transformation import (
+    checked_shift,
+    default_shift,
+    lifted,
+    projected,
+    time_scale,
+    time_transformed,
+)
+from sympflow.integrators.base import FixedStep, Outcome, Problem, Steps
 from sympflow.integrators.physical_time import PhysicalRun
-from sympflow.integrators.schemes import SCHEMES
 from sympflow.integrators.splitting import splitting
 from sympflow.integrators.time_search import reach
 from sympflow.integrators.timed_pass import timed_pass
-from sympflow.system import HamiltonianSystem
-from sympflow.time_transformation import checked_shift, default_shift, lifted, projected, time_scale, time_transformed
+from sympflow.schemes import SCHEMES
 
 SCHEME_NAMES = ("leapfrog", "blanes_moan4", "kahan_li8")
 _TRANSFORMED: WeakKeyDictionary[HamiltonianSystem, dict[float, HamiltonianSystem]] = WeakKeyDictionary()

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sympflow.hamiltonian.time_transformation import lifted, projected
 from sympflow.integrators.base import FINISHED, Outcome, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.time_search import reach
-from sympflow.time_transformation import lifted, projected
 
 if TYPE_CHECKING:
     from sympflow.integrators.logarithmic import Logarithmic

@@ -10,11 +10,11 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-from sympflow.imports import whole_import
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator
-from sympflow.integrators.schemes import SCHEMES
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED
-from sympflow.system import HamiltonianSystem
+from sympflow.lazy import whole_import
+from sympflow.schemes import SCHEMES
 
 T = TypeVar("T")
 

@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arrays import Array, per_state, to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator
-from sympflow.system import HamiltonianSystem
 
 
 class ExplicitStep(Integrator):

@@ -14,10 +14,10 @@ from scipy.integrate import OdeSolution
 
 from sympflow.arrays import Array, is_tensor
 from sympflow.events import ENDED
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FINISHED, Outcome, Problem, Steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.runge_kutta import RungeKutta, hopeless
-from sympflow.system import HamiltonianSystem
 
 
 @dataclass(frozen=True)

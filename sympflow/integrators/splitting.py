@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from sympflow.arguments import check_flag
 from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
-from sympflow.integrators.base import FixedStep, Problem, check_flag
-from sympflow.integrators.scheme import Substep
-from sympflow.integrators.schemes import SCHEMES, Scheme
-from sympflow.monomials import Monomials, gradient
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.monomials import Monomials, gradient
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import FixedStep, Problem
+from sympflow.schemes import SCHEMES, Scheme, Substep, scheme_evaluations
 
 if TYPE_CHECKING:
     from sympflow.kernels.splitting import SplittingKernel
@@ -159,29 +159,6 @@ class Splitting(FixedStep):
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
-
-
-def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-    """Evaluations of the force, of force gradients and of curvature terms in a run, as `FixedStep.evaluations`."""
-    kicks = _kicks(scheme)
-    counts = {"force_evaluations": (scheme.force_evaluations, [1] * len(kicks))}
-    counts["hessian_evaluations"] = scheme.hessian_evaluations, [g for g, _ in kicks]
-    if any(scheme.curvatures):
-        counts["curvature_evaluations"] = scheme.curvature_evaluations, [c for _, c in kicks]
-    if backend != "compiled" or not kicks:
-        return {name: (n_steps + n_extra) * sum(each) for name, (_, each) in counts.items()}
-    # compiled, the last kick of a step is merged with the next step's first, except where a state is saved
-    closed = n_saved if len(kicks) > scheme.force_evaluations else 0
-    return {
-        name: n_steps * of_a_step + closed * each[-1] + n_extra * sum(each)
-        for name, (of_a_step, each) in counts.items()
-    }
-
-
-@lru_cache(maxsize=256)
-def _kicks(scheme: Scheme) -> tuple[tuple[bool, bool], ...]:
-    """Whether each of its kicks has a Hessian, and a curvature term."""
-    return tuple((s.three != 0 or s.five != 0, s.five != 0) for s in scheme.substeps if s.kind == "kick")
 
 
 def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials: Monomials) -> Array:

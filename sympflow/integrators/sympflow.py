@@ -9,11 +9,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from sympflow.arguments import check_flag
 from sympflow.arrays import Array, is_tensor
 from sympflow.domain_exit import check_start
-from sympflow.integrators.base import FixedStep, Outcome, Problem, check_flag
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import FixedStep, Outcome, Problem
 from sympflow.integrators.flows import FlowIntegrator, known
-from sympflow.system import HamiltonianSystem
 
 SEARCH, SEARCH_OF_EACH = 50_000, 2_000
 """Forces that take as long as finding the outputs of a run, or of each trajectory in a batch, by their times."""

@@ -8,12 +8,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from sympflow.arguments import check_dt
 from sympflow.arrays import Array
-from sympflow.integrators.base import Problem, Steps, check_dt
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import Problem, Steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.interpolants import hermite
 from sympflow.integrators.torchdiffeq_driver import Trace, Visit, Watched
-from sympflow.system import HamiltonianSystem
 
 
 @dataclass(frozen=True)

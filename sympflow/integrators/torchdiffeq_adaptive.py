@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arrays import Array, to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Problem, Steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.interpolants import Interpolant, quartic
 from sympflow.integrators.runge_kutta import RungeKutta, weighted
 from sympflow.integrators.tableaux import Tableau
 from sympflow.integrators.torchdiffeq_driver import TooManyStepsError, Trace, Visit, Watched
-from sympflow.system import HamiltonianSystem
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ import numpy as np
 
 from sympflow.arrays import Array, full_of_nan, is_tensor, stack
 from sympflow.events import ENDED
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FINISHED, Integrator, Outcome, Problem
 from sympflow.integrators.interpolants import Interpolant, Piecewise
 from sympflow.integrators.runge_kutta import hopeless
 from sympflow.integrators.torchdiffeq_batches import run_in_parts
-from sympflow.system import HamiltonianSystem
 
 Visit = Callable[[Interpolant], bool]
 """Takes a step as soon as it is accepted; whether the run ends in it."""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from sympflow.arrays import to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
-from sympflow.system import HamiltonianSystem
 
 
 def own_velocity(integrator: FixedStep, system: HamiltonianSystem | None, y: np.ndarray) -> np.ndarray:

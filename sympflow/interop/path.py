@@ -10,10 +10,10 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
-from sympflow.system import HamiltonianSystem
 
 MAX_EVENT_STEPS = 1_000_000
 _EPS = 4 * float(np.finfo(float).eps)

@@ -11,11 +11,11 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.integrate import DenseOutput, OdeSolver
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import check_applies, naming_plugin
 from sympflow.interop.matching import fixed_step, warn_of_another_system
-from sympflow.system import HamiltonianSystem
 
 LOOK_AHEAD = 64
 

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 N_NODES = 16  # Gauss–Legendre nodes of the line integral: exact for fields of degree 31
 TOLERANCE = 1e-8

@@ -17,12 +17,12 @@ import torch
 import torchdiffeq
 from torch import Tensor
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import available, check_applies
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED
 from sympflow.interop.matching import fixed_step, warn_of_another_system
 from sympflow.interop.path import Path
-from sympflow.system import HamiltonianSystem
 
 State = Tensor | tuple[Tensor, ...]
 _THEIRS = {*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver"}

@@ -22,10 +22,10 @@ try:
 except ImportError as error:  # pragma: no cover
     raise ImportError("sympflow.interop.torchode needs torchode: pip install torchode.") from error
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.registry import check_applies, naming_plugin
 from sympflow.interop.matching import fixed_step
-from sympflow.system import HamiltonianSystem
 
 
 def register(name: str, system: HamiltonianSystem, method: Any = None, **options: Any) -> None:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.splitting import splitting_kernel
 from sympflow.kernels.timed import reach_times
-from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from sympflow.flow.clocked import ClockedFlow

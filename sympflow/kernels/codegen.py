@@ -8,8 +8,8 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympy.printing.pycode import PythonCodePrinter
 
-from sympflow.monomials import Monomials
-from sympflow.symbolic import SymbolicHamiltonian, printable
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
 
 __all__ = [
     "algebra_source",

@@ -9,10 +9,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import sympy as sp
 
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import statements
 from sympflow.kernels.modules import load_algebra, run_rows
-from sympflow.symbolic import SymbolicHamiltonian
-from sympflow.system import HamiltonianSystem
 
 __all__ = ["ImplicitKernel", "implicit_kernel"]
 

@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 
 import sympy as sp
 
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
 from sympflow.kernels.codegen import printed
 from sympflow.kernels.nested import nested
 from sympflow.kernels.scheduling import FUSED, Schedule
-from sympflow.monomials import Monomials
-from sympflow.symbolic import SymbolicHamiltonian, printable
 
 __all__ = ["B", "C", "G", "polynomial_letters", "shapes"]
 

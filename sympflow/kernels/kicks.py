@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import sympy as sp
 
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.codegen import printed
 from sympflow.kernels.kick_shapes import polynomial_letters, shapes
 from sympflow.kernels.pipeline import Operation, cycles_per_turn
 from sympflow.kernels.scheduling import FUSED, PRODUCTS, Schedule
-from sympflow.monomials import Monomials
-from sympflow.symbolic import SymbolicHamiltonian
 
 __all__ = ["kick_cycles", "kicks_source"]
 

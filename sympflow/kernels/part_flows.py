@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import sympy as sp
 
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions
+from sympflow.hamiltonian.symbolic import printable
 from sympflow.kernels.codegen import printed
 from sympflow.kernels.scheduling import FUSED, Schedule
-from sympflow.parts import LINEAR, ExactParts, PartFunctions
-from sympflow.symbolic import printable
 
 __all__ = ["PRODUCT", "TURN_WIDTH", "PartFlow", "linear_flow", "part_flow", "unpacked"]
 

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
 from sympflow.kernels.modules import NEVER, load_algebra, run_one, run_rows
 from sympflow.kernels.part_flows import TURN_WIDTH
 from sympflow.kernels.parts_codegen import IDLE, WITH_GRADIENT, parts_source
-from sympflow.parts import LINEAR, ExactParts, Map, PartFunctions
-from sympflow.shears import shears
 
 __all__ = ["PartsKernel"]
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sympflow.hamiltonian.parts import ExactParts
 from sympflow.kernels.codegen import tuple_algebra
 from sympflow.kernels.part_flows import PRODUCT, TURN_WIDTH, PartFlow, linear_flow, part_flow, unpacked
-from sympflow.parts import ExactParts
 
 __all__ = ["IDLE", "WITH_GRADIENT", "parts_source"]
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.integrators.scheme import CURVATURE, Scheme
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import run_one, run_rows
 from sympflow.kernels.splitting import splitting_kernel
 from sympflow.kernels.tables import scaled_run_table, scaled_step_table
-from sympflow.system import HamiltonianSystem
+from sympflow.schemes import CURVATURE, Scheme
 
 if TYPE_CHECKING:
     from sympflow.flow.frozen import Tables

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.hamiltonian.parts import Map
 from sympflow.integrators.exact_maps import kernel_of
 from sympflow.kernels.parts import PartsKernel
-from sympflow.parts import Map
 
 if TYPE_CHECKING:
     from sympflow.flow.split import SplitFlow

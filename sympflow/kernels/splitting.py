@@ -12,14 +12,14 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.integrators.scheme import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
 from sympflow.kernels.tables import Table, scaled_run_table, step_table
-from sympflow.monomials import Monomials
-from sympflow.system import HamiltonianSystem
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 
 if TYPE_CHECKING:
-    from sympflow.symbolic import SymbolicHamiltonian
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 __all__ = ["SplittingKernel", "splitting_kernel"]
 

@@ -7,12 +7,12 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.domain import Box, EnergySublevel
+from sympflow.hamiltonian.domain import Box, EnergySublevel
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import statements
 from sympflow.kernels.modules import load_algebra
 from sympflow.kernels.outputs import all_between
-from sympflow.symbolic import SymbolicHamiltonian
-from sympflow.system import HamiltonianSystem
 
 __all__ = ["all_within"]
 

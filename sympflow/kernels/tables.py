@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.integrators.scheme import Scheme
+from sympflow.schemes import Scheme
 
 __all__ = ["Table", "scaled_run_table", "scaled_step_table", "step_table"]
 

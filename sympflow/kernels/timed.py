@@ -9,13 +9,13 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.integrators.schemes import Scheme
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import algebra_source, statements
 from sympflow.kernels.modules import load_algebra, run_one, run_rows
 from sympflow.kernels.splitting import symbolic_module
 from sympflow.kernels.tables import scaled_run_table, step_table
-from sympflow.symbolic import SymbolicHamiltonian
-from sympflow.system import HamiltonianSystem
+from sympflow.schemes import Scheme
 
 __all__ = ["lifted_rows", "reach_times"]
 

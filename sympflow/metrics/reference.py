@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sympflow.arrays import to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.solver import solve
-from sympflow.system import HamiltonianSystem
 
 _HALVINGS = 7
 _ROUNDING = 1e-14

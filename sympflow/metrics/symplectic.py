@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.arguments import check_solution
 from sympflow.metrics.energy import failed
 from sympflow.solution import Solution
-from sympflow.system import HamiltonianSystem
 
 
 def step_tangents(sol: Solution) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

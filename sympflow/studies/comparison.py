@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.arguments import check_counts, check_t_span
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.accuracy import reference_error, states_of
 from sympflow.metrics.energy import failed, max_energy_error
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
-from sympflow.solver import solve
+from sympflow.solver import check_y0, solve
 from sympflow.studies.candidates import candidates
 from sympflow.studies.comparison_report import Comparison
 from sympflow.studies.matching import match as match_to
 from sympflow.studies.matching import tunable
 from sympflow.studies.measurements import MEASURES, Row, Run, largest, measure, note_backends
-from sympflow.system import HamiltonianSystem
 from sympflow.timing import interleaved
-from sympflow.validation import check_counts, check_t_span, check_y0
 
 METRICS = tuple(MEASURES)
 MATCHES = ("time", "evaluations", "energy_error")

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.reference import Reference
 from sympflow.studies.measurements import Row, Run
 from sympflow.studies.tables import Column, number, plain, records, seconds, text_table, write_csv, write_json
-from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

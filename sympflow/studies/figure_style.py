@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sympflow.files import naming_path, writable
+from sympflow.arguments import naming_path, writable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
-from sympflow.system import HamiltonianSystem
 
 _CLOSE = math.log(1.05)
 _LONGEST_JUMP = math.log(16.0)

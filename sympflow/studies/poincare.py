@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.arguments import check_t_span
 from sympflow.arrays import is_tensor
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator
 from sympflow.integrators.registry import build, check_applies, name_of
+from sympflow.solver import check_y0
 from sympflow.studies.comparison_report import title
 from sympflow.studies.crossings import Plane, crossings
 from sympflow.studies.tables import Column, text_table, write_csv
-from sympflow.system import HamiltonianSystem
-from sympflow.validation import check_t_span, check_y0
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.arguments import check_counts, check_t_span
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.accuracy import reference_error
 from sympflow.metrics.energy import failed, max_energy_error
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
-from sympflow.solver import solve
+from sympflow.solver import check_y0, solve
 from sympflow.studies.candidates import Candidate, candidates
 from sympflow.studies.precision_points import Point, break_even
 from sympflow.studies.precision_report import WorkPrecision
-from sympflow.system import HamiltonianSystem
 from sympflow.timing import interleaved
-from sympflow.validation import check_counts, check_t_span, check_y0
 
 METHODS = ("verlet", "leapfrog", "blanes_moan4", "srkn11b", "kahan_li8", "rk45", "dop853", "sympflow", "mlp")
 TOLERANCES = tuple(10.0**-k for k in range(3, 13))

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.reference import Reference
 from sympflow.studies.comparison_report import title
 from sympflow.studies.precision_points import Point, cost_at
 from sympflow.studies.tables import Column, number, plain, records, seconds, text_table, write_csv, write_json
-from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.studies.tables import Column, number, plain, text_table, write_csv
-from sympflow.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

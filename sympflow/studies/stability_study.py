@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.arguments import MAX_SAVED_VALUES
 from sympflow.domain_exit import domain_of
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.energy import energy_drift, max_energy_error
 from sympflow.metrics.symplectic import symplecticity_defect, volume_error
@@ -20,8 +22,6 @@ from sympflow.studies.candidates import Candidate
 from sympflow.studies.comparison_report import title
 from sympflow.studies.singularities import blow_up, failure_times
 from sympflow.studies.stability_report import StabilityRow
-from sympflow.system import HamiltonianSystem
-from sympflow.validation import MAX_SAVED_VALUES
 
 STEPS = tuple(2.0**k for k in range(-1, 7))
 """Default steps of classical methods, times the system's; those of a trained flow are fractions of its Δt."""

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.arguments import check_counts, check_t_span
 from sympflow.arrays import is_tensor
-from sympflow.solver import solve
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.solver import check_y0, solve
 from sympflow.studies.candidates import candidates
 from sympflow.studies.comparison_report import title
 from sympflow.studies.stability_report import StabilityReport, StabilityRow, StepLimit
 from sympflow.studies.stability_study import Study
 from sympflow.studies.step_limits import step_limit
-from sympflow.system import HamiltonianSystem
-from sympflow.validation import check_counts, check_t_span, check_y0
 
 DEFAULT = ("sympflow", "verlet", "leapfrog", "kahan_li8", "implicit_midpoint", "rk4", "rk45")
 METRICS = ("energy", "drift", "volume", "symplecticity", "domain")

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from sympflow.files import naming_path, writable
+from sympflow.arguments import naming_path, writable
 
 
 @dataclass(frozen=True)

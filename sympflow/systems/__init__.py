@@ -2,20 +2,20 @@
 
 from collections.abc import Callable
 
-from sympflow.system import HamiltonianSystem
-from sympflow.systems.double_well import double_well
-from sympflow.systems.fput import fput, oscillatory_energies
-from sympflow.systems.harmonic_oscillator import harmonic_oscillator
-from sympflow.systems.henon_heiles import henon_heiles, henon_heiles_escape
-from sympflow.systems.kepler import kepler, kepler_ellipse
-from sympflow.systems.lennard_jones import lennard_jones
-from sympflow.systems.nonseparable import nonseparable
-from sympflow.systems.outer_solar_system import outer_solar_system
-from sympflow.systems.pendulum import pendulum, pendulum_separatrix
-from sympflow.systems.quartic import quartic
-from sympflow.systems.spring_pendulum import spring_pendulum
-from sympflow.systems.three_body import three_body
-from sympflow.systems.toda import lax_eigenvalues, toda_lattice
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.systems.celestial import kepler, kepler_ellipse, outer_solar_system, three_body
+from sympflow.systems.chains import fput, lax_eigenvalues, lennard_jones, oscillatory_energies, toda_lattice
+from sympflow.systems.textbook import (
+    double_well,
+    harmonic_oscillator,
+    henon_heiles,
+    henon_heiles_escape,
+    nonseparable,
+    pendulum,
+    pendulum_separatrix,
+    quartic,
+    spring_pendulum,
+)
 
 SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {
     "harmonic-oscillator": harmonic_oscillator,

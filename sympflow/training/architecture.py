@@ -8,14 +8,14 @@ from typing import Any
 
 import torch
 
-from sympflow.domain import Domain
 from sympflow.flow.base import FlowMap
 from sympflow.flow.mlp import MLPFlow, matching_widths
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.interruption import Interruption
 from sympflow.training.recipes import BUDGET, PrimedRecipe, default_recipe

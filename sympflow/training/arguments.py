@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from sympflow.arrays import to_numpy
-from sympflow.domain import Domain, EnergySublevel
 from sympflow.flow.sympflow import SympFlow
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain, EnergySublevel
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.checkpoint import check_writable
 from sympflow.training.choices import is_number
 from sympflow.training.run import Labelled

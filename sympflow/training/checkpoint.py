@@ -12,7 +12,7 @@ import torch
 
 if TYPE_CHECKING:
     from sympflow.flow.base import FlowMap
-    from sympflow.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
 FORMAT = 1
 FIELDS = {

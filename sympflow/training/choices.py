@@ -6,7 +6,7 @@ import math
 from dataclasses import fields
 from typing import Any
 
-from sympflow.flow.arguments import plain
+from sympflow.arguments import plain
 
 
 def to_plain_numbers(config: Any) -> None:

@@ -15,11 +15,11 @@ import torch
 from scipy.integrate import solve_ivp
 
 from sympflow.flow.clocked import ClockedFlow
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
 from sympflow.integrators.log_sympflow import LogSympFlow
 from sympflow.metrics.energy import max_energy_error
 from sympflow.solver import solve
-from sympflow.system import HamiltonianSystem
-from sympflow.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
 from sympflow.training.collocation import Stream, states
 
 TOLERANCE = 1e-13

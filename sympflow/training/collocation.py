@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sympflow.domain import Domain
+from sympflow.hamiltonian.domain import Domain
 
 BLOCK = 32  # steps drawn at once: a rejection-sampled domain then costs little
 

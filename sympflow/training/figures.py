@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from sympflow.flow.base import FlowMap
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.exact_flow import reference_step
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.labels import Labels
-from sympflow.training.validation import reference_step
 
 FRACTIONAL_TIMES = 50
 

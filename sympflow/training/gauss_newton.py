@@ -23,10 +23,10 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from sympflow.domain import Domain
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.collocation import PointSource, Stream, states, stream_seed
 from sympflow.training.labels import Labels
 from sympflow.training.levenberg_marquardt import Minimum

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sympflow.system import HamiltonianSystem
-from sympflow.training.validation import reference_step
+from sympflow.hamiltonian.exact_flow import reference_step
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 TOLERANCE = 1e-13
 

@@ -15,9 +15,9 @@ from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.energy import max_energy_error
 from sympflow.solver import solve
-from sympflow.system import HamiltonianSystem
 from sympflow.systems import SYSTEMS
 from sympflow.training.clock_fit import energy_errors, train_clock
 from sympflow.training.table_fit import force_gradient_in

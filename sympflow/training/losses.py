@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from sympflow.flow.base import FlowMap
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.collocation import Points
 
 Terms = tuple[Tensor | None, Tensor | None, Tensor | None]

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.domain import Box, EnergySublevel
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Box, EnergySublevel
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.systems import harmonic_oscillator, henon_heiles, pendulum
 from sympflow.training.figures import measure, one_step_errors
 from sympflow.training.ladder import certify

@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 
-from sympflow.domain import Domain
 from sympflow.flow.base import FlowMap
 from sympflow.flow.scaling import Scaling
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 OUT_OF_TIME = "the time budget was used up"
 INTERRUPTED = "it was interrupted"

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from sympflow.domain import Domain
 from sympflow.flow.base import FlowMap
 from sympflow.flow.scaling import Scaling
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.collocation import PointSource, Stream, states, stream_seed
 from sympflow.training.config import TrainingConfig

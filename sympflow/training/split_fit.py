@@ -12,13 +12,13 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from sympflow.domain import Domain
 from sympflow.flow.columns import Column
 from sympflow.flow.split import SplitFlow
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.parts import Map
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.exact_maps import kernel_of
 from sympflow.kernels.parts import PartsKernel
-from sympflow.parts import Map
-from sympflow.system import HamiltonianSystem
 from sympflow.training.collocation import Stream, states, stream_seed
 from sympflow.training.labels import Labels
 from sympflow.training.levenberg_marquardt import Minimum, levenberg_marquardt

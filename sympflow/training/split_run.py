@@ -11,9 +11,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sympflow.domain import Domain
 from sympflow.flow.split import SplitFlow
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.levenberg_marquardt import Minimum
 from sympflow.training.search import SearchRun, Stop
 from sympflow.training.search_config import SplitConfig

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.domain import Box, Domain, EnergySublevel
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
+from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.solver import solve
-from sympflow.system import HamiltonianSystem
 from sympflow.systems import fput, spring_pendulum
 from sympflow.training.ladder import cost
 from sympflow.training.trainer import train

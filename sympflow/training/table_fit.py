@@ -11,7 +11,7 @@ import torch
 
 from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
-from sympflow.monomials import in_monomials
+from sympflow.hamiltonian.monomials import in_monomials
 from sympflow.training.labels import Labels
 from sympflow.training.levenberg_marquardt import Minimum, levenberg_marquardt
 from sympflow.training.losses import Objective

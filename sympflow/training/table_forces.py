@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sympflow.integrators.scheme import CURVATURE, FORCE_GRADIENT
-from sympflow.monomials import Monomials
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 ALONG = 1e-4  # length of the difference, relative to q, that gives the third derivative of V along M⁻¹∇V
 

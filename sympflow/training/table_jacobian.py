@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sympflow.monomials import Monomials
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.table_forces import forces_of
 
 

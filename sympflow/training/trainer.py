@@ -9,10 +9,11 @@ from typing import Any
 import torch
 from numpy.typing import ArrayLike
 
-from sympflow.domain import Domain
-from sympflow.flow.arguments import check_system, plain
+from sympflow.arguments import plain
+from sympflow.flow.arguments import check_system
 from sympflow.flow.base import FlowMap
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.architecture import check_flow, kind_of, new_primed
 from sympflow.training.arguments import check_surroundings, domain_for, refuse_unknown
 from sympflow.training.interruption import Interruption

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sympflow.domain import Domain
 from sympflow.flow.scaling import Scaling
-from sympflow.integrators.scheme import CURVATURE, FORCE_GRADIENT
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 from sympflow.training.collocation import Stream, states
 from sympflow.training.gauss_newton import GaussNewtonRun
 from sympflow.training.recipes import PHASE, PrimedRecipe, default_recipe

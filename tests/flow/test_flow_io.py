@@ -8,7 +8,6 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from sympflow.domain import Ball, Box
 from sympflow.flow.io import KEY, load, save
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.mlp import MLPFlow
@@ -16,6 +15,7 @@ from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.record import checksum
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
+from sympflow.hamiltonian.domain import Ball, Box
 from sympflow.systems import harmonic_oscillator, henon_heiles
 
 MAKERS = {

@@ -14,7 +14,7 @@ from safetensors.torch import save as save_tensors
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, get, solve, symplecticity_defect, systems, train
-from sympflow.integrators.schemes import SCHEMES
+from sympflow.schemes import SCHEMES
 
 EPS = np.finfo(float).eps
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
@@ -466,7 +466,7 @@ def test_systems_it_does_not_apply_to():
 
 
 def test_asymmetric_schemes_make_no_palindrome():
-    from sympflow.integrators.schemes import Scheme
+    from sympflow.schemes import Scheme
 
     euler = Scheme("symplectic Euler", 1, (1.0,), (1.0,), (0.0,), "test")
     with pytest.raises(ValueError, match=r"^`scheme` 'symplectic Euler' is not symmetric"):

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sympflow import Ball, Box, EnergySublevel, HamiltonianSystem, Tube, systems
-from sympflow.domain import domain_from_dict
+from sympflow.hamiltonian.domain import domain_from_dict
 
 
 def kinetic_plus_square(x):

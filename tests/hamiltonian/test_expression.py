@@ -9,10 +9,10 @@ import sympy as sp
 from watchdog import watched
 
 from sympflow import HamiltonianSystem, SympFlow, load, solve, systems
-from sympflow.expression import Unreadable, read
 from sympflow.flow import seal as command
 from sympflow.flow.io import reseal
 from sympflow.flow.record import seal
+from sympflow.hamiltonian.expression import Unreadable, read
 
 q, p, q1, q2 = sp.symbols("q p q1 q2", real=True)
 

@@ -6,9 +6,8 @@ import torch
 from scipy.linalg import expm
 
 from sympflow import HamiltonianSystem, SympFlow, solve, time_transformed
-from sympflow.decomposition import exact_parts
-from sympflow.linear_part import LinearPart
-from sympflow.parts import ExactParts, Map
+from sympflow.hamiltonian.linear_part import LinearPart
+from sympflow.hamiltonian.parts import ExactParts, Map, exact_parts
 from sympflow.systems import fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum, toda_lattice
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sympflow import HamiltonianSystem, solve, systems
-from sympflow.integrators.schemes import SCHEMES
+from sympflow.schemes import SCHEMES
 
 HH = systems.henon_heiles()
 PLAIN = HamiltonianSystem(lambda q: (q**4).sum(-1), ndof=1, y0=[1.0, 0.0])

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sympflow import HamiltonianSystem, get, max_energy_error, solve, systems
-from sympflow.integrators.checks import check_integrator
+from sympflow.testing.checks import check_integrator
 
 METHODS = ("implicit_midpoint", "gauss_legendre4")
 EPS = np.finfo(float).eps

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from sympflow import HamiltonianSystem, get, solve, symplecticity_defect
+from sympflow.hamiltonian.parts import sheared, shears
 from sympflow.integrators.linear_splitting import LINEAR_SPLITTINGS, PARTS_SPLITTINGS
-from sympflow.shears import sheared, shears
 from sympflow.systems import fput, harmonic_oscillator, henon_heiles, spring_pendulum
-from sympflow.systems.fput import oscillatory_energies
+from sympflow.systems.chains import oscillatory_energies
 
 SOFT = fput(omega=2.0)  # where the order shows
 EXACT = solve(SOFT, "dop853", (0, 2), t_eval=[2.0], rtol=1e-13, atol=1e-14).y[:, -1]

@@ -19,14 +19,14 @@ from sympflow import (
 )
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.shipped import choose
+from sympflow.hamiltonian.time_transformation import lifted
 from sympflow.integrators.base import Problem
-from sympflow.integrators.checks import check_integrator
 from sympflow.integrators.log_sympflow import LogSympFlow
 from sympflow.integrators.physical_time import PhysicalRun
 from sympflow.integrators.timed_pass import timed_pass
 from sympflow.interop.scipy import as_scipy
-from sympflow.systems.kepler import kepler_ellipse
-from sympflow.time_transformation import lifted
+from sympflow.systems.celestial import kepler_ellipse
+from sympflow.testing.checks import check_integrator
 from sympflow.training.clock_fit import train_clock
 
 METHODS = ("log_leapfrog", "log_blanes_moan4", "log_kahan_li8")

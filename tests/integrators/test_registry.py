@@ -10,7 +10,7 @@ import pytest
 from sympflow import available, compare, get, poincare_section, register, solve, systems
 from sympflow.integrators import registry
 from sympflow.integrators.base import FixedStep
-from sympflow.integrators.schemes import SCHEMES
+from sympflow.schemes import SCHEMES
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sympflow.integrators.schemes import SCHEMES, Scheme
+from sympflow.schemes import SCHEMES, Scheme
 
 ALL = pytest.mark.parametrize("scheme", SCHEMES.values(), ids=SCHEMES.keys())
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from sympflow.integrators.schemes import SCHEMES, Scheme
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.splitting import splitting_kernel
-from sympflow.system import HamiltonianSystem
+from sympflow.schemes import SCHEMES, Scheme
 from sympflow.systems import harmonic_oscillator, henon_heiles
 
 VERLET, KAHAN_LI8 = SCHEMES["verlet"], SCHEMES["kahan_li8"]

@@ -8,6 +8,7 @@ import pytest
 import sympy as sp
 
 from sympflow import SympFlow, systems
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import printed
 from sympflow.kernels.kick_shapes import shapes
 from sympflow.kernels.kicks import _function, _scheduled
@@ -15,7 +16,6 @@ from sympflow.kernels.nested import nested
 from sympflow.kernels.pipeline import Operation, cycles_per_turn
 from sympflow.kernels.primed_flow import PrimedFlowKernel
 from sympflow.kernels.scheduling import ADD, FUSED, MULTIPLY, Schedule
-from sympflow.system import HamiltonianSystem
 
 SCENES = {
     "henon_heiles": systems.henon_heiles,

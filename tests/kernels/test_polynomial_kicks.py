@@ -9,12 +9,12 @@ import torch
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, train
-from sympflow.integrators.scheme import Scheme
+from sympflow.hamiltonian.monomials import gradient, in_monomials, monomials, value
 from sympflow.integrators.splitting import Splitting
 from sympflow.kernels.kick_shapes import shapes
 from sympflow.kernels.kicks import _function, _scheduled
 from sympflow.kernels.splitting import splitting_kernel
-from sympflow.monomials import gradient, in_monomials, monomials, value
+from sympflow.schemes import Scheme
 from sympflow.training.ladder import Rung
 
 EPS = np.finfo(float).eps

@@ -1,7 +1,6 @@
 """The built-in scenes: each is what its docstring says, and the truths that are known of it hold."""
 
 import math
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +9,9 @@ import torch
 
 from sympflow import solve, systems
 from sympflow.commands.arguments import scenes
-from sympflow.domain import domain_from_dict
-from sympflow.systems import SYSTEMS
+from sympflow.hamiltonian.domain import domain_from_dict
+from sympflow.systems import SYSTEMS, celestial, chains
 
-outer = import_module("sympflow.systems.outer_solar_system")  # the package's attributes are the functions
-argon = import_module("sympflow.systems.lennard_jones")
 PLANETS, ARGON = systems.outer_solar_system(), systems.lennard_jones()  # what is compiled belongs to the system
 
 # a scene as it is built, and H(y0) worked out by hand
@@ -296,8 +293,8 @@ def test_the_pythagorean_bodies_meet_as_they_should():
 def test_bodies_keep_their_momenta():
     for system, dimension, mass in (
         (systems.three_body(), 2, np.array([3.0, 4, 5])),
-        (PLANETS, 3, outer.MASSES),
-        (ARGON, 2, np.full(7, argon.MASS)),
+        (PLANETS, 3, celestial.PLANET_MASSES),
+        (ARGON, 2, np.full(7, chains.MASS)),
     ):
         backend = "array" if system.symbols else "compiled"
         sol = solve(system, "kahan_li8", (0, 400 * system.dt), save_every=20, backend=backend)
@@ -312,11 +309,11 @@ def test_bodies_keep_their_momenta():
 
 def test_the_outer_solar_system_is_that_of_the_book():
     system = systems.outer_solar_system()
-    m, G = outer.MASSES, outer.G
+    m, G = celestial.PLANET_MASSES, celestial.G
     q, p = (x.reshape(6, 3) for x in np.split(system.y0, 2))
     v = p / m[:, None]
-    np.testing.assert_allclose(q - q[0], outer.POSITIONS, atol=1e-14)
-    np.testing.assert_allclose(v - v[0], outer.VELOCITIES, atol=1e-17)
+    np.testing.assert_allclose(q - q[0], celestial.POSITIONS, atol=1e-14)
+    np.testing.assert_allclose(v - v[0], celestial.VELOCITIES, atol=1e-17)
     # osculating elements about the Sun: semi-major axes in AU, periods in days
     r, speed2 = np.linalg.norm(q[1:] - q[0], axis=1), ((v[1:] - v[0]) ** 2).sum(1)
     mu = G * (m[0] + m[1:])

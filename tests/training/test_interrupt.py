@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from sympflow.imports import whole_import
+from sympflow.lazy import whole_import
 
 SCRIPT = """
 import os, signal, threading

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from sympflow import SympFlow, systems, train
+from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trainer, trials
 from sympflow.training.gauss_newton import GaussNewtonRun
@@ -18,7 +19,6 @@ from sympflow.training.interruption import Interruption
 from sympflow.training.levenberg_marquardt import STOPPED, Minimum
 from sympflow.training.recipes import default_recipe
 from sympflow.training.table_fit import TableFit
-from sympflow.training.validation import reference_step
 from sympflow.training.watch import Watch
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends the process there")

@@ -11,11 +11,12 @@ import pytest
 import torch
 
 import sympflow
-from sympflow.domain import Box
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Box
+from sympflow.hamiltonian.exact_flow import reference_step
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.systems import harmonic_oscillator, henon_heiles
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.collocation import Points, PointSource, Stream, states
@@ -24,7 +25,6 @@ from sympflow.training.line_search import Trial, strong_wolfe
 from sympflow.training.losses import Loss
 from sympflow.training.quasi_newton import BFGS, LBFGS
 from sympflow.training.trainer import train
-from sympflow.training.validation import reference_step
 
 QUICK = {"pairs": 1, "hidden": (5,), "points": 60, "validation_points": 60, "reference_states": 5, "progress": False}
 MORE = {k: v for k, v in QUICK.items() if k not in ("pairs", "hidden")}

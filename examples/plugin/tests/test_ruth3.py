@@ -2,7 +2,7 @@
 
 from sympflow_ruth.ruth3 import Ruth3
 
-from sympflow.integrators.checks import parametrize_with_checks
+from sympflow.testing.checks import parametrize_with_checks
 
 
 @parametrize_with_checks([Ruth3])

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from sympflow.arrays import Array, concatenate, per_state
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
-from sympflow.system import HamiltonianSystem
 
 KICKS = (7 / 24, 3 / 4, -1 / 24)
 DRIFTS = (2 / 3, -2 / 3, 1.0)

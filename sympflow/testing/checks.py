@@ -2,8 +2,7 @@
 
 Each check is a function check(integrator, system) that raises an AssertionError which says what is wrong, or
 `NotApplicable` with the reason why there is nothing to check. They judge by the mathematics: the declared order by
-slope, the declared symplecticity by the Jacobian of the step that ran. They are in
-`checks_of_runs`, `checks_of_steps` and `checks_of_consistency`.
+slope, the declared symplecticity by the Jacobian of the step that ran. They are in `laws`.
 """
 
 from __future__ import annotations
@@ -14,11 +13,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from sympflow.integrators import checks_of_consistency, checks_of_runs, checks_of_steps
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator
-from sympflow.integrators.check_setting import NotApplicable, default_system
 from sympflow.integrators.registry import named
-from sympflow.system import HamiltonianSystem
+from sympflow.testing import laws
+from sympflow.testing.laws import NotApplicable, default_system
 
 Factory = Callable[[], Integrator]
 
@@ -55,7 +54,7 @@ class Check:
             raise AssertionError(f"{self.name} of {integrator!r}: {what}") from error
 
 
-CHECKS = tuple(map(Check, (*checks_of_runs.ALL, *checks_of_steps.ALL, *checks_of_consistency.ALL)))
+CHECKS = tuple(map(Check, (*laws.OF_STEPS, *laws.OF_RUNS, *laws.OF_CONSISTENCY)))
 
 
 @dataclass(frozen=True)

@@ -4,20 +4,41 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-
-from sympflow.stiff_directions import GAP, inverse_mass, turning
 
 if TYPE_CHECKING:
     import sympy as sp
 
-    from sympflow.system import HamiltonianSystem
 
 ZERO = 1e-12  # of the largest squared frequency: what is below is a free drift
 SAME = 1e-9  # relative difference below which two frequencies are one
 EQUILIBRIUM_STEPS = 100
+
+
+class Scene(Protocol):
+    """The properties of a `HamiltonianSystem` that tell its linear part."""
+
+    name: str
+    ndof: int
+    symbols: Any
+    quadratic_kinetic: bool
+    inverse_mass: np.ndarray | None
+    stiffness_matrix: np.ndarray | None
+    domain: Any
+    y0: Any
+    t_span: Any
+
+    separable: bool
+
+    def potential(self, q: Any) -> Any: ...
+
+    def force(self, q: Any) -> Any: ...
+
+    def potential_hessian(self, q: Any) -> Any: ...
+
+    def kinetic_hessian(self, p: Any) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -138,7 +159,7 @@ class LinearPart:
         return float(self.frequencies.max(initial=0.0) * self.interval)
 
 
-def linear_part(system: HamiltonianSystem) -> LinearPart:
+def linear_part(system: Scene) -> LinearPart:
     """The quadratic part of a system, read off its symbols or made from its `stiffness_matrix`.
 
     Of H = T(p) + V(q) or of any other H the terms ½ pᵀBp + ½ qᵀKq + linear ones are taken, where B belongs to
@@ -158,7 +179,7 @@ def linear_part(system: HamiltonianSystem) -> LinearPart:
     else:
         raise ValueError(
             f"`system` {system.name!r} is given by functions, from which no linear part can be read: pass "
-            "stiffness_matrix=K to HamiltonianSystem."
+            "stiffness_matrix=K to Hamiltonian."
         )
     if system.quadratic_kinetic and (reason := turning(system, part)):
         raise ValueError(f"`system` {system.name!r} has no linear part that would help: {reason}.")
@@ -175,7 +196,7 @@ def linear_part(system: HamiltonianSystem) -> LinearPart:
     return part
 
 
-def _equilibrium(system: HamiltonianSystem, K: np.ndarray) -> np.ndarray:
+def _equilibrium(system: Scene, K: np.ndarray) -> np.ndarray:
     """c in the range of K where ∇V vanishes along it, so that the rest U stays small beside the stiff ½ (q−c)ᵀK(q−c).
 
     By q ← q − K⁺∇V(q) from 0, or from y0 where V is singular there. Where that does not converge, K is no curvature of
@@ -198,7 +219,7 @@ def _equilibrium(system: HamiltonianSystem, K: np.ndarray) -> np.ndarray:
     return np.zeros(system.ndof)
 
 
-def _interval(system: HamiltonianSystem) -> float:
+def _interval(system: Scene) -> float:
     return abs(system.t_span[1] - system.t_span[0])
 
 
@@ -269,3 +290,84 @@ def _degree(term: sp.Expr, variables: tuple[sp.Symbol, ...]) -> float:
         elif base.free_symbols or exponent.free_symbols:
             return np.inf
     return degree
+
+
+DRAWN, SAMPLES = 4096, 64  # states drawn, and those of lowest potential at which Hessians are compared
+GAP = 10.0  # between the curvatures of a stiff direction and of the others
+TURN = 0.1  # radians by which a stiff direction may turn and still count as constant
+
+
+def inverse_mass(system: Scene) -> np.ndarray:
+    """M⁻¹ (d, d)."""
+    if not system.quadratic_kinetic:
+        raise ValueError("`stiffness_matrix` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
+    return np.asarray(system.kinetic_hessian(np.zeros(system.ndof)), dtype=float)
+
+
+def turning(system: Scene, part: LinearPart | None) -> str | None:
+    """Why a constant K does not follow the stiff directions of V, or None.
+
+    ∇²V is taken at states of low potential, in the domain or about y0: in the valleys where orbits are. It is stiff if
+    at the median state a gap divides its curvatures; then the stiff directions must be those of K at all of them, or,
+    where there is no K, those at the first.
+    """
+    q = _positions(system)
+    if q is None or system.ndof < 2:
+        return None
+    try:
+        with np.errstate(all="ignore"):
+            hessians = np.asarray(system.potential_hessian(q))
+    except (TypeError, ValueError):  # a callable that has no Hessian: nothing can be compared
+        return None
+    hessians = hessians[np.isfinite(hessians).all((-1, -2))]
+    if len(hessians) < 2:
+        return None
+    L = np.linalg.cholesky(inverse_mass(system))
+    curvature, directions = np.linalg.eigh(L.T @ hessians @ L)
+    order = np.argsort(-np.abs(curvature), axis=-1)
+    typical = np.median(np.abs(np.take_along_axis(curvature, order, -1)), axis=0)
+    ratios = typical[:-1] / np.maximum(typical[1:], 1e-12 * typical[0])
+    m = int(np.argmax(ratios)) + 1
+    if not ratios[m - 1] > GAP:
+        return None
+    stiff = np.take_along_axis(directions, order[:, None, :m], -1)
+    if (angle := _angle(stiff[0], stiff)) > TURN:
+        return (
+            f"its stiff directions turn, by {np.degrees(angle):.0f}° from one state of the domain to others, so no "
+            "constant matrix K follows them. Write it in coordinates in which they do not turn, such as polar ones"
+        )
+    if part is None:
+        return None
+    eigenvalues, W = np.linalg.eigh(L.T @ part.stiffness_matrix @ L)
+    if (angle := _angle(W[:, np.argsort(-np.abs(eigenvalues))[:m]], stiff)) <= TURN:
+        return None
+    if system.stiffness_matrix is not None:
+        return (
+            f"`stiffness_matrix` is stiff in other directions than V, {np.degrees(angle):.0f}° away. Pass ∇²V at a "
+            "state of low potential, without what is not stiff in it"
+        )
+    return (
+        f"its stiff directions do not turn, but they are none of its quadratic terms, from the stiffest of which "
+        f"they are {np.degrees(angle):.0f}° away. Give the system by functions, Hamiltonian(V, ndof=…, "
+        "stiffness_matrix=K) with K the curvature ∇²V of the stiff directions"
+    )
+
+
+def _angle(reference: np.ndarray, directions: np.ndarray) -> float:
+    """Angle in radians from the span of m orthonormal columns to those of others (n, d, m), exceeded by one in ten."""
+    cosines = np.linalg.svd(reference.T @ directions, compute_uv=False)[:, -1]
+    return float(np.arccos(np.clip(np.quantile(cosines, 0.1), 0.0, 1.0)))
+
+
+def _positions(system: Scene) -> np.ndarray | None:
+    if system.domain is not None:
+        q = system.domain.sample(DRAWN, 0)[:, : system.ndof]
+    elif system.y0 is not None:
+        center = system.y0[: system.ndof]
+        spread = 0.5 * max(float(np.linalg.norm(center)), 1e-3) / np.sqrt(system.ndof)
+        q = center + spread * np.random.default_rng(0).standard_normal((DRAWN, system.ndof))
+    else:
+        return None
+    with np.errstate(all="ignore"):
+        V = np.asarray(system.potential(q))
+    return q[np.argsort(np.where(np.isfinite(V), V, np.inf))[:SAMPLES]]

@@ -12,7 +12,7 @@ import numpy as np
 from sympflow.arrays import Array, is_tensor, stack
 
 if TYPE_CHECKING:
-    from sympflow.symbolic import SymbolicHamiltonian
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 __all__ = ["MOST_MONOMIALS", "Monomials", "in_monomials", "monomials"]
 

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow import matrices
 from sympflow.arrays import Array
-from sympflow.domain import Domain, EnergySublevel
-from sympflow.fingerprints import fingerprint
-from sympflow.hamiltonian import Hamiltonian
+from sympflow.hamiltonian import matrices
+from sympflow.hamiltonian.domain import Domain, EnergySublevel
+from sympflow.hamiltonian.fingerprint import fingerprint
+from sympflow.hamiltonian.hamiltonian import Hamiltonian
 
 if TYPE_CHECKING:
     import sympy
 
-    from sympflow.linear_part import LinearPart
+    from sympflow.hamiltonian.linear_part import LinearPart
 
 MOST_DEGREES = 1_000_000
 
@@ -93,7 +93,7 @@ class HamiltonianSystem(Hamiltonian):
         dt: float = 0.05,
         energy_scale: float | None = None,
     ) -> None:
-        from sympflow.callables import CallableHamiltonian
+        from sympflow.hamiltonian.callables import CallableHamiltonian
 
         number = isinstance(ndof, int | float | np.number) and not isinstance(ndof, bool) and 1 <= ndof <= MOST_DEGREES
         if ndof is None or not number or int(ndof) != ndof:
@@ -143,7 +143,7 @@ class HamiltonianSystem(Hamiltonian):
         ValueError, TypeError
             If the expression cannot be parsed, has symbols without a value, or depends on t.
         """
-        from sympflow.symbolic import SymbolicHamiltonian
+        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
         symbols = SymbolicHamiltonian(expression, params)
         self = cls.__new__(cls)
@@ -195,7 +195,7 @@ class HamiltonianSystem(Hamiltonian):
         ValueError
             If there is none, or its stiff direction turns, with the reason.
         """
-        from sympflow.linear_part import linear_part
+        from sympflow.hamiltonian.linear_part import linear_part
 
         return linear_part(self)
 

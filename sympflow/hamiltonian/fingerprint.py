@@ -11,7 +11,7 @@ import numpy as np
 from sympflow.arrays import to_numpy
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian import Hamiltonian
+    from sympflow.hamiltonian.hamiltonian import Hamiltonian
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:

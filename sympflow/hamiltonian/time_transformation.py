@@ -9,9 +9,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor
-from sympflow.domain import Domain
-from sympflow.hamiltonian import Hamiltonian
-from sympflow.system import HamiltonianSystem
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.hamiltonian import Hamiltonian
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 LARGEST_SHIFT = 1e30
 _ENERGIES: WeakKeyDictionary[HamiltonianSystem, tuple[bytes, float]] = WeakKeyDictionary()

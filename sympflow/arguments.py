@@ -1,0 +1,214 @@
+"""Arguments, checked before anything runs: an error names the argument and ends with the remedy."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.arrays import is_tensor, to_numpy
+
+MAX_SAVED_VALUES = 10_000_000
+MAX_ASKED_VALUES = 1_000_000_000
+"""Of a batch, or of outputs that were asked for one by one: 8 GB."""
+LONGEST_STEP = 1e100
+"""Beyond it the powers of dt in a step are no floating-point numbers."""
+_FLOAT64 = np.dtype(np.float64)
+_PLAIN = {float, int}
+FEWEST_TIMES = 8  # floating-point numbers that an interval must span
+_MOST_SAMPLES = 100_000_000
+
+
+def check_t_span(t_span: Any) -> tuple[float, float]:
+    try:
+        if type(t_span) is tuple and len(t_span) == 2 and {type(t_span[0]), type(t_span[1])} <= _PLAIN:
+            t0, t1 = float(t_span[0]), float(t_span[1])
+        elif isinstance(t_span, str | bytes | set | frozenset | dict):
+            raise TypeError(type(t_span).__name__)
+        else:
+            t0, t1 = (_real(t) for t in t_span)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"`t_span` must be two numbers, start and end; got {t_span!r}: pass a tuple such as (0, 100)."
+        ) from error
+    except OverflowError:
+        t0, t1 = -math.inf, math.inf
+    if not math.isfinite(t1 - t0):
+        raise ValueError(f"`t_span` must be finite; got ({t0:g}, {t1:g}). Choose an end that can be reached.")
+    spacing = math.ulp(max(abs(t0), abs(t1)))
+    if 0 < abs(t1 - t0) < FEWEST_TIMES * spacing:
+        raise ValueError(
+            f"`t_span` spans fewer than {FEWEST_TIMES} floating-point numbers, which are {spacing:g} apart there; got "
+            f"({t0!r}, {t1!r}). Start at 0: H does not depend on time."
+        )
+    return t0, t1
+
+
+def _real(x: Any) -> float:
+    if type(x) is float or type(x) is int:
+        return float(x)
+    if np.iscomplexobj(x):  # NumPy's complex numbers would lose their imaginary part with a warning
+        raise TypeError("a complex number")
+    return float(x)
+
+
+def check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
+    plain = type(t_eval) is np.ndarray and t_eval.dtype == _FLOAT64 and t_eval.ndim == 1
+    if plain and 0 < t_eval.size <= MAX_SAVED_VALUES and _proper(t_eval, t0, t1):
+        return t_eval.copy()
+    try:
+        times = to_numpy(t_eval)
+        if times.dtype.kind not in "fiu":
+            raise TypeError(f"dtype {times.dtype}")
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"`t_eval` must be real numbers; got {error}. Pass times such as [0.5, 1.0].") from error
+    if np.ma.is_masked(t_eval):
+        raise ValueError("`t_eval` has masked entries: fill them, or leave these times out.")
+    if times.ndim != 1:
+        raise ValueError(f"`t_eval` must be one-dimensional; got shape {times.shape}: pass a list of times.")
+    if times.size > MAX_ASKED_VALUES:
+        raise ValueError(f"`t_eval` has {times.size:.3g} times, more than {MAX_ASKED_VALUES:.0e}: choose fewer.")
+    times = times.astype(float)
+    if times.size and _proper(times, t0, t1):
+        return times
+    low, high = min(t0, t1), max(t0, t1)
+    if times.size and not (times.min() >= low and times.max() <= high):
+        raise ValueError(f"`t_eval` must lie within `t_span`, [{low:g}, {high:g}]: extend `t_span` or drop times.")
+    if (np.diff(times) * (1 if t1 >= t0 else -1) < 0).any():
+        raise ValueError("`t_eval` must be ordered from the start of `t_span` to its end: sort it.")
+    return times
+
+
+def _proper(times: np.ndarray, t0: float, t1: float) -> bool:
+    """Whether times lie between t0 and t1, in this order."""
+    first, last = float(times[0]), float(times[-1])
+    if not (t0 <= first <= last <= t1 if t0 <= t1 else t0 >= first >= last >= t1):
+        return False
+    if len(times) == 1:
+        return True
+    ordered = times[:-1] <= times[1:] if t0 <= t1 else times[:-1] >= times[1:]
+    return int(np.count_nonzero(ordered)) == len(times) - 1
+
+
+def check_save_every(save_every: Any, times: np.ndarray | None) -> int:
+    if save_every is None:
+        return 1
+    if times is not None:
+        raise ValueError("`save_every` and `t_eval` both choose the outputs: give one of them.")
+    check_counts(save_every=save_every)
+    return min(int(save_every), 2**53)
+
+
+def check_counts(**values: Any) -> None:
+    """Positive integers."""
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
+
+
+def check_dt(dt: Any) -> None:
+    """Raise unless `dt` is None or a step length."""
+    number = isinstance(dt, int | float | np.number) and not isinstance(dt, bool)
+    if dt is not None and not (number and 0 < dt <= LONGEST_STEP):
+        raise ValueError(f"`dt` must be a positive and finite number, at most {LONGEST_STEP:g}; got {dt!r}.")
+
+
+def check_flag(name: str, value: Any) -> None:
+    """Raise unless the option `name` is True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"`{name}` must be True or False; got {value!r}.")
+
+
+def floats(name: str, value: Any) -> np.ndarray:
+    """`value` as an array of floats, if it is one of real numbers."""
+    try:
+        array = np.array(value)
+    except ValueError:  # rows of different lengths
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"`{name}` must be made of real numbers; got {value!r}.")
+    return array.astype(float)
+
+
+def check_number(name: str, value: Any) -> None:
+    """A TypeError unless `value` is a real number."""
+    if not isinstance(value, int | float | np.number) or isinstance(value, bool) or np.iscomplexobj(value):
+        raise TypeError(f"`{name}` must be a number; got {value!r}.")
+
+
+def vector(name: str, value: ArrayLike) -> tuple[float, ...]:
+    """`value` as the finite numbers of a state [q, p], (2d,)."""
+    array = floats(name, value)
+    if array.ndim != 1 or array.size == 0 or array.size % 2:
+        raise ValueError(f"`{name}` must have shape (2d,), one entry for each of [q, p]; got {array.shape}.")
+    if not np.isfinite(array).all():
+        raise ValueError(f"`{name}` must be finite; got {array.tolist()}.")
+    return tuple(array.tolist())
+
+
+def checked_states(x: ArrayLike, width: int) -> np.ndarray:
+    """`x`, checked to be numbers of shape (..., width)."""
+    try:
+        array = to_numpy(x)
+    except ValueError:  # rows of different lengths
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"`x` must be states of real numbers; got {x!r}: pass an array of shape (..., {width}).")
+    if array.ndim == 0 or array.shape[-1] != width:
+        raise ValueError(
+            f"`x` must have shape (..., {width}), states [q, p] of the domain; got {array.shape}: "
+            "put them on the last axis."
+        )
+    return array
+
+
+def sample_count(n: int) -> int:
+    """`n` as an integer, at least one and not more than memory holds."""
+    number = isinstance(n, int | float | np.number) and np.isfinite(n)
+    if not number or n < 1 or int(n) != n:
+        raise ValueError(f"`n` must be a positive integer; got {n!r}.")
+    if n > _MOST_SAMPLES:
+        raise ValueError(f"`n` must be at most {_MOST_SAMPLES:.0e}; got {n:.3g}: draw in parts, with several seeds.")
+    return int(n)
+
+
+def plain(value: Any) -> Any:
+    """A number of NumPy's or torch's as one of Python's, which JSON takes as well; anything else as it is."""
+    array = isinstance(value, np.generic | np.ndarray) or is_tensor(value)
+    return value.item() if array and value.ndim == 0 else value
+
+
+def writable(path: Any) -> Path:
+    """`path` of a file to be written, its folder made.
+
+    Raises
+    ------
+    TypeError
+        If it is no path.
+    ValueError
+        If it is a folder, or its folder cannot be made.
+    """
+    if isinstance(path, bytes) or not isinstance(path, str | os.PathLike):
+        raise TypeError(f"`path` must be a file name or a pathlib.Path; got {type(path).__name__}.")
+    file = Path(os.fsdecode(path))
+    if not str(path) or file.is_dir():
+        raise ValueError(f"`path` {str(path)!r} is {'a folder' if str(path) else 'empty'}: name a file in a folder.")
+    with naming_path(file):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    return file
+
+
+@contextmanager
+def naming_path(path: Path) -> Iterator[None]:
+    """What the system refuses about a file as a ValueError that names the argument."""
+    try:
+        yield
+    except OSError as error:
+        why = error.strerror or type(error).__name__
+        raise ValueError(f"`path` {str(path)!r} cannot be written ({why}): name a file that can be.") from error

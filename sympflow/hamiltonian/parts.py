@@ -1,0 +1,464 @@
+"""H as a sum of parts that are solved exactly, two or more, and their flows on arrays.
+
+A part is solved exactly if it is quadratic, ½ pᵀBp + ½ (q − c)ᵀK(q − c) (the *linear* part, in its normal modes), or
+if no two of the variables that it depends on are conjugate to each other: then these variables do not move, and its
+flow over a time s is x + s J∇H_k(x). V(q) and T(p) are of this kind, and so is p_θ²/(2r²).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sympflow.arrays import Array, concatenate, is_tensor, stack
+from sympflow.hamiltonian.linear_part import LinearPart, linear_part, read_off
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, parse
+
+if TYPE_CHECKING:
+    import sympy as sp
+
+    from sympflow.hamiltonian.system import HamiltonianSystem
+
+LINEAR = 0
+"""The number of the linear part; the others are 1, 2, …"""
+
+
+@dataclass(frozen=True)
+class Map:
+    """The exact flow of a part, in units of absolute time; every entry may have a batch shape in front.
+
+    Attributes
+    ----------
+    part : int
+    length : (...) for the parts 1, 2, …; (..., F) for the linear part
+        How long it acts; the linear part has a time for each of its F frequencies.
+    gradient : (...)
+        g, adds −g ½|∇H_k|²_{M⁻¹} to the Hamiltonian of a part H_k(q), times 1.
+    filters : (..., F) or None
+        φ: the part acts at c + C φ X in place of q = c + C X, with a factor for each frequency.
+    """
+
+    part: int
+    length: Any
+    gradient: Any = 0.0
+    filters: Any = None
+
+    def inverse(self) -> Map:
+        return Map(self.part, -self.length, -self.gradient, self.filters)
+
+
+class PartFunctions(SymbolicHamiltonian):
+    """A part H_k(q, p) as a SymPy expression, with array functions of states [q, p]."""
+
+    def __init__(self, H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> None:
+        self.H, self.q, self.p, self.ndof = H, q, p, len(q)
+        self.V = self.T = None
+        self.separable = False
+
+    @property
+    def of_positions(self) -> bool:
+        """Whether it is a potential, H_k(q)."""
+        return not self.H.has(*self.p)
+
+
+class RestOfPotential:
+    """U(q) = V(q) − ½ (q − c)ᵀK(q − c) of a system given by functions."""
+
+    of_positions = True
+
+    def __init__(self, system: HamiltonianSystem, linear: LinearPart) -> None:
+        self.system, self.K, self.center, self.ndof = system, linear.stiffness_matrix, linear.center, system.ndof
+
+    def hamiltonian(self, y: Array) -> Array:
+        q = y[..., : self.ndof]
+        x = q - like(self.center, q)
+        return self.system.potential(q) - (x * (x @ like(self.K, q))).sum(-1) / 2
+
+    def gradient(self, y: Array) -> Array:
+        q = y[..., : self.ndof]
+        return concatenate([-self.system.force(q) - (q - like(self.center, q)) @ like(self.K, q), 0 * q])
+
+    def hessian_vector(self, y: Array, v: Array) -> Array:
+        return self.system.hessian_vector(y[..., : self.ndof], v) - v @ like(self.K, v)
+
+
+class ExactParts:
+    """The parts of a system, and their flows in the normal modes (X, Y) of the linear one.
+
+    Parameters
+    ----------
+    linear : LinearPart or None
+    rest : sequence of PartFunctions
+        The parts 1, 2, …
+    ndof : int
+    sequence : sequence of int, optional
+        The parts in the order of a splitting, the last innermost; the default is 1, 2, …, 0: kicks outside.
+    """
+
+    def __init__(
+        self, linear: LinearPart | None, rest: Sequence[Any], ndof: int, sequence: Sequence[int] | None = None
+    ) -> None:
+        self.linear, self.rest, self.ndof = linear, tuple(rest), ndof
+        self.sequence = tuple(range(1, len(self.rest) + 1)) + (LINEAR,) * (linear is not None)
+        if sequence is not None:
+            self.sequence = tuple(sequence)
+        self.C: np.ndarray = linear.modes if linear else np.eye(ndof)
+        self.inverse_C: np.ndarray = linear.inverse_modes if linear else np.eye(ndof)
+        self.center = linear.center if linear else np.zeros(ndof)
+        self.classes = linear.classes if linear else np.zeros(ndof, dtype=int)
+        self.n_classes = linear.n_classes if linear else 1
+        self.diagonal = not np.count_nonzero(self.C - np.diag(np.diag(self.C)))
+
+    def __len__(self) -> int:
+        return len(self.rest) + (self.linear is not None)
+
+    def check_filters(self, part: int) -> None:
+        """Raise unless the part, filtered, is still solved exactly: it must not come to hold a conjugate pair."""
+        if not (self.diagonal or self.rest[part - 1].of_positions):
+            raise ValueError("`filters` cannot act on a part that depends on momenta where modes are mixed: leave out.")
+
+    # normal modes -------------------------------------------------------------------------------------
+
+    def to_modes(self, y: Array) -> tuple[Array, Array]:
+        """X = C⁻¹(q − c), Y = Cᵀp."""
+        d = self.ndof
+        return self._times(self.inverse_C, y[..., :d] - like(self.center, y)), self._times(self.C.T, y[..., d:])
+
+    def from_modes(self, X: Array, Y: Array) -> Array:
+        """[c + C X, C⁻ᵀY]."""
+        return concatenate([like(self.center, X) + self._times(self.C, X), self._times(self.inverse_C.T, Y)])
+
+    def _times(self, A: np.ndarray, x: Array) -> Array:
+        if self.diagonal:
+            return x * like(np.diag(A), x)
+        return x @ like(A.T, x)
+
+    def by_class(self, values: Array) -> Array:
+        """Values for each frequency (..., F) as values for each mode (..., d)."""
+        return values[..., self.classes]
+
+    # flows ----------------------------------------------------------------------------------------------
+
+    def apply(self, maps: Sequence[Map], X: Array, Y: Array) -> tuple[Array, Array]:
+        """The maps one after another, the first first."""
+        for m in maps:
+            if m.part == LINEAR:
+                X, Y = self.linear_flow(X, Y, m.length)
+                continue
+            dX, dY = self.slopes(m.part, X, Y, m.filters)
+            length = each_mode(m.length)
+            X, Y = (X, Y - length * dX) if dY is None else (X + length * dY, Y - length * dX)
+            if not (isinstance(m.gradient, float) and m.gradient == 0.0):
+                Y = Y + each_mode(m.gradient) * self.force_gradient(m.part, X, m.filters)
+        return X, Y
+
+    def linear_flow(self, X: Array, Y: Array, s: Any) -> tuple[Array, Array]:
+        """The linear part over the times s (..., F), or by the shears that `prepared` has put in their place."""
+        return sheared(X, Y, s if isinstance(s, tuple) else self._shears(s, X))
+
+    def prepared(self, maps: Sequence[Map], X: Array) -> list[Map]:
+        """The maps for repeated use on states of the kind of X: the shears of the linear ones computed once."""
+        return [replace(m, length=self._shears(m.length, X)) if m.part == LINEAR else m for m in maps]
+
+    def _shears(self, s: Any, X: Array) -> tuple[Array, Array, Array, Array]:
+        assert self.linear is not None
+        return shears(self.linear.kinds, like(self.linear.rates, X), self.by_class(matching(s, X)))
+
+    def linear_energies(self, X: Array, Y: Array) -> Array:
+        """Energy of the linear part in each frequency: (..., F)."""
+        assert self.linear is not None
+        sign = {"oscillator": 1.0, "hyperbolic": -1.0, "free": 0.0, "idle": 0.0}
+        squares = like(np.array([sign[k] for k in self.linear.kinds]), X) * X * X + Y * Y
+        energies = like(self.linear.rates, X) * squares / 2
+        return stack([energies[..., self.classes == f].sum(-1) for f in range(self.n_classes)])
+
+    def value(self, part: int, X: Array, Y: Array, filters: Array | None) -> Array:
+        """H_k: (...)."""
+        return self.rest[part - 1].hamiltonian(self._state(X, Y, filters))
+
+    def slopes(self, part: int, X: Array, Y: Array, filters: Array | None) -> tuple[Array, Array | None]:
+        """∂H_k/∂X and ∂H_k/∂Y, (..., d) each; None for what is zero."""
+        functions, d = self.rest[part - 1], self.ndof
+        g = functions.gradient(self._state(X, Y, filters))
+        dX = self._times(self.C.T, g[..., :d])
+        dX = dX if filters is None else self.by_class(matching(filters, X)) * dX
+        return dX, None if functions.of_positions else self._times(self.inverse_C, g[..., d:])
+
+    def force_gradient(self, part: int, X: Array, filters: Array | None) -> Array:
+        """½ ∇|∇U|²_{M⁻¹} of U(X) = H_k(c + C φ X): (..., d)."""
+        functions, d = self.rest[part - 1], self.ndof
+        y = self._state(X, 0 * X, filters)
+        phi = 1.0 if filters is None else self.by_class(matching(filters, X))
+        v = self.inverse_masses(X) * phi * self._times(self.C.T, functions.gradient(y)[..., :d])
+        v = self._times(self.C, phi * v)
+        if hasattr(functions, "hessian_vector"):
+            product = functions.hessian_vector(y, v)
+        else:
+            product = (functions.hessian(y)[..., :d, :d] @ v[..., None])[..., 0]
+        return phi * self._times(self.C.T, product)
+
+    def inverse_masses(self, X: Array) -> Array:
+        """The diagonal M⁻¹ of the modes: Ω of each."""
+        assert self.linear is not None
+        return like(self.linear.rates, X)
+
+    def _state(self, X: Array, Y: Array, filters: Array | None) -> Array:
+        return self.from_modes(X if filters is None else self.by_class(matching(filters, X)) * X, Y)
+
+    @cached_property
+    def has_force_gradient(self) -> bool:
+        """Whether kicks may carry force gradients: every momentum must enter by the linear part."""
+        return (
+            self.linear is not None
+            and "idle" not in self.linear.kinds
+            and all(functions.of_positions for functions in self.rest)
+        )
+
+
+def each_mode(value: Any) -> Any:
+    """A number for each state as one that broadcasts against (..., d)."""
+    return value[..., None] if getattr(value, "ndim", 0) else value
+
+
+def like(constant: np.ndarray, x: Array) -> Array:
+    """A constant array in the library, dtype and device of `x`."""
+    if is_tensor(x):
+        import torch
+
+        return torch.as_tensor(np.array(constant), dtype=x.dtype, device=x.device)
+    return constant.astype(x.dtype, copy=False)
+
+
+def matching(value: Any, x: Array) -> Array:
+    """Times or filters in the library, dtype and device of `x`."""
+    if is_tensor(value):
+        return value.to(dtype=x.dtype, device=x.device)
+    return like(np.asarray(value), x)
+
+
+SPLITTER = 134217729.0  # 2²⁷ + 1
+
+
+# The exact flow of a normal mode (X, Y) as three shears, of determinant 1 whatever their rounding, after quarter turns:
+# it turns by θ = kπ/2 + r with |r| ≤ π/4, the k quarter turns swap X and Y and are exact, and
+#     X ← X + tan(r/2) Y,   Y ← Y − sin(r) X,   X ← X + tan(r/2) Y
+# is the rest. A matrix of cosines and sines would have the rounded determinant cos² + sin², and an energy that drifts.
+
+
+def shears(kinds: Sequence[str], rates: Array, s: Array) -> tuple[Array, Array, Array, Array]:
+    """t, σ, c, d (..., n) of modes of these kinds and rates Ω (n,) over the times s (..., n), in the library of s.
+
+    The flow is X ← cX + dY, Y ← cY − dX, where c and d are 0 or ±1, then X ← X + tY, Y ← Y − σX, X ← X + tY.
+    """
+    module: Any = np
+    if is_tensor(s):
+        import torch
+
+        module = torch
+    theta = rates * s
+    k, r = _reduced(theta, 0.0 if is_tensor(s) else _low(rates, s, theta), module)
+    one, zero = 1 + 0 * theta, 0 * theta
+    c = module.where(k == 0, one, zero) - module.where(abs(k) == 2, one, zero)
+    d = module.where(k == 1, one, zero) - module.where(k == -1, one, zero)
+    t, sigma = module.tan(r / 2), module.sin(r)
+    others = {
+        "hyperbolic": lambda: (module.tanh(theta / 2), -module.sinh(theta)),
+        "free": lambda: (theta / 2, zero),
+        "idle": lambda: (zero, zero),
+    }
+    for kind in set(kinds) & set(others):
+        here = np.array([other == kind for other in kinds])
+        here = here if module is np else module.as_tensor(here, device=s.device)
+        own_t, own_sigma = others[kind]()
+        t, sigma = module.where(here, own_t, t), module.where(here, own_sigma, sigma)
+        c, d = module.where(here, one, c), module.where(here, zero, d)
+    return t, sigma, c, d
+
+
+def sheared(X: Array, Y: Array, coefficients: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
+    """The flow of `shears` on modes (..., n)."""
+    t, sigma, c, d = coefficients
+    X, Y = c * X + d * Y, c * Y - d * X
+    X = X + t * Y
+    Y = Y - sigma * X
+    return X + t * Y, Y
+
+
+def _reduced(theta: Array, low: Any, module: Any) -> tuple[Array, Array]:
+    """θ + `low` as k quarter turns, −2 … 2, and the rest r, each to its own rounding: the library reduces θ exactly."""
+    sine, cosine = module.sin(theta), module.cos(theta)
+    k = module.round(module.arctan2(sine, cosine) / (np.pi / 2))
+    s = module.where(abs(k) == 1, -k * cosine, module.where(k == 0, sine, -sine))
+    c = module.where(abs(k) == 1, k * sine, module.where(k == 0, cosine, -cosine))
+    r = module.arctan2(s, c) + low
+    # what rounding of Ω s leaves of whole quarter turns is none: its shears would round one way in every step
+    none = abs(r) <= 4 * float(module.finfo(theta.dtype).eps) * abs(theta)
+    return k, module.where(none, r - r.detach() if is_tensor(r) else 0.0, r)
+
+
+def _low(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> np.ndarray:
+    """What rounding took from the product a·b, exactly [Dekker 1971]; 0 where it overflows, or in float32."""
+    if product.dtype != np.float64:
+        return np.zeros_like(product)
+    with np.errstate(all="ignore"):
+        a_high, b_high = (SPLITTER * x - (SPLITTER * x - x) for x in (a, b))
+        a_low, b_low = a - a_high, b - b_high
+        low = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
+    return np.where(np.isfinite(low), low, 0.0)
+
+
+def linear_and_rest(system: HamiltonianSystem) -> ExactParts:
+    """The linear part and U(q), for the kicks and exact linear flows of Nyström splittings.
+
+    Raises
+    ------
+    ValueError
+        If the system has no linear part, or more than a potential beside it.
+    """
+    linear = system.linear_part
+    parts = exact_parts(system)
+    if any(not functions.of_positions for functions in parts.rest) or len(parts.rest) > 1:
+        raise ValueError(
+            f"`system` {system.name!r} has {len(parts)} parts, not just a linear one and U(q): use 'strang_parts'."
+        )
+    return ExactParts(linear, parts.rest, system.ndof)
+
+
+def exact_parts(system: HamiltonianSystem, expressions: Sequence[str] | None = None) -> ExactParts:
+    """H as a sum of parts that are solved exactly.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        Symbolic, or given by functions with a `stiffness_matrix`.
+    expressions : sequence of str, optional
+        The parts, in the symbols of the system, in the order of the splitting, the last innermost. The default is as
+        few as the terms of H allow, potentials first, and at the end the linear part, if there is one.
+
+    Raises
+    ------
+    ValueError
+        If a part is not solved exactly, or the parts do not add up to H.
+    """
+    if system.symbols is None:
+        if expressions is not None:
+            raise ValueError("`parts` are read as symbols, which the system has not: define it with from_sympy.")
+        linear = system.linear_part
+        return ExactParts(linear, [RestOfPotential(system, linear)], system.ndof)
+    if expressions is None:
+        return _detected(system)
+    return _given(system, tuple(expressions))
+
+
+def _detected(system: HamiltonianSystem) -> ExactParts:
+    import sympy as sp
+
+    symbols = system.symbols
+    assert symbols is not None
+    try:
+        linear = linear_part(system)
+        rest = linear.potential
+        assert rest is not None
+    except ValueError:
+        linear, rest = None, symbols.H
+    if _groups(rest, symbols) is None:
+        rest = sp.expand(rest)
+    groups = _groups(rest, symbols)
+    if groups is None:
+        raise ValueError(
+            f"`system` {system.name!r} does not split into parts that are solved exactly: a term holds a coordinate "
+            "and its momentum. Use an implicit or a Runge–Kutta method, or train a SympFlow."
+        )
+    rest = [PartFunctions(g, symbols.q, symbols.p) for g in groups]
+    return ExactParts(linear, sorted(rest, key=lambda part: not part.of_positions), system.ndof)
+
+
+def _groups(H: sp.Expr, symbols: SymbolicHamiltonian) -> list[sp.Expr] | None:
+    """The terms of H in as few groups without conjugate pairs as come about greedily, or None."""
+    import sympy as sp
+
+    groups: list[tuple[set[sp.Symbol], list[sp.Expr]]] = []
+    terms = [t for t in sp.Add.make_args(H) if t.free_symbols]
+    for term in sorted(terms, key=lambda t: -len(t.free_symbols)):
+        if _has_pair(term.free_symbols, symbols):
+            return None
+        for variables, members in groups:
+            if not _has_pair(variables | term.free_symbols, symbols):
+                variables.update(term.free_symbols)
+                members.append(term)
+                break
+        else:
+            groups.append((set(term.free_symbols), [term]))
+    return [sp.Add(*members) for _, members in groups]
+
+
+def _has_pair(variables: set[sp.Symbol], symbols: SymbolicHamiltonian) -> bool:
+    return any(q in variables and p in variables for q, p in zip(symbols.q, symbols.p, strict=True))
+
+
+def _given(system: HamiltonianSystem, expressions: tuple[str, ...]) -> ExactParts:
+    import sympy as sp
+
+    symbols = system.symbols
+    assert symbols is not None
+    parts = [_parsed(expression, system) for expression in expressions]
+    difference = sp.expand(sp.Add(*parts) - symbols.H)
+    probes = np.random.default_rng(0).uniform(0.3, 0.9, (8, 2 * system.ndof))
+    H = PartFunctions(symbols.H, symbols.q, symbols.p).hamiltonian(probes)
+    with np.errstate(all="ignore"):
+        excess = PartFunctions(difference, symbols.q, symbols.p).hamiltonian(probes) if difference.free_symbols else 0.0
+    if not np.allclose(np.ptp(excess), 0, atol=1e-12 * np.abs(H).max()):
+        raise ValueError(f"`parts` do not add up to the Hamiltonian: they leave out {-difference}.")
+    linear: LinearPart | None = None
+    rest: list[PartFunctions] = []
+    sequence = []
+    for expression, part in zip(expressions, parts, strict=True):
+        if not _has_pair(part.free_symbols, symbols):
+            rest.append(PartFunctions(part, symbols.q, symbols.p))
+            sequence.append(len(rest))
+            continue
+        candidate = read_off(part, symbols.q, symbols.p, abs(system.t_span[1] - system.t_span[0]))
+        if linear is not None or candidate is None or getattr(candidate.potential, "free_symbols", None):
+            raise ValueError(
+                f"`parts` has {expression!r}, which is not solved exactly: it holds a coordinate and its momentum and "
+                "is not the one quadratic part. Split it further."
+            )
+        linear = candidate
+        sequence.append(LINEAR)
+    return ExactParts(linear, rest, system.ndof, sequence)
+
+
+def _parsed(expression: str, system: HamiltonianSystem) -> sp.Expr:
+    """A part in the symbols q1 … pd of the system."""
+    assert system.symbols is not None
+    if not isinstance(expression, str):
+        raise ValueError(f"`parts` must be expressions as text; got {expression!r}.")
+    words = set(re.findall(r"[A-Za-z_]\w*", expression))
+    try:
+        part = parse(expression, {name: value for name, value in system.params.items() if name in words})
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"`parts` has one that is not admissible: {error}") from None
+    known = {s.name for s in (*system.symbols.q, *system.symbols.p)} | {"q", "p"}
+    if foreign := {s.name for s in part.free_symbols} - known:
+        raise ValueError(f"`parts` has {', '.join(sorted(foreign))}, which the system has not: leave it out.")
+    first = {"q": system.symbols.q[0], "p": system.symbols.p[0]}
+    return part.xreplace({s: first[s.name] for s in part.free_symbols if s.name in first})
+
+
+def map_evaluations(maps: Sequence[Map], n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+    """Evaluations of slopes and force gradients, as `FixedStep.evaluations`; linear flows cost none."""
+    counts = [sum(m.part != LINEAR for m in maps), sum(_has_gradient(m) for m in maps)]
+    counts = [count * (n_steps + n_extra) for count in counts]
+    if backend == "compiled" and len(maps) > 1 and maps[0].part == maps[-1].part:
+        last = maps[-1].part != LINEAR, _has_gradient(maps[-1])  # it is the next step's first one
+        counts = [count - (n_steps - n_saved) * one for count, one in zip(counts, last, strict=True)]
+    return {"force_evaluations": int(counts[0]), "hessian_evaluations": int(counts[1])}
+
+
+def _has_gradient(m: Map) -> bool:
+    return m.gradient != 0.0 if isinstance(m.gradient, float) else bool(np.any(m.gradient))

@@ -1,0 +1,67 @@
+"""Imports: whole although interrupted, and by the paths that modules had before they moved."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import FrameType, ModuleType
+
+FORMER = {
+    "callables": "hamiltonian.callables",
+    "domain": "hamiltonian.domain",
+    "expression": "hamiltonian.expression",
+    "files": "arguments",
+    "imports": "lazy",
+    "integrators.checks": "testing.checks",
+    "integrators.scheme": "schemes",
+    "integrators.schemes": "schemes",
+    "linear_part": "hamiltonian.linear_part",
+    "monomials": "hamiltonian.monomials",
+    "numba_functions": "hamiltonian.callables",
+    "parts": "hamiltonian.parts",
+    "symbolic": "hamiltonian.symbolic",
+    "system": "hamiltonian.system",
+    "time_transformation": "hamiltonian.time_transformation",
+    "tube": "hamiltonian.domain",
+}
+"""Former module paths, of documented modules and of classes in pickles, and those of today, both below `sympflow`."""
+
+
+class _FormerPaths(MetaPathFinder, Loader):
+    """Finder of modules by their former paths: each is the module of today itself."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        package, _, name = fullname.partition(".")
+        return ModuleSpec(fullname, self) if package == "sympflow" and name in FORMER else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        sys.modules[module.__name__] = import_module(f"sympflow.{FORMER[module.__name__.partition('.')[2]]}")
+
+
+FORMER_PATHS = _FormerPaths()
+
+
+def whole_import(name: str) -> ModuleType:
+    """Import a module; Ctrl-C meanwhile takes effect after it.
+
+    A compiled library that is left half initialized, as torch within the second that its import takes, cannot be
+    imported again: the process crashes.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    if name in sys.modules or not callable(handler) or threading.current_thread() is not threading.main_thread():
+        return import_module(name)
+    pending: list[tuple[int, FrameType | None]] = []
+    signal.signal(signal.SIGINT, lambda number, frame: pending.append((number, frame)))
+    try:
+        return import_module(name)
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if pending:
+            handler(*pending[0])

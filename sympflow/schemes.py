@@ -1,0 +1,492 @@
+"""Scheme: a splitting method as a table of numbers.
+
+A separable Hamiltonian H(q, p) = T(p) + V(q) is the sum of two that are solved exactly: the *drift*
+q += a h ∇T(p) and the *kick* p −= b h ∇V(q).  A splitting scheme is a list of kicks and drifts, and this
+module knows nothing else: no system, no array library.
+
+When T is quadratic, T = ½ pᵀM⁻¹p, the kick may carry a *force gradient*: stage i is the exact flow over h of
+
+    b_i V(q) − g_i h² ½ |∇V(q)|²_{M⁻¹},       p += b_i h F(q) + g_i h³ ∇²V(q) M⁻¹∇V(q),      F = −∇V,
+
+that is exp(h b_i B + ½ h³ g_i [B, [A, B]]) with the Lie derivatives A and B along T and V.  (Chin's
+V + (h²/48)[V, [T, V]] in a kick of weight b is g = b/24, a χ of Omelyan, Mryglod and Folk is g = 2χ.)
+It may further carry the next commutator that depends on q alone, the *curvature* of V along the acceleration
+v = M⁻¹∇V (Blanes, Casas and Ros, Appl. Numer. Math. 39 (2001) 245):
+
+    + c_i h⁴ ½ v·∇²V(q) v,       p −= c_i h⁵ (∇²V M⁻¹∇²V v + ½ ∇³V(v, v)).
+
+In place of these two a kick may carry a polynomial in q, which no order condition knows: trained flows have them.
+
+    + h² Σ_m e_im q^m,           p −= h³ Σ_m e_im ∇q^m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from math import sqrt
+from typing import Any, NamedTuple
+
+__all__ = ["CURVATURE", "FORCE_GRADIENT", "POLYNOMIAL", "SCHEMES", "Scheme", "Substep", "compose", "scheme_evaluations"]
+
+FORCE_GRADIENT, CURVATURE, POLYNOMIAL = 1, 2, 3  # levels of a scheme, or of a flow: what its kicks have beside V
+
+
+class Substep(NamedTuple):
+    """A kick by b, g, c and the coefficients e of a polynomial, or a drift by a = `one`."""
+
+    kind: str
+    one: float
+    three: float = 0.0
+    five: float = 0.0
+    polynomial: tuple[float, ...] = ()
+
+    @property
+    def idle(self) -> bool:
+        return not (self.one or self.three or self.five or any(self.polynomial))
+
+    def numbers(self) -> tuple[float, ...]:
+        return (self.one, self.three, self.five, *self.polynomial)
+
+    def merged(self, other: Substep) -> Substep:
+        """Both in turn, of one kind."""
+        e = tuple(map(float.__add__, self.polynomial, other.polynomial))
+        return Substep(self.kind, self.one + other.one, self.three + other.three, self.five + other.five, e)
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """A splitting method: stage i kicks by ``kicks[i]`` and ``gradients[i]``, then drifts by ``drifts[i]``.
+
+    Attributes
+    ----------
+    name : str
+        The method's name, the key in `SCHEMES`.
+    order : int or None
+        Classical order of convergence; None where nothing is claimed (a trained table).
+    kicks, drifts, gradients : tuple of float
+        Coefficients b, a and g of the stages in their order of execution; zeros cost nothing.
+    curvatures : tuple of float
+        Coefficients c, none for none.
+    polynomials : tuple of tuple of float
+        Coefficients e of each stage, none for none; then there are neither g nor c.
+    monomials : tuple of tuple of int
+        The exponents m of these.
+    source : str
+        Where the coefficients come from.
+    nystrom : bool
+        True if the order holds only for a kinetic energy quadratic in p, where [B, [B, [B, A]]] = 0
+        (the Nyström condition).
+
+    Raises
+    ------
+    ValueError
+        If the tuples differ in length or are empty.
+    """
+
+    name: str
+    order: int | None
+    kicks: tuple[float, ...]
+    drifts: tuple[float, ...]
+    gradients: tuple[float, ...]
+    source: str
+    nystrom: bool = False
+    curvatures: tuple[float, ...] = ()
+    polynomials: tuple[tuple[float, ...], ...] = ()
+    monomials: tuple[tuple[int, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        if not len(self.kicks) == len(self.drifts) == len(self.gradients) > 0:
+            raise ValueError(
+                f"`kicks`, `drifts` and `gradients` must have one coefficient per stage, got "
+                f"{len(self.kicks)}, {len(self.drifts)} and {len(self.gradients)}: pad with zeros."
+            )
+        if len(self.curvatures) not in (0, len(self.kicks)):
+            raise ValueError(
+                f"`curvatures` must have one coefficient per stage, {len(self.kicks)}, or none; got "
+                f"{len(self.curvatures)}: pad with zeros."
+            )
+        if len(self.polynomials) not in (0, len(self.kicks)) or any(
+            len(e) != len(self.monomials) for e in self.polynomials
+        ):
+            raise ValueError(
+                f"`polynomials` must have {len(self.monomials)} coefficients per stage, one for each of `monomials`, "
+                "or there must be none: pad with zeros."
+            )
+        if self.polynomials and (any(self.gradients) or any(self.curvatures)):
+            raise ValueError("`polynomials` stand in place of `gradients` and `curvatures`: leave these out.")
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Made once: tables are looked up by their scheme in every run."""
+        return hash((self.name, self.kicks, self.drifts, self.gradients, self.curvatures))
+
+    @cached_property
+    def substeps(self) -> tuple[Substep, ...]:
+        """The maps really executed: no zeros, like neighbours merged."""
+        merged: list[Substep] = []
+        n = len(self.kicks)
+        columns = self.curvatures or (0.0,) * n, self.polynomials or ((),) * n
+        for b, g, c, e, a in zip(self.kicks, self.gradients, *columns, self.drifts, strict=True):
+            for substep in (Substep("kick", b, g, c, e), Substep("drift", a)):
+                if substep.idle:
+                    continue
+                merged.append(merged.pop().merged(substep) if merged and merged[-1].kind == substep.kind else substep)
+        return tuple(merged)
+
+    @cached_property
+    def symmetric(self) -> bool:
+        """Whether the step is its own adjoint, Φ(−h) = Φ(h)⁻¹ (the coefficients read the same backwards)."""
+        forwards, backwards = self.substeps, self.substeps[::-1]
+        return len(forwards) > 0 and all(
+            one.kind == other.kind
+            and sum(abs(a - b) for a, b in zip(one.numbers(), other.numbers(), strict=True)) < 1e-13
+            for one, other in zip(forwards, backwards, strict=True)
+        )
+
+    @cached_property
+    def first_same_as_last(self) -> bool:
+        """Whether a step ends with the kind of map that it begins with, so that successive steps share it."""
+        return len(self.substeps) > 1 and self.substeps[0][0] == self.substeps[-1][0]
+
+    @cached_property
+    def level(self) -> int:
+        """What the kicks have: 0 the force alone, `FORCE_GRADIENT`, or `CURVATURE` terms as well, or a `POLYNOMIAL`."""
+        if self.polynomials:
+            return POLYNOMIAL
+        return CURVATURE if any(self.curvatures) else FORCE_GRADIENT if any(self.gradients) else 0
+
+    @cached_property
+    def force_evaluations(self) -> int:
+        """Forces per step in a long run, the last kick merged with the next step's first one."""
+        kinds = [kind for kind, *_ in self.substeps]
+        return kinds.count("kick") - (self.first_same_as_last and kinds[0] == "kick")
+
+    @cached_property
+    def hessian_evaluations(self) -> int:
+        """Force gradients (Hessian–vector products) per step, counted like `force_evaluations`."""
+        return self._kicks_with(lambda g, c: g != 0.0 or c != 0.0)
+
+    @cached_property
+    def curvature_evaluations(self) -> int:
+        """Curvature terms (third derivatives of V) per step, likewise."""
+        return self._kicks_with(lambda g, c: c != 0.0)
+
+    def _kicks_with(self, has: Callable[[float, float], bool]) -> int:
+        with_it = [has(s.three, s.five) for s in self.substeps if s.kind == "kick"]
+        shared = self.first_same_as_last and self.substeps[0][0] == "kick"
+        return sum(with_it[1:-1] if shared else with_it) + (shared and (with_it[0] or with_it[-1]))
+
+    def inverse(self) -> Scheme:
+        """The scheme Ψ with Ψ(h) ∘ Φ(h) = identity: the stages backwards, with opposite signs."""
+        nothing: Any = [(0.0,), (0.0,), (0.0,), ((0.0,) * len(self.monomials),)]
+        columns: Any = self.kicks, self.gradients, self.curvatures, self.polynomials
+        # kick and drift change places: an idle kick comes before, an idle drift after, unless that was there already
+        kicks = [zero + tuple(map(_opposite, reversed(column))) for zero, column in zip(nothing, columns, strict=True)]
+        drifts = (*(-a for a in reversed(self.drifts)), 0.0)
+        part = slice(None)
+        if drifts[0] == 0.0:
+            part = slice(1, None)
+        elif not any(_any(column[-1]) for column, was in zip(kicks, columns, strict=True) if was):
+            part = slice(-1)
+        b, g, c, e = (column[part] if was else () for column, was in zip(kicks, columns, strict=True))
+        name, source = f"{self.name}⁻¹", f"the inverse of {self.name}"
+        return Scheme(name, self.order, b, drifts[part], g, source, self.nystrom, c, e, self.monomials)
+
+
+def _any(number: Any) -> bool:
+    return any(number) if isinstance(number, tuple) else number != 0.0
+
+
+def _opposite(number: Any) -> Any:
+    return tuple(-e for e in number) if isinstance(number, tuple) else -number
+
+
+def _kick_first(kicks: tuple[float, ...], drifts: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
+    return kicks, (*drifts, 0.0)
+
+
+def _drift_first(drifts: tuple[float, ...], kicks: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
+    return (0.0, *kicks), drifts
+
+
+def _palindrome(half: tuple[float, ...], total: float = 1.0) -> tuple[float, ...]:
+    """Coefficients w₁ … w_m, w₀, w_m … w₁ with the middle one making the sum `total`."""
+    return (*half, total - 2.0 * sum(half), *reversed(half))
+
+
+def _even_palindrome(half: tuple[float, ...]) -> tuple[float, ...]:
+    """Coefficients w₁ … w_m, w_m … w₁ with sum 1, the given ones completed by w_m."""
+    half = (*half, 0.5 - sum(half))
+    return (*half, *reversed(half))
+
+
+def compose(name: str, order: int | None, weights: tuple[float, ...], source: str) -> Scheme:
+    """Leapfrog (drift–kick–drift) steps of lengths ``weights[i] h`` in a row, neighbouring drifts merged."""
+    padded = (0.0, *weights, 0.0)
+    drifts = tuple(0.5 * (one + other) for one, other in pairwise(padded))
+    return _scheme(name, order, _drift_first(drifts, weights), source)
+
+
+def _scheme(
+    name: str,
+    order: int | None,
+    kicks_and_drifts: tuple[tuple[float, ...], ...],
+    source: str,
+    *,
+    gradients: dict[int, float] | None = None,
+    nystrom: bool = False,
+) -> Scheme:
+    kicks, drifts = kicks_and_drifts
+    g = tuple((gradients or {}).get(i, 0.0) for i in range(len(kicks)))
+    return Scheme(name, order, kicks, drifts, g, source, nystrom or gradients is not None)
+
+
+def _adjoint_composition(alphas: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
+    """Φ(α_s h) Φ*(β_s h) … Φ(α₁h) Φ*(β₁h), β_i = α_{s+1−i}; Φ is kick then drift, Φ* drift then kick."""
+    betas = alphas[::-1]
+    kicks = tuple(a + b for a, b in zip(alphas, betas, strict=True))
+    inner = tuple(a + b for a, b in zip(alphas[:-1], betas[1:], strict=True))
+    return _drift_first((betas[0], *inner, alphas[-1]), kicks)
+
+
+_YOSHIDA = "H. Yoshida, Construction of higher order symplectic integrators, Phys. Lett. A 150 (1990) 262–268"
+_KAHAN_LI = (
+    "W. Kahan and R.-C. Li, Composition constants for raising the orders of unconventional schemes for "
+    "ordinary differential equations, Math. Comp. 66 (1997) 1089–1099"
+)
+_BLANES_MOAN = (
+    "S. Blanes and P. C. Moan, Practical symplectic partitioned Runge–Kutta and Runge–Kutta–Nyström methods, "
+    "J. Comput. Appl. Math. 142 (2002) 313–330"
+)
+_CHIN = "S. A. Chin, Symplectic integrators from composite operator factorizations, Phys. Lett. A 226 (1997) 344–348"
+_OMELYAN = (
+    "I. P. Omelyan, I. M. Mryglod and R. Folk, Construction of high-order force-gradient algorithms for "
+    "integration of motion in classical and quantum systems, Phys. Rev. E 66 (2002) 026701"
+)
+
+_YOSHIDA4_WEIGHT = 1.0 / (2.0 - 2.0 ** (1.0 / 3.0))
+_SUZUKI4_WEIGHT = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
+_ROOT19 = sqrt(19.0)
+_MCLACHLAN4_ALPHAS = (
+    (146.0 + 5.0 * _ROOT19) / 540.0,
+    (-2.0 + 10.0 * _ROOT19) / 135.0,
+    1.0 / 5.0,
+    (-23.0 - 20.0 * _ROOT19) / 270.0,
+    (14.0 - _ROOT19) / 108.0,
+)
+_OMELYAN4_LAMBDA = 0.2470939580390842
+_OMELYAN4_THETA = 0.5 - 1.0 / sqrt(24.0 * _OMELYAN4_LAMBDA)
+_OMELYAN4_CHI = (1.0 - sqrt(6.0 * _OMELYAN4_LAMBDA) * (1.0 - _OMELYAN4_LAMBDA)) / 12.0
+
+_TABLE = (
+    _scheme(
+        "verlet",
+        2,
+        _kick_first((0.5, 0.5), (1.0,)),
+        "L. Verlet, Phys. Rev. 159 (1967) 98–103; kick–drift–kick form (velocity Verlet)",
+    ),
+    _scheme(
+        "leapfrog",
+        2,
+        _drift_first((0.5, 0.5), (1.0,)),
+        "Störmer–Verlet in drift–kick–drift form; E. Hairer, C. Lubich and G. Wanner, Geometric numerical "
+        "integration illustrated by the Störmer–Verlet method, Acta Numerica 12 (2003) 399–450",
+    ),
+    compose(
+        "yoshida4",
+        4,
+        _palindrome((_YOSHIDA4_WEIGHT,)),
+        f"{_YOSHIDA}, eq. (2.11); E. Forest and R. D. Ruth (1990)",
+    ),
+    compose(
+        "yoshida6",
+        6,
+        _palindrome((0.78451361047755726381949763, 0.23557321335935813368479318, -1.17767998417887100694641568)),
+        f"{_YOSHIDA}, solution A of table 1",
+    ),
+    compose(
+        "suzuki4",
+        4,
+        _palindrome((_SUZUKI4_WEIGHT, _SUZUKI4_WEIGHT)),
+        "M. Suzuki, Fractal decomposition of exponential operators, Phys. Lett. A 146 (1990) 319–323",
+    ),
+    _scheme(
+        "mclachlan4",
+        4,
+        _adjoint_composition(_MCLACHLAN4_ALPHAS),
+        "R. I. McLachlan, On the numerical integration of ordinary differential equations by symmetric "
+        "composition methods, SIAM J. Sci. Comput. 16 (1995) 151–168, five stages and their adjoints",
+    ),
+    _scheme(
+        "blanes_moan4",
+        4,
+        _kick_first(
+            _palindrome((0.0792036964311957, 0.353172906049774, -0.0420650803577195)),
+            _even_palindrome((0.209515106613362, -0.143851773179818)),
+        ),
+        f"{_BLANES_MOAN}, table 2, S6 of order 4",
+    ),
+    compose(
+        "kahan_li6",
+        6,
+        _palindrome(
+            (
+                0.39216144400731413927925056,
+                0.33259913678935943859974864,
+                -0.70624617255763935980996482,
+                0.08221359629355080023149045,
+            )
+        ),
+        f"{_KAHAN_LI}, s9odr6a",
+    ),
+    compose(
+        "kahan_li8",
+        8,
+        _palindrome(
+            (
+                0.13020248308889008087881763,
+                0.56116298177510838456196441,
+                -0.38947496264484728640807860,
+                0.15884190655515560089621075,
+                -0.39590389413323757733623154,
+                0.18453964097831570709183254,
+                0.25837438768632204729397911,
+                0.29501172360931029887096624,
+            )
+        ),
+        f"{_KAHAN_LI}, s17odr8a",
+    ),
+    _scheme(
+        "srkn6b",
+        4,
+        _kick_first(
+            _palindrome((0.0829844064174052, 0.396309801498368, -0.0390563049223486)),
+            _even_palindrome((0.245298957184271, 0.604872665711080)),
+        ),
+        f"{_BLANES_MOAN}, table 3, SRKN 6b",  # tuned for a quadratic T; being symmetric, of order 4 for any
+    ),
+    _scheme(
+        "srkn11b",
+        6,
+        _kick_first(
+            _even_palindrome(
+                (
+                    0.0414649985182624,
+                    0.198128671918067,
+                    -0.0400061921041533,
+                    0.0752539843015807,
+                    -0.0115113874206879,
+                )
+            ),
+            _palindrome(
+                (
+                    0.123229775946271,
+                    0.290553797799558,
+                    -0.127049212625417,
+                    -0.246331761062075,
+                    0.357208872795928,
+                )
+            ),
+        ),
+        f"{_BLANES_MOAN}, table 3, SRKN 11b",
+        nystrom=True,
+    ),
+    _scheme(
+        "srkn14a",
+        6,
+        _drift_first(
+            _palindrome(
+                (
+                    0.0378593198406116,
+                    0.102635633102435,
+                    -0.0258678882665587,
+                    0.314241403071447,
+                    -0.130144459517415,
+                    0.106417700369543,
+                    -0.00879424312851058,
+                )
+            ),
+            _even_palindrome(
+                (
+                    0.09171915262446165,
+                    0.183983170005006,
+                    -0.05653436583288827,
+                    0.004914688774712854,
+                    0.143761127168358,
+                    0.328567693746804,
+                )
+            ),
+        ),
+        f"{_BLANES_MOAN}, table 3, SRKN 14a",
+        nystrom=True,
+    ),
+    _scheme(
+        "chin4a",
+        4,
+        _kick_first((1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0), (0.5, 0.5)),
+        f"{_CHIN}, scheme A",
+        gradients={1: 1.0 / 36.0},
+    ),
+    _scheme(
+        "chin4c",
+        4,
+        _drift_first((1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0), (3.0 / 8.0, 1.0 / 4.0, 3.0 / 8.0)),
+        f"{_CHIN}, scheme C",
+        gradients={2: 1.0 / 96.0},
+    ),
+    _scheme(
+        "omelyan4",
+        4,
+        _drift_first(
+            _even_palindrome((_OMELYAN4_THETA,)),
+            _palindrome((_OMELYAN4_LAMBDA,)),
+        ),
+        f"{_OMELYAN}, eqs. (38)–(42), three forces and one force gradient",
+        gradients={2: 2.0 * _OMELYAN4_CHI},
+    ),
+    _scheme(
+        "omelyan6",
+        6,
+        _drift_first(
+            _even_palindrome((0.1097059723948682, 0.4140632267310831)),
+            _palindrome((0.2693315848935301, 1.1319803486515564)),
+        ),
+        f"{_OMELYAN}, eqs. (50)–(51), five forces and three force gradients",
+        gradients={
+            1: 2.0 * 0.0008642161339706166,
+            3: -2.0 * 0.01324638643416052,
+            5: 2.0 * 0.0008642161339706166,
+        },
+    ),
+)
+
+SCHEMES: dict[str, Scheme] = {scheme.name: scheme for scheme in _TABLE}
+
+
+def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+    """Evaluations of the force, of force gradients and of curvature terms in a run, as `FixedStep.evaluations`."""
+    kicks = _kicks(scheme)
+    counts = {"force_evaluations": (scheme.force_evaluations, [1] * len(kicks))}
+    counts["hessian_evaluations"] = scheme.hessian_evaluations, [g for g, _ in kicks]
+    if any(scheme.curvatures):
+        counts["curvature_evaluations"] = scheme.curvature_evaluations, [c for _, c in kicks]
+    if backend != "compiled" or not kicks:
+        return {name: (n_steps + n_extra) * sum(each) for name, (_, each) in counts.items()}
+    # compiled, the last kick of a step is merged with the next step's first, except where a state is saved
+    closed = n_saved if len(kicks) > scheme.force_evaluations else 0
+    return {
+        name: n_steps * of_a_step + closed * each[-1] + n_extra * sum(each)
+        for name, (of_a_step, each) in counts.items()
+    }
+
+
+@lru_cache(maxsize=256)
+def _kicks(scheme: Scheme) -> tuple[tuple[bool, bool], ...]:
+    """Whether each of its kicks has a Hessian, and a curvature term."""
+    return tuple((s.three != 0 or s.five != 0, s.five != 0) for s in scheme.substeps if s.kind == "kick")

@@ -1,0 +1,212 @@
+"""Celestial scenes: the Kepler problem, the Pythagorean three-body problem, the outer solar system."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.systems.pairs import OPTIONS, pair_functions
+
+_WIDEST = 0.9  # above it a uniform draw hardly ever meets the thin shell of the family
+
+
+def kepler(e: float = 0.6) -> HamiltonianSystem:
+    """H = (p₁² + p₂²)/2 − 1/√(q₁² + q₂²): motion about a unit mass, on an ellipse of eccentricity e.
+
+    Parameters
+    ----------
+    e : float
+        Eccentricity, 0 ≤ e < 1, of the ellipse that starts from y0, at its pericentre q = (1 − e, 0). Its semi-major
+        axis is 1, its period 2π.
+
+    Notes
+    -----
+    Known truths: H = −1/2 and q₁p₂ − q₂p₁ = √(1 − e²) from y0, and y(2πk) = y0.
+
+    The domain is the shell of all orbits, at any angle and in both senses, with a semi-major axis from 0.95 to 1.05 and
+    an angular momentum from 0.9625 to 1.075 times that of the ellipse; for e > 0.9 a `Tube` around the ellipse. The
+    default interval is 100 periods, the default step a thousandth of one.
+
+    References
+    ----------
+    .. [1] E. Hairer, C. Lubich, G. Wanner, "Geometric Numerical Integration", 2nd ed., Springer 2006, I.2.
+    """
+    if not (isinstance(e, int | float) and 0 <= e < 1):
+        raise ValueError(f"`e` must be an eccentricity, 0 ≤ e < 1; got {e!r}.")
+    period = 2 * math.pi
+    return HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)",
+        name="kepler",
+        domain=_shell(e) if e <= _WIDEST else Tube(kepler_ellipse(e, np.linspace(0, period, 1025)), 0.05 * (1 - e)),
+        y0=[1 - e, 0.0, 0.0, math.sqrt((1 + e) / (1 - e))],
+        t_span=(0.0, 100 * period),
+        dt=period / 1000,
+    )
+
+
+def kepler_ellipse(e: float, anomaly: np.ndarray) -> np.ndarray:
+    """States [q, p] on the ellipse at eccentric anomalies E, (...) to (..., 4); the time there is E − e·sin E."""
+    c, s, b = np.cos(anomaly), np.sin(anomaly), math.sqrt(1 - e * e)
+    r = 1 - e * c
+    return np.stack([c - e, b * s, -s / r, b * c / r], axis=-1)
+
+
+def _shell(e: float) -> Domain:
+    low, high = -1 / (2 * 0.95), -1 / (2 * 1.05)  # the energy of a semi-major axis a is −1/(2a)
+    L = math.sqrt(1 - e * e)
+    momentum = 0.9625 * L, 1.075 * L
+    widest = math.sqrt(1 + 2 * high * momentum[0] ** 2)
+    q, p = 1.05 * (1 + widest), (1 + widest) / momentum[0]  # apocentre, and speed at pericentre
+    return EnergySublevel(high, Box([-q, -q, -p, -p], [q, q, p, p]), above=low, angular_momentum=momentum)
+
+
+MASSES = (3, 4, 5)
+
+
+def three_body() -> HamiltonianSystem:
+    """H = Σ|p_i|²/(2m_i) − Σ_{i<j} m_i m_j/|q_i − q_j|, d = 6, in a plane.
+
+    Masses of 3, 4 and 5 are at rest at the corners of a triangle, each opposite the side of its own length. q and p
+    list the bodies' two coordinates one body after the other.
+
+    Notes
+    -----
+    Known truths: H(y0) = −769/60 = −12.81666…; momentum and angular momentum are 0. After many close encounters, the
+    closest of them to 4.14e-4 at t = 15.8299, the lightest body is thrown out. At t = 70 the bodies are at
+    (6.933464, 20.261804), (−2.003006, −6.872463), (−2.557673, −6.659112), where hardly a method gets: energy errors say
+    little here.
+
+    The domain is a box that holds the bodies until t = 70, but for the momenta of close encounters: nothing to train
+    on. The default interval is (0, 70), the default step 1e-4.
+
+    References
+    ----------
+    .. [1] C. Burrau, "Numerische Berechnung eines Spezialfalles des Dreikörperproblems", Astron. Nachr. 195 (1913)
+       113–118.
+    .. [2] V. Szebehely, C. F. Peters, "Complete solution of a general problem of three bodies", Astron. J. 72 (1967)
+       876–883.
+    """
+    kinetic = " + ".join(f"(p{2 * i + 1}**2 + p{2 * i + 2}**2)/{2 * m}" for i, m in enumerate(MASSES))
+    attraction = " - ".join(
+        f"{MASSES[i] * MASSES[j]}/sqrt((q{2 * i + 1} - q{2 * j + 1})**2 + (q{2 * i + 2} - q{2 * j + 2})**2)"
+        for i, j in combinations(range(3), 2)
+    )
+    high = [25.0] * 6 + [50.0] * 6
+    return HamiltonianSystem.from_sympy(
+        f"{kinetic} - {attraction}",
+        name="three_body",
+        domain=Box([-x for x in high], high),
+        y0=[1.0, 3.0, -2.0, -1.0, 1.0, -1.0, *[0.0] * 6],
+        t_span=(0.0, 70.0),
+        dt=1e-4,
+    )
+
+
+G = 2.95912208286e-4
+"""Gravitational constant in AU³ per day² and solar mass."""
+
+BODIES = ("Sun", "Jupiter", "Saturn", "Uranus", "Neptune", "Pluto")
+
+PLANET_MASSES = np.array(
+    [1.00000597682, 0.000954786104043, 0.000285583733151, 0.0000437273164546, 0.0000517759138449, 1 / 1.3e8]
+)
+"""In solar masses; the Sun's includes the inner planets."""
+
+POSITIONS = np.array(
+    [
+        [0.0, 0.0, 0.0],
+        [-3.5023653, -3.8169847, -1.5507963],
+        [9.0755314, -3.0458353, -1.6483708],
+        [8.3101420, -16.2901086, -7.2521278],
+        [11.4707666, -25.7294829, -10.8169456],
+        [-15.5387357, -25.2225594, -3.1902382],
+    ]
+)
+"""Heliocentric, in astronomical units, on 5 September 1994 at 0 h."""
+
+VELOCITIES = np.array(
+    [
+        [0.0, 0.0, 0.0],
+        [0.00565429, -0.00412490, -0.00190589],
+        [0.00168318, 0.00483525, 0.00192462],
+        [0.00354178, 0.00137102, 0.00055029],
+        [0.00288930, 0.00114527, 0.00039677],
+        [0.00276725, -0.00170702, -0.00136504],
+    ]
+)
+"""Heliocentric, in astronomical units per day."""
+
+_PERIOD = 90_600.0  # of Pluto, in days: the longest
+_THICKNESS = 0.2  # of the tube, relative to each planet's distance and speed
+
+
+def outer_solar_system() -> HamiltonianSystem:
+    """H = Σ|p_i|²/(2m_i) − G Σ_{i<j} m_i m_j/|q_i − q_j|, d = 18: Sun, Jupiter, Saturn, Uranus, Neptune, Pluto.
+
+    Lengths are in astronomical units, times in days, masses in solar masses; q and p list the bodies' three coordinates
+    one body after the other. It is given by Numba functions.
+
+    Notes
+    -----
+    y0 holds the book's data, which has the Sun at rest at the origin, as seen from the centre of mass: so the bodies
+    stay where they are. Known truths: the total momentum is 0 and the angular momentum constant; Jupiter's period is
+    4332 days.
+
+    The domain is a `Tube` around the orbit over one period of Pluto, in which each body is near its own path, at any
+    phase; the orbit stays in it for 1e5 years. The default interval is the book's, (0, 200000) days, the default step
+    50 days.
+
+    References
+    ----------
+    .. [1] E. Hairer, C. Lubich, G. Wanner, "Geometric Numerical Integration", 2nd ed., Springer 2006, I.2.4: data from
+       "Ahnerts Kalender für Sternfreunde 1994", Johann Ambrosius Barth Verlag 1993.
+    """
+    q, v = (x - PLANET_MASSES @ x / PLANET_MASSES.sum() for x in (POSITIONS, VELOCITIES))
+    y0 = np.concatenate([q.ravel(), (PLANET_MASSES[:, None] * v).ravel()])
+    return HamiltonianSystem(
+        **_gravity(),
+        mass=np.repeat(PLANET_MASSES, 3),
+        name="outer_solar_system",
+        domain=_tube(q, v),
+        y0=y0,
+        t_span=(0.0, 200_000.0),
+        dt=50.0,
+    )
+
+
+@cache
+def _gravity() -> dict[str, Any]:
+    from numba import njit
+
+    @njit(**OPTIONS)
+    def attraction(s: Any) -> Any:
+        r = np.sqrt(s)
+        return -1 / r, 0.5 / (s * r), -0.75 / (s * s * r)
+
+    return pair_functions(attraction, G * np.outer(PLANET_MASSES, PLANET_MASSES), 3)
+
+
+def _tube(q: np.ndarray, v: np.ndarray) -> Tube:
+    """Around the path of each body, found by leapfrog: it is off by far less than the thickness."""
+    h, n = 100.0, int(_PERIOD / 100)
+    states = []
+    for k in range(n):
+        q = q + h / 2 * v
+        away = q[:, None] - q
+        cubes = (away**2).sum(-1, keepdims=True) ** 1.5 + np.eye(6)[..., None]
+        v = v - h * G * (PLANET_MASSES[:, None] * away / cubes).sum(1)
+        q = q + h / 2 * v
+        if k % 4 == 0:
+            states.append([q, PLANET_MASSES[:, None] * v])
+    orbit = np.array(states)  # (n, 2, body, axis)
+    size = np.sqrt((orbit**2).sum(-1).mean(0))  # (2, body)
+    radius = np.repeat(np.where(np.arange(6) == 0, 1.0, _THICKNESS) * size, 3)
+    groups = [[*range(3 * i, 3 * i + 3), *range(18 + 3 * i, 21 + 3 * i)] for i in range(6)]
+    digits = np.vectorize(lambda x: float(f"{x:.5g}"))  # a domain is kept in the files of flows
+    return Tube(digits(orbit.reshape(len(orbit), 36)), digits(radius), groups)

@@ -1,0 +1,279 @@
+"""Textbook scenes of one and two degrees of freedom."""
+
+from __future__ import annotations
+
+import math
+
+from sympflow.hamiltonian.domain import Box, EnergySublevel
+from sympflow.hamiltonian.system import HamiltonianSystem
+
+
+def harmonic_oscillator(omega: float = 1.0) -> HamiltonianSystem:
+    """H = (p² + ω²q²)/2; period 2π/ω.
+
+    Parameters
+    ----------
+    omega : float
+        Angular frequency ω > 0, from 1e-100 to 1e100, so that ω² is a floating-point number.
+
+    Notes
+    -----
+    The domain is the ellipse H < ω²·1.7²/2, that is |q| < 1.7: with ω = 1 it contains [−1.2, 1.2]². The default
+    interval is 100 units of 1/ω and the default step 0.05/ω.
+    """
+    if not (isinstance(omega, int | float) and 1e-100 <= omega <= 1e100):
+        raise ValueError(f"`omega` must be positive and finite, from 1e-100 to 1e100; got {omega!r}.")
+    amplitude = 1.7
+    return HamiltonianSystem.from_sympy(
+        "(p**2 + omega**2*q**2)/2",
+        params={"omega": omega},
+        name="harmonic_oscillator",
+        domain=EnergySublevel(
+            (omega * amplitude) ** 2 / 2,
+            Box([-amplitude, -omega * amplitude], [amplitude, omega * amplitude]),
+        ),
+        y0=[1.0, 0.0],
+        t_span=(0.0, 100.0 / omega),
+        dt=0.05 / omega,
+    )
+
+
+_H = "p**2/2 + 1 - cos(q)"
+
+
+def pendulum() -> HamiltonianSystem:
+    """H = p²/2 + 1 − cos q, libration: the domain is H < 1.8 around q = 0 (the separatrix is H = 2)."""
+    q, p = math.acos(1 - 1.8), math.sqrt(2 * 1.8)
+    return HamiltonianSystem.from_sympy(
+        _H,
+        name="pendulum",
+        domain=EnergySublevel(1.8, Box([-q, -p], [q, p])),
+        y0=[1.5, 0.0],
+        t_span=(0.0, 100.0),
+        dt=0.05,
+    )
+
+
+def pendulum_separatrix(energy: float = 2.0) -> HamiltonianSystem:
+    """H = p²/2 + 1 − cos q from the bottom, q = 0, with the energy of the separatrix or any other.
+
+    Parameters
+    ----------
+    energy : float
+        H(y0) > 0: below 2 the pendulum swings, above it turns over.
+
+    Notes
+    -----
+    Known truth: on the separatrix q(t) = 4 arctan(eᵗ) − π, p(t) = 2 sech t: it never reaches the top, while any error
+    grows with exp(t). The domain is H < 2.5 in −π ≤ q ≤ π.
+
+    References
+    ----------
+    .. [1] V. I. Arnold, "Mathematical Methods of Classical Mechanics", 2nd ed., Springer 1989, § 4.
+    """
+    if not (isinstance(energy, int | float) and 0 < energy < math.inf):
+        raise ValueError(f"`energy` must be positive and finite; got {energy!r}.")
+    p = math.sqrt(5.0)
+    return HamiltonianSystem.from_sympy(
+        _H,
+        name="pendulum_separatrix",
+        domain=EnergySublevel(2.5, Box([-math.pi, -p], [math.pi, p])),
+        y0=[0.0, math.sqrt(2 * energy)],
+        t_span=(0.0, 100.0),
+        dt=0.05,
+    )
+
+
+def double_well(energy: float = 0.25) -> HamiltonianSystem:
+    """H = p²/2 + (q² − 1)²/4: wells at q = ±1, a saddle of energy ¼ between them.
+
+    Parameters
+    ----------
+    energy : float
+        H(y0) > 0: y0 is the outer turning point q = √(1 + 2√energy), p = 0. With ¼, the default, it lies on the
+        separatrix, below ¼ within the right well.
+
+    Notes
+    -----
+    Known truth: on the separatrix q(t) = √2 sech t, p(t) = −√2 sech t tanh t. As any error grows with exp(t) there,
+    a numerical solution comes back from the saddle after t ≈ ln(1/error). The domain is H < ½.
+
+    References
+    ----------
+    .. [1] J. Guckenheimer, P. Holmes, "Nonlinear Oscillations, Dynamical Systems, and Bifurcations of Vector Fields",
+       Springer 1983, 2.2 and 4.5 (Duffing's equation).
+    """
+    if not (isinstance(energy, int | float) and 0 < energy < math.inf):
+        raise ValueError(f"`energy` must be positive and finite; got {energy!r}.")
+    q, p = math.sqrt(1 + math.sqrt(2)), 1.0
+    return HamiltonianSystem.from_sympy(
+        "p**2/2 + (q**2 - 1)**2/4",
+        name="double_well",
+        domain=EnergySublevel(0.5, Box([-q, -p], [q, p])),
+        y0=[math.sqrt(1 + 2 * math.sqrt(energy)), 0.0],
+        t_span=(0.0, 100.0),
+        dt=0.05,
+        energy_scale=0.25,
+    )
+
+
+def quartic() -> HamiltonianSystem:
+    """H = (p₁² + p₂²)/2 + (q₁⁴ + q₂⁴)/4 + 3 q₁²q₂²/10 + q₁²/5.
+
+    The domain is H < 0.6, which is bounded. From y0 the energy is 0.419025.
+
+    References
+    ----------
+    .. [1] A. Carnegie, I. C. Percival, "Regular and chaotic motion in some quartic potentials", J. Phys. A 17 (1984)
+       801–813; with a quadratic term added.
+    """
+    energy = 0.6
+    q1 = math.sqrt(2 * (math.sqrt(0.04 + energy) - 0.2))  # q₁⁴/4 + q₁²/5 = 0.6
+    q2, p = (4 * energy) ** 0.25, math.sqrt(2 * energy)
+    return HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 + (q1**4 + q2**4)/4 + 3*q1**2*q2**2/10 + q1**2/5",
+        name="quartic",
+        domain=EnergySublevel(energy, Box([-q1, -q2, -p, -p], [q1, q2, p, p])),
+        y0=[0.8, 0.5, 0.3, -0.4],
+        t_span=(0.0, 100.0),
+        dt=0.05,
+    )
+
+
+def henon_heiles() -> HamiltonianSystem:
+    """H = (p₁² + p₂²)/2 + (q₁² + q₂²)/2 + q₁²q₂ − q₂³/3.
+
+    The domain is the bounded well below the escape energy 1/6. Its configuration part is the equilateral triangle with
+    the saddles (0, 1), (±√3/2, −1/2) as corners, so the box that encloses it picks the bounded component.
+
+    References
+    ----------
+    .. [1] M. Hénon, C. Heiles, "The applicability of the third integral of motion: some numerical experiments",
+       Astron. J. 69 (1964) 73–79.
+    """
+    return _scene("henon_heiles", [0.3, -0.3, 0.3, 0.15])
+
+
+def henon_heiles_escape(energy: float = 0.245) -> HamiltonianSystem:
+    """The same H from the centre of the well, q = 0, straight towards the saddle at (0, 1), whose energy is 1/6.
+
+    Parameters
+    ----------
+    energy : float
+        H(y0) > 0. Up to 1/6 the orbit stays on the axis q₁ = 0 within the well, above it escapes.
+
+    Notes
+    -----
+    Known truth: above 1/6 the solution ends in finite time, t* = ∫₀^∞ dq/√(2·energy − q² + 2q³/3): at
+    5.450984210235402 for 0.245, that is p = (0, 0.7). Near t* it is q₂ = 6/(t* − t)² to leading order.
+
+    The domain is the bounded well below 1/6, as for `henon_heiles`.
+    """
+    if not (isinstance(energy, int | float) and 0 < energy < math.inf):
+        raise ValueError(f"`energy` must be positive and finite; got {energy!r}.")
+    return _scene("henon_heiles_escape", [0.0, 0.0, 0.0, math.sqrt(2 * energy)])
+
+
+def _scene(name: str, y0: list[float]) -> HamiltonianSystem:
+    q1, p = math.sqrt(3) / 2, 1 / math.sqrt(3)
+    return HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 + (q1**2 + q2**2)/2 + q1**2*q2 - q2**3/3",
+        name=name,
+        domain=EnergySublevel(1 / 6, Box([-q1, -0.5, -p, -p], [q1, 1.0, p, p])),
+        y0=y0,
+        t_span=(0.0, 100.0),
+        dt=0.05,
+    )
+
+
+GRAVITY = 1.0
+ANGLE = 1.0  # of y0 from the downward vertical
+
+
+def spring_pendulum(k: float = 100.0, coordinates: str = "cartesian", radial_energy: float = 0.0) -> HamiltonianSystem:
+    """A unit mass on a spring of length 1 and stiffness k, in a plane, under gravity g = 1.
+
+    In Cartesian coordinates, q₂ upwards, it is separable: H = (p₁² + p₂²)/2 + k(|q| − 1)²/2 + q₂. In polar ones,
+    q₁ = r and q₂ = θ from the downward vertical, it is not, but has three parts that are solved exactly (the radial
+    oscillator, the rotation, gravity): H = [p₁²/2 + k(q₁ − 1)²/2] + p₂²/(2q₁²) − q₁ cos q₂.
+
+    Parameters
+    ----------
+    k : float
+        Stiffness, from 1e-6 to 1e30; the fast frequency is √k.
+    coordinates : "cartesian" or "polar"
+    radial_energy : float
+        Energy of the fast oscillation in y0: 0 starts on the slow manifold, ½ excites the fast mode.
+
+    Notes
+    -----
+    y0 is at rest at θ = 1, with the spring drawn out to its instantaneous balance k(r − 1) = cos θ, so that without
+    `radial_energy` the fast mode stays at O(1/k³) of the energy. Known truth: H(y0) = −cos(1)(1 + cos(1)/(2k)) plus
+    the radial energy, in both coordinates. Errors are relative to g·length = 1. The domain is a box of angles up to 1.4
+    and stretches up to twice those of the orbit. The default interval is (0, 20), the default step 0.1/√k.
+
+    References
+    ----------
+    .. [1] U. M. Ascher, S. Reich, "The midpoint scheme and variants for Hamiltonian systems: advantages and pitfalls",
+       SIAM J. Sci. Comput. 21 (1999) 1045–1065.
+    """
+    if not (isinstance(k, int | float) and 1e-6 <= k <= 1e30):
+        raise ValueError(f"`k` must be positive, a stiffness from 1e-6 to 1e30; got {k!r}.")
+    if not (isinstance(radial_energy, int | float) and 0 <= radial_energy < math.inf):
+        raise ValueError(f"`radial_energy` must be finite and not negative; got {radial_energy!r}.")
+    c, s = math.cos(ANGLE), math.sin(ANGLE)
+    r, speed = 1 + GRAVITY * c / k, math.sqrt(2 * radial_energy)
+    stretch = 2 * (speed / math.sqrt(k) + 3 * GRAVITY / k)  # at the bottom 2g(1 − cos 1) + g pull on the spring
+    fast = 2 * (speed + 3 * GRAVITY / math.sqrt(k))
+    if coordinates == "polar":
+        expression = "p1**2/2 + k*(q1 - 1)**2/2 + p2**2/(2*q1**2) - g*q1*cos(q2)"
+        y0 = [r, ANGLE, speed, 0.0]
+        low, high = [max(1 - stretch, 0.1), -1.4, -fast, -1.5], [1 + stretch, 1.4, fast, 1.5]
+    elif coordinates == "cartesian":
+        expression = "(p1**2 + p2**2)/2 + k*(sqrt(q1**2 + q2**2) - 1)**2/2 + g*q2"
+        y0 = [r * s, -r * c, speed * s, -speed * c]
+        reach, p = 1 + stretch, 1.5 + fast
+        low, high = [-reach, -reach, -p, -p], [reach, 0.1, p, p]
+    else:
+        raise ValueError(f"`coordinates` must be 'cartesian' or 'polar'; got {coordinates!r}.")
+    return HamiltonianSystem.from_sympy(
+        expression,
+        params={"k": k, "g": GRAVITY},
+        name="spring_pendulum",
+        domain=Box(low, high),
+        y0=y0,
+        t_span=(0.0, 20.0),
+        dt=0.1 / math.sqrt(k),
+        energy_scale=GRAVITY,
+    )
+
+
+def nonseparable(amplitude: float = 3.0) -> HamiltonianSystem:
+    """H = (q² + 1)(p² + 1)/2, which does not split into T(p) + V(q).
+
+    Parameters
+    ----------
+    amplitude : float
+        a > 0: y0 is q = −a, p = 0.
+
+    Notes
+    -----
+    Known truth: q(t) = −a·cn(√(1 + a²) t | m) with the parameter m = a²/(1 + a²), and p = q′/(1 + q²); H = (1 + a²)/2,
+    and the period is 4K(m)/√(1 + a²). The domain is H < (1 + 1.1²a²)/2, in which all orbits are closed.
+
+    References
+    ----------
+    .. [1] M. Tao, "Explicit symplectic approximation of nonseparable Hamiltonians: algorithm and long time
+       performance", Phys. Rev. E 94 (2016) 043303.
+    """
+    if not (isinstance(amplitude, int | float) and 0 < amplitude < math.inf):
+        raise ValueError(f"`amplitude` must be positive and finite; got {amplitude!r}.")
+    widest = 1.1 * amplitude  # of q and of p
+    return HamiltonianSystem.from_sympy(
+        "(q**2 + 1)*(p**2 + 1)/2",
+        name="nonseparable",
+        domain=EnergySublevel((1 + widest**2) / 2, Box([-widest] * 2, [widest] * 2)),
+        y0=[-amplitude, 0.0],
+        t_span=(0.0, 100.0),
+        dt=0.05 / math.sqrt(1 + amplitude**2),
+    )

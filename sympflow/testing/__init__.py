@@ -1,0 +1,5 @@
+"""What every integrator must pass, ours and those of third parties."""
+
+from sympflow.testing.checks import check_integrator
+
+__all__ = ["check_integrator"]
