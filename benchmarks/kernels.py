@@ -31,11 +31,10 @@ from training_step import autodiff_map, published_value
 
 import sympflow
 from sympflow.flow.sympflow import SympFlow
-from sympflow.kernels.mlp_flow import mlp_flow_kernel
-from sympflow.kernels.splitting import splitting_kernel
+from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES
+from sympflow.studies.attempts import interleaved
 from sympflow.systems import henon_heiles
-from sympflow.timing import interleaved
 
 H = 0.05
 TRAJECTORIES = 1024  # whole blocks, for the hand-written loops have no others
@@ -44,14 +43,14 @@ import time
 import numpy as np
 import numba
 from sympflow.integrators.schemes import SCHEMES
-from sympflow.kernels.splitting import splitting_kernel
+from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.systems import henon_heiles
 
 system = henon_heiles()
 start = time.perf_counter()
-kernel, save = splitting_kernel(system), np.array([10])
-kernel.run(SCHEMES["verlet"], 0.05, system.y0, 10, save)
-kernel.run_batch(SCHEMES["verlet"], 0.05, system.y0[None], 10, save)
+kernel, save = splitting_loops(system).kernel(SCHEMES["verlet"]), np.array([10])
+kernel.run(0.05, system.y0, 10, save)
+kernel.run_batch(0.05, system.y0[None], 10, save)
 print(time.perf_counter() - start)
 """
 
@@ -85,7 +84,7 @@ def ratio(what: str, ours: Call, theirs: Call, work: int, limit: float, repeats:
 
 def splitting_rows(repeats: int, n_single: int, n_batch: int) -> list[Row]:
     system = henon_heiles()
-    kernel = splitting_kernel(system)
+    kernels = {name: splitting_loops(system).kernel(SCHEMES[name]) for name in ("verlet", "kahan_li8")}
     y0, batch = system.y0, np.tile(system.y0, (TRAJECTORIES, 1))
     kahan_li8 = composition_table("kahan_li8", H)
     hand_written: dict[str, tuple[Call, Call]] = {
@@ -99,15 +98,15 @@ def splitting_rows(repeats: int, n_single: int, n_batch: int) -> list[Row]:
     for name, (one, many) in hand_written.items():
         n, m = (n_single, n_batch) if name == "verlet" else (n_single // 10, n_batch // 10)
         ours: dict[str, Call] = {
-            "kernel": lambda name=name, n=n: kernel.run(SCHEMES[name], H, y0, n, np.array([n])),
+            "kernel": lambda name=name, n=n: kernels[name].run(H, y0, n, np.array([n])),
             "solve": lambda name=name, n=n: sympflow.solve(
                 system, method=name, t_span=(0.0, n * H), y0=y0, dt=H, t_eval=[n * H]
             ),
         }
         rows += [ratio(f"{name}, one trajectory, {what}", call, one, n, 1.2, repeats) for what, call in ours.items()]
-        ours_many = lambda name=name, m=m: kernel.run_batch(SCHEMES[name], H, batch, m, np.array([m]), threads=1)  # noqa: E731
+        ours_many = lambda name=name, m=m: kernels[name].run_batch(H, batch, m, np.array([m]), threads=1)  # noqa: E731
         rows.append(ratio(f"{name}, batch of {TRAJECTORIES}", ours_many, many, m * TRAJECTORIES, 1.3, repeats))
-    one_step: Call = lambda: kernel.run(SCHEMES["verlet"], H, y0, 1, np.array([1]))  # noqa: E731
+    one_step: Call = lambda: kernels["verlet"].run(H, y0, 1, np.array([1]))  # noqa: E731
     solve: Call = lambda: sympflow.solve(system, method="verlet", t_span=(0.0, H), y0=y0, dt=H, t_eval=[H])  # noqa: E731
     calls = interleaved([one_step, solve], 50 * repeats)
     rows.append(Row("a call of the kernel", 1e6 * calls[0].median, "µs", 20))
@@ -135,7 +134,7 @@ def start_up_rows() -> list[Row]:
 
 def flow_rows(repeats: int) -> list[Row]:
     flow, y0 = SympFlow(2, pairs=5), henon_heiles().y0
-    kernel, batch = mlp_flow_kernel(flow), np.tile(y0, (1000, 1))
+    kernel, batch = flow.kernel_for(henon_heiles()), np.tile(y0, (1000, 1))
     x, t = torch.as_tensor(y0)[None].requires_grad_(), torch.ones(1, dtype=torch.float64)
     n, m = 1000, 20
     calls: list[Call] = [

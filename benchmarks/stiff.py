@@ -35,10 +35,10 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
-from sympflow.flow.io import shipped
-from sympflow.integrators.exact_maps import kernel_of, known_maps
-from sympflow.integrators.linear_splitting import LinearSplitting
-from sympflow.kernels.parts import PartsKernel
+from sympflow.flow.shipped import shipped
+from sympflow.integrators.compositions import known_maps
+from sympflow.integrators.splitting import LinearSplitting
+from sympflow.kernels.parts_loops import parts_loops
 from sympflow.schemes import SCHEMES
 from sympflow.systems.chains import oscillatory_energies
 
@@ -103,8 +103,9 @@ def with_linear_flow(name: str, **changes: Any) -> LinearSplitting:
 def run_scheme(system: HamiltonianSystem, method: LinearSplitting, n: int) -> Run:
     """n steps over T, 1000 outputs on the grid."""
     parts = method.parts_of(system)
-    kernel, save = kernel_of(parts, PartsKernel), np.linspace(0, n, INSTANTS + 1).round().astype(np.int64)
-    loops = partial(kernel.run, lambda h: known_maps(method, parts, float(h)), T_END / n, system.y0, n, save)
+    kernel = parts_loops(parts).kernel(lambda h: known_maps(method, parts, float(h)))
+    save = np.linspace(0, n, INSTANTS + 1).round().astype(np.int64)
+    loops = partial(kernel.run, T_END / n, system.y0, n, save)
     call = partial(solve, system, replace(method, dt=T_END / n), t_eval=T_END / n * save)
     scheme = method.scheme
     forces, hessians = n * scheme.force_evaluations, n * scheme.hessian_evaluations

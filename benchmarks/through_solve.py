@@ -31,11 +31,11 @@ pin_to_one_thread()
 import numpy as np
 
 from sympflow import HamiltonianSystem, Solution, solve, systems
-from sympflow.flow.io import shipped
-from sympflow.integrators.exact_maps import kernel_of, known_maps
-from sympflow.integrators.linear_splitting import LinearSplitting
-from sympflow.kernels.parts import PartsKernel
-from sympflow.kernels.splitting import splitting_kernel
+from sympflow.flow.shipped import shipped
+from sympflow.integrators.compositions import known_maps
+from sympflow.integrators.splitting import LinearSplitting
+from sympflow.kernels.parts_loops import parts_loops
+from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES
 
 DT = 0.625  # of srkn11b
@@ -91,7 +91,7 @@ def henon_heiles(quick: bool) -> Iterator[Pair]:
     errors = [median_energy_error(system, run, 20.0 if quick else 1000.0) for run in (flow, scheme)]
     print(f"\nHénon–Heiles: energy error of the flow {errors[0]:.1e}, of srkn11b {errors[1]:.1e}\n")
     kernel = shipped(system, tol=1e-6).kernel_for(system)
-    splitting, step = splitting_kernel(system), flow((0, 1)).stats["dt"]
+    untrained, step = splitting_loops(system).kernel(SCHEMES["srkn11b"]), flow((0, 1)).stats["dt"]
     many = system.domain.sample(8 if quick else 1000, 3)  # type: ignore[union-attr]
 
     def pair(name: str, t_end: float, y0: np.ndarray | None = None, outputs: int = 1) -> Pair:
@@ -103,12 +103,12 @@ def henon_heiles(quick: bool) -> Iterator[Pair]:
         if y0 is None:
             loops: tuple[Any, Any] = (
                 partial(kernel.run, step, system.y0, n, np.array([n])),
-                partial(splitting.run, SCHEMES["srkn11b"], DT, system.y0, m, np.array([m])),
+                partial(untrained.run, DT, system.y0, m, np.array([m])),
             )
         else:
             loops = (
                 partial(kernel.run_batch, step, y0, n, np.array([n]), 1),
-                partial(splitting.run_batch, SCHEMES["srkn11b"], DT, y0, m, np.array([m]), False, 1),
+                partial(untrained.run_batch, DT, y0, m, np.array([m]), 1),
             )
         return Pair(name, calls, loops)  # type: ignore[arg-type]
 
@@ -137,7 +137,7 @@ def fput(omega: float, quick: bool) -> Iterator[Pair]:
     print(f"\nFPUT, ω = {omega:g}: energy error of the flow {errors[0]:.1e}, of linear chin4a {errors[1]:.1e}\n")
     kernel = flow.kernel_for(system)
     parts = method.parts_of(system)
-    untrained = partial(kernel_of(parts, PartsKernel).run, lambda h: known_maps(method, parts, float(h)))
+    untrained = parts_loops(parts).kernel(lambda h: known_maps(method, parts, float(h))).run
     loops = (
         partial(kernel.run, flow.dt, system.y0, m, saves[0]),
         partial(untrained, t_end / n, system.y0, n, saves[1]),

@@ -14,7 +14,7 @@ from contenders import compiled_loops, ours
 from contenders.calibration import Judged, calibrate
 from contenders.contender import Contender, Skipped
 from contenders.scene import Scene
-from sympflow.timing import interleaved
+from sympflow.studies.attempts import interleaved
 
 PROBE = 0.01  # part of the interval that a run's duration is estimated from
 LEAST_PART = {"dt": 0.001, "tol": 0.05}  # adaptive steps differ along the orbit, so their average needs more of it

@@ -13,9 +13,8 @@ import numpy as np
 from sympflow import HamiltonianSystem, get, solve
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
-from sympflow.integrators.log_sympflow import LogSympFlow
-from sympflow.kernels.primed_flow import PrimedFlowKernel
-from sympflow.kernels.splitting import splitting_kernel
+from sympflow.integrators.flows import LogSympFlow
+from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.metrics.reference import reference
 from sympflow.schemes import SCHEMES
 
@@ -48,7 +47,7 @@ class Runner:
         if isinstance(flow, ClockedFlow):
             name = f"{flow.scheme.name} with a clock, Δt = {flow.figures['step']:g}"
             return cls._through_solve(name, flow.scheme.force_evaluations, system, partial(LogSympFlow, flow=flow))
-        kernel, scheme = PrimedFlowKernel(flow, system), flow.kernel_scheme()
+        kernel, scheme = flow.kernel_for(system), flow.kernel_scheme()
         name = f"Δt = {flow.dt:g}, {scheme.force_evaluations} + {flow.processor}"
         name += f", degree {max(map(sum, flow.monomials))}" if flow.monomials else ""
         many = partial(kernel.run_batch, threads=1)
@@ -56,8 +55,9 @@ class Runner:
 
     @classmethod
     def of_scheme(cls, name: str, system: HamiltonianSystem) -> Runner:
-        kernel, scheme = splitting_kernel(system), SCHEMES[name]
-        one, many = partial(kernel.run, scheme), partial(kernel.run_batch, scheme, threads=1)
+        scheme = SCHEMES[name]
+        kernel = splitting_loops(system).kernel(scheme)
+        one, many = kernel.run, partial(kernel.run_batch, threads=1)
         return cls(name, scheme.force_evaluations, scheme.hessian_evaluations, one, many)
 
     @classmethod
