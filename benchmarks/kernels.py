@@ -30,11 +30,11 @@ import torch
 from contenders.loops import composition, composition_batch, composition_table, verlet, verlet_batch
 from measuring import fragments
 from measuring.compiled import last, network_loops, scheme_loops
-from sympflow.timing import interleaved
 from training_step import autodiff_map, published_value
 
 import sympflow
 from sympflow import SympFlow
+from sympflow.studies.attempts import interleaved
 from sympflow.systems import henon_heiles
 
 H = 0.05

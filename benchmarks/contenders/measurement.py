@@ -10,10 +10,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from sympflow.timing import interleaved
 
 from contenders import loops, ours
 from contenders.contender import Contender, Scene, Skipped, Work
+from sympflow.studies.attempts import interleaved
 
 SHORT = 0.1  # part of the interval over which a `short` calibration runs
 PROBE = 0.01  # part of the interval that a run's duration is estimated from
