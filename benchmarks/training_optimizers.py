@@ -24,11 +24,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from contenders.environment import pin_to_one_thread
+from measuring.machine import pin_to_one_thread
 
 pin_to_one_thread()
 
 import torch
+from measuring import fragments
 
 from sympflow import train
 from sympflow.training.shipped import rows
@@ -110,10 +111,18 @@ def trained(recipe: Recipe, optimizer: str, seconds: float) -> Result:
 
 def row(result: Result) -> str:
     published = PUBLISHED[result.scene, result.kind]
-    return (
-        f"| {result.scene}, {result.kind} ({result.parameters}) | {result.optimizer} | {result.seconds:.0f} s | "
-        f"{result.steps:,} | {result.at_dt:.1e} | {result.fractional:.1e} | {published:.1e} | "
-        f"{published / result.at_dt:.0f} |"
+    lower = published / result.at_dt
+    return fragments.row(
+        [
+            f"{result.scene.replace('_', ' ')}, {result.kind} ({result.parameters})",
+            result.optimizer,
+            f"{result.seconds:.0f} s",
+            f"{result.steps:,}",
+            f"{result.at_dt:.1e}",
+            f"{result.fractional:.1e}",
+            f"{published:.1e}",
+            f"{lower:.0f}" if lower >= 10 else f"{lower:.1g}",
+        ]
     )
 
 
@@ -138,11 +147,14 @@ def main() -> None:
     parser.add_argument("--scene", action="append", choices=sorted({scene for scene, _ in PUBLISHED}))
     parser.add_argument("--kind", action="append", choices=("sympflow", "mlp"))
     parser.add_argument("--optimizer", action="append", choices=OPTIMIZERS)
+    fragments.add_out(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
     seconds = 1.0 if options.quick else options.seconds
     scenes = options.scene or ["harmonic_oscillator", "henon_heiles"]
-    print("\n" + run(seconds, scenes, options.kind or ["sympflow", "mlp"], options.optimizer or list(OPTIMIZERS)))
+    found = run(seconds, scenes, options.kind or ["sympflow", "mlp"], options.optimizer or list(OPTIMIZERS))
+    print("\n" + found)
+    fragments.write(options.out, "training-optimizers", found)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ import torch
 from scipy.linalg import solve_triangular
 from torch import Tensor
 
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap
 from sympflow.training.losses import Objective
 from sympflow.training.options import LossOptions
 

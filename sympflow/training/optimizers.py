@@ -15,7 +15,7 @@ import torch
 from scipy.optimize import line_search
 from torch import Tensor
 
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap
 from sympflow.training.least_squares import MAX_PARAMETERS, GaussNewton, put_weights, weight_vector
 from sympflow.training.losses import Objective
 from sympflow.training.options import LossOptions

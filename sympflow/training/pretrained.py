@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from sympflow.flow.io import load
+from sympflow.flow.files import load
 from sympflow.training.shipped import rows
 from sympflow.training.shipped.recipe import Recipe, file_of, made, scenes
 

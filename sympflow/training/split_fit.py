@@ -16,13 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from sympflow.flow.columns import Column
+from sympflow.flow.coefficients import Column
 from sympflow.flow.split import SplitFlow
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.parts import Map
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.exact_maps import kernel_of
-from sympflow.kernels.parts import PartsKernel
+from sympflow.kernels.parts_loops import parts_loops
 from sympflow.training.least_squares import Minimum, Stop, levenberg_marquardt, put_weights
 from sympflow.training.options import SplitOptions
 from sympflow.training.points import Labels, Stream, states, stream_seed
@@ -88,8 +87,7 @@ class SplitFit:
 
     def __init__(self, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, options: SplitOptions) -> None:
         self.flow, self.options, self.parts = flow, options, flow.parts
-        self.kernel: PartsKernel = kernel_of(self.parts, PartsKernel)
-        self.kernel.source()
+        self.kernel = parts_loops(self.parts)
         self.columns = flow.columns()
         ends = np.cumsum([(c.n + 1) // 2 for c in self.columns])
         self.slices = [slice(int(end) - (c.n + 1) // 2, int(end)) for c, end in zip(self.columns, ends, strict=True)]

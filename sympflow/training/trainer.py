@@ -13,8 +13,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import plain
-from sympflow.flow.arguments import check_system
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap, check_system
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow

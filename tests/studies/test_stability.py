@@ -1,10 +1,8 @@
 """stability(): the limits that are known, blow-ups told apart, and what is refused."""
 
 import csv
-import importlib.util
 import math
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +12,7 @@ from typer.testing import CliRunner
 import sympflow
 from sympflow import HamiltonianSystem, max_energy_error, solve, stability, systems
 from sympflow.commands import app
-from sympflow.studies.singularities import blow_up
-from sympflow.studies.step_stability import initial_states
+from sympflow.studies.step_stability import blow_up, initial_states
 
 SINGULARITY = 5.450984210235402  # of Hénon–Heiles from q = 0, p = (0, 0.7)
 
@@ -283,17 +280,6 @@ def test_the_command(tmp_path):
     result = CliRunner().invoke(app, ["stability", "pendulum", "--vary", "omega=1"])
     assert result.exit_code == 2
     assert "which is not a parameter of pendulum" in result.output
-
-
-def test_the_words_of_the_page_hold_a_place_for_every_table():
-    folder = Path(__file__).parents[2] / "benchmarks"
-    specification = importlib.util.spec_from_file_location("stability_words", folder / "stability_words.py")
-    words = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(words)
-    source = (folder / "stability.py").read_text(encoding="utf-8")
-    sections = re.findall(r'^    "(\w+)": ', source[source.index("SECTIONS: dict") :], re.MULTILINE)
-    page = words.page({name: f"<{name}>" for name in sections})
-    assert [name for name in sections if f"<{name}>" not in page] == ["maps"]  # figures alone
 
 
 def test_a_limit_that_is_not_found_is_explained_and_progress_names_every_step():

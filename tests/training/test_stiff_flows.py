@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sympflow import solve
-from sympflow.flow.io import shipped
+from sympflow.flow.shipped import shipped
 from sympflow.systems import fput
 from sympflow.training.shipped.judges import PHASES
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from sympflow.flow.base import FlowMap
 from sympflow.flow.certificate import upper_limit
 from sympflow.flow.clocked import ClockedFlow
+from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
