@@ -19,11 +19,12 @@ import math
 import time
 from dataclasses import dataclass
 
-from contenders.environment import pin_to_one_thread
+from measuring.machine import pin_to_one_thread
 
 pin_to_one_thread()
 
 import numpy as np
+from measuring import fragments
 
 import sympflow
 from sympflow import HamiltonianSystem, energy_drift, solve, systems
@@ -54,7 +55,7 @@ def scenes() -> list[HamiltonianSystem]:
 
 @dataclass(frozen=True)
 class Drift:
-    """What a flow's energy does over N steps."""
+    """The energy of a flow over N steps."""
 
     flow: str
     steps: int
@@ -71,7 +72,7 @@ class Drift:
 
 
 def drift_of(entry: ShippedFlow, system: HamiltonianSystem, steps: int) -> Drift:
-    """That of a shipped flow."""
+    """The drift of a shipped flow."""
     flow = entry.load(system)
     y0 = np.asarray(REGULAR.get(system.name, system.y0), dtype=float)
     T, every = steps * flow.dt, max(1, steps // OUTPUTS)
@@ -87,12 +88,10 @@ def drift_of(entry: ShippedFlow, system: HamiltonianSystem, steps: int) -> Drift
     return Drift(entry.name, steps, largest, abs(slope) * T, 3 * error * T, rounding, seconds, left)
 
 
-def run(steps: int, named: list[str] | None = None) -> str:
-    """The table, its rows printed as they are made."""
-    lines = [
-        "| flow | largest energy error | change by the slope | 3 standard errors | 10 ε √N | verdict |",
-        "|---|---|---|---|---|---|",
-    ]
+def run(steps: int, named: list[str] | None = None) -> list[Drift]:
+    """The drift of each flow, printed as a row of a table."""
+    print("| flow | largest energy error | change by the slope | 3 standard errors | 10 ε √N | verdict |")
+    print("|---|---|---|---|---|---|")
     entries = sympflow.shipped_flows(kind="sympflow")
     found: list[Drift] = []
     for system in scenes():
@@ -106,12 +105,23 @@ def run(steps: int, named: list[str] | None = None) -> str:
             verdict = "no drift" if d.passed else "**drifts**"
             if d.left is not None:
                 verdict += f", leaves Ω at t = {d.left:.3g}"
-            lines.append(
-                f"| {d.flow} | {d.largest:.1e} | {d.change:.1e} | {d.three_errors:.1e} | {d.rounding:.1e} | {verdict} |"
-            )
-            print(f"{lines[-1]} ({d.seconds:.0f} s)", flush=True)
+            cells = [f"{x:.1e}" for x in (d.largest, d.change, d.three_errors, d.rounding)]
+            print(fragments.row([d.flow, *cells, verdict]), f"({d.seconds:.0f} s)", flush=True)
+    return found
+
+
+def failures(found: list[Drift]) -> str:
+    """The table of the flows that drift, and how many do not."""
     passed = sum(d.passed for d in found)
-    return "\n".join([*lines, "", f"{passed} of {len(found)} flows show no drift over {steps:,} steps."])
+    rows = [
+        (f"{passed} of {len(found)} flows", "no drift", "", "", f"{10 * EPS * math.sqrt(found[0].steps):.1e}"),
+        *(
+            (d.flow, f"{d.change:.1e}", f"{d.three_errors:.1e}", f"{d.largest:.1e}", f"{d.rounding:.1e}")
+            for d in found
+            if not d.passed
+        ),
+    ]
+    return fragments.table(("flow", "change", "3 standard errors", "largest error", "10 ε √N"), rows)
 
 
 def main() -> None:
@@ -119,9 +129,12 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="20,000 steps of the flows of the pendulum")
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--system", action="append", help="name of a system; all if none is named")
+    fragments.add_out(parser)
     options = parser.parse_args()
     steps = QUICK_STEPS if options.quick else options.steps
-    print("\n" + run(steps, options.system or (["pendulum"] if options.quick else None)))
+    found = run(steps, options.system or (["pendulum"] if options.quick else None))
+    print(f"\n{sum(d.passed for d in found)} of {len(found)} flows show no drift over {steps:,} steps.")
+    fragments.write(options.out, "drift", failures(found))
 
 
 if __name__ == "__main__":

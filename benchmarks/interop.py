@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from measuring import fragments
 from scipy.integrate import RK45
 
 from sympflow import get, solve, systems
@@ -142,6 +143,7 @@ def zeros() -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--json", type=Path)
+    fragments.add_out(parser)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     get("sympflow")().check(HH)
@@ -181,6 +183,23 @@ def main() -> None:
             ]
         )
     )
+    steps = [
+        (row["solver"], f"{row['step'] / rk45['step']:.2f}", f"{row['step_and_dense'] / rk45['step_and_dense']:.2f}")
+        for row in result["solve_ivp"]
+    ]
+    titles = ("solver", "a step, of SciPy's RK45", "with a state within the step")
+    fragments.write(arguments.out, "interop-steps", fragments.table(titles, steps))
+    ratios = [
+        (
+            row["method"],
+            f"{row['error']:.1e}",
+            f"{row['dopri5_time'] / row['time']:.2g}",
+            f"{row['dopri5_time_with_gradient'] / row['time_with_gradient']:.2g}",
+        )
+        for row in rows
+    ]
+    titles = ("method", "error", "times faster", "with gradients")
+    fragments.write(arguments.out, "interop-odeint", fragments.table(titles, ratios))
     found = result["zeros_of_cos"]
     print(f"\n{found['found']} zeros of cos t found, the worst wrong by {found['error']:.1e}")
     if arguments.json:

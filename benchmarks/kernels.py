@@ -3,7 +3,7 @@
     python benchmarks/kernels.py
 
 Hénon–Heiles, float64, one thread. What is compared is timed in turn, in rounds, and the median of the rounds counts.
-The hand-written loops (`contenders.compiled_loops`) merge kicks and vectorise as ours do. Start-up times are of fresh
+The hand-written loops (`contenders.loops`) merge kicks and vectorise as ours do. Start-up times are of fresh
 processes, with an empty cache folder and with a filled one, imports apart. The flow has L = 5 pairs of potentials with
 two hidden layers of 10.
 """
@@ -19,20 +19,21 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
-from contenders.environment import pin_to_one_thread
+from measuring.machine import pin_to_one_thread
 
 pin_to_one_thread()
 
 import numpy as np
 import torch
-from contenders.compiled_loops import composition, composition_batch, composition_table, verlet, verlet_batch
+from contenders.loops import composition, composition_batch, composition_table, verlet, verlet_batch
+from measuring import fragments
+from measuring.compiled import last, network_loops, scheme_loops
 from training_step import autodiff_map, published_value
 
 import sympflow
-from sympflow.flow.sympflow import SympFlow
-from sympflow.kernels.splitting_loops import splitting_loops
-from sympflow.schemes import SCHEMES
+from sympflow import SympFlow
 from sympflow.studies.attempts import interleaved
 from sympflow.systems import henon_heiles
 
@@ -42,15 +43,14 @@ START_UP = """
 import time
 import numpy as np
 import numba
-from sympflow.integrators.schemes import SCHEMES
-from sympflow.kernels.splitting_loops import splitting_loops
+from measuring.compiled import last, scheme_loops
 from sympflow.systems import henon_heiles
 
 system = henon_heiles()
 start = time.perf_counter()
-kernel, save = splitting_loops(system).kernel(SCHEMES["verlet"]), np.array([10])
-kernel.run(0.05, system.y0, 10, save)
-kernel.run_batch(0.05, system.y0[None], 10, save)
+loops = scheme_loops(system, "verlet")
+loops.one(0.05, system.y0, 10, last(10))
+loops.many(0.05, system.y0[None], 10, last(10))
 print(time.perf_counter() - start)
 """
 
@@ -68,10 +68,13 @@ class Row:
     at_least: bool = False
     note: str = ""
 
-    def __str__(self) -> str:
+    @property
+    def verdict(self) -> str:
         met = self.measured >= self.limit if self.at_least else self.measured <= self.limit
-        limit = f"{'≥' if self.at_least else '≤'} {self.limit:g} {'met' if met else 'MISSED'}"
-        return f"{self.what:<47}{self.measured:>8.3g} {self.unit:<18}{limit:<15}{self.note}"
+        return f"{'≥' if self.at_least else '≤'} {self.limit:g} {'met' if met else 'MISSED'}"
+
+    def __str__(self) -> str:
+        return f"{self.what:<47}{self.measured:>8.3g} {self.unit:<18}{self.verdict:<15}{self.note}"
 
 
 def ratio(what: str, ours: Call, theirs: Call, work: int, limit: float, repeats: int) -> Row:
@@ -84,7 +87,6 @@ def ratio(what: str, ours: Call, theirs: Call, work: int, limit: float, repeats:
 
 def splitting_rows(repeats: int, n_single: int, n_batch: int) -> list[Row]:
     system = henon_heiles()
-    kernels = {name: splitting_loops(system).kernel(SCHEMES[name]) for name in ("verlet", "kahan_li8")}
     y0, batch = system.y0, np.tile(system.y0, (TRAJECTORIES, 1))
     kahan_li8 = composition_table("kahan_li8", H)
     hand_written: dict[str, tuple[Call, Call]] = {
@@ -97,16 +99,18 @@ def splitting_rows(repeats: int, n_single: int, n_batch: int) -> list[Row]:
     rows = []
     for name, (one, many) in hand_written.items():
         n, m = (n_single, n_batch) if name == "verlet" else (n_single // 10, n_batch // 10)
+        loops = scheme_loops(system, name)
         ours: dict[str, Call] = {
-            "kernel": lambda name=name, n=n: kernels[name].run(H, y0, n, np.array([n])),
+            "kernel": lambda loops=loops, n=n: loops.one(H, y0, n, last(n)),
             "solve": lambda name=name, n=n: sympflow.solve(
                 system, method=name, t_span=(0.0, n * H), y0=y0, dt=H, t_eval=[n * H]
             ),
         }
         rows += [ratio(f"{name}, one trajectory, {what}", call, one, n, 1.2, repeats) for what, call in ours.items()]
-        ours_many = lambda name=name, m=m: kernels[name].run_batch(H, batch, m, np.array([m]), threads=1)  # noqa: E731
+        ours_many = lambda loops=loops, m=m: loops.many(H, batch, m, last(m))  # noqa: E731
         rows.append(ratio(f"{name}, batch of {TRAJECTORIES}", ours_many, many, m * TRAJECTORIES, 1.3, repeats))
-    one_step: Call = lambda: kernels["verlet"].run(H, y0, 1, np.array([1]))  # noqa: E731
+    loops = scheme_loops(system, "verlet")
+    one_step: Call = lambda: loops.one(H, y0, 1, last(1))  # noqa: E731
     solve: Call = lambda: sympflow.solve(system, method="verlet", t_span=(0.0, H), y0=y0, dt=H, t_eval=[H])  # noqa: E731
     calls = interleaved([one_step, solve], 50 * repeats)
     rows.append(Row("a call of the kernel", 1e6 * calls[0].median, "µs", 20))
@@ -117,7 +121,8 @@ def splitting_rows(repeats: int, n_single: int, n_batch: int) -> list[Row]:
 def start_up_rows() -> list[Row]:
     """The first single run and the first batch of a fresh process."""
     with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {"SYMPFLOW_CACHE_DIR": folder}
+        paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = os.environ | {"SYMPFLOW_CACHE_DIR": folder, "PYTHONPATH": os.pathsep.join(paths)}
         seconds = [
             float(
                 subprocess.run(
@@ -134,12 +139,12 @@ def start_up_rows() -> list[Row]:
 
 def flow_rows(repeats: int) -> list[Row]:
     flow, y0 = SympFlow(2, pairs=5), henon_heiles().y0
-    kernel, batch = flow.kernel_for(henon_heiles()), np.tile(y0, (1000, 1))
+    loops, batch = network_loops(flow), np.tile(y0, (1000, 1))
     x, t = torch.as_tensor(y0)[None].requires_grad_(), torch.ones(1, dtype=torch.float64)
     n, m = 1000, 20
     calls: list[Call] = [
-        lambda: kernel.run(1.0, y0, n, np.array([n])),
-        lambda: kernel.run_batch(1.0, batch, m, np.array([m]), threads=1),
+        lambda: loops.one(1.0, y0, n, last(n)),
+        lambda: loops.many(1.0, batch, m, last(m)),
         lambda: autodiff_map(flow, published_value, t, x),
         lambda: flow.psi(1.0, x.detach()),
     ]
@@ -161,13 +166,18 @@ def main() -> None:
     parser.add_argument(
         "--steps", type=int, default=1_000_000, help="of Verlet, one trajectory; a tenth for Kahan–Li 8"
     )
+    fragments.add_out(parser)
     options = parser.parse_args()
+    found: list[Row] = []
     for rows in (
         splitting_rows(options.repeats, options.steps, max(10, options.steps // 1000)),
         flow_rows(options.repeats),
         start_up_rows(),
     ):
         print(*rows, sep="\n")
+        found += rows
+    cells = [(r.what, f"{r.measured:.3g} {r.unit}", r.verdict, r.note) for r in found]
+    fragments.write(options.out, "kernels", fragments.table(("what", "measured", "limit", "in detail"), cells))
 
 
 if __name__ == "__main__":

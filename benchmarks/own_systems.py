@@ -16,11 +16,12 @@ import argparse
 import time
 import warnings
 
-from contenders.environment import pin_to_one_thread
+from measuring.machine import pin_to_one_thread
 
 pin_to_one_thread()
 
 import numpy as np
+from measuring import fragments
 
 from sympflow import Box, EnergySublevel, HamiltonianSystem, get, max_energy_error, solve, train
 
@@ -112,14 +113,20 @@ def main(given: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("systems", nargs="*", metavar="system", help=f"of {', '.join(SYSTEMS)}")
     parser.add_argument("--quick", action="store_true", help="does it run?")
+    fragments.add_out(parser)
     arguments = parser.parse_args(given)
     unknown = set(arguments.systems) - set(SYSTEMS)
     if unknown:
         parser.error(f"no system {', '.join(sorted(unknown))}: choose of {', '.join(SYSTEMS)}")
-    print("| system | Δt | training | energy error, T = 1000 | best scheme takes | Kahan–Li 8 takes |")
-    print("|---|---|---|---|---|---|")
+    lines = [
+        "| system | Δt | training | energy error, T = 1000 | best scheme takes | Kahan–Li 8 takes |",
+        "|---|---|---|---|---|---|",
+    ]
+    print(*lines, sep="\n")
     for name in arguments.systems or SYSTEMS:
-        print(row(name, SYSTEMS[name], arguments.quick), flush=True)
+        lines.append(row(name, SYSTEMS[name], arguments.quick))
+        print(lines[-1], flush=True)
+    fragments.write(arguments.out, "own-systems", "\n".join(lines))
 
 
 if __name__ == "__main__":

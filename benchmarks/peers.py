@@ -1,9 +1,9 @@
-"""sympflow and its peers on one scene, in one run: writes docs/benchmarks.md and its figure.
+"""sympflow and its peers on one scene, in one run: the fragments of docs/benchmarks.md and its figure.
 
-    python benchmarks/peers.py --out docs/benchmarks.md
+    python benchmarks/peers.py --out docs/measured
 
 Everything runs on one thread. Packages that are not installed are left out, with the reason. The measured numbers can
-be kept with `--results file.json`, and the page written from them again with `--reuse`.
+be kept with `--results file.json`, and the fragments written from them again with `--reuse`.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from contenders.contender import Contender, Skipped
+    from contenders.contender import Contender, Scene, Skipped
     from contenders.measurement import Results
-    from contenders.scene import Scene
 
 PEERS = {"diffrax": "diffrax_solvers", "heyoka": "heyoka_taylor"}
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
@@ -27,21 +26,21 @@ TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks.md"))
+    parser.add_argument("--out", type=Path, default=Path("docs/measured"), help="folder of the fragments")
     parser.add_argument("--results", type=Path, help="JSON file for the measured numbers")
-    parser.add_argument("--reuse", action="store_true", help="write the page from --results, without a run")
+    parser.add_argument("--reuse", action="store_true", help="write the fragments from --results, without a run")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--cap", type=float, default=0.3, help="seconds above which a run is timed in part")
     parser.add_argument("--t-end", type=float, default=1000.0, help="length of the interval (the targets need 1000)")
     parser.add_argument("--only", default="", help="comma-separated packages to compare, for a quick look")
     arguments = parser.parse_args()
 
-    from contenders.environment import pin_to_one_thread
+    from measuring import fragments
+    from measuring.machine import pin_to_one_thread
 
     pin_to_one_thread()
-    from contenders.figure import draw
+    from contenders import tables
     from contenders.measurement import Results
-    from contenders.page import page
 
     if arguments.reuse:
         results = Results.from_dict(json.loads(arguments.results.read_text()))
@@ -51,14 +50,15 @@ def main() -> None:
             arguments.results.parent.mkdir(parents=True, exist_ok=True)
             arguments.results.write_text(json.dumps(results.to_dict(), indent=1))
     figure = arguments.out.parent / "figures" / "work_precision_peers.png"
-    draw(results, figure)
-    arguments.out.write_text(page(results, figure.relative_to(arguments.out.parent)))
+    tables.draw(results, figure)
+    for name, body in tables.fragments(results).items():
+        fragments.write(arguments.out, name, body)
 
 
 def run(arguments: argparse.Namespace) -> Results:
-    from contenders.environment import describe, load
+    from contenders.contender import Scene
     from contenders.measurement import measure
-    from contenders.scene import Scene
+    from measuring.machine import describe, load
 
     start = time.perf_counter()
     scene = Scene(t_end=arguments.t_end)
@@ -76,12 +76,10 @@ def run(arguments: argparse.Namespace) -> Results:
 
 def gather(scene: Scene) -> tuple[list[Contender], list[Skipped]]:
     """The contenders whose packages are there, and the packages that are not."""
-    from contenders import compiled_loops, interpreted_loops, ours, runge_kutta
+    from contenders import loops, ours, runge_kutta
     from contenders.contender import Skipped
 
-    contenders = [
-        c for module in (ours, compiled_loops, interpreted_loops, runge_kutta) for c in module.contenders(scene)
-    ]
+    contenders = [c for module in (ours, loops, runge_kutta) for c in module.contenders(scene)]
     skipped = []
     for package, module in PEERS.items():
         if importlib.util.find_spec(package) is None:

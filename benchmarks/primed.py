@@ -5,6 +5,7 @@
     python benchmarks/primed.py --fit --flows folder   flows that are fitted first, and kept in a folder
     python benchmarks/primed.py --ablation             what of a flow and its training pays, on Hénon–Heiles
     python benchmarks/primed.py --quick                the same in miniature
+    python benchmarks/primed.py --out docs/measured    with the fragments of docs/primed.md
 
 The flows are those that the package ships, or those in `--flows`. For each target each of them, and each scheme, gets
 the fewest steps (for a flow, of at most its Δt and at least a quarter of it) with which the median error over 20
@@ -27,41 +28,42 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from contenders.environment import pin_to_one_thread
+from measuring.machine import pin_to_one_thread
 
 pin_to_one_thread()
 
-from contenders import primed_race
-from contenders.primed_race import Measure, Row, Runner, fewest_steps, race, schemes
+from measuring import fragments
+from measuring.race import MOST_FORCES, Measure, Row, Runner, fewest_steps, race, schemes
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, time_transformed, train
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.hamiltonian.fingerprint import same_system
-from sympflow.training.recipes import PrimedRecipe
+from sympflow.training.starts import Primed
 
 TARGETS = (1e-4, 1e-6, 1e-8)
 SHIPPED = Path(sympflow.__file__).parent / "pretrained"
 MEASURES = {"energy": 1000.0, "state": 100.0}
 FLOWS = {
     "henon_heiles": (
-        PrimedRecipe(1.1, 2), PrimedRecipe(0.65, 2), PrimedRecipe(0.9, 3), PrimedRecipe(0.55, 3, restarts=48),
+        (Primed(1.1, 2), 24), (Primed(0.65, 2), 24), (Primed(0.9, 3), 24), (Primed(0.55, 3), 48),
     ),
     "pendulum": (
-        PrimedRecipe(0.8, 1), PrimedRecipe(1.2, 2, 4), PrimedRecipe(0.5, 2), PrimedRecipe(0.5, 3, restarts=48),
+        (Primed(0.8, 1), 24), (Primed(1.2, 2, 4), 24), (Primed(0.5, 2), 24), (Primed(0.5, 3), 48),
     ),
-    "quartic": (PrimedRecipe(0.8, 2), PrimedRecipe(0.5, 3), PrimedRecipe(0.3, 3, restarts=48)),
-    "kepler": (PrimedRecipe(0.15, 2), PrimedRecipe(0.1, 3), PrimedRecipe(0.045, 3, restarts=48)),
+    "quartic": ((Primed(0.8, 2), 24), (Primed(0.5, 3), 24), (Primed(0.3, 3), 48)),
+    "kepler": ((Primed(0.15, 2), 24), (Primed(0.1, 3), 24), (Primed(0.045, 3), 48)),
 }  # fmt: skip
+"""Starts of trainings, and how many tables their searches begin from."""
 
 
-def fitted(system: HamiltonianSystem, recipe: PrimedRecipe, folder: Path, **options: Any) -> PrimedFlow:
-    """The flow of a recipe, from the folder if it is there."""
-    path = folder / f"{system.name}-{recipe.dt:g}-{recipe.stages}-{recipe.processor}.safetensors"
+def fitted(system: HamiltonianSystem, start: Primed, tables: int, folder: Path, **options: Any) -> PrimedFlow:
+    """The flow that comes of a start, from the folder if it is there."""
+    path = folder / f"{system.name}-{start.dt:g}-{start.stages}-{start.processor}.safetensors"
     if path.exists():
         return sympflow.load(path, system=system)
-    flow = train(system, flow=recipe.flow(system), progress=False, **(recipe.options() | options))
+    flow = train(system, flow=start.flow(system), progress=False, **({"restarts": tables} | options))
     folder.mkdir(parents=True, exist_ok=True)
     flow.save(path)
     return flow
@@ -85,9 +87,9 @@ def taylor_of(system: HamiltonianSystem) -> Any:
     """heyoka's integrators of the system, None where it is not installed."""
     if importlib.util.find_spec("heyoka") is None:
         return None
-    from contenders.heyoka_systems import Taylor
+    from contenders.heyoka_taylor import Taylor
 
-    return Taylor(system)
+    return Taylor.of_system(system)
 
 
 def table(rows: list[Row]) -> str:
@@ -107,6 +109,24 @@ def table(rows: list[Row]) -> str:
             f"{r.one_step_error:.1e} / {r.fractional_error:.1e} | {r.evaluations_saved:.1f}× | {' | '.join(versus)} |"
         )
     return "\n".join(lines)
+
+
+SCENES = {"henon_heiles": "Hénon–Heiles", "pendulum": "pendulum", "quartic": "quartic", "kepler": "Kepler, e = 0.6"}
+
+
+def fragment(rows: list[Row]) -> str:
+    """The table of the page: what each scheme and heyoka takes, in times of the flow's time."""
+    titles = ["scene, error", "flow: Δt, kicks + processor", "forces saved", "one trajectory: best scheme"]
+    lines = []
+    for r in rows:
+        one, outputs, many = (f"{r.faster[kind]:.2f} {r.rival[kind]}" for kind in ("one", "outputs", "batch"))
+        taylor = [r.faster.get(f"heyoka {kind}") for kind in ("one", "batch")]
+        heyoka = " / ".join("–" if x is None else f"{x:.1f}" if x < 10 else f"{x:.0f}" for x in taylor)
+        target = f"{SCENES[r.system]}, {r.measure} {r.target:.0e}".replace("e-0", "e-")
+        scheme, _, dt = r.flow.rpartition("Δt = ")
+        flow = f"{dt}, clock" if "clock" in scheme else dt
+        lines.append([target, flow, f"{r.evaluations_saved:.1f}", one, outputs, many, heyoka])
+    return fragments.table([*titles, "1000 outputs", "batch of 1000", "heyoka: one / batch"], lines)
 
 
 # ablation ----------------------------------------------------------------------------------------------------
@@ -155,7 +175,7 @@ def ablation(system: HamiltonianSystem, dt: float, variants: tuple[Variant, ...]
         error = measure.of(runner, n)
         needed = []
         for rival in schemes(system):
-            most = primed_race.MOST_FORCES // rival.forces
+            most = MOST_FORCES // rival.forces
             steps = fewest_steps(partial(measure.of, rival), error, max(1, 3 * n // rival.forces), 1, most)
             needed += [] if steps is None else [steps * rival.forces]
         saved = f"{min(needed) / (n * runner.forces):.1f}×" if needed else "–"
@@ -181,6 +201,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--batch", type=int, default=1000)
     parser.add_argument("--json", type=Path, help="file for the rows")
+    fragments.add_out(parser)
     print(run(parser.parse_args()))
 
 
@@ -191,12 +212,16 @@ def run(options: argparse.Namespace) -> str:
     targets, measures = (TARGETS, MEASURES) if not options.quick else ((1e-2,), {"energy": 20.0, "state": 5.0})
     if options.ablation:
         system = getattr(systems, (options.system or ["henon_heiles"])[0])()
-        return ablation(system, 0.6, ABLATION[:3] if options.quick else ABLATION, **quick)
+        found = ablation(system, 0.6, ABLATION[:3] if options.quick else ABLATION, **quick)
+        fragments.write(options.out, "primed-ablation", found)
+        return found
     rows: list[Row] = []
     for name in options.system or FLOWS:
         system = getattr(systems, name)()
         if options.fit:
-            flows = [fitted(system, r, options.flows, **quick) for r in FLOWS[name][: 1 if options.quick else None]]
+            flows = [
+                fitted(system, *row, options.flows, **quick) for row in FLOWS[name][: 1 if options.quick else None]
+            ]
         else:
             flows = stored(system, options.flows)
         if not flows:
@@ -213,6 +238,7 @@ def run(options: argparse.Namespace) -> str:
                 print(table([row]).splitlines()[-1], flush=True)
     if options.json:
         options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
+    fragments.write(options.out, "primed-race", fragment(rows))
     return "\n" + table(rows)
 
 

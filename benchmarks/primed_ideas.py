@@ -29,21 +29,23 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from typing import Any
 
-from contenders.environment import pin_to_one_thread
+from measuring.machine import pin_to_one_thread
 
 pin_to_one_thread()
 
 import numpy as np
 import torch
+from measuring import fragments
 
 from sympflow import HamiltonianSystem, SympFlow, Tube, max_energy_error, solve, systems, train
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.primed import PrimedFlow
-from sympflow.training.figures import one_step_errors
-from sympflow.training.ladder import Rung
+from sympflow.training.shipped.judges import one_step_errors
+from sympflow.training.starts import Primed
 
 IDEAS = ("curvature", "polynomial", "energy", "tube", "network")
 DT, STAGES, PROCESSOR = 1.0, 3, 6
@@ -85,7 +87,7 @@ def energy_error(system: HamiltonianSystem, flow: SympFlow, y0: Any, t_end: floa
 
 
 def curvature(t_end: float, scenes: Any, **options: Any) -> str:
-    """What the term in t⁵ brings, and what it costs."""
+    """The gain by the term in t⁵, and its cost."""
     lines = [
         "| system | Δt, kicks + processor | curvature | error at Δt / at fractional t | energy error | µs a step |",
         "|---|---|---|---|---|---|",
@@ -110,7 +112,7 @@ def row(system: HamiltonianSystem, flow: PrimedFlow, t_end: float, *cells: str) 
 
 
 def polynomial(t_end: float, scenes: Any, **options: Any) -> str:
-    """What polynomials in place of force gradients bring, and what they cost."""
+    """The gain by polynomials in place of force gradients, and their cost."""
     lines = [
         "| system | Δt, kicks + processor | kicks | error at Δt / at fractional t | energy error | µs a step |",
         "|---|---|---|---|---|---|",
@@ -119,19 +121,23 @@ def polynomial(t_end: float, scenes: Any, **options: Any) -> str:
         stages, processor, dt, first, degree = POLYNOMIALS[name]
         system = getattr(systems, name.partition(",")[0])()
         shape = f"{dt:g}, {stages} + {processor}"
-        plain = Rung(stages, dt, processor, first=first).train(system, progress=False, **options)
-        rung = Rung(stages, dt, processor, polynomial=degree, first=first)
+        start = Primed(dt, stages, processor, first=first)
+        fit: dict[str, Any] = {"restarts": 12, "progress": False, **options}
+        plain = train(system, flow=start.flow(system), **fit)
+        bent = replace(start, polynomial=degree)
         kinds = {
             "force gradients": plain,
-            f"degree {degree}, from these": rung.train(system, plain, progress=False, **(options | {"restarts": 1})),
-            f"degree {degree}": rung.train(system, progress=False, **options),
+            f"degree {degree}, from these": train(
+                system, flow=bent.flow(system, earlier=plain), **(fit | {"restarts": 1})
+            ),
+            f"degree {degree}": train(system, flow=bent.flow(system), **fit),
         }
         lines += [row(system, flow, t_end, name, shape, kind) for kind, flow in kinds.items()]
     return "\n".join(lines)
 
 
 def energy(t_end: float, scenes: Any, **options: Any) -> str:
-    """What a weight of the energy brings."""
+    """The gain by a weight of the energy."""
     lines = [
         "| system | Δt, kicks + processor | weight | error at Δt / at fractional t | energy error | µs a step |",
         "|---|---|---|---|---|---|",
@@ -147,7 +153,7 @@ def energy(t_end: float, scenes: Any, **options: Any) -> str:
 
 
 def tube(system: HamiltonianSystem, well: PrimedFlow, t_end: float, **options: Any) -> str:
-    """What fitting to the surroundings of one orbit brings along it."""
+    """The gain along one orbit by a fit to its surroundings."""
     lines = ["| orbit | fitted to the well | fitted to its tube | times less |", "|---|---|---|---|"]
     for name, y0 in ORBITS.items():
         orbit = solve(system, "kahan_li8", (0.0, t_end), y0, dt=0.02, save_every=5).states
@@ -180,7 +186,7 @@ def microseconds(system: HamiltonianSystem, flow: SympFlow) -> float:
 
 
 def network(system: HamiltonianSystem, well: PrimedFlow, t_end: float, sizes: Any, **options: Any) -> str:
-    """What a kick and a drift with MLP potentials bring, and what they cost."""
+    """The gain by a kick and a drift with MLP potentials, and their cost."""
     assert system.domain is not None
     x = system.domain.sample(HELD_OUT, SEED)
     alone = microseconds(system, well)
@@ -205,36 +211,40 @@ def network(system: HamiltonianSystem, well: PrimedFlow, t_end: float, sizes: An
     return "\n".join(lines)
 
 
-def run(ideas: list[str], quick: bool) -> str:
+def run(ideas: list[str], quick: bool) -> dict[str, str]:
+    """The tables by their ideas."""
     system = systems.henon_heiles()
     options = QUICK if quick else FULL
     t_end = 20.0 if quick else T_END
-    tables = []
+    tables = {}
     if "curvature" in ideas:
-        tables.append(curvature(t_end, ("pendulum",) if quick else CURVATURE, **options))
+        tables["curvature"] = curvature(t_end, ("pendulum",) if quick else CURVATURE, **options)
     if "polynomial" in ideas:
-        tables.append(polynomial(t_end, ("quartic",) if quick else POLYNOMIALS, **options))
+        tables["polynomial"] = polynomial(t_end, ("quartic",) if quick else POLYNOMIALS, **options)
     if "energy" in ideas:
-        tables.append(energy(t_end, ("pendulum",) if quick else WEIGHTED, **options))
+        tables["energy"] = energy(t_end, ("pendulum",) if quick else WEIGHTED, **options)
     if not {"tube", "network"} & set(ideas):
-        return "\n\n".join(tables)
+        return tables
     well = fitted(system, **options)
     if "tube" in ideas:
-        tables.append(tube(system, well, t_end, **options))
+        tables["tube"] = tube(system, well, t_end, **options)
     if "network" in ideas:
         gauss_newton: dict[str, Any] = {"optimizer": "gauss-newton", "loss": "labels"}
         gauss_newton |= {"steps": 3, "points": 40} if quick else {"steps": 100, "points": 200}
-        tables.append(network(system, well, t_end, ((4,),) if quick else ((5,), (10,), (10, 10)), **gauss_newton))
-    return "\n\n".join(tables)
+        tables["network"] = network(system, well, t_end, ((4,),) if quick else ((5,), (10,), (10, 10)), **gauss_newton)
+    return tables
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--idea", action="append", choices=IDEAS, help="all if none is named")
     parser.add_argument("--quick", action="store_true", help="tiny fits, short runs")
+    fragments.add_out(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    print("\n" + run(options.idea or list(IDEAS), options.quick))
+    for idea, table in run(options.idea or list(IDEAS), options.quick).items():
+        print("\n" + table)
+        fragments.write(options.out, f"ideas-{idea}", table, f"--idea {idea}")
 
 
 if __name__ == "__main__":

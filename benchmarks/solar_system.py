@@ -20,12 +20,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from contenders.environment import pin_to_one_thread
+from measuring.machine import pin_to_one_thread
 
 pin_to_one_thread()
 
 import numpy as np
-from contenders.primed_race import MOST_FORCES, SHORTEST, fewest_steps
+from measuring import fragments
+from measuring.race import MOST_FORCES, SHORTEST, fewest_steps
 
 import sympflow
 from sympflow import HamiltonianSystem, Solution, solve
@@ -124,17 +125,18 @@ def run(years: float = 1e5, target: float = TARGET, repeats: int = 5, names: tup
     if not own:
         raise RuntimeError("No flow that ships for the outer solar system meets the target.")
     best = min(own, key=lambda r: seconds[r])
-    lines = [
-        f"| {years:g} years, energy error {target:g} | step | energy error | forces | gradients | time | of the best |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for r in sorted(racing, key=lambda r: seconds[r]):
         n = racing[r]
-        lines.append(
-            f"| {r.name} | {years * YEAR / n:.1f} d | {r.error(system, years, n):.1e} | {n * r.forces:,} | "
-            f"{n * r.hessians:,} | {seconds[r]:.2f} s | {seconds[r] / seconds[best]:.2f} |"
-        )
-    return "\n".join(lines)
+        work = [
+            f"{years * YEAR / n:.3g} d",
+            f"{r.error(system, years, n):.1e}",
+            f"{n * r.forces:,}",
+            f"{n * r.hessians:,}",
+        ]
+        lines.append([r.name, *work, f"{seconds[r]:.2f} s", f"{seconds[r] / seconds[best]:.2f}"])
+    titles = ["method", "step", "energy error", "forces", "force gradients", "run time", "of the best"]
+    return fragments.table(titles, lines)
 
 
 def main() -> None:
@@ -143,9 +145,12 @@ def main() -> None:
     parser.add_argument("--years", type=float)
     parser.add_argument("--target", type=float, default=TARGET)
     parser.add_argument("--repeats", type=int, default=5)
+    fragments.add_out(parser)
     options = parser.parse_args()
     years = options.years or (1e3 if options.quick else 1e5)
-    print("\n" + run(years, options.target, options.repeats, QUICK if options.quick else None))
+    found = run(years, options.target, options.repeats, QUICK if options.quick else None)
+    print("\n" + found)
+    fragments.write(options.out, "solar-system", found)
 
 
 if __name__ == "__main__":

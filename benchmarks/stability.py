@@ -1,10 +1,7 @@
-"""Every method where things break: writes docs/stability.md and its figures.
+"""Every method where things break: the fragments of docs/stability.md and its figures.
 
-    python benchmarks/stability.py --out docs/stability.md
-
-Everything runs on one thread; ten minutes or so. With `--results file.json` the tables are kept, and with `--only
-kepler,round_off` the named sections alone are measured again and the others taken from there. The words around the
-tables are in benchmarks/stability_words.py.
+python benchmarks/stability.py --out docs/measured                          ten minutes or so, on one thread
+python benchmarks/stability.py --out docs/measured --only kepler,round_off  the named sections alone
 """
 
 # ruff: noqa: E402
@@ -12,26 +9,25 @@ tables are in benchmarks/stability_words.py.
 from __future__ import annotations
 
 import argparse
-import json
 import math
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from contenders.environment import pin_to_one_thread
+from measuring.machine import pin_to_one_thread
 
 pin_to_one_thread()
 
 import numpy as np
-import stability_words as words
+from measuring.fragments import add_out, number, table, write
+from sympflow.studies.stability_report import StabilityReport, StabilityRow
 
 import sympflow
 from sympflow import HamiltonianSystem, energy_growth, get, max_energy_error, solve, stability, systems
 from sympflow.integrators.flows import LogSympFlow
-from sympflow.studies.attempts import Row
-from sympflow.studies.step_stability import StabilityReport
-from sympflow.systems.chains import oscillatory_energies
+from sympflow.systems import oscillatory_energies
 
 CLASSICAL = ("verlet", "leapfrog", "blanes_moan4", "srkn11b", "kahan_li8", "implicit_midpoint", "gauss_legendre4")
 LINEAR = ("impulse", "mollified_impulse", "implicit_explicit", "linear_srkn14a")
@@ -39,42 +35,32 @@ ADAPTIVE = ("rk45", "dop853")
 PYTHAGOREAN = [6.933464, 20.261804, -2.003006, -6.872463, -2.557673, -6.659112]
 SINGULARITY = 5.450984210235402
 
+Fragments = dict[str, str]
+"""The tables of a section by their names."""
+
+Section = Callable[[Path], Fragments]
+"""Measures a section; its figures go into the folder that it is given."""
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("docs/stability.md"))
-    parser.add_argument("--results", type=Path, help="JSON file that keeps the tables")
-    parser.add_argument("--only", default="", help="comma-separated sections to measure; printed without --results")
+    parser.add_argument("--only", default="", help=f"comma-separated sections to measure, of {', '.join(SECTIONS)}")
+    add_out(parser)
     arguments = parser.parse_args()
-    figures = arguments.out.parent / "figures"
     chosen = arguments.only.split(",") if arguments.only else list(SECTIONS)
-    parts: dict[str, str] = {}
-    if arguments.results and arguments.only:
-        parts = json.loads(arguments.results.read_text())
-    for name in chosen:
-        start = time.perf_counter()
-        parts[name] = SECTIONS[name](figures)
-        print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
-        if arguments.results:
-            arguments.results.write_text(json.dumps(parts, indent=1))
-    if set(parts) == set(SECTIONS):
-        arguments.out.write_text(words.page(parts))
-    else:
-        print("\n\n".join(parts.values()))
+    if unknown := set(chosen) - set(SECTIONS):
+        parser.error(f"no section {', '.join(sorted(unknown))}: choose of {', '.join(SECTIONS)}")
+    with tempfile.TemporaryDirectory() as folder:
+        figures = Path(folder) if arguments.out is None else arguments.out.parent / "figures"
+        for section in chosen:
+            start = time.perf_counter()
+            for name, body in SECTIONS[section](figures).items():
+                print(f"\n{name}\n\n{body}", flush=True)
+                write(arguments.out, f"stability-{name}", body, f"--only {section}")
+            print(f"\n{section}: {time.perf_counter() - start:.0f} s", flush=True)
 
 
-# tables ---------------------------------------------------------------------------------------------------
-
-
-def table(titles: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    lines = [titles, ["---"] * len(titles), *rows]
-    return "\n".join(f"| {' | '.join(str(cell) for cell in line)} |" for line in lines)
-
-
-def number(x: float | None, digits: int = 1) -> str:
-    if x is None:
-        return ""
-    return f"{x:.{digits}e}" if math.isfinite(x) else "∞"
+# scenes ---------------------------------------------------------------------------------------------------
 
 
 def flows(system: HamiltonianSystem) -> list[Any]:
@@ -98,8 +84,6 @@ def scene(
     titles = ["method", "longest stable step", "step", "steps", "energy error", "drift per unit t", "what happens"]
     missing = [(r.label, r.reason) for report in reports for r in report.rows if r.status == "not applicable"]
     notes = "".join(f"\n\n`{label}` does not apply: {reason}" for label, reason in dict(missing).items())
-    if not own:
-        notes += "\n\nNo SympFlow ships for this scene."
     return table(titles, rows) + notes
 
 
@@ -125,7 +109,7 @@ def lines(report: StabilityReport) -> list[list[str]]:
     return found
 
 
-def happening(row: Row) -> str:
+def happening(row: StabilityRow) -> str:
     parts = []
     if row.blow_up is not None:
         parts.append(f"{'singular' if row.singular else 'ends'} at t = {row.blow_up:.6g}")
@@ -139,8 +123,8 @@ def happening(row: Row) -> str:
 # sections -------------------------------------------------------------------------------------------------
 
 
-def linear_limit(figures: Path) -> str:
-    """The bounds over 1e5 steps, and the limits that `stability` finds."""
+def linear_limit(figures: Path) -> Fragments:
+    """Verlet's and leapfrog's bounds over 1e5 steps, and the limits that `stability` finds."""
     rows = []
     for method in ("verlet", "leapfrog"):
         for omega in (1.0, 1e3, 1e6):
@@ -154,10 +138,10 @@ def linear_limit(figures: Path) -> str:
             assert limit.stable is not None
             rows.append([method, f"{omega:g}", *cells, f"{limit.stable * omega:.4f}"])
     titles = ["method", "ω", "z = 0.1: error / bound", "z = 1", "z = 1.9", "z = 1.99", "longest stable z found"]
-    return table(titles, rows)
+    return {"linear-limit": table(titles, rows)}
 
 
-def maps(figures: Path) -> str:
+def maps(figures: Path) -> Fragments:
     """Maps of step against stiffness."""
     families: dict[str, tuple[list[HamiltonianSystem], Sequence[str], np.ndarray]] = {
         "harmonic_oscillator": (
@@ -182,10 +166,10 @@ def maps(figures: Path) -> str:
             family, methods, steps=steps.tolist(), t_span=span, metrics=("energy",), limits=False, max_steps=20_000
         )
         report.plot(figures / f"stability_{name}.png")
-    return ""
+    return {}
 
 
-def fput(figures: Path) -> str:
+def fput(figures: Path) -> Fragments:
     rows = []
     for omega, lengths in ((50.0, (0.05, 0.5, 1.5, 2.05, 5.0)), (1000.0, (20.0,))):
         system = systems.fput(omega)
@@ -199,7 +183,9 @@ def fput(figures: Path) -> str:
         if omega == 50.0:
             rows += [_fput_row(system, method, get(method)(rtol=1e-6, atol=1e-9), None) for method in ADAPTIVE]
             rows.append(_radau_row(system))
-    return table(["ω", "method", "hω", "force evaluations", "energy error", "largest ∣I − 1∣", "max I₂"], rows)
+    return {
+        "fput": table(["ω", "method", "hω", "force evaluations", "energy error", "largest ∣I − 1∣", "max I₂"], rows)
+    }
 
 
 def _fput_row(system: HamiltonianSystem, label: str, integrator: Any, z: float | None) -> list[str]:
@@ -242,7 +228,7 @@ def _radau_row(system: HamiltonianSystem) -> list[str]:
     return ["50", "SciPy Radau", "adaptive, rtol 1e-4", work, *cells, f"{energies[:, 1].max():.3g}"]
 
 
-def spring(figures: Path) -> str:
+def spring(figures: Path) -> Fragments:
     rows = []
     for energy, kind in ((0.0, "slow manifold"), (0.5, "fast mode excited")):
         cartesian = systems.spring_pendulum(1e6, radial_energy=energy)
@@ -263,7 +249,7 @@ def spring(figures: Path) -> str:
             for label, flow in flows(system):
                 cells = _spring_cells(system, sympflow.get("sympflow")(flow=flow))
                 rows.append([kind, name, label, f"{flow.dt * 1e3:g}", *cells])
-    return table(["start", "coordinates", "method", "h√k", "steps", "energy error", "what happens"], rows)
+    return {"spring": table(["start", "coordinates", "method", "h√k", "steps", "energy error", "what happens"], rows)}
 
 
 def _spring_cells(system: HamiltonianSystem, integrator: Any) -> list[str]:
@@ -275,7 +261,7 @@ def _spring_cells(system: HamiltonianSystem, integrator: Any) -> list[str]:
     return [f"{sol.stats['n_steps']:,}", number(error), "" if sol.success else f"ends at t = {sol.t[-1]:.4g}"]
 
 
-def kepler(figures: Path) -> str:
+def kepler(figures: Path) -> Fragments:
     rows = []
     for e in (0.6, 0.9, 0.99, 0.999):
         system = systems.kepler(e)
@@ -287,7 +273,9 @@ def kepler(figures: Path) -> str:
             rows.append([f"{e:g}", label, f"{sol.stats['n_steps']:,}", *_kepler_cells(system, flow, sol)])
         sol = solve(system, "rk45")
         rows.append([f"{e:g}", "rk45", f"{sol.stats['n_steps']:,}", *_kepler_cells(system, "rk45", sol)])
-    return table(["e", "method", "steps", "energy error", "state error after 100 periods", "what happens"], rows)
+    return {
+        "kepler": table(["e", "method", "steps", "energy error", "state error after 100 periods", "what happens"], rows)
+    }
 
 
 def _kepler_cells(system: HamiltonianSystem, method: Any, sol: Any) -> list[str]:
@@ -296,7 +284,7 @@ def _kepler_cells(system: HamiltonianSystem, method: Any, sol: Any) -> list[str]
     return [number(float(max_energy_error(sol))), state, ends]
 
 
-def log_flow(figures: Path) -> str:
+def log_flow(figures: Path) -> Fragments:
     """A flow trained on the logarithmic Hamiltonian, 50 steps a period, against schemes at as many forces."""
     period = 2 * math.pi
     system, ds = systems.kepler(0.9), period / 50
@@ -317,10 +305,10 @@ def log_flow(figures: Path) -> str:
         sol = solve(system, integrator, t_eval=times, on_domain_exit="ignore")
         state = np.abs(sol.y - sol.y[:, :1]).max()
         rows.append([label, f"{sol.nfev:,}", number(float(max_energy_error(sol))), number(float(state))])
-    return table(["method, e = 0.9", "force evaluations", "energy error", "state error"], rows)
+    return {"log-flow": table(["method, e = 0.9", "force evaluations", "energy error", "state error"], rows)}
 
 
-def three_body(figures: Path) -> str:
+def three_body(figures: Path) -> Fragments:
     system, rows = systems.three_body(), []
     cases = [
         ("verlet", {"dt": 1e-4}),
@@ -357,10 +345,10 @@ def three_body(figures: Path) -> str:
         "state error at t = 70",
         "time",
     ]
-    return table(titles, rows)
+    return {"three-body": table(titles, rows)}
 
 
-def escape(figures: Path) -> str:
+def escape(figures: Path) -> Fragments:
     system, rows = systems.henon_heiles_escape(), []
     for method in ("verlet", "kahan_li8", "implicit_midpoint", "gauss_legendre4", "rk4"):
         for dt in (0.1, 0.01):
@@ -380,7 +368,8 @@ def escape(figures: Path) -> str:
             left = "" if domain is None else f"leaves Ω at t = {domain:.4g}"
             ends = "" if sol.success else f"ends at t = {sol.stats['failed_at']:.5g}"
             near.append([f"{energy:.5f}", label, str(sol.status), error, ", ".join(x for x in (left, ends) if x)])
-    return first + "\n\n" + table(["energy", "method", "status", "energy error", "what happens"], near)
+    energies = table(["energy", "method", "status", "energy error", "what happens"], near)
+    return {"escape": first, "escape-energies": energies}
 
 
 def _escape_cells(sol: Any) -> list[str]:
@@ -388,7 +377,7 @@ def _escape_cells(sol: Any) -> list[str]:
     return [f"{sol.stats['failed_at']:.6g}", f"{time:.8g}", number(abs(time - SINGULARITY))]
 
 
-def precision(figures: Path) -> str:
+def precision(figures: Path) -> Fragments:
     rows = []
     for system in (systems.henon_heiles(), systems.kepler(0.6)):
         report = stability(
@@ -405,10 +394,10 @@ def precision(figures: Path) -> str:
             cells = [number(r.energy_error), number(r.volume_error), number(r.symplecticity_defect)]
             rows.append([r.system, r.label, r.dtype, *cells, happening(r)])
     titles = ["system", "method", "precision", "energy error", "volume error", "symplecticity defect", "what happens"]
-    return table(titles, rows)
+    return {"precision": table(titles, rows)}
 
 
-def round_off(figures: Path) -> str:
+def round_off(figures: Path) -> Fragments:
     system = systems.henon_heiles()
     y0 = system.domain.sample(8, 3)  # type: ignore[union-attr]
     kahan_li = sympflow.SympFlow.primed(system, scheme="kahan_li8", dt=0.05)
@@ -431,7 +420,7 @@ def round_off(figures: Path) -> str:
         drift = f"{number(g.drift)} ± {number(g.drift_error, 0)}"
         rows.append([label, f"{n:.0e}", ends, f"{g.exponent:.2f} ± {g.exponent_error:.2f}", drift])
     _round_off_figure(curves, figures / "stability_round_off.png")
-    return table(["method", "steps", "rms energy error", "exponent", "drift per step"], rows)
+    return {"round-off": table(["method", "steps", "rms energy error", "exponent", "drift per step"], rows)}
 
 
 def _round_off_figure(curves: list[tuple[str, Any]], path: Path) -> None:
@@ -453,11 +442,11 @@ def _round_off_figure(curves: list[tuple[str, Any]], path: Path) -> None:
     save(figure, path)
 
 
-def _scene(make: Callable[[], HamiltonianSystem], methods: Sequence[Any], **options: Any) -> Callable[[Path], str]:
-    return lambda figures: scene(make(), methods, **options)
+def _scene(name: str, make: Callable[[], HamiltonianSystem], methods: Sequence[Any], **options: Any) -> Section:
+    return lambda figures: {name: scene(make(), methods, **options)}
 
 
-SECTIONS: dict[str, Callable[[Path], str]] = {
+SECTIONS: dict[str, Section] = {
     "linear_limit": linear_limit,
     "maps": maps,
     "fput": fput,
@@ -466,13 +455,21 @@ SECTIONS: dict[str, Callable[[Path], str]] = {
     "log_flow": log_flow,
     "three_body": three_body,
     "escape": escape,
-    "henon_heiles": _scene(systems.henon_heiles, (*CLASSICAL, "rk4", *ADAPTIVE)),
-    "double_well": _scene(systems.double_well, ("verlet", "kahan_li8", "gauss_legendre4", "rk45")),
-    "pendulum_separatrix": _scene(systems.pendulum_separatrix, ("verlet", "kahan_li8", "gauss_legendre4", "rk45")),
-    "toda": _scene(systems.toda_lattice, ("verlet", "srkn11b", "kahan_li8", "gauss_legendre4", "rk45")),
-    "nonseparable": _scene(systems.nonseparable, ("verlet", "implicit_midpoint", "gauss_legendre4", "rk4", "rk45")),
+    "henon_heiles": _scene("henon-heiles", systems.henon_heiles, (*CLASSICAL, "rk4", *ADAPTIVE)),
+    "double_well": _scene("double-well", systems.double_well, ("verlet", "kahan_li8", "gauss_legendre4", "rk45")),
+    "pendulum_separatrix": _scene(
+        "pendulum-separatrix", systems.pendulum_separatrix, ("verlet", "kahan_li8", "gauss_legendre4", "rk45")
+    ),
+    "toda": _scene("toda", systems.toda_lattice, ("verlet", "srkn11b", "kahan_li8", "gauss_legendre4", "rk45")),
+    "nonseparable": _scene(
+        "nonseparable", systems.nonseparable, ("verlet", "implicit_midpoint", "gauss_legendre4", "rk4", "rk45")
+    ),
     "lennard_jones": _scene(
-        systems.lennard_jones, ("verlet", "srkn11b", "kahan_li8"), factors=(1.0, 2.0, 4.0), max_steps=50_000
+        "lennard-jones",
+        systems.lennard_jones,
+        ("verlet", "srkn11b", "kahan_li8"),
+        factors=(1.0, 2.0, 4.0),
+        max_steps=50_000,
     ),
     "precision": precision,
     "round_off": round_off,

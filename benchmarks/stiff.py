@@ -1,10 +1,7 @@
 """Stiff systems: the FPUT chain and the spring pendulum, by every method and by the shipped flows.
 
-    python benchmarks/stiff.py --out docs/stiff.md    both frequencies of FPUT, the pendulum, the oscillator
+    python benchmarks/stiff.py --out docs/measured     both frequencies of FPUT, the pendulum, the oscillator
     python benchmarks/stiff.py --only fput --omega 50
-
-With `--out` every section that is measured takes the place of the one under the same heading in that page; else they
-are printed.
 
 FPUT runs over T = 200 from y0; energy errors are the largest of 1000 instants, |I − 1| of 20,000. Of the splitting
 schemes with the exact linear flow (every table of the package, with the drift replaced) the cheapest is sought that has
@@ -19,28 +16,26 @@ Radau and DOP853 are SciPy's, over the interval stated.
 from __future__ import annotations
 
 import argparse
-import re
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from contenders.environment import pin_to_one_thread
+from measuring.machine import pin_to_one_thread
 
 pin_to_one_thread()
 
 import numpy as np
+from measuring import fragments
+from measuring.compiled import flow_loops, linear_loops, with_linear_flow, with_step
+from measuring.fragments import table
 from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
 from sympflow.flow.shipped import shipped
-from sympflow.integrators.compositions import known_maps
-from sympflow.integrators.splitting import LinearSplitting
-from sympflow.kernels.parts_loops import parts_loops
 from sympflow.schemes import SCHEMES
-from sympflow.systems.chains import oscillatory_energies
+from sympflow.systems import oscillatory_energies
 
 T_END, INSTANTS = 200.0, 1000
 DENSE = 20_000  # instants at which I is compared: it oscillates fast, and a thousand miss its largest values
@@ -94,19 +89,11 @@ def dense_invariant(r: Run) -> float:
     return errors(system, sol.y.T)[1] if len(sol.t) > DENSE else np.inf
 
 
-def with_linear_flow(name: str, **changes: Any) -> LinearSplitting:
-    """The scheme with its drift replaced by the exact linear flow."""
-    namespace = {"name": name, "order": SCHEMES[name].order, "scheme": SCHEMES[name], **changes}
-    return dataclass(frozen=True)(type(name, (LinearSplitting,), namespace))()
-
-
-def run_scheme(system: HamiltonianSystem, method: LinearSplitting, n: int) -> Run:
+def run_scheme(system: HamiltonianSystem, method: Any, n: int) -> Run:
     """n steps over T, 1000 outputs on the grid."""
-    parts = method.parts_of(system)
-    kernel = parts_loops(parts).kernel(lambda h: known_maps(method, parts, float(h)))
     save = np.linspace(0, n, INSTANTS + 1).round().astype(np.int64)
-    loops = partial(kernel.run, T_END / n, system.y0, n, save)
-    call = partial(solve, system, replace(method, dt=T_END / n), t_eval=T_END / n * save)
+    loops = partial(linear_loops(system, method), T_END / n, system.y0, n, save)
+    call = partial(solve, system, with_step(method, T_END / n), t_eval=T_END / n * save)
     scheme = method.scheme
     forces, hessians = n * scheme.force_evaluations, n * scheme.hessian_evaluations
     turn = T_END / n * system.params["omega"]
@@ -115,8 +102,8 @@ def run_scheme(system: HamiltonianSystem, method: LinearSplitting, n: int) -> Ru
 
 def run_flow(system: HamiltonianSystem, flow: Any) -> Run:
     n = round(T_END / flow.dt)
-    kernel, save = flow.kernel_for(system), np.linspace(0, n, INSTANTS + 1).round().astype(np.int64)
-    loops = partial(kernel.run, flow.dt, system.y0, n, save)
+    save = np.linspace(0, n, INSTANTS + 1).round().astype(np.int64)
+    loops = partial(flow_loops(system, flow).one, flow.dt, system.y0, n, save)
     call = partial(solve, system, flow, t_eval=flow.dt * save)
     counts = flow.evaluations(n, 0, 0, "compiled")
     turn = flow.dt * system.params["omega"]
@@ -162,7 +149,8 @@ def verlet(system: HamiltonianSystem, turn: float) -> Run:
     return Run("verlet", T_END / n * system.params["omega"], n, 0, *found, call)
 
 
-def fput_section(omega: float, repeats: int) -> str:
+def fput_section(omega: float, repeats: int) -> dict[str, str]:
+    """The table of all methods, that of the flow against the fastest, and what else a flow costs and errs."""
     system = systems.fput(omega=omega)
     flow = shipped(system)
     ours = run_flow(system, flow)
@@ -170,8 +158,8 @@ def fput_section(omega: float, repeats: int) -> str:
     tried = candidates(system)
     rows = [adaptive(system, name, IMPLICIT_TIME.get(omega, 2.0)) for name in ("Radau", "DOP853")]
     rows += [verlet(system, turn) for turn in (0.05, 1.0)]
-    plain, mollified = with_linear_flow("verlet"), with_linear_flow("verlet", mollified=True)
-    midpoint = with_linear_flow("verlet", midpoint=True)
+    plain, mollified = with_linear_flow("verlet"), with_linear_flow("verlet", "mollified")
+    midpoint = with_linear_flow("verlet", "midpoint")
     same = [(plain, "impulse"), (mollified, "mollified_impulse"), (midpoint, "implicit_explicit")]
     for name in ("srkn6b", "srkn11b", "srkn14a"):
         same.append((with_linear_flow(name), f"linear_{name}"))
@@ -190,40 +178,35 @@ def fput_section(omega: float, repeats: int) -> str:
     seconds = {id(r): s for r, s in zip(timed, medians, strict=True)}
     looped = [r for r in rows if r.loops is not None]
     bare = {id(r): s for r, s in zip(looped, cpu_seconds([r.loops for r in looped], repeats), strict=True)}  # type: ignore[misc]
-    timings = "`solve`, ms | over the flow's | loops alone, ms | over the flow's"
-    lines = [
-        f"### FPUT, ω = {omega:g}, T = {T_END:g}\n",
-        f"| method | hω | forces | force gradients | {timings} | energy error | \\|I − 1\\| |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
+    lines = []
     for r in rows:
         spent = seconds.get(id(r), r.seconds)
         turn = "adaptive" if r.turn is None else f"{r.turn:.3g}"
         ratio = "" if r.note else f"{spent / seconds[id(ours)]:.3g}"
-        loops = f"{bare[id(r)] * 1e3:.3g} | {bare[id(r)] / bare[id(ours)]:.3g}" if id(r) in bare else " | "
+        loops = [f"{bare[id(r)] * 1e3:.3g}", f"{bare[id(r)] / bare[id(ours)]:.3g}"] if id(r) in bare else ["", ""]
         name = f"{r.name}, {r.note}" if r.note else r.name
-        lines.append(
-            f"| {name} | {turn} | {r.forces:,} | {r.hessians:,} | {spent * 1e3:.3g} | {ratio} | {loops} | "
-            f"{_error(r.energy_error)} | {_error(dense_invariant(r))} |"
-        )
-    lines.append(f"\nThe flow needs {ours.forces + ours.hessians:,} evaluations.")
-    for words, (_, run) in zip(("to 1e-4", "as good as the flow"), best, strict=True):
+        work = [turn, f"{r.forces:,}", f"{r.hessians:,}", f"{spent * 1e3:.3g}", ratio, *loops]
+        lines.append([name, *work, _error(r.energy_error), _error(dense_invariant(r))])
+    against = [["the flow", f"{ours.forces + ours.hessians:,}", "1", "1"]]
+    for label, (_, run) in zip(labels, best, strict=True):
         if run is not None:
             r = next(r for r in rows if r.call is run.call)
-            lines.append(
-                f"The fastest untrained scheme {words}, {run.name}, needs {run.forces + run.hessians:,}, and takes "
-                f"{seconds[id(r)] / seconds[id(ours)]:.2f} times as long as the flow in a whole call of `solve`, "
-                f"{bare[id(r)] / bare[id(ours)]:.2f} times in the compiled loops."
-            )
+            ratios = [f"{of[id(r)] / of[id(ours)]:.2f}" for of in (seconds, bare)]
+            against.append([f"{label}: linear {run.name}", f"{run.forces + run.hessians:,}", *ratios])
     unchecked, checked = cpu_seconds([partial(_without_domain, ours), ours.call], repeats)
     share = 1 - unchecked / checked
-    took = f"{100 * share:.0f} %" if share > 0.03 else "less than 3 %"
-    lines.append(
-        f'The check of a flow\'s outputs against its domain takes {took} of a call; `on_domain_exit="ignore"` leaves '
-        f"it out. Between the steps, at {PHASES} phases, the flow's energy error is at most "
-        f"{between_steps(system, flow):.2g}."
-    )
-    return "\n".join(lines) + "\n"
+    beside = [
+        ["share of a call that the check of its domain takes", f"{100 * share:.0f} %" if share > 0.03 else "< 3 %"],
+        [f"largest energy error between the steps, at {PHASES} phases", f"{between_steps(system, flow):.2g}"],
+    ]
+    timings = ["`solve`, ms", "over the flow's", "loops alone, ms", "over the flow's"]
+    errors_of = ["energy error", "\\|I − 1\\|"]
+    name = f"stiff-fput-{omega:g}"
+    return {
+        name: table(["method", "hω", "forces", "force gradients", *timings, *errors_of], lines),
+        f"{name}-against": table(["method", "evaluations", "`solve`, over the flow's", "loops"], against),
+        f"{name}-flow": table(["the flow", ""], beside),
+    }
 
 
 def _without_domain(run: Run) -> Any:
@@ -245,13 +228,9 @@ def _error(value: float) -> str:
     return f"{value:.2g}" if np.isfinite(value) else "not finite"
 
 
-def pendulum_section() -> str:
-    lines = [
-        "### Stiff spring pendulum, k = 1e6, T = 20\n",
-        "Energy error relative to |H(y0)|; excited: half a unit of energy in the fast mode.\n",
-        "| method | coordinates | h√k | slow manifold | fast mode excited |",
-        "| --- | --- | --- | --- | --- |",
-    ]
+def pendulum_section() -> dict[str, str]:
+    """Energy errors of the spring pendulum, k = 1e6, T = 20, relative to |H(y0)|."""
+    lines = []
     k = 1e6
     cases = [("verlet", "cartesian", 0.1), ("implicit_midpoint", "cartesian", 10.0)]
     cases += [(m, "polar", 10.0) for m in ("strang_parts", "suzuki4_parts", "kahan_li6_parts", "sympflow")]
@@ -262,8 +241,9 @@ def pendulum_section() -> str:
             sol = solve(system, method, (0.0, 20.0), dt=turn / np.sqrt(k), on_domain_exit="ignore")
             H = sol.energy()
             found.append(_error(float(np.abs(H / H[0] - 1).max())) if sol.success else f"status −1: {sol.message[:40]}")
-        lines.append(f"| {method} | {coordinates} | {turn:g} | {found[0]} | {found[1]} |")
-    return "\n".join(lines) + "\n"
+        lines.append([method, coordinates, f"{turn:g}", *found])
+    titles = ["method", "coordinates", "h√k", "slow manifold", "fast mode excited"]
+    return {"stiff-pendulum": table(titles, lines)}
 
 
 TURNS = {
@@ -280,23 +260,16 @@ TURNS = {
 }
 
 
-def oscillator_section() -> str:
-    lines = [
-        "### Harmonic oscillator, a million steps of a linear layer\n",
-        "| ω | hω | largest relative energy error |",
-        "| --- | --- | --- |",
-    ]
+def oscillator_section() -> dict[str, str]:
+    """Energy errors of a linear layer over a million steps, and the change a step that is left after many."""
+    lines = []
     for omega in (1.0, 1e3, 1e6):
         for turn in (20.0, 1e3):
             system = systems.harmonic_oscillator(omega)
             flow = SympFlow.split(system, 1, dt=turn / omega)
             sol = solve(system, flow, (0.0, 1e6 * flow.dt), save_every=100)
-            lines.append(f"| {omega:g} | {turn:g} | {np.abs(sol.energy_error()).max():.1e} |")
-    lines += [
-        "\nThe change of the energy a step that is left after many, the largest of eight states:\n",
-        "| hω | compiled, 1e7 steps | arrays, 1e5 steps |",
-        "| --- | --- | --- |",
-    ]
+            lines.append([f"{omega:g}", f"{turn:g}", f"{np.abs(sol.energy_error()).max():.1e}"])
+    changes = []
     y0 = np.random.default_rng(1).normal(size=(8, 2))
     for name, turn in TURNS.items():
         cells = []
@@ -304,18 +277,11 @@ def oscillator_section() -> str:
             system = systems.harmonic_oscillator()
             sol = solve(system, "impulse", (0.0, n * turn), y0, dt=turn, t_eval=[n * turn], backend=backend)
             cells.append(f"{np.abs(sol.energy_error()).max() / n:.1e}")
-        lines.append(f"| {name} | {cells[0]} | {cells[1]} |")
-    return "\n".join(lines) + "\n"
-
-
-def put(page: str, section: str) -> str:
-    """The page with the section in place of the one under its heading."""
-    heading = section.splitlines()[0]
-    pattern = rf"^{re.escape(heading)}$.*?(?=^##|\Z)"
-    new, count = re.subn(pattern, lambda _: section + "\n", page, flags=re.MULTILINE | re.DOTALL)
-    if count != 1:
-        raise ValueError(f"`--out` has {count} sections {heading!r}: it must have one.")
-    return new
+        changes.append([name, *cells])
+    return {
+        "stiff-oscillator": table(["ω", "hω", "largest relative energy error"], lines),
+        "stiff-oscillator-change": table(["hω", "compiled, 1e7 steps", "arrays, 1e5 steps"], changes),
+    }
 
 
 def main() -> None:
@@ -323,20 +289,20 @@ def main() -> None:
     parser.add_argument("--only", choices=("fput", "pendulum", "oscillator"))
     parser.add_argument("--omega", type=float, action="append")
     parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--out", type=Path, help="the page whose sections are written; printed without it")
+    fragments.add_out(parser)
     options = parser.parse_args()
-    measured: list[Callable[[], str]] = []
+    measured: list[tuple[str, Callable[[], dict[str, str]]]] = []
     if options.only in (None, "fput"):
-        measured += [partial(fput_section, omega, options.repeats) for omega in options.omega or (50.0, 1000.0)]
+        for omega in options.omega or (50.0, 1000.0):
+            measured.append((f"fput --omega {omega:g}", partial(fput_section, omega, options.repeats)))
     if options.only in (None, "pendulum"):
-        measured.append(pendulum_section)
+        measured.append(("pendulum", pendulum_section))
     if options.only in (None, "oscillator"):
-        measured.append(oscillator_section)
-    for measure in measured:
-        section = measure()
-        print(section, flush=True)
-        if options.out:
-            options.out.write_text(put(options.out.read_text(encoding="utf-8"), section), encoding="utf-8")
+        measured.append(("oscillator", oscillator_section))
+    for section, measure in measured:
+        for name, body in measure().items():
+            print(f"\n{name}\n\n{body}", flush=True)
+            fragments.write(options.out, name, body, f"--only {section}")
 
 
 if __name__ == "__main__":

@@ -24,32 +24,20 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from contenders.environment import pin_to_one_thread
+from measuring.machine import pin_to_one_thread
 
 pin_to_one_thread()
 
 import numpy as np
+from measuring import fragments
+from measuring.compiled import flow_loops, last, linear_loops, scheme_loops, with_linear_flow, with_step
 
 from sympflow import HamiltonianSystem, Solution, solve, systems
 from sympflow.flow.shipped import shipped
-from sympflow.integrators.compositions import known_maps
-from sympflow.integrators.splitting import LinearSplitting
-from sympflow.kernels.parts_loops import parts_loops
-from sympflow.kernels.splitting_loops import splitting_loops
-from sympflow.schemes import SCHEMES
 
 DT = 0.625  # of srkn11b
 TURN = {50.0: 1.43, 1000.0: 3.28}  # dt ω of chin4a, at which its energy error is below 1e-4
 ENOUGH, FEWEST, SECONDS = 1000, 20, 3.0  # repeats of a pair of calls, and how long they may take
-
-
-@dataclass(frozen=True)
-class Chin4a(LinearSplitting):
-    """The force-gradient scheme with its drifts replaced by the exact linear flow."""
-
-    name = "chin4a"
-    order = SCHEMES["chin4a"].order
-    scheme = SCHEMES["chin4a"]
 
 
 @dataclass(frozen=True)
@@ -90,8 +78,8 @@ def henon_heiles(quick: bool) -> Iterator[Pair]:
     flow, scheme = partial(solve, system, "sympflow", tol=1e-6), partial(solve, system, "srkn11b", dt=DT)
     errors = [median_energy_error(system, run, 20.0 if quick else 1000.0) for run in (flow, scheme)]
     print(f"\nHénon–Heiles: energy error of the flow {errors[0]:.1e}, of srkn11b {errors[1]:.1e}\n")
-    kernel = shipped(system, tol=1e-6).kernel_for(system)
-    untrained, step = splitting_loops(system).kernel(SCHEMES["srkn11b"]), flow((0, 1)).stats["dt"]
+    of_flow, of_scheme = flow_loops(system, shipped(system, tol=1e-6)), scheme_loops(system, "srkn11b")
+    step = flow((0, 1)).stats["dt"]
     many = system.domain.sample(8 if quick else 1000, 3)  # type: ignore[union-attr]
 
     def pair(name: str, t_end: float, y0: np.ndarray | None = None, outputs: int = 1) -> Pair:
@@ -102,14 +90,11 @@ def henon_heiles(quick: bool) -> Iterator[Pair]:
         n, m = round(t_end / step), round(t_end / DT)
         if y0 is None:
             loops: tuple[Any, Any] = (
-                partial(kernel.run, step, system.y0, n, np.array([n])),
-                partial(untrained.run, DT, system.y0, m, np.array([m])),
+                partial(of_flow.one, step, system.y0, n, last(n)),
+                partial(of_scheme.one, DT, system.y0, m, last(m)),
             )
         else:
-            loops = (
-                partial(kernel.run_batch, step, y0, n, np.array([n]), 1),
-                partial(untrained.run_batch, DT, y0, m, np.array([m]), 1),
-            )
+            loops = partial(of_flow.many, step, y0, n, last(n)), partial(of_scheme.many, DT, y0, m, last(m))
         return Pair(name, calls, loops)  # type: ignore[arg-type]
 
     yield pair("T = 40, the end", 40.0)
@@ -126,7 +111,7 @@ def fput(omega: float, quick: bool) -> Iterator[Pair]:
     system = systems.fput(omega=omega)
     flow, t_end, outputs = shipped(system), 2.0 if quick else 200.0, 10 if quick else 1000
     n = outputs * round(t_end * omega / TURN[omega] / outputs)
-    method = Chin4a(dt=t_end / n)
+    method = with_step(with_linear_flow("chin4a"), t_end / n)
     m = round(t_end / flow.dt)
     saves = [np.linspace(0, k, outputs + 1).round().astype(np.int64) for k in (m, n)]
     calls = (
@@ -135,34 +120,41 @@ def fput(omega: float, quick: bool) -> Iterator[Pair]:
     )
     errors = [float(np.abs(sol.energy_error()).max()) for sol in (call() for call in calls)]
     print(f"\nFPUT, ω = {omega:g}: energy error of the flow {errors[0]:.1e}, of linear chin4a {errors[1]:.1e}\n")
-    kernel = flow.kernel_for(system)
-    parts = method.parts_of(system)
-    untrained = parts_loops(parts).kernel(lambda h: known_maps(method, parts, float(h))).run
     loops = (
-        partial(kernel.run, flow.dt, system.y0, m, saves[0]),
-        partial(untrained, t_end / n, system.y0, n, saves[1]),
+        partial(flow_loops(system, flow).one, flow.dt, system.y0, m, saves[0]),
+        partial(linear_loops(system, method), t_end / n, system.y0, n, saves[1]),
     )
     yield Pair(f"T = {t_end:g}, {outputs} outputs", calls, loops)
 
 
-def report(pairs: Iterator[Pair], quick: bool) -> None:
+def report(scene: str, pairs: Iterator[Pair], quick: bool) -> list[tuple[str, ...]]:
+    """The rows of the table, which are printed as they are made."""
+    rows = []
     for pair in pairs:
         mine, theirs = fastest(pair.calls, quick)
         line = f"{pair.name:28} flow {mine * 1e3:8.3f} ms   scheme {theirs * 1e3:8.3f} ms"
         line += f"   {theirs / mine:5.2f} times faster"
+        alone = ""
         if pair.loops is not None:
             ours, others = fastest(pair.loops, quick)
+            alone = f"{others / ours:.1f}"
             line += f"   (loops {others / ours:5.2f})"
         print(line, flush=True)
+        times = (f"{1e3 * mine:.3g}", f"{1e3 * theirs:.3g}", f"{theirs / mine:.2f}", alone)
+        rows.append((f"{scene}, {pair.name}", *times))
+    return rows
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Whole calls of solve")
     parser.add_argument("--quick", action="store_true", help="every case once, on short intervals")
+    fragments.add_out(parser)
     options = parser.parse_args(arguments)
-    report(henon_heiles(options.quick), options.quick)
+    rows = report("Hénon–Heiles", henon_heiles(options.quick), options.quick)
     for omega in TURN:
-        report(fput(omega, options.quick), options.quick)
+        rows += report(f"FPUT, ω = {omega:g}", fput(omega, options.quick), options.quick)
+    titles = ("call", "flow, ms", "scheme, ms", "times faster", "loops alone")
+    fragments.write(options.out, "through-solve", fragments.table(titles, rows))
 
 
 if __name__ == "__main__":

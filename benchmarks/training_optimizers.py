@@ -24,15 +24,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from contenders.environment import pin_to_one_thread
+from measuring.machine import pin_to_one_thread
 
 pin_to_one_thread()
 
 import torch
+from measuring import fragments
 
 from sympflow import train
-from sympflow.training.figures import one_step_errors
-from sympflow.training.networks import NetworkRecipe, recipes
+from sympflow.training.shipped import rows
+from sympflow.training.shipped.judges import AsPublished, one_step_errors
+from sympflow.training.shipped.recipe import Recipe
+from sympflow.training.starts import Network
 
 PUBLISHED = {
     ("harmonic_oscillator", "sympflow"): 3.5e-4,
@@ -59,21 +62,31 @@ class Result:
     fractional: float
 
 
-def trained(recipe: NetworkRecipe, scene: str, kind: str, optimizer: str, seconds: float) -> Result:
+def recipe_of(scene: str, kind: str) -> Recipe:
+    """The recipe of a network that ships."""
+    return next(recipe for recipe in rows.networks() if (recipe.scene, recipe.kind) == (scene, kind))
+
+
+def trained(recipe: Recipe, optimizer: str, seconds: float) -> Result:
     """A flow that was trained for so many seconds of processor time, and what it achieves."""
-    options: dict[str, Any] = {"optimizer": optimizer, "domain": recipe.domain, "matching_weight": 0.0, "steps": MANY}
+    system, start, judge = recipe.system(), recipe.start, recipe.judge
+    assert isinstance(start, Network)
+    assert isinstance(judge, AsPublished)
+    points = [fit.points for fit in recipe.fits]
+    options: dict[str, Any] = {"optimizer": optimizer, "domain": recipe.domain_of(system), "matching_weight": 0.0}
+    options["steps"] = MANY
     options |= {"progress": False, "validate_every": 1}
-    new = {"dt": recipe.dt, "kind": kind}
+    new: dict[str, Any] = {"dt": start.dt, "kind": start.kind}
     if optimizer == "adam":
         for _ in range(2):  # the first sets up what later steps find
             begin = time.process_time()
-            train(recipe.system, **new, **(options | {"steps": TRIAL, "validate_every": TRIAL}))
+            train(system, **new, **(options | {"steps": TRIAL, "validate_every": TRIAL}))
         options["steps"] = max(TRIAL, int(TRIAL * seconds / (time.process_time() - begin)))
         options["validate_every"] = max(1, options["steps"] // 40)
     elif optimizer == "gauss-newton":
-        options |= {"validate_every": 5, "points": recipe.points[0]}
+        options |= {"validate_every": 5, "points": points[0]}
     else:
-        options["points"] = recipe.points[1]
+        options["points"] = points[1]
     begin = time.process_time()
 
     def until(share: float) -> Callable[[int, dict[str, float]], None]:
@@ -86,24 +99,30 @@ def trained(recipe: NetworkRecipe, scene: str, kind: str, optimizer: str, second
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # that a run was stopped is what is meant
         if optimizer == "gauss-newton":
-            flow = train(recipe.system, **new, callback=until(0.5), **options)
-            flow = train(
-                recipe.system, flow=flow, callback=until(1.0), **(options | {"points": recipe.points[1]}), seed=1
-            )
+            flow = train(system, **new, callback=until(0.5), **options)
+            flow = train(system, flow=flow, callback=until(1.0), **(options | {"points": points[1]}), seed=1)
         else:
-            flow = train(recipe.system, **new, callback=until(1.0), **options)
+            flow = train(system, **new, callback=until(1.0), **options)
     spent = time.process_time() - begin
-    at_dt, fractional = one_step_errors(flow, recipe.system, recipe.initial())
+    at_dt, fractional = one_step_errors(flow, system, judge.initial())
     steps = sum(stage["steps_taken"] for stage in flow.recipe["stages"])
-    return Result(scene, kind, optimizer, flow.n_parameters, spent, steps, at_dt, fractional)
+    return Result(recipe.scene, recipe.kind, optimizer, flow.n_parameters, spent, steps, at_dt, fractional)
 
 
 def row(result: Result) -> str:
     published = PUBLISHED[result.scene, result.kind]
-    return (
-        f"| {result.scene}, {result.kind} ({result.parameters}) | {result.optimizer} | {result.seconds:.0f} s | "
-        f"{result.steps:,} | {result.at_dt:.1e} | {result.fractional:.1e} | {published:.1e} | "
-        f"{published / result.at_dt:.0f} |"
+    lower = published / result.at_dt
+    return fragments.row(
+        [
+            f"{result.scene.replace('_', ' ')}, {result.kind} ({result.parameters})",
+            result.optimizer,
+            f"{result.seconds:.0f} s",
+            f"{result.steps:,}",
+            f"{result.at_dt:.1e}",
+            f"{result.fractional:.1e}",
+            f"{published:.1e}",
+            f"{lower:.0f}" if lower >= 10 else f"{lower:.1g}",
+        ]
     )
 
 
@@ -113,11 +132,10 @@ def run(seconds: float, scenes: list[str], kinds: list[str], optimizers: list[st
         "| network (parameters) | optimizer | time | steps | error at Δt | at fractional t | published | times lower |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    made = recipes()
     for scene in scenes:
         for kind in kinds:
             for optimizer in optimizers:
-                lines.append(row(trained(made[scene], scene, kind, optimizer, seconds)))
+                lines.append(row(trained(recipe_of(scene, kind), optimizer, seconds)))
                 print(lines[-1], flush=True)
     return "\n".join(lines)
 
@@ -129,11 +147,14 @@ def main() -> None:
     parser.add_argument("--scene", action="append", choices=sorted({scene for scene, _ in PUBLISHED}))
     parser.add_argument("--kind", action="append", choices=("sympflow", "mlp"))
     parser.add_argument("--optimizer", action="append", choices=OPTIMIZERS)
+    fragments.add_out(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
     seconds = 1.0 if options.quick else options.seconds
     scenes = options.scene or ["harmonic_oscillator", "henon_heiles"]
-    print("\n" + run(seconds, scenes, options.kind or ["sympflow", "mlp"], options.optimizer or list(OPTIMIZERS)))
+    found = run(seconds, scenes, options.kind or ["sympflow", "mlp"], options.optimizer or list(OPTIMIZERS))
+    print("\n" + found)
+    fragments.write(options.out, "training-optimizers", found)
 
 
 if __name__ == "__main__":

@@ -18,17 +18,17 @@ import time
 from collections.abc import Callable
 
 import torch
+from measuring import fragments
 from torch import Tensor
 from torch.nn.functional import linear
 
+from sympflow import HamiltonianSystem, SympFlow
 from sympflow.flow.layers import Kick
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
-from sympflow.flow.sympflow import SympFlow
-from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.systems import harmonic_oscillator, henon_heiles
-from sympflow.training.collocation import Points, PointSource
 from sympflow.training.losses import Loss
+from sympflow.training.points import Points, PointSource
 
 Value = Callable[[MLPPotential, Tensor, Tensor], Tensor]
 
@@ -96,7 +96,9 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=700)
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--rounds", type=int, default=9)
+    fragments.add_out(parser)
     options = parser.parse_args()
+    rows = []
     torch.set_num_threads(1)
     print(f"{'system':<22}{'way':<34}{'ms a step':>10}{'times slower':>14}")
     for system in (harmonic_oscillator(), henon_heiles()):
@@ -124,7 +126,10 @@ def main() -> None:
         medians = {name: statistics.median(r[name] for r in rounds) for name in ways}
         for name, seconds in medians.items():
             ratio = seconds / medians["closed form"]
+            rows.append((system.name, name, f"{1e3 * seconds:.2f}", f"{ratio:.1f}"))
             print(f"{system.name:<22}{name:<34}{1e3 * seconds:>10.2f}{ratio:>14.1f}")
+    titles = ("system", "way", "ms a step", "times slower")
+    fragments.write(options.out, "training-step", fragments.table(titles, rows))
 
 
 if __name__ == "__main__":

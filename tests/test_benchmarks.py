@@ -6,6 +6,7 @@ import dataclasses
 import importlib.util
 import json
 import math
+import re
 import sys
 from pathlib import Path
 
@@ -26,14 +27,21 @@ import primed_ideas
 import solar_system
 import through_solve
 import training_optimizers
-from contenders import compiled_loops, interpreted_loops, ours, primed_race, runge_kutta
-from contenders.calibration import Judged, largest_control
-from contenders.contender import Skipped, Work
-from contenders.goals import Goal, goals, worst_ratio
-from contenders.measurement import Results, Row, check_agreement, measure
-from contenders.page import duration, page, three
-from contenders.prose import power
-from contenders.scene import Scene
+from contenders import loops, ours, runge_kutta, tables
+from contenders.contender import Scene, Skipped, Work
+from contenders.measurement import (
+    Goal,
+    Judged,
+    Results,
+    Row,
+    check_agreement,
+    goals,
+    largest_control,
+    measure,
+    worst_ratio,
+)
+from measuring import fragments
+from measuring import race as at_equal_error
 
 from sympflow import SympFlow, shipped_flows
 from sympflow.hamiltonian.fingerprint import same_system
@@ -95,15 +103,14 @@ def test_first_after_takes_the_next_step_or_the_last():
 @pytest.mark.parametrize("trajectories", [1, TINY.trajectories])
 def test_hand_written_and_interpreted_loops_take_our_steps(trajectories):
     leader = next(c for c in ours.contenders(TINY) if c.label == "verlet" and c.trajectories == trajectories)
-    for module in (compiled_loops, interpreted_loops):
-        for contender in module.contenders(TINY):
-            if contender.trajectories == trajectories:
-                check_agreement(TINY, contender, leader, 0.05)
+    for contender in loops.contenders(TINY):
+        if contender.trajectories == trajectories:
+            check_agreement(TINY, contender, leader, 0.05)
 
 
 @pytest.mark.parametrize("trajectories", [1, TINY.trajectories])
 def test_hand_written_kahan_li8_takes_our_steps(trajectories):
-    by_hand = compiled_loops.run_kahan_li8(TINY, trajectories, 0.2, TINY.t_end)
+    by_hand = loops.run_kahan_li8(TINY, trajectories, 0.2, TINY.t_end)
     np.testing.assert_allclose(by_hand, ours.run(TINY, "kahan_li8", trajectories, 0.2, TINY.t_end), atol=1e-13)
 
 
@@ -178,10 +185,16 @@ def test_worst_ratio_compares_equal_targets_only():
 
 
 def test_numbers_are_written_with_three_digits():
-    assert [three(x) for x in (0.001234, 1.0, 12.34, 123.4, 123456.0)] == ["0.00123", "1.00", "12.3", "123", "123,000"]
-    assert [duration(s) for s in (2.5, 0.0123, 4.56e-5, 3e-9)] == ["2.50 s", "12.3 ms", "45.6 µs", "3.00 ns"]
-    assert power(1e-3) == "1e-3"
-    assert power(1e-12) == "1e-12"
+    assert [fragments.three(x) for x in (0.001234, 1.0, 12.34, 123.4, 123456.0)] == [
+        "0.00123",
+        "1.00",
+        "12.3",
+        "123",
+        "123,000",
+    ]
+    assert [fragments.duration(s) for s in (2.5, 0.0123, 4.56e-5, 3e-9)] == ["2.50 s", "12.3 ms", "45.6 µs", "3.00 ns"]
+    assert tables.power(1e-3) == "1e-3"
+    assert tables.power(1e-12) == "1e-12"
 
 
 def test_a_missing_peer_is_a_line_with_the_reason(monkeypatch):
@@ -191,13 +204,12 @@ def test_a_missing_peer_is_a_line_with_the_reason(monkeypatch):
     assert {c.package for c in contenders} == {"sympflow", "Numba", "NumPy", "torch", "SciPy", "torchdiffeq"}
 
 
-def test_a_tiny_run_fills_the_page_and_survives_json():
+def test_a_tiny_run_fills_the_fragments_and_survives_json(tmp_path):
     chosen = [c for c in ours.contenders(TINY) if c.label in ("verlet", "kahan_li8")]
-    contenders = [*chosen, *compiled_loops.contenders(TINY)]
+    contenders = [*chosen, *(c for c in loops.contenders(TINY) if c.package == "Numba")]
     results = measure(TINY, contenders, [1e-3, 1e-6], 1, cap=0.05, step_counts=(1000, 100), note=lambda line: None)
     results.skipped = [Skipped("heyoka", "not installed")]
-    results.environment = {"processor": "any", "cores": 1, "system": "any", "load": 0.0, "versions": {"python": "3"}}
-    results.environment |= {"minutes": 0.1, "repeats": 1, "load_after": 0.0}
+    results.environment = {"versions": {"python": "3"}, "minutes": 0.1, "repeats": 1, "load": 0.0, "load_after": 0.0}
     assert {(r.label, r.trajectories, r.target) for r in results.rows} == {
         (label, n, target)
         for label in ("verlet", "kahan_li8", "Verlet loop")
@@ -206,11 +218,38 @@ def test_a_tiny_run_fills_the_page_and_survives_json():
     }
     assert all(0.9 * r.target < r.energy_error <= r.target for r in results.rows if r.label == "verlet")
     assert [goal.verdict for goal in goals(results)][-1] == "not measured"
-    text = page(results, Path("figures/figure.png"))
-    assert "| kahan_li8 | sympflow |" in text
-    assert "- heyoka: not installed." in text
+    found = tables.fragments(results)
+    assert "| kahan_li8 | sympflow |" in found["peers-one"]
+    assert "| heyoka | all | not installed |" in found["peers-left-out"]
     again = Results.from_dict(json.loads(json.dumps(results.to_dict())))
-    assert page(again, Path("figures/figure.png")) == text
+    assert tables.fragments(again) == found
+    tables.draw(results, tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 0
+
+
+def test_a_fragment_says_where_it_is_from(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["benchmarks/drift.py", "--quick", "--out", "docs/measured", "--steps", "9"])
+    fragments.write(tmp_path / "measured", "one", fragments.table(["a", "b"], [[1, 2]]))
+    table, source = (tmp_path / "measured" / "one.md").read_text(encoding="utf-8").strip().split("\n\n")
+    assert table == "| a | b |\n| --- | --- |\n| 1 | 2 |"
+    assert re.fullmatch(
+        r"<small>`python benchmarks/drift.py --quick --steps 9` · .+ · commit .+ · \d{4}-\d\d-\d\d</small>", source
+    )
+    assert fragments.command_line("--only kepler").endswith("drift.py --quick --steps 9 --only kepler")
+    fragments.write(None, "two", "")  # printed only
+
+
+def test_every_fragment_has_a_command_that_writes_it():
+    """The names in the sources; stability and the ideas put a prefix before the names of their sections."""
+    sources = "".join(path.read_text(encoding="utf-8") for path in BENCHMARKS.rglob("*.py"))
+    for path in (BENCHMARKS.parent / "docs" / "measured").glob("*.md"):
+        if path.stem == "flows":  # the table of `sympflow flows`
+            continue
+        section = path.stem.removeprefix("stability-").removeprefix("ideas-")
+        section = re.sub(r"^stiff-fput-\d+", "stiff-fput-", section)
+        section = re.sub(r"^peers-(one|batch)", "peers-", section)
+        stem = section.removesuffix("-against").removesuffix("-flow").removesuffix("-work")
+        assert f'"{section}"' in sources or f'"{stem}' in sources, path.name
 
 
 # primed flows against schemes -------------------------------------------------------------------------
@@ -224,14 +263,15 @@ def test_fewest_steps_are_the_fewest():
 
 
 def arguments(**options):
-    given = {"system": ["pendulum"], "ablation": False, "quick": True, "fit": True, "json": None}
+    given = {"system": ["pendulum"], "ablation": False, "quick": True, "fit": True, "json": None, "out": None}
     return argparse.Namespace(**{**given, "fit_seconds": None, "repeats": 1, "batch": 16, **options})
 
 
 def test_a_tiny_race_of_primed_flows(tmp_path, monkeypatch):
-    monkeypatch.setattr(primed_race, "TIMED_SPAN", 20.0)
-    text = primed.run(arguments(flows=tmp_path, json=tmp_path / "rows.json"))
+    monkeypatch.setattr(at_equal_error, "TIMED_SPAN", 20.0)
+    text = primed.run(arguments(flows=tmp_path, json=tmp_path / "rows.json", out=tmp_path / "measured"))
     assert text.count("| pendulum, ") == 2
+    assert (tmp_path / "measured" / "primed-race.md").read_text(encoding="utf-8").count("| pendulum, ") == 2
     for row in json.loads((tmp_path / "rows.json").read_text()):
         assert 0 < row["error"] <= row["target"]
         assert row["dt"] <= 0.8
@@ -239,7 +279,7 @@ def test_a_tiny_race_of_primed_flows(tmp_path, monkeypatch):
         assert all(value > 0 for value in row["faster"].values())
     assert len(list(tmp_path.glob("*.safetensors"))) == 1
     system = pendulum()
-    again = primed.fitted(system, primed.FLOWS["pendulum"][0], tmp_path)  # not fitted again, but read
+    again = primed.fitted(system, *primed.FLOWS["pendulum"][0], tmp_path)  # not fitted again, but read
     assert again.recipe["stages"][0]["restarts"] == 2
 
 
@@ -269,13 +309,13 @@ def test_whole_calls_are_timed_beside_their_loops(capsys, monkeypatch):
 
 def test_heyoka_solves_any_symbolic_system():
     pytest.importorskip("heyoka")
-    from contenders.heyoka_systems import Taylor
+    from contenders.heyoka_taylor import Taylor
 
     from sympflow.systems import quartic
 
     system = quartic()
-    taylor, y0 = Taylor(system), system.domain.sample(5, 0)
-    expected = primed_race.reference(system, (0.0, 10.0), y0, np.array([10.0])).y[..., 0]
+    taylor, y0 = Taylor.of_system(system), system.domain.sample(5, 0)
+    expected = at_equal_error.reference(system, (0.0, 10.0), y0, np.array([10.0])).y[..., 0]
     np.testing.assert_allclose(taylor.run_lanes(1e-9, y0, 10.0), expected, atol=1e-6)
     np.testing.assert_allclose(taylor.run(1e-9, y0[0], 10.0), expected[0], atol=1e-6)
     np.testing.assert_allclose(taylor.grid(1e-9, y0[0], np.array([0.0, 5.0, 10.0]))[-1], expected[0], atol=1e-6)
@@ -284,13 +324,13 @@ def test_heyoka_solves_any_symbolic_system():
 def test_on_kepler_the_logarithmic_methods_race():
     """They end where the exact flow does, take few steps for it, and no other system has them."""
     system = kepler()
-    runners = {r.name: r for r in primed_race.transformed(system)}
+    runners = {r.name: r for r in at_equal_error.transformed(system)}
     assert set(runners) == {"log_leapfrog", "log_blanes_moan4", "log_kahan_li8"}
-    assert not primed_race.transformed(henon_heiles())
-    measure = primed_race.Measure(system, "state", 10.0)
-    fixed = primed_race.Runner.of_scheme("kahan_li8", system)
+    assert not at_equal_error.transformed(henon_heiles())
+    measure = at_equal_error.Measure(system, "state", 10.0)
+    fixed = at_equal_error.Runner.of_scheme("kahan_li8", system)
     assert measure.of(runners["log_kahan_li8"], 100) < 0.1 * measure.of(fixed, 100)
-    energy = primed_race.Measure(system, "energy", 10.0)
+    energy = at_equal_error.Measure(system, "energy", 10.0)
     assert energy.of(runners["log_leapfrog"], 100) < 1e-11
     single = runners["log_kahan_li8"].one(0.1, system.y0, 100, np.array([0, 100]))[0]
     assert single.shape == (2, 4)
@@ -301,20 +341,23 @@ def test_on_kepler_the_logarithmic_methods_race():
 
 @pytest.mark.parametrize("optimizer", training_optimizers.OPTIMIZERS)
 def test_each_optimizer_stops_when_its_time_is_over(optimizer):
-    made = training_optimizers.recipes()["harmonic_oscillator"]
-    quick = dataclasses.replace(made, points=(40, 60))
-    result = training_optimizers.trained(quick, "harmonic_oscillator", "sympflow", optimizer, 0.05)
+    made = training_optimizers.recipe_of("harmonic_oscillator", "sympflow")
+    fits = tuple(dataclasses.replace(fit, points=n) for fit, n in zip(made.fits, (40, 60), strict=True))
+    quick = dataclasses.replace(made, fits=fits)
+    result = training_optimizers.trained(quick, optimizer, 0.05)
     assert result.steps >= 1
     assert 0 < result.at_dt < 10
     assert training_optimizers.row(result).count("|") == 9
 
 
 def test_a_tiny_search_for_drift():
-    table = drift.run(2_000, ["pendulum"])
+    found = drift.run(2_000, ["pendulum"])
     n = sum(f.system == "pendulum" for f in shipped_flows(pendulum(), "sympflow"))
-    assert f"{n} of {n} flows show no drift" in table
+    assert len(found) == n
+    assert all(d.passed for d in found)
     drifting = drift.Drift("rk4", 100, 1.0, change=1e-3, three_errors=1e-4, rounding=1e-13, seconds=0.0, left=None)
     assert not drifting.passed
+    assert "| rk4 | 1.0e-03 | 1.0e-04 | 1.0e+00 |" in drift.failures([*found, drifting])
 
 
 def test_scenes_of_the_drift_are_those_of_all_flows():

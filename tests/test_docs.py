@@ -14,7 +14,11 @@ from sympflow import shipped_flows
 from sympflow.integrators import registry
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    *(page for page in sorted((ROOT / "docs").rglob("*.md")) if page.parent.name != "measured"),
+]
+MEASURED = ROOT / "docs" / "measured"
 BLOCK = re.compile(r"(?:<!-- needs: (?P<needs>\w+) -->\n)?^```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -47,7 +51,7 @@ def test_the_code_on_a_page_runs(page, tmp_path, monkeypatch):
 
 
 def test_the_table_of_flows_is_that_of_the_package():
-    assert shipped_flows().table() in (ROOT / "docs" / "training.md").read_text(encoding="utf-8")
+    assert shipped_flows().table() in (MEASURED / "flows.md").read_text(encoding="utf-8")
 
 
 def test_relative_links_lead_somewhere():
@@ -58,7 +62,7 @@ def test_relative_links_lead_somewhere():
 
 def test_every_page_is_in_the_navigation():
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    for page in (ROOT / "docs").rglob("*.md"):
+    for page in PAGES[1:]:
         assert page.relative_to(ROOT / "docs").as_posix() in navigation
 
 
@@ -80,3 +84,72 @@ def test_the_site_builds_without_warnings(tmp_path):
     assert run.returncode == 0, run.stdout + run.stderr
     page = (tmp_path / "site" / "reference" / "solve" / "index.html").read_text(encoding="utf-8")
     assert "poincare_section" in page
+
+
+# figures ----------------------------------------------------------------------------------------------
+
+QUOTES = re.compile(r"^(?!    ).*?<!-- quotes (?P<fragment>[\w-]+): (?P<figures>[^>]+?) -->", re.MULTILINE)
+FIGURE = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[-+−]?\d+)?")
+
+
+def quotes(page):
+    """Each comment with the paragraph that it stands in, comments taken out: (fragment, figures, words)."""
+    for paragraph in re.split(r"\n\s*\n", page.read_text(encoding="utf-8")):
+        words = re.sub(r"<!--.*?-->", "", paragraph, flags=re.DOTALL)
+        for comment in QUOTES.finditer(paragraph):
+            yield comment["fragment"], [f.strip() for f in comment["figures"].split(", ")], words
+
+
+def figures(text):
+    """The numbers in a text as they are written."""
+    return [f.rstrip(",") for f in FIGURE.findall(text)]
+
+
+def stands_in(figure, others):
+    """True if one of the numbers is the figure, or rounds to it at the digits that the figure has."""
+    plain = figure.replace(",", "").replace("−", "-")
+    mantissa, _, power = plain.partition("e")
+    unit = 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))
+    values = (float(other.replace(",", "").replace("−", "-")) for other in others)
+    return any(abs(value - float(plain)) <= 0.5000001 * unit for value in values)
+
+
+def test_a_figure_stands_where_it_is_or_is_rounded_from():
+    assert stands_in("3.8", ["3.79", "12"])
+    assert stands_in("1.0e-08", ["1.02e-8"])
+    assert stands_in("8,000", ["8000"])
+    assert not stands_in("3.7", ["3.79"])
+    assert not stands_in("5.4e-7", ["5.5e-07"])
+    assert figures("takes 1,243,312 steps, 2.3 to 4e-5 s") == ["1,243,312", "2.3", "4e-5"]
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if QUOTES.search(page.read_text("utf-8"))], ids=lambda p: p.stem
+)
+def test_quoted_figures_stand_in_their_fragments(page):
+    for fragment, quoted, words in quotes(page):
+        table = (MEASURED / f"{fragment}.md").read_text(encoding="utf-8")
+        for figure in quoted:
+            assert figure in figures(words), f"{page.name} quotes {figure} of {fragment}, but does not say it"
+            assert stands_in(figure, figures(table)), f"{page.name} quotes {figure}, which is not in {fragment}"
+
+
+def test_the_diagrams_are_those_of_the_package():
+    diagrams = runpy.run_path(str(ROOT / "docs" / "diagrams.py"))
+    for name in ("rooms", "solve"):
+        drawn = (ROOT / "docs" / "figures" / f"{name}.svg").read_text(encoding="utf-8")
+        assert drawn == diagrams[name](), f"python docs/diagrams.py draws another {name}.svg"
+    rooms = [room for row, _ in diagrams["ROOMS"] for room in row]
+    package = ROOT / "sympflow"
+    for room in rooms:
+        assert (package / room / "__init__.py").exists() or (package / f"{room}.py").exists(), room
+    for folder in package.glob("*/__init__.py"):
+        assert folder.parent.name in rooms, folder.parent.name
+
+
+def test_every_fragment_is_included_and_says_where_it_is_from():
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    for fragment in MEASURED.glob("*.md"):
+        assert f'--8<-- "measured/{fragment.name}"' in text, fragment.name
+        source = fragment.read_text(encoding="utf-8").splitlines()[-1]
+        assert re.fullmatch(r"<small>`[^`]+` · .+ · commit .+ · \d{4}-\d\d-\d\d</small>", source), fragment.name

@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from contenders.contender import Contender, Outputs, Work, whole_steps
+from contenders.contender import Contender, Outputs, Scene, Work, whole_steps
 from contenders.runge_kutta import first_after
-from contenders.scene import Scene
 
 jax.config.update("jax_enable_x64", True)
 MAX_STEPS = 60_000

@@ -1,21 +1,21 @@
-"""One run of the whole comparison: first calls, calibration, and interleaved timing."""
+"""One run of the whole comparison: first calls, calibration, interleaved timing, and the targets set for it."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from contenders import compiled_loops, ours
-from contenders.calibration import Judged, calibrate
-from contenders.contender import Contender, Skipped
-from contenders.scene import Scene
+from contenders import loops, ours
+from contenders.contender import Contender, Scene, Skipped, Work
 from sympflow.studies.attempts import interleaved
 
+SHORT = 0.1  # part of the interval over which a `short` calibration runs
 PROBE = 0.01  # part of the interval that a run's duration is estimated from
 LEAST_PART = {"dt": 0.001, "tol": 0.05}  # adaptive steps differ along the orbit, so their average needs more of it
 AGREEMENT = 1e-10  # of two implementations of one scheme, over a short run: far above rounding, far below any error
@@ -75,6 +75,74 @@ class Results:
             [tuple(entry) for entry in content["unreached"]],
             content["environment"],
         )
+
+
+# the step or tolerance that reaches an energy error ------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A method at one setting of its step or tolerance."""
+
+    control: float
+    energy_error: float
+    state_error: float | None
+    work: Work
+
+
+def largest_control(
+    judge: Callable[[float], Judged], target: float, guess: float, order: float, window: float, attempts: int = 14
+) -> Judged | None:
+    """The largest step or tolerance whose energy error meets the target, by bracketing on the logarithms.
+
+    The next trial is where the error would be just below the target if it went as control^order; once there is a
+    bracket, a trial outside it is replaced by its geometric middle. None if no trial met the target.
+    """
+    best: Judged | None = None
+    low, high = 0.0, math.inf  # the largest control known to meet the target, the smallest known not to
+    control = guess
+    for _ in range(attempts):
+        trial = judge(control)
+        if trial.energy_error <= target:
+            if best is None or control > best.control:
+                best, low = trial, control
+            if trial.energy_error >= window * target:
+                break
+        else:
+            high = min(high, control)
+        if low >= high or high / max(low, 1e-300) < 1.005:
+            break
+        excess = trial.energy_error / (math.sqrt(window) * target)
+        factor = 0.5 if not math.isfinite(excess) else float(np.clip(excess ** (-1 / order), 1 / 16, 16))
+        control *= factor
+        if not low < control < high:
+            control = math.sqrt(low * high)
+    return best
+
+
+def calibrate(scene: Scene, contender: Contender, target: float) -> Judged | None:
+    """`largest_control` of a contender; errors are those at the end of the whole interval."""
+    assert contender.outputs is not None
+    outputs, n = contender.outputs, contender.trajectories
+    short = target in contender.short
+    part = SHORT if short else 1.0
+
+    def judge(control: float) -> Judged:
+        result = outputs(control, part * scene.t_end)
+        energy_error = scene.energy_error(result.states, scene.sample(n)) / part
+        state_error = None if short else scene.state_error(result.final, n)
+        work = result.work
+        if short:
+            forces = work.force_evaluations
+            work = replace(
+                work, steps=round(work.steps / part), force_evaluations=None if forces is None else round(forces / part)
+            )
+        return Judged(control, energy_error, state_error, work)
+
+    return largest_control(judge, target, contender.guesses[target], contender.order, contender.window)
+
+
+# timing --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -195,10 +263,10 @@ def check_agreement(scene: Scene, contender: Contender, leader: Contender, dt: f
 
 def step_loops(scene: Scene, counts: tuple[int, int], dt: float = 0.01) -> dict[str, Timed]:
     """Verlet and Kahan–Li 8 of equal step, ours and hand-written; scaled to seconds a step and trajectory."""
-    loops = {"verlet": compiled_loops.run_verlet, "kahan_li8": compiled_loops.run_kahan_li8}
+    by_name = {"verlet": loops.run_verlet, "kahan_li8": loops.run_kahan_li8}
     timed = {}
     for n, count in zip((1, scene.trajectories), counts, strict=True):
-        for method, loop in loops.items():
+        for method, loop in by_name.items():
             t_end, scale = count * dt, 1.0 / (count * n)
             by_hand = partial(loop, scene, n, dt, t_end)
             mine = partial(ours.run, scene, method, n, dt, t_end)
@@ -206,3 +274,60 @@ def step_loops(scene: Scene, counts: tuple[int, int], dt: float = 0.01) -> dict[
             timed[f"{method} {n} hand-written"] = Timed(by_hand, scale)
             timed[f"{method} {n} sympflow"] = Timed(mine, scale)
     return timed
+
+
+# targets -------------------------------------------------------------------------------------------
+
+LEVEL = 1.05
+"""A ratio of run times up to which two methods count as level: the scatter of the medians."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A ratio, its limit, and the side of the limit that it should be on. The ratio is None if a peer is missing."""
+
+    text: str
+    ratio: float | None
+    limit: float
+    at_least: bool = False
+
+    @property
+    def verdict(self) -> str:
+        if self.ratio is None:
+            return "not measured"
+        return "pass" if (self.ratio >= self.limit if self.at_least else self.ratio <= self.limit) else "miss"
+
+
+def goals(results: Results) -> list[Goal]:
+    batch = max((row.trajectories for row in results.rows), default=1)
+    found = []
+    for n, limit in ((1, 1.2), (batch, 1.3)):
+        for method, name in (("verlet", "Verlet"), ("kahan_li8", "Kahan–Li 8")):
+            ratio = results.step_seconds[f"{method} {n} sympflow"] / results.step_seconds[f"{method} {n} hand-written"]
+            steps = "one trajectory, 1e6 steps" if n == 1 else f"batch of {n}"
+            found.append(Goal(f"{name} through `solve` against the hand-written loop, {steps}", ratio, limit))
+    for package in ("diffrax", "NumPy", "torch"):
+        for n in (1, batch):
+            kind = "one trajectory" if n == 1 else f"batch of {n}"
+            text = f"verlet against the same scheme in {package}, {kind}, the worst of the targets"
+            found.append(Goal(text, worst_ratio(results, package, n), LEVEL))
+    ours = find(results, lambda r: r.label == "kahan_li8" and r.trajectories == batch and r.target == 1e-6)
+    theirs = find(results, lambda r: r.package == "heyoka" and r.trajectories == batch and r.target == 1e-6)
+    times_faster = theirs.seconds / ours.seconds if ours and theirs else None
+    text = f"heyoka's SIMD batch against kahan_li8, batch of {batch}, energy error 1e-6"
+    return [*found, Goal(text, times_faster, 5.0, at_least=True)]
+
+
+def worst_ratio(results: Results, package: str, trajectories: int) -> float | None:
+    """The largest of our Verlet's time over the package's, over the targets that both have."""
+    mine = {r.target: r.seconds for r in results.rows if r.label == "verlet" and r.trajectories == trajectories}
+    theirs = {
+        r.target: r.seconds
+        for r in results.rows
+        if r.package == package and r.control == "dt" and r.trajectories == trajectories
+    }
+    return max((mine[t] / theirs[t] for t in mine.keys() & theirs.keys()), default=None)
+
+
+def find(results: Results, matches: Callable[[Row], bool]) -> Row | None:
+    return next((row for row in results.rows if matches(row)), None)

@@ -7,8 +7,7 @@ from functools import partial
 import numpy as np
 
 import sympflow
-from contenders.contender import Contender, Outputs, Work, whole_steps
-from contenders.scene import Scene
+from contenders.contender import Contender, Outputs, Scene, Work, whole_steps
 from sympflow.schemes import SCHEMES
 
 GUESSES = {  # method: steps for energy errors of 1e-3, 1e-6, 1e-9 and 1e-12 over T = 1000

@@ -11,9 +11,8 @@ import torch
 from scipy.integrate import solve_ivp
 from torchdiffeq import odeint
 
-from contenders.contender import Contender, Outputs, Work
-from contenders.interpreted_loops import torch_force
-from contenders.scene import Scene
+from contenders.contender import Contender, Outputs, Scene, Work
+from contenders.loops import torch_force
 
 
 def scalar_rhs(t: float, y: np.ndarray) -> list[float]:

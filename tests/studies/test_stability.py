@@ -1,12 +1,10 @@
 """stability(): the limits that are known, blow-ups told apart, and what is refused."""
 
 import csv
-import importlib.util
 import json
 import math
 import re
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -286,17 +284,6 @@ def test_the_command(tmp_path):
     result = CliRunner().invoke(app, ["stability", "pendulum", "--vary", "omega=1"])
     assert result.exit_code == 2
     assert "which is not a parameter of pendulum" in result.output
-
-
-def test_the_words_of_the_page_hold_a_place_for_every_table():
-    folder = Path(__file__).parents[2] / "benchmarks"
-    specification = importlib.util.spec_from_file_location("stability_words", folder / "stability_words.py")
-    words = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(words)
-    source = (folder / "stability.py").read_text(encoding="utf-8")
-    sections = re.findall(r'^    "(\w+)": ', source[source.index("SECTIONS: dict") :], re.MULTILINE)
-    page = words.page({name: f"<{name}>" for name in sections})
-    assert [name for name in sections if f"<{name}>" not in page] == ["maps"]  # figures alone
 
 
 def test_a_limit_that_is_not_found_is_explained_and_progress_names_every_step():

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from measuring.compiled import flow_loops, last, scheme_loops
 from sympflow import HamiltonianSystem, get, solve
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.integrators.flows import LogSympFlow
-from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.metrics.reference import reference
 from sympflow.schemes import SCHEMES
 
@@ -33,7 +33,7 @@ WORK = 20_000_000  # kicks of all trajectories together in a timed batch, which 
 
 @dataclass(frozen=True)
 class Runner:
-    """What takes steps: a flow or a scheme. `one` and `many` are its compiled loops: (h, y0, n, save) to states."""
+    """A flow or a scheme that takes steps. `one` and `many` are its compiled loops: (h, y0, n, save) to states."""
 
     name: str
     forces: int
@@ -47,18 +47,15 @@ class Runner:
         if isinstance(flow, ClockedFlow):
             name = f"{flow.scheme.name} with a clock, Δt = {flow.figures['step']:g}"
             return cls._through_solve(name, flow.scheme.force_evaluations, system, partial(LogSympFlow, flow=flow))
-        kernel, scheme = flow.kernel_for(system), flow.kernel_scheme()
+        loops, scheme = flow_loops(system, flow), flow.kernel_scheme()
         name = f"Δt = {flow.dt:g}, {scheme.force_evaluations} + {flow.processor}"
         name += f", degree {max(map(sum, flow.monomials))}" if flow.monomials else ""
-        many = partial(kernel.run_batch, threads=1)
-        return cls(name, scheme.force_evaluations, scheme.hessian_evaluations, kernel.run, many, flow.dt)
+        return cls(name, scheme.force_evaluations, scheme.hessian_evaluations, loops.one, loops.many, flow.dt)
 
     @classmethod
     def of_scheme(cls, name: str, system: HamiltonianSystem) -> Runner:
-        scheme = SCHEMES[name]
-        kernel = splitting_loops(system).kernel(scheme)
-        one, many = kernel.run, partial(kernel.run_batch, threads=1)
-        return cls(name, scheme.force_evaluations, scheme.hessian_evaluations, one, many)
+        loops, scheme = scheme_loops(system, name), SCHEMES[name]
+        return cls(name, scheme.force_evaluations, scheme.hessian_evaluations, loops.one, loops.many)
 
     @classmethod
     def of_transformed(cls, name: str, system: HamiltonianSystem) -> Runner:
@@ -232,7 +229,7 @@ def _single(near, steps, measure, taylor, tol, repeats, outputs):  # type: ignor
     calls: dict[str, Callable[[], Any]] = {}
     for runner in near:
         n = repeat * steps[runner]
-        save = np.array([n])
+        save = last(n)
         if outputs:
             save = np.unique(np.linspace(0, n, repeat * INSTANTS + 1).round().astype(np.int64))
         calls[runner.name] = partial(_each, partial(runner.one, T / steps[runner]), y0, n, save)
@@ -256,7 +253,7 @@ def _batch(near, steps, measure, taylor, tol, repeats, batch):  # type: ignore[n
         n = steps[runner]
         part = max(1, min(n, WORK // (batch * runner.forces)))
         share[runner.name] = n / part
-        calls[runner.name] = partial(runner.many, T / n, y0, part, np.array([part]))
+        calls[runner.name] = partial(runner.many, T / n, y0, part, last(part))
     if tol is not None:
         part = min(T, T * WORK / (50 * batch * max(steps[r] * r.forces for r in near)))
         share["heyoka"] = T / part
