@@ -33,7 +33,7 @@ from sympflow import get, solve, systems
 from sympflow.flow.shipped import named
 from sympflow.interop.scipy import as_scipy
 from sympflow.interop.torchdiffeq import odeint
-from sympflow.studies.tables import Column, number, seconds, text_table
+from sympflow.studies.reports import Column, number, seconds, text_table
 
 HH = systems.henon_heiles()
 N, T_END = 1000, 20.0

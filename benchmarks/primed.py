@@ -40,29 +40,40 @@ from sympflow import HamiltonianSystem, SympFlow, systems, time_transformed, tra
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.hamiltonian.fingerprint import same_system
-from sympflow.training.recipes import PrimedRecipe
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A primed flow to be fitted."""
+
+    dt: float
+    stages: int
+    processor: int = 6
+    restarts: int = 24
+
 
 TARGETS = (1e-4, 1e-6, 1e-8)
 SHIPPED = Path(sympflow.__file__).parent / "pretrained"
 MEASURES = {"energy": 1000.0, "state": 100.0}
 FLOWS = {
     "henon_heiles": (
-        PrimedRecipe(1.1, 2), PrimedRecipe(0.65, 2), PrimedRecipe(0.9, 3), PrimedRecipe(0.55, 3, restarts=48),
+        Fit(1.1, 2), Fit(0.65, 2), Fit(0.9, 3), Fit(0.55, 3, restarts=48),
     ),
     "pendulum": (
-        PrimedRecipe(0.8, 1), PrimedRecipe(1.2, 2, 4), PrimedRecipe(0.5, 2), PrimedRecipe(0.5, 3, restarts=48),
+        Fit(0.8, 1), Fit(1.2, 2, 4), Fit(0.5, 2), Fit(0.5, 3, restarts=48),
     ),
-    "quartic": (PrimedRecipe(0.8, 2), PrimedRecipe(0.5, 3), PrimedRecipe(0.3, 3, restarts=48)),
-    "kepler": (PrimedRecipe(0.15, 2), PrimedRecipe(0.1, 3), PrimedRecipe(0.045, 3, restarts=48)),
+    "quartic": (Fit(0.8, 2), Fit(0.5, 3), Fit(0.3, 3, restarts=48)),
+    "kepler": (Fit(0.15, 2), Fit(0.1, 3), Fit(0.045, 3, restarts=48)),
 }  # fmt: skip
 
 
-def fitted(system: HamiltonianSystem, recipe: PrimedRecipe, folder: Path, **options: Any) -> PrimedFlow:
-    """The flow of a recipe, from the folder if it is there."""
-    path = folder / f"{system.name}-{recipe.dt:g}-{recipe.stages}-{recipe.processor}.safetensors"
+def fitted(system: HamiltonianSystem, fit: Fit, folder: Path, **options: Any) -> PrimedFlow:
+    """The fitted flow, from the folder if it is there."""
+    path = folder / f"{system.name}-{fit.dt:g}-{fit.stages}-{fit.processor}.safetensors"
     if path.exists():
         return sympflow.load(path, system=system)
-    flow = train(system, flow=recipe.flow(system), progress=False, **(recipe.options() | options))
+    start = SympFlow.primed(system, fit.stages, dt=fit.dt, processor=fit.processor)
+    flow = train(system, flow=start, progress=False, **({"restarts": fit.restarts} | options))
     folder.mkdir(parents=True, exist_ok=True)
     flow.save(path)
     return flow
@@ -218,7 +229,7 @@ def run(options: argparse.Namespace) -> str:
     for name in options.system or FLOWS:
         system = getattr(systems, name)()
         if options.fit:
-            flows = [fitted(system, r, options.flows, **quick) for r in FLOWS[name][: 1 if options.quick else None]]
+            flows = [fitted(system, fit, options.flows, **quick) for fit in FLOWS[name][: 1 if options.quick else None]]
         else:
             flows = stored(system, options.flows)
         if not flows:

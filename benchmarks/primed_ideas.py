@@ -43,8 +43,8 @@ from sympflow import HamiltonianSystem, SympFlow, Tube, max_energy_error, solve,
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.primed import PrimedFlow
-from sympflow.training.figures import one_step_errors
-from sympflow.training.ladder import Rung
+from sympflow.training.shipped.judges import one_step_errors
+from sympflow.training.starts import Primed
 
 IDEAS = ("curvature", "polynomial", "energy", "tube", "network")
 DT, STAGES, PROCESSOR = 1.0, 3, 6
@@ -110,6 +110,10 @@ def row(system: HamiltonianSystem, flow: PrimedFlow, t_end: float, *cells: str) 
     return line
 
 
+def _trained(system: HamiltonianSystem, start: PrimedFlow, **options: Any) -> PrimedFlow:
+    return train(system, flow=start, progress=False, **({"restarts": 12} | options))
+
+
 def polynomial(t_end: float, scenes: Any, **options: Any) -> str:
     """The gain by polynomials in place of force gradients, and their cost."""
     lines = [
@@ -120,12 +124,14 @@ def polynomial(t_end: float, scenes: Any, **options: Any) -> str:
         stages, processor, dt, first, degree = POLYNOMIALS[name]
         system = getattr(systems, name.partition(",")[0])()
         shape = f"{dt:g}, {stages} + {processor}"
-        plain = Rung(stages, dt, processor, first=first).train(system, progress=False, **options)
-        rung = Rung(stages, dt, processor, polynomial=degree, first=first)
+        plain, kicks = Primed(dt, stages, processor, first=first), Primed(dt, stages, processor, False, degree, first)
+        gradients = _trained(system, plain.flow(system), **options)
         kinds = {
-            "force gradients": plain,
-            f"degree {degree}, from these": rung.train(system, plain, progress=False, **(options | {"restarts": 1})),
-            f"degree {degree}": rung.train(system, progress=False, **options),
+            "force gradients": gradients,
+            f"degree {degree}, from these": _trained(
+                system, kicks.flow(system, None, gradients), **(options | {"restarts": 1})
+            ),
+            f"degree {degree}": _trained(system, kicks.flow(system), **options),
         }
         lines += [row(system, flow, t_end, name, shape, kind) for kind, flow in kinds.items()]
     return "\n".join(lines)

@@ -32,8 +32,10 @@ import torch
 from measuring import fragments
 
 from sympflow import train
-from sympflow.training.figures import one_step_errors
-from sympflow.training.networks import NetworkRecipe, recipes
+from sympflow.training.shipped.judges import AsPublished, one_step_errors
+from sympflow.training.shipped.recipe import Recipe
+from sympflow.training.shipped.rows import networks
+from sympflow.training.starts import Network
 
 PUBLISHED = {
     ("harmonic_oscillator", "sympflow"): 3.5e-4,
@@ -60,21 +62,30 @@ class Result:
     fractional: float
 
 
-def trained(recipe: NetworkRecipe, scene: str, kind: str, optimizer: str, seconds: float) -> Result:
+def recipe_of(scene: str, kind: str) -> Recipe:
+    """The recipe by which a network ships."""
+    return next(recipe for recipe in networks() if (recipe.scene, recipe.kind) == (scene, kind))
+
+
+def trained(recipe: Recipe, optimizer: str, seconds: float) -> Result:
     """A flow that was trained for so many seconds of processor time, and what it achieves."""
-    options: dict[str, Any] = {"optimizer": optimizer, "domain": recipe.domain, "matching_weight": 0.0, "steps": MANY}
-    options |= {"progress": False, "validate_every": 1}
-    new = {"dt": recipe.dt, "kind": kind}
+    system, judge = recipe.system(), recipe.judge
+    assert isinstance(recipe.start, Network)
+    assert isinstance(judge, AsPublished)
+    first, second = (fit.points for fit in recipe.fits)
+    options: dict[str, Any] = {"optimizer": optimizer, "domain": recipe.domain_of(system), "matching_weight": 0.0}
+    options |= {"steps": MANY, "progress": False, "validate_every": 1}
+    new = {"dt": recipe.start.dt, "kind": recipe.kind}
     if optimizer == "adam":
         for _ in range(2):  # the first sets up what later steps find
             begin = time.process_time()
-            train(recipe.system, **new, **(options | {"steps": TRIAL, "validate_every": TRIAL}))
+            train(system, **new, **(options | {"steps": TRIAL, "validate_every": TRIAL}))
         options["steps"] = max(TRIAL, int(TRIAL * seconds / (time.process_time() - begin)))
         options["validate_every"] = max(1, options["steps"] // 40)
     elif optimizer == "gauss-newton":
-        options |= {"validate_every": 5, "points": recipe.points[0]}
+        options |= {"validate_every": 5, "points": first}
     else:
-        options["points"] = recipe.points[1]
+        options["points"] = second
     begin = time.process_time()
 
     def until(share: float) -> Callable[[int, dict[str, float]], None]:
@@ -87,16 +98,14 @@ def trained(recipe: NetworkRecipe, scene: str, kind: str, optimizer: str, second
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # that a run was stopped is what is meant
         if optimizer == "gauss-newton":
-            flow = train(recipe.system, **new, callback=until(0.5), **options)
-            flow = train(
-                recipe.system, flow=flow, callback=until(1.0), **(options | {"points": recipe.points[1]}), seed=1
-            )
+            flow = train(system, **new, callback=until(0.5), **options)
+            flow = train(system, flow=flow, callback=until(1.0), **(options | {"points": second}), seed=1)
         else:
-            flow = train(recipe.system, **new, callback=until(1.0), **options)
+            flow = train(system, **new, callback=until(1.0), **options)
     spent = time.process_time() - begin
-    at_dt, fractional = one_step_errors(flow, recipe.system, recipe.initial())
+    at_dt, fractional = one_step_errors(flow, system, judge.initial())
     steps = sum(stage["steps_taken"] for stage in flow.recipe["stages"])
-    return Result(scene, kind, optimizer, flow.n_parameters, spent, steps, at_dt, fractional)
+    return Result(recipe.scene, recipe.kind, optimizer, flow.n_parameters, spent, steps, at_dt, fractional)
 
 
 def row(result: Result) -> str:
@@ -122,11 +131,10 @@ def run(seconds: float, scenes: list[str], kinds: list[str], optimizers: list[st
         "| network (parameters) | optimizer | time | steps | error at Δt | at fractional t | published | times lower |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    made = recipes()
     for scene in scenes:
         for kind in kinds:
             for optimizer in optimizers:
-                lines.append(row(trained(made[scene], scene, kind, optimizer, seconds)))
+                lines.append(row(trained(recipe_of(scene, kind), optimizer, seconds)))
                 print(lines[-1], flush=True)
     return "\n".join(lines)
 

@@ -27,8 +27,8 @@ from sympflow.flow.layers import Kick
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
 from sympflow.systems import harmonic_oscillator, henon_heiles
-from sympflow.training.collocation import Points, PointSource
 from sympflow.training.losses import Loss
+from sympflow.training.points import Points, PointSource
 
 Value = Callable[[MLPPotential, Tensor, Tensor], Tensor]
 

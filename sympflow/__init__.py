@@ -25,7 +25,7 @@ _HOME = {
     "register": "integrators.registry",
     "SympFlow": "flow.sympflow",
     "MLPFlow": "flow.mlp",
-    "load": "flow.io",
+    "load": "flow.files",
     "shipped_flows": "flow.shipped",
     "train": "training.trainer",
     "compare": "studies.comparison",
@@ -35,7 +35,7 @@ _HOME = {
     "energy_error": "metrics.energy",
     "max_energy_error": "metrics.energy",
     "energy_drift": "metrics.energy",
-    "energy_growth": "metrics.round_off",
+    "energy_growth": "metrics.energy",
     "volume_error": "metrics.symplectic",
     "symplecticity_defect": "metrics.symplectic",
     "loop_area_error": "metrics.symplectic",
@@ -49,7 +49,7 @@ __all__ = ["__version__", *_HOME, *_MODULES]  # noqa: PLE0604
 if TYPE_CHECKING:
     from sympflow import interop as interop
     from sympflow import systems as systems
-    from sympflow.flow.io import load as load
+    from sympflow.flow.files import load as load
     from sympflow.flow.mlp import MLPFlow as MLPFlow
     from sympflow.flow.shipped import shipped_flows as shipped_flows
     from sympflow.flow.sympflow import SympFlow as SympFlow
@@ -66,8 +66,8 @@ if TYPE_CHECKING:
     from sympflow.metrics.accuracy import time_reversal_error as time_reversal_error
     from sympflow.metrics.energy import energy_drift as energy_drift
     from sympflow.metrics.energy import energy_error as energy_error
+    from sympflow.metrics.energy import energy_growth as energy_growth
     from sympflow.metrics.energy import max_energy_error as max_energy_error
-    from sympflow.metrics.round_off import energy_growth as energy_growth
     from sympflow.metrics.symplectic import loop_area_error as loop_area_error
     from sympflow.metrics.symplectic import symplecticity_defect as symplecticity_defect
     from sympflow.metrics.symplectic import volume_error as volume_error

@@ -5,24 +5,19 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
 
 from sympflow.arrays import Array, is_tensor, stack, to_numpy
 
-if TYPE_CHECKING:
-    from sympflow.integrators.base import Integrator, Outcome, Problem
-
 EventFunction = Callable[[float, Array], Any]
 Dense = Callable[[float], Array]
 """The state at a time within one step."""
 
 _EPS = float(np.finfo(float).eps)
-
-ENDED = "A termination event occurred."
 
 
 @dataclass(frozen=True)
@@ -192,39 +187,3 @@ class EventSearch:
     def states(self, y0: Array) -> list[Array]:
         """`y_events` of the solution: an array (n, 2d) for each event, like `y0`; tensors without gradient."""
         return [stack([y for _, y in zeros], axis=0) if zeros else y0[None][:0] for zeros in self.found]
-
-
-def run_and_search(integrator: Integrator, problem: Problem, search: EventSearch) -> Outcome:
-    """A run of an integrator that does not look for events itself: they are sought on its dense output afterwards.
-
-    Raises
-    ------
-    ValueError
-        If the integrator has no dense output.
-    """
-    full = integrator.run(replace(problem, t_eval=None, save_every=1, dense_output=True, events=None))
-    if full.sol is None:
-        raise ValueError(
-            f"`events` are located on the dense output, which method {integrator.name!r} does not give: use another "
-            "method."
-        )
-    sign = 1 if problem.t1 >= problem.t0 else -1
-    search.max_interval = search.max_interval or problem.system.dt
-    if len(full.t) == 1:
-        search.step(full.t[0], full.y[0], full.t[0], full.y[0], full.sol)
-    for k in range(len(full.t) - 1):
-        if search.step(float(full.t[k]), full.y[k], float(full.t[k + 1]), full.y[k + 1], full.sol):
-            break
-    t_end = search.end[0] if search.end else float(full.t[-1]) if full.status else problem.t1
-    if problem.t_eval is not None:
-        t = problem.t_eval[(problem.t_eval - t_end) * sign <= 0]
-        y = stack([full.sol(s) for s in t.tolist()], axis=0) if t.size else problem.y0[None][:0]
-    else:
-        keep = np.unique([*range(0, len(full.t), problem.save_every), len(full.t) - 1])
-        keep = keep[(full.t[keep] - t_end) * sign <= 0]
-        t, y = full.t[keep], full.y[keep]
-        if search.end and t[-1] != t_end:
-            t, y = np.append(t, t_end), stack([*y, search.end[1]], axis=0)
-    if search.end:
-        full.status, full.message = 1, ENDED
-    return replace(full, t=t, y=y, sol=full.sol if problem.dense_output else None)

@@ -182,6 +182,18 @@ class Scheme:
         shared = self.first_same_as_last and self.substeps[0][0] == "kick"
         return sum(with_it[1:-1] if shared else with_it) + (shared and (with_it[0] or with_it[-1]))
 
+    @cached_property
+    def strang_weights(self) -> tuple[float, ...] | None:
+        """The lengths of the Strang steps that the scheme is composed of; None if it is not."""
+        kinds = [s.kind for s in self.substeps]
+        inner = kinds[1] if len(kinds) > 2 and len(kinds) % 2 else ""
+        weights = tuple(s.one for s in self.substeps if s.kind == inner)
+        padded = (0.0, *weights, 0.0)
+        halves = [0.5 * (one + other) for one, other in pairwise(padded)]
+        outer = [s.one for s in self.substeps if s.kind != inner]
+        composed = self.level == 0 and weights and all(abs(a - b) < 1e-15 for a, b in zip(halves, outer, strict=True))
+        return weights if composed else None
+
     def inverse(self) -> Scheme:
         """The scheme Ψ with Ψ(h) ∘ Φ(h) = identity: the stages backwards, with opposite signs."""
         nothing: Any = [(0.0,), (0.0,), (0.0,), ((0.0,) * len(self.monomials),)]

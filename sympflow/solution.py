@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,10 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
     from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.integrators.base import Integrator
+    from sympflow.integrators.contract import Integrator
+
+SMALLEST_SCALE = 1e-12
+"""|H(y0)| below which an energy error is absolute, unless the system declares its `energy_scale`."""
 
 
 @dataclass
@@ -91,9 +95,15 @@ class Solution:
 
     def energy_error(self) -> np.ndarray:
         """Relative energy error over time, (..., n); inf where H is beyond floats; see `sympflow.energy_error`."""
-        from sympflow.metrics.energy import energy_error
+        return energy_change(self, stacklevel=3)
 
-        return energy_error(self)
+    def energy_scale(self) -> np.ndarray:
+        """The scale of the energy errors of each trajectory, (...); see `sympflow.metrics.energy.energy_scale`."""
+        declared = self.system.energy_scale
+        H0 = np.abs(_energy(self, self.y0))
+        if declared is not None:
+            return np.full_like(H0, declared)
+        return np.where(H0 < SMALLEST_SCALE, np.nan, H0)
 
     def to_scipy(self) -> OptimizeResult:
         """The `OdeResult` that `scipy.integrate.solve_ivp` would have returned; of a single trajectory.
@@ -128,3 +138,38 @@ class Solution:
         if not self.success:
             raise RuntimeError(self.message)
         return self
+
+
+def check_solution(sol: object, name: str = "sol") -> None:
+    """Raise a TypeError unless `sol` is a Solution."""
+    if not isinstance(sol, Solution):
+        raise TypeError(f"`{name}` must be a Solution; got {type(sol).__name__}. Pass what solve() returns.")
+
+
+def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> np.ndarray:
+    """H(y(t)) − H(y0) in float64, (..., n): the metric `sympflow.energy_error`, where it is documented.
+
+    The warning that the error is absolute is attributed to the caller `stacklevel` frames up.
+    """
+    with np.errstate(all="ignore"):
+        states = to_numpy(sol.states)
+        error = _energy(sol, states) - _energy(sol, sol.y0)[..., None]
+        if np.isnan(error).any():
+            error = np.where(np.isnan(error) & np.isfinite(states).all(-1), np.inf, error)
+        if not relative:
+            return error
+        scale = sol.energy_scale()
+        if (absolute := np.isnan(scale)).any():
+            warnings.warn(
+                f"The energy error is absolute where |H(y0)| < {SMALLEST_SCALE:g}: give the system an `energy_scale`.",
+                RuntimeWarning,
+                stacklevel=stacklevel,
+            )
+        compared = error / np.where(absolute, 1.0, scale)[..., None]
+        return np.where(np.isinf(error), error, compared)  # H(y0) may be infinite itself: inf/inf
+
+
+def _energy(sol: Solution, y: Array) -> np.ndarray:
+    """H in float64, whatever the precision of the run."""
+    with np.errstate(all="ignore"):
+        return np.asarray(sol.system.hamiltonian(to_numpy(y).astype(float)))

@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import MAX_ASKED_VALUES, MAX_SAVED_VALUES, check_save_every, check_t_eval, check_t_span
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
-from sympflow.domain_exit import check_domain
-from sympflow.events import EventSearch, parse, run_and_search
+from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import Integrator, Outcome, Problem
+from sympflow.integrators.base import run_and_search
+from sympflow.integrators.contract import Integrator, Outcome, Problem
+from sympflow.integrators.domain_exit import check_domain
 from sympflow.integrators.registry import build, check_applies, naming_plugin
 from sympflow.solution import Solution
 
@@ -104,8 +105,7 @@ def solve(
     integrator = build(method, options)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
-    if hasattr(integrator, "resolved"):  # which integrator a method is may depend on what it is asked for
-        integrator = integrator.resolved(system, y_start, abs(t1 - t0))
+    integrator = integrator.resolved(system, y_start, abs(t1 - t0))
     check_applies(integrator, system)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
     every = check_save_every(save_every, times)
@@ -132,7 +132,7 @@ def solve(
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
     if outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0):
-        from sympflow.singularity import note_singularities
+        from sympflow.integrators.diagnosis import note_singularities
 
         note_singularities(outcome, integrator, problem)
     if action != "ignore":
@@ -289,7 +289,7 @@ def check_memory(integrator: Integrator, problem: Problem) -> None:
         )
     if problem.t_eval is not None and not problem.dense_output:
         return
-    length = getattr(integrator, "step_length", lambda system: None)(problem.system)
+    length = integrator.step_length(problem.system)
     if length is None:
         return
     n_steps = abs(problem.t1 - problem.t0) / length

@@ -341,9 +341,9 @@ def test_on_kepler_the_logarithmic_methods_race():
 
 @pytest.mark.parametrize("optimizer", training_optimizers.OPTIMIZERS)
 def test_each_optimizer_stops_when_its_time_is_over(optimizer):
-    made = training_optimizers.recipes()["harmonic_oscillator"]
-    quick = dataclasses.replace(made, points=(40, 60))
-    result = training_optimizers.trained(quick, "harmonic_oscillator", "sympflow", optimizer, 0.05)
+    recipe = training_optimizers.recipe_of("harmonic_oscillator", "sympflow")
+    fits = tuple(dataclasses.replace(fit, points=n) for fit, n in zip(recipe.fits, (40, 60), strict=True))
+    result = training_optimizers.trained(dataclasses.replace(recipe, fits=fits), optimizer, 0.05)
     assert result.steps >= 1
     assert 0 < result.at_dt < 10
     assert training_optimizers.row(result).count("|") == 9

@@ -13,7 +13,7 @@ import numpy as np
 
 from contenders import loops, ours
 from contenders.contender import Contender, Scene, Skipped, Work
-from sympflow.timing import interleaved
+from sympflow.studies.attempts import interleaved
 
 SHORT = 0.1  # part of the interval over which a `short` calibration runs
 PROBE = 0.01  # part of the interval that a run's duration is estimated from

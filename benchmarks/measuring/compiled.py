@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from sympflow import HamiltonianSystem
-from sympflow.kernels.splitting import splitting_kernel
+from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES
-
-# What belongs to flows and to linear parts is imported where it is used: the start-up of a scheme, which kernels.py
-# times, imports neither.
 
 Run = Callable[..., Any]
 
@@ -33,52 +30,19 @@ class Loops:
 
 def scheme_loops(system: HamiltonianSystem, name: str) -> Loops:
     """The loops of a splitting scheme of the package."""
-    kernel, scheme = splitting_kernel(system), SCHEMES[name]
-    return Loops(partial(kernel.run, scheme), partial(kernel.run_batch, scheme, threads=1))
+    kernel = splitting_loops(system).kernel(SCHEMES[name])
+    return Loops(kernel.run, partial(kernel.run_batch, threads=1))
 
 
 def flow_loops(system: HamiltonianSystem, flow: Any) -> Loops:
-    """The loops that `solve` takes for a trained flow, which keep its numbers from call to call."""
+    """The loops of a trained flow, which keep its numbers from call to call."""
     kernel = flow.kernel_for(system)
-    return Loops(kernel.run, lambda h, y0, n, save: kernel.run_batch(h, y0, n, save, 1))
-
-
-def primed_loops(system: HamiltonianSystem, flow: Any) -> Loops:
-    """The loops of a primed flow alone."""
-    from sympflow.kernels.primed_flow import PrimedFlowKernel
-
-    kernel = PrimedFlowKernel(flow, system)
     return Loops(kernel.run, partial(kernel.run_batch, threads=1))
 
 
-def network_loops(flow: Any) -> Loops:
-    """The loops of a SympFlow with MLP potentials."""
-    from sympflow.kernels.mlp_flow import mlp_flow_kernel
-
-    kernel = mlp_flow_kernel(flow)
-    return Loops(kernel.run, partial(kernel.run_batch, threads=1))
-
-
-def with_linear_flow(name: str, **changes: Any) -> Any:
-    """The integrator of a scheme whose drift is replaced by the exact linear flow; `changes` are class attributes."""
-    from sympflow.integrators.linear_splitting import LinearSplitting
-
-    namespace = {"name": name, "order": SCHEMES[name].order, "scheme": SCHEMES[name], **changes}
-    return dataclass(frozen=True)(type(name, (LinearSplitting,), namespace))()
-
-
-def linear_loops(system: HamiltonianSystem, method: Any) -> Run:
-    """The loops of a method `with_linear_flow`, one state: (h, y0, n, save)."""
-    from sympflow.integrators.exact_maps import kernel_of, known_maps
-    from sympflow.kernels.parts import PartsKernel
-
-    parts = method.parts_of(system)
-    return partial(kernel_of(parts, PartsKernel).run, lambda h: known_maps(method, parts, float(h)))
-
-
-def with_step(method: Any, dt: float) -> Any:
-    """The method with another step."""
-    return replace(method, dt=dt)
+def method_loops(system: HamiltonianSystem, method: Any) -> Run:
+    """The loops of any splitting method, a scheme × a splitting, of one state: (h, y0, n, save)."""
+    return method.composed(system).kernel(False).run
 
 
 def last(n: int) -> np.ndarray:

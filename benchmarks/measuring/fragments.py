@@ -49,7 +49,7 @@ def command_line(section: str = "") -> str:
     """The command that runs, without the files that it writes; with `section` where it runs several."""
     script, *given = sys.argv
     words = [word for before, word in zip(["", *given], given, strict=False) if not {before, word} & set(FILES)]
-    if section and section.split()[0] not in words:
+    if section and section.split(maxsplit=1)[0] not in words:
         words.append(section)
     return " ".join(["python", f"benchmarks/{Path(script).name}", *words])
 

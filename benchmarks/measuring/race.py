@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from measuring.compiled import last, primed_loops, scheme_loops
+from measuring.compiled import flow_loops, last, scheme_loops
 from sympflow import HamiltonianSystem, get, solve
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
-from sympflow.integrators.log_sympflow import LogSympFlow
+from sympflow.integrators.flows import LogSympFlow
 from sympflow.metrics.reference import reference
 from sympflow.schemes import SCHEMES
 
@@ -47,7 +47,7 @@ class Runner:
         if isinstance(flow, ClockedFlow):
             name = f"{flow.scheme.name} with a clock, Δt = {flow.figures['step']:g}"
             return cls._through_solve(name, flow.scheme.force_evaluations, system, partial(LogSympFlow, flow=flow))
-        loops, scheme = primed_loops(system, flow), flow.kernel_scheme()
+        loops, scheme = flow_loops(system, flow), flow.kernel_scheme()
         name = f"Δt = {flow.dt:g}, {scheme.force_evaluations} + {flow.processor}"
         name += f", degree {max(map(sum, flow.monomials))}" if flow.monomials else ""
         return cls(name, scheme.force_evaluations, scheme.hessian_evaluations, loops.one, loops.many, flow.dt)

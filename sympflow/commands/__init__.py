@@ -7,21 +7,21 @@ from typing import Annotated
 import typer
 
 from sympflow import __version__
-from sympflow.commands import comparing, limits, listing, solving, training
-from sympflow.commands.output import out
+from sympflow.commands import listings, running, studying
+from sympflow.commands.console import out
 
 PARAMETERS = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Options that are unknown to a command may be parameters of a system: --omega 100."""
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
-app.command()(listing.systems)
-app.command()(listing.methods)
-app.command(context_settings=PARAMETERS)(listing.flows)
-app.command(context_settings=PARAMETERS)(solving.solve)
-app.command(context_settings=PARAMETERS)(comparing.compare)
-app.command(context_settings=PARAMETERS)(comparing.bench)
-app.command(context_settings=PARAMETERS)(limits.stability)
-app.command(context_settings=PARAMETERS)(training.train)
+app.command()(listings.systems)
+app.command()(listings.methods)
+app.command(context_settings=PARAMETERS)(listings.flows)
+app.command(context_settings=PARAMETERS)(running.solve)
+app.command(context_settings=PARAMETERS)(studying.compare)
+app.command(context_settings=PARAMETERS)(studying.bench)
+app.command(context_settings=PARAMETERS)(studying.stability)
+app.command(context_settings=PARAMETERS)(running.train)
 
 
 @app.callback(invoke_without_command=True)

@@ -13,23 +13,23 @@ with the c_k trained, orbit and time are exact but for what the series leaves ou
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from sympflow.flow.base import FlowMap
-from sympflow.flow.contents import Contents
+from sympflow.flow.files import MAX_DEGREE, Refused, checked_integer
+from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.layers import Drift, Kick, Layer
-from sympflow.flow.placement import checked_device, checked_dtype
 from sympflow.flow.potentials import Potential, Time
 from sympflow.flow.primed_potentials import KINETIC, POTENTIAL, Binding, PrimedPotential
-from sympflow.flow.sympflow import SympFlow
+from sympflow.flow.sympflow import UNCOMPENSATED, SympFlow
+from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, scheme_evaluations
 
-if TYPE_CHECKING:
-    from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.kernels.clocked_flow import ClockedFlowKernel
+if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.kernels.flow_loops import ClockedFlowKernel
 
 
 class ClockPotential(Potential):
@@ -112,7 +112,7 @@ class ClockedFlow(SympFlow):
     ndof : int
         Of the transformed system.
     scheme : str
-        A symmetric one of `sympflow.integrators.schemes.SCHEMES`, without force gradients.
+        A symmetric one of `sympflow.schemes.SCHEMES`, without force gradients.
     terms : int
         Of the clock.
     dt : float
@@ -147,9 +147,8 @@ class ClockedFlow(SympFlow):
         self.scheme = table
         self.clock = ClockPotential(ndof, terms, checked_dtype(dtype), checked_device(device))
         self._binding = Binding(system)
-        self._kernel: ClockedFlowKernel | None = None
-        self._contents = Contents([self.clock._parameters])
-        self._numbers: tuple[bytes, tuple[float, ...]] | None = None
+        self._loops: ClockedFlowKernel | None = None  # compiled, of the system that was asked for last
+        self._numbers: Kept[tuple[float, ...]] = Kept([self.clock._parameters])
         maps: list[Layer] = []
         for kind, c, *_ in table.substeps:
             term = KINETIC if kind == "drift" else POTENTIAL
@@ -175,31 +174,28 @@ class ClockedFlow(SympFlow):
         return self.clock.numbers.device
 
     def advance(self, s: Any, B: Any) -> Any:
-        """By how much the clock puts the time forward in steps s, which may be negative, at B: numbers or arrays."""
+        """Return by how much the clock puts the time forward in steps s at B: numbers or arrays; s may be negative."""
         square = s * s * B
         total = 0.0 * square
-        for c in self.numbers():
+        for c in self.clock_numbers():
             total = total * square + c
         return s * s * s * total
 
-    def numbers(self) -> tuple[float, ...]:
-        """The c_k that the clock has now, the last one first."""
-        snapshot, known = self._contents.snapshot(), self._numbers
-        if known is None or known[0] != snapshot:
-            values = self.clock.numbers.detach().cpu().double().numpy()[::-1].tolist()
-            known = self._numbers = snapshot, tuple(values)
-        return known[1]
+    def clock_numbers(self) -> tuple[float, ...]:
+        """Return the c_k that the clock has now, the last one first."""
+        return self._numbers.current(lambda: tuple(self.clock.numbers.detach().cpu().double().numpy()[::-1].tolist()))
 
-    def kernel_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
-        """The compiled loops of this flow."""
-        if self._kernel is None or self._kernel.system is not system:
-            from sympflow.kernels.clocked_flow import ClockedFlowKernel
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> ClockedFlowKernel:
+        from sympflow.kernels.flow_loops import ClockedFlowKernel
 
-            self._kernel = ClockedFlowKernel(self, system)
-        return self._kernel
+        if compensated:
+            raise ValueError(UNCOMPENSATED)
+        check_compilable(self.dtype, self.device)
+        if self._loops is None or self._loops.system is not system:
+            self._loops = ClockedFlowKernel(self.scheme, system, self.advance, self.clock_numbers)
+        return self._loops
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Evaluations of the forces, as `FixedStep.evaluations`."""
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
 
     @property
@@ -207,7 +203,7 @@ class ClockedFlow(SympFlow):
         """The transformed system whose V and T the flow uses, None for one loaded without it."""
         return self._binding.system if self._binding.known else None
 
-    def bind(self, system: HamiltonianSystem) -> ClockedFlow:
+    def bind(self, system: HamiltonianSystem) -> Self:
         """Give a flow that was loaded from a file its transformed system; itself.
 
         Raises
@@ -220,9 +216,17 @@ class ClockedFlow(SympFlow):
         self._binding.bind(system)
         return self
 
-    def bound(self, system: HamiltonianSystem) -> ClockedFlow:
-        """This flow, bound to `system` if it was loaded without one."""
+    def bound(self, system: HamiltonianSystem) -> Self:
         return self if self._binding.known else self.bind(system)
 
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.ndof, "clocked": {"scheme": self.scheme.name, "terms": len(self.clock.numbers)}}
+
+    @classmethod
+    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
+        """Return a flow that has no system yet: `bind` will give it one."""
+        described = plan["clocked"]
+        if not isinstance(described, dict) or not isinstance(described.get("scheme"), str):
+            raise Refused("its scheme is missing")
+        terms = checked_integer(described.get("terms"), "number of terms", MAX_DEGREE)
+        return cls(ndof, described["scheme"], terms, dt, dtype=dtype)

@@ -5,11 +5,14 @@ Arrays are feature-major, as in `sympflow.flow.potentials`: q and p have shape (
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor, nn
 
-from sympflow.flow.potentials import Potential, Time
+from sympflow.flow.potentials import NO_NETWORK, Potential, Time
+
+if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.kernels.network_loops import NetworkLayer
 
 
 class Layer(nn.Module):
@@ -45,6 +48,16 @@ class Layer(nn.Module):
     def to_dict(self) -> dict[str, Any]:
         raise NotImplementedError
 
+    def network(self) -> NetworkLayer:
+        """Return its weights for compiled loops.
+
+        Raises
+        ------
+        ValueError
+            If there are none: if it is not a kick or a drift with an MLP potential.
+        """
+        raise ValueError(NO_NETWORK)
+
 
 class _PotentialLayer(Layer):
     def __init__(self, potential: Potential) -> None:
@@ -54,6 +67,9 @@ class _PotentialLayer(Layer):
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": self.kind, "potential": self.potential.to_dict()}
+
+    def network(self) -> NetworkLayer:
+        return self.potential.network(self.kind == "kick")
 
 
 class Kick(_PotentialLayer):

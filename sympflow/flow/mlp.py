@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from sympflow.flow.activations import activation as activation_named
-from sympflow.flow.arguments import checked_time
-from sympflow.flow.base import FlowMap
-from sympflow.flow.placement import checked_device, checked_dtype
-from sympflow.flow.potentials import hidden_widths, outer
+from sympflow.flow.files import checked_widths
+from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.potentials import activation_named, hidden_widths, outer
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
+from sympflow.flow.weights import checked_device, checked_dtype
 
 MAX_DIFFERENCE = 6  # between the widths of two layers that are about the same
 
@@ -92,9 +91,14 @@ class MLPFlow(FlowMap):
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.ndof, "hidden": list(self.hidden), "activation": self.activation}
 
+    @classmethod
+    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
+        hidden = checked_widths(plan.get("hidden"), 2 * ndof)
+        return cls(ndof, hidden, str(plan.get("activation")), dt, dtype)
+
     def forward(self, t: float | Tensor, x: Tensor) -> Tensor:
         """ψ_t(x) for t ≥ 0, extended beyond Δt as SympFlow is; for t < 0 a ValueError, for want of an inverse."""
-        checked = checked_time(self, t, x)
+        checked = self._checked_time(t, x)
         negative = checked < 0 if isinstance(checked, float) else bool((checked < 0).any())
         if negative:
             raise ValueError("`t` must not be negative: an MLPFlow has no exact inverse; use a SympFlow to go back.")

@@ -2,22 +2,132 @@
 
 Arrays here are feature-major: points x have shape (d, N), hidden features (h, N), one column a point. Products with
 the small weight matrices are several times faster that way round. A time t is a float or a tensor of shape () or (N,).
+
+A potential must be C² (Canizares et al. 2024, section 2.1), so every activation σ is smooth. Each is given by what the
+sweeps through a network need of it, which shares more than separate derivatives would.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from sympflow.arguments import plain
-from sympflow.flow.activations import activation as activation_named
-from sympflow.flow.placement import checked_device, checked_dtype
+from sympflow.flow.weights import checked_device, checked_dtype
+
+if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.kernels.network_loops import NetworkLayer
 
 Time = float | Tensor
+
+NO_NETWORK = "`flow` has layers other than kicks and drifts with MLP potentials: use backend='array'."
+
+
+class Activation:
+    """σ, and its derivatives as the sweeps need them."""
+
+    def value(self, a: Tensor) -> Tensor:
+        """σ(a)."""
+        return self.slope(a)[0]
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        """σ(a) and σ'(a)."""
+        raise NotImplementedError
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """σ(a) and σ'(a), then their derivatives σ'(a) ȧ and σ''(a) ȧ along ȧ."""
+        raise NotImplementedError
+
+
+class Tanh(Activation):
+    """tanh a."""
+
+    def value(self, a: Tensor) -> Tensor:
+        return torch.tanh(a)
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        h = torch.tanh(a)
+        return h, 1 - h * h
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        h, slope = self.slope(a)
+        dh = slope * da
+        return h, slope, dh, -2 * h * dh
+
+
+class Sin(Activation):
+    """sin a."""
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.sin(a), torch.cos(a)
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        h, slope = self.slope(a)
+        return h, slope, slope * da, -h * da
+
+
+class Sigmoid(Activation):
+    """1 / (1 + exp(−a))."""
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        h = torch.sigmoid(a)
+        return h, h * (1 - h)
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        h, slope = self.slope(a)
+        dh = slope * da
+        return h, slope, dh, (1 - 2 * h) * dh
+
+
+class Softplus(Activation):
+    """log(1 + exp a)."""
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.logaddexp(a, torch.zeros_like(a)), torch.sigmoid(a)
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        h, slope = self.slope(a)
+        dh = slope * da
+        return h, slope, dh, (1 - slope) * dh
+
+
+class LogCosh(Activation):
+    """log cosh a, whose derivative is tanh a."""
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.logaddexp(a, -a) - math.log(2), torch.tanh(a)
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        h, slope = self.slope(a)
+        return h, slope, slope * da, (1 - slope * slope) * da
+
+
+ACTIVATIONS: dict[str, Activation] = {
+    "tanh": Tanh(),
+    "sin": Sin(),
+    "sigmoid": Sigmoid(),
+    "softplus": Softplus(),
+    "logcosh": LogCosh(),
+}
+
+
+def activation_named(name: str) -> Activation:
+    """Return the activation of that name.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    if not isinstance(name, str) or name not in ACTIVATIONS:
+        raise ValueError(f"`activation` {name!r} is unknown: choose one of {', '.join(ACTIVATIONS)}.")
+    return ACTIVATIONS[name]
 
 
 class Potential(nn.Module):
@@ -28,7 +138,7 @@ class Potential(nn.Module):
     1. `impulse(t, x)`: ∇V(t, x) − ∇V(0, x), shape (d, N).
     2. `impulse_and_rate(t, x)`: the impulse, and ∂_tV(t, x) of shape (N,).
     3. `impulse_and_tangent(t, x, dx)`: the impulse, and its derivative along a curve x(t) with velocity dx.
-    4. `to_dict()`: its architecture, JSON-able, from which `flow.io` builds it again.
+    4. `to_dict()`: its architecture, JSON-able, from which its family builds it again.
     """
 
     ndof: int
@@ -45,6 +155,10 @@ class Potential(nn.Module):
     def to_dict(self) -> dict[str, Any]:
         raise NotImplementedError
 
+    def network(self, is_kick: bool) -> NetworkLayer:
+        """Return the weights of a kick or drift of it for compiled loops; ValueError if there are none."""
+        raise ValueError(NO_NETWORK)
+
 
 class MLPPotential(Potential):
     """V(t, x) = c · N(t/τ, x/s), N a multilayer perceptron of any depth whose input is x with t appended.
@@ -60,7 +174,7 @@ class MLPPotential(Potential):
     hidden : sequence of int
         Widths of the hidden layers; the published architecture is (10, 10).
     activation : str
-        σ, a name in `sympflow.flow.activations.ACTIVATIONS`.
+        σ, a name in `sympflow.flow.potentials.ACTIVATIONS`.
     scale, center : sequence of d floats, optional
         s, and the mean of x that the initial biases allow for.
     tau, gain : float
@@ -136,6 +250,16 @@ class MLPPotential(Potential):
         """The weights (K/s, k/τ, [b_l], [W_l], c·w): V(t, x) = c·w · σ(… σ((K/s) x + (k/τ) t + b_1) …)."""
         K, k, w = self.weight_x / self.scale, self.weight_t / self.tau, self.gain * self.weight_out
         return K, k, list(self.biases), list(self.weights), w
+
+    def network(self, is_kick: bool) -> NetworkLayer:
+        from sympflow.kernels.network_loops import NetworkLayer
+
+        K, k, b, W, w = self.folded()
+
+        def array(weight: Tensor) -> np.ndarray:
+            return weight.detach().cpu().numpy()
+
+        return NetworkLayer(is_kick, self.activation, array(K), array(k), [*map(array, b)], [*map(array, W)], array(w))
 
     # V and its derivatives at one time ---------------------------------------------------------------
 
@@ -242,7 +366,7 @@ def outer(k: Tensor, t: Time) -> Tensor:
 
 
 def hidden_widths(hidden: Sequence[int]) -> tuple[int, ...]:
-    """`hidden`, checked."""
+    """Return `hidden`, checked."""
     widths = tuple(map(plain, hidden)) if isinstance(hidden, Sequence) else ()
     if not widths or any(isinstance(h, bool) or not isinstance(h, int) or h < 1 for h in widths):
         raise ValueError(f"`hidden` must be the widths of one or more hidden layers, such as (10, 10); got {hidden!r}.")

@@ -6,7 +6,7 @@
 In place of the last two terms a kick may have a trained polynomial, t³ Σ_m e_m(τ) q^m.
 
 Frozen at any t such a flow is a splitting scheme, kicks b, force gradients γ, curvatures c and drifts a in the
-convention of `sympflow.integrators.scheme`: a SympFlow of this kind is a table of numbers that varies smoothly with t.
+convention of `sympflow.schemes`: a SympFlow of this kind is a table of numbers that varies smoothly with t.
 
 With a processor it is ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹, the kernel K and the processor χ being such tables: over many steps
 of Δt only K is executed, as the χ between two steps cancel.
@@ -14,18 +14,21 @@ of Δt only K is executed, as the χ between two steps cancel.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from sympflow.flow.base import FlowMap
+from sympflow.arguments import check_flag, plain
 from sympflow.flow.coefficients import Coefficients, Entry
-from sympflow.flow.frozen import KeptTables, Kind, Substep, Tables
+from sympflow.flow.files import MAX_DEGREE, MAX_LAYERS, Refused, checked_integer
+from sympflow.flow.flow_map import FlowMap, check_system
 from sympflow.flow.layers import Drift, Kick
-from sympflow.flow.placement import checked_device, checked_dtype
+from sympflow.flow.potentials import Time
 from sympflow.flow.primed_potentials import (
     CURVATURE,
     FORCE_GRADIENT,
@@ -36,15 +39,339 @@ from sympflow.flow.primed_potentials import (
     PrimedPotential,
     Term,
 )
-from sympflow.flow.sequences import Terms, alternating, columns_of, substeps_of
 from sympflow.flow.sympflow import SympFlow
-from sympflow.hamiltonian.monomials import Monomials
-from sympflow.schemes import Scheme
+from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
+from sympflow.hamiltonian.monomials import MOST_MONOMIALS, Monomials, monomials
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.schemes import CURVATURE as CURVATURE_LEVEL
+from sympflow.schemes import POLYNOMIAL as POLYNOMIAL_LEVEL
+from sympflow.schemes import SCHEMES, Scheme, compose, scheme_evaluations
 
-if TYPE_CHECKING:
-    from sympflow.flow.potentials import Time
-    from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.kernels.primed_flow import PrimedFlowKernel
+if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.kernels.flow_loops import PrimedFlowKernel
+    from sympflow.kernels.stages import StageTable
+
+Kind = Literal["kick", "drift"]
+
+MOST_KEPT = 256  # a flow with a processor has five for each step length
+
+
+@dataclass(frozen=True)
+class PrimedShape:
+    """The architecture of a primed flow.
+
+    Parameters
+    ----------
+    first : {"kick", "drift"}
+        The map that comes first, in the kernel and in the processor.
+    maps : int
+        How many kicks and drifts the kernel has.
+    degree : int
+        Degree in t of t b(t/Δt) and t a(t/Δt).
+    palindromic, force_gradient : bool
+    processor : int
+        Number C of pairs of χ, 2C + 1 maps; 0 for none.
+    curvature : bool
+        True if kicks with force gradients have curvature terms too, for symbolic systems.
+    monomials : tuple of tuple of int
+        The exponents m of polynomials that stand in place of both, for symbolic systems; none for none.
+
+    Raises
+    ------
+    ValueError
+        If there is no such flow.
+    """
+
+    first: Kind
+    maps: int
+    degree: int
+    palindromic: bool
+    force_gradient: bool
+    processor: int = 0
+    curvature: bool = False
+    monomials: Monomials = ()
+
+    def __post_init__(self) -> None:
+        maps, degree, processor = self.maps, self.degree, self.processor
+        for name, value, least in (("maps", maps, 1), ("degree", degree, 1), ("processor", processor, 0)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                kind = "positive" if least else "non-negative"
+                remedy = "give 1 or more" if least else "0 is for none"
+                raise ValueError(f"`{name}` must be a {kind} integer; got {value!r}: {remedy}.")
+        if maps < 2 or (self.palindromic and maps % 2 == 0):
+            raise ValueError(f"`maps` must be at least 2, and odd for a palindrome; got {maps}: add a kick or a drift.")
+        if processor and degree < 2:
+            raise ValueError(
+                f"`degree` must be at least 2 with a processor, whose lowest power of t is t²; got {degree}."
+            )
+        if self.curvature and not self.force_gradient:
+            raise ValueError("`curvature` goes with force gradients: leave it out.")
+        if self.monomials and self.force_gradient:
+            raise ValueError("`monomials` stand in place of force gradients: leave these out.")
+
+    @property
+    def kernel(self) -> tuple[Kind, ...]:
+        """The kinds of the maps of K."""
+        return _alternating(self.first, self.maps)
+
+    @property
+    def outer(self) -> tuple[Kind, ...]:
+        """The kinds of the maps of χ."""
+        return _alternating(self.first, 2 * self.processor + 1 if self.processor else 0)
+
+    def columns(self, sequence: Sequence[Kind], dt: float, total: float | None, **like: Any) -> Columns:
+        """Return untrained columns of the numbers of K, whose kicks and drifts have a `total` of 1, or of χ."""
+        if not sequence:
+            return Columns()
+        powers, mirrored = range(0, self.degree, 2 if self.palindromic else 1), self.palindromic and total is not None
+
+        def column(kind: Kind, power: int, total: float | None = None) -> Coefficients:
+            return Coefficients(sequence.count(kind), tuple(powers), dt, power, mirrored, total, **like)
+
+        return Columns(
+            column("kick", 1, total),
+            column("drift", 1, total),
+            column("kick", 3) if self.force_gradient else None,
+            column("kick", 5) if self.curvature else None,
+            nn.ModuleList(column("kick", 3) for _ in self.monomials) if self.monomials else None,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {
+            "first": self.first,
+            "maps": self.maps,
+            "degree": self.degree,
+            "palindromic": self.palindromic,
+            "force_gradient": self.force_gradient,
+            "processor": self.processor,
+            "curvature": self.curvature,
+            **({"monomials": [list(m) for m in self.monomials]} if self.monomials else {}),
+        }
+
+    @classmethod
+    def from_dict(cls, plan: Any, ndof: int) -> Self:
+        """Return the shape that a file describes, all of which is checked.
+
+        Raises
+        ------
+        Refused, ValueError
+        """
+        if not isinstance(plan, dict) or plan.get("first") not in ("kick", "drift"):
+            raise Refused("its plan of a primed flow is missing")
+        flags: dict[str, Any] = {name: plan.get(name) for name in ("palindromic", "force_gradient")}
+        flags["curvature"] = plan.get("curvature", False)
+        for name, value in flags.items():
+            if not isinstance(value, bool):
+                raise Refused(f"its {name} is neither true nor false")
+        maps = checked_integer(plan.get("maps"), "number of maps", MAX_LAYERS)
+        degree = checked_integer(plan.get("degree"), "degree", MAX_DEGREE)
+        processor = plan.get("processor", 0)
+        if processor != 0 or isinstance(processor, bool):
+            processor = checked_integer(processor, "processor", MAX_LAYERS)
+        exponents = _checked_monomials(plan.get("monomials", []), ndof)
+        return cls(plan["first"], maps, degree, processor=processor, monomials=exponents, **flags)
+
+
+def _alternating(first: Kind, n: int) -> tuple[Kind, ...]:
+    """Return the kinds of n maps."""
+    other: Kind = "drift" if first == "kick" else "kick"
+    return tuple(first if i % 2 == 0 else other for i in range(n))
+
+
+def _checked_monomials(plan: Any, ndof: int) -> Monomials:
+    if not isinstance(plan, list) or len(plan) > MOST_MONOMIALS:
+        raise Refused(f"its monomials are not a list of at most {MOST_MONOMIALS}")
+    for m in plan:
+        if not isinstance(m, list) or len(m) != ndof:
+            raise Refused(f"its monomials do not have {ndof} exponents each")
+        if not all(isinstance(e, int) and not isinstance(e, bool) and 0 <= e <= MAX_DEGREE for e in m):
+            raise Refused(f"its monomials have exponents that are not integers from 0 to {MAX_DEGREE}")
+    exponents = tuple(tuple(m) for m in plan)
+    if len(set(exponents)) < len(exponents) or (0,) * ndof in exponents:
+        raise Refused("its monomials are not different ones that vary with q")
+    return exponents
+
+
+class Columns(NamedTuple):
+    """The columns of a sequence of maps; all None if it is empty."""
+
+    kicks: Any = None
+    drifts: Any = None
+    gradients: Any = None
+    curvatures: Any = None
+    polynomials: Any = None
+
+
+@dataclass(frozen=True)
+class Substep:
+    """A kick or a drift of the flow: its coefficient, and those of a kick's other terms.
+
+    These are a force gradient and a curvature, or one for each monomial of a polynomial.
+    """
+
+    kind: Kind
+    weight: Entry
+    more: tuple[Entry, ...] = ()
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        return self.weight, *self.more
+
+
+def substeps_of(sequence: Sequence[Kind], columns: Columns, sign: int) -> list[Substep]:
+    """Return the maps of a sequence, with their places in the columns."""
+    kicks, drifts, gradients, curvatures, polynomials = columns
+    more = [c for c in (gradients, curvatures) if c is not None] if polynomials is None else polynomials
+    made = []
+    for i, kind in enumerate(sequence):
+        one, *others = [kicks, *more] if kind == "kick" else [drifts]
+        made.append(Substep(kind, Entry(one, i // 2, sign), tuple(Entry(c, i // 2, sign) for c in others)))
+    return made
+
+
+class Tables:
+    """The numbers of kicks and drifts of ψ̄_t, K_t and χ_t: at one t as a `Scheme`, at all t as polynomials.
+
+    Parameters
+    ----------
+    substeps : sequence of Substep
+        χ⁻¹, K, χ, with the numbers that they have now.
+    outer : int
+        How many of them χ has.
+    dt : float
+        Δt.
+    monomials
+        Of the polynomials of kicks, where they have them.
+    """
+
+    def __init__(self, substeps: Sequence[Substep], outer: int, dt: float, monomials: Monomials = ()) -> None:
+        last = len(substeps) - outer
+        self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
+        self.dt, self.processed = dt, outer > 0
+        self.kernel: PrimedFlowKernel | None = None  # the compiled loops that were made of these last
+        self.monomials = monomials
+        self.level = POLYNOMIAL_LEVEL if monomials else max(len(s.more) for s in substeps)
+        numbers = [c.table for c in columns_of(substeps)]
+        self.placements = {(c.dtype, c.device) for c in numbers}
+        exponents = columns_of(substeps)[0].exponents
+        self._coefficients = {id(c): c.table.detach().cpu().double().numpy() for c in columns_of(substeps)}
+        self._exponents = np.array(exponents, dtype=float)
+        self._even = exponents[1:2] != (1,)
+        self._kept: dict[Any, Any] = {}
+
+    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return what `make` gives, made once for each key."""
+        if key not in self._kept:
+            if len(self._kept) > MOST_KEPT:
+                self._kept.clear()
+            self._kept[key] = make()
+        return self._kept[key]
+
+    def scheme(self, part: str, t: float | None, back: bool = False) -> Scheme:
+        """The part at t ∈ (0, Δt], the default Δt; `back` its inverse."""
+
+        def make() -> Scheme:
+            return self.scheme(part, t).inverse() if back else self._frozen(part, t)
+
+        return self.kept((part, t, back), make)
+
+    def polynomials(self, back: bool) -> StageTable:
+        """The stages of ψ̄_t or of its inverse for all t, as coefficients of polynomials (m, K).
+
+        Kicks and drifts are divided by t, gradients and polynomials in q by t³, curvatures by t⁵. They multiply the
+        powers 0 … K−1 of `variable`; K is at least 3, by zeros if need be.
+        """
+
+        from sympflow.kernels.stages import StageTable
+
+        def make() -> StageTable:
+            parts, sign = self._parts["primed"], -1 if back else 1
+            substeps = reversed(parts) if back else parts
+            stages = self._stages((s.kind, _numbers(s, self._coefficients, sign)) for s in substeps)
+            numbers = np.array(stages, dtype=float)  # (m, columns, K)
+            numbers = np.pad(numbers, ((0, 0), (0, 0), (0, max(0, 3 - numbers.shape[2]))))
+            kicks, gradients, curvatures = (numbers[:, i] for i in range(3))
+            return StageTable(self.level, kicks, numbers[:, -1], gradients, curvatures, numbers[:, 3:-1])
+
+        return self.kept(("polynomials", back), make)
+
+    def variable(self, t: np.ndarray) -> np.ndarray:
+        """t/Δt, or its square where all polynomials are even.
+
+        Raises
+        ------
+        ValueError
+            If a t lies beyond Δt.
+        """
+        tau = t / self.dt
+        if not (tau <= 1 + 1e-12).all():
+            raise ValueError(f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t.max():g}.")
+        return tau * tau if self._even else tau
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Count forces, force gradients and curvature terms of a run: `FlowMap.evaluations`."""
+
+        def make() -> dict[str, int]:
+            counts = [scheme_evaluations(self.scheme("primed kernel", None), n_steps, n_saved, 0, backend)]
+            if n_extra:
+                counts.append(scheme_evaluations(self.scheme("primed", None), 0, 0, n_extra, backend))
+            if self.processed:  # once at the start, and for each output
+                n = n_saved + (n_steps > 0)
+                counts.append(scheme_evaluations(self.scheme("primed processor", None), 0, 0, n, backend))
+            return {name: sum(count[name] for count in counts) for name in counts[0]}
+
+        return dict(self.kept((n_steps, n_saved, n_extra, backend), make))
+
+    def _frozen(self, part: str, t: float | None) -> Scheme:
+        t = self.dt if t is None else float(t)
+        if not 0 < t <= self.dt * (1 + 1e-12):
+            raise ValueError(
+                f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t!r}: longer times are several steps, of at most dt."
+            )
+        powers = (t / self.dt) ** self._exponents
+        values = {column: table @ powers for column, table in self._coefficients.items()}
+        stages = self._stages((s.kind, _numbers(s, values, 1)) for s in self._parts[part])
+        columns = [tuple(map(float, column)) for column in zip(*stages, strict=True)]
+        kicks, gradients, curvatures, drifts = *columns[:3], columns[-1]
+        source = f"a primed SympFlow, Δt = {self.dt:g}, frozen at t = {t:g}"
+        more: dict[str, Any] = {"curvatures": curvatures} if self.level == CURVATURE_LEVEL else {}
+        if self.monomials:
+            more = {"polynomials": tuple(zip(*columns[3:-1], strict=True)), "monomials": self.monomials}
+        return Scheme(part, None, kicks, drifts, gradients, source, self.level > 0, **more)
+
+    def _stages(self, substeps: Iterable[tuple[Kind, list[Any]]]) -> list[list[Any]]:
+        """[kick, gradient, curvature, polynomial …, drift] of the stages, neighbours of one kind merged."""
+        stages: list[list[Any]] = []
+        before = "drift"
+        width = 3 + len(self.monomials)
+        for kind, numbers in substeps:
+            zero = 0 * numbers[0]
+            if kind == "drift" and stages:
+                stages[-1][-1] = stages[-1][-1] + numbers[0]
+            elif kind == "drift":
+                stages.append([zero] * width + numbers)
+            else:
+                # Polynomials stand in place of force gradients and curvatures.
+                kick = [numbers[0], *([zero] * 2 if self.monomials else []), *numbers[1:]]
+                kick += [zero] * (width - len(kick))
+                if before == "kick" and stages:
+                    stages[-1][:-1] = [one + two for one, two in zip(stages[-1][:-1], kick, strict=True)]
+                else:
+                    stages.append([*kick, zero])
+            before = kind
+        return stages
+
+
+def columns_of(substeps: Sequence[Substep]) -> list[Coefficients]:
+    """Return the distinct columns that the substeps take their numbers from."""
+    entries = [entry for s in substeps for entry in s.entries]
+    return list({id(entry.column): entry.column for entry in entries}.values())
+
+
+def _numbers(s: Substep, values: dict[int, np.ndarray], sign: int) -> list[Any]:
+    """Return the coefficients of a substep, out of those of the columns."""
+    return [sign * e.sign * values[id(e.column)][e.row] for e in s.entries]
 
 
 class PrimedFlow(SympFlow):
@@ -56,23 +383,11 @@ class PrimedFlow(SympFlow):
     Parameters
     ----------
     ndof : int
-    first : {"kick", "drift"}
-        The map that comes first, in the kernel and in the processor.
-    maps : int
-        How many kicks and drifts the kernel has.
-    degree : int
-        Degree in t of t b(t/Δt) and t a(t/Δt).
-    palindromic, force_gradient : bool
+    shape : PrimedShape
     dt : float
         Δt.
     system : HamiltonianSystem, optional
         Without it the flow has a `scheme`, but no values.
-    processor : int
-        Number C of pairs of χ, 2C + 1 maps; 0 for none.
-    curvature : bool
-        Whether kicks with force gradients have curvature terms too, for symbolic systems.
-    monomials : tuple of tuple of int
-        The exponents m of polynomials that stand in place of both, for symbolic systems; none for none.
     dtype, device
         Of the parameters.
 
@@ -87,60 +402,117 @@ class PrimedFlow(SympFlow):
     processor_kicks, processor_drifts, processor_gradients, processor_curvatures, processor_polynomials
         Those of χ, or None.
     substeps : tuple of Substep
-        What is executed, in this order: χ⁻¹, K, χ.
+        The maps in the order in which they are executed: χ⁻¹, K, χ.
     """
 
     def __init__(
         self,
         ndof: int,
-        first: Kind,
-        maps: int,
-        degree: int,
-        palindromic: bool,
-        force_gradient: bool,
+        shape: PrimedShape,
         dt: float = 1.0,
         system: HamiltonianSystem | None = None,
-        processor: int = 0,
-        curvature: bool = False,
-        monomials: Monomials = (),
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
         FlowMap.__init__(self, ndof, dt)
-        for name, value, least in (("maps", maps, 1), ("degree", degree, 1), ("processor", processor, 0)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                kind = "positive" if least else "non-negative"
-                remedy = "give 1 or more" if least else "0 is for none"
-                raise ValueError(f"`{name}` must be a {kind} integer; got {value!r}: {remedy}.")
-        if maps < 2 or (palindromic and maps % 2 == 0):
-            raise ValueError(f"`maps` must be at least 2, and odd for a palindrome; got {maps}: add a kick or a drift.")
-        if processor and degree < 2:
-            raise ValueError(
-                f"`degree` must be at least 2 with a processor, whose lowest power of t is t²; got {degree}."
-            )
-        if curvature and not force_gradient:
-            raise ValueError("`curvature` goes with force gradients: leave it out.")
-        if monomials and force_gradient:
-            raise ValueError("`monomials` stand in place of force gradients: leave these out.")
-        self.degree, self.palindromic, self.processor, self.monomials = degree, palindromic, processor, monomials
+        self.shape = shape
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
-        kernel, chi = alternating(first, maps), alternating(first, 2 * processor + 1 if processor else 0)
-        stride, terms = 2 if palindromic else 1, Terms(force_gradient, curvature, len(monomials))
-        inside = columns_of(kernel, degree, stride, self.dt, palindromic, 1.0, terms, **like)
-        outside = columns_of(chi, degree, stride, self.dt, False, None, terms, **like)
+        inside = shape.columns(shape.kernel, self.dt, 1.0, **like)
+        outside = shape.columns(shape.outer, self.dt, None, **like)
         self.kicks, self.drifts, self.gradients, self.curvatures, self.polynomials = inside
         self.processor_kicks, self.processor_drifts, self.processor_gradients = outside[:3]
         self.processor_curvatures, self.processor_polynomials = outside[3:]
-        inner = substeps_of(kernel, inside, 1)
-        outer = {sign: substeps_of(chi, outside, sign) for sign in (1, -1)}
+        inner = substeps_of(shape.kernel, inside, 1)
+        outer = {sign: substeps_of(shape.outer, outside, sign) for sign in (1, -1)}
         self.substeps: tuple[Substep, ...] = (*reversed(outer[-1]), *inner, *outer[1])
-        self._n_outer = len(chi)
-        self._tables = KeptTables(self.substeps, self._n_outer, self.dt, monomials)
+        self._tables: Kept[Tables] = Kept(column._parameters for column in columns_of(self.substeps))
         self._binding = Binding(system)
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(self._layer(substep) for substep in self.substeps)  # type: ignore[assignment]
         if system is not None:
             self.fingerprint, self.system_name = system.fingerprint, system.name
+
+    @classmethod
+    def untrained(
+        cls,
+        system: HamiltonianSystem,
+        *,
+        stages: int | None,
+        dt: float,
+        palindromic: bool,
+        scheme: Scheme | str | None,
+        degree: int | None,
+        force_gradient: bool | None,
+        processor: int,
+        curvature: bool,
+        polynomial: int | None,
+        first: str,
+        dtype: torch.dtype,
+        device: torch.device | str | None,
+    ) -> Self:
+        """Return a flow that is, at every t, equal leapfrog steps or the given scheme: see `SympFlow.primed`."""
+        stages, palindromic, scheme, degree, force_gradient = map(
+            plain, (stages, palindromic, scheme, degree, force_gradient)
+        )
+        processor, curvature, polynomial = map(plain, (processor, curvature, polynomial))
+        check_system(system)
+        check_flag("palindromic", palindromic)
+        check_flag("curvature", curvature)
+        if force_gradient is not None:
+            check_flag("force_gradient", force_gradient)
+        if not system.separable:
+            raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
+        exponents = _monomials_of(system, polynomial, force_gradient, curvature)
+        force_gradient = _force_gradient_of(system, False if exponents else force_gradient, curvature)
+        scheme = _starting_scheme(system, scheme, stages, first)
+        if palindromic and not scheme.symmetric:
+            raise ValueError(f"`scheme` {scheme.name!r} is not symmetric: take another, or palindromic=False.")
+        if any(scheme.gradients) and exponents:
+            raise ValueError(
+                f"`polynomial` stands in place of force gradients, as {scheme.name!r} has them: take another."
+            )
+        if any(scheme.gradients) and not force_gradient:
+            raise ValueError(f"`force_gradient` is False but {scheme.name!r} has force gradients: leave it out.")
+        substeps = scheme.substeps
+        shape = PrimedShape(
+            first="kick" if substeps[0].kind == "kick" else "drift",
+            maps=len(substeps),
+            degree=degree if degree is not None else 5 if processor else 7,
+            palindromic=palindromic,
+            force_gradient=force_gradient,
+            processor=processor,
+            curvature=curvature,
+            monomials=exponents,
+        )
+        flow = cls(system.ndof, shape, dt, system, dtype, device)
+        kicks, drifts = ([s for s in substeps if s.kind == kind] for kind in ("kick", "drift"))
+        flow.kicks.set_constant([s.one for s in kicks])
+        flow.drifts.set_constant([s.one for s in drifts])
+        if flow.gradients is not None:
+            flow.gradients.set_constant([s.three for s in kicks])
+        if flow.curvatures is not None:
+            flow.curvatures.set_constant([s.five for s in kicks])
+        return flow
+
+    @classmethod
+    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
+        """Return a flow that has no system yet: `bind` will give it one."""
+        return cls(ndof, PrimedShape.from_dict(plan["primed"], ndof), dt, dtype=dtype)
+
+    def architecture(self) -> dict[str, Any]:
+        return {"ndof": self.ndof, "primed": self.shape.to_dict()}
+
+    @property
+    def palindromic(self) -> bool:
+        return self.shape.palindromic
+
+    @property
+    def processor(self) -> int:
+        return self.shape.processor
+
+    @property
+    def monomials(self) -> Monomials:
+        return self.shape.monomials
 
     @property
     def dtype(self) -> torch.dtype:
@@ -181,8 +553,11 @@ class PrimedFlow(SympFlow):
 
     @property
     def tables(self) -> Tables:
-        """Those of the numbers that the flow has now."""
-        return self._tables.current()
+        """The tables of the numbers that the flow has now."""
+        return self._tables.current(self._frozen)
+
+    def _frozen(self) -> Tables:
+        return Tables(self.substeps, len(self.shape.outer), self.dt, self.monomials)
 
     def scheme(self, t: float | None = None) -> Scheme:
         """ψ̄_t as a splitting scheme of step t, for t ∈ (0, Δt]; the default is Δt.
@@ -210,31 +585,31 @@ class PrimedFlow(SympFlow):
             ) from None
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Force and force-gradient evaluations of a run, as `FixedStep.evaluations`."""
         return self.tables.evaluations(n_steps, n_saved, n_extra, backend)
 
-    def kernel_for(self, system: HamiltonianSystem) -> PrimedFlowKernel:
-        """The compiled loops of this flow, the same while no number of it changes."""
-        tables = self.tables
-        if tables.kernel is None or tables.kernel.system is not system:
-            from sympflow.kernels.primed_flow import PrimedFlowKernel
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> PrimedFlowKernel:
+        from sympflow.kernels.flow_loops import PrimedFlowKernel
 
-            tables.kernel = PrimedFlowKernel(self, system)
+        tables = self.tables
+        for placement in tables.placements:
+            check_compilable(*placement)
+        if compensated:
+            return PrimedFlowKernel(tables, system, compensated=True)
+        if tables.kernel is None or tables.kernel.system is not system:
+            tables.kernel = PrimedFlowKernel(tables, system)
         return tables.kernel
 
     # kernel and processor as maps ---------------------------------------------------------------------------
 
     def prepare(self, t: float | Tensor, x: Tensor) -> Tensor:
-        """χ_t⁻¹(x), unchecked: where a run of kernel steps starts."""
-        return self._partly(t, x, slice(0, self._n_outer))
+        return self._partly(t, x, slice(0, len(self.shape.outer)))
 
     def finish(self, t: float | Tensor, x: Tensor) -> Tensor:
-        """χ_t(x), unchecked: what such a run gives as its output."""
-        return self._partly(t, x, slice(len(self.substeps) - self._n_outer, None))
+        return self._partly(t, x, slice(len(self.substeps) - len(self.shape.outer), None))
 
     def kernel_step(self, t: float | Tensor, x: Tensor, back: bool = False) -> Tensor:
-        """K_t(x), or its inverse, unchecked."""
-        return self._partly(t, x, slice(self._n_outer, len(self.substeps) - self._n_outer), back)
+        outer = len(self.shape.outer)
+        return self._partly(t, x, slice(outer, len(self.substeps) - outer), back)
 
     def _partly(self, t: Time, x: Tensor, part: slice, back: bool = False) -> Tensor:
         t, y, batch = self._columns(t, x)
@@ -250,7 +625,7 @@ class PrimedFlow(SympFlow):
         """The system whose V and T the flow uses, None for one loaded without it."""
         return self._binding.system if self._binding.known else None
 
-    def bind(self, system: HamiltonianSystem) -> PrimedFlow:
+    def bind(self, system: HamiltonianSystem) -> Self:
         """Give a flow that was loaded from a file the V and T of its system; itself.
 
         Raises
@@ -262,21 +637,76 @@ class PrimedFlow(SympFlow):
         self._binding.bind(system)
         return self
 
-    def bound(self, system: HamiltonianSystem) -> PrimedFlow:
-        """This flow, bound to `system` if it was loaded without one."""
+    def bound(self, system: HamiltonianSystem) -> Self:
         return self if self._binding.known else self.bind(system)
 
-    def architecture(self) -> dict[str, Any]:
-        return {
-            "ndof": self.ndof,
-            "primed": {
-                "first": self.sequence[0],
-                "maps": len(self.sequence) - 2 * self._n_outer,
-                "degree": self.degree,
-                "palindromic": self.palindromic,
-                "force_gradient": self.gradients is not None,
-                "processor": self.processor,
-                "curvature": self.curvatures is not None,
-                **({"monomials": [list(m) for m in self.monomials]} if self.monomials else {}),
-            },
-        }
+    def initial_velocity(self, x: Tensor) -> Tensor:
+        """d/dt ψ̄_t(x) at t = 0: that of its system, as the coefficients of V and T sum up to 1."""
+        return super().initial_velocity(x) if self.system is None else self.system.vector_field(x)
+
+
+def _starting_scheme(system: HamiltonianSystem, scheme: Any, stages: Any, first: str) -> Scheme:
+    """Return the scheme that an untrained flow is: the given one, or so many equal steps."""
+    if scheme is None:
+        stages = 6 if stages is None else stages
+        if isinstance(stages, bool) or not isinstance(stages, int) or stages < 1:
+            raise ValueError(f"`stages` must be a positive integer, the number of kicks; got {stages!r}: 3 is usual.")
+        scheme = _equal_steps(stages, first)
+    elif stages is not None or first != "drift":
+        given = "stages" if stages is not None else "first"
+        raise ValueError(f"`{given}` and `scheme` were both given: leave out `{given}`, the scheme has its own.")
+    if isinstance(scheme, str):
+        if scheme not in SCHEMES:
+            raise ValueError(f"`scheme` {scheme!r} is unknown: choose one of {', '.join(SCHEMES)}.")
+        scheme = SCHEMES[scheme]
+    if not isinstance(scheme, Scheme):
+        raise TypeError(
+            f"`scheme` must be a Scheme or the name of one; got {scheme!r}: choose one of {', '.join(SCHEMES)}."
+        )
+    if (scheme.nystrom or any(scheme.gradients)) and not system.quadratic_kinetic:
+        raise ValueError(f"`scheme` {scheme.name!r} needs a kinetic energy ½ pᵀM⁻¹p: take 'kahan_li8', for instance.")
+    return scheme
+
+
+def _force_gradient_of(system: HamiltonianSystem, asked: bool | None, curvature: bool) -> bool:
+    """Return True if the kicks have force gradients: if asked for, or by default where T is quadratic."""
+    if asked is None:
+        functions = system.numba_functions
+        asked = system.quadratic_kinetic and (functions is None or functions[2] is not None)
+    elif asked and not system.quadratic_kinetic:
+        raise ValueError("`force_gradient` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
+    if curvature and not (asked and system.symbols is not None):
+        remedy = "leave it out"
+        if system.symbols is None:
+            remedy += ", or define the system with HamiltonianSystem.from_sympy"
+        elif system.quadratic_kinetic:
+            remedy = "leave out `force_gradient`, or `curvature`"
+        raise ValueError(f"`curvature` goes with force gradients of a symbolic system, H = ½ pᵀM⁻¹p + V(q): {remedy}.")
+    return asked
+
+
+def _equal_steps(n: int, first: str) -> Scheme:
+    if first == "drift":
+        return compose("leapfrog", 2, (1 / n,) * n, "equal leapfrog steps")
+    if first != "kick":
+        raise ValueError(f"`first` must be 'drift' or 'kick', which a step begins with; got {first!r}.")
+    kicks = 0.5 / n, *(1 / n,) * (n - 1), 0.5 / n
+    return Scheme("verlet", 2, kicks, (*(1 / n,) * n, 0.0), (0.0,) * (n + 1), "equal Verlet steps")
+
+
+def _monomials_of(
+    system: HamiltonianSystem, polynomial: int | None, force_gradient: bool | None, curvature: bool
+) -> Monomials:
+    """Return the exponents that `polynomial` asks for."""
+    if polynomial is None:
+        return ()
+    if isinstance(polynomial, bool) or not isinstance(polynomial, int) or polynomial < 1:
+        raise ValueError(f"`polynomial` must be a positive integer, its degree; got {polynomial!r}: 6 is usual.")
+    if force_gradient or curvature:
+        raise ValueError("`polynomial` stands in place of `force_gradient` and `curvature`: leave these out.")
+    if system.symbols is None or not system.quadratic_kinetic:
+        raise ValueError(
+            "`polynomial` is for symbolic systems, H = ½ pᵀM⁻¹p + V(q): leave it out, or define the system with "
+            "HamiltonianSystem.from_sympy."
+        )
+    return monomials(system.symbols, polynomial)

@@ -104,7 +104,7 @@ class ShippedFlow:
 
     def load(self, system: HamiltonianSystem | None = None) -> Any:
         """The flow itself; see `sympflow.load`."""
-        from sympflow.flow.io import load
+        from sympflow.flow.files import load  # torch, which a list of flows does not need
 
         if system is None or self.shift is None:
             return load(self.path, system=system)
@@ -234,6 +234,17 @@ def choose(
             f"(relative energy errors: {there}): {clock if others else ''}raise it, or train a flow and pass flow=flow."
         )
     return able[0]
+
+
+def shipped(system: HamiltonianSystem, kind: str = "sympflow", tol: float | None = None) -> Any:
+    """Return the flow that the package ships for `system`, recognised by its fingerprint: see `choose`.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or none that meets `tol`; the message lists those there are.
+    """
+    return choose(system, kind, tol).load(system)
 
 
 def named(name: str) -> ShippedFlow:

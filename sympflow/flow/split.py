@@ -11,29 +11,150 @@ are the untrained cases. Frozen at any t the flow is a list of maps, and runs in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sympflow.arguments import check_flag, plain
 from sympflow.arrays import jvp
-from sympflow.flow.base import FlowMap
-from sympflow.flow.columns import Column
-from sympflow.flow.contents import Contents
-from sympflow.flow.placement import checked_device, checked_dtype
+from sympflow.flow.coefficients import Column
+from sympflow.flow.files import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
+from sympflow.flow.flow_map import FlowMap, check_system
+from sympflow.flow.layers import Layer
 from sympflow.flow.potentials import Time
-from sympflow.flow.split_layers import KeptMaps, PartsBinding, SplitLayer
-from sympflow.flow.sympflow import SympFlow
-from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts
+from sympflow.flow.sympflow import UNCOMPENSATED, SympFlow
+from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
+from sympflow.hamiltonian.expression import Unreadable, read
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, map_evaluations
+from sympflow.hamiltonian.system import HamiltonianSystem
 
-if TYPE_CHECKING:
-    from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.kernels.split_flow import SplitFlowKernel
+if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.kernels.flow_loops import SplitFlowKernel
 
+MOST_KEPT = 64  # steps whose maps are kept
+KINDS_OF_MODES = ("oscillator", "hyperbolic", "free", "idle")
 FILTERED = ("oscillator", "hyperbolic")
 """The kinds of modes that filters act on; others pass."""
+
+
+class PartsBinding:
+    """The system whose parts a flow is made of; shared by copies of the flow, stored in no file."""
+
+    def __init__(self, system: HamiltonianSystem | None, expressions: Sequence[str] | None) -> None:
+        self.expressions = None if expressions is None else tuple(expressions)
+        self.system, self._parts = system, None if system is None else exact_parts(system, expressions)
+
+    @property
+    def parts(self) -> ExactParts:
+        if self._parts is None:
+            raise ValueError(
+                "`flow` is made of the parts of a system, which its file does not hold: give it by "
+                "sympflow.load(path, system=system) or flow.bind(system)."
+            )
+        return self._parts
+
+    def bind(self, system: HamiltonianSystem, parts: ExactParts) -> None:
+        self.system, self._parts = system, parts
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> PartsBinding:
+        copied = PartsBinding(None, self.expressions)
+        copied.system, copied._parts = self.system, self._parts
+        return copied
+
+
+class KeptMaps:
+    """The maps of a flow of fixed numbers, the same objects for the same step, and what they cost.
+
+    Attributes
+    ----------
+    placement : tuple
+        Dtype and device of the numbers: asked once, as torch answers slowly.
+    """
+
+    def __init__(
+        self, make: Callable[[np.ndarray], list[Map]], coefficients: list[Map], dt: float, like: Tensor
+    ) -> None:
+        self._make, self._dt = make, dt
+        self.kernel: SplitFlowKernel | None = None  # the compiled loops that were made of these last
+        self._coefficients = coefficients, [m.inverse() for m in reversed(coefficients)]
+        self.placement = like.dtype, like.device
+        self._maps: dict[float, list[Map]] = {}
+        self._counts: dict[tuple[int, int, int, str], dict[str, int]] = {}
+
+    def maps(self, t: float) -> list[Map]:
+        if t not in self._maps:
+            if len(self._maps) >= MOST_KEPT:
+                self._maps.clear()
+            self._maps[t] = self._make(np.array(t))
+        return self._maps[t]
+
+    def coefficients(self, back: bool) -> list[Map]:
+        """Return the maps at all t, or those of the inverse: see `PartsKernel.step_by_coefficients`."""
+        return self._coefficients[back]
+
+    def evaluations(self, *run: Any) -> dict[str, int]:
+        """Count slopes of parts, and force gradients, of a run: `FlowMap.evaluations`."""
+        if run not in self._counts:
+            if len(self._counts) >= MOST_KEPT:
+                self._counts.clear()
+            self._counts[run] = map_evaluations(self.maps(self._dt), *run)
+        return dict(self._counts[run])
+
+
+class SplitLayer(Layer):
+    """The exact flow of a part of H, times functions of t; `index` is its place in the flow."""
+
+    def __init__(self, flow: SplitFlow, index: int) -> None:
+        super().__init__()
+        self.ndof, self.index = flow.ndof, index
+        self.part = flow.sequence[index]
+        self.kind = "linear" if self.part == LINEAR else flow.kinds[self.part - 1]  # type: ignore[misc]
+        self._of = (flow,)  # in a tuple: a layer does not own its flow
+
+    @property
+    def flow(self) -> SplitFlow:
+        return self._of[0]
+
+    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self._apply_map(self.flow.maps(t)[self.index], q, p)
+
+    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self._apply_map(self.flow.maps(t)[self.index].inverse(), q, p)
+
+    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        def along(s: Tensor) -> Tensor:
+            return torch.cat(self(t + s, q + s * dq, p + s * dp))
+
+        x, dx = jvp(along, q.new_zeros(()), q.new_ones(()))
+        return (*x.chunk(2), *dx.chunk(2))
+
+    def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        q, p = self.inverse(t, q, p)
+        parts = self.flow.parts
+        X, Y = parts.to_modes(torch.cat([q, p]).T)
+
+        def generator(s: Tensor) -> Tensor:
+            m = self.flow.maps(t + s)[self.index]
+            if m.part == LINEAR:
+                return (m.length * parts.linear_energies(X, Y)).sum(-1)
+            V = m.length * parts.value(m.part, X, Y, m.filters)
+            if isinstance(m.gradient, Tensor):
+                slope, _ = parts.slopes(m.part, X, Y, m.filters)
+                V = V - m.gradient * (slope * parts.inverse_masses(X) * slope).sum(-1) / 2
+            return V
+
+        return q, p, jvp(generator, q.new_zeros(()), q.new_ones(()))[1]
+
+    def _apply_map(self, m: Map, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        parts = self.flow.parts
+        y = parts.from_modes(*parts.apply([m], *parts.to_modes(torch.cat([q, p]).T))).T
+        return y.chunk(2)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": self.kind, "part": self.part}
 
 
 class SplitFlow(SympFlow):
@@ -49,7 +170,7 @@ class SplitFlow(SympFlow):
     kinds : sequence of str
         Of the parts 1, 2, …: "kick" for a potential, else "shear".
     classes : sequence of str
-        What the distinct frequencies are, see `LinearPart.kinds`.
+        Kinds of the distinct frequencies, see `LinearPart.kinds`.
     terms : int
         Basis functions of each coefficient.
     filters : bool
@@ -122,26 +243,77 @@ class SplitFlow(SympFlow):
             if c.power < 3:
                 c.set(np.eye(1, terms).repeat(c.n, 0) / (c.n if c.power else 1))
         self._binding = PartsBinding(system, expressions)
-        self._known: tuple[bytes, KeptMaps] | None = None
-        self._contents = Contents(column._parameters for column in self.columns())
+        self._maps: Kept[KeptMaps] = Kept(column._parameters for column in self.columns())
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(SplitLayer(self, i) for i in range(len(self.sequence)))  # type: ignore[assignment]
         if system is not None:
             self._check_parts(self._binding.parts)
             self.fingerprint, self.system_name = system.fingerprint, system.name
 
+    @classmethod
+    def untrained(
+        cls,
+        system: HamiltonianSystem,
+        *,
+        stages: int,
+        dt: float,
+        terms: int,
+        filters: bool,
+        force_gradient: bool | Sequence[int] | None,
+        parts: Sequence[str] | None,
+        linear_outside: bool,
+        dtype: torch.dtype,
+        device: torch.device | str | None,
+    ) -> Self:
+        """Return a flow of so many equal Strang steps: see `SympFlow.split`."""
+        stages, terms = plain(stages), plain(terms)
+        check_system(system)
+        check_flag("filters", filters)
+        check_flag("linear_outside", linear_outside)
+        if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= 1000:
+            raise ValueError(f"`stages` must be a positive integer, at most 1000; got {stages!r}: 4 is usual.")
+        exact = exact_parts(system, parts)
+        if force_gradient is None:
+            force_gradient = exact.has_force_gradient
+        order = exact.sequence
+        if linear_outside and order[-1] == LINEAR:
+            order = (LINEAR, *order[:-1])
+        one = (*order, *order[-2::-1])
+        sequence = one + (stages - 1) * one[1:]
+        kicks: Sequence[int] = range(sequence.count(1)) if isinstance(force_gradient, bool) else force_gradient
+        return cls(
+            system.ndof,
+            sequence,
+            part_kinds(exact),
+            class_kinds(exact),
+            terms=terms,
+            filters=filters,
+            gradients=() if force_gradient is False else kicks,
+            dt=dt,
+            expressions=parts,
+            system=system,
+            dtype=dtype,
+            device=device,
+        )
+
+    @classmethod
+    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
+        """Return a flow that has no system yet: `bind` will give it one."""
+        shape = _checked_plan(plan["split"])
+        return cls(ndof, dt=dt, dtype=dtype, **shape)
+
     def columns(self) -> list[Column]:
-        """All coefficients: s, w, φ, γ."""
+        """Return all coefficients: s, w, φ, γ."""
         groups = (self.linear, self.weights, self.filters, self.gradients)
         return [column for group in groups for column in group if isinstance(column, Column)]
 
     @property
     def dtype(self) -> torch.dtype:
-        return self._contents.first().dtype
+        return self._maps.first().dtype
 
     @property
     def device(self) -> torch.device:
-        return self._contents.first().device
+        return self._maps.first().device
 
     # the maps -----------------------------------------------------------------------------------------------
 
@@ -157,14 +329,10 @@ class SplitFlow(SympFlow):
         return self.frozen().maps(float(t)) if t.ndim == 0 else self._numpy_maps(t)
 
     def frozen(self) -> KeptMaps:
-        """The maps of the numbers that the flow has now."""
-        snapshot = self._contents.snapshot()
-        if self._known is None or self._known[0] != snapshot:
-            self._known = (
-                snapshot,
-                KeptMaps(self._numpy_maps, self._coefficient_maps(), self.dt, self._contents.first()),
-            )
-        return self._known[1]
+        """Return the maps of the numbers that the flow has now."""
+        return self._maps.current(
+            lambda: KeptMaps(self._numpy_maps, self._coefficient_maps(), self.dt, self._maps.first())
+        )
 
     def _numpy_maps(self, t: np.ndarray) -> list[Map]:
         maps = self._assemble(
@@ -215,18 +383,19 @@ class SplitFlow(SympFlow):
         parts = self.parts
         return parts.from_modes(*parts.apply(maps, *parts.to_modes(y.T))).T
 
-    def kernel_for(self, system: HamiltonianSystem) -> SplitFlowKernel:
-        """The compiled loops of this flow, the same while no number of it changes."""
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> SplitFlowKernel:
+        from sympflow.kernels.flow_loops import SplitFlowKernel
+
+        if compensated:
+            raise ValueError(UNCOMPENSATED)
         flow = self.bound(system)
         frozen = flow.frozen()
+        check_compilable(*frozen.placement)
         if frozen.kernel is None or frozen.kernel.parts is not flow.parts:
-            from sympflow.kernels.split_flow import SplitFlowKernel
-
-            frozen.kernel = SplitFlowKernel(flow)
+            frozen.kernel = SplitFlowKernel(frozen, flow.parts, flow.dt)
         return frozen.kernel
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Evaluations of the slopes of parts, and of force gradients, as `FixedStep.evaluations`."""
         return self.frozen().evaluations(n_steps, n_saved, n_extra, backend)
 
     # its system ---------------------------------------------------------------------------------------------
@@ -240,7 +409,7 @@ class SplitFlow(SympFlow):
         """The system whose parts the flow uses, None for one loaded without it."""
         return self._binding.system
 
-    def bind(self, system: HamiltonianSystem) -> SplitFlow:
+    def bind(self, system: HamiltonianSystem) -> Self:
         """Give a flow that was loaded from a file the parts of its system; itself.
 
         Raises
@@ -254,8 +423,7 @@ class SplitFlow(SympFlow):
         self._binding.bind(system, parts)
         return self
 
-    def bound(self, system: HamiltonianSystem) -> SplitFlow:
-        """This flow, bound to `system` if it was loaded without one."""
+    def bound(self, system: HamiltonianSystem) -> Self:
         return self if self._binding.system is not None else self.bind(system)
 
     def _check_parts(self, parts: ExactParts) -> None:
@@ -287,12 +455,51 @@ class SplitFlow(SympFlow):
 
 
 def part_kinds(parts: ExactParts) -> tuple[str, ...]:
-    """ "kick" for a potential, else "shear", of the parts 1, 2, …"""
+    """Return "kick" for a potential, else "shear", of the parts 1, 2, …"""
     return tuple("kick" if part.of_positions else "shear" for part in parts.rest)
 
 
 def class_kinds(parts: ExactParts) -> tuple[str, ...]:
-    """What each of the distinct frequencies is."""
+    """Return the kind of each of the distinct frequencies."""
     if parts.linear is None:
         return ()
     return tuple(parts.linear.kinds[j] for j in parts.linear.representatives)
+
+
+def _checked_plan(plan: Any) -> dict[str, Any]:
+    """Return the arguments of a `SplitFlow` that a file describes, all of which are checked."""
+    if not isinstance(plan, dict):
+        raise Refused("its plan of a split flow is missing")
+    if not isinstance(plan.get("filters"), bool):
+        raise Refused("its filters are neither true nor false")
+    gradients = plan.get("gradients")
+    if not isinstance(gradients, list) or not all(isinstance(i, int) and 0 <= i < MAX_LAYERS for i in gradients):
+        raise Refused("its gradients are not a list of kicks")
+    for name, admissible in (("kinds", ("kick", "shear")), ("classes", KINDS_OF_MODES)):
+        value = plan.get(name)
+        if not isinstance(value, list) or len(value) > MAX_LAYERS or not all(entry in admissible for entry in value):
+            raise Refused(f"its {name} are not a list of {', '.join(admissible)}")
+    sequence, expressions = plan.get("sequence"), plan.get("expressions")
+    if not isinstance(sequence, list) or not 1 <= len(sequence) <= MAX_LAYERS:
+        raise Refused("its sequence of maps is missing or absurdly long")
+    if not all(isinstance(k, int) and not isinstance(k, bool) and 0 <= k <= len(plan["kinds"]) for k in sequence):
+        raise Refused("its sequence of maps does not consist of numbers of parts")
+    if expressions is not None:
+        _check_expressions(expressions, len(plan["kinds"]))
+    terms = checked_integer(plan.get("terms"), "number of terms", MAX_DEGREE)
+    if len(sequence) * terms * (len(plan["classes"]) + 2) > MAX_PARAMETERS // 100:
+        raise Refused("its architecture is absurdly large")
+    names = ("sequence", "kinds", "classes", "terms", "filters", "gradients", "expressions")
+    return {name: plan.get(name) for name in names}
+
+
+def _check_expressions(expressions: Any, kinds: int) -> None:
+    if not (isinstance(expressions, list) and all(isinstance(e, str) for e in expressions)):
+        raise Refused("its parts are not a list of expressions")
+    if len(expressions) > kinds + 1:
+        raise Refused("it has more parts than kinds of them")
+    try:
+        for expression in expressions:
+            read(expression)
+    except Unreadable as error:
+        raise Refused(f"its parts are not all expressions ({error})") from None

@@ -3,23 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor, nn
 
 from sympflow.arguments import plain
-from sympflow.flow.arguments import bare_time
-from sympflow.flow.base import FlowMap
-from sympflow.flow.layers import Drift, Kick, Layer
+from sympflow.flow.families import family
+from sympflow.flow.files import (
+    MAX_LAYERS,
+    MAX_PARAMETERS,
+    Refused,
+    checked_widths,
+    count_parameters,
+)
+from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.layers import LAYERS, Drift, Kick, Layer
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
+from sympflow.flow.weights import Kept, check_compilable
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.protocol import Kernel
+from sympflow.schemes import Scheme
 
-if TYPE_CHECKING:
-    from sympflow.flow.primed import PrimedFlow
-    from sympflow.flow.split import SplitFlow
-    from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.schemes import Scheme
+if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.kernels.network_loops import MLPFlowKernel
+
+UNCOMPENSATED = (
+    "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave it out, or take a "
+    "flow of SympFlow.primed."
+)
 
 
 class SympFlow(FlowMap):
@@ -59,6 +72,8 @@ class SympFlow(FlowMap):
     """
 
     kind = "sympflow"
+    symplectic = True
+    _network: Kept[Any] | None = None
 
     def __init__(
         self,
@@ -102,8 +117,8 @@ class SympFlow(FlowMap):
         )
 
     @classmethod
-    def from_layers(cls, layers: Iterable[Layer], dt: float) -> SympFlow:
-        """The composition of `layers`, the first applied first, for t ∈ [0, dt].
+    def from_layers(cls, layers: Iterable[Layer], dt: float) -> Self:
+        """Return the composition of `layers`, the first applied first, for t ∈ [0, dt].
 
         Raises
         ------
@@ -134,8 +149,8 @@ class SympFlow(FlowMap):
         first: str = "drift",
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
-    ) -> PrimedFlow:
-        """A SympFlow whose potentials are the system's own V and T times polynomials in t.
+    ) -> Any:
+        """Return a `PrimedFlow`: its potentials are the system's own V and T times polynomials in t.
 
         Untrained it is a classical splitting scheme; `train(system, flow=flow)` fits it to the system and its domain.
         Frozen at any t it is a splitting scheme again, `flow.scheme(t)`, and as fast as one.
@@ -151,7 +166,7 @@ class SympFlow(FlowMap):
         palindromic : bool
             Whether it is time-reversible, with half the parameters.
         scheme : Scheme or str, optional
-            A table, or its name in `sympflow.integrators.schemes.SCHEMES`, to start from in place of leapfrog.
+            A table, or its name in `sympflow.schemes.SCHEMES`, to start from in place of leapfrog.
         degree : int, optional
             Of the polynomials that multiply V and T; 7 by default, 5 with a processor, which has more of them.
         force_gradient : bool, optional
@@ -178,10 +193,21 @@ class SympFlow(FlowMap):
         ValueError
             If the system is not separable, or an argument is not admissible.
         """
-        from sympflow.flow.untrained_primed import primed
-
-        shape = (stages, dt, palindromic, scheme, degree, force_gradient, processor, curvature, polynomial, first)
-        return primed(system, *map(plain, shape), dtype, device)  # type: ignore[call-arg]
+        return family("primed").untrained(
+            system,
+            stages=stages,
+            dt=dt,
+            palindromic=palindromic,
+            scheme=scheme,
+            degree=degree,
+            force_gradient=force_gradient,
+            processor=processor,
+            curvature=curvature,
+            polynomial=polynomial,
+            first=first,
+            dtype=dtype,
+            device=device,
+        )
 
     @staticmethod
     def split(
@@ -196,15 +222,15 @@ class SympFlow(FlowMap):
         linear_outside: bool = True,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
-    ) -> SplitFlow:
-        """A SympFlow of exact flows of the parts of H, the linear one among them, for stiff systems.
+    ) -> Any:
+        """Return a `SplitFlow`, for stiff systems: of exact flows of the parts of H, the linear one among them.
 
         Untrained it is so many equal Strang steps; `train(system, flow=flow)` fits it to the system and its domain.
 
         Parameters
         ----------
         system : HamiltonianSystem
-            One with parts that are solved exactly: `sympflow.decomposition.exact_parts`.
+            One with parts that are solved exactly: `sympflow.hamiltonian.parts.exact_parts`.
         stages : int
             Number of Strang steps, palindromic throughout.
         dt : float
@@ -228,13 +254,53 @@ class SympFlow(FlowMap):
         ValueError
             If the system has no such parts, or an argument is not admissible.
         """
-        from sympflow.flow.untrained_split import split
-
-        numbers = plain(stages), plain(dt), plain(terms)
-        return split(system, *numbers, filters, force_gradient, parts, linear_outside, dtype, device)
+        return family("split").untrained(
+            system,
+            stages=stages,
+            dt=dt,
+            terms=terms,
+            filters=filters,
+            force_gradient=force_gradient,
+            parts=parts,
+            linear_outside=linear_outside,
+            dtype=dtype,
+            device=device,
+        )
 
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.ndof, "layers": [layer.to_dict() for layer in self.layers]}  # type: ignore[operator]
+
+    @classmethod
+    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
+        layers = plan.get("layers")
+        if not isinstance(layers, list) or not 1 <= len(layers) <= MAX_LAYERS:
+            raise Refused("its list of layers is missing or absurdly long")
+        # All sizes first: nothing is allocated for a file that asks for too much.
+        potentials = [_potential_of(layer) for layer in layers]
+        widths = [checked_widths(potential.get("hidden"), ndof) for potential in potentials]
+        if sum(count_parameters(w, ndof) for w in widths) > MAX_PARAMETERS:
+            raise Refused("its architecture is absurdly large")
+        return cls.from_layers(
+            (
+                LAYERS[layer["kind"]](MLPPotential(ndof, hidden, str(potential.get("activation")), dtype=dtype))
+                for layer, potential, hidden in zip(layers, potentials, widths, strict=True)
+            ),
+            dt,
+        )
+
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
+        if compensated:
+            raise ValueError(UNCOMPENSATED)
+        if self._network is None:
+            self._network = Kept(d for m in self.modules() for d in (m._parameters, m._buffers))
+        return self._network.current(self._compiled)
+
+    def _compiled(self) -> MLPFlowKernel:
+        from sympflow.kernels.network_loops import MLPFlowKernel
+
+        networks = [layer.network() for layer in self.layers]  # type: ignore[operator]
+        check_compilable(self.dtype, self.device)
+        return MLPFlowKernel(self.ndof, networks)
 
     def hamiltonian(self, t: float | Tensor, x: Tensor) -> Tensor:
         """𝓗(ψ̄)(t, x), (...), for t ∈ [0, Δt]: the Hamiltonian of which ψ̄_t is the exact flow.
@@ -242,7 +308,7 @@ class SympFlow(FlowMap):
         The sum over the layers of ∂_tV at the point pulled back through the layers after it (the recursion of [1]_,
         section 2.2). It is defined up to a function of t alone.
         """
-        return self.hamiltonian_unchecked(bare_time(self, t, x), x)
+        return super().hamiltonian(t, x)
 
     def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor) -> Tensor:
         """`hamiltonian` without checks, for inner loops."""
@@ -272,3 +338,13 @@ class SympFlow(FlowMap):
         for layer in self.layers:
             q, p, dq, dp = layer.tangent(t, q, p, dq, dp)  # type: ignore[operator]
         return torch.cat([q, p]), torch.cat([dq, dp])
+
+
+def _potential_of(layer: Any) -> dict[str, Any]:
+    """Return the potential of a layer's description."""
+    if not isinstance(layer, dict) or str(layer.get("kind")) not in LAYERS:
+        raise Refused("it has a layer of unknown kind")
+    potential = layer.get("potential")
+    if not isinstance(potential, dict) or potential.get("type") != "mlp":
+        raise Refused("it has a potential of unknown type")
+    return potential

@@ -1,131 +1,47 @@
-"""The contract between `solve` and an integrator.
+"""Integrators of fixed steps on the grid t0 + k·dt, and the one driver of their runs.
 
-An integrator is a frozen dataclass whose fields are its options (`dt`, `rtol`, …). Its duties:
-
-1. `step(system, t, y, h)` maps states y (..., 2d) over a step h, negative or not, of shape () or y.shape[:-1].
-2. `order` (None if trained), `symplectic` and `trained` are class attributes that tell the truth.
-3. `check(system)` raises a ValueError with the reason where the method does not apply.
-4. `run(problem)` produces the states that were asked for, and no others, as an `Outcome`.
-5. `steps(system, t_span, y0)` executes the same run again as a stream of the steps that it takes, and
-6. `tangent(system, t, y, h)` differentiates such a step, so that metrics judge the map that was really executed.
-7. `inverse(system, t, y, h)` undoes `step(system, t, y, h)` exactly, or raises a TypeError.
-8. `finds_events` is False, and `solve` seeks events on the dense output afterwards; or `run` hands every step to
-   `problem.events`, if there are any, and ends where that says.
-
-`FixedStep` does 4, 5, 6 and 8 for any integrator that has a step: a new one needs duties 1 to 3 only.
+`FixedStep` is the choice of a method; `Stepper` is one run of it, with its kernel or arrays and its counts; `GridRun`
+walks the grid, finds what is not finite, places the outputs and looks for events.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
-from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from sympflow.arguments import check_dt
-from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
+from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.array_rollout import checked_state, rollout
+from sympflow.integrators.contract import ENDED, FINISHED, Integrator, Outcome, Problem, Steps
 from sympflow.integrators.grid import EPS, Grid
-from sympflow.integrators.grid_failures import report_failures
 
 if TYPE_CHECKING:
-    from sympflow.events import EventSearch
+    from sympflow.kernels.protocol import Kernel
 
-Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
-"""Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What `solve` asks of an integrator, validated."""
-
-    system: HamiltonianSystem
-    t0: float
-    t1: float
-    y0: Array
-    t_eval: np.ndarray | None = None
-    save_every: int = 1
-    dense_output: bool = False
-    backend: str = "auto"
-    events: EventSearch | None = None
-
-
-@dataclass
-class Outcome:
-    """What an integrator answers. `y` has time first: (n, ..., 2d)."""
-
-    t: np.ndarray
-    y: Array
-    status: int | np.ndarray
-    message: str
-    stats: dict[str, Any]
-    sol: Callable[[Any], Array] | None = None
-    finite: bool = False
-    """Whether `y` has been looked at and is finite all over; `solve` looks again where this is not said."""
-
+__all__ = [
+    "FINISHED",
+    "FixedStep",
+    "Integrator",
+    "KernelStepper",
+    "Outcome",
+    "Problem",
+    "Recorder",
+    "Stepper",
+    "Steps",
+    "checked_state",
+    "compiled_loops",
+    "rollout",
+    "run_and_search",
+]
 
 FEW = 8
 """Outputs that are placed on the grid by NumPy: a compiled pass is worth its loading for more."""
-
-FINISHED = "The solver successfully reached the end of the integration interval."
-
-
-class Integrator:
-    """Base class of all integrators. See the module's docstring for the contract."""
-
-    name: ClassVar[str]
-    order: ClassVar[int | None]
-    symplectic: ClassVar[bool]
-    trained: ClassVar[bool] = False
-    compiles: ClassVar[bool] = False
-    finds_events: ClassVar[bool] = False
-    tangent_holds: ClassVar[str] = ""
-    """What `tangent` holds fixed though a step from a neighbouring state would change it; "" for nothing."""
-
-    @classmethod
-    def options(cls) -> tuple[str, ...]:
-        """The names of the options that this method takes."""
-        return _field_names(cls)  # type: ignore[arg-type]
-
-    def check(self, system: HamiltonianSystem) -> None:
-        """Raise a ValueError with the reason if the method does not apply to the system."""
-
-    def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        """One step of signed length h from the states y (..., 2d)."""
-        raise TypeError(f"`method` {self.name!r} has no bare step: use solve().")
-
-    def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        """The state from which `step(system, t, ·, h)` leads to y."""
-        raise TypeError(f"`method` {self.name!r} has no exact inverse: use a symplectic method.")
-
-    def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
-        """The step from y (..., 2d) and its Jacobian A (..., 2d, 2d), by forward-mode differentiation of `step`."""
-        import torch
-
-        from sympflow.arrays import jvp
-
-        def step(x: torch.Tensor) -> torch.Tensor:
-            return self.step(system, t, x, torch.as_tensor(h, dtype=x.dtype))
-
-        x = torch.as_tensor(to_numpy(y))
-        columns = []
-        for i in range(x.shape[-1]):
-            direction = torch.zeros_like(x)
-            direction[..., i] = 1
-            y_next, column = jvp(step, x, direction)
-            columns.append(column)
-        return to_numpy(y_next), to_numpy(torch.stack(columns, dim=-1))
-
-    def run(self, problem: Problem) -> Outcome:
-        """Solve the problem."""
-        raise NotImplementedError(f"{type(self).__name__} must define run().")
-
-    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
-        """Execute the run again as a stream of its steps."""
-        raise NotImplementedError(f"{type(self).__name__} must define steps().")
+FIRST_CHUNK, LAST_CHUNK = 8, 1024  # steps between two looks at the events
+MOST_SAMPLES = 65536  # of the events, in a chunk
 
 
 @dataclass(frozen=True)
@@ -145,22 +61,19 @@ class FixedStep(Integrator):
 
     finds_events: ClassVar[bool] = True
     on_grid: ClassVar[bool] = True
-    """Whether the steps are those of the grid t0 + k·dt, as a peer that drives them presumes."""
-    saves_finite: ClassVar[bool] = False
-    """Whether the states that a compiled `rollout` saves up to the last finite one are known to be finite."""
     breakdown: ClassVar[tuple[str, str]] = ("The solution became non-finite", "Reduce `dt`")
-    """What it means when the run cannot go on, and the remedy: for the message of status −1."""
+    """The meaning of a run that cannot go on, and the remedy: for the message of status −1."""
 
     def __post_init__(self) -> None:
         check_dt(self.dt)
 
     def step_length(self, system: HamiltonianSystem) -> float:
-        """The step that is used for a system."""
+        """Return the step that is used for a system."""
         return float(self.dt if self.dt is not None else system.dt)
 
-    def counting(self, system: HamiltonianSystem) -> Self:
-        """The integrator whose `evaluations` hold for one run on the system: a copy, where it must keep count."""
-        return self
+    def stepper(self, problem: Problem) -> Stepper:
+        """Return the stepper of one run, for states such as the problem's y0."""
+        return Stepper(self, problem)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Force and force-gradient evaluations of n_steps steps, n_saved saved states, n_extra shorter steps."""
@@ -176,87 +89,20 @@ class FixedStep(Integrator):
         )
         return states, finite, "torch" if is_tensor(problem.y0) else "numpy"
 
-    def run(self, problem: Problem) -> Outcome:
-        if problem.events is not None:
-            from sympflow.integrators.grid_events import run_with_events
-
-            return run_with_events(self, problem, problem.events)
-        system = problem.system
-        grid = Grid(problem.t0, problem.t1, self.step_length(system))
-        t, remainder, save, place = self._placed(problem, grid)
-        last = int(save[-1]) if save.size else 0
-        saved, finite, backend = self.rollout(problem, grid.h, last, save)
-
-        y = saved if place is None else saved[place]
-        extra = remainder.nonzero()[0]
-        if extra.size:
-            y = self.shorter_steps(system, y, extra, remainder[extra], backend)
-        n_steps = min(last, int(finite.max() if finite.ndim else finite) + 1)
-        end = len(save) if n_steps == last else int(save.searchsorted(n_steps, "right"))
-        n_saved = end - int(save.searchsorted(0, "right") if end and save[0] <= 0 else 0)
-        at_end = int(bool(extra.size) and extra[-1] == len(t) - 1 and t[-1] == grid.t1)
-        stats = {
-            "dt": abs(grid.h),
-            "n_steps": n_steps + at_end,
-            **self.evaluations(n_steps, n_saved, int(extra.size), backend),
-            "backend": backend,
-        }
-        outcome = Outcome(t, y, 0, FINISHED, stats)
-        if problem.dense_output:
-            from sympflow.integrators.grid_solution import GridSolution
-
-            outcome.sol = GridSolution(self, system, grid, saved, backend)
-        outcome.finite = backend == "compiled" and self.saves_finite and not extra.size
-        report_failures(outcome, grid, finite, last, self.breakdown)
-        return outcome
-
-    def _placed(self, problem: Problem, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-        """Output times and their remainders, the counts whose states are to be saved, and where among these each is.
-
-        The last is None where every output is a state of its own.
-        """
-        t, y0, system = problem.t_eval, problem.y0, problem.system
-        compiled = self.compiles and problem.backend != "array" and type(y0) is np.ndarray and y0.dtype == np.float64
-        compiled = compiled and (system.symbols is not None or system.numba_functions is not None)
-        if compiled and t is not None and len(t) > FEW and not problem.dense_output:
-            from sympflow.kernels.outputs import place
-
-            return t, *place(t, grid.t0, grid.h, 4 * EPS)
-        t, count, remainder = grid.outputs(t, problem.save_every)
-        save, position = (np.arange(grid.n_steps + 1), count) if problem.dense_output else distinct(count)
-        return t, remainder, save, position
-
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
         """`step` on the backend of the run that it belongs to."""
         return self.step(system, 0.0, y, h)
 
-    def shorter_steps(
-        self, system: HamiltonianSystem, y: Array, extra: np.ndarray, h: np.ndarray, backend: str
-    ) -> Array:
-        """Replace the states y[extra] by those a step h later."""
-        first, last = int(extra[0]), int(extra[-1])
-        together = last - first == len(extra) - 1  # nearly always, and a slice is copied ten times sooner
-        rows: Any = slice(first, last + 1) if together and not is_tensor(y) else extra
-        states = y[rows]
-        lengths = h if y.ndim == 2 else np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy()
-        if not is_tensor(y):
-            with np.errstate(all="ignore"):
-                advanced = self.substep(system, states, lengths.astype(y.dtype), backend)
-                y[rows] = checked_state(advanced, states)
-            return y
-        import torch
-
-        h_extra = torch.as_tensor(lengths, dtype=y.dtype, device=y.device)
-        advanced = checked_state(self.substep(system, states, h_extra, backend), states)
-        return y.index_copy(0, torch.as_tensor(extra, device=y.device), advanced)
+    def run(self, problem: Problem) -> Outcome:
+        return GridRun(self, problem).outcome()
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         grid = Grid(*t_span, self.step_length(system))
+        stepper = self.stepper(Problem(system, *t_span, y0))
         chunk, y, k = 256, y0, 0
         while k < grid.n_steps:
             n = min(chunk, grid.n_steps - k)
-            piece = Problem(system, grid.time(k), grid.time(k + n), y)
-            states, finite, _ = self.rollout(piece, grid.h, n, np.arange(n + 1))
+            states, finite = stepper.rollout(y, grid.h, n, np.arange(n + 1), grid.time(k))
             good = int(finite.max()) if finite.max() < n else n
             if good:
                 yield grid.t0 + np.arange(k, k + good) * grid.h, states[:good], np.full(good, grid.h)
@@ -265,6 +111,427 @@ class FixedStep(Integrator):
             y, k = states[n], k + n
         if grid.remainder:
             yield np.array([grid.time(k)]), y[None], np.array([grid.remainder])
+
+
+# one run of a method -------------------------------------------------------------------------------
+
+
+class Stepper:
+    """One run of a fixed-step integrator: all that a run changes or counts is here.
+
+    This one runs array operations, by the integrator's own `rollout`, `substep` and `evaluations`.
+
+    Attributes
+    ----------
+    backend : str
+        The means of the run, for `stats["backend"]`: "compiled", "numpy", "torch", or the name of another library.
+    compiled : bool
+        True if the steps run in compiled loops.
+    saves_finite : bool
+        True if the states that `rollout` saves up to the last finite one are known to be finite.
+    """
+
+    compiled: bool = False
+    saves_finite: bool = False
+
+    def __init__(self, integrator: FixedStep, problem: Problem) -> None:
+        self.integrator, self.system, self.asked = integrator, problem.system, problem.backend
+        self.backend = "torch" if is_tensor(problem.y0) else "numpy"
+
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
+        """Return the states (len(save), ..., 2d) after the steps `save` (sorted counts in 0 … n_steps) of length h.
+
+        Also the index of the last finite state of each trajectory, of shape y0.shape[:-1].
+        """
+        piece = Problem(self.system, t0, t0 + n_steps * h, y0, backend=self.asked)
+        states, finite, self.backend = self.integrator.rollout(piece, h, n_steps, save)
+        return states, finite
+
+    def shorter(self, y: Array, h: Any) -> Array:
+        """Return the states a step of length h, a number or one for each state, after y (..., 2d)."""
+        return self.integrator.substep(self.system, y, h, self.backend)
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
+        """Evaluations of the force and its derivatives so far, if it made so many steps, saves and shorter steps."""
+        return self.integrator.evaluations(n_steps, n_saved, n_extra, self.backend)
+
+    def more_stats(self) -> dict[str, int]:
+        """Further entries of the statistics."""
+        return {}
+
+
+class KernelStepper(Stepper):
+    """A run in compiled loops."""
+
+    compiled = True
+
+    def __init__(self, integrator: FixedStep, problem: Problem, kernel: Kernel) -> None:
+        self.integrator, self.system, self.asked = integrator, problem.system, problem.backend
+        self.kernel, self.backend, self.saves_finite = kernel, "compiled", kernel.saves_finite
+        self.iterations = 0
+
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
+        if y0.ndim == 1:
+            states, last, iterations = self.kernel.run(h, y0, n_steps, save)
+            self.iterations += iterations
+            return states, np.asarray(last)
+        rows = y0.reshape(-1, y0.shape[-1])
+        states, finite, iterations = self.kernel.run_batch(h, rows, n_steps, save)
+        self.iterations += iterations
+        return states.swapaxes(0, 1).reshape(len(save), *y0.shape), np.asarray(finite).reshape(y0.shape[:-1])
+
+    def shorter(self, y: Array, h: Any) -> Array:
+        if y.ndim == 2 and np.shape(h) == (len(y),):
+            states, iterations = self.kernel.step(h, y)
+        else:
+            rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
+            states, iterations = self.kernel.step(np.broadcast_to(h, y.shape[:-1]).reshape(-1), rows)
+        self.iterations += iterations
+        return states.reshape(y.shape)
+
+
+def compiled_loops(
+    make: Callable[[], Any], y0: Array, backend: str, compensated: bool = False, reason: str | None = None
+) -> Any:
+    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations.
+
+    The one place where this is decided.
+
+    Parameters
+    ----------
+    make : callable
+        Raises a ValueError with the reason where there is no compiled form.
+    y0 : array or tensor
+    backend : "auto", "compiled" or "array"
+    compensated : bool
+        Compiled loops are needed, for compensated sums.
+    reason : str, optional
+        Why the method has no compiled form at all.
+
+    Raises
+    ------
+    ValueError
+        If compiled loops are asked for, or needed, and there are none.
+    """
+    if backend == "array":
+        reason = "`backend` is 'array': choose 'auto'."
+    elif is_tensor(y0):
+        reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
+    elif y0.dtype != np.float64:
+        reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
+    if reason is None:
+        try:
+            return make()
+        except ValueError as error:
+            reason = str(error)
+    if backend == "compiled":
+        raise ValueError(f"`backend` 'compiled' does not apply. {reason}") from None
+    if compensated:
+        raise ValueError(f"`compensated` sums need compiled loops. {reason}") from None
+    return None
+
+
+def rollout(
+    step: Callable[[int, Array], Array], y: Array, n_steps: int, save: np.ndarray, block: int = 64
+) -> tuple[Array, np.ndarray]:
+    """Apply `step(k, y)` n_steps times; the states at the counts `save`, and the last finite count of each trajectory.
+
+    Finiteness is tested once a block; a block that ends non-finite is run again to find where. The run stops when no
+    trajectory is finite any more; later states are NaN.
+    """
+    tensor = is_tensor(y)
+    out: Any = [] if tensor else np.full((len(save), *y.shape), np.nan, dtype=y.dtype)
+    wanted = save.tolist()
+    position = 0
+    finite = np.where(to_numpy(all_finite(y)), n_steps, -1)
+    if wanted and wanted[0] == 0:
+        out.append(y) if tensor else out.__setitem__(0, y)
+        position = 1
+    k = 0
+    with np.errstate(all="ignore"):
+        while k < n_steps and (finite == n_steps).any():
+            start, y_start = k, y
+            for k in range(start, min(start + block, n_steps)):
+                y = checked_state(step(k, y), y)
+                if position < len(wanted) and wanted[position] == k + 1:
+                    if tensor:
+                        out.append(y)
+                    else:
+                        out[position] = y
+                    position += 1
+            k += 1
+            failed = (finite == n_steps) & ~to_numpy(all_finite(y))
+            if failed.any():
+                z = y_start
+                for j in range(start, k):
+                    z = step(j, z)
+                    first = failed & (finite == n_steps) & ~to_numpy(all_finite(z))
+                    finite = np.where(first, j, finite)
+    if tensor:
+        out += [full_of_nan(y)] * (len(wanted) - len(out))
+        out = stack(out, axis=0) if out else y[None][:0]
+    return out, np.asarray(finite)
+
+
+def checked_state(y_next: Any, y: Array) -> Array:
+    """Return the result of a step from y, checked to be of the same kind, shape and dtype: it may be a plug-in's."""
+    shape = getattr(y_next, "shape", None)
+    if shape == y.shape and y_next.dtype == y.dtype and is_tensor(y_next) == is_tensor(y):
+        return y_next
+    what = "" if shape is None else f" of {y_next.dtype} and shape {tuple(shape)}"
+    raise TypeError(
+        f"`step` must return states as those that it is given, of {y.dtype} and shape {tuple(y.shape)}; got "
+        f"{type(y_next).__name__}{what}. Mend the integrator: check_integrator tests it."
+    )
+
+
+def shorter_steps(stepper: Stepper, y: Array, extra: np.ndarray, h: np.ndarray) -> Array:
+    """Replace the states y[extra] by those a step h later."""
+    first, last = int(extra[0]), int(extra[-1])
+    together = last - first == len(extra) - 1  # nearly always, and a slice is copied ten times sooner
+    rows: Any = slice(first, last + 1) if together and not is_tensor(y) else extra
+    states = y[rows]
+    lengths = h if y.ndim == 2 else np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy()
+    if not is_tensor(y):
+        with np.errstate(all="ignore"):
+            y[rows] = checked_state(stepper.shorter(states, lengths.astype(y.dtype)), states)
+        return y
+    import torch
+
+    h_extra = torch.as_tensor(lengths, dtype=y.dtype, device=y.device)
+    advanced = checked_state(stepper.shorter(states, h_extra), states)
+    return y.index_copy(0, torch.as_tensor(extra, device=y.device), advanced)
+
+
+# the driver ----------------------------------------------------------------------------------------
+
+
+class GridRun:
+    """One run on the grid: the steps, the outputs among and within them, the events, and what is not finite."""
+
+    def __init__(self, integrator: FixedStep, problem: Problem) -> None:
+        self.integrator, self.problem = integrator, problem
+        self.grid = Grid(problem.t0, problem.t1, integrator.step_length(problem.system))
+        self.stepper = integrator.stepper(problem)
+
+    def outcome(self) -> Outcome:
+        """Run: at once, or, with events, in chunks of steps."""
+        search = self.problem.events
+        return self._whole() if search is None else self._streamed(search)
+
+    def _whole(self) -> Outcome:
+        problem, grid, stepper = self.problem, self.grid, self.stepper
+        t, remainder, save, place = self._placed()
+        last = int(save[-1]) if save.size else 0
+        saved, finite = stepper.rollout(problem.y0, grid.h, last, save, problem.t0)
+
+        y = saved if place is None else saved[place]
+        extra = remainder.nonzero()[0]
+        if extra.size:
+            y = shorter_steps(stepper, y, extra, remainder[extra])
+        n_steps = min(last, int(finite.max() if finite.ndim else finite) + 1)
+        end = len(save) if n_steps == last else int(save.searchsorted(n_steps, "right"))
+        n_saved = end - int(save.searchsorted(0, "right") if end and save[0] <= 0 else 0)
+        at_end = int(bool(extra.size) and extra[-1] == len(t) - 1 and t[-1] == grid.t1)
+        outcome = Outcome(t, y, 0, FINISHED, self._stats(n_steps + at_end, n_steps, n_saved, int(extra.size)))
+        if problem.dense_output:
+            outcome.sol = GridSolution(stepper, grid, saved)
+        outcome.finite = stepper.compiled and stepper.saves_finite and not extra.size
+        self._report_failures(outcome, finite, last)
+        return outcome
+
+    def _stats(self, n_told: int, n_steps: int, n_saved: int, n_extra: int) -> dict[str, Any]:
+        stepper = self.stepper
+        return {
+            "dt": abs(self.grid.h),
+            "n_steps": n_told,
+            **stepper.evaluations(n_steps, n_saved, n_extra),
+            "backend": stepper.backend,
+            **stepper.more_stats(),
+        }
+
+    def _placed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+        """Output times and their remainders, the counts whose states are to be saved, and where among these each is.
+
+        The last is None where every output is a state of its own.
+        """
+        problem, grid = self.problem, self.grid
+        t = problem.t_eval
+        if self.stepper.compiled and t is not None and len(t) > FEW and not problem.dense_output:
+            from sympflow.kernels.output_loops import place
+
+            return t, *place(t, grid.t0, grid.h, 4 * EPS)
+        t, count, remainder = grid.outputs(t, problem.save_every)
+        save, position = (np.arange(grid.n_steps + 1), count) if problem.dense_output else distinct(count)
+        return t, remainder, save, position
+
+    # events: the run in chunks of steps, each searched before the next is computed ----------------------------------
+
+    def _streamed(self, search: EventSearch) -> Outcome:
+        """The same steps for a single trajectory with events, never more than a chunk of them in memory."""
+        problem, grid, stepper = self.problem, self.grid, self.stepper
+        system, y = problem.system, problem.y0
+        times, count, remainder = grid.outputs(problem.t_eval, problem.save_every)
+        outputs: list[Array] = [y[None][:0]]
+        kept: list[Array] = []
+        chunk, k, shorter, delivered, failed = FIRST_CHUNK, 0, 0, 0, False
+        largest = max(1, min(LAST_CHUNK, MOST_SAMPLES // search.parts(grid.h, system.dt)))
+
+        while True:
+            n = min(chunk, largest, grid.n_steps - k)
+            states, finite = stepper.rollout(y, grid.h, n, np.arange(n + 1), grid.time(k))
+            good = min(n, int(finite))
+            failed = good < n
+            last = k + n == grid.n_steps or failed
+
+            taken, ended = self._search(search, k, states[: good + 1])
+            if not ended and last and not failed and grid.remainder:
+                shorter = 1
+                ended = self._search_remainder(search, states[good])
+
+            # outputs before the end of this chunk; a state at its end belongs to the next, unless there is none
+            due = delivered + int(np.searchsorted(count[delivered:], k + good, "right" if last else "left"))
+            chosen = slice(delivered, due)
+            y_due, extra = states[count[chosen] - k], np.flatnonzero(remainder[chosen])
+            if extra.size:
+                y_due = shorter_steps(stepper, y_due, extra, remainder[chosen][extra])
+            outputs.append(y_due)
+            delivered = due
+            if problem.dense_output:
+                kept.append(states[: good + 1] if last or ended else states[:good])
+            if ended or last:
+                k += taken if ended else good
+                break
+            y, k, chunk = states[n], k + n, 2 * chunk
+
+        t, y_out = times[:delivered], _join(outputs)
+        finite_outputs = to_numpy(all_finite(y_out))  # a shorter step may overflow too
+        failed = failed or not finite_outputs.all()
+        t_end = search.end[0] if search.end else grid.time(k) if failed else grid.t1
+        keep = finite_outputs & ((t - t_end) * np.sign(grid.h) <= 0)
+        n_keep = len(t) if keep.all() else int(np.argmin(keep))
+        t, y_out = t[:n_keep], y_out[:n_keep]
+        if search.end and problem.t_eval is None and not (len(t) and t[-1] == t_end):
+            t, y_out = np.append(t, t_end), _join([y_out, search.end[1][None]])
+
+        n_extra = search.n_dense + int(np.count_nonzero(remainder[:delivered]))
+        stats = self._stats(k + shorter, k, k, n_extra)
+        outcome = Outcome(t, y_out, int(search.end is not None), ENDED if search.end else FINISHED, stats)
+        if failed and not search.end:
+            outcome.status = -1
+            outcome.stats["failed_at"] = t_end
+            outcome.message = self._failure(t_end, k)
+        if problem.dense_output:
+            outcome.sol = GridSolution(stepper, Grid(grid.t0, t_end, abs(grid.h)), _join(kept))
+        return outcome
+
+    def _search(self, search: EventSearch, k: int, states: Array) -> tuple[int, bool]:
+        """Search the steps between `states`, which begin at grid point k: the number searched; does the run end?"""
+        grid, stepper = self.grid, self.stepper
+        inner = self._samples(search, states[:-1], grid.h)
+        for j in range(len(states) - 1):
+            t, y = grid.time(k + j), states[j]
+
+            def dense(s: float, t: float = t, y: Array = y) -> Array:
+                return stepper.shorter(y, s - t)
+
+            if search.step(t, y, grid.time(k + j + 1), states[j + 1], dense, inner[j]):
+                return j + 1, True
+        return len(states) - 1, False
+
+    def _samples(self, search: EventSearch, states: Array, h: float) -> Array:
+        """States (n, parts − 1, 2d) that divide the steps of length h from `states` (n, 2d), all computed at once."""
+        parts = search.parts(h, self.problem.system.dt)
+        search.n_dense += len(states) * (parts - 1)
+        lengths = h * np.arange(1, parts) / parts * np.ones((len(states), 1))
+        if parts == 1 or not len(states):
+            return states[:, None][:, :0]
+        if is_tensor(states):
+            import torch
+
+            with torch.no_grad():
+                repeated = states[:, None].expand(-1, parts - 1, -1)
+                return self.stepper.shorter(repeated, torch.as_tensor(lengths).to(repeated))
+        with np.errstate(all="ignore"):
+            repeated = np.repeat(states[:, None], parts - 1, axis=1)
+            return self.stepper.shorter(repeated, lengths.astype(states.dtype))
+
+    def _search_remainder(self, search: EventSearch, y: Array) -> bool:
+        """Search the last, shorter step of an interval that dt does not divide."""
+        grid = self.grid
+        t = grid.time(grid.n_steps)
+
+        def dense(s: float) -> Array:
+            return self.stepper.shorter(y, s - t)
+
+        y_end = dense(grid.t1)
+        search.n_dense += 1
+        if not to_numpy(all_finite(y_end)):
+            return False
+        inner = self._samples(search, y[None], grid.remainder)
+        return bool(search.step(t, y, grid.t1, y_end, dense, inner[0]))
+
+    # failures -----------------------------------------------------------------------------------------------------
+
+    def _failure(self, t: float, step: int) -> str:
+        what, remedy = self.integrator.breakdown
+        return f"{what} after t = {t:.17g} (step {step + 1} of {self.grid.n_steps}). {remedy}, or end `t_span` earlier."
+
+    def _report_failures(self, outcome: Outcome, finite: np.ndarray, n_run: int) -> None:
+        """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there.
+
+        `stats["failed_at"]` is the time of the last finite state on the grid, in a batch an array with NaN for those
+        that reached their end.
+        """
+        grid = self.grid
+        what, remedy = self.integrator.breakdown
+        done = bool((finite >= n_run).all()) if finite.ndim else int(finite) >= n_run
+        outcome.finite = done and (outcome.finite or _all_finite(outcome.y, self.stepper.compiled))
+        if outcome.finite:
+            if finite.ndim:
+                outcome.status = np.zeros(finite.shape, dtype=int)
+            return
+        ok = to_numpy(all_finite(outcome.y))  # (n, ...): shorter steps may overflow too
+        if finite.ndim:
+            outcome.status = np.where((finite < n_run) | ~ok.all(0), -1, 0)
+            failed = np.argwhere(outcome.status)
+            if failed.size:
+                i = tuple(failed[0].tolist())
+                times = grid.t0 + np.minimum(finite, grid.n_steps) * grid.h
+                outcome.stats["failed_at"] = np.where(outcome.status < 0, times, np.nan)
+                outcome.message = (
+                    f"{len(failed)} of {finite.size} trajectories failed, the first of them (index "
+                    f"{', '.join(map(str, i))}) after t = {grid.time(int(finite[i])):.17g}. {what}. {remedy}."
+                )
+            return
+        if finite < n_run or not ok.all():
+            last = int(finite) if finite < n_run else int(grid.locate(outcome.t[~ok][:1])[0][0])
+            outcome.status = -1
+            outcome.stats["failed_at"] = grid.time(last)
+            outcome.message = self._failure(grid.time(last), last)
+            keep = int(np.argmin(ok)) if not ok.all() else len(ok)
+            outcome.t, outcome.y = outcome.t[:keep], outcome.y[:keep]
+
+
+class GridSolution:
+    """Dense output of a fixed-step method: a shorter step from the last grid point before t.
+
+    Call it with a time or an array of times (n,); the result has shape (..., 2d) or (..., 2d, n).
+    """
+
+    def __init__(self, stepper: Stepper, grid: Grid, states: Array) -> None:
+        self.stepper, self.grid, self.states = stepper, grid, states
+        self.t_min, self.t_max = sorted((grid.t0, grid.t1))
+
+    def __call__(self, t: float | np.ndarray) -> Array:
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        count, remainder = self.grid.locate(times)
+        y = self.states[count]
+        extra = np.flatnonzero(remainder)
+        if extra.size:
+            y = shorter_steps(self.stepper, y, extra, remainder[extra])
+        y = y.movedim(0, -1) if is_tensor(y) else np.moveaxis(y, 0, -1)
+        return y[..., 0] if np.ndim(t) == 0 else y
 
 
 def distinct(count: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
@@ -277,6 +544,102 @@ def distinct(count: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     return (count, None) if new.all() else (count[new], np.cumsum(new) - 1)
 
 
-@cache
-def _field_names(cls: type) -> tuple[str, ...]:
-    return tuple(f.name for f in fields(cls))
+def _all_finite(y: Array, compiled: bool) -> bool:
+    """True if an array is known to be finite all over, by the means of the run."""
+    if is_tensor(y):
+        return False
+    if not compiled or y.dtype != np.float64 or not (y.flags.c_contiguous or y.flags.f_contiguous):
+        return bool(np.isfinite(y).all())
+    from sympflow.kernels.output_loops import all_finite
+
+    return all_finite(y)
+
+
+def _join(parts: Sequence[Array]) -> Array:
+    if is_tensor(parts[0]):
+        import torch
+
+        return torch.cat(list(parts))
+    return np.concatenate(parts)
+
+
+# runs whose steps the method chooses -----------------------------------------------------------------
+
+
+class Recorder:
+    """The outputs and events of a run whose steps the method chooses, taken from its steps one by one.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of a single trajectory, or of a batch that shares its steps.
+    times : ndarray of shape (n,)
+        The outputs that are wanted within the steps; none where every step is one.
+    """
+
+    def __init__(self, problem: Problem, times: np.ndarray) -> None:
+        self.search, self.wanted = problem.events, times.tolist()
+        self.sign = 1 if problem.t1 >= problem.t0 else -1
+        self.outputs: list[Array] = [problem.y0 for t in self.wanted if t == problem.t0]
+
+    @property
+    def end(self) -> tuple[float, Array] | None:
+        """The time and state of the event that ended the run, if one did."""
+        return None if self.search is None else self.search.end
+
+    def take(self, t_old: float, y_old: Array, t: float, y: Any, dense: Callable[[float], Array]) -> tuple[float, Any]:
+        """Take a step; return its end, or the event within it that ends the run.
+
+        `y` is the state at t, where it is known; `dense` gives the states within the step.
+        """
+        if self.search is not None:
+            y = dense(t) if y is None else y
+            t, y = self.search.step(t_old, y_old, t, y, dense) or (t, y)
+        while (n := len(self.outputs)) < len(self.wanted) and (self.wanted[n] - t) * self.sign <= 0:
+            s = self.wanted[n]
+            self.outputs.append(dense(s) if y is None or s != t else y)
+        return t, y
+
+    def empty(self, t: float, y: Array) -> None:
+        """Look for events in an interval of length zero."""
+        if self.search is not None:
+            self.search.step(t, y, t, y, lambda s: y)
+
+
+# events of integrators that do not look for them themselves ------------------------------------------
+
+
+def run_and_search(integrator: Integrator, problem: Problem, search: EventSearch) -> Outcome:
+    """Run an integrator that does not look for events itself: they are sought on its dense output afterwards.
+
+    Raises
+    ------
+    ValueError
+        If the integrator has no dense output.
+    """
+    full = integrator.run(replace(problem, t_eval=None, save_every=1, dense_output=True, events=None))
+    if full.sol is None:
+        raise ValueError(
+            f"`events` are located on the dense output, which method {integrator.name!r} does not give: use another "
+            "method."
+        )
+    sign = 1 if problem.t1 >= problem.t0 else -1
+    search.max_interval = search.max_interval or problem.system.dt
+    if len(full.t) == 1:
+        search.step(full.t[0], full.y[0], full.t[0], full.y[0], full.sol)
+    for k in range(len(full.t) - 1):
+        if search.step(float(full.t[k]), full.y[k], float(full.t[k + 1]), full.y[k + 1], full.sol):
+            break
+    t_end = search.end[0] if search.end else float(full.t[-1]) if full.status else problem.t1
+    if problem.t_eval is not None:
+        t = problem.t_eval[(problem.t_eval - t_end) * sign <= 0]
+        y = stack([full.sol(s) for s in t.tolist()], axis=0) if t.size else problem.y0[None][:0]
+    else:
+        keep = np.unique([*range(0, len(full.t), problem.save_every), len(full.t) - 1])
+        keep = keep[(full.t[keep] - t_end) * sign <= 0]
+        t, y = full.t[keep], full.y[keep]
+        if search.end and t[-1] != t_end:
+            t, y = np.append(t, t_end), stack([*y, search.end[1]], axis=0)
+    if search.end:
+        full.status, full.message = 1, ENDED
+    return replace(full, t=t, y=y, sol=full.sol if problem.dense_output else None)

@@ -1,30 +1,39 @@
-"""Trained flows as integrators: what the methods "sympflow" and "mlp" have in common."""
+"""Trained flows as integrators: the methods "sympflow" and "mlp", and flows in another time."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from numbers import Real
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
 
+from sympflow.arguments import check_flag
 from sympflow.arrays import Array, is_tensor
-from sympflow.domain_exit import check_start
+from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.shipped import choose, forces_saved, named, shipped, shipped_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.array_rollout import rollout
-from sympflow.integrators.base import FixedStep, Outcome, Problem
-
-if TYPE_CHECKING:
-    from sympflow.flow.mlp import MLPFlow
-    from sympflow.flow.primed import PrimedFlow
-    from sympflow.flow.sympflow import SympFlow
-    from sympflow.kernels.mlp_flow import MLPFlowKernel
-    from sympflow.kernels.primed_flow import PrimedFlowKernel
+from sympflow.hamiltonian.time_transformation import checked_shift
+from sympflow.integrators.base import FixedStep, GridRun, KernelStepper, Stepper, compiled_loops, rollout
+from sympflow.integrators.clocks import (
+    BREAKDOWN,
+    LogarithmicClock,
+    physical_length,
+    scale_of,
+    step_of_length,
+    transformed_system,
+)
+from sympflow.integrators.contract import Outcome, Problem, Steps
+from sympflow.integrators.domain_exit import check_start
 
 T = TypeVar("T")
 
+SEARCH, SEARCH_OF_EACH = 50_000, 2_000
+"""Forces that take as long as finding the outputs of a run, or of each trajectory in a batch, by their times."""
 _KNOWN: dict[tuple[Any, ...], Any] = {}
 
 
@@ -33,6 +42,11 @@ def known(key: tuple[Any, ...], make: Callable[[], T]) -> T:
     if key not in _KNOWN:
         _KNOWN[key] = make()
     return _KNOWN[key]
+
+
+def flow_named(name: str) -> FlowMap:
+    """The flow that ships under a name, read once."""
+    return known((name,), lambda: named(name).load())
 
 
 @dataclass(frozen=True)
@@ -52,39 +66,41 @@ class FlowIntegrator(FixedStep):
     order: ClassVar[int | None] = None
     trained: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
-    prepared: ClassVar[tuple[Any, Any] | None] = None
-    """Of a copy that makes one run: the flow for its states, with the numbers that it has now, and its kernel."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.flow is None:
             return
         if isinstance(self.flow, str):
-            object.__setattr__(self, "flow", _named(self.flow))
-        if getattr(self.flow, "kind", None) != self.name:
+            object.__setattr__(self, "flow", flow_named(self.flow))
+        if not isinstance(self.flow, FlowMap) or self.flow.kind != self.name:
             raise TypeError(
                 f"`flow` must be a trained flow of kind {self.name!r}; got {type(self.flow).__name__}. Load one with "
                 "sympflow.load or train one with sympflow.train."
             )
         self._check_dt(self.flow)
 
-    def _check_dt(self, flow: Any) -> None:
+    def _check_dt(self, flow: FlowMap) -> None:
         if self.dt is not None and self.dt > flow.dt * (1 + 1e-12):
             raise ValueError(
                 f"`dt` must be at most the flow's Δt = {flow.dt:g}, beyond which ψ̄ was not trained; got {self.dt:g}."
             )
 
-    def flow_for(self, system: HamiltonianSystem) -> SympFlow | MLPFlow:
-        """The flow that is used for a system: the one given, else the one shipped."""
-        if self.flow is not None:
-            return self.flow.bound(system)
-        name, tolerance = self.name, self._tolerance
-        return known((name, system.fingerprint, tolerance), lambda: _shipped(system, name, tolerance))
+    @property
+    def tolerance(self) -> float | None:
+        """The energy error by which the shipped flow is chosen, where there is a choice."""
+        return None
 
     @property
-    def _tolerance(self) -> float | None:
-        """The energy error by which the shipped flow is chosen, where there is a choice."""
-        return getattr(self, "tol", None)
+    def given_flow(self) -> FlowMap | None:
+        return self.flow
+
+    def flow_for(self, system: HamiltonianSystem) -> FlowMap:
+        """Return the flow that is used for a system: the one given, else the one shipped."""
+        if self.flow is not None:
+            return self.flow.bound(system)
+        name, tolerance = self.name, self.tolerance
+        return known((name, system.fingerprint, tolerance), lambda: shipped(system, name, tolerance))
 
     def check(self, system: HamiltonianSystem) -> None:
         if self.flow is not None:
@@ -94,8 +110,8 @@ class FlowIntegrator(FixedStep):
     def step_length(self, system: HamiltonianSystem) -> float:
         return float(self.dt if self.dt is not None else self.flow_for(system).dt)
 
-    def _flow_like(self, system: HamiltonianSystem, y: Array) -> Any:
-        """The flow for states such as y: a shipped one in their dtype and on their device, a given one as it is.
+    def flow_like(self, system: HamiltonianSystem, y: Array) -> FlowMap:
+        """Return the flow for states such as y: a shipped one in their dtype and on their device, a given one as it is.
 
         Raises
         ------
@@ -110,7 +126,7 @@ class FlowIntegrator(FixedStep):
             return flow
         if self.flow is None:
             dtype, device = tensor.dtype, tensor.device
-            key = (self.name, system.fingerprint, self._tolerance, dtype, device)
+            key = (self.name, system.fingerprint, self.tolerance, dtype, device)
             return known(key, lambda: copy.deepcopy(flow).to(dtype=dtype, device=device))
         if tensor.dtype != flow.dtype:
             raise TypeError(
@@ -119,104 +135,73 @@ class FlowIntegrator(FixedStep):
             )
         raise ValueError(f"`y0` is on {tensor.device}, but the flow is on {flow.device}: move one of them.")
 
+    def kernel(self, flow: FlowMap, problem: Problem) -> Any:
+        """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
+        return compiled_loops(lambda: flow.kernel_for(problem.system), problem.y0, problem.backend)
+
+    def stepper(self, problem: Problem) -> FlowStepper | CompiledFlowStepper:
+        flow = self.flow_for(problem.system)
+        if type(problem.y0) is np.ndarray and problem.y0.dtype == np.float64:  # a kernel tells the flow's own dtype
+            kernel = self.kernel(flow, problem)
+            if kernel is not None:
+                return CompiledFlowStepper(self, problem, flow, kernel)
+        flow = self.flow_like(problem.system, problem.y0)
+        kernel = self.kernel(flow, problem)
+        if kernel is not None:
+            return CompiledFlowStepper(self, problem, flow, kernel)
+        return FlowStepper(self, problem, flow)
+
+    def run(self, problem: Problem) -> Outcome:
+        run = GridRun(self, problem)
+        if self.tolerance is not None:
+            check_start(self.flow_for(problem.system), problem.system, problem.y0, run.stepper.compiled)
+        return run.outcome()
+
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        return self.substep(system, y, h, "auto")
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("prepared", "saves_finite")}
-
-    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
-        if self.prepared is not None and backend == "compiled":
-            flow, kernel = self.prepared
-        else:
-            flow = self._flow_like(system, y)
-            kernel = kernel_of(system, flow, y, "array" if backend == "torch" else backend)
-        if kernel is None:
-            return _apply(flow, y, h)
-        if y.ndim == 2 and np.shape(h) == (len(y),):
-            return kernel.step(h, y)
-        rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
-        lengths = np.broadcast_to(h, y.shape[:-1]).reshape(-1)
-        return kernel.step(lengths, rows).reshape(y.shape)
+        return self.stepper(Problem(system, t, t, y)).shorter(y, h)
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        return _apply(self._flow_like(system, y).inverse, y, h)
+        return _apply(self.flow_like(system, y).inverse, y, h)
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         self.flow_for(system)  # files cannot be read inside a function transform
         return super().tangent(system, t, y, h)
 
-    def run(self, problem: Problem) -> Outcome:
-        flow, kernel = prepared = self._flow_and_kernel(problem)
-        chosen = object.__new__(type(self))  # with this flow from here on; the fields have been checked
-        finite = getattr(kernel, "saves_finite", False)
-        vars(chosen).update(vars(self), flow=flow, prepared=prepared, saves_finite=finite)
-        if self._tolerance is not None:
-            check_start(flow, problem.system, problem.y0, kernel is not None)
-            vars(chosen).update(tol=None)
-        return super(FlowIntegrator, chosen).run(problem)
 
-    def _flow_and_kernel(self, problem: Problem) -> tuple[Any, Any]:
-        """The flow for the states of the problem, and its compiled loops or None."""
-        system, y0 = problem.system, problem.y0
-        flow = self.flow_for(system)
-        if type(y0) is np.ndarray and y0.dtype == np.float64:  # a kernel says itself what flow it is for
-            kernel = kernel_of(system, flow, y0, problem.backend)
-            if kernel is not None:
-                return flow, kernel
-        flow = self._flow_like(system, y0)
-        return flow, kernel_of(system, flow, y0, problem.backend)
+class FlowStepper(Stepper):
+    """A run of a flow by tensor operations: of ψ̄ = χ ∘ K ∘ χ⁻¹ the χ between two steps cancel."""
 
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        if self.prepared is not None and hasattr(self.prepared[1], "evaluations"):
-            return self.prepared[1].evaluations(n_steps, n_saved, n_extra, backend)
-        if not hasattr(self.flow, "evaluations"):  # an MLP flow evaluates no forces
-            return super().evaluations(n_steps, n_saved, n_extra, backend)
-        return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
+    def __init__(self, integrator: FlowIntegrator, problem: Problem, flow: FlowMap) -> None:
+        super().__init__(integrator, problem)
+        self.flow, self.backend = flow, "torch"
 
-    def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
-        y0 = problem.y0
-        flow, kernel = self._flow_and_kernel(problem) if self.prepared is None else self.prepared
-        if kernel is not None:
-            if y0.ndim == 1:
-                states, last = kernel.run(h, y0, n_steps, save)
-                return states, np.asarray(last), "compiled"
-            rows = y0.reshape(-1, y0.shape[-1])
-            states, finite = kernel.run_batch(h, rows, n_steps, save)
-            states = states.swapaxes(0, 1).reshape(len(save), *y0.shape)
-            return states, np.asarray(finite).reshape(y0.shape[:-1]), "compiled"
-        if isinstance(y0, torch.Tensor) and hasattr(flow, "processor") and flow.processor:
-            return *_processed_rollout(flow, h, y0, n_steps, save), "torch"
-        if is_tensor(y0):
-            return super().rollout(problem, h, n_steps, save)
-        with torch.no_grad():
-            tensors = Problem(problem.system, problem.t0, problem.t1, torch.from_numpy(np.ascontiguousarray(y0)))
-            states, finite, _ = self.rollout(tensors, h, n_steps, save)
-        return states.numpy(), finite, "torch"
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
+        if not is_tensor(y0):
+            with torch.no_grad():
+                states, finite = self.rollout(torch.from_numpy(np.ascontiguousarray(y0)), h, n_steps, save)
+            return states.numpy(), finite
+        flow, t = self.flow, abs(h)
+        states, finite = rollout(lambda k, y: flow.kernel_step(t, y, h < 0), flow.prepare(t, y0), n_steps, save)
+        states = flow.finish(t, states)
+        start = int(np.count_nonzero(save == 0))  # `save` is sorted
+        return torch.cat([y0.expand(start, *y0.shape), states[start:]]), finite
+
+    def shorter(self, y: Array, h: Any) -> Array:
+        return _apply(self.flow, y, h)
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
+        return self.flow.evaluations(n_steps, n_saved, n_extra, self.backend)
 
 
-def _named(name: str) -> Any:
-    """The flow that ships under a name."""
-    from sympflow.flow.shipped import named
+class CompiledFlowStepper(KernelStepper):
+    """A run of a flow in its compiled loops."""
 
-    return known((name,), lambda: named(name).load())
+    def __init__(self, integrator: FlowIntegrator, problem: Problem, flow: FlowMap, kernel: Any) -> None:
+        super().__init__(integrator, problem, kernel)
+        self.flow = flow
 
-
-def _shipped(system: HamiltonianSystem, kind: str, tol: float | None) -> Any:
-    from sympflow.flow.io import shipped
-
-    return shipped(system, kind, tol)
-
-
-def _processed_rollout(
-    flow: PrimedFlow, h: float, y0: torch.Tensor, n_steps: int, save: np.ndarray
-) -> tuple[torch.Tensor, np.ndarray]:
-    """A run of ψ̄ = χ ∘ K ∘ χ⁻¹ in which the χ between two steps cancel."""
-    t = abs(h)
-    states, finite = rollout(lambda k, y: flow.kernel_step(t, y, h < 0), flow.prepare(t, y0), n_steps, save)
-    states = flow.finish(t, states)
-    start = int(np.count_nonzero(save == 0))  # `save` is sorted
-    return torch.cat([y0.expand(start, *y0.shape), states[start:]]), finite
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
+        return self.flow.evaluations(n_steps, n_saved, n_extra, "compiled")
 
 
 def _apply(function: Any, y: Array, h: float | Array) -> Array:
@@ -228,21 +213,255 @@ def _apply(function: Any, y: Array, h: float | Array) -> Array:
         return function(length, torch.from_numpy(np.ascontiguousarray(y))).numpy()
 
 
-def kernel_of(system: HamiltonianSystem, flow: Any, y: Array, backend: str) -> MLPFlowKernel | PrimedFlowKernel | None:
-    """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
-    if backend == "array":
-        return None
-    try:
-        if is_tensor(y):
-            raise ValueError("`y0` is a tensor: pass a NumPy array, or use backend='array'.")
-        if flow.kind != "sympflow":
-            raise ValueError("`method` 'mlp' has no compiled form: use backend='array'.")
-        if hasattr(flow, "kernel_for"):
-            return flow.kernel_for(system)
-        from sympflow.kernels.mlp_flow import mlp_flow_kernel
+@dataclass(frozen=True)
+class SympFlowIntegrator(FlowIntegrator):
+    """A trained SympFlow: symplectic for every step length, with an exact inverse.
 
-        return mlp_flow_kernel(flow)
-    except ValueError as reason:
-        if backend == "compiled":
-            raise ValueError(f"`backend` 'compiled' does not apply. {reason}") from None
+    Parameters
+    ----------
+    dt : float, optional
+        Step length, at most the flow's Δt, which is the default. A smaller one composes ψ̄_dt, which is another map.
+    flow : SympFlow or str, optional
+        A flow, or the name of one that ships, as `sympflow.shipped_flows()` lists them. The default is, of those that
+        ship for the system, the cheapest whose figure is at most 1e-6, or else the most accurate.
+    tol : float, optional
+        Take the cheapest shipped flow whose relative energy error up to T = 1000, the 95 % quantile over held-out
+        states, is at most this; `sympflow.shipped_flows(system)` lists them, and a T that differs. Where y0 is outside
+        the domain of that flow there is no such figure, and a ValueError says so. It says nothing of a smaller `dt`.
+    compensated : bool
+        Whether to sum with Kahan's compensation, which slows the growth of round-off. Compiled primed flows only.
+
+    References
+    ----------
+    .. [1] P. Canizares, D. Murari, C.-B. Schönlieb, F. Sherry, Z. Shumaylov, "Hamiltonian matching for symplectic
+       neural integrators" (2024).
+    """
+
+    tol: float | None = None
+    compensated: bool = False
+
+    name: ClassVar[str] = "sympflow"
+    source: ClassVar[str] = "A trained SympFlow: symplectic for every step length, with an exact inverse."
+    symplectic: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_flag("compensated", self.compensated)
+        if self.tol is None:
+            return
+        if not isinstance(self.tol, Real) or isinstance(self.tol, bool) or not 0 < self.tol < math.inf:
+            raise ValueError(
+                f"`tol` must be a positive number, a relative energy error; got {self.tol!r}: take 1e-6, for instance."
+            )
+        for name in ("flow", "dt"):
+            if getattr(self, name) is not None:
+                raise ValueError(f"`tol` chooses the flow and its Δt, but `{name}` is given: leave out one of them.")
+
+    @property
+    def tolerance(self) -> float | None:
+        return self.tol
+
+    @property
+    def in_another_time(self) -> bool:  # type: ignore[override]
+        """True for a flow that was given and is one in another time."""
+        return self.flow is not None and self.flow.origin is not None
+
+    def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> FixedStep:
+        """Return the integrator that runs: with `tol`, over a `length` that is worth it, a flow in another time.
+
+        So does a flow in another time of this system that is given. A `tol` that no other meets is worth any length.
+        """
+        if self.flow is not None:
+            return self._given_in_another_time(system)
+        if self.tol is None or self.compensated or is_tensor(y0) or y0.dtype != np.float64:
+            return self
+        name, tol = self.name, self.tol
+        other = known(("in another time", name, system.fingerprint, tol), lambda: _in_another_time(system, name, tol))
+        if other is None:
+            return self
+        flow, shift, saved = other
+        trajectories = y0.size // y0.shape[-1]
+        if trajectories * length * saved < SEARCH + SEARCH_OF_EACH * trajectories:
+            return self
+        check_start(flow, system, y0, False)
+        return LogSympFlow(flow=flow, shift=shift)
+
+    def _given_in_another_time(self, system: HamiltonianSystem) -> FixedStep:
+        origin = self.flow.origin
+        if origin is None or not origin.is_of(system):
+            return self
+        if self.compensated:
+            raise ValueError("`compensated` sums are not for a flow in another time: leave it out.")
+        return LogSympFlow(flow=self.flow, shift=origin.shift, dt=self.dt)
+
+    def kernel(self, flow: FlowMap, problem: Problem) -> Any:
+        if not self.compensated:
+            return super().kernel(flow, problem)
+        kernel = compiled_loops(lambda: flow.kernel_for(problem.system, True), problem.y0, problem.backend)
+        if kernel is None:
+            raise ValueError(
+                "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave "
+                "it out, or take a flow of SympFlow.primed."
+            )
+        return kernel
+
+
+def _in_another_time(system: HamiltonianSystem, kind: str, tol: float) -> tuple[FlowMap, float, float] | None:
+    """The flow that meets `tol`, if it is one in another time: it, its shift, and the forces that it saves."""
+    chosen = choose(system, kind, tol, transformed=True)
+    if chosen.shift is None:
         return None
+    return chosen.load(system), chosen.shift, forces_saved(chosen, system, tol)
+
+
+@dataclass(frozen=True)
+class MLPIntegrator(FlowIntegrator):
+    """The paper's baseline: an unconstrained neural flow map. Not symplectic; no inverse, so no backward time.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Step length, at most the flow's Δt, which is the default.
+    flow : MLPFlow or str, optional
+        A flow, or the name of one that ships. The default is the one shipped for the system.
+    """
+
+    name: ClassVar[str] = "mlp"
+    source: ClassVar[str] = (
+        "The paper's baseline: an unconstrained neural flow map. Not symplectic; no inverse, so no backward time."
+    )
+    symplectic: ClassVar[bool] = False
+
+    def run(self, problem: Problem) -> Outcome:
+        if problem.t1 < problem.t0:
+            raise ValueError(
+                "`t_span` runs backwards, but method 'mlp' has no inverse: use a symplectic method for backward time."
+            )
+        return super().run(problem)
+
+    def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        raise TypeError("`method` 'mlp' has no exact inverse: use a symplectic method.")
+
+
+@dataclass(frozen=True)
+class LogSympFlow(FixedStep):
+    """A SympFlow trained on `sympflow.time_transformed(system)`, in the physical time.
+
+    Parameters
+    ----------
+    dt : float, optional
+        The physical length of a step where the kinetic energy is B = c − E, at the energy E of the system's y0, by the
+        flow's own clock where it has one; the step in s that it means is at most the flow's Δ, which is the default.
+    shift : float, optional
+        c of the transformed system that the flow was trained on, which a flow that ships knows.
+    flow : SympFlow or str, optional
+        Trained on, or primed with, the transformed system; or the name of one that ships. `solve` takes by default
+        the one that ships for the system. ``solve(system, "sympflow", flow=...)`` comes here by itself.
+    """
+
+    shift: float | None = None
+    flow: Any = field(default=None, repr=False)
+
+    name: ClassVar[str] = "log_sympflow"
+    order: ClassVar[int | None] = None
+    symplectic: ClassVar[bool] = True
+    trained: ClassVar[bool] = True
+    compiles: ClassVar[bool] = True
+    source: ClassVar[str] = "A SympFlow trained on `sympflow.time_transformed(system)`, in the physical time."
+    finds_events: ClassVar[bool] = False  # they are sought on the dense output
+    on_grid: ClassVar[bool] = False
+    in_another_time: ClassVar[bool] = True
+    tangent_holds: ClassVar[str] = "the realised step in s, and B,"
+    breakdown: ClassVar[tuple[str, str]] = BREAKDOWN
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.shift is not None:
+            checked_shift(self.shift)
+        if isinstance(self.flow, str):
+            object.__setattr__(self, "flow", flow_named(self.flow))
+        flow = self.flow
+        if flow is None:
+            return
+        if not isinstance(flow, FlowMap) or flow.kind != "sympflow":
+            raise TypeError(
+                f"`flow` must be a SympFlow of the transformed system, or the name of one; got {type(flow).__name__}."
+            )
+        if self.shift is None and flow.origin is not None:
+            object.__setattr__(self, "shift", checked_shift(flow.origin.shift))
+
+    def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> LogSympFlow:
+        """Return the integrator with the flow that ships for the system unless one is given, and its shift."""
+        if self.flow is not None:
+            return self
+        found = [f for f in shipped_flows(system, "sympflow") if f.shift is not None]
+        if not found:
+            raise ValueError(
+                f"`flow` is needed, for none in another time ships for {system.name!r}: train one on "
+                "sympflow.time_transformed(system), or prime one with it, and pass it; or use 'log_leapfrog'."
+            )
+        return replace(self, flow=found[0].load(system), shift=found[0].shift if self.shift is None else self.shift)
+
+    def on_clock(self, system: HamiltonianSystem) -> LogarithmicClock:
+        """Return the flow on its clock.
+
+        Where the kinetic energy is B, ds/dt is the scale. Without y0 no B is known, by which a trained clock advances.
+        """
+        flow: FlowMap = self.flow
+        if flow is None:
+            raise ValueError(
+                "`flow` is needed: train one on sympflow.time_transformed(system), or prime one with it, and pass it."
+            )
+        transformed = transformed_system(system, self.shift)
+        scale, numbers = scale_of(system, transformed.params["shift"]), flow.clock_numbers()
+        clock = () if system.y0 is None else numbers
+        if self.dt is None:
+            dt, new_step = physical_length(flow.dt, scale, clock), flow.dt
+        else:
+            dt, new_step = float(self.dt), step_of_length(float(self.dt), scale, clock)
+        inner = SympFlowIntegrator(flow=flow)
+
+        def reach_times(
+            transformed: HamiltonianSystem,
+            h: float,
+            start: np.ndarray,
+            times: np.ndarray,
+            stride: int,
+            expected: float,
+            backend: str,
+        ) -> Any:
+            bound = flow.bound(transformed)
+            kernel = compiled_loops(lambda: bound.kernel_for(transformed), start, backend)
+            if kernel is None:
+                return None
+            return kernel.reach_times(h, start, times, stride, expected, numbers)
+
+        return LogarithmicClock(self.name, system, transformed, inner, dt, new_step, flow.evaluations, reach_times)
+
+    def figures(self, system: HamiltonianSystem) -> Mapping[str, Any]:
+        return {} if self.flow is None else self.flow.figures
+
+    def step_length(self, system: HamiltonianSystem) -> float:
+        return self.on_clock(system).dt
+
+    def check(self, system: HamiltonianSystem) -> None:
+        clock = self.on_clock(system)
+        self.flow.check_system(clock.transformed)
+        if not clock.new_step <= self.flow.dt * (1 + 1e-12):
+            longest = replace(self, dt=None).on_clock(system).dt
+            raise ValueError(f"`dt` must be at most {longest:g}, where the step in s is the flow's Δ; got {self.dt:g}.")
+
+    def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        return self.on_clock(system).step(y, h)
+
+    def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        return self.on_clock(system).inverse(y, h)
+
+    def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
+        return self.on_clock(system).tangent(y, h)
+
+    def run(self, problem: Problem) -> Outcome:
+        return self.on_clock(problem.system).run(problem)
+
+    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        return self.on_clock(system).steps(t_span, y0)

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from math import sqrt
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from sympflow.arguments import check_flag
 from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, Outcome, Problem
+from sympflow.integrators.base import FixedStep, KernelStepper, Problem, Stepper, compiled_loops, rollout
 
 if TYPE_CHECKING:
-    from sympflow.kernels.implicit import ImplicitKernel, Tableau
+    from sympflow.kernels.implicit_loops import ImplicitKernel, Tableau
 
 MOST_ITERATIONS = 50
 
@@ -58,8 +57,12 @@ class Gauss(FixedStep):
         check_flag("compensated", self.compensated)
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        K, _ = self._stages(system, y, per_state(h, y))
-        return self._advanced(y, K)
+        return self.counted_step(system, y, h)[0]
+
+    def counted_step(self, system: HamiltonianSystem, y: Array, h: float | Array) -> tuple[Array, int]:
+        """The step, and the iterations that it took, in sum over the states."""
+        K, iterations = self._stages(system, y, per_state(h, y))
+        return self._advanced(y, K), iterations
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         return self.step(system, t, y, -h)  # the methods are symmetric
@@ -75,77 +78,22 @@ class Gauss(FixedStep):
         dK = _solved(M, (h[..., None, None] * D).reshape(*y.shape[:-1], s * n, n)).reshape(*y.shape[:-1], s, n, n)
         return self._advanced(y, K), np.eye(n, dtype=y.dtype) + np.einsum("i,...ijk->...jk", b, dK)
 
-    def run(self, problem: Problem) -> Outcome:
-        counting = self.counting(problem.system)
-        outcome = super(Gauss, counting).run(problem)
-        outcome.stats["newton_iterations"] = counting._iterations[0]  # type: ignore[attr-defined]
-        return outcome
+    def stepper(self, problem: Problem) -> CompiledGauss | ArrayGauss:
+        from sympflow.kernels.implicit_loops import implicit_kernel
 
-    def counting(self, system: HamiltonianSystem) -> Self:
-        counting = copy.copy(self)  # Newton's iterations are counted in a copy: an integrator has no state
-        object.__setattr__(counting, "_iterations", [0, 0])  # all, and those that `evaluations` has told
-        return counting
-
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Those since it was last asked."""
-        total, told = self._iterations  # type: ignore[attr-defined]
-        self._iterations[1] = total  # type: ignore[attr-defined]
-        n = (total - told) * len(self.tableau[1])
-        return {"force_evaluations": n, "hessian_evaluations": n}
-
-    def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
-        kernel = self._kernel(problem)
-        if kernel is None:
-            return super().rollout(problem, h, n_steps, save)
-        y0 = problem.y0
-        rows = y0.reshape(-1, y0.shape[-1])
-        states, finite, iterations = kernel.run_batch(h, rows, n_steps, save, self.compensated)
-        self._count(iterations)
-        states = states.swapaxes(0, 1).reshape(len(save), *y0.shape)
-        return states, finite.reshape(y0.shape[:-1]), "compiled"
-
-    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
-        if backend != "compiled":
-            return self.step(system, 0.0, y, h)
-        from sympflow.kernels.implicit import implicit_kernel
-
-        rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
-        out, iterations = implicit_kernel(system, self.tableau).step(np.broadcast_to(h, y.shape[:-1]).reshape(-1), rows)
-        self._count(iterations)
-        return out.reshape(y.shape)
-
-    def _kernel(self, problem: Problem) -> ImplicitKernel | None:
-        """The compiled loops for the problem, or None where it needs, or asks for, array operations."""
-        y0, reason = problem.y0, None
-        if problem.backend == "array":
-            reason = "`backend` is 'array': choose 'auto'."
-        elif is_tensor(y0):
-            reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
-        elif y0.dtype != np.float64:
-            reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
-        if reason is None:
-            from sympflow.kernels.implicit import implicit_kernel
-
-            try:
-                return implicit_kernel(problem.system, self.tableau)
-            except ValueError as error:
-                reason = str(error)
-        if problem.backend == "compiled":
-            raise ValueError(f"`backend` 'compiled' does not apply. {reason}")
-        if self.compensated:
-            raise ValueError(f"`compensated` sums need compiled loops. {reason}")
-        return None
-
-    def _count(self, iterations: int) -> None:
-        counter = getattr(self, "_iterations", None)
-        if counter is not None:
-            counter[0] += iterations
+        kernel = compiled_loops(
+            lambda: implicit_kernel(problem.system, self.tableau, bool(self.compensated)),
+            problem.y0,
+            problem.backend,
+            self.compensated,
+        )
+        return ArrayGauss(self, problem) if kernel is None else CompiledGauss(self, problem, kernel)
 
     def _advanced(self, y: Array, K: Array) -> Array:
         return y + sum(b * K[..., i, :] for i, b in enumerate(self.tableau[1]))
 
     def _stages(self, system: HamiltonianSystem, y: Array, h: Any) -> tuple[Array, int]:
-        """The K (..., s, 2d) of a step, NaN for states whose step was not solved; and the iterations taken."""
+        """The K (..., s, 2d) of a step, NaN where the step was not solved; and the iterations, over all states."""
         if is_tensor(y):
             return self._tensor_stages(system, y, h)
         A = np.array(self.tableau[0], dtype=y.dtype)
@@ -166,8 +114,7 @@ class Gauss(FixedStep):
                 K[lost] = np.nan
                 done, before = done | small | lost, size
         K[~done] = np.nan
-        self._count(iteration * done.size)
-        return K, iteration
+        return K, iteration * done.size
 
     def _tensor_stages(self, system: HamiltonianSystem, y: Array, h: Any) -> tuple[Array, int]:
         """`_stages` of tensors: solved without a graph, then two more iterations in it, which give it derivatives.
@@ -180,13 +127,51 @@ class Gauss(FixedStep):
         constant = h.detach() if is_tensor(h) else h
         with torch.no_grad():
             flat = to_numpy(y.detach())
-            K0, iteration = self._stages(system, flat, to_numpy(constant) if is_tensor(h) else h)
+            K0, iterations = self._stages(system, flat, to_numpy(constant) if is_tensor(h) else h)
         K = torch.as_tensor(K0, dtype=y.dtype, device=y.device)
         A = torch.as_tensor(self.tableau[0], dtype=y.dtype, device=y.device)
         for _ in range(2):
             M, residual = _equations(system, y, K, h, A)
             K = K - torch.linalg.solve_ex(M, residual[..., None])[0][..., 0].reshape(K.shape)
-        return K, iteration + 2
+        return K, iterations
+
+
+class _Counts:
+    """Counts of a run of a Gauss method: Newton's iterations, each with the force and the Hessian at every stage."""
+
+    gauss: Gauss
+    iterations: int
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
+        n = self.iterations * len(self.gauss.tableau[1])
+        return {"force_evaluations": n, "hessian_evaluations": n}
+
+    def more_stats(self) -> dict[str, int]:
+        return {"newton_iterations": self.iterations}
+
+
+class CompiledGauss(_Counts, KernelStepper):
+    """A run of a Gauss method in compiled loops."""
+
+    def __init__(self, gauss: Gauss, problem: Problem, kernel: ImplicitKernel) -> None:
+        super().__init__(gauss, problem, kernel)
+        self.gauss = gauss
+
+
+class ArrayGauss(_Counts, Stepper):
+    """A run of a Gauss method by array operations."""
+
+    def __init__(self, gauss: Gauss, problem: Problem) -> None:
+        super().__init__(gauss, problem)
+        self.gauss, self.iterations = gauss, 0
+
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
+        return rollout(lambda k, y: self.shorter(y, h), y0, n_steps, save)
+
+    def shorter(self, y: Array, h: Any) -> Array:
+        y_next, iterations = self.gauss.counted_step(self.system, y, h)
+        self.iterations += iterations
+        return y_next
 
 
 def _equations(system: HamiltonianSystem, y: Array, K: Array, h: Any, A: Array) -> tuple[Array, Array]:
@@ -250,6 +235,9 @@ class ImplicitMidpoint(Gauss):
     """
 
     name: ClassVar[str] = "implicit_midpoint"
+    source: ClassVar[str] = (
+        "The implicit midpoint rule, y₁ = y + h f((y + y₁)/2): order 2, symplectic, symmetric, A-stable."
+    )
     order: ClassVar[int | None] = 2
     tableau: ClassVar[Tableau] = (((0.5,),), (1.0,))
 
@@ -272,5 +260,6 @@ class GaussLegendre4(Gauss):
     """
 
     name: ClassVar[str] = "gauss_legendre4"
+    source: ClassVar[str] = "The Gauss–Legendre method of two stages: order 4, symplectic, symmetric, A-stable."
     order: ClassVar[int | None] = 4
     tableau: ClassVar[Tableau] = (((0.25, 0.5 - _A21), (_A21, 0.25)), (0.5, 0.5))

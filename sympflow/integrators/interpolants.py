@@ -11,7 +11,7 @@ import numpy as np
 from sympflow.arrays import Array, is_tensor, stack
 
 if TYPE_CHECKING:
-    from sympflow.integrators.base import Outcome
+    from sympflow.integrators.contract import Outcome
 
 Time = Any
 """A number, or a tensor that carries a gradient."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import logging
+import sys
 import warnings
 from collections.abc import Callable
 from functools import cache
@@ -11,35 +12,15 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import Integrator
-from sympflow.integrators.tableaux import ADAPTIVE, FIXED
+from sympflow.integrators.contract import Integrator
+from sympflow.integrators.methods import CLASSES, NAMES, TORCHDIFFEQ, TRIPLES, UNLISTED
 from sympflow.lazy import whole_import
-from sympflow.schemes import SCHEMES
 
 T = TypeVar("T")
 
 GROUP = "sympflow.integrators"
 """The entry-point group in which a distribution announces its integrators: `name = "package.module:Class"`."""
 
-_BUILT_IN = {
-    "rk45": "scipy_methods:RK45",
-    "dop853": "scipy_methods:DOP853",
-    "sympflow": "sympflow:SympFlowIntegrator",
-    "mlp": "sympflow:MLPIntegrator",
-    "implicit_midpoint": "implicit:ImplicitMidpoint",
-    "gauss_legendre4": "implicit:GaussLegendre4",
-    "log_leapfrog": "logarithmic:log_leapfrog",
-    "log_blanes_moan4": "logarithmic:log_blanes_moan4",
-    "log_kahan_li8": "logarithmic:log_kahan_li8",
-}
-_UNLISTED = {"log_sympflow": "log_sympflow:LogSympFlow"}  # what "sympflow" is for a flow in another time
-_WITH_PARTS = (
-    *("impulse", "mollified_impulse", "implicit_explicit"),
-    *("linear_srkn6b", "linear_srkn11b", "linear_srkn14a", "linear_omelyan4"),
-    *("strang_parts", "suzuki4_parts", "kahan_li6_parts", "kahan_li8_parts"),
-)
-_TORCHDIFFEQ = (*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams")
-_NAMES = frozenset((*SCHEMES, *_BUILT_IN, *_WITH_PARTS, *_TORCHDIFFEQ))
 _INSTEAD = {
     "max_step": "`dt` is the step, and `event_step` samples events within it",
     **dict.fromkeys(("h", "step", "step_size"), "the step of fixed-step methods is `dt`"),
@@ -50,7 +31,7 @@ _loaded: dict[type[Integrator], EntryPoint] = {}
 
 def available() -> list[str]:
     """The names of all methods: built in, registered, and from plug-ins. Nothing is imported to list them."""
-    return sorted({*_NAMES, *_registered, *_plugins()})
+    return sorted({*NAMES, *_registered, *_plugins()})
 
 
 def get(method: str | type[Integrator]) -> type[Integrator]:
@@ -71,17 +52,13 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
         return method
     if not isinstance(method, str):
         raise TypeError(f"`method` must be a name or an Integrator class; got {type(method).__name__}.")
-    if method in SCHEMES:
-        from sympflow.integrators.splitting import splitting
+    if method in TRIPLES:
+        from sympflow.integrators.splitting import splitting_method
 
-        return splitting(method)
-    if method in _BUILT_IN or method in _UNLISTED:
+        return splitting_method(method)
+    if method in CLASSES or method in UNLISTED:
         return _built_in(method)
-    if method in _WITH_PARTS:
-        from sympflow.integrators.linear_splitting import maps_stepper
-
-        return maps_stepper(method)
-    if method in _TORCHDIFFEQ:
+    if method in TORCHDIFFEQ:
         from sympflow.integrators.torchdiffeq_methods import torchdiffeq_method
 
         return torchdiffeq_method(method)
@@ -96,7 +73,7 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
 
 @cache
 def _built_in(method: str) -> type[Integrator]:
-    module, _, attribute = (_BUILT_IN | _UNLISTED)[method].partition(":")
+    module, _, attribute = (CLASSES | UNLISTED)[method].partition(":")
     return getattr(whole_import(f"sympflow.integrators.{module}"), attribute)
 
 
@@ -114,7 +91,7 @@ def register(name: str, integrator: type[Integrator]) -> None:
         raise TypeError(f"`name` must be a string, such as 'my_method'; got {type(name).__name__}.")
     if not name.strip():
         raise ValueError(f"`name` must not be empty; got {name!r}. Choose one, such as 'my_method'.")
-    if name in _NAMES or name in _UNLISTED:
+    if name in NAMES or name in UNLISTED:
         raise ValueError(f"`name` {name!r} is a built-in method, which cannot be replaced: choose another name.")
     if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
         raise TypeError(f"`integrator` must be a subclass of sympflow.integrators.base.Integrator; got {integrator!r}.")
@@ -150,7 +127,7 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
         options = {"flow": method, **options}
         method = method.kind
     cls = get(method)
-    own = isinstance(method, str) and method in _NAMES
+    own = isinstance(method, str) and method in NAMES
     known = cls.options() if own else _made(method, cls.options)
     unknown = [name for name in options if name not in known]
     if unknown:
@@ -166,7 +143,7 @@ def _made(method: Any, make: Callable[[], T]) -> T:
     try:
         return make()
     except (Exception, SystemExit) as error:
-        if not isinstance(method, str) or method in _NAMES or method in _UNLISTED or method in _registered:
+        if not isinstance(method, str) or method in NAMES or method in UNLISTED or method in _registered:
             raise
         plugin = f"the plug-in {_distribution(_plugins()[method])}"
         if isinstance(error, TypeError | ValueError):  # what its options were given, most likely
@@ -179,14 +156,16 @@ def _made(method: Any, make: Callable[[], T]) -> T:
 
 
 def _is_flow(method: Any) -> bool:
-    return hasattr(method, "layers") or type(method).__name__ == "MLPFlow"
+    """True for a trained flow: there is none unless its module has been imported, with torch."""
+    flows = sys.modules.get("sympflow.flow.flow_map")
+    return flows is not None and isinstance(method, flows.FlowMap)
 
 
 @cache
 def _plugins() -> dict[str, EntryPoint]:
     found: dict[str, EntryPoint] = {}
     for point in entry_points(group=GROUP):
-        if point.name in _NAMES or point.name in found:
+        if point.name in NAMES or point.name in found:
             message = f"The integrator {point.name!r} of {_distribution(point)} is ignored: the name is taken."
             try:
                 warnings.warn(message, RuntimeWarning, stacklevel=4)
@@ -259,7 +238,7 @@ def name_of(integrator: Integrator) -> str:
     cls = type(integrator)
     if cls in _loaded:
         return _loaded[cls].name
-    if integrator.name in _NAMES and get(integrator.name) is cls:
+    if integrator.name in NAMES and get(integrator.name) is cls:
         return integrator.name
     return next((name for name, registered in _registered.items() if registered is cls), integrator.name)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sympflow.arrays import Array, per_state, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import Integrator
+from sympflow.integrators.contract import Integrator
 
 
 class ExplicitStep(Integrator):

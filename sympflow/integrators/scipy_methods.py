@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -13,9 +13,9 @@ from scipy.integrate import RK45 as ScipyRK45
 from scipy.integrate import OdeSolution
 
 from sympflow.arrays import Array, is_tensor
-from sympflow.events import ENDED
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FINISHED, Outcome, Problem, Steps
+from sympflow.integrators.base import Recorder
+from sympflow.integrators.contract import ENDED, FINISHED, Outcome, Problem, Steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.runge_kutta import RungeKutta, hopeless
 
@@ -39,6 +39,7 @@ class _Scipy(RungeKutta):
 
     solver: ClassVar[Any]
     finds_events: ClassVar[bool] = True
+    one_by_one: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -102,11 +103,9 @@ class _Scipy(RungeKutta):
                 f"The vector field or the first step is not finite at t = {t0:.17g}. Check `y0` and its scale, or "
                 "raise `atol`."
             )
-        wanted = [] if t_eval is None else t_eval.tolist()
-        outputs: list[np.ndarray] = [y0 for t in wanted if t == t0]
-        search = problem.events
-        if search is not None and t1 == t0:
-            search.step(t0, y0, t1, y0, lambda t: y0)
+        record = Recorder(replace(problem, y0=y0), np.empty(0) if t_eval is None else t_eval)
+        if t1 == t0:
+            record.empty(t0, y0)
         y_old, reached = y0, t0
         with np.errstate(all="ignore"):
             while solver is not None and solver.status == "running":
@@ -121,32 +120,24 @@ class _Scipy(RungeKutta):
                 failure = hopeless(stats["n_steps"], t0, solver.t, t1)
                 if failure:
                     break
-                t, y, interpolant = solver.t, solver.y, None
-                if search is not None:
-                    interpolant = _Lazily(solver.dense_output)
-                    t, y = search.step(solver.t_old, y_old, t, y, interpolant) or (t, y)
-                due: list[float] = []
-                while (n := len(outputs) + len(due)) < len(wanted) and (t - wanted[n]) * solver.direction >= 0:
-                    due.append(wanted[n])
-                if problem.dense_output or due:
-                    interpolant = solver.dense_output() if interpolant is None else interpolant.output
-                    outputs += [y if s == t else interpolant(s) for s in due]
-                    if problem.dense_output:
-                        interpolants.append(interpolant)
+                interpolant = _Lazily(solver.dense_output)
+                t_new, y_new = record.take(solver.t_old, y_old, solver.t, solver.y, interpolant)
+                if problem.dense_output:
+                    interpolants.append(interpolant.output)
                 if t_eval is None or problem.dense_output:
-                    times.append(t)
-                    states.append(y)
-                if search is not None and search.end is not None:
+                    times.append(t_new)
+                    states.append(y_new)
+                if record.end is not None:
                     break
-                y_old, reached = y, t
+                y_old, reached = y_new, t_new
         stats["force_evaluations"] = 0 if solver is None else int(solver.nfev)
         if t_eval is None:
             keep = sorted({*range(0, len(times), problem.save_every), len(times) - 1})
             t, y = np.array(times)[keep], np.array(states)[keep]
         else:
-            t, y = t_eval[: len(outputs)], np.array(outputs).reshape(-1, len(y0))
+            t, y = t_eval[: len(record.outputs)], np.array(record.outputs).reshape(-1, len(y0))
         outcome = Outcome(t, y.astype(y0.dtype), -1 if failure else 0, failure or FINISHED, stats)
-        if search is not None and search.end is not None:
+        if record.end is not None:
             outcome.status, outcome.message = 1, ENDED
         elif failure:
             stats["failed_at"] = float(reached)
@@ -224,6 +215,7 @@ class RK45(_Scipy):
 
     name: ClassVar[str] = "rk45"
     order: ClassVar[int | None] = 5
+    source: ClassVar[str] = "Dormand–Prince 5(4), SciPy's `RK45`: the paper's ODE45, at the default tolerances."
     solver: ClassVar[Any] = ScipyRK45
     A: ClassVar[np.ndarray] = ScipyRK45.A
     B: ClassVar[np.ndarray] = ScipyRK45.B
@@ -241,6 +233,7 @@ class DOP853(_Scipy):
 
     name: ClassVar[str] = "dop853"
     order: ClassVar[int | None] = 8
+    source: ClassVar[str] = "Dormand–Prince 8(5,3), SciPy's `DOP853`."
     solver: ClassVar[Any] = ScipyDOP853
     A: ClassVar[np.ndarray] = ScipyDOP853.A
     B: ClassVar[np.ndarray] = ScipyDOP853.B

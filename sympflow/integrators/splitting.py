@@ -1,195 +1,254 @@
-"""The one stepper that runs any splitting scheme on a separable system."""
+"""Splitting methods: a scheme × a splitting × a clock, as one integrator class."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
-from sympflow.hamiltonian.monomials import Monomials, gradient
+from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, Problem
-from sympflow.schemes import SCHEMES, Scheme, Substep, scheme_evaluations
+from sympflow.hamiltonian.time_transformation import checked_shift
+from sympflow.integrators.base import FixedStep, KernelStepper, Stepper, compiled_loops
+from sympflow.integrators.clocks import BREAKDOWN, LogarithmicClock, scale_of, transformed_system
+from sympflow.integrators.compositions import SPLITTINGS, Composition
+from sympflow.integrators.contract import Outcome, Problem, Steps
+from sympflow.integrators.methods import TRIPLES
+from sympflow.schemes import SCHEMES, Scheme
 
 if TYPE_CHECKING:
-    from sympflow.kernels.splitting import SplittingKernel
+    from sympflow.kernels.protocol import Kernel
+
+CLOCKS = ("physical", "logarithmic")
+"""The clocks by the name that the option `clock` takes."""
 
 
-@dataclass(frozen=True)
+class OfClock:
+    """A trait of the contract that depends on the clock of the method: one value for each."""
+
+    def __init__(self, physical: Any, logarithmic: Any) -> None:
+        self.values = {"physical": physical, "logarithmic": logarithmic}
+
+    def __get__(self, method: Splitting | None, cls: type[Splitting]) -> Any:
+        return self.values[cls.clock if method is None else method.clock]
+
+
+@dataclass(frozen=True, repr=False)
 class Splitting(FixedStep):
-    """Kicks p += b h F(q) and drifts q += a h ∇T(p) in the order and with the coefficients of a `Scheme`.
+    """A scheme, a table of numbers, composed of the exact flows of the parts of H.
 
     Parameters
     ----------
     dt : float, optional
-        Step length; the default is `system.dt`.
+        Step length; the default is `system.dt`. On the logarithmic clock the physical length of a step where the
+        kinetic energy is B = c − E, at the energy E of the system's y0; for Newtonian attraction the mean along the
+        orbit. Elsewhere a step is then dt·2B/(c − V(q)).
     compensated : bool
-        Whether to sum with Kahan's compensation, which slows the growth of round-off over many steps. Compiled only.
-        The sums begin anew with each piece of a run that is executed in pieces: with events, within SciPy's
-        `solve_ivp`, and where the metrics execute it again.
+        True to sum with Kahan's compensation, which slows the growth of round-off over many steps. Compiled only, for
+        the splitting "kinetic". The sums begin anew with each piece of a run that is executed in pieces: with events,
+        within SciPy's `solve_ivp`, and where the metrics execute it again.
+    splitting : str
+        The parts: "kinetic" | potential; "linear" | rest, the exact flow of the quadratic part of H in place of the
+        drifts, with the kicks filtered ("mollified") or the implicit midpoint rule's angles ("midpoint"); or any
+        solvable "parts" of H, for schemes that are compositions of Strang steps.
+    clock : str
+        The time in which the steps are equal: "physical", or "logarithmic", that of the logarithmic Hamiltonian
+        (`sympflow.time_transformed`), for close encounters. There a method is symplectic for the transformed system,
+        in [q, t, p, B], and in [q, p] at a fixed step in s and a fixed B, which is how a step is differentiated.
+    parts : sequence of str, optional
+        For the splitting "parts": expressions that add up to H, in their order, the last innermost. The default is
+        found in the terms of H: as few as possible, potentials first and the linear part last.
+    shift : float, optional
+        For the logarithmic clock: c, above the energy; default E + |E|, which is 0 for a bound system.
+
+    Raises
+    ------
+    ValueError
+        From `check`, where the splitting, or the scheme with it, has no meaning for the system.
+
+    References
+    ----------
+    .. [1] S. Mikkola, K. Tanikawa, Celest. Mech. Dyn. Astron. 74 (1999) 287–295.
+    .. [2] M. Preto, S. Tremaine, Astron. J. 118 (1999) 2532–2541.
     """
 
     compensated: bool = False
+    splitting: str = "kinetic"
+    clock: str = "physical"
+    parts: tuple[str, ...] | None = None
+    shift: float | None = None
 
     scheme: ClassVar[Scheme]
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
-    saves_finite: ClassVar[bool] = True
+    finds_events: ClassVar[Any] = OfClock(True, False)  # on the other clock they are sought on the dense output
+    on_grid: ClassVar[Any] = OfClock(True, False)
+    in_another_time: ClassVar[Any] = OfClock(False, True)
+    tangent_holds: ClassVar[Any] = OfClock("", "the realised step in s, and B,")
+    breakdown: ClassVar[Any] = OfClock(FixedStep.breakdown, BREAKDOWN)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_flag("compensated", self.compensated)
+        for name, known in (("splitting", SPLITTINGS), ("clock", CLOCKS)):
+            value = getattr(self, name)
+            if not isinstance(value, str) or value not in known:
+                raise ValueError(f"`{name}` must be one of {', '.join(map(repr, known))}; got {value!r}.")
+        if self.compensated and not SPLITTINGS[self.splitting].compensates:
+            raise ValueError("`compensated` sums are for the splitting 'kinetic': leave it out.")
+        if self.shift is not None:
+            checked_shift(self.shift)
+            if self.clock == "physical":
+                raise ValueError("`shift` is for the clock 'logarithmic': leave it out.")
+        if self.parts is None:
+            return
+        sequence = isinstance(self.parts, list | tuple)
+        if not sequence or not all(isinstance(part, str) for part in self.parts) or not self.parts:
+            raise TypeError(f"`parts` must be a sequence of expressions; got {self.parts!r}: pass a list of strings.")
+        if self.splitting != "parts":
+            raise ValueError("`parts` are for the splitting 'parts': leave them out.")
+        object.__setattr__(self, "parts", tuple(self.parts))
+
+    def __repr__(self) -> str:
+        changed = (f for f in fields(self) if getattr(self, f.name) != f.default)
+        return f"{type(self).__name__}({', '.join(f'{f.name}={getattr(self, f.name)!r}' for f in changed)})"
+
+    def composed(self, system: HamiltonianSystem) -> Composition:
+        """Return the scheme × the splitting on a system."""
+        return SPLITTINGS[self.splitting](self.name, self.scheme, system, self.parts)
+
+    def on_clock(self, system: HamiltonianSystem) -> LogarithmicClock | None:
+        """Return the method on its clock, where that is not the physical one."""
+        if self.clock == "physical":
+            return None
+        if self.splitting != "kinetic":
+            raise ValueError(
+                f"`clock` 'logarithmic' needs the splitting 'kinetic', as log(T + B) − log(c − V) has exact flows; "
+                f"method {self.name!r} has {self.splitting!r}: leave one of them out."
+            )
+        transformed = transformed_system(system, self.shift)
+        inner = _plain(self.scheme.name, bool(self.compensated))
+        dt = self.step_length(system)
+
+        def reach_times(
+            transformed: HamiltonianSystem,
+            h: float,
+            start: np.ndarray,
+            times: np.ndarray,
+            stride: int,
+            expected: float,
+            backend: str,
+        ) -> Any:
+            no_loops = self.compensated or transformed.symbols is None
+            if no_loops or compiled_loops(lambda: inner.composed(transformed).kernel(False), start, backend) is None:
+                return None
+            from sympflow.kernels.timed_loops import reach_times
+
+            return reach_times(transformed, self.scheme, h, start, times, stride, expected)
+
+        return LogarithmicClock(
+            self.name,
+            system,
+            transformed,
+            inner,
+            dt,
+            dt * scale_of(system, transformed.params["shift"]),
+            inner.composed(transformed).evaluations,
+            reach_times,
+        )
 
     def check(self, system: HamiltonianSystem) -> None:
-        if not system.separable:
-            raise ValueError(
-                f"`method` {self.name!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use a "
-                "Runge–Kutta method or train a SympFlow."
-            )
-        if (self.scheme.nystrom or self.scheme.level) and not system.quadratic_kinetic:
-            raise ValueError(
-                f"`method` {self.name!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.name!r} has not: use a scheme "
-                "for any separable system, such as 'kahan_li8'."
-            )
+        if self.clock == "physical":
+            self.composed(system)
+        else:
+            self.on_clock(system)
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        self.check(system)
-        q, p = y[..., : system.ndof], y[..., system.ndof :]
-        h = per_state(h, y)
-        for substep in self.scheme.substeps:
-            if substep.kind == "drift":
-                q = q + (substep.one * h) * system.velocity(p)
-            else:
-                p = p + _kick(system, q, substep, h, self.scheme.monomials)
-        return concatenate([q, p])
+        return (self.on_clock(system) or self.composed(system)).step(y, h)
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        self.check(system)
-        q, p = y[..., : system.ndof], y[..., system.ndof :]
-        h = per_state(h, y)
-        for substep in reversed(self.scheme.substeps):
-            if substep.kind == "drift":
-                q = q - (substep.one * h) * system.velocity(p)
-            else:
-                p = p - _kick(system, q, substep, h, self.scheme.monomials)
-        return concatenate([q, p])
+        return (self.on_clock(system) or self.composed(system)).inverse(y, h)
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
-        if self.scheme.level:  # would need third derivatives of V: differentiate the step itself
-            return super().tangent(system, t, y, h)
-        d = system.ndof
-        y = to_numpy(y)
-        q, p, h = y[..., :d], y[..., d:], np.asarray(h, dtype=y.dtype)[..., None]
-        A = np.broadcast_to(np.eye(2 * d, dtype=y.dtype), (*y.shape, 2 * d)).copy()
-        for kind, c, *_ in self.scheme.substeps:
-            if kind == "drift":
-                q = q + c * h * system.velocity(p)
-                A[..., :d, :] += c * h[..., None] * (system.kinetic_hessian(p) @ A[..., d:, :])
-            else:
-                A[..., d:, :] -= c * h[..., None] * (system.potential_hessian(q) @ A[..., :d, :])
-                p = p + c * h * system.force(q)
-        return np.concatenate([q, p], axis=-1), A
+        known = (self.on_clock(system) or self.composed(system)).tangent(y, h)
+        return super().tangent(system, t, y, h) if known is None else known
 
-    def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
-        self.check(problem.system)
-        kernel = self._kernel(problem.system, problem.y0, problem.backend)
+    def stepper(self, problem: Problem) -> Stepper:
+        composition = self.composed(problem.system)
+        kernel = compiled_loops(
+            lambda: composition.kernel(bool(self.compensated)), problem.y0, problem.backend, self.compensated
+        )
         if kernel is None:
-            return super().rollout(problem, h, n_steps, save)
-        y0 = problem.y0
-        if y0.ndim == 1:
-            states, last = kernel.run(self.scheme, h, y0, n_steps, save, self.compensated)
-            return states, np.asarray(last), "compiled"
-        rows = y0.reshape(-1, y0.shape[-1])
-        states, finite = kernel.run_batch(self.scheme, h, rows, n_steps, save, self.compensated)
-        return states.swapaxes(0, 1).reshape(len(save), *y0.shape), finite.reshape(y0.shape[:-1]), "compiled"
+            return ArrayComposition(self, problem, composition)
+        return CompiledComposition(self, problem, composition, kernel)
 
-    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
-        if backend != "compiled":
-            return self.step(system, 0.0, y, h)
-        from sympflow.kernels.splitting import splitting_kernel
+    def run(self, problem: Problem) -> Outcome:
+        clock = self.on_clock(problem.system)
+        return super().run(problem) if clock is None else clock.run(problem)
 
-        rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
-        lengths = np.broadcast_to(h, y.shape[:-1]).reshape(-1)
-        return splitting_kernel(system).step(self.scheme, lengths, rows).reshape(y.shape)
-
-    def reach_times(
-        self,
-        system: HamiltonianSystem,
-        h: float,
-        y0: np.ndarray,
-        times: np.ndarray,
-        stride: int,
-        expected: float,
-        backend: str,
-    ) -> Any:
-        """`kernels.timed.reach_times` of the scheme; None where it does not apply."""
-        if self.compensated or system.symbols is None or self._kernel(system, y0, backend) is None:
-            return None
-        from sympflow.kernels.timed import reach_times
-
-        return reach_times(system, self.scheme, h, y0, times, stride, expected)
-
-    def _kernel(self, system: HamiltonianSystem, y0: Array, backend: str) -> SplittingKernel | None:
-        """The compiled loops for such states, or None where these need, or the call asks for, array operations."""
-        reason = None
-        if backend == "array":
-            reason = "`backend` is 'array': choose 'auto'."
-        elif is_tensor(y0):
-            reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
-        elif y0.dtype != np.float64:
-            reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
-        elif system.symbols is None and system.numba_functions is None:
-            reason = f"`system` {system.name!r} is given by plain functions: use backend='array'."
-        if reason is None:
-            from sympflow.kernels.splitting import splitting_kernel
-
-            try:
-                return splitting_kernel(system)
-            except ValueError as error:  # H holds a function that has no compiled form
-                reason = str(error)
-        if backend == "compiled":
-            raise ValueError(f"`backend` 'compiled' does not apply. {reason}")
-        if self.compensated:
-            raise ValueError(f"`compensated` sums need compiled loops. {reason}")
-        return None
-
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
+    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        clock = self.on_clock(system)
+        return super().steps(system, t_span, y0) if clock is None else clock.steps(t_span, y0)
 
 
-def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials: Monomials) -> Array:
-    """What a kick adds to p, where the scheme has it the force gradient, the curvature or the polynomial too."""
-    force = system.force(q)
-    change = (kick.one * h) * force
-    if kick.three:
-        change = change - (kick.three * h**3) * system.hessian_vector(q, system.velocity(force))
-    if kick.five:
-        change = change - (kick.five * h**5) * system.curvature_gradient(q)
-    if kick.polynomial:
-        change = change - h**3 * gradient(monomials, kick.polynomial, q)
-    return change
+class ArrayComposition(Stepper):
+    """A run of a composition by array operations."""
+
+    def __init__(self, integrator: FixedStep, problem: Problem, composition: Composition) -> None:
+        super().__init__(integrator, problem)
+        self.composition = composition
+
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
+        return self.composition.rollout(y0, h, n_steps, save)
+
+    def shorter(self, y: Array, h: Any) -> Array:
+        return self.composition.step(y, h)
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
+        return self.composition.evaluations(n_steps, n_saved, n_extra, self.backend)
+
+
+class CompiledComposition(KernelStepper):
+    """A run of a composition in compiled loops."""
+
+    def __init__(self, integrator: FixedStep, problem: Problem, composition: Composition, kernel: Kernel) -> None:
+        super().__init__(integrator, problem, kernel)
+        self.composition = composition
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
+        return self.composition.evaluations(n_steps, n_saved, n_extra, "compiled")
+
+
+@cache
+def _plain(scheme: str, compensated: bool) -> Splitting:
+    """The scheme with the default splitting and clock."""
+    return splitting_method(scheme)(compensated=compensated)
+
+
+@cache
+def splitting_method(name: str) -> type[Splitting]:
+    """Return the integrator class of a row of `TRIPLES`."""
+    row = TRIPLES[name]
+    scheme = SCHEMES[row.scheme]
+    namespace: dict[str, Any] = {
+        "name": name,
+        "order": scheme.order,
+        "scheme": scheme,
+        "source": row.source,
+        "splitting": row.splitting,
+        "clock": row.clock,
+        "__annotations__": {"splitting": str, "clock": str},
+        "__doc__": f"{name}: order {scheme.order}, {row.source}\n\n{Splitting.__doc__}",
+        "__module__": __name__,
+    }
+    return dataclass(frozen=True, repr=False)(type(name, (Splitting,), namespace))
 
 
 def __getattr__(name: str) -> type[Splitting]:
     """The integrator classes as attributes of the module, where pickle looks for them."""
-    if name in SCHEMES:
-        return splitting(name)
+    if name in TRIPLES:
+        return splitting_method(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-@cache
-def splitting(name: str) -> type[Splitting]:
-    """The integrator class of the scheme of that name."""
-    scheme = SCHEMES[name]
-    namespace = {
-        "name": name,
-        "order": scheme.order,
-        "scheme": scheme,
-        "__doc__": f"{name}: order {scheme.order}, {scheme.source}\n\n{Splitting.__doc__}",
-        "__module__": __name__,
-    }
-    return dataclass(frozen=True)(type(name, (Splitting,), namespace))

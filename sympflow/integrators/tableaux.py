@@ -141,3 +141,6 @@ ADAPTIVE = {
         middle=(1 / 2, 0.0),
     ),
 }
+
+MULTISTEP = {"explicit_adams": 3, "implicit_adams": 4}
+"""Orders with `max_order` 4, the default: Adams–Bashforth then uses three slopes, Adams–Moulton four."""

@@ -1,31 +1,495 @@
-"""torchdiffeq's solvers as integrators, by name: batches in one tensor, gradients by backpropagation."""
+"""torchdiffeq's solvers as integrators, by name: batches in one tensor, gradients by backpropagation.
+
+Their loop is watched step by step through torchdiffeq's callbacks.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import warnings
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
 
-from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
-from sympflow.integrators.base import FixedStep, Integrator, Problem
-from sympflow.integrators.runge_kutta import ExplicitStep
-from sympflow.integrators.tableaux import ADAPTIVE, FIXED, Tableau
-from sympflow.integrators.torchdiffeq_adams import Adams
-from sympflow.integrators.torchdiffeq_adaptive import Adaptive
+from sympflow.arguments import check_dt
+from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import FixedStep, Recorder
+from sympflow.integrators.contract import ENDED, FINISHED, Integrator, Outcome, Problem, Steps
+from sympflow.integrators.grid import Grid
+from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
+from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
+from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
 
-MULTISTEP = {"explicit_adams": 3, "implicit_adams": 4}
-"""Orders with `max_order` 4, the default: Adams–Bashforth then uses three slopes, Adams–Moulton four."""
+Visit = Callable[[Interpolant], bool]
+"""Takes a step as soon as it is accepted; whether the run ends in it."""
+
+
+class Trace:
+    """The right-hand side that torchdiffeq is given, in elapsed time: it counts its calls and announces the steps.
+
+    A subclass makes the interpolant of a step from what torchdiffeq's public callbacks tell.
+    """
+
+    def __init__(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> None:
+        self.system, self.visit, self.t_span = system, visit, t_span
+        self.direction = math.copysign(1.0, t_span[1] - t_span[0])
+        self.tensor = is_tensor(y0)
+        self.evaluations = self.n_steps = 0
+        self.reached = t_span[0]
+        self.last: Array | None = None  # the state at the beginning of the step that ended there
+        self.note = ""  # for the message, when the run ends
+        self.most_steps: int | None = None
+        self.n_tried = 0  # steps, where they are bounded, with those that were rejected
+        self.failed = False
+        self.spent = False  # whether it failed because it took too many steps
+
+    def __call__(self, s: Any, y: Any) -> Any:
+        self.evaluations += 1
+        f = self.system.vector_field(y)
+        self.evaluated(y, f)
+        return f if self.direction > 0 else -f
+
+    def evaluated(self, y: Any, f: Any) -> None:
+        """Called with the slope f at each state y where torchdiffeq asks for it."""
+
+    def array(self, x: Any) -> Array:
+        """A tensor of torchdiffeq's as what the user gave."""
+        return x if self.tensor else x.numpy()
+
+    def announce(self, step: Interpolant) -> None:
+        self.n_steps += 1
+        self.reached, self.last = step.t1, step.y0
+        if stuck := hopeless(self.n_steps, self.t_span[0], self.reached, self.t_span[1]):
+            raise AssertionError(stuck)
+        if self.visit(step):
+            raise _EndedError
+
+
+class _EndedError(Exception):
+    """Raised to leave torchdiffeq's loop at a terminal event."""
+
+
+class TooManyStepsError(Exception):
+    """Raised by `integrate` where a bound on the number of steps is met: the message says so, and the remedy."""
+
+
+class Watched(Integrator):
+    """A method of torchdiffeq that interpolates: outputs, events and dense output are one polynomial in each step."""
+
+    finds_events: ClassVar[bool] = True
+
+    def outputs(self, problem: Problem) -> tuple[np.ndarray, dict[str, Any]]:
+        """The times to report, and what the statistics say of the steps."""
+        raise NotImplementedError
+
+    def integrate(self, trace: Trace, y: Any, length: float) -> None:
+        """Run torchdiffeq from the tensor y over an elapsed time."""
+        raise NotImplementedError
+
+    def watch(
+        self,
+        system: HamiltonianSystem,
+        t_span: tuple[float, float],
+        y0: Array,
+        visit: Visit,
+        most_steps: int | None = None,
+    ) -> tuple[Trace, str | None]:
+        """Run, handing over every step until `visit` says so; and why it failed, if it did."""
+        import torch
+
+        trace, failure = self.make_trace(system, t_span, y0, visit), None
+        trace.most_steps = self.most_steps if most_steps is None else most_steps
+        if t_span[0] == t_span[1]:
+            return trace, failure
+        y = y0 if is_tensor(y0) else torch.from_numpy(np.ascontiguousarray(y0))
+        with torch.set_grad_enabled(is_tensor(y0) and torch.is_grad_enabled()), np.errstate(all="ignore"):
+            try:
+                self.integrate(trace, y, abs(t_span[1] - t_span[0]))
+            except _EndedError:
+                pass
+            except AssertionError as error:  # torchdiffeq's step underflow, or a state that is not finite
+                failure = f"torchdiffeq stopped after t = {trace.reached:.17g} ({error}). End `t_span` earlier."
+            except TooManyStepsError as error:
+                failure, trace.spent = str(error), True
+        return trace, failure
+
+    @property
+    def most_steps(self) -> int | None:
+        """Most steps of a call, those that are tried and rejected included; None if there is no bound."""
+        return None
+
+    def make_trace(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> Trace:
+        raise NotImplementedError
+
+    def run(self, problem: Problem) -> Outcome:
+        times, stats = self.outputs(problem)
+        outcome, trace = self.run_jointly(problem, times)
+        if trace.failed and problem.y0.ndim > 1 and not trace.spent:
+            outcome = run_in_parts(self, problem, outcome, trace)
+        outcome.stats = stats | outcome.stats
+        return outcome
+
+    def run_jointly(self, problem: Problem, times: np.ndarray, most_steps: int | None = None) -> tuple[Outcome, Trace]:
+        """All trajectories with the same steps, at the times (n,); with NaN in a batch after the last finite state."""
+        t0, y0 = problem.t0, problem.y0
+        sign = 1 if problem.t1 >= t0 else -1
+        everything = problem.t_eval is None or problem.dense_output or problem.events is not None
+        t_end = problem.t1 if everything else float(times[-1]) if times.size else t0
+        record, kept = Recorder(problem, times), list[Interpolant]()
+
+        def visit(step: Interpolant) -> bool:
+            t = step.t1 if (step.t1 - t_end) * sign < 0 else t_end  # the last step reaches beyond the end
+            record.take(step.t0, step.y0, t, None, step)
+            if problem.dense_output:
+                kept.append(step)
+            return record.end is not None
+
+        trace, failure = self.watch(problem.system, (t0, t_end), y0, visit, most_steps)
+        if t0 == t_end:
+            record.empty(t0, y0)
+        states = record.outputs
+        stats: dict[str, Any] = {
+            "n_steps": trace.n_steps,
+            "force_evaluations": trace.evaluations,
+            "hessian_evaluations": 0,
+            "backend": "torchdiffeq",
+        }
+        ended = record.end is not None
+        trace.failed = bool(failure) and not ended
+        if trace.failed:
+            t_end = trace.reached
+            stats["failed_at"] = t_end if y0.ndim == 1 else np.full(y0.shape[:-1], t_end)
+        if y0.ndim > 1:
+            states += [full_of_nan(y0)] * (len(times) - len(states))
+        times = times[: len(states)]
+        if record.end is not None:
+            t_end = record.end[0]
+            if problem.t_eval is None and not (times.size and times[-1] == t_end):
+                times, states = np.append(times, t_end), [*states, record.end[1]]
+        status: Any = 1 if ended else -int(bool(failure))
+        outcome = Outcome(
+            times,
+            stack(states, axis=0) if states else y0[None][:0],
+            np.full(y0.shape[:-1], status) if y0.ndim > 1 else status,
+            (ENDED if status == 1 else failure or FINISHED) + trace.note,
+            stats,
+        )
+        if problem.dense_output:
+            outcome.sol = Piecewise(kept, y0, t0, t_end)
+        return outcome, trace
+
+
+COUNTS = ("n_steps", "force_evaluations", "hessian_evaluations")
+
+
+def run_in_parts(method: Watched, problem: Problem, joint: Outcome, trace: Trace) -> Outcome:
+    """The outcome of a batch that failed when run jointly.
+
+    A part that fails is divided, until what fails is one trajectory: the fast ones from the others where some are much
+    faster, as before a singularity, else into halves. So a few that fail cost a few runs, not one run a trajectory.
+    The steps of all parts count against one bound, the method's; where it is
+    met, what had been computed is kept, of the part or of what it is a half of, whichever came further.
+    """
+    batch, times = problem.y0.shape[:-1], joint.t
+    rows = problem.y0.reshape(-1, problem.y0.shape[-1])
+    n = len(rows)
+    whole = replace(joint, y=joint.y.reshape(len(times), *rows.shape))
+    source: list[tuple[Outcome, int]] = [
+        (whole, i) for i in range(n)
+    ]  # of each trajectory its run, and its place there
+    reached = np.full(n, trace.reached)
+    done, unfinished = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+    counts = {key: joint.stats[key] for key in COUNTS}
+    left = None if method.most_steps is None else method.most_steps - trace.n_tried
+    parts = deque(_divided(problem, np.arange(n), trace))
+    while parts:
+        part = parts.popleft()
+        if left is not None and left <= 0:
+            unfinished[part] = True
+            continue
+        outcome, trace = method.run_jointly(replace(problem, y0=rows[part], t_eval=times), times, left)
+        left = None if left is None else left - trace.n_tried
+        counts = {key: counts[key] + outcome.stats[key] for key in COUNTS}
+        if not trace.failed or abs(trace.reached - problem.t0) >= abs(reached[part[0]] - problem.t0):
+            reached[part] = trace.reached
+            for j, i in enumerate(part.tolist()):
+                source[i] = outcome, j
+        done[part] = not trace.failed
+        unfinished[part] = trace.failed and trace.spent
+        if trace.failed and not trace.spent:
+            parts.extend(_divided(problem, part, trace))
+
+    stats: dict[str, Any] = {**counts, "backend": "torchdiffeq"}
+    if not done.all():
+        stats["failed_at"] = np.where(done, np.nan, reached).reshape(batch)
+    outcome = Outcome(
+        times,
+        stack([run.y[:, j] for run, j in source], axis=1).reshape(len(times), *problem.y0.shape),
+        np.where(done, 0, -1).reshape(batch),
+        _message(method, batch, source, done, unfinished, reached),
+        stats,
+    )
+    if problem.dense_output:
+        outcome.sol = Batch(source, batch, (problem.t0, problem.t1))
+    return outcome
+
+
+def _divided(problem: Problem, part: np.ndarray, trace: Trace) -> list[np.ndarray]:
+    """Two parts of one, by the rates |f|/|y| of its trajectories in the last state before it failed."""
+    if len(part) < 2:
+        return []
+    y = trace.last
+    rates = np.zeros(len(part))
+    if y is not None:
+        with np.errstate(all="ignore"):
+            f = to_numpy(problem.system.vector_field(y)).reshape(len(part), -1)
+            rates = np.nan_to_num(np.abs(f).max(-1) / np.abs(to_numpy(y)).reshape(f.shape).max(-1), nan=np.inf)
+    order = np.argsort(rates, kind="stable")
+    with np.errstate(all="ignore"):
+        gaps = np.nan_to_num(rates[order[1:]] / rates[order[:-1]], nan=1.0)
+    cut = int(np.argmax(gaps)) + 1 if gaps.max() > 10 else len(part) // 2
+    return [np.sort(part[order[:cut]]), np.sort(part[order[cut:]])]
+
+
+def _message(
+    method: Watched,
+    batch: tuple[int, ...],
+    source: list[tuple[Outcome, int]],
+    done: np.ndarray,
+    unfinished: np.ndarray,
+    reached: np.ndarray,
+) -> str:
+    said = []
+    failed = np.flatnonzero(~done & ~unfinished)
+    if len(failed):
+        said.append(f"Trajectory {_index(failed[0], batch)}: {source[failed[0]][0].message}")
+    if unfinished.any():
+        first = np.argmax(unfinished)
+        said.append(
+            f"`max_num_steps` = {method.most_steps} steps, in sum over the batch and the parts that it was run in "
+            f"because some of its trajectories fail, ended before {unfinished.sum()} of {len(done)} trajectories: they "
+            f"are kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.17g}. Raise "
+            "`max_num_steps`, or solve those that fail in another call, or end `t_span` before they do."
+        )
+    return " ".join(said) or FINISHED
+
+
+def _index(i: Any, batch: tuple[int, ...]) -> str:
+    return ", ".join(str(k) for k in np.unravel_index(int(i), batch))
+
+
+@dataclass(frozen=True)
+class Adaptive(Watched, RungeKutta):
+    """An adaptive Runge–Kutta method of torchdiffeq.
+
+    The trajectories of a batch share their steps; if that fails, it is run in parts, so that those of its trajectories
+    that can reach their end do. Without `t_eval` the
+    states are reported every `system.dt`. Between the steps, for outputs, events and the dense output alike, the state
+    is torchdiffeq's interpolation: the quartic through both ends, their slopes and the state at the middle of the step.
+
+    Parameters
+    ----------
+    rtol, atol : float
+        The local error, in the root mean square over the batch, is kept below atol + rtol·|y|; torchdiffeq's defaults.
+    max_num_steps : int
+        Most steps of a call, those that are tried and rejected included, in sum over the parts of a batch; then it ends
+        with status −1. torchdiffeq's own default, 2³¹ − 1, is none: before a singularity a method of order 2 takes
+        minutes.
+    """
+
+    rtol: float = 1e-7
+    atol: float = 1e-9
+    max_num_steps: int = 5_000
+
+    tableau: ClassVar[Tableau]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        most = self.max_num_steps
+        if isinstance(most, bool) or not isinstance(most, int | np.integer) or not 0 < most < 2**31:
+            raise ValueError(f"`max_num_steps` must be a positive integer below 2**31; got {most!r}.")
+
+    def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
+        if self.tableau.carries_slope:
+            raise TypeError(
+                f"`method` {self.name!r} is no one-step map in torchdiffeq, which carries a slope from step to step: "
+                "volume and symplecticity have no meaning for it. Use 'heun2', or 'dopri5'."
+            )
+        return super().tangent(system, t, y, h)
+
+    def outputs(self, problem: Problem) -> tuple[np.ndarray, dict[str, Any]]:
+        if problem.t_eval is not None:
+            return problem.t_eval, {}
+        dt = problem.system.dt
+        return Grid(problem.t0, problem.t1, dt).outputs(None, problem.save_every)[0], {"output_step": dt}
+
+    @property
+    def most_steps(self) -> int:
+        return int(self.max_num_steps)
+
+    def make_trace(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> Trace:
+        return _Stages(self.tableau, system, t_span, y0, visit)
+
+    def integrate(self, trace: Trace, y: Any, length: float) -> None:
+        import torch
+        from torchdiffeq import odeint
+
+        s = torch.tensor([0.0, length], dtype=torch.float64, device=y.device)
+        assert isinstance(trace, _Stages)
+        most = trace.most_steps or self.max_num_steps
+        options = {"max_num_steps": most}
+        try:
+            odeint(trace, y, s, rtol=self.rtol, atol=self.atol, method=self.name, options=options)
+        except AssertionError:
+            if trace.n_tried < most:
+                raise
+            (t0, t1), t = trace.t_span, trace.reached
+            more = most * abs(t1 - t) / abs(t - t0) if t != t0 else math.inf
+            raise TooManyStepsError(
+                f"After `max_num_steps` = {self.max_num_steps} steps t = {t:.17g} is reached, and at this pace the end "
+                f"needs about {more:.2g} more. Raise `max_num_steps` or the tolerances, or end `t_span` earlier."
+            ) from None
+
+    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        y0, steps = to_numpy(y0), []
+
+        def visit(step: Interpolant) -> bool:
+            steps.append(step)
+            return False
+
+        self.watch(system, t_span, y0, visit)
+        for step in steps:
+            yield np.array([step.t0]), step.y0[None], np.full((1, *y0.shape[:-1]), step.t1 - step.t0)
+
+
+class _Stages(Trace):
+    """Collects the slopes of each step: torchdiffeq interpolates from them."""
+
+    def __init__(self, tableau: Tableau, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.tableau = tableau
+        self.first: Any = None
+        self.slopes: list[Any] = []
+
+    def evaluated(self, y: Any, f: Any) -> None:
+        self.slopes.append(f)
+
+    def callback_step(self, s: Any, y: Any, dt: Any) -> None:
+        """A step is tried. Its first slope is the last of the step before, or at the start that of the state."""
+        self.n_tried += 1
+        self.first = self.slopes[0] if self.first is None else self.first
+        self.slopes.clear()
+
+    def callback_accept_step(self, s: Any, y: Any, dt: Any) -> None:
+        K, y = [self.array(f) for f in (self.first, *self.slopes)], self.array(y)
+        if not (s.requires_grad or dt.requires_grad):
+            s, dt = float(s), float(dt)
+        t0, t1 = (self.t_span[0] + self.direction * x for x in (s, s + dt))
+        h = self.direction * dt
+        y1, middle = (y + h * weighted(weights, K) for weights in (self.tableau.B, self.tableau.middle))
+        self.first = self.slopes[-1]
+        self.announce(quartic(t0, t1, y, y1, middle, K[0], K[-1]))
+
+
+@dataclass(frozen=True)
+class Adams(Watched):
+    """A multistep method on the grid t0 + k·dt, begun with Runge–Kutta steps; cubic interpolation in between.
+
+    It has no one-step map: there is no bare step, and no volume to measure.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Step length; the default is `system.dt`.
+    max_order : int
+        Highest order that is built up, at least 4; torchdiffeq's own default of 12 is unstable for dt of ordinary size.
+    """
+
+    dt: float | None = None
+    max_order: int = 4
+
+    symplectic: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_dt(self.dt)
+        if not isinstance(self.max_order, int | np.integer) or self.max_order not in range(4, 13):
+            raise ValueError(f"`max_order` must be an integer from 4 to 12; got {self.max_order!r}.")
+
+    def step_length(self, system: HamiltonianSystem) -> float:
+        return float(self.dt if self.dt is not None else system.dt)
+
+    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        raise TypeError(
+            f"`method` {self.name!r} is a multistep method, with no bare step to repeat or differentiate: use a "
+            "one-step method."
+        )
+
+    def outputs(self, problem: Problem) -> tuple[np.ndarray, dict[str, Any]]:
+        dt = self.step_length(problem.system)
+        return Grid(problem.t0, problem.t1, dt).outputs(problem.t_eval, problem.save_every)[0], {"dt": dt}
+
+    def make_trace(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> Trace:
+        return _Nodes(self.step_length(system), system, t_span, y0, visit)
+
+    def integrate(self, trace: Trace, y: Any, length: float) -> None:
+        import torch
+        from torchdiffeq import odeint
+
+        assert isinstance(trace, _Nodes)
+        nodes = torch.as_tensor(np.abs(np.array(trace.times) - trace.times[0]), device=y.device)
+        options = {"grid_constructor": lambda f, y0, t: nodes, "max_order": self.max_order}
+        with warnings.catch_warnings(record=True) as raised:
+            warnings.simplefilter("always")
+            states = odeint(trace, y, nodes[[0, -1]], method=self.name, rtol=1e-7, atol=1e-9, options=options)
+        for warning in raised:
+            if str(warning.message).startswith("Functional iteration did not converge"):
+                trace.note = " Its functional iteration did not converge in every step: reduce `dt`."
+            else:
+                warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+        trace.callback_step(None, None, None)
+        trace(None, states[-1])
+
+
+class _Nodes(Trace):
+    """Follows the grid: the first slope that is asked for in a step is that at its beginning."""
+
+    def __init__(self, dt: float, system: HamiltonianSystem, t_span: tuple[float, float], *arguments: Any) -> None:
+        super().__init__(system, t_span, *arguments)
+        grid = Grid(*t_span, dt)
+        self.times = [grid.t0 + k * grid.h for k in range(grid.n_steps + bool(grid.remainder))] + [grid.t1]
+        self.before: tuple[Array, Array] | None = None
+        self.begins = False
+
+    def callback_step(self, s: Any, y: Any, dt: Any) -> None:
+        self.begins = True
+
+    def evaluated(self, y: Any, f: Any) -> None:
+        if not self.begins:
+            return
+        self.begins = False
+        if not (y.isfinite().all() and f.isfinite().all()):
+            raise AssertionError("the state is not finite; reduce `dt`")
+        y, f = self.array(y), self.array(f)
+        before, self.before = self.before, (y, f)
+        if before is not None:
+            k = self.n_steps
+            self.announce(hermite(self.times[k], self.times[k + 1], before[0], y, before[1], f))
 
 
 @cache
 def torchdiffeq_method(name: str) -> type[Integrator]:
     """The integrator class of torchdiffeq's solver of that name."""
     if name in MULTISTEP:
-        return _named(name, Adams, {"order": MULTISTEP[name], "__doc__": f"torchdiffeq's `{name}`: {Adams.__doc__}"})
+        doc = f"torchdiffeq's `{name}`: {Adams.__doc__}"
+        return _named(name, Adams, {"order": MULTISTEP[name], "source": doc.partition("\n")[0], "__doc__": doc})
     tableau = (ADAPTIVE | FIXED)[name]
     base: type[Integrator] = Adaptive if name in ADAPTIVE else FixedGrid
+    source = f"torchdiffeq's `{name}`, order {tableau.order}: {tableau.source}"
     return _named(
         name,
         base,
@@ -34,7 +498,8 @@ def torchdiffeq_method(name: str) -> type[Integrator]:
             "tableau": tableau,
             "A": tableau.A,
             "B": tableau.B,
-            "__doc__": f"torchdiffeq's `{name}`, order {tableau.order}: {tableau.source}\n\n{base.__doc__}",
+            "source": source,
+            "__doc__": f"{source}\n\n{base.__doc__}",
         },
     )
 

@@ -14,18 +14,14 @@ from sympflow.integrators.base import FixedStep
 
 def own_velocity(integrator: FixedStep, system: HamiltonianSystem | None, y: np.ndarray) -> np.ndarray:
     """The velocity at y of the motion that the integrator computes: ∂_tψ̄ at t = 0 for a flow, else J∇H."""
-    if not integrator.trained:
+    flow = integrator.given_flow if system is None else integrator.flow_for(system)
+    if flow is None:
         assert system is not None
         return system.vector_field(y)
     import torch
 
-    from sympflow.flow.primed import PrimedFlow
-
-    flow = integrator.flow_for(system)  # type: ignore[attr-defined]
-    if isinstance(flow, PrimedFlow) and flow.system is not None:  # consistent: at t = 0 it is that of its system
-        return flow.system.vector_field(y)
     with torch.no_grad():
-        return to_numpy(flow.velocity(0.0, torch.from_numpy(np.array(y)).to(flow.dtype)))
+        return to_numpy(flow.initial_velocity(torch.from_numpy(np.array(y)).to(flow.dtype)))
 
 
 def warn_of_another_system(
@@ -64,7 +60,7 @@ def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
             f"`method` {integrator.name!r} is no fixed-step map, which is what can be handed to {peer}: use a "
             f"splitting method or a trained flow, or {peer}'s own method."
         )
-    if (getattr(getattr(integrator, "flow", None), "recipe", None) or {}).get("transforms") is not None:
+    if integrator.in_another_time and integrator.given_flow is not None:
         raise TypeError(
             f"`flow` runs in another time, so that its steps are not equal in t, which {peer} cannot drive: use "
             "solve(), or a flow in the system's own time (sympflow.shipped_flows() lists them, `shift` is None)."

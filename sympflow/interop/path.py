@@ -60,9 +60,9 @@ class Path:
         plain = self._plain()
         if plain:
             y0 = self.y0.detach().numpy()
-        problem = Problem(self.system, 0.0, n_steps * self.h, y0)
         with naming_plugin(self.integrator):
-            states, _, _ = self.integrator.rollout(problem, self.h, n_steps, save)
+            stepper = self.integrator.stepper(Problem(self.system, 0.0, n_steps * self.h, y0))
+            states, _ = stepper.rollout(y0, self.h, n_steps, save)
         if plain:
             states = torch.from_numpy(np.ascontiguousarray(states))
         return states[torch.as_tensor(np.searchsorted(save, count), device=self.y0.device)]
@@ -85,7 +85,7 @@ class Path:
 
     def _learns(self) -> bool:
         """Whether the flow has weights that require gradients."""
-        flow = self.integrator.flow_for(self.system) if self.integrator.trained else None  # type: ignore[attr-defined]
+        flow = self.integrator.flow_for(self.system)
         return flow is not None and any(w.requires_grad for w in flow.parameters())
 
     def first_zero(self, g: Callable[[Tensor, Tensor], Tensor]) -> Tensor:

@@ -6,16 +6,19 @@ import math
 import warnings
 from collections import deque
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from scipy.integrate import DenseOutput, OdeSolver
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, Problem
+from sympflow.integrators.base import FixedStep, Problem, Stepper
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import check_applies, naming_plugin
 from sympflow.interop.matching import fixed_step, warn_of_another_system
+
+if TYPE_CHECKING:
+    from sympflow.flow.flow_map import FlowMap
 
 LOOK_AHEAD = 64
 
@@ -105,18 +108,18 @@ class FlowSolver(OdeSolver):
             raise ValueError(f"`max_step` must be positive; got {max_step!r}.")
         if not (math.isfinite(t0) and math.isfinite(t_bound)):
             raise ValueError(f"`t_span` must be finite; got ({t0}, {t_bound}). Choose an end that can be reached.")
-        self._evaluations = _Count()
+        self._counts = _Counts()
         super().__init__(fun, t0, y0, t_bound, vectorized)
         self._check(fun)
         system = self._solved
-        self._counting = self.integrator if system is None else self.integrator.counting(system)
+        self._stepper = self._counts.stepper = self.integrator.stepper(Problem(system, t0, t_bound, self.y))
         self._grid = Grid(t0, t_bound, self.integrator.step_length(system))
         self._parts = max(1, math.ceil(abs(self._grid.h) / max_step * (1 - 1e-12)))
         self._k, self._part = 0, 0  # the grid point before the state, and the sample after it
         self._t_anchor, self._anchor = float(t0), self.y
         self._next_anchor = (self._t_anchor, self.y)
         self._ahead: deque[np.ndarray] = deque()
-        self._block, self._backend = 1, "auto"
+        self._block = 1
 
     def _check(self, fun: Callable[..., Any]) -> None:
         self._solved: Any = self.system
@@ -128,7 +131,8 @@ class FlowSolver(OdeSolver):
                 f"`system` is needed for method {integrator.name!r}: as_scipy({integrator.name!r}, system), or pass a "
                 "HamiltonianSystem as `fun`."
             )
-        size = 2 * (self._solved.ndof if self._solved is not None else self._flow().ndof)
+        flow = self._flow()
+        size = 2 * (self._solved if flow is None else flow).ndof
         if self.n != size:
             raise ValueError(f"`y0` must have length {size}, [q, p]; got {self.n}.")
         if not np.isfinite(self.y).all():
@@ -142,21 +146,21 @@ class FlowSolver(OdeSolver):
             raise ValueError(f"`fun` must return shape {self.y.shape}, as `y0`; got {slope.shape}.")
         known = fun is self._solved and not integrator.trained
         if np.isfinite(slope).all() and not known:
-            self.nfev += integrator.evaluations(0, 0, 1, "array")["force_evaluations"] if integrator.trained else 1
+            flow = self._flow()
+            self.nfev += 1 if flow is None else flow.evaluations(0, 0, 1, "array")["force_evaluations"]
             warn_of_another_system(integrator, self._solved, self.y, slope, stacklevel=5)
 
     @property
     def nfev(self) -> int:
-        return self._evaluations.total
+        return self._counts.total()
 
     @nfev.setter
     def nfev(self, value: int) -> None:
-        self._evaluations.total = value
+        self._counts.others += value - self._counts.total()
 
-    def _flow(self) -> Any:
-        """The flow, or None if it cannot be known without a system."""
-        integrator: Any = self.integrator
-        return integrator.flow if self._solved is None else integrator.flow_for(self._solved)
+    def _flow(self) -> FlowMap | None:
+        """The flow; None for a classical method, or if it cannot be known without a system."""
+        return self.integrator.given_flow if self._solved is None else self.integrator.flow_for(self._solved)
 
     def _step_impl(self) -> tuple[bool, str | None]:
         grid = self._grid
@@ -186,28 +190,35 @@ class FlowSolver(OdeSolver):
         if not self._ahead:
             n = min(self._block, self._grid.n_steps - self._k)
             self._block = min(2 * self._block, LOOK_AHEAD)
-            piece = Problem(self._solved, self._t_anchor, self._t_anchor + n * self._grid.h, self._anchor)
-            with naming_plugin(self._counting):
-                states, _, self._backend = self._counting.rollout(piece, self._grid.h, n, np.arange(1, n + 1))
-                self.nfev += self._counting.evaluations(n, n, 0, self._backend)["force_evaluations"]
+            with naming_plugin(self.integrator):
+                states, _ = self._stepper.rollout(self._anchor, self._grid.h, n, np.arange(1, n + 1), self._t_anchor)
+            self._counts.steps += n
             self._ahead.extend(states)
         return self._ahead.popleft()
 
     def _shorter(self, h: float) -> np.ndarray:
-        with naming_plugin(self._counting), np.errstate(all="ignore"):
-            y = self._counting.substep(self._solved, self._anchor, h, self._backend)
-            self.nfev += self._counting.evaluations(0, 0, 1, self._backend)["force_evaluations"]
+        with naming_plugin(self.integrator), np.errstate(all="ignore"):
+            y = self._stepper.shorter(self._anchor, h)
+        self._counts.shorter += 1
         return y
 
     def _dense_output_impl(self) -> DenseOutput:
         return FlowOutput(self, self._t_anchor, self._anchor)
 
 
-class _Count:
-    """Evaluations so far; the dense outputs of a solver count into it too, while the solver runs."""
+class _Counts:
+    """Steps, shorter steps and other evaluations so far; those of the dense outputs of a solver too."""
 
     def __init__(self) -> None:
-        self.total = 0
+        self.steps = self.shorter = self.others = 0
+        self.stepper: Stepper | None = None
+
+    def total(self) -> int:
+        """Evaluations of the force."""
+        if self.stepper is None or not (self.steps or self.shorter):
+            return self.others
+        made = self.stepper.evaluations(self.steps, self.steps, self.shorter)
+        return self.others + made["force_evaluations"]
 
 
 class FlowOutput(DenseOutput):
@@ -215,9 +226,8 @@ class FlowOutput(DenseOutput):
 
     def __init__(self, solver: Any, t_anchor: float, anchor: np.ndarray) -> None:
         super().__init__(solver.t_old, solver.t)
-        self._integrator, self._system, self._backend = solver._counting, solver._solved, solver._backend
+        self._integrator, self._stepper, self._counts = solver.integrator, solver._stepper, solver._counts
         self._t_anchor, self._anchor, self._y = t_anchor, anchor, solver.y
-        self._evaluations = solver._evaluations
 
     def _call_impl(self, t: np.ndarray) -> np.ndarray:
         times = np.atleast_1d(t).astype(float)
@@ -227,7 +237,6 @@ class FlowOutput(DenseOutput):
         states[times == self.t] = self._y
         if moving.any():
             with naming_plugin(self._integrator), np.errstate(all="ignore"):
-                states[moving] = self._integrator.substep(self._system, states[moving], h[moving], self._backend)
-            counts = self._integrator.evaluations(0, 0, int(np.count_nonzero(moving)), self._backend)
-            self._evaluations.total += counts["force_evaluations"]
+                states[moving] = self._stepper.shorter(states[moving], h[moving])
+            self._counts.shorter += int(np.count_nonzero(moving))
         return states.T if t.ndim else states[0]

@@ -77,7 +77,7 @@ class SymplecticStep(SingleStepMethod):
         super().__init__()
         self.integrator, self.system = integrator, system
         # the longest step that a flow was trained for; the state's own module, so that its weights are parameters
-        self.flow = integrator.flow_for(system) if integrator.trained else None  # type: ignore[attr-defined]
+        self.flow = integrator.flow_for(system)
 
     def init(self, term: Any, problem: Any, f0: Tensor | None, *, stats: dict[str, Any], args: Any) -> Tensor:
         """The state of the method: the end of each sample."""

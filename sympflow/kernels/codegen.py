@@ -13,7 +13,6 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
 
 __all__ = [
     "algebra_source",
-    "coefficients_source",
     "curvature_kick_source",
     "gradient_kick_source",
     "polynomial_kick_source",
@@ -119,7 +118,7 @@ def algebra_source(symbols: SymbolicHamiltonian) -> str:
     parts = [
         f"NDOF = {d}",
         tuple_algebra(d),
-        _function("kick", "q, b, work", q, [-s for s in slope], [f"b*{{{i}}}" for i in range(d)]),
+        _function("kick", "q, numbers, work", q, [-s for s in slope], [f"b*{{{i}}}" for i in range(d)], "b"),
         _function("drift", "p, a, work", p, velocity, [f"a*{{{i}}}" for i in range(d)]),
     ]
     return "\n\n\n".join(parts) + "\n"
@@ -159,7 +158,9 @@ def gradient_kick_source(symbols: SymbolicHamiltonian) -> str:
         other.append(" + ".join(f"(g*{{{n}}})*{velocity(j)}" for j, n in row.items() if j != i) or "0.0")
     results = [f"({', '.join(change)},)" for change in (own, other)]
     coupled = f"COUPLED = {any(term != '0.0' for term in other)}"
-    return f"{coupled}\n\n\n" + _function("gradient_kick", "q, b, g, work", q, [*slope, *entries], results) + "\n"
+    return (
+        f"{coupled}\n\n\n" + _function("gradient_kick", "q, numbers, work", q, [*slope, *entries], results, "bg") + "\n"
+    )
 
 
 def curvature_kick_source(symbols: SymbolicHamiltonian) -> str:
@@ -175,11 +176,11 @@ def curvature_kick_source(symbols: SymbolicHamiltonian) -> str:
     products = sp.hessian(symbols.V, q) * M * slope
     bent = [sp.diff(symbols.W, s) for s in q]
     results = [f"((g*{{{d + i}}} - b*{{{i}}}) - c*{{{2 * d + i}}})" for i in range(d)]
-    return _function("curvature_kick", "q, b, g, c, work", q, [*slope, *products, *bent], results) + "\n"
+    return _function("curvature_kick", "q, numbers, work", q, [*slope, *products, *bent], results, "bgc") + "\n"
 
 
 def polynomial_kick_source(symbols: SymbolicHamiltonian, monomials: Monomials) -> str:
-    """−b∇V − Σ_m c_m ∇q^m, c the coefficients of the polynomial.
+    """−b∇V − Σ_m e_m ∇q^m, e the coefficients of the polynomial.
 
     Raises
     ------
@@ -193,37 +194,28 @@ def polynomial_kick_source(symbols: SymbolicHamiltonian, monomials: Monomials) -
     for i, s in enumerate(q):
         for m, product in enumerate(products):
             if (slope := sp.diff(product, s)) != 0:
-                places[i].append(f" - c[{m}]*{{{len(slopes)}}}")
+                places[i].append(f" - numbers[{m + 1}]*{{{len(slopes)}}}")
                 slopes.append(slope)
-    return _function("polynomial_kick", "q, b, c, work", q, slopes, ["".join(terms) for terms in places]) + "\n"
-
-
-def coefficients_source(d: int, n: int) -> str:
-    """The number n of monomials that kicks have, and their coefficients as a tuple: out of an array, or of a lane."""
-
-    def each(pattern: str) -> str:
-        return "(" + "".join(pattern.format(m, 2 * d + 8 + m) + ", " for m in range(n)) + ")"
-
-    return f"""N_MONOMIALS = {n}
-
-
-@njit(**OPTIONS)
-def coefficients_of(c):
-    return {each("c[{0}]")}
-
-
-@njit(**OPTIONS)
-def lane_coefficients(Y, lane):
-    return {each("Y[{1}, lane]")}"""
+    results = ["".join(terms) for terms in places]
+    return _function("polynomial_kick", "q, numbers, work", q, slopes, results, "b") + "\n"
 
 
 def _function(
-    name: str, arguments: str, variables: Sequence[sp.Symbol], expressions: list[sp.Expr], results: list[str]
+    name: str,
+    arguments: str,
+    variables: Sequence[sp.Symbol],
+    expressions: list[sp.Expr],
+    results: list[str],
+    letters: str = "",
 ) -> str:
-    """A jitted function that returns the tuple `results`, ``{n}`` in them standing for the n-th expression."""
+    """A jitted function that returns the tuple `results`, ``{n}`` in them standing for the n-th expression.
+
+    Its first argument holds the variables, and `numbers` begin with those called by the `letters`.
+    """
     names = [f"v_{n}" for n in range(len(expressions))]
     lines = ["@njit(**OPTIONS)", f"def {name}({arguments}):"]
     lines.append(f"    {', '.join(s.name for s in variables)}, = {arguments[0]}")
+    lines += [f"    {letter} = numbers[{i}]" for i, letter in enumerate(letters)]
     lines += [f"    {statement}" for statement in statements(names, expressions)]
     lines.append(f"    return ({''.join(result.format(*names) + ', ' for result in results)})")
     return "\n".join(lines)

@@ -1,130 +1,289 @@
-"""The loops of a SympFlow with MLP potentials: its map, a run. Source text, pasted after `activations` and `aligned`.
+"""Compiled loops of flows that are made of a system: primed, split and clocked ones, by the loops of their systems."""
 
-What comes before defines `NDOF`, `DEPTH` (hidden layers), `WIDTH` (of each, narrower ones padded with zero weights),
-`CHUNK` (a divisor of it), `STATES` (how many states go side by side) and `activation`.
+from __future__ import annotations
 
-A layer adds ∓(∇V(t, x) − ∇V(0, x)) to p or to q. V(t, ·) and V(0, ·) share K x and then run side by side through
-
-    a₁ = K x + b₁ (+ k t),  z_l = σ(a_l),  a_{l+1} = W_l z_l + b_{l+1},      V = w · z_n,
-    r_n = w σ'(a_n),  r_l = σ'(a_l) W_lᵀ r_{l+1},                          ∇V = Kᵀ r₁,
-
-so a feature is a row of 2·STATES columns, t before 0, all rows in one flat array: loops over it become vector
-instructions, for one state as for many. Constant bounds let the compiler unroll the products.
-"""
-# ruff: noqa: F821
-# mypy: ignore-errors
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, Protocol
 
 import numpy as np
-from numba import njit
+from numpy.typing import ArrayLike
 
-COLUMNS = 2 * STATES
-PADDED = (WIDTH * COLUMNS + 7) // 8 * 8  # whole vectors
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.parts import ExactParts, Map
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.modules import run_one, run_rows
+from sympflow.kernels.parts_loops import parts_loops
+from sympflow.kernels.protocol import Run, Steps
+from sympflow.kernels.splitting_loops import LoopFunctions, SplittingKernel, splitting_loops
+from sympflow.kernels.stages import StageTable, run_table, single_table
+from sympflow.kernels.timed_loops import reach_times
+from sympflow.schemes import CURVATURE, Scheme
 
-
-@njit(**OPTIONS, inline="always")  # twice as fast for one state: what the arrays are is known then
-def multiply(M, z, start, out):
-    """out = M z + start, the vector `start` added to every column."""
-    for i in range(WIDTH):
-        for chunk in range(0, WIDTH, CHUNK):
-            for c in range(COLUMNS):
-                total = start[i] if chunk == 0 else out[i * COLUMNS + c]
-                for k in range(CHUNK):
-                    total += M[i, chunk + k] * z[(chunk + k) * COLUMNS + c]
-                out[i * COLUMNS + c] = total
-
-
-@njit(**OPTIONS, inline="always")
-def add_impulse(x, t, sign, target, weights, scratch):
-    """target += sign · (∇V(t, x) − ∇V(0, x)) with the weights of one layer; x and target are (NDOF · STATES,)."""
-    K, k, b, W, W_transposed, w = weights
-    z, r, slopes = scratch
-    for i in range(WIDTH):
-        for s in range(STATES):
-            a = b[0, i]
-            for j in range(NDOF):
-                a += K[j, i] * x[j * STATES + s]
-            r[i * COLUMNS + s] = a + k[i] * t[s]
-            r[i * COLUMNS + STATES + s] = a
-    for m in range(PADDED):
-        z[m], slopes[0, m] = activation(r[m])
-    for layer in range(1, DEPTH):
-        multiply(W[layer - 1], z, b[layer], r)
-        for m in range(PADDED):
-            z[m], slopes[layer, m] = activation(r[m])
-    for i in range(WIDTH):
-        for c in range(COLUMNS):
-            r[i * COLUMNS + c] = w[i] * slopes[DEPTH - 1, i * COLUMNS + c]
-    for layer in range(DEPTH - 2, -1, -1):
-        multiply(W_transposed[layer], r, b[DEPTH], z)
-        for m in range(PADDED):
-            r[m] = z[m] * slopes[layer, m]
-    for j in range(NDOF):
-        for s in range(STATES):
-            total = 0.0
-            for i in range(WIDTH):
-                total += K[j, i] * (r[i * COLUMNS + s] - r[i * COLUMNS + STATES + s])
-            target[j * STATES + s] += sign * total
+__all__ = [
+    "ClockedFlowKernel",
+    "MapSource",
+    "PrimedFlowKernel",
+    "SplitFlowKernel",
+    "TableSource",
+]
 
 
-@njit(**OPTIONS)
-def psi(q, p, t, backwards, weights, scratch):
-    """ψ̄_t of the states (NDOF · STATES,), or its inverse, in place; a time t for each."""
-    is_kick, K, k, b, W, W_transposed, w = weights
-    for n in range(len(is_kick)):
-        i = len(is_kick) - 1 - n if backwards else n
-        x, target = (q, p) if is_kick[i] else (p, q)
-        sign = 1.0 if is_kick[i] == backwards else -1.0
-        layer = K[i], k[i], b[i], W[i], W_transposed[i], w[i]
-        add_impulse(x, t, sign, target, layer, scratch)
+class TableSource(Protocol):
+    """The numbers of a primed flow ψ̄ = χ ∘ K ∘ χ⁻¹, which do not change.
 
-
-@njit(**OPTIONS)
-def is_finite(q, p, s):
-    total = 0.0
-    for j in range(NDOF):
-        total += 0.0 * q[j * STATES + s] + 0.0 * p[j * STATES + s]
-    return total == 0.0
-
-
-@njit(**OPTIONS)
-def store(q, p, s, row):
-    for j in range(NDOF):
-        row[j], row[NDOF + j] = q[j * STATES + s], p[j * STATES + s]
-
-
-@njit(**OPTIONS)
-def rollout(weights, backwards, t_steps, y0, n_steps, save, out, n_finite, stop):
-    """`n_steps` steps of ``t_steps[i] ≥ 0`` from ``y0[i]``, the states after ``save[j]`` steps into ``out[i, j]``.
-
-    ``n_finite[i]`` is the last step that ends in a finite state; rows of later steps are NaN. Ends early when
-    another thread sets ``stop[0]``.
+    Attributes
+    ----------
+    level : int
+        The terms of its kicks: see `sympflow.schemes.Scheme.level`.
+    monomials
+        Of the polynomials of kicks, where they have them.
+    processed : bool
+        False if χ is the identity.
     """
-    q, p, t = aligned_zeros(NDOF * STATES), aligned_zeros(NDOF * STATES), aligned_zeros(STATES)
-    scratch = aligned_zeros(PADDED), aligned_zeros(PADDED), aligned_zeros(DEPTH * PADDED).reshape((DEPTH, PADDED))
-    for first in range(0, y0.shape[0], STATES):
-        count = min(STATES, y0.shape[0] - first)
-        for s in range(STATES):
-            i = first + min(s, count - 1)  # spare places repeat the last state
-            t[s] = t_steps[i]
-            for j in range(NDOF):
-                q[j * STATES + s], p[j * STATES + s] = y0[i, j], y0[i, NDOF + j]
-            n_finite[i] = n_steps
-        n_alive = count
-        saved = 0
-        for n in range(n_steps + 1):
-            if n > 0:
-                psi(q, p, t, backwards, weights, scratch)
-                for s in range(count):
-                    if n_finite[first + s] == n_steps and not is_finite(q, p, s):
-                        n_finite[first + s] = n - 1
-                        n_alive -= 1
-            while saved < len(save) and save[saved] == n:
-                for s in range(count):
-                    if n_finite[first + s] >= n:
-                        store(q, p, s, out[first + s, saved])
-                    else:
-                        out[first + s, saved] = np.nan
-                saved += 1
-            if n_alive == 0 or stop[0] != 0:
-                break
-        out[first : first + count, saved:] = np.nan
+
+    level: int
+    monomials: Monomials
+    processed: bool
+
+    def scheme(self, part: str, t: float | None, back: bool = False) -> Scheme:
+        """The "primed kernel" K_t or the "primed processor" χ_t at t > 0; `back` its inverse."""
+        ...
+
+    def polynomials(self, back: bool) -> StageTable:
+        """ψ̄_t or its inverse for h = 1, as coefficients (m, K) of polynomials in `variable`, K at least 3."""
+        ...
+
+    def variable(self, t: np.ndarray) -> np.ndarray:
+        """The variable of the polynomials, of step lengths t (N,)."""
+        ...
+
+    def kept(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """The result of `make`, made once for each key."""
+        ...
+
+
+class PrimedFlowKernel:
+    """Compiled loops of a primed flow on its system, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
+
+    A flow with a processor, ψ̄ = χ ∘ K ∘ χ⁻¹, starts a run by χ⁻¹, makes its steps by K, and applies χ to each output.
+
+    Parameters
+    ----------
+    tables : TableSource
+        The numbers of the flow.
+    system : HamiltonianSystem
+        The flow's, one that can be compiled.
+    compensated : bool
+        Sum with Kahan's compensation in runs.
+    """
+
+    saves_finite = True
+
+    def __init__(self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False) -> None:
+        if tables.level >= CURVATURE and system.symbols is None:
+            raise ValueError(
+                f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled: "
+                "use backend='array'."
+            )
+        self.system = system
+        self._tables, self._splitting, self._compensated = tables, splitting_loops(system), compensated
+
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+        """`n_steps` times ψ̄_h from one state: see `Kernel`."""
+        if not self._tables.processed:
+            return self._kernel(h).run(abs(h), y0, n_steps, save)
+        tables, rollout = self._processed(h), self._functions().rollout_processed
+        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+        out = np.empty((len(save), len(y0)))
+        work = _stages(tables, n_steps, len(save)) * len(y0) // 2
+        n_finite = run_one(lambda stop: rollout(*tables, y0, n_steps, save, out, stop), work)
+        return Run(out, n_finite)
+
+    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
+        if len(y0) == 1:
+            return _as_batch(self.run(h, y0[0], n_steps, save))
+        if not self._tables.processed:
+            return self._kernel(h).run_batch(abs(h), y0, n_steps, save, threads)
+        tables, rollout = self._processed(h), self._functions().rollout_processed_batch
+        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+        out = np.empty((len(y0), len(save), y0.shape[1]))
+        n_finite = np.empty(len(y0), dtype=np.int64)
+
+        def rows(i: slice, stop: np.ndarray) -> None:
+            rollout(*tables, y0[i], n_steps, save, out[i], n_finite[i], stop)
+
+        run_rows(rows, len(y0), _stages(tables, n_steps, len(save)) * y0.shape[1] // 2, threads)
+        return Run(out, n_finite)
+
+    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,); its numbers are polynomials in h."""
+        h = np.asarray(h, dtype=np.float64)
+        h = h.repeat(len(y)) if h.ndim == 0 else h
+        if len(h) == 1 and h[0] != 0:
+            back = bool(h[0] < 0)
+            return Steps(self._stepped(-h if back else h, y, back))
+        forwards = h > 0
+        if forwards.all():
+            return Steps(self._stepped(h, y, False))
+        if (h < 0).all():
+            return Steps(self._stepped(-h, y, True))
+        out = np.array(y, dtype=np.float64)
+        for rows, back in ((forwards, False), (h < 0, True)):
+            if rows.any():
+                out[rows] = self._stepped(np.abs(h[rows]), y[rows], back)
+        return Steps(out)
+
+    def _stepped(self, t: np.ndarray, y: np.ndarray, back: bool) -> np.ndarray:
+        tables = self._tables
+        return self._splitting.step_rows(tables.polynomials(back), tables.variable(t), t, y, tables.monomials)
+
+    def _kernel(self, h: float) -> SplittingKernel:
+        """K_h, or for h < 0 its inverse."""
+        return self._splitting.kernel(self._tables.scheme("primed kernel", abs(h), back=h < 0), self._compensated)
+
+    def _functions(self) -> LoopFunctions:
+        """The compiled functions for the kicks of the flow."""
+        return self._splitting.functions(self._tables.level, self._compensated, self._tables.monomials)
+
+    def _processed(self, h: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The tables of χ⁻¹, of a run of K, and of χ, of steps |h|, or for h < 0 of their inverse."""
+
+        def make() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            t, tables = abs(h), self._tables
+            kernel = run_table(tables.scheme("primed kernel", t, back=h < 0), t)
+            before, after = (single_table(tables.scheme("primed processor", t, back=back), t) for back in (True, False))
+            return before.packed, kernel.packed, after.packed
+
+        return self._tables.kept(("processed", h), make)
+
+
+def _stages(tables: Sequence[np.ndarray], n_steps: int, n_saved: int) -> int:
+    """Stages of a run with a processor."""
+    return n_steps * tables[1].shape[1] + n_saved * tables[2].shape[1]
+
+
+class MapSource(Protocol):
+    """The maps of a split flow, which do not change."""
+
+    def maps(self, t: float) -> Sequence[Map]:
+        """The maps of a step, for t < 0 those of the inverse; the same object for the same t."""
+        ...
+
+    def coefficients(self, back: bool) -> Sequence[Map]:
+        """The maps of all steps, or of their inverses: see `PartsLoops.step_by_coefficients`."""
+        ...
+
+
+class SplitFlowKernel:
+    """Compiled loops of a flow made of exact flows of parts, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
+
+    Parameters
+    ----------
+    maps : MapSource
+    parts : ExactParts
+        Of a system that can be compiled.
+    dt : float
+        Δt.
+    """
+
+    saves_finite = True
+
+    def __init__(self, maps: MapSource, parts: ExactParts, dt: float) -> None:
+        self.parts, self._maps, self._dt = parts, maps, dt
+        self._loops = parts_loops(parts)
+        self._kernel = self._loops.kernel(lambda h: maps.maps(float(h)))
+
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+        """`n_steps` times ψ̄_h from one state: see `Kernel`."""
+        return self._kernel.run(h, y0, n_steps, save)
+
+    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
+        if len(y0) == 1:
+            return _as_batch(self.run(h, y0[0], n_steps, save))
+        return self._kernel.run_batch(h, y0, n_steps, save, threads)
+
+    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
+        h = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
+        out = np.array(y, dtype=np.float64)
+        for back, rows in ((False, h > 0), (True, h < 0)):
+            sequence, dt = self._maps.coefficients(back), self._dt
+            if rows.all():
+                return Steps(self._loops.step_by_coefficients(sequence, dt, np.abs(h), y))
+            if rows.any():
+                out[rows] = self._loops.step_by_coefficients(sequence, dt, np.abs(h[rows]), y[rows])
+        return Steps(out)
+
+
+def _as_batch(run: Run) -> Run:
+    """A run of one state as that of a batch of one."""
+    return Run(run.states[None], np.array([run.n_finite]))
+
+
+class ClockedFlowKernel:
+    """Compiled loops of a flow with a trained clock, a `Kernel`; states are [q, t, p, B].
+
+    B is constant and nothing depends on t, so n steps of the clock are n times one, added where a state is kept.
+
+    Parameters
+    ----------
+    scheme : Scheme
+    system : HamiltonianSystem
+        The transformed one, one that can be compiled.
+    advance : callable
+        By how much the clock puts the time forward in steps s at B, ``advance(s, B)``, numbers or arrays.
+    numbers : callable
+        The numbers of the clock, those that it has now: see `reach_times`.
+    """
+
+    saves_finite = False
+
+    def __init__(
+        self,
+        scheme: Scheme,
+        system: HamiltonianSystem,
+        advance: Callable[[Any, Any], Any],
+        numbers: Callable[[], tuple[float, ...]],
+    ) -> None:
+        self.system = system
+        self._scheme, self._kernel = scheme, splitting_loops(system).kernel(scheme)
+        self._advance, self._numbers, self._time = advance, numbers, system.ndof - 1
+
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+        """`n_steps` times ψ̄_h from one state, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
+        Y, n_finite, _ = self._kernel.run(h, y0, n_steps, save)
+        Y[:, self._time] += np.asarray(save) * self._advance(float(h), float(y0[-1]))
+        return Run(Y, n_finite)
+
+    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
+        Y, n_finite, _ = self._kernel.run_batch(h, y0, n_steps, save, threads)
+        Y[:, :, self._time] += np.asarray(save) * self._advance(h, y0[:, -1])[:, None]
+        return Run(Y, n_finite)
+
+    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
+        out = self._kernel.step(h, y).states
+        if len(out) == 1:  # as plain numbers, ten times faster
+            out[0, self._time] += self._advance(float(np.ravel(h)[0]), float(y[0, -1]))
+        else:
+            out[:, self._time] += self._advance(np.asarray(h, dtype=np.float64), y[:, -1])
+        return Steps(out)
+
+    def reach_times(
+        self,
+        h: float,
+        y0: np.ndarray,
+        times: np.ndarray,
+        stride: int,
+        expected: float,
+        numbers: tuple[float, ...] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """The states of rows of `y0` (N, 2d) at elapsed times: see `timed_loops.reach_times`.
+
+        `numbers` are those of the clock, if they have been asked for.
+        """
+        numbers = self._numbers() if numbers is None else numbers
+        return reach_times(self.system, self._scheme, h, y0, times, stride, expected, numbers)

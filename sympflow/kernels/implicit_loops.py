@@ -1,175 +1,117 @@
-"""The loops of an implicit Gauss method: Newton's iteration, a step, a run. Source text for `implicit`.
+"""Compiled loops of implicit Gauss methods: Newton's iteration with the Hessian of a symbolic H."""
 
-What comes before defines `NDOF`, `COMPENSATED`, the tableau `A` and `B` of `STAGES` stages as tuples, and the system's
-``gradient_and_hessian(y, g, S)``, which leaves the entries of S that are always zero as they are.
+from __future__ import annotations
 
-The unknowns are K_i = h f(y + Σ_j a_ij K_j), in which the coefficients of both methods that are used are exact where it
-matters for the long run, and y + Σ b_i K_i needs no further evaluation of f.
-"""
-# ruff: noqa: F821
-# mypy: ignore-errors
+from functools import lru_cache
+from types import ModuleType
+from weakref import WeakKeyDictionary
 
 import numpy as np
-from numba import njit
+import sympy as sp
+from numpy.typing import ArrayLike
 
-SIZE = 2 * NDOF
-TOLERANCE = 1e-11  # of a relative increment: convergence is quadratic, so what is left is below rounding
-ROUNDING = 1e-9  # increments below this that no longer shrink are rounding
-MOST_ITERATIONS = 50
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.codegen import statements
+from sympflow.kernels.modules import load_algebra, run_rows
+from sympflow.kernels.protocol import Run, Steps
 
+__all__ = ["ImplicitKernel", "implicit_kernel"]
 
-@njit(**OPTIONS)
-def workspace():
-    n = STAGES * SIZE
-    return np.zeros(n), np.zeros(n), np.zeros((n, n)), np.zeros(SIZE), np.zeros(SIZE), np.zeros((SIZE, SIZE))
-
-
-@njit(**OPTIONS)
-def solve_in_place(M, x):
-    """M⁻¹x into x by Gaussian elimination with partial pivoting; M is overwritten. False if a pivot vanishes."""
-    n = len(x)
-    for k in range(n):
-        pivot = k
-        for i in range(k + 1, n):
-            if abs(M[i, k]) > abs(M[pivot, k]):
-                pivot = i
-        if not abs(M[pivot, k]) > 0.0:
-            return False
-        if pivot != k:
-            for j in range(k, n):
-                M[k, j], M[pivot, j] = M[pivot, j], M[k, j]
-            x[k], x[pivot] = x[pivot], x[k]
-        for i in range(k + 1, n):
-            factor = M[i, k] / M[k, k]
-            if factor != 0.0:
-                for j in range(k + 1, n):
-                    M[i, j] -= factor * M[k, j]
-                x[i] -= factor * x[k]
-    for k in range(n - 1, -1, -1):
-        total = x[k]
-        for j in range(k + 1, n):
-            total -= M[k, j] * x[j]
-        x[k] = total / M[k, k]
-    return True
+Tableau = tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]
 
 
-@njit(**OPTIONS)
-def relative_size(change, y, K):
-    """The largest of ‖Δq‖/(‖q‖ + ‖K_q‖) and ‖Δp‖/(‖p‖ + ‖K_p‖), maxima over components and stages; NaN stays NaN."""
-    worst = 0.0
-    for part in range(2):
-        top, scale = 0.0, 0.0
-        for m in range(part * NDOF, (part + 1) * NDOF):
-            largest = 0.0
-            for i in range(STAGES):
-                value = abs(change[i * SIZE + m])
-                if not value <= top:
-                    top = value
-                largest = max(largest, abs(K[i * SIZE + m]))
-            scale = max(scale, abs(y[m]) + largest)
-        ratio = 0.0 if top == 0.0 else top / scale
-        if not ratio <= worst:
-            worst = ratio
-    return worst
+def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> ImplicitKernel:
+    """The compiled loops of a method on a symbolic system, built once.
 
-
-@njit(**OPTIONS)
-def stages(y, h, work):
-    """The K of a step of length h from y, by Newton's iteration from 0: the iterations taken, negative if in vain."""
-    K, change, M, Y, g, S = work
-    K[:] = 0.0
-    before = np.inf
-    for iteration in range(1, MOST_ITERATIONS + 1):
-        for i in range(STAGES):
-            row = i * SIZE
-            for m in range(SIZE):
-                Y[m] = y[m]
-                for j in range(STAGES):
-                    Y[m] += A[i][j] * K[j * SIZE + m]
-            gradient_and_hessian(Y, g, S)
-            for m in range(SIZE):
-                sign = 1.0 if m < NDOF else -1.0  # J∇H = (∂H/∂p, −∂H/∂q)
-                other = m + NDOF if m < NDOF else m - NDOF
-                change[row + m] = K[row + m] - h * sign * g[other]
-                for j in range(STAGES):
-                    factor = h * sign * A[i][j]
-                    for n in range(SIZE):
-                        M[row + m, j * SIZE + n] = -factor * S[other, n]
-                M[row + m, row + m] += 1.0
-        if not solve_in_place(M, change):
-            return -iteration
-        for m in range(len(K)):
-            K[m] -= change[m]
-        size = relative_size(change, y, K)
-        if size <= TOLERANCE or (size <= ROUNDING and size >= 0.5 * before):
-            return iteration
-        if not size < np.inf:
-            return -iteration
-        before = size
-    return -MOST_ITERATIONS
-
-
-@njit(**OPTIONS)
-def advance(y, error, K):
-    """y + Σ b_i K_i in place; if `COMPENSATED` by Kahan's compensated sum. Whether the result is finite."""
-    total = 0.0
-    for m in range(SIZE):
-        change = 0.0
-        for i in range(STAGES):
-            change += B[i] * K[i * SIZE + m]
-        if COMPENSATED:
-            change -= error[m]
-            new = y[m] + change
-            error[m] = (new - y[m]) - change
-            y[m] = new
-        else:
-            y[m] += change
-        total += 0.0 * y[m]
-    return total == 0.0
-
-
-@njit(**OPTIONS)
-def rollout(h, y0, n_steps, save, out, work, stop):
-    """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``; later rows are NaN.
-
-    Returns the index of the last step that was solved and ends in a finite state, and the iterations taken. Ends early,
-    with rows unset, when another thread sets ``stop[0]``.
+    Raises
+    ------
+    ValueError
+        If the system cannot be compiled, with the reason.
     """
-    y, error = y0.copy(), np.zeros(SIZE)
-    saved = iterations = 0
-    while saved < len(save) and save[saved] <= 0:
-        out[saved] = y
-        saved += 1
-    for n in range(1, n_steps + 1):
-        if stop[0] != 0:
-            break
-        taken = stages(y, h, work)
-        iterations += abs(taken)
-        if taken < 0 or not advance(y, error, work[0]):
-            out[saved:] = np.nan
-            return n - 1, iterations
-        while saved < len(save) and save[saved] == n:
-            out[saved] = y
-            saved += 1
-    return n_steps, iterations
+    kernels = _KERNELS.setdefault(system, {})
+    if (tableau, compensated) not in kernels:
+        kernels[tableau, compensated] = ImplicitKernel(system, tableau, compensated)
+    return kernels[tableau, compensated]
 
 
-@njit(**OPTIONS)
-def rollout_each(h, y0, n_steps, save, out, n_finite, iterations, stop):
-    """`rollout` of every row of `y0` (N, 2d)."""
-    work = workspace()
-    for i in range(y0.shape[0]):
-        n_finite[i], iterations[i] = rollout(h, y0[i], n_steps, save, out[i], work, stop)
+_KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], ImplicitKernel]] = WeakKeyDictionary()
 
 
-@njit(**OPTIONS)
-def step_each(h, y, out, iterations):
-    """One step of length ``h[i]`` from every row of `y` (N, 2d); NaN where it has no solution."""
-    work, error = workspace(), np.zeros(SIZE)
-    for i in range(y.shape[0]):
-        out[i] = y[i]
-        taken = stages(y[i], h[i], work)
-        iterations[i] = abs(taken)
-        error[:] = 0.0
-        if taken < 0 or not advance(out[i], error, work[0]):
-            out[i] = np.nan
+class ImplicitKernel:
+    """Compiled loops of an implicit Runge–Kutta method on one system, a `Kernel`.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        Symbolic.
+    tableau : (A, b)
+        As tuples of numbers.
+    compensated : bool
+        Sum with Kahan's compensation in runs.
+    """
+
+    saves_finite = False
+
+    def __init__(self, system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> None:
+        if system.symbols is None:
+            raise ValueError(
+                "`system` cannot be compiled: its Hessian is not symbolic. Use HamiltonianSystem.from_sympy, "
+                "or use backend='array'."
+            )
+        self.ndof, self._tableau, self._compensated = system.ndof, tableau, compensated
+        self._algebra = gradient_and_hessian_source(system.symbols)
+
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+        """`n_steps` steps of length `h` from one state: see `Kernel`."""
+        Y, n_finite, iterations = self.run_batch(h, y0[None], n_steps, save)
+        return Run(Y[0], n_finite[0], iterations)
+
+    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+        """`run` for every row of `y0` (N, 2d), where it pays on several threads."""
+        loops = _load(self._algebra, self._tableau, self._compensated)
+        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+        out = np.empty((len(y0), len(save), 2 * self.ndof))
+        n_finite, iterations = np.empty(len(y0), dtype=np.int64), np.empty(len(y0), dtype=np.int64)
+
+        def rows(i: slice, stop: np.ndarray) -> None:
+            loops.rollout_each(h, y0[i], n_steps, save, out[i], n_finite[i], iterations[i], stop)
+
+        size = 2 * self.ndof * len(self._tableau[1])
+        run_rows(rows, len(y0), n_steps * 4 * size**3, threads)
+        return Run(out, n_finite, int(iterations.sum()))
+
+    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+        """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
+        y = np.ascontiguousarray(y, dtype=np.float64)
+        h = np.ascontiguousarray(np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1]))
+        out, iterations = np.empty_like(y), np.empty(len(y), dtype=np.int64)
+        _load(self._algebra, self._tableau, False).step_each(h, y, out, iterations)
+        return Steps(out, int(iterations.sum()))
+
+
+@lru_cache(maxsize=256)
+def _load(algebra: str, tableau: Tableau, compensated: bool) -> ModuleType:
+    A, b = tableau
+    return load_algebra(algebra, ["newton"], COMPENSATED=compensated, STAGES=len(b), A=A, B=b)
+
+
+def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:
+    """``gradient_and_hessian(y, g, S)``: ∇H into g and ∇²H into S, as statements; zeros of S are not written.
+
+    Raises
+    ------
+    ValueError
+        If a function in H has no counterpart in compiled code.
+    """
+    variables = symbols.q + symbols.p
+    slopes = [sp.diff(symbols.H, s) for s in variables]
+    triangle = [(i, j) for i in range(len(variables)) for j in range(i, len(variables))]
+    entries = {ij: sp.diff(slopes[ij[0]], variables[ij[1]]) for ij in triangle}
+    entries = {ij: entry for ij, entry in entries.items() if entry != 0}
+    targets = [f"g[{i}]" for i in range(len(variables))]
+    targets += [f"S[{i}, {j}] = S[{j}, {i}]" if i != j else f"S[{i}, {i}]" for i, j in entries]
+    lines = [f"NDOF = {symbols.ndof}\n\n", "@njit(**OPTIONS)", "def gradient_and_hessian(y, g, S):"]
+    lines += [f"    {s.name} = y[{i}]" for i, s in enumerate(variables)]
+    lines += [f"    {statement}" for statement in statements(targets, [*slopes, *entries.values()])]
+    return "\n".join(lines) + "\n"

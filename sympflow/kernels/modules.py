@@ -39,8 +39,8 @@ _WORTH_A_THREAD = 500_000  # units of work, about a nanosecond each, below which
 
 
 def template(name: str) -> str:
-    """The source text of the module `name` of this package."""
-    return files(__package__).joinpath(f"{name}.py").read_text(encoding="utf-8")
+    """The text of loops of that name: see `sympflow.kernels.text`."""
+    return files(__package__).joinpath("text", f"{name}.py").read_text(encoding="utf-8")
 
 
 def cache_folder() -> Path:

@@ -1,214 +1,268 @@
-"""The loops of a splitting into exactly solvable parts. Source text, pasted after the algebra of a system.
+"""Compiled loops of splittings into exactly solvable parts, in the normal modes of the linear one."""
 
-The algebra that comes before defines tuples of normal modes x, y (``unpack``, ``pack``, …), ``to_modes`` and
-``from_modes``, ``apply_map`` and ``apply_map_lanes``. Where a run is asked to be `in_modes`, it takes and gives modes
-instead of states. A step is a list of maps, a code and a row of coefficients each. A run executes the rows
-[opening, inner …, link, closing]: a step is the link (the first step, the opening) and the inner maps, so that
-consecutive steps share their common map; an output is the closing map applied to a copy.
-"""
-# ruff: noqa: F821
-# mypy: ignore-errors
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
-from numba import njit
+from numpy.typing import ArrayLike
 
-CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where nothing is saved
-LANES = 64
-VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
+from sympflow.kernels.modules import NEVER, load_algebra, run_one, run_rows
+from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
+from sympflow.kernels.protocol import Run, Steps
 
+__all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 
-@njit(**OPTIONS, forceinline=True)  # called, it would take and give its states in memory
-def one_step(x, y, codes, table, first, link):
-    x, y = apply_map(x, y, codes[first], table, first)
-    for j in range(1, link):
-        x, y = apply_map(x, y, codes[j], table, j)
-    return x, y
+ONE = np.ones(1, dtype=np.int64)
+KNOWN_TABLES = 64  # run tables that are kept: those of the steps in use
 
-
-@njit(**OPTIONS, forceinline=True)
-def closed(x, y, codes, table, in_modes):
-    """What a step ends in."""
-    x, y = apply_map(x, y, codes[len(codes) - 1], table, len(codes) - 1)
-    return (x, y) if in_modes else from_modes(x, y)
+Maps = Callable[[np.ndarray], Sequence[Map]]
+"""The maps of a step of length h (...), their entries of that batch shape."""
 
 
-@njit(**OPTIONS)
-def first_non_finite(x, y, codes, table, first, n_steps, in_modes):
-    """The first of `n_steps` steps from a running state whose end is not finite; `n_steps` if none is."""
-    link = len(codes) - 2
-    for n in range(1, n_steps):
-        x, y = one_step(x, y, codes, table, first, link)
-        first = link
-        end_x, end_y = closed(x, y, codes, table, in_modes)
-        if not is_finite(end_x, end_y):
-            return n
-    return n_steps
+@dataclass(frozen=True)
+class LoopFunctions:
+    """The compiled functions of one variant (with or without filters and force gradients)."""
+
+    rollout: Callable[..., int]
+    rollout_batch: Callable[..., None]
+    step_each: Callable[..., None]
+    step_lanes: Callable[..., None]
+    fill_rows: Callable[..., None]
+    row_width: int
 
 
-@njit(**OPTIONS)
-def rollout(codes, table, y0, in_modes, n_steps, save, out, stop):
-    """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
+def parts_loops(parts: ExactParts) -> PartsLoops:
+    """The compiled loops of the parts of a system, made once.
 
-    Returns the index of the last step that ends in a finite state; rows of later steps are NaN. Ends early, with
-    rows unset, when another thread sets ``stop[0]``.
+    Raises
+    ------
+    ValueError
+        If the parts cannot be compiled, with the reason.
     """
-    link = len(codes) - 2
-    x, y = unpack(y0)
-    n = saved = first = 0
-    while saved < len(save) and save[saved] <= 0:
-        pack(x, y, out[saved])
-        saved += 1
-    if not in_modes:
-        x, y = to_modes(x, y)
-    while n < n_steps and stop[0] == 0:
-        block = min(CHECK_EVERY, n_steps - n)
-        if saved < len(save):
-            block = min(block, save[saved] - n)
-        start_x, start_y, start = x, y, first
-        for _ in range(block):
-            x, y = one_step(x, y, codes, table, first, link)
-            first = link
-        end_x, end_y = closed(x, y, codes, table, in_modes)
-        if not is_finite(end_x, end_y):
-            out[saved:] = np.nan
-            return n - 1 + first_non_finite(start_x, start_y, codes, table, start, block, in_modes)
-        n += block
-        while saved < len(save) and save[saved] == n:
-            pack(end_x, end_y, out[saved])
-            saved += 1
-    return n_steps
+    loops = _LOOPS.get(parts)
+    if loops is None:
+        loops = _LOOPS[parts] = PartsLoops(parts)
+    return loops
 
 
-@njit(**OPTIONS)
-def step_each(codes, tables, z, in_modes, out):
-    """One step from every row of `z` (N, 2d) by the maps `codes`, each row with its own table (N, n, W)."""
-    for i in range(z.shape[0]):
-        x, y = unpack(z[i])
-        if not in_modes:
-            x, y = to_modes(x, y)
-        for j in range(len(codes)):
-            x, y = apply_map(x, y, codes[j], tables[i], j)
-        if not in_modes:
-            x, y = from_modes(x, y)
-        pack(x, y, out[i])
+_LOOPS: WeakKeyDictionary[ExactParts, PartsLoops] = WeakKeyDictionary()
 
 
-TABLE = 2 * NDOF  # lines of the row of a map, for each lane; then come its numbers, the time and the basis functions
-NUMBERS = TABLE + ROW_WIDTH
-TIME = NUMBERS + 2 + N_CLASSES
-BASIS = TIME + 1
+class PartsLoops:
+    """Compiled loops over the maps of any splitting of one system; states are [q, p], float64.
 
+    The linear part's modes rotate by three shears, each with determinant 1 whatever its number, by at most an eighth of
+    a turn, after exact quarter turns; the run stays in the modes. So rounding is none at whole quarter turns, and a
+    random walk elsewhere, but at some simple fractions of a turn, such as a sixth: the state comes back to nearly
+    the same numbers, whose rounding repeats, and the energy drifts by up to 5e-17 of it with each step.
 
-@njit(**OPTIONS, inline="always")
-def fill_number(Z, width, i, coefficients, power):
-    """t to a power, times the sum of the basis functions with these coefficients."""
-    for lane in range(width):
-        Z[NUMBERS + i, lane] = coefficients[0]
-    for k in range(1, len(coefficients)):
-        for lane in range(width):
-            Z[NUMBERS + i, lane] += coefficients[k] * Z[BASIS + k, lane]
-    for _ in range(power):
-        for lane in range(width):
-            Z[NUMBERS + i, lane] *= Z[TIME, lane]
+    Parameters
+    ----------
+    parts : ExactParts
+        Of a symbolic system.
 
-
-@njit(**OPTIONS)
-def step_lanes(codes, coefficients, dt, t, y, in_modes, out):
-    """One step from every row of `y` (N, 2d), each of its own length t[i] > 0, `LANES` rows at a time.
-
-    The numbers of the maps, coefficients (m, numbers, K), are sums of the functions 1 and τ² T_k(2τ² − 1), τ = t/dt,
-    with Chebyshev's T_k: lengths times t, force gradients times t³, and filters.
+    Raises
+    ------
+    ValueError
+        If the parts are plain functions, or H holds a function that has no compiled form.
     """
-    terms = coefficients.shape[2]
-    Z = aligned_zeros((BASIS + max(terms, 3)) * LANES).reshape((BASIS + max(terms, 3), LANES))
-    for block_start in range(0, y.shape[0], LANES):
-        count = min(LANES, y.shape[0] - block_start)
-        width = (count + VECTOR - 1) // VECTOR * VECTOR
-        for lane in range(width):
-            i = block_start + min(lane, count - 1)
-            q, p = unpack(y[i])
-            if not in_modes:
-                q, p = to_modes(q, p)
-            pack_lane(q, p, Z, lane)
-            square = (t[i] / dt) ** 2
-            Z[TIME, lane] = t[i]
-            Z[BASIS + 1, lane], Z[BASIS + 2, lane] = square, square * (2.0 * square - 1.0)
-        for k in range(3, terms):
-            for lane in range(width):
-                x = 2.0 * (2.0 * Z[BASIS + 1, lane] - 1.0)
-                Z[BASIS + k, lane] = x * Z[BASIS + k - 1, lane] - Z[BASIS + k - 2, lane]
-        for j in range(len(codes)):
-            if codes[j] == 0:
-                for f in range(N_CLASSES):
-                    fill_number(Z, width, f, coefficients[j, f], 1)
-                fill_turns(Z, width)
-            else:
-                fill_number(Z, width, 0, coefficients[j, 0], 1)
-                fill_number(Z, width, 1, coefficients[j, 1], 3)
-                for lane in range(width):
-                    Z[TABLE, lane], Z[TABLE + 1, lane] = Z[NUMBERS, lane], Z[NUMBERS + 1, lane]
-                if FILTERS:
-                    for f in range(N_CLASSES):
-                        fill_number(Z, width, 2 + f, coefficients[j, 2 + f], 0)
-                    fill_filters(Z, width)
-            apply_map_each(Z, width, codes[j])
-        for lane in range(count):
-            q, p = unpack_lane(Z, lane)
-            if not in_modes:
-                q, p = from_modes(q, p)
-            pack(q, p, out[block_start + lane])
+
+    def __init__(self, parts: ExactParts) -> None:
+        if not all(isinstance(part, PartFunctions) for part in parts.rest):
+            raise ValueError("`system` is given by plain functions: define it with from_sympy, or use backend='array'.")
+        parts_source(parts, False, False)
+        self.parts = parts
+        self._variants: dict[tuple[bool, bool], LoopFunctions] = {}
+        self.mixed = not parts.diagonal  # modes that are sums of coordinates: transformed outside the loops
+        self._coefficients: dict[int, tuple[Sequence[Map], np.ndarray, np.ndarray]] = {}
+        self._tables: dict[int, tuple[Sequence[Map], tuple[np.ndarray, np.ndarray], LoopFunctions]] = {}
+
+    def kernel(self, maps: Maps) -> PartsKernel:
+        """The loops of one splitting, whose step of length h is `maps(h)`.
+
+        The tables of runs are kept by the identity of what `maps` returns.
+        """
+        return PartsKernel(self, maps)
+
+    def step_by_coefficients(self, sequence: Sequence[Map], dt: float, t: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """One step from each row of y (N, 2d), each of its own length t (N,) > 0, by maps that are functions of t.
+
+        Parameters
+        ----------
+        sequence : sequence of Map
+            With coefficients (K, …) in place of numbers: of 1 and τ² T_k(2τ² − 1), k = 0 … K−2, where τ = t/dt and T_k
+            are Chebyshev's polynomials; lengths are t and force gradients t³ times these sums.
+        """
+        known = self._coefficients.get(id(sequence))
+        if known is None or known[0] is not sequence:
+            if len(self._coefficients) >= KNOWN_TABLES:
+                self._coefficients.clear()
+            known = self._coefficients[id(sequence)] = sequence, *self._coefficient_table(sequence)
+        out = np.empty(y.shape)
+        functions, t = self.functions(sequence), np.ascontiguousarray(t, dtype=np.float64)
+        functions.step_lanes(*known[1:], dt, t, self.modes(y), self.mixed, out)
+        return self.states(out)
+
+    def _coefficient_table(self, sequence: Sequence[Map]) -> tuple[np.ndarray, np.ndarray]:
+        """Codes (m,) and coefficients (m, 2 + F, K): lengths, or a weight, a force gradient and filters."""
+        F, terms = self.parts.n_classes, len(sequence[0].length)
+        codes, table = np.empty(len(sequence), dtype=np.int64), np.zeros((len(sequence), 2 + F, terms))
+        for j, m in enumerate(sequence):
+            codes[j] = m.part + WITH_GRADIENT * has_gradient(m)
+            if m.part == LINEAR:
+                table[j, :F] = m.length.T
+                continue
+            table[j, 0], table[j, 1] = m.length, m.gradient
+            if m.filters is not None:
+                table[j, 2:] = m.filters.T
+        return codes, table
+
+    def step_modes(self, sequence: Sequence[Map], modes: np.ndarray) -> np.ndarray:
+        """The maps applied once to every row [X, Y] of `modes` (N, 2d), which stay modes."""
+        functions = self.functions(sequence)
+        out, n_finite = np.empty((len(modes), 1, modes.shape[1])), np.empty(len(modes), dtype=np.int64)
+        functions.rollout_batch(*self.run_table(sequence), modes, True, 1, ONE, out, n_finite, NEVER)
+        return out[:, 0]
+
+    def modes(self, y: np.ndarray) -> np.ndarray:
+        """What the loops take: modes where these are mixed, else states."""
+        y = np.ascontiguousarray(y, dtype=np.float64)
+        return np.ascontiguousarray(np.concatenate(self.parts.to_modes(y), axis=-1)) if self.mixed else y
+
+    def states(self, out: np.ndarray, save: np.ndarray | None = None, y0: np.ndarray | None = None) -> np.ndarray:
+        """States of what the loops gave."""
+        if not self.mixed:
+            return out
+        d = self.parts.ndof
+        states = self.parts.from_modes(out[..., :d], out[..., d:])
+        if save is not None and len(save) and save[0] <= 0:
+            states[..., : np.searchsorted(save, 0, "right"), :] = y0
+        return states
+
+    def functions(self, sequence: Sequence[Map]) -> LoopFunctions:
+        known = self._tables.get(id(sequence))
+        if known is not None and known[0] is sequence:
+            return known[2]
+        filters, gradients = any(m.filters is not None for m in sequence), any(map(has_gradient, sequence))
+        if gradients and not self.parts.has_force_gradient:
+            raise ValueError("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
+        if (filters, gradients) not in self._variants:
+            algebra = parts_source(self.parts, filters, gradients)
+            module = load_algebra(algebra, ["aligned", "part_maps"], COMPENSATED=False)
+            self._variants[filters, gradients] = LoopFunctions(
+                module.rollout,
+                module.rollout_lanes,
+                module.step_each,
+                module.step_lanes,
+                module.fill_rows,
+                module.ROW_WIDTH,
+            )
+        return self._variants[filters, gradients]
+
+    def table(self, sequence: Sequence[Map], n: int, functions: LoopFunctions) -> tuple[np.ndarray, np.ndarray]:
+        """Codes (m,) and coefficients (n, m, W)."""
+        codes, tables = np.empty(len(sequence), dtype=np.int64), np.zeros((n, len(sequence), functions.row_width))
+        F = TURN_WIDTH * self.parts.n_classes
+        for j, m in enumerate(sequence):
+            codes[j] = m.part + WITH_GRADIENT * has_gradient(m)
+            if m.part == LINEAR:
+                tables[:, j, :F] = self._turns(np.asarray(m.length)).reshape(-1, F)
+                continue
+            tables[:, j, 0], tables[:, j, 1] = m.length, m.gradient
+            if m.filters is not None:
+                scale = np.diag(self.parts.C) if self.parts.diagonal else 1.0
+                tables[:, j, 2 : 2 + self.parts.ndof] = self.parts.by_class(np.asarray(m.filters)) * scale
+        functions.fill_rows(codes, tables)
+        return codes, tables
+
+    def _turns(self, s: np.ndarray) -> np.ndarray:
+        """What turns each frequency by Ω s, (..., F, 6): t, σ, c and d of `shears`, c − td and d + tc."""
+        linear = self.parts.linear
+        assert linear is not None
+        kinds = [linear.kinds[j] for j in linear.representatives]
+        t, sigma, c, d = shears(kinds, linear.rates[linear.representatives], s)
+        return np.stack([t, sigma, c, d, c - t * d, d + t * c], axis=-1)
+
+    def run_table(self, sequence: Sequence[Map]) -> tuple[np.ndarray, np.ndarray]:
+        """Codes and rows of [opening, inner …, link, closing]: see `text/part_maps.py`."""
+        known = self._tables.get(id(sequence))
+        if known is not None and known[0] is sequence:
+            return known[1]
+        idle = Map(IDLE, 0.0)
+        first, last = sequence[0], sequence[-1]
+        merged = merge(last, first) if len(sequence) > 1 else None
+        rows = [idle, *sequence, idle, idle] if merged is None else [first, *sequence[1:-1], merged, last]
+        functions = self.functions(sequence)
+        codes, table = self.table(rows, 1, functions)
+        if len(self._tables) >= KNOWN_TABLES:
+            self._tables.clear()
+        self._tables[id(sequence)] = sequence, (codes, np.ascontiguousarray(table[0])), functions
+        return self._tables[id(sequence)][1]
 
 
-@njit(**OPTIONS)
-def rollout_lanes(codes, table, y0, in_modes, n_steps, save, out, n_finite, stop):
-    """`rollout` of every row of `y0` (N, 2d), `LANES` at a time."""
-    link = len(codes) - 2
-    Z = aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
-    start = aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
-    for block_start in range(0, y0.shape[0], LANES):
-        count = min(LANES, y0.shape[0] - block_start)
-        width = (count + VECTOR - 1) // VECTOR * VECTOR
-        for lane in range(width):
-            i = block_start + min(lane, count - 1)
-            x, y = unpack(y0[i])
-            n_finite[i] = n_steps
-            for row in range(len(save)):
-                if save[row] > 0:
-                    break
-                pack(x, y, out[i, row])
-            if not in_modes:
-                x, y = to_modes(x, y)
-            pack_lane(x, y, Z, lane)
-        n = saved = first = 0
-        while saved < len(save) and save[saved] <= 0:
-            saved += 1
-        n_alive = count
-        while n < n_steps and n_alive > 0 and stop[0] == 0:
-            copy_lanes(Z, start)
-            begin = first
-            block = min(CHECK_EVERY, n_steps - n)
-            if saved < len(save):
-                block = min(block, save[saved] - n)
-            for _ in range(block):
-                for k in range(link):
-                    j = first if k == 0 else k
-                    apply_map_lanes(Z, width, codes[j], table, j)
-                first = link
-            next_saved = saved
-            while next_saved < len(save) and save[next_saved] == n + block:
-                next_saved += 1
-            for lane in range(count):
-                i = block_start + lane
-                if n_finite[i] < n_steps:
-                    continue
-                x, y = unpack_lane(Z, lane)
-                x, y = closed(x, y, codes, table, in_modes)
-                if not is_finite(x, y):
-                    x, y = unpack_lane(start, lane)
-                    n_finite[i] = n - 1 + first_non_finite(x, y, codes, table, begin, block, in_modes)
-                    n_alive -= 1
-                    out[i, saved:] = np.nan
-                else:
-                    for row in range(saved, next_saved):
-                        pack(x, y, out[i, row])
-            n, saved = n + block, next_saved
+class PartsKernel:
+    """The compiled loops of one splitting of a system into parts, a `Kernel`: see `PartsLoops.kernel`."""
+
+    saves_finite = True
+
+    def __init__(self, loops: PartsLoops, maps: Maps) -> None:
+        self.loops, self.maps = loops, maps
+
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+        """`n_steps` steps of length `h` from one state: see `Kernel`."""
+        loops, sequence = self.loops, self.maps(np.asarray(h, dtype=float))
+        functions, save = loops.functions(sequence), np.ascontiguousarray(save, dtype=np.int64)
+        out = np.empty((2 * loops.parts.ndof, len(save))).T  # each component in one piece, as a solution has them
+        codes, table = loops.run_table(sequence)
+        start, mixed = loops.modes(y0), loops.mixed
+        n_finite = run_one(
+            lambda stop: functions.rollout(codes, table, start, mixed, n_steps, save, out, stop),
+            n_steps * len(codes) * loops.parts.ndof,
+        )
+        return Run(loops.states(out, save, y0), n_finite)
+
+    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
+        loops, sequence = self.loops, self.maps(np.asarray(h, dtype=float))
+        functions, save = loops.functions(sequence), np.ascontiguousarray(save, dtype=np.int64)
+        codes, table = loops.run_table(sequence)
+        start, mixed = loops.modes(y0), loops.mixed
+        out = np.empty((len(y0), len(save), 2 * loops.parts.ndof))
+        n_finite = np.empty(len(y0), dtype=np.int64)
+
+        def rows(i: slice, stop: np.ndarray) -> None:
+            functions.rollout_batch(codes, table, start[i], mixed, n_steps, save, out[i], n_finite[i], stop)
+
+        run_rows(rows, len(y0), n_steps * len(codes) * loops.parts.ndof, threads)
+        return Run(loops.states(out, save, y0[:, None]), n_finite)
+
+    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+        """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
+        loops, sequence = self.loops, self.maps(np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1]))
+        functions = loops.functions(sequence)
+        out = np.empty(y.shape)
+        codes, tables = loops.table(sequence, len(y), functions)
+        functions.step_each(codes, tables, loops.modes(y), loops.mixed, out)
+        return Steps(loops.states(out))
+
+
+def has_gradient(m: Map) -> bool:
+    return bool(np.any(m.gradient))
+
+
+def merge(one: Map, other: Map) -> Map | None:
+    """The map that is `other` after `one`, if it is one map."""
+    if one.part != other.part:
+        return None
+    if one.part != LINEAR and not _same(one.filters, other.filters):
+        return None
+    return Map(one.part, one.length + other.length, one.gradient + other.gradient, one.filters)
+
+
+def _same(a: Any, b: Any) -> bool:
+    return (a is None and b is None) or (a is not None and b is not None and np.array_equal(a, b))

@@ -1,249 +1,144 @@
-"""Runs of equal steps in another time, up to physical times. Source text, pasted after `lanes`.
+"""Compiled runs, in the physical time, of methods whose steps are equal in another time."""
 
-States are [q, t, p, B] of a logarithmic Hamiltonian, scheduled or not, without force gradients. Elapsed times are
-positive: t is multiplied by the sign of the step. What a clock adds to t at each step, `advance`, is no part of the
-running state: it is constant, and added where a time is needed.
+from __future__ import annotations
 
-A run looks at the time after each `stride` steps, a single one seldomer far from an output. If an output is due since,
-they are made again, one by one, and a last step is shortened until its time is the one that is wanted.
-"""
-# ruff: noqa: F821
-# mypy: ignore-errors
-
-import math
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from types import ModuleType
+from weakref import WeakKeyDictionary
 
 import numpy as np
-from numba import njit
 
-EPS = 2.0**-52
-MOST_TRIALS = 80
-MOST_AT_ONCE = 1024  # steps between two looks
-CLOSE = 1e-3  # of the elapsed time, beyond which a residual means that no step leads to that time
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.codegen import algebra_source, statements
+from sympflow.kernels.modules import load_algebra, run_one, run_rows
+from sympflow.kernels.splitting_loops import symbolic_module
+from sympflow.kernels.stages import run_table, step_table
+from sympflow.schemes import Scheme
 
+__all__ = ["lifted_rows", "reach_times"]
 
-@njit(**OPTIONS)
-def clock_advance(clock, s, B):
-    """Σ_k c_k s^(3+2k) B^k, of reversed numbers c."""
-    square = s * s * B
-    total = 0.0
-    for c in clock:
-        total = total * square + c
-    return s * s * s * total
+FEWEST, MANY = 1000, 8.0  # steps after which a run is given up: these, and so many times the expected ones
+_LOOPS: WeakKeyDictionary[SymbolicHamiltonian, ModuleType] = WeakKeyDictionary()
+_LIFTS: WeakKeyDictionary[SymbolicHamiltonian, Callable[..., bool]] = WeakKeyDictionary()
 
 
-@njit(**OPTIONS, forceinline=True)
-def kick_alone(q, p, b):
-    if SCHEDULED:
-        return kicked_lane(q, p, b)
-    return plus(p, kick(q, b, None))
+def reach_times(
+    system: HamiltonianSystem,
+    scheme: Scheme,
+    h: float,
+    y0: np.ndarray,
+    times: np.ndarray,
+    stride: int,
+    expected: float,
+    clock: Sequence[float] = (),
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The states at elapsed times of a scheme with equal steps on a logarithmic Hamiltonian, each by a shorter step.
 
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        The transformed one, symbolic, with states [q, t, p, B].
+    scheme : Scheme
+        Without force gradients.
+    h : float
+        Step in the other time, negative to go back.
+    y0 : ndarray of shape (N, 2d + 2)
+        With t = 0.
+    times : ndarray of shape (n,)
+        Elapsed ones, increasing, positive for every sign of h.
+    stride : int
+        Steps between two looks at the time.
+    expected : float
+        Steps that a run takes, roughly; after many more it is given up.
+    clock : sequence of float
+        Of a trained clock: the numbers c_k of what it adds to t in a step s, Σ_k c_k s^(3+2k) B^k, the last one first.
 
-@njit(**OPTIONS)
-def short_step(q, p, kicks, drifts, sigma):
-    """A step of length sigma by the numbers for h = 1."""
-    last = len(kicks) - 1
-    for j in range(last):
-        q, p, _, _ = plain_lane(q, p, None, None, sigma * kicks[j], sigma * drifts[j])
-    if drifts[last] == 0.0:  # a kick alone: the time, for which there are many trials, does not wait for it
-        return q, kick_alone(q, p, sigma * kicks[last])
-    q, p, _, _ = plain_lane(q, p, None, None, sigma * kicks[last], sigma * drifts[last])
-    return q, p
+    Returns
+    -------
+    Y : ndarray of shape (n, N, 2d)
+        [q, p].
+    counts : ndarray of int64, shape (N, 2)
+        The steps taken, and those tried to meet the times.
 
-
-@njit(**OPTIONS)
-def step_to(q, p, before, after, target, h, kicks, drifts, clock):
-    """The state after a step from (q, p), whose time is `before`, to the time `target`: secants within brackets.
-
-    Also the steps that were tried, or minus these if none leads there. `after` is the time of a whole step.
+    None where a trajectory does not reach its times: because a state is not finite, time turns, or steps run out.
     """
-    sign = 1.0 if h > 0.0 else -1.0
-    B, t = p[NDOF - 1], q[NDOF - 1]
-    tolerance = 2.0 * EPS * max(target, before)
-    low, high, last_sigma, last_t = 0.0, abs(h), 0.0, before
-    sigma = abs(h) * (target - before) / (after - before) if after > before else 0.0
-    sigma = min(max(sigma, low), high)
-    best_q, best_p, best = q, p, abs(before - target)
-    trials = 0
-    while trials < MOST_TRIALS and (trials == 0 or best > tolerance):
-        trials += 1
-        new_q, new_p = short_step(q, p, kicks, drifts, sign * sigma)
-        now = before + sign * ((new_q[NDOF - 1] - t) + clock_advance(clock, sign * sigma, B))
-        residual = now - target
-        if abs(residual) < best:
-            best_q, best_p, best = new_q, new_p, abs(residual)
-        if residual < 0.0:
-            low = sigma
-        else:  # NaN counts as too far
-            high = sigma
-        slope = (now - last_t) / (sigma - last_sigma)
-        last_sigma, last_t = sigma, now
-        secant = sigma - residual / slope
-        inside = slope > 0.0 and slope < math.inf and secant > low and secant < high
-        sigma = secant if inside else 0.5 * (low + high)
-    found = best <= max(CLOSE * (target - before), 100.0 * tolerance)
-    return best_q, best_p, trials if found else -trials
-
-
-@njit(**OPTIONS)
-def deliver(q, p, first, n, block, end, table, work, step, h, advance, clock, targets, saved, out, i):
-    """The outputs of row i until the elapsed time `end`, within `block` steps from the running state (q, p) after n.
-
-    How many there are then, the steps that were tried for them, and that in which the last one lies; saved is −1 if
-    one of them is not reached.
-    """
-    kicks, drifts, gradients, curvatures = table[0], table[1], table[2], table[3]
-    sign, link, tried, last = 1.0 if h > 0.0 else -1.0, len(kicks) - 2, 0, n
-    q_error, p_error = no_error(q), no_error(p)
-    before_q, before_p = q, p
-    if n > 0:
-        before_q, before_p = close(q, p, q_error, p_error, kicks, drifts, gradients, curvatures, work)
-    for k in range(1, block + 1):
-        for j in range(link):
-            row = first if j == 0 else j
-            q, p, q_error, p_error = called_stage(
-                q, p, q_error, p_error, kicks[row], gradients[row], curvatures[row], drifts[row], row, work
-            )
-        first = link
-        after_q, after_p = close(q, p, q_error, p_error, kicks, drifts, gradients, curvatures, work)
-        before = sign * (before_q[NDOF - 1] + (n + k - 1) * advance)
-        after = sign * (after_q[NDOF - 1] + (n + k) * advance)
-        while saved < len(targets) and targets[saved] <= end and (targets[saved] <= after or k == block):
-            at_q, at_p = after_q, after_p
-            if targets[saved] != after:
-                at_q, at_p, trials = step_to(
-                    before_q, before_p, before, after, targets[saved], h, step[0], step[1], clock
-                )
-                tried += abs(trials)
-                if trials < 0:
-                    return -1, tried, n
-            for j in range(NDOF - 1):
-                out[saved, i, j] = at_q[j]
-                out[saved, i, NDOF - 1 + j] = at_p[j]
-            saved, last = saved + 1, n + k
-        if saved == len(targets) or targets[saved] > end:
-            break
-        before_q, before_p = after_q, after_p
-    return saved, tried, last
-
-
-@njit(**OPTIONS)
-def reach_times(table, step, h, clock, y0, targets, stride, most_steps, out, counts, stop):
-    """The states [q, p] of one trajectory from ``y0[0]`` at the elapsed times `targets`, into ``out[:, 0]``.
-
-    `table` is that of a run of steps h (kicks, drifts, gradients and curvatures as rows), `step` that of a single step
-    for h = 1. The steps that were taken, and those that were tried to meet the times, go into ``counts[0]``. Returns
-    whether all are reached: it ends where a state is not finite, where time turns, or after `most_steps`.
-    """
-    kicks, drifts, gradients, curvatures = table[0], table[1], table[2], table[3]
-    sign, link = 1.0 if h > 0.0 else -1.0, len(kicks) - 2
-    work = prepared(kicks, gradients, curvatures)
-    q, p = unpack(y0[0])
-    advance = clock_advance(clock, h, p[NDOF - 1])
-    q_error, p_error = no_error(q), no_error(p)
-    n, saved, j, now = 0, 0, 0, 0.0
-    while saved < len(targets) and stop[0] == 0:
-        block = stride
-        if now > 0.0:  # far from the next output: half of the steps left, by the pace so far
-            block = max(stride, min(MOST_AT_ONCE, int(0.5 * n * (targets[saved] - now) / now)))
-        block = min(block, most_steps - n)
-        start_q, start_p, begin = q, p, j
-        for _ in range(block * link):
-            b, g, c, a = kicks[j], gradients[j], curvatures[j], drifts[j]
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, b, g, c, a, j, work)
-            j = j + 1 if j < link else 1
-        end_q, end_p = close(q, p, q_error, p_error, kicks, drifts, gradients, curvatures, work)
-        then = sign * (end_q[NDOF - 1] + (n + block) * advance)
-        if block <= 0 or not is_finite(end_q, end_p) or not then >= now:
-            return False
-        if then >= targets[saved]:
-            saved, tried, counts[0, 0] = deliver(
-                start_q, start_p, begin, n, block, then, table, work, step, h, advance, clock, targets, saved, out, 0
-            )
-            counts[0, 1] += tried
-            if saved < 0:
-                return False
-        n, now = n + block, then
-    return stop[0] == 0
-
-
-@njit(**OPTIONS)
-def enter(Y, lane, row, table, work):
-    """The running state after the first step from `row`, into a lane."""
-    kicks, drifts, gradients, curvatures = table[0], table[1], table[2], table[3]
-    q, p = unpack(row)
-    q_error, p_error = no_error(q), no_error(p)
-    for j in range(len(kicks) - 2):
-        q, p, q_error, p_error = called_stage(
-            q, p, q_error, p_error, kicks[j], gradients[j], curvatures[j], drifts[j], j, work
+    loops = _loops(system)
+    run, step = run_table(scheme, h).packed, _step(scheme)
+    n_rows = len(y0)
+    out = np.empty((len(times), n_rows, y0.shape[1] - 2))
+    counts = np.zeros((n_rows, 2), dtype=np.int64)
+    most_steps, work = int(FEWEST + MANY * expected), int(expected * run.shape[1] * system.ndof)
+    numbers = _numbers(tuple(clock))
+    if n_rows == 1:
+        reached = run_one(
+            lambda stop: loops.reach_times(run, step, h, numbers, y0, times, stride, most_steps, out, counts, stop),
+            work,
         )
-    pack_lane(q, p, Y, lane)
+        return (out, counts) if reached else None
+    done = []
+
+    def rows(i: slice, stop: np.ndarray) -> None:
+        done.append(
+            loops.reach_times_lanes(
+                run, step, h, numbers, y0, i.start, i.stop, times, stride, most_steps, out, counts, stop
+            )
+        )
+
+    run_rows(rows, n_rows, work, None)
+    return (out, counts) if all(done) else None
 
 
-@njit(**OPTIONS)
-def reach_times_lanes(table, step, h, clock, y0, begin, end, targets, stride, most_steps, out, counts, stop):
-    """`reach_times` of the rows `begin` … `end` of `y0`, in vector lanes; where one has ended the next one enters."""
-    kicks, drifts, gradients, curvatures = table[0], table[1], table[2], table[3]
-    sign, link = 1.0 if h > 0.0 else -1.0, len(kicks) - 2
-    work = prepared(kicks, gradients, curvatures)
-    Y, start, error = empty_lanes(), empty_lanes(), empty_lanes()
-    row, n = np.zeros(LANES, dtype=np.int64), np.zeros(LANES, dtype=np.int64)
-    saved, now, advance = np.zeros(LANES, dtype=np.int64), np.zeros(LANES), np.zeros(LANES)
-    count, following = 0, begin
-    regular = True
-    while regular and stop[0] == 0:
-        while count < LANES and following < end:  # their first step: the opening stage is not that of the others
-            enter(Y, count, y0[following], table, work)
-            row[count], n[count], saved[count], now[count] = following, 1, 0, 0.0
-            q, p = close_lane(Y, error, count, kicks, drifts, gradients, curvatures, work)
-            advance[count] = clock_advance(clock, h, p[NDOF - 1])
-            now[count] = sign * (q[NDOF - 1] + advance[count])
-            regular &= is_finite(q, p) and now[count] >= 0.0
-            if regular and now[count] >= targets[0]:
-                q, p = unpack(y0[following])
-                saved[count], tried, counts[following, 0] = deliver(
-                    q, p, 0, 0, 1, now[count], table, work, step, h, advance[count], clock, targets, 0, out,
-                    following,
-                )  # fmt: skip
-                counts[following, 1] += tried
-                regular &= saved[count] >= 0
-            following += 1
-            count += saved[count] < len(targets)
-        if count == 0 or not regular:
-            break
-        width = (count + VECTOR - 1) // VECTOR * VECTOR
-        for lane in range(count, width):
-            q, p = unpack_lane(Y, count - 1)
-            pack_lane(q, p, Y, lane)
-        copy_lanes(Y, start)
-        for _ in range(stride):
-            stage_lanes(Y, error, width, kicks[link], gradients[link], curvatures[link], drifts[link])
-            for j in range(1, link):
-                stage_lanes(Y, error, width, kicks[j], gradients[j], curvatures[j], drifts[j])
-        lane = 0
-        while lane < count:
-            i = row[lane]
-            q, p = close_lane(Y, error, lane, kicks, drifts, gradients, curvatures, work)
-            then = sign * (q[NDOF - 1] + (n[lane] + stride) * advance[lane])
-            if not is_finite(q, p) or not then >= now[lane] or n[lane] > most_steps:
-                return False
-            if then >= targets[saved[lane]]:
-                q, p = unpack_lane(start, lane)
-                saved[lane], tried, counts[i, 0] = deliver(
-                    q, p, link, n[lane], stride, then, table, work, step, h, advance[lane], clock, targets, saved[lane],
-                    out, i,
-                )  # fmt: skip
-                counts[i, 1] += tried
-                if saved[lane] < 0:
-                    return False
-            n[lane], now[lane] = n[lane] + stride, then
-            if saved[lane] < len(targets):
-                lane += 1
-                continue
-            count -= 1
-            q, p = unpack_lane(Y, count)
-            pack_lane(q, p, Y, lane)
-            q, p = unpack_lane(start, count)
-            pack_lane(q, p, start, lane)
-            row[lane], n[lane], saved[lane] = row[count], n[count], saved[count]
-            now[lane], advance[lane] = now[count], advance[count]
-    return regular and stop[0] == 0
+def lifted_rows(system: HamiltonianSystem, y: np.ndarray, c: float) -> np.ndarray | None:
+    """States [q, t, p, B] (N, 2d + 2) with t = 0 and B = c − H of rows of `y` (N, 2d) of a symbolic system.
+
+    None unless c exceeds V at all of them, or where H has no compiled form.
+    """
+    symbols = system.symbols
+    assert symbols is not None
+    lift = _LIFTS.get(symbols)
+    if lift is None:
+        lift = _LIFTS[symbols] = _compiled_lift(symbols)
+    out = np.empty((len(y), y.shape[1] + 2))
+    return out if lift(np.ascontiguousarray(y), c, out) else None
+
+
+def _compiled_lift(symbols: SymbolicHamiltonian) -> Callable[..., bool]:
+    d = symbols.ndof
+    try:
+        energies = statements(["V", "T"], [symbols.V, symbols.T])
+    except ValueError:  # a function in H has no compiled form
+        return lambda y, c, out: False
+    lines = [f"{v} = y[n, {i}]" for i, v in enumerate(symbols.q + symbols.p)]
+    lines += [*energies, "fine &= V < c", f"out[n, {d}], out[n, {2 * d + 1}] = 0.0, c - (T + V)"]
+    lines += [f"out[n, {i + (i >= d)}] = {v}" for i, v in enumerate(symbols.q + symbols.p)]
+    body = "\n        ".join(lines)
+    return load_algebra(f"""@njit(**OPTIONS)
+def lift(y, c, out):
+    fine = True
+    for n in range(y.shape[0]):
+        {body}
+    return fine
+""").lift
+
+
+def _loops(system: HamiltonianSystem) -> ModuleType:
+    symbols = system.symbols
+    assert symbols is not None
+    loops = _LOOPS.get(symbols)
+    if loops is None:
+        after = ("loops", "aligned", "lanes", "elapsed_times")
+        loops = _LOOPS[symbols] = symbolic_module(symbols, algebra_source(symbols), 0, False, after)
+    return loops
+
+
+@lru_cache(maxsize=256)
+def _step(scheme: Scheme) -> np.ndarray:
+    """The table of one step for h = 1, (2, m)."""
+    return np.ascontiguousarray(step_table(scheme).packed[..., 0])
+
+
+@lru_cache(maxsize=64)
+def _numbers(clock: tuple[float, ...]) -> np.ndarray:
+    return np.array(clock, dtype=float)

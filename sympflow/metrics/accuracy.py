@@ -6,11 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, is_tensor, to_numpy
-from sympflow.metrics.arguments import check_solution
 from sympflow.metrics.energy import failed
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
-from sympflow.solution import Solution
+from sympflow.solution import Solution, check_solution
 from sympflow.solver import solve
 
 

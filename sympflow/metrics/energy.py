@@ -1,20 +1,16 @@
-"""Energy: its error over time, the largest, and its drift with an honest uncertainty."""
+"""Energy: its error over time, the largest, its drift with an honest uncertainty, and its growth by round-off."""
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from sympflow.arrays import to_numpy
-from sympflow.metrics.arguments import check_solution
-from sympflow.solution import Solution
-
-SMALLEST_SCALE = 1e-12
-"""|H(y0)| below which an energy error is absolute, unless the system declares its `energy_scale`."""
+from sympflow.solution import Solution, check_solution, energy_change
 
 MIN_BLOCKS = 20
+WINDOWS_PER_DECADE = 3
 
 
 def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
@@ -27,7 +23,7 @@ def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
     ----------
     sol : Solution
     relative : bool
-        Whether to divide by the scale.
+        True to divide by the scale.
 
     Warns
     -----
@@ -40,35 +36,16 @@ def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
         If `sol` is not a Solution.
     """
     check_solution(sol)
-    with np.errstate(all="ignore"):
-        states = to_numpy(sol.states)
-        error = _energy(sol, states) - _energy(sol, sol.y0)[..., None]
-        if np.isnan(error).any():
-            error = np.where(np.isnan(error) & np.isfinite(states).all(-1), np.inf, error)
-        if not relative:
-            return error
-        scale = energy_scale(sol)
-        if (absolute := np.isnan(scale)).any():
-            warnings.warn(
-                f"The energy error is absolute where |H(y0)| < {SMALLEST_SCALE:g}: give the system an `energy_scale`.",
-                RuntimeWarning,
-                stacklevel=2,
-            )
-        compared = error / np.where(absolute, 1.0, scale)[..., None]
-        return np.where(np.isinf(error), error, compared)  # H(y0) may be infinite itself: inf/inf
+    return energy_change(sol, relative, stacklevel=3)
 
 
 def energy_scale(sol: Solution) -> np.ndarray:
-    """What the energy errors of each trajectory are relative to, (...): `system.energy_scale`, else |H(y0)|.
+    """Return the scale of the energy errors of each trajectory, (...): `system.energy_scale`, else |H(y0)|.
 
     It is NaN where |H(y0)| < 1e-12: there `energy_error` is absolute, and warns.
     """
     check_solution(sol)
-    declared = sol.system.energy_scale
-    H0 = np.abs(_energy(sol, sol.y0))
-    if declared is not None:
-        return np.full_like(H0, declared)
-    return np.where(H0 < SMALLEST_SCALE, np.nan, H0)
+    return sol.energy_scale()
 
 
 def max_energy_error(sol: Solution, relative: bool = True) -> np.floating | np.ndarray:
@@ -83,7 +60,7 @@ def max_energy_error(sol: Solution, relative: bool = True) -> np.floating | np.n
 
 
 def failed(sol: Solution) -> np.ndarray:
-    """Which trajectories did not reach their end, (...); stopping at the edge of the domain is no failure."""
+    """Tell which trajectories did not reach their end, (...); stopping at the edge of the domain is no failure."""
     stopped_on_request = "domain_exit" in sol.stats and bool(np.isfinite(to_numpy(sol.y)).all())
     return (np.asarray(sol.status) < 0) & (not stopped_on_request)
 
@@ -164,7 +141,85 @@ def energy_drift(sol: Solution, blocks: int = MIN_BLOCKS, relative: bool = True)
     return EnergyDrift(np.where(lost, np.inf, slope)[()], np.where(lost, np.inf, error)[()], t, means)
 
 
-def _energy(sol: Solution, y: object) -> np.ndarray:
-    """H in float64, whatever the precision of the run."""
-    with np.errstate(all="ignore"):
-        return np.asarray(sol.system.hamiltonian(to_numpy(y).astype(float)))
+@dataclass(frozen=True)
+class EnergyGrowth:
+    """The growth rms|ΔH| ~ n^exponent of the energy error with the number of steps n, and its drift.
+
+    Attributes
+    ----------
+    steps : ndarray (w,)
+        Numbers of steps, the geometric middles of windows of a third of a decade.
+    rms : ndarray (w,)
+        Root mean square of the energy error over the outputs of the window and all trajectories.
+    exponent, exponent_error : float
+        Slope of log rms against log steps, and its standard error. Independent rounding errors give ½ (Brouwer's law),
+        a systematic error in each step gives 1, a truncation error above the rounding 0.
+    drift, drift_error : float
+        Slope of the energy error per step, the mean over the trajectories, and its standard error from the scatter
+        between them; the error is inf for a single trajectory, whose random walk cannot be told from a drift.
+    """
+
+    steps: np.ndarray = field(repr=False)
+    rms: np.ndarray = field(repr=False)
+    exponent: float
+    exponent_error: float
+    drift: float
+    drift_error: float
+
+
+def energy_growth(sol: Solution, first: float = 1000.0) -> EnergyGrowth:
+    """Fit the growth of the energy error of a long run with the number of its steps.
+
+    Parameters
+    ----------
+    sol : Solution
+        Of a fixed-step method, better of a batch of eight trajectories or more, with regular outputs (`save_every`).
+    first : float
+        Steps before which the outputs are not used.
+
+    Raises
+    ------
+    TypeError
+        If `sol` is not a Solution.
+    ValueError
+        If it has no fixed step, has failed, or is shorter than a decade beyond `first`.
+
+    Notes
+    -----
+    Of a run at regular times the slope through the origin, Σ eₖtₖ/Σ tₖ², is fitted to each trajectory.
+
+    References
+    ----------
+    .. [1] D. Brouwer, "On the accumulation of errors in numerical integration", Astron. J. 46 (1937) 149–153.
+    .. [2] E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, 2nd ed. (Springer 2006), VIII.5.
+    """
+    check_solution(sol)
+    dt = sol.stats.get("dt")
+    if dt is None:
+        raise ValueError("`sol` has no fixed step: growth with the number of steps is that of a fixed-step method.")
+    if failed(sol).any():
+        raise ValueError("`sol` has failed: solve again with a shorter `dt` or interval.")
+    n = np.abs(sol.t - sol.t[0]) / dt
+    if not (first > 0 and len(n) and n[-1] >= 10 * first):
+        raise ValueError(f"`sol` must have at least {10 * first:g} steps, ten times `first`; got {n[-1]:g}.")
+    error = energy_error(sol).reshape(-1, len(n))
+    windows = max(3, round(WINDOWS_PER_DECADE * np.log10(n[-1] / first)))
+    edges = np.geomspace(first, n[-1] * (1 + 1e-9), windows + 1)
+    index = np.searchsorted(edges, n, side="right") - 1
+    filled = [k for k in range(windows) if (index == k).any()]
+    if len(filled) < 3:
+        raise ValueError(
+            f"`sol` has outputs in {len(filled)} of {windows} windows between {first:g} and {n[-1]:g} steps: leave "
+            "`t_eval` out, or give it more times."
+        )
+    steps = np.sqrt(edges[:-1] * edges[1:])[filled]
+    rms = np.array([np.sqrt(np.mean(error[:, index == k] ** 2)) for k in filled])
+    x, y = np.log(steps), np.log(np.maximum(rms, np.finfo(float).tiny))
+    x = x - x.mean()
+    exponent = float(x @ y / (x @ x))
+    scatter = y - y.mean() - exponent * x
+    exponent_error = float(np.sqrt(scatter @ scatter / max(1, len(x) - 2) / (x @ x)))
+    slopes = error @ n / (n @ n)
+    several = len(slopes) > 1
+    drift_error = float(slopes.std(ddof=1) / np.sqrt(len(slopes))) if several else np.inf
+    return EnergyGrowth(steps, rms, exponent, exponent_error, float(slopes.mean()), drift_error)

@@ -34,6 +34,10 @@ class Reference:
     method: str
     accuracy: float
 
+    def summary(self) -> dict[str, str | float]:
+        """The method and its accuracy, as reports hold them."""
+        return {"method": self.method, "accuracy": self.accuracy}
+
 
 def reference(
     system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, t: np.ndarray, target: float = 0.0

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike
 
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.metrics.arguments import check_solution
 from sympflow.metrics.energy import failed
-from sympflow.solution import Solution
+from sympflow.solution import Solution, check_solution
 
 
 def step_tangents(sol: Solution) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -46,7 +45,7 @@ def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.nda
     ----------
     sol : Solution
     over_time : bool
-        Whether to return the running sum at the times `sol.t`, (..., n), instead of its last value, (...).
+        True for the running sum at the times `sol.t`, (..., n), instead of its last value, (...).
 
     Warns
     -----

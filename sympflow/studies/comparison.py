@@ -1,32 +1,41 @@
-"""compare(): several methods on one system, at the same instants, against one reference."""
+"""compare(): several methods on one system, at the same instants, against one reference; and its report."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_counts, check_t_span
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.metrics.accuracy import reference_error, states_of
-from sympflow.metrics.energy import failed, max_energy_error
+from sympflow.integrators.base import FixedStep, Integrator
+from sympflow.metrics.accuracy import states_of
+from sympflow.metrics.energy import max_energy_error
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
 from sympflow.solver import check_y0, solve
-from sympflow.studies.candidates import candidates
-from sympflow.studies.comparison_report import Comparison
-from sympflow.studies.matching import match as match_to
-from sympflow.studies.matching import tunable
-from sympflow.studies.measurements import MEASURES, Row, Run, largest, measure, note_backends
-from sympflow.timing import interleaved
+from sympflow.studies import attempts
+from sympflow.studies.attempts import Attempt, Metric, Row, candidates, interleaved, tolerance_of
+from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table, title
 
-METRICS = tuple(MEASURES)
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MEASURES: dict[str, Metric] = {
+    "energy": attempts.energy,
+    "drift": attempts.drift,
+    "volume": attempts.volume,
+    "symplecticity": attempts.symplecticity,
+    "reversal": attempts.reversal,
+}
+METRICS = ("error", *MEASURES)
 MATCHES = ("time", "evaluations", "energy_error")
 PAPER = ("sympflow", "mlp", "verlet", "leapfrog", "rk45")
 
@@ -110,32 +119,41 @@ def compare(
     def run(integrator: Any) -> Solution:
         return solve(system, integrator, (t0, t1), start, t_eval=t, backend=backend)
 
-    runs = [Run(c, Row(_identify(system), c.method, c.label)) for c in candidates(methods, dt)]
+    runs = [Attempt(c, Row(_identify(system), c.method, c.label)) for c in candidates(methods, dt)]
     for one in runs:
         say(f"{system.name}: running {one.candidate.label}")
-        _first_run(one, run)
+        one.run(run)
     if match is not None:
         _match(runs, match, run, system, repeats, say)
-    note_backends(runs)
+    _note_backends(runs)
     ready = [one for one in runs if one.row.status == "ok"]
     say(f"{system.name}: timing")
-    times = interleaved([partial(run, one.candidate.integrator) for one in ready], repeats) if ready else []
+    times = interleaved([partial(run, one.candidate.integrator) for one in ready], repeats)
     for one, run_time in zip(ready, times, strict=True):
-        one.row = replace(one.row, run_time=run_time.median, run_time_spread=run_time.spread)
+        one.fill(run_time=run_time.median, run_time_spread=run_time.spread)
     truth = None
     if "error" in asked and any(one.sol is not None for one in runs):
         say(f"{system.name}: reference")
-        truth = _errors(runs, system, (t0, t1), start, t, given)
+        truth = _errors([one for one in runs if one.sol is not None], system, (t0, t1), start, t, given)
     for one in runs:
         if one.sol is not None:
             say(f"{system.name}: measuring {one.candidate.label}")
-            measure(one, one.sol, asked)
+            one.measure(MEASURES, [metric for metric in asked if metric in MEASURES])
     return Comparison(system, (t0, t1), start, t, asked, repeats, match, truth, tuple(runs))
 
 
 def _identify(system: HamiltonianSystem) -> str:
     params = ", ".join(f"{k}={v:g}" for k, v in system.params.items())
     return f"{system.name}({params})" if params else system.name
+
+
+def _note_backends(runs: Sequence[Attempt]) -> None:
+    """Say of a flow that runs in eager torch that others run compiled: its run time is not one of the same kind."""
+    if not any(run.row.backend == "compiled" for run in runs):
+        return
+    for run in runs:
+        if run.row.backend == "torch":
+            run.note("Runs in eager torch, while others run compiled: the run times are not like for like.")
 
 
 def _given(reference: Reference | Solution | ArrayLike, y0: np.ndarray, t: np.ndarray) -> Reference:
@@ -161,42 +179,44 @@ def _check_metrics(metrics: Sequence[str]) -> tuple[str, ...]:
     return asked
 
 
-def _first_run(one: Run, run: Callable[[Any], Solution]) -> None:
-    """Run once, which also compiles; note what the solution says, or why there is none."""
-    integrator = one.candidate.integrator
-    try:
-        if one.candidate.problem:
-            raise ImportError(one.candidate.problem)
-        sol = run(integrator)
-    except (ValueError, TypeError, ImportError, NotImplementedError) as error:
-        one.row = replace(one.row, status="not applicable", reason=str(error))
-        return
-    except Exception as error:
-        one.row = replace(one.row, status="failed", reason=f"{type(error).__name__}: {error}")
-        return
-    stats = sol.stats
-    one.sol = sol
-    one.row = replace(
-        one.row,
-        status="failed" if failed(sol).all() or (sol.y.ndim == 2 and not sol.success) else "ok",
-        reason="" if sol.success else sol.message,
-        dt=stats.get("dt"),
-        tolerance=getattr(integrator, "rtol", None),
-        backend=stats.get("backend"),
-        force_evaluations=int(stats["force_evaluations"]),
-        hessian_evaluations=int(stats["hessian_evaluations"]),
-    )
-    if sol.success and "domain_exit" in stats:
-        one.note(f"The state left the flow's domain at t = {stats['domain_exit']:.4g}.")
-    ran: Any = sol.integrator  # with `tol` it may be another than was asked for: see `SympFlowIntegrator.resolved`
-    if ran.trained:
-        flow = getattr(ran, "flow", None)
-        figures = (ran.flow_for(sol.system) if flow is None else flow).figures
-        one.row = replace(one.row, training_time=figures.get("training_seconds"))
+def _errors(
+    runs: Sequence[Attempt],
+    system: HamiltonianSystem,
+    t_span: tuple[float, float],
+    y0: np.ndarray,
+    t: np.ndarray,
+    given: Reference | None,
+) -> Reference | None:
+    """Fill in the errors; tighten a computed reference until it is 100 times better than the best of them."""
+    target = 1e-8
+    for _ in range(2):
+        try:
+            truth = given or compute_reference(system, t_span, y0, t, target)
+        except (ValueError, RuntimeError) as problem:
+            for one in runs:
+                one.note(f"No error: {problem}")
+            return None
+        for one in runs:
+            attempts.accuracy(one, truth)
+        found = [one.row.error for one in runs if one.row.error is not None]
+        target = min(found, default=math.inf) / 100
+        if given is not None or truth.accuracy <= target:
+            break
+    for one in runs:
+        if one.row.error is not None and one.row.error < 3 * truth.accuracy:
+            one.note("The error is no larger than the uncertainty of the reference.")
+    return truth
+
+
+# methods matched to each other ----------------------------------------------------------------------------------
+
+_CLOSE = math.log(1.05)
+_LONGEST_JUMP = math.log(16.0)
+_ROUNDS = 12
 
 
 def _match(
-    runs: list[Run],
+    runs: Sequence[Attempt],
     what: str,
     run: Callable[[Any], Solution],
     system: HamiltonianSystem,
@@ -224,39 +244,243 @@ def _match(
             one.note(f"Not matched: {one.candidate.label} has no step to tune.")
             continue
         say(f"{system.name}: matching {one.candidate.label}")
-        integrator, reached = match_to(one.candidate.integrator, system, figure, target, what == "energy_error")
+        integrator, reached = matched(one.candidate.integrator, system, figure, target, what == "energy_error")
         one.candidate = replace(one.candidate, integrator=integrator)
         one.row = Row(_identify(system), one.candidate.method, one.candidate.label)
-        _first_run(one, run)
+        one.run(run)
         if not abs(math.log(reached / target)) < 0.1:
             one.note(f"Matched only to {reached:.2g} where {anchor.candidate.label} has {target:.2g}.")
 
 
-def _errors(
-    runs: list[Run],
+def tunable(integrator: Integrator) -> bool:
+    """Tell whether the method has a step or a tolerance that may be changed; a trained flow is what it is."""
+    return not integrator.trained and (isinstance(integrator, FixedStep) or tolerance_of(integrator) is not None)
+
+
+def tuned(integrator: Integrator, system: HamiltonianSystem, factor: float) -> Integrator:
+    """Multiply the integrator's step, or both its tolerances, by `factor`."""
+    options: dict[str, Any]
+    if isinstance(integrator, FixedStep):
+        options = {"dt": integrator.step_length(system) * factor}
+    else:
+        options = {name: getattr(integrator, name) * factor for name in ("rtol", "atol")}
+        options["rtol"] = min(max(options["rtol"], 2.5e-14), 0.1)  # the least that SciPy takes, and the most of any use
+    return replace(integrator, **options)  # type: ignore[type-var]
+
+
+def matched(
+    integrator: Integrator,
     system: HamiltonianSystem,
-    t_span: tuple[float, float],
-    y0: np.ndarray,
-    t: np.ndarray,
-    given: Reference | None,
-) -> Reference | None:
-    """Fill in the errors; tighten a computed reference until it is 100 times better than the best of them."""
-    measured = [(one, one.sol) for one in runs if one.sol is not None]
-    target = 1e-8
-    for _ in range(2):
-        try:
-            truth = given or compute_reference(system, t_span, y0, t, target)
-        except (ValueError, RuntimeError) as problem:
-            for one, _ in measured:
-                one.note(f"No error: {problem}")
-            return None
-        for one, sol in measured:
-            error = largest(reference_error(sol, truth), sol)
-            one.row = replace(one.row, error=float(np.median(error)))
-        target = min((one.row.error for one, _ in measured if one.row.error is not None), default=math.inf) / 100
-        if given is not None or truth.accuracy <= target:
+    measure: Callable[[Integrator], float],
+    target: float,
+    grows: bool,
+) -> tuple[Integrator, float]:
+    """Tune the integrator until `measure` is within 5 % of `target`; return the nearest found, and its figure.
+
+    Parameters
+    ----------
+    measure : callable
+        A positive figure of a run; inf if the run fails, which asks for smaller steps.
+    grows : bool
+        True if the figure grows with the step (an error), False if it falls (a cost).
+
+    Notes
+    -----
+    The secant method on the logarithms, safeguarded by the nearest points found on either side.
+    """
+    x, slope = 0.0, (2.0 if grows else -1.0)
+    below: tuple[float, float] | None = None  # (x, f) with too small a step, and with too large a one
+    above: tuple[float, float] | None = None
+    best: tuple[float, Integrator, float] = (math.inf, integrator, math.nan)
+    for _ in range(_ROUNDS):
+        candidate = tuned(integrator, system, math.exp(x))
+        value = measure(candidate)
+        f = math.log(value / target) if 0 < value < math.inf else math.inf
+        if not math.isfinite(f):
+            above = (x, math.inf)
+            x = x - 1.0 if below is None else (x + below[0]) / 2
+            continue
+        if abs(f) < best[0]:
+            best = (abs(f), candidate, value)
+        if abs(f) < _CLOSE:
             break
-    for one, _ in measured:
-        if one.row.error is not None and one.row.error < 3 * truth.accuracy:
-            one.note("The error is no larger than the uncertainty of the reference.")
-    return truth
+        if (f > 0) == grows:
+            above = (x, f)
+        else:
+            below = (x, f)
+        if below is not None and above is not None and math.isfinite(above[1]):
+            slope = (above[1] - below[1]) / (above[0] - below[0])
+        x = x + max(-_LONGEST_JUMP, min(_LONGEST_JUMP, -f / slope))
+        if below is not None and above is not None:
+            margin = 0.05 * (above[0] - below[0])
+            x = min(max(x, below[0] + margin), above[0] - margin)
+    return best[1], best[2]
+
+
+# the report -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Comparison(Report):
+    """Methods side by side on one system.
+
+    Attributes
+    ----------
+    system, t_span, y0
+        The problem.
+    t : ndarray (n,)
+        The instants.
+    metrics : tuple of str
+    repeats : int
+    match : str or None
+    reference : Reference or None
+        What the errors are against, if they were asked for.
+    rows : tuple of Row
+    runs : tuple
+        Behind each row: its solution (`.sol`) and the energy and volume errors over time (`.energy`, `.volume`).
+    """
+
+    columns: ClassVar[tuple[str, ...]] = (
+        *("system", "method", "label", "status", "reason", "dt", "tolerance", "backend", "run_time", "run_time_spread"),
+        *("force_evaluations", "hessian_evaluations", "error", "energy_error", "energy_drift", "energy_drift_error"),
+        *("volume_error", "symplecticity_defect", "time_reversal_error", "training_time"),
+    )
+
+    system: HamiltonianSystem
+    t_span: tuple[float, float]
+    y0: np.ndarray = field(repr=False)
+    t: np.ndarray = field(repr=False)
+    metrics: tuple[str, ...]
+    repeats: int
+    match: str | None
+    reference: Reference | None
+    runs: tuple[Attempt, ...] = field(repr=False)
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        return tuple(run.row for run in self.runs)
+
+    @property
+    def title(self) -> str:
+        """The scene in a line."""
+        return title(self.system)
+
+    def table(self, width: int | None = None) -> str:
+        """The rows as text, with what was done above and the reasons below.
+
+        Where `width` characters do not hold them, the methods are columns.
+        """
+        return combined_table([self], width)
+
+    def settings(self) -> dict[str, Any]:
+        return {
+            "system": described(self.system),
+            "t_span": list(self.t_span),
+            "y0": self.y0.tolist(),
+            "n_outputs": len(self.t),
+            "repeats": self.repeats,
+            "match": self.match,
+            "reference": None if self.reference is None else self.reference.summary(),
+        }
+
+    def figure(self, kind: str = "overview") -> Figure:
+        """A matplotlib figure: "overview", "energy", "volume", "error" (against run time) or "portrait"."""
+        from sympflow.studies.figures import comparison_figure
+
+        return comparison_figure(self, kind)
+
+    def plot(self, path: str | os.PathLike[str] | None = None, kind: str = "overview", prefix: str = "") -> Figure:
+        """The figure, by default the overview; with a path it is also saved.
+
+        Parameters
+        ----------
+        path : path-like, optional
+            A file (.png, .pdf or .svg); or a folder, in which the overview saves every kind to a file of its own.
+        kind : str
+            As for `figure`.
+        prefix : str
+            What the names of the files in a folder begin with; the kinds follow.
+        """
+        from sympflow.studies.figures import save_comparison
+
+        figure = self.figure(kind)
+        if path is not None:
+            save_comparison(self, path, kind, prefix)
+        return figure
+
+
+def combined_table(comparisons: Sequence[Comparison], width: int | None = None) -> str:
+    """The rows of several comparisons as one table, with the settings above and the reasons below.
+
+    Where `width` characters do not hold it, there is a table for each system with the methods as columns.
+    """
+    rows = [row for c in comparisons for row in c.rows]
+    several = len(comparisons) > 1
+    names = [c.title for c in comparisons for _ in c.rows]
+    first = [i == 0 for c in comparisons for i in range(len(c.rows))]
+    columns = [
+        Column("system", [n if f and several else "" for n, f in zip(names, first, strict=True)], left=True),
+        *_columns(rows),
+    ]
+    notes = [
+        f"  {f'{name}, ' if several else ''}{row.label}: {row.reason}"
+        for name, row in zip(names, rows, strict=True)
+        if row.reason
+    ]
+    below = ["", "Notes", *notes] if notes else []
+    table = text_table(columns)
+    if width is None or max(map(len, table.splitlines())) <= width:
+        return "\n".join([*map(_settings, comparisons), "", table, *below])
+    blocks = [line for c in comparisons for line in (_settings(c), "", _upright(_columns(c.rows)), "")]
+    return "\n".join([*blocks[:-1], *below])
+
+
+def _upright(columns: Sequence[Column]) -> str:
+    """The table turned round: a line for each of its columns."""
+    names, *others = [c for c in columns if any(c.cells)]
+    titles = Column("", [c.title for c in others], left=True)
+    cells = [Column(name, [c.cells[i] for c in others]) for i, name in enumerate(names.cells)]
+    return text_table([titles, *cells])
+
+
+def _columns(rows: Sequence[Row]) -> list[Column]:
+    return [
+        Column("method", [row.label for row in rows], left=True),
+        Column("step", [_step(row) for row in rows]),
+        Column("backend", [row.backend or "" for row in rows], left=True),
+        Column("run time", [_run_time(row) for row in rows]),
+        Column("forces", [f"{row.force_evaluations:,}" if row.force_evaluations else "" for row in rows]),
+        Column("Hessians", [f"{row.hessian_evaluations:,}" if row.hessian_evaluations else "" for row in rows]),
+        Column("error", [number(row.error) for row in rows]),
+        Column("energy error", [number(row.energy_error) for row in rows]),
+        Column("drift per unit t", [_with_error(row.energy_drift, row.energy_drift_error) for row in rows]),
+        Column("volume error", [number(row.volume_error) for row in rows]),
+        Column("sympl. defect", [number(row.symplecticity_defect) for row in rows]),
+        Column("reversal", [number(row.time_reversal_error) for row in rows]),
+        Column("training", [seconds(row.training_time) for row in rows]),
+        Column("status", ["" if row.status == "ok" else row.status for row in rows], left=True),
+    ]
+
+
+def _settings(c: Comparison) -> str:
+    batch = f", batch of {int(np.prod(c.y0.shape[:-1]))}" if c.y0.ndim > 1 else ""
+    text = f"{c.title}: t = {c.t_span[0]:g} … {c.t_span[1]:g}{batch}, {len(c.t)} instants, median of {c.repeats} runs"
+    if c.match:
+        text += f", matched in {c.match.replace('_', ' ')}"
+    if c.reference is not None:
+        text += f"; reference: {c.reference.method}, good to {number(c.reference.accuracy)}"
+    return text
+
+
+def _step(row: Row) -> str:
+    return plain(row.dt) if row.dt is not None else f"rtol {row.tolerance:.0e}" if row.tolerance is not None else ""
+
+
+def _run_time(row: Row) -> str:
+    if not row.run_time or row.run_time_spread is None:
+        return ""
+    return f"{seconds(row.run_time)} ± {100 * row.run_time_spread / row.run_time:2.0f} %"
+
+
+def _with_error(value: float | None, error: float | None) -> str:
+    return "" if value is None else f"{number(value)} ± {number(error, 1)}"

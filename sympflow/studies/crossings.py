@@ -117,8 +117,9 @@ class _Search:
         n, step = len(y), float(h[-1])
         with np.errstate(all="ignore"):
             piece = Problem(self.system, float(t[0]), float(t[-1]) + step, y[0])
-            states, _, backend = self.integrator.rollout(piece, step, n, np.arange(n + 1))
-            end = states[-1] if step == grid.h else self.integrator.substep(self.system, y[0], step, backend)
+            stepper = self.integrator.stepper(piece)
+            states, _ = stepper.rollout(y[0], step, n, np.arange(n + 1), float(t[0]))
+            end = states[-1] if step == grid.h else stepper.shorter(y[0], step)
         return np.asarray(end)
 
     def search(self, t: np.ndarray, y: np.ndarray, h: np.ndarray, y_end: np.ndarray) -> None:

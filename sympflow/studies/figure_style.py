@@ -1,4 +1,4 @@
-"""How the figures look: colours and markers of the methods, frame and grid; and how they are saved.
+"""Style of the figures: colours and markers of the methods, frame and grid; and how they are saved.
 
 `Figure` objects, never pyplot: nothing global is touched, and any backend will do.
 """
@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 import os
+import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +30,7 @@ _STYLES = {
 _OTHER_COLOURS = ("#E69F00", "#000000", "#7F3C8D", "#8C6D31", "#666666", "#A5AA99")
 _OTHER_MARKERS = ("P", "X", "*", "<", ">", "h")
 TEXT = "#333333"
+LETTER = 0.55  # mean width of a letter, in units of the font size
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -75,20 +77,30 @@ def frame(ax: Axes, points: np.ndarray, margin: float) -> None:
     ax.set_ylim(bottom, top)
 
 
-def legend_above(figure: Figure, axes: Iterable[Axes], columns: int) -> None:
-    """One legend above all panels, of their labelled lines, in at most so many columns."""
-    handles = {h.get_label(): h for ax in axes for h in ax.lines if not str(h.get_label()).startswith("_")}
-    figure.legend(
-        handles=list(handles.values()),
-        loc="outside upper center",
-        ncols=min(len(handles), columns) or 1,
-        frameon=False,
-        fontsize=9,
-    )
+def labelled(axes: Iterable[Axes]) -> list[Any]:
+    """The lines of the panels that have a label, one for each label."""
+    return list({h.get_label(): h for ax in axes for h in ax.lines if not str(h.get_label()).startswith("_")}.values())
+
+
+def legend_above(figure: Figure, handles: Sequence[Any], columns: int) -> None:
+    """One legend above all panels, in at most so many columns and in as few as the width of the figure needs."""
+    for n in range(min(len(handles), columns), 0, -1):
+        legend = figure.legend(
+            handles=list(handles), loc="outside upper center", ncols=n, frameon=False, fontsize=9, labelcolor=TEXT
+        )
+        if n == 1 or legend.get_window_extent().width <= 0.98 * figure.bbox.width:
+            return
+        legend.remove()
+
+
+def filled(text: str, inches: float, size: float) -> str:
+    """Break the lines of a text that are longer than a width in inches at a font size in points."""
+    width = max(12, int(72 * inches / (LETTER * size)))
+    return "\n".join(textwrap.fill(line, width, break_long_words=False) for line in text.splitlines())
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write a figure, making its folder; errors as for `tables.writable`, and a ValueError for an unknown format."""
+    """Write a figure, making its folder; errors as for `files.writable`, and a ValueError for an unknown format."""
     path = writable(path)
     known = figure.canvas.get_supported_filetypes()
     if path.suffix and path.suffix[1:].lower() not in known:

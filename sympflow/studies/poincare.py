@@ -18,9 +18,8 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator
 from sympflow.integrators.registry import build, check_applies, name_of
 from sympflow.solver import check_y0
-from sympflow.studies.comparison_report import title
 from sympflow.studies.crossings import Plane, crossings
-from sympflow.studies.tables import Column, text_table, write_csv
+from sympflow.studies.reports import Column, Report, described, text_table, title
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,7 +65,7 @@ def poincare_section(
     Returns
     -------
     PoincareSection
-        With `.rows`, `.table()`, `.plot()` and `.to_csv()`.
+        With `.rows`, `.table()`, `.plot()`, `.to_csv()` and `.to_json()`.
 
     Raises
     ------
@@ -88,8 +87,7 @@ def poincare_section(
     if is_tensor(y0):
         raise TypeError("`y0` is a tensor, but crossings are located on NumPy arrays: pass y0.numpy().")
     start = check_y0(system, system.y0 if y0 is None else y0, None)
-    if hasattr(integrator, "resolved"):
-        integrator = integrator.resolved(system, start, abs(span[1] - span[0]))
+    integrator = integrator.resolved(system, start, abs(span[1] - span[0]))
     check_applies(integrator, system)
     index = _check_coordinate(coordinate, system.ndof)
     if direction not in (-1, 0, 1):
@@ -119,19 +117,19 @@ def poincare_section(
 
 
 @dataclass(frozen=True)
-class PoincareSection:
+class PoincareSection(Report):
     """The crossings of a plane, those of each trajectory together and in order of time.
 
     Attributes
     ----------
     system, integrator, t_span
-        What was run.
+        The run.
     y0 : ndarray (N, 2d)
         The initial states.
     coordinate, level, direction
         The plane.
     trajectory : ndarray (n,)
-        Which of the initial states each crossing belongs to.
+        The index of the initial state that each crossing belongs to.
     t : ndarray (n,)
     states : ndarray (n, 2d)
     status : int, or ndarray (N,) of a batch
@@ -189,13 +187,31 @@ class PoincareSection:
         failure = "" if self.success else f"\n{self.message}"
         return (text_table(columns) + more if len(self) else "no crossing") + failure
 
+    @property
+    def columns(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The fields of the rows that files hold."""
+        return ("trajectory", "t", *names(self.system.ndof))
+
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write all crossings to a CSV file, numbers to full precision."""
         if not len(self):
             raise ValueError("`section` has no crossing to write: run it longer, or move `level`.")
-        return write_csv(self.rows, path)
+        return super().to_csv(path)
 
-    def plot(self, x: int | str | None = None, y: int | str | None = None) -> Figure:
+    def settings(self) -> dict[str, Any]:
+        return {
+            "system": described(self.system),
+            "method": name_of(self.integrator),
+            "t_span": list(self.t_span),
+            "y0": self.y0.tolist(),
+            "coordinate": names(self.system.ndof)[self.coordinate],
+            "level": self.level,
+            "direction": self.direction,
+            "status": np.asarray(self.status).tolist(),
+            "message": self.message,
+        }
+
+    def figure(self, x: int | str | None = None, y: int | str | None = None) -> Figure:
         """The crossings in the plane of two coordinates, each trajectory in a shade of its own.
 
         Parameters
@@ -208,30 +224,28 @@ class PoincareSection:
         ImportError
             Without matplotlib.
         """
-        from sympflow.studies.figure_style import TEXT, dress, frame, new_figure
+        from sympflow.studies.figures import section_figure
 
         d, label = self.system.ndof, names(self.system.ndof)
         position = next((j for j in range(d) if j != self.coordinate), d)
         i = position if x is None else _check_coordinate(x, d)
         j = (position + d if position < d else 0) if y is None else _check_coordinate(y, d)
-        figure = new_figure(4.6, 4.4)
-        ax = figure.add_subplot()
-        ax.scatter(
-            self.states[:, i],
-            self.states[:, j],
-            c=self.trajectory,
-            cmap="viridis",
-            s=3.0,
-            linewidths=0,
-            vmax=max(1.15 * (len(self.y0) - 1), 1),
-            rasterized=True,
-        )
-        frame(ax, self.states[:, [i, j]], 0.05)
         way = {1: f", {label[self.coordinate]} increasing", -1: f", {label[self.coordinate]} decreasing", 0: ""}
         in_time = self.direction if self.t_span[1] >= self.t_span[0] else -self.direction
         plane = f"{label[self.coordinate]} = {self.level:g}{way[in_time]}"
-        ax.set_title(f"{title(self.system)}, {name_of(self.integrator)}: {plane}", fontsize=9, color=TEXT)
-        dress(ax, label[i], label[j])
+        heading = f"{title(self.system)}, {name_of(self.integrator)}: {plane}"
+        points = self.states[:, [i, j]]
+        return section_figure(points, self.trajectory, len(self.y0), (label[i], label[j]), heading)
+
+    def plot(
+        self, x: int | str | None = None, y: int | str | None = None, path: str | os.PathLike[str] | None = None
+    ) -> Figure:
+        """The figure, as `figure`; with a path it is also saved."""
+        figure = self.figure(x, y)
+        if path is not None:
+            from sympflow.studies.figure_style import save
+
+            save(figure, path)
         return figure
 
 

@@ -1,35 +1,39 @@
-"""work_precision(): error against cost, for every method over a sweep of its steps or tolerances."""
+"""work_precision(): error against cost, for every method over a sweep of its steps or tolerances; and its report."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_counts, check_t_span
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, Integrator
-from sympflow.metrics.accuracy import reference_error
-from sympflow.metrics.energy import failed, max_energy_error
+from sympflow.integrators.base import FixedStep
+from sympflow.metrics.energy import failed
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
 from sympflow.solver import check_y0, solve
-from sympflow.studies.candidates import Candidate, candidates
-from sympflow.studies.precision_points import Point, break_even
-from sympflow.studies.precision_report import WorkPrecision
-from sympflow.timing import interleaved
+from sympflow.studies import attempts
+from sympflow.studies.attempts import Attempt, Candidate, Row, candidates, interleaved, tolerance_of
+from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table, title
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 METHODS = ("verlet", "leapfrog", "blanes_moan4", "srkn11b", "kahan_li8", "rk45", "dop853", "sympflow", "mlp")
 TOLERANCES = tuple(10.0**-k for k in range(3, 13))
 LARGEST_STEP, N_STEPS = 32, 14  # the default sweep: from 32·system.dt, halving
+LEVELS = (1e-3, 1e-6, 1e-9)  # energy errors for which the table gives the costs
 FLOOR = 1e-12  # energy error from which smaller steps only cost more
-SCIPY_SAMPLE = 4  # trajectories of a batch that are run by a method that takes them one by one
+SAMPLE = 4  # trajectories of a batch that are run by a method that takes them one by one
 MARGIN = 100.0  # by which a reference must be better than an error
 
 
@@ -103,12 +107,12 @@ def work_precision(
         steps = [LARGEST_STEP * system.dt / 2**k for k in range(N_STEPS)]
     swept = [(c, _sweep(c, c.label in methods, steps, tolerances)) for c in candidates(methods)]
     t = t0 + (t1 - t0) * np.arange(1, n_outputs + 1) / n_outputs
-    rows: list[Point] = []
+    rows: list[Row] = []
     references: list[Reference | None] = []
     for start in starts:
-        scene = f"{system.name}, {start.size // start.shape[-1]} trajectories"
-        say = partial(_prefixed, progress, scene)
-        measured, truth = _measure(system, swept, (t0, t1), start, t, repeats, budget, backend, say)
+        conditions = Conditions(system, (t0, t1), start, t, backend)
+        say = partial(_prefixed, progress, f"{system.name}, {conditions.trajectories} trajectories")
+        measured, truth = _measure(conditions, swept, repeats, budget, say)
         rows += break_even(measured, abs(t1 - t0))
         references.append(truth)
     return WorkPrecision(system, (t0, t1), n_outputs, repeats, tuple(references), tuple(rows))
@@ -139,124 +143,269 @@ def _sweep(candidate: Candidate, by_name: bool, steps: Sequence[float], toleranc
         return [integrator]
     if isinstance(integrator, FixedStep):
         return [replace(integrator, dt=dt) for dt in sorted(steps, reverse=True)]
-    if "rtol" in integrator.options():
+    if tolerance_of(integrator) is not None:
         return [replace(integrator, rtol=r, atol=r / 1000) for r in sorted(tolerances, reverse=True)]
     return [integrator]
 
 
+# the points -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """One set of initial states, the interval and the instants, under which every point is run."""
+
+    system: HamiltonianSystem
+    t_span: tuple[float, float]
+    y0: np.ndarray
+    t: np.ndarray
+    backend: str
+
+    @property
+    def trajectories(self) -> int:
+        return self.y0.size // self.y0.shape[-1]
+
+    def run(self, integrator: Any) -> Solution:
+        """The solution from all initial states, or of a method that takes them one by one from a few."""
+        few = integrator.one_by_one and self.trajectories > SAMPLE
+        y0 = self.y0[:SAMPLE] if few else self.y0
+        return solve(self.system, integrator, self.t_span, y0, t_eval=self.t, backend=self.backend)
+
+
 def _measure(
-    system: HamiltonianSystem,
+    conditions: Conditions,
     swept: list[tuple[Candidate, list[Any]]],
-    t_span: tuple[float, float],
-    y0: np.ndarray,
-    t: np.ndarray,
     repeats: int,
     budget: float,
-    backend: str,
     say: Callable[[str], None],
-) -> tuple[list[Point], Reference | None]:
+) -> tuple[list[Row], Reference | None]:
     """All points for one set of initial states."""
-    n = len(y0) if y0.ndim > 1 else 1
-
-    def run(integrator: Integrator | None) -> Solution:
-        few = y0[:SCIPY_SAMPLE] if _one_by_one(integrator) and n > SCIPY_SAMPLE else y0
-        return solve(system, integrator, t_span, few, t_eval=t, backend=backend)
-
-    points: list[Point] = []
-    solutions: list[Solution | None] = []
+    points: list[Attempt] = []
     for candidate, integrators in swept:
         say(candidate.label)
         for integrator in integrators:
-            empty = Point(system.name, candidate.method, candidate.label, n)
-            sol, point = _first(empty, candidate, partial(run, integrator))
+            point = _first(replace(candidate, integrator=integrator), conditions)
             points.append(point)
-            solutions.append(sol)
-            if point.status == "not applicable" or (point.energy_error or math.inf) < FLOOR:
+            row = point.row
+            if row.status == "not applicable" or (row.energy_error or math.inf) < FLOOR:
                 break
-
     say("timing")
-    again = [
-        (i, sol)
-        for i, (p, sol) in enumerate(zip(points, solutions, strict=True))
-        if sol is not None and p.status == "ok" and (p.run_time or 0.0) * repeats <= budget
-    ]
-    times = interleaved([partial(run, sol.integrator) for _, sol in again], repeats) if again else []
-    for (i, _), time in zip(again, times, strict=True):
-        points[i] = replace(points[i], run_time=time.median, run_time_spread=time.spread, repeats=repeats)
-    points = [
-        p if sol is None else _scaled(p, n / (sol.y0.size // sol.y0.shape[-1]))
-        for p, sol in zip(points, solutions, strict=True)
-    ]
+    again = [p for p in points if p.row.status == "ok" and (p.row.run_time or 0.0) * repeats <= budget]
+    times = interleaved([partial(conditions.run, p.candidate.integrator) for p in again], repeats)
+    for point, run_time in zip(again, times, strict=True):
+        point.fill(run_time=run_time.median, run_time_spread=run_time.spread, repeats=repeats)
+    for point in points:
+        if point.sol is not None and (few := point.sol.y0.size // point.sol.y0.shape[-1]) < conditions.trajectories:
+            _scale(point, few, conditions.trajectories)
     say("reference")
-    return _errors(points, solutions, system, t_span, y0, t)
+    truth = _errors(points, conditions)
+    return [point.row for point in points], truth
 
 
-def _scaled(point: Point, share: float) -> Point:
-    """The point of a few trajectories, for all of them."""
-    if share == 1:
-        return point
-    note = f"Timed on {point.trajectories / share:.0f} trajectories, which the method takes one by one."
-    run_time, spread = (None if x is None else x * share for x in (point.run_time, point.run_time_spread))
-    return replace(point, run_time=run_time, run_time_spread=spread, reason=f"{point.reason} {note}".strip())
-
-
-def _one_by_one(integrator: Integrator | None) -> bool:
-    """Whether the method loops over the trajectories of a batch."""
-    return integrator is not None and type(integrator).__module__.endswith("scipy_methods")
-
-
-def _first(point: Point, candidate: Candidate, run: Callable[[], Solution]) -> tuple[Solution | None, Point]:
+def _first(candidate: Candidate, conditions: Conditions) -> Attempt:
     """The first run of a point, which also compiles."""
-    try:
-        if candidate.problem:
-            raise ImportError(candidate.problem)
-        sol = run()
-    except (ValueError, TypeError, ImportError, NotImplementedError) as error:
-        return None, replace(point, status="not applicable", reason=str(error))
-    except Exception as error:
-        return None, replace(point, status="failed", reason=f"{type(error).__name__}: {error}")
-    stats, n = sol.stats, sol.y0[..., 0].size
-    integrator: Any = sol.integrator
-    share = n if _one_by_one(integrator) else 1
-    figures = integrator.flow_for(sol.system).figures if integrator.trained else {}
+    row = Row(conditions.system.name, candidate.method, candidate.label, trajectories=conditions.trajectories)
+    point = Attempt(candidate, row)
+    point.run(conditions.run)
+    if (sol := point.sol) is None:
+        return point
     lost = bool(np.median(failed(sol)) > 0)
-    return sol, replace(
-        point,
-        dt=stats.get("dt"),
-        tolerance=getattr(integrator, "rtol", None),
+    share = sol.y0[..., 0].size if sol.integrator.one_by_one else 1
+    point.fill(
         status="failed" if lost else "ok",
-        reason="" if sol.success else sol.message,
-        backend=stats.get("backend"),
-        run_time=None if lost else stats["wall_time"],
+        run_time=None if lost else sol.stats["wall_time"],
         repeats=1,
-        force_evaluations=stats["force_evaluations"] / share,
-        hessian_evaluations=stats["hessian_evaluations"] / share,
-        energy_error=float(np.median(max_energy_error(sol))),
-        training_time=figures.get("training_seconds"),
+        force_evaluations=sol.stats["force_evaluations"] / share,
+        hessian_evaluations=sol.stats["hessian_evaluations"] / share,
     )
+    point.measure({"energy": attempts.energy}, ["energy"])
+    return point
 
 
-def _errors(
-    points: list[Point],
-    solutions: list[Solution | None],
-    system: HamiltonianSystem,
-    t_span: tuple[float, float],
-    y0: np.ndarray,
-    t: np.ndarray,
-) -> tuple[list[Point], Reference | None]:
+def _scale(point: Attempt, few: int, all_of_them: int) -> None:
+    """Scale the run time of a few trajectories to all of them."""
+    times = {"run_time": point.row.run_time, "run_time_spread": point.row.run_time_spread}
+    point.fill(**{name: None if x is None else x * (all_of_them / few) for name, x in times.items()})
+    point.note(f"Timed on {few} trajectories, which the method takes one by one.")
+
+
+def _errors(points: Sequence[Attempt], conditions: Conditions) -> Reference | None:
     """Fill in the errors against a reference; mark those that it cannot resolve."""
     try:
-        truth = compute_reference(system, t_span, y0, t)
+        truth = compute_reference(conditions.system, conditions.t_span, conditions.y0, conditions.t)
     except (ValueError, RuntimeError) as problem:
-        return [replace(p, reason=f"{p.reason} No error: {problem}".strip()) for p in points], None
+        for point in points:
+            point.note(f"No error: {problem}")
+        return None
+    for point in points:
+        if point.row.status == "ok":
+            attempts.accuracy(point, truth)
+            resolved = (point.row.error or 0.0) >= MARGIN * truth.accuracy
+            point.fill(status="ok" if resolved else "uncertain")
+    return truth
+
+
+# read off the points --------------------------------------------------------------------------------------------------
+
+
+def break_even(points: list[Row], length: float) -> list[Row]:
+    """Fill in when the training of each flow has paid for itself, for runs over an interval of that length."""
+    done = [p for p in points if p.run_time and p.energy_error is not None and math.isfinite(p.energy_error)]
+    untrained = [p for p in done if p.training_time is None and p.method not in ("sympflow", "mlp")]
     filled = []
-    for point, sol in zip(points, solutions, strict=True):
-        if sol is None or point.status != "ok":
-            filled.append(point)
-            continue
-        y_ref = truth.y if sol.y.shape == truth.y.shape else truth.y[: len(sol.y0)]
-        worst = reference_error(sol, y_ref).max(axis=-1)
-        error = float(np.median(np.where(np.isnan(worst), np.inf, worst)))
-        status = "ok" if error >= MARGIN * truth.accuracy else "uncertain"
-        filled.append(replace(point, error=error, status=status))
-    return filled, truth
+    for point in points:
+        if point in done and point.training_time is not None and untrained:
+            labels = {p.label for p in untrained}
+            rival = min(cost_at([p for p in untrained if p.label == n], point.energy_error or 0.0) for n in labels)
+            if math.isinf(rival):  # no untrained point is as accurate: nothing to compare with
+                reason = "No break-even: no untrained method was run at a step that reaches this energy error."
+                filled.append(replace(point, reason=f"{point.reason} {reason}".strip()))
+                continue
+            saved = (rival - (point.run_time or 0.0)) / length
+            point = replace(point, break_even=point.training_time / saved if saved > 0 else math.inf)  # noqa: PLW2901
+        filled.append(point)
+    return filled
+
+
+def cost_at(points: Sequence[Row], error: float, cost: str = "run_time", measure: str = "energy_error") -> float:
+    """Return the cost of one method for an error: between two of its points by interpolation of the logarithms.
+
+    The cheapest point that is more accurate is taken where that costs less; inf if no point is accurate enough.
+    """
+    known = [(getattr(p, measure), getattr(p, cost)) for p in points]
+    known = sorted((e, c) for e, c in known if e and c and math.isfinite(e))
+    enough = min((c for e, c in known if e <= error), default=math.inf)
+    for (e0, c0), (e1, c1) in pairwise(known):
+        if e0 <= error <= e1 and e0 < e1:
+            share = math.log(error / e0) / math.log(e1 / e0)
+            enough = min(enough, c0 * (c1 / c0) ** share)
+    return enough
+
+
+# the report -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class WorkPrecision(Report):
+    """Error against cost on one system.
+
+    Attributes
+    ----------
+    system, t_span, n_outputs, repeats
+        What was run.
+    references : tuple of (Reference or None)
+        For one trajectory, and for the batch if there is one.
+    rows : tuple of Row
+    """
+
+    columns: ClassVar[tuple[str, ...]] = (
+        *("system", "method", "label", "trajectories", "dt", "tolerance", "status", "reason", "backend", "run_time"),
+        *("run_time_spread", "repeats", "force_evaluations", "hessian_evaluations", "error", "energy_error"),
+        *("training_time", "break_even"),
+    )
+
+    system: HamiltonianSystem
+    t_span: tuple[float, float]
+    n_outputs: int
+    repeats: int
+    references: tuple[Reference | None, ...]
+    rows: tuple[Row, ...]
+
+    @property
+    def title(self) -> str:
+        """The scene in a line."""
+        return title(self.system)
+
+    @property
+    def sizes(self) -> list[int]:
+        """Numbers of trajectories: 1, and the size of the batch."""
+        return sorted({row.trajectories for row in self.rows})
+
+    def table(self, levels: tuple[float, ...] = LEVELS) -> str:
+        """Evaluations and run time of each method for each level of the energy error; then every point."""
+        heading = [f"{self.title}: t = {self.t_span[0]:g} … {self.t_span[1]:g}, {self.n_outputs} instants"]
+        for size, reference in zip(self.sizes, self.references, strict=True):
+            known = "none" if reference is None else f"{reference.method}, good to {number(reference.accuracy)}"
+            heading.append(f"reference for {_size(size)}: {known}")
+        blocks = [
+            f"For an energy error of …, {_size(size)} (run time of all, evaluations of one)\n\n{self._at(size, levels)}"
+            for size in self.sizes
+        ]
+        notes = dict.fromkeys(f"  {row.label}: {row.reason}" for row in self.rows if row.reason)
+        below = ["\n".join(["Notes", *notes])] if notes else []
+        return "\n\n".join(["\n".join(heading), *blocks, "Every point\n\n" + self._points(), *below])
+
+    def _at(self, size: int, levels: tuple[float, ...]) -> str:
+        rows = [row for row in self.rows if row.trajectories == size]
+        labels = list(dict.fromkeys(row.label for row in rows))
+        columns = [Column("method", labels, left=True)]
+        for level in levels:
+            for cost, show in (("force_evaluations", _count), ("run_time", seconds)):
+                found = [cost_at([r for r in rows if r.label == label], level, cost) for label in labels]
+                head = f"{level:.0e}" if cost == "run_time" else "forces"
+                columns.append(Column(head, [show(x) if math.isfinite(x) else "–" for x in found]))
+        trained = {row.label: row for row in rows if row.training_time is not None}
+        columns.append(Column("training", [seconds(trained[n].training_time) if n in trained else "" for n in labels]))
+        paid = [_paid(trained[n].break_even) if n in trained else "" for n in labels]
+        columns.append(Column("paid after t =", paid))
+        return text_table(columns)
+
+    def _points(self) -> str:
+        rows = self.rows
+        return text_table(
+            [
+                Column("method", [r.label for r in rows], left=True),
+                Column("batch", [f"{r.trajectories:,}" for r in rows]),
+                Column("step", [plain(r.dt) for r in rows]),
+                Column("rtol", ["" if r.tolerance is None else f"{r.tolerance:.0e}" for r in rows]),
+                Column("backend", [r.backend or "" for r in rows], left=True),
+                Column("run time", [seconds(r.run_time) for r in rows]),
+                Column("±", [seconds(r.run_time_spread) for r in rows]),
+                Column("forces", [_count(r.force_evaluations) for r in rows]),
+                Column("Hessians", [_count(r.hessian_evaluations or None) for r in rows]),
+                Column("error", [number(r.error) for r in rows]),
+                Column("energy error", [number(r.energy_error) for r in rows]),
+                Column("status", ["" if r.status == "ok" else r.status for r in rows], left=True),
+            ]
+        )
+
+    def settings(self) -> dict[str, Any]:
+        return {
+            "system": described(self.system),
+            "t_span": list(self.t_span),
+            "n_outputs": self.n_outputs,
+            "repeats": self.repeats,
+            "references": [None if r is None else r.summary() for r in self.references],
+        }
+
+    def figure(self, measure: str = "energy_error") -> Figure:
+        """Error against run time and against evaluations, log–log; a row for one trajectory and one for the batch.
+
+        Parameters
+        ----------
+        measure : "energy_error" or "error"
+        """
+        from sympflow.studies.figures import precision_figure
+
+        return precision_figure(self.rows, f"{self.title}, T = {self.t_span[1] - self.t_span[0]:g}", measure)
+
+    def plot(self, path: str | os.PathLike[str] | None = None, measure: str = "energy_error") -> Figure:
+        """The figure, as `figure`; with a path it is also saved."""
+        from sympflow.studies.figure_style import save
+
+        figure = self.figure(measure)
+        if path is not None:
+            save(figure, path)
+        return figure
+
+
+def _size(n: int) -> str:
+    return "one trajectory" if n == 1 else f"a batch of {n:,}"
+
+
+def _count(x: float | None) -> str:
+    return "" if not x else f"{x:,.0f}"
+
+
+def _paid(x: float | None) -> str:
+    return "" if x is None else "never" if x == math.inf else f"{x:.2g}"

@@ -1,29 +1,48 @@
-"""stability(): how long a step each method bears on a system, and what happens beyond."""
+"""stability(): how long a step each method bears on a system, and how it fails beyond; and its report."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Any
+import os
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_counts, check_t_span
-from sympflow.arrays import is_tensor
+from sympflow.arguments import MAX_SAVED_VALUES, check_counts, check_t_span
+from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import FixedStep, Integrator
+from sympflow.metrics.energy import max_energy_error
+from sympflow.metrics.symplectic import symplecticity_defect, volume_error
+from sympflow.solution import Solution
 from sympflow.solver import check_y0, solve
-from sympflow.studies.candidates import candidates
-from sympflow.studies.comparison_report import title
-from sympflow.studies.stability_report import StabilityReport, StabilityRow, StepLimit
-from sympflow.studies.stability_study import Study
-from sympflow.studies.step_limits import step_limit
+from sympflow.studies import attempts
+from sympflow.studies.attempts import REFUSALS, Attempt, Candidate, Metric, Row, candidates
+from sympflow.studies.reports import Column, Report, described, number, plain, records, text_table, title
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DEFAULT = ("sympflow", "verlet", "leapfrog", "kahan_li8", "implicit_midpoint", "rk4", "rk45")
 METRICS = ("energy", "drift", "volume", "symplecticity", "domain")
+STEPS = tuple(2.0**k for k in range(-1, 7))
+"""Default steps of classical methods, times the system's; those of a trained flow are fractions of its Δt."""
+FRACTIONS = (0.25, 0.5, 1.0)
 PHASES = (0.0, 3.0, 10.0, 31.0)
 """Where the initial states lie along the orbit, in the system's steps: several, for one may hide an instability."""
+PRECISION = 1.002  # the shortest unstable step found, in units of the longest stable one
+STABLE = ("stable", "bounded")
+MOST_OUTPUTS, TANGENT_STEPS, FEWEST_FOR_DRIFT = 20_000, 256, 40
+FEW_STARTS = 16  # up to so many, a compiled method runs one by one: the kernel for batches takes longer to compile
+ARRAYS_SLOWER = 200  # times, by which runs on arrays are shortened
+TAIL = 20  # steps before a blow-up whose growth is looked at
+StabilityRow = Row  # the name that its rows had before those of all studies were of one kind
 
 
 def stability(
@@ -66,7 +85,7 @@ def stability(
         Steps of a run; where both cannot be, `max_steps` holds. Methods that run with array operations, and float32,
         take at most `max_steps`/200.
     limits : bool
-        Whether to find the longest stable step, by bisection between the longest stable and the shortest unstable one,
+        True to find the longest stable step, by bisection between the longest stable and the shortest unstable one,
         to 0.2 %. If all are stable, longer ones are tried, and shorter ones if none is.
     progress : callable, optional
         Called with a line of text when something begins: a method, each of its steps, each trial for the longest one.
@@ -74,7 +93,8 @@ def stability(
     Returns
     -------
     StabilityReport
-        With `.rows` (one for each system, method, precision and step), `.limits`, `.table()`, `.to_csv()`, `.plot()`.
+        With `.rows` (one for each system, method, precision and step), `.limits`, `.table()`, `.to_csv()`,
+        `.to_json()` and `.plot()`.
 
     Examples
     --------
@@ -102,7 +122,7 @@ def stability(
     unknown = [d for d in dtypes if d not in ("float32", "float64")]
     if isinstance(dtypes, str) or unknown or not len(dtypes):
         raise ValueError(f"`dtypes` must be a list of 'float32' and 'float64'; got {dtypes!r}.")
-    rows: list[StabilityRow] = []
+    rows: list[Row] = []
     found: list[StepLimit] = []
     for one in family:
         span = check_t_span(one.t_span if t_span is None else t_span)
@@ -116,7 +136,7 @@ def stability(
                 say("")
                 own = [study.row(h) for h in study.lengths(lengths)]
                 rows += own
-                if limits and study.has_steps and any(row.status != "not applicable" for row in own):
+                if limits and study.has_steps and any(_ran(row) for row in own):
                     found.append(step_limit(study, own))
     return StabilityReport(family, tuple(metrics), float(bound), tuple(rows), tuple(found))
 
@@ -150,3 +170,531 @@ def _checked_steps(steps: Sequence[float]) -> list[float]:
     if not lengths or not all(0 < h < math.inf for h in lengths):
         raise ValueError(f"`steps` must be positive and finite; got {steps!r}.")
     return lengths
+
+
+# one method with a range of steps -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Study:
+    """One method on one system in one precision."""
+
+    system: HamiltonianSystem
+    candidate: Candidate
+    dtype: str
+    t_span: tuple[float, float]
+    starts: np.ndarray
+    metrics: tuple[str, ...]
+    bound: float
+    min_steps: int
+    max_steps: int
+    say: Callable[[str], None] = lambda text: None  # for a line of progress
+
+    @cached_property
+    def integrator(self) -> Any:
+        """The integrator that runs: a flow in another time is run as such. None if there is none."""
+        asked = self.candidate.integrator
+        if asked is None:
+            return None
+        try:
+            return asked.resolved(self.system, self.starts[0], abs(self.t_span[1] - self.t_span[0]))
+        except REFUSALS:  # the rows say so
+            return asked
+
+    @property
+    def has_steps(self) -> bool:
+        return isinstance(self.integrator, FixedStep)
+
+    @property
+    def compiled(self) -> bool:
+        return self.integrator.compiles and self.dtype == "float64"
+
+    @property
+    def most_steps(self) -> int:
+        return self.max_steps if self.compiled else max(1, self.max_steps // ARRAYS_SLOWER)
+
+    def lengths(self, asked: list[float] | None) -> list[float | None]:
+        """The steps to run; None for an adaptive method."""
+        if not self.has_steps:
+            return [None]
+        if asked is not None and not self.integrator.trained:
+            return [*asked]
+        try:
+            own = self.integrator.step_length(self.system)
+        except ValueError:  # there is no flow: the row says so
+            return [self.system.dt]
+        if asked is not None:
+            return [*asked]
+        return [own * f for f in (FRACTIONS if self.integrator.trained else STEPS)]
+
+    def with_step(self, h: float | None) -> Integrator:
+        return self.integrator if h is None else replace(self.integrator, dt=h)
+
+    def span(self, h: float | None) -> tuple[float, float]:
+        """The interval, extended or shortened to between `min_steps` and `max_steps` steps."""
+        t0, t1 = self.t_span
+        if h is None:
+            return t0, t1
+        length = min(max(abs(t1 - t0), h * self.min_steps), h * self.most_steps)
+        return t0, t0 + math.copysign(length, t1 - t0)
+
+    def runs(self, integrator: Any, h: float | None, span: tuple[float, float]) -> list[Solution]:
+        """Solutions that hold every step, or equally many of them, of each state."""
+        y0 = self.starts
+        together = isinstance(integrator, FixedStep) and integrator.on_grid
+        together &= not (self.compiled and len(y0) <= FEW_STARTS)
+        width = y0.size if together else y0.shape[1]
+        most = min(MOST_OUTPUTS, MAX_SAVED_VALUES // (2 * width))
+        every = 1 if h is None else max(1, math.ceil(abs(span[1] - span[0]) / h / most))
+        with _quiet():
+            return [
+                solve(self.system, integrator, span, y, save_every=every, dtype=self.dtype, on_domain_exit="ignore")
+                for y in ([y0] if together else list(y0))
+            ]
+
+    def attempt(self, h: float | None, span: tuple[float, float]) -> Attempt:
+        """Run all initial states with one step; the row has the largest energy error, and the status."""
+        params = self.system.params
+        row = Row(
+            title(self.system),
+            self.candidate.method,
+            self.candidate.label,
+            parameter=next(iter(params), None),
+            value=next(iter(params.values()), None),
+            dtype=self.dtype,
+            t_end=self.span(h)[1],
+        )
+        one = Attempt(self.candidate, row)
+        one.run(lambda _: self.runs(self.with_step(h), h, span))
+        one.fill(dt=h)
+        if one.sol is not None:
+            with one.noting_warnings():
+                one.fill(energy_error=largest_error(one.sols))
+            status, words = self.verdict(one)
+            one.fill(status=status, reason=f"{one.row.reason} {words}".strip())
+        return one
+
+    def verdict(self, one: Attempt) -> tuple[str, str]:
+        """The status of runs with their largest energy error, and what is to be said."""
+        worst = one.row.energy_error if one.row.energy_error is not None else math.inf
+        exit_time = domain_exit(one.sols) if self.integrator.trained else None
+        left = (
+            "" if exit_time is None else f"Left the flow's domain at t = {exit_time:.6g}, where the flow says nothing."
+        )
+        if left or not worst <= self.bound:
+            return ("unstable" if not worst <= self.bound else "outside"), left
+        return (
+            ("stable", "") if worst <= 1 else ("bounded", f"The energy error stays bounded, but reaches {worst:.3g}.")
+        )
+
+    def stable(self, h: float) -> tuple[bool, float]:
+        """Tell whether all runs with this step stay below the bound and in a flow's domain, and their largest error.
+
+        Most unstable steps show in the first `min_steps` of them.
+        """
+        self.say(f"longest stable step: dt = {h:.6g}")
+        t0, t1 = span = self.span(h)
+        if abs(t1 - t0) > 4 * h * self.min_steps:
+            early = self.attempt(h, (t0, t0 + math.copysign(h * self.min_steps, t1 - t0))).row.energy_error
+            if early is None or not early <= self.bound:
+                return False, math.inf if early is None else early
+        row = self.attempt(h, span).row
+        return row.status in STABLE, math.inf if row.energy_error is None else row.energy_error
+
+    def row(self, h: float | None) -> Row:
+        """Everything that is asked for at one step."""
+        self.say("" if h is None else f"dt = {h:.6g}")
+        one = self.attempt(h, self.span(h))
+        if one.sol is not None:
+            _note_blow_up(one)
+            one.measure(MEASURES, self.metrics)
+        return one.row
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """No RuntimeWarnings, nor NumPy's of overflow: a step that is too long is no surprise here."""
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", RuntimeWarning)
+        yield
+
+
+def largest_error(sols: Sequence[Solution]) -> float:
+    """The largest energy error over states and outputs, inf where a run failed or is not finite."""
+    worst = [float(np.max(max_energy_error(sol))) for sol in sols]
+    return math.inf if any(math.isnan(x) for x in worst) else max(worst)
+
+
+def domain_exit(sols: Sequence[Solution]) -> float | None:
+    """The time at which the first trajectory leaves the domain of the flow, or of the system."""
+    system = sols[0].system
+    flow = sols[0].integrator.flow_for(system)
+    domain = system.domain if flow is None else flow.domain_for(system)
+    if domain is None:
+        return None
+    slack = 0.0 if flow is None else float(flow.figures.get("energy_error_max") or 0.0)
+    times = []
+    for sol in sols:
+        thin = max(1, len(sol.t) // 2000)
+        states = np.asarray(sol.states)[..., ::thin, :]
+        outside = ~domain.contains(states, slack=slack) & np.isfinite(states).all(-1)
+        outside = outside.reshape(-1, outside.shape[-1]).any(0)
+        if outside.any():
+            times.append(float(sol.t[::thin][int(np.argmax(outside))]))
+    return min(times) if times else None
+
+
+# metrics: those of attempts, of as much of the runs as they need here -----------------------------------------------
+
+
+def _drift(one: Attempt) -> None:
+    if one.row.status != "unstable" and len(one.sols[0].t) >= FEWEST_FOR_DRIFT:
+        attempts.drift(one)
+
+
+def _first_steps(one: Attempt) -> Solution:
+    """The first steps from the first state, run again."""
+    sol = one.sols[0]
+    t0, t1 = sol.t_span
+    h = sol.system.dt if one.row.dt is None else one.row.dt
+    t1 = t0 + math.copysign(min(abs(t1 - t0), TANGENT_STEPS * h), t1 - t0)
+    y0 = to_numpy(sol.y0).reshape(-1, 2 * sol.system.ndof)[0]
+    with _quiet():
+        return solve(sol.system, sol.integrator, (t0, t1), y0, dtype=str(y0.dtype), on_domain_exit="ignore")
+
+
+MEASURES: dict[str, Metric] = {
+    "energy": lambda one: None,  # of every run, for its status depends on it
+    "drift": _drift,
+    "volume": lambda one: one.fill(volume_error=abs(float(volume_error(_first_steps(one))))),
+    "symplecticity": lambda one: one.fill(
+        symplecticity_defect=float(symplecticity_defect(_first_steps(one), relative=True))
+    ),
+    "domain": lambda one: one.fill(domain_exit=domain_exit(one.sols)),
+}
+
+
+# blow-ups -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class BlowUp:
+    """The end of a run that could not go on.
+
+    Attributes
+    ----------
+    time : float
+        Of the singularity, as `solve` estimates it; or of the last finite state, where there is none.
+    singular : bool
+        True if the solution itself becomes infinite.
+    growth : float or None
+        Else the factor by which ‖y‖ grew with each step, the median over the last steps before the overflow; None for
+        an adaptive method, whose steps differ.
+    """
+
+    time: float
+    singular: bool
+    growth: float | None
+
+    def __str__(self) -> str:
+        if self.singular:
+            return f"The solution becomes infinite at t = {self.time:.6g}."
+        if self.growth is not None and self.growth > 1.001:
+            return f"The state grows by a factor {self.growth:.4g} a step until it overflows at t = {self.time:.6g}."
+        return f"The run cannot go on after t = {self.time:.6g}."
+
+
+def failure_times(sol: Solution) -> np.ndarray:
+    """For each trajectory (n,) the time after which it could not go on, NaN if it did not fail."""
+    status = np.atleast_1d(np.asarray(sol.status))
+    last = sol.t[-1] if len(sol.t) else sol.t_span[0]
+    times = np.broadcast_to(np.asarray(sol.stats.get("failed_at", last), dtype=float), status.shape)
+    return np.where(status < 0, times, np.nan).reshape(-1)
+
+
+def blow_up(sol: Solution, i: int = 0) -> BlowUp:
+    """Describe how trajectory i of a solution ended that could not go on."""
+    y0 = to_numpy(sol.y0).reshape(-1, 2 * sol.system.ndof)
+    failed_at = float(failure_times(sol)[i])
+    time = float(np.ravel(sol.stats.get("blow_up_time", np.full(len(y0), np.nan)))[i])
+    growth = _growth(sol, y0[i], failed_at)
+    return BlowUp(time, True, growth) if np.isfinite(time) else BlowUp(failed_at, False, growth)
+
+
+def _growth(sol: Solution, y0: np.ndarray, failed_at: float) -> float | None:
+    if not (isinstance(sol.integrator, FixedStep) and sol.integrator.on_grid):
+        return None
+    t0, h = sol.t_span[0], np.copysign(sol.stats["dt"], sol.t_span[1] - sol.t_span[0])
+    n = int(np.rint((failed_at - t0) / h))
+    if n < 1:
+        return 1.0
+    times = np.clip(t0 + h * np.arange(max(0, n - TAIL), n + 1), min(t0, failed_at), max(t0, failed_at))
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", RuntimeWarning)
+        tail = solve(sol.system, sol.integrator, (t0, failed_at), y0, t_eval=times, on_domain_exit="ignore").y
+        change = np.diff(np.log(np.abs(tail).max(0)))
+    return float(np.exp(np.median(change))) if len(change) and np.isfinite(change).all() else 1.0
+
+
+def _note_blow_up(one: Attempt) -> None:
+    """Enter the time and manner of the first failure, of the first state that fails."""
+    for sol in one.sols:
+        lost = np.isfinite(failure_times(sol))
+        if lost.any():
+            end = blow_up(sol, int(np.argmax(lost)))
+            one.fill(blow_up=end.time, singular=end.singular)
+            if not (end.singular and "infinite" in one.row.reason):
+                one.note(str(end))
+            return
+
+
+# the longest stable step ----------------------------------------------------------------------------------------------
+
+
+def _ran(row: Row) -> bool:
+    return row.status not in ("not applicable", "failed")
+
+
+def step_limit(study: Study, rows: Sequence[Row]) -> StepLimit:
+    """Find the longest stable step, from the rows and by bisection below the first unstable one."""
+    tried = [row for row in rows if row.dt is not None and row.status != "not applicable"]
+    ran = [(row.dt, row.status in STABLE) for row in tried if row.dt is not None]
+    first_bad = next((i for i, (_, good) in enumerate(ran) if not good), len(ran))
+    low = ran[first_bad - 1][0] if first_bad else None
+    high = ran[first_bad][0] if first_bad < len(ran) else None
+    reached = ""
+    if high is None and low is not None:
+        low, high, reached = _longer(study, low)
+    elif low is None and any(row.singular for row in tried):
+        reached = "none: the solution is singular"  # no step helps
+    elif low is None and tried and all(row.status == "outside" for row in tried):
+        reached = "none: the solution leaves the flow's domain"
+    elif low is None and high is not None:
+        low, high = _shorter(study, high)
+    error = None
+    while low is not None and high is not None and high / low > PRECISION:
+        middle = math.sqrt(low * high)
+        good, error_there = study.stable(middle)
+        low, high, error = (middle, high, error_there) if good else (low, middle, error)
+    if low is not None and error is None:
+        error = study.stable(low)[1]
+    c, params = study.candidate, study.system.params
+    return StepLimit(
+        title(study.system),
+        next(iter(params), None),
+        next(iter(params.values()), None),
+        c.method,
+        c.label,
+        study.dtype,
+        low,
+        high,
+        error,
+        reached,
+    )
+
+
+def _longer(study: Study, low: float) -> tuple[float, float | None, str]:
+    """Double a stable step until it is unstable, refused, or as long as the interval."""
+    longest = abs(study.t_span[1] - study.t_span[0])
+    if study.integrator.trained:
+        top = study.integrator.step_length(study.system)
+        if low >= top * (1 - 1e-12):
+            return low, None, "all up to the flow's Δt"
+        good, _ = study.stable(top)
+        return (top, None, "all up to the flow's Δt") if good else (low, top, "")
+    while low < longest:
+        if not study.stable(2 * low)[0]:
+            return low, 2 * low, ""
+        low = 2 * low
+    return low, None, "all up to the length of the interval"
+
+
+def _shorter(study: Study, high: float) -> tuple[float | None, float]:
+    for _ in range(12):
+        if study.stable(high / 2)[0]:
+            return high / 2, high
+        high = high / 2
+    return None, high
+
+
+# the report -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StepLimit:
+    """The longest stable step of one method on one system.
+
+    Attributes
+    ----------
+    system, parameter, value, method, label, dtype
+        As in `Row`.
+    stable : float or None
+        The longest step that was found stable or bounded, all shorter ones that were tried being so; None if there is
+        none.
+    unstable : float or None
+        The next longer one that was tried, which is not; None if all were stable.
+    energy_error : float
+        The largest energy error with `stable`.
+    reached : str
+        A remark: that all steps are stable, up to the flow's Δt or the length of the interval; or that
+        the solution itself is singular, or leaves the flow's domain, so that none is.
+    """
+
+    system: str
+    parameter: str | None
+    value: float | None
+    method: str
+    label: str
+    dtype: str
+    stable: float | None
+    unstable: float | None
+    energy_error: float | None = None
+    reached: str = ""
+
+
+@dataclass(frozen=True)
+class StabilityReport(Report):
+    """Methods and steps on a system or a family of them.
+
+    Attributes
+    ----------
+    systems : tuple of HamiltonianSystem
+    metrics : tuple of str
+    bound : float
+        The energy error above which a run counts as unstable.
+    rows : tuple of Row
+    limits : tuple of StepLimit
+    """
+
+    columns: ClassVar[tuple[str, ...]] = (
+        *("system", "parameter", "value", "method", "label", "dtype", "dt", "t_end", "status", "reason", "n_steps"),
+        *("energy_error", "energy_drift", "energy_drift_error", "blow_up", "singular", "domain_exit", "volume_error"),
+        "symplecticity_defect",
+    )
+
+    systems: tuple[HamiltonianSystem, ...] = field(repr=False)
+    metrics: tuple[str, ...]
+    bound: float
+    rows: tuple[Row, ...] = field(repr=False)
+    limits: tuple[StepLimit, ...]
+
+    def table(self) -> str:
+        """The longest stable steps, and all rows, as text; the reasons below."""
+        notes = [
+            f"  {row.system}, {row.label}{'' if row.dt is None else f', dt = {plain(row.dt)}'}: {row.reason}"
+            for row in self.rows
+            if row.reason
+        ]
+        parts = [text_table(self._limit_columns()), *self.without_limit(), ""] if self.limits else []
+        below = ["", "Notes", *dict.fromkeys(notes)] if notes else []
+        return "\n".join([*parts, text_table(self._columns()), *below])
+
+    def without_limit(self) -> list[str]:
+        """For each method whose longest stable step is not found on some systems, where that is and why: sentences."""
+        found = {(x.system, x.label, x.dtype): x for x in self.limits}
+        why: dict[tuple[str, str], list[str]] = {}
+        for row in self.rows:
+            limit = found.get((row.system, row.label, row.dtype))
+            if limit is not None and limit.stable is not None and limit.unstable is not None:
+                continue
+            if limit is not None:
+                reason = f"{'stable: ' * (limit.stable is not None)}{limit.reached}" or "none of the steps is stable"
+            else:
+                reason = "an adaptive method" if row.dt is None else f"{row.status}: see the notes"
+            systems = why.setdefault((row.label, reason), [])
+            if row.system not in systems:
+                systems.append(row.system)
+        several = len(self.systems) > 1
+        return [
+            f"No limit of {label}{f' on {_listed(systems)}' if several else ''}: {reason}."
+            for (label, reason), systems in why.items()
+        ]
+
+    def settings(self) -> dict[str, Any]:
+        return {
+            "systems": [described(system) for system in self.systems],
+            "metrics": list(self.metrics),
+            "bound": self.bound,
+            "limits": records(self.limits, [f.name for f in fields(StepLimit)]),
+        }
+
+    def figure(self, kind: str | None = None) -> Figure:
+        """A matplotlib figure: "steps", the energy error against the step; or "map", step against stiffness.
+
+        The default is the map for a family, else the steps.
+
+        Raises
+        ------
+        ValueError
+            For another kind, or a map of a single system.
+        """
+        from sympflow.studies.figures import stability_map, step_errors
+
+        kind = kind or ("map" if len(self.systems) > 1 else "steps")
+        if kind == "steps":
+            return step_errors(self.rows)
+        if kind != "map":
+            raise ValueError(f"`kind` must be 'steps' or 'map'; got {kind!r}.")
+        if len({row.value for row in self.rows}) < 2:
+            raise ValueError(
+                "`kind` 'map' needs several systems that differ in a parameter: pass a family to stability()."
+            )
+        lines: dict[str, list[tuple[float, float]]] = {}
+        for x in self.limits:
+            if x.stable is not None and x.unstable and x.value is not None:
+                lines.setdefault(x.label, []).append((x.stable, x.value))
+        return stability_map(self.rows, lines, self.without_limit() if self.limits else [])
+
+    def plot(self, path: str | os.PathLike[str] | None = None, kind: str | None = None) -> Figure:
+        """The figure, as `figure`; with a path it is also saved."""
+        figure = self.figure(kind)
+        if path is not None:
+            from sympflow.studies.figure_style import save
+
+            save(figure, path)
+        return figure
+
+    def _limit_columns(self) -> list[Column]:
+        return [
+            *self._names(self.limits),
+            Column("longest stable step", ["none" if x.stable is None else f"{x.stable:.5g}" for x in self.limits]),
+            Column("energy error there", [number(x.energy_error) for x in self.limits]),
+            Column("stable", [x.reached for x in self.limits], left=True),
+        ]
+
+    def _columns(self) -> list[Column]:
+        rows = self.rows
+        drifts = [
+            "" if r.energy_drift is None else f"{number(r.energy_drift)} ± {number(r.energy_drift_error, 1)}"
+            for r in rows
+        ]
+        ends = ["" if r.blow_up is None else f"{r.blow_up:.6g}{' (singular)' if r.singular else ''}" for r in rows]
+        return [
+            *self._names(rows),
+            Column("step", [plain(r.dt) for r in rows]),
+            Column("steps", [f"{r.n_steps:,}" if r.n_steps else "" for r in rows]),
+            Column("energy error", [number(r.energy_error) for r in rows]),
+            Column("drift per unit t", drifts),
+            Column("blow-up at t", ends),
+            Column("leaves domain at t", [plain(r.domain_exit) for r in rows]),
+            Column("volume error", [number(r.volume_error) for r in rows]),
+            Column("sympl. defect", [number(r.symplecticity_defect) for r in rows]),
+            Column("status", [r.status for r in rows], left=True),
+        ]
+
+    def _names(self, rows: Sequence[Row | StepLimit]) -> list[Column]:
+        several = len(self.systems) > 1
+        precisions = {r.dtype for r in rows}
+        return [
+            Column("system", [r.system if several else "" for r in rows], left=True),
+            Column("method", [r.label for r in rows], left=True),
+            Column("dtype", [r.dtype if len(precisions) > 1 else "" for r in rows], left=True),
+        ]
+
+
+def _listed(systems: list[str]) -> str:
+    """Names that begin alike, as of a family, once: "oscillator, ω = 1, 100"."""
+    first, _, _ = systems[0].rpartition(" = ")
+    if first and all(name.startswith(f"{first} = ") for name in systems):
+        return f"{first} = {', '.join(name.removeprefix(f'{first} = ') for name in systems)}"
+    return "; ".join(systems)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 if TYPE_CHECKING:
-    from sympflow.flow.base import FlowMap
+    from sympflow.flow.flow_map import FlowMap
     from sympflow.hamiltonian.system import HamiltonianSystem
 
 FORMAT = 1

@@ -17,10 +17,10 @@ from scipy.integrate import solve_ivp
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
-from sympflow.integrators.log_sympflow import LogSympFlow
+from sympflow.integrators.flows import LogSympFlow
 from sympflow.metrics.energy import max_energy_error
 from sympflow.solver import solve
-from sympflow.training.collocation import Stream, states
+from sympflow.training.points import Stream, states
 
 TOLERANCE = 1e-13
 NEWTON_STEPS = 5  # to the nearest point of an orbit
@@ -95,7 +95,7 @@ def _lateness(
     """ψ̄_s(x) of rows, and how much later than it holds the exact solution is where it comes: (N, 2d + 2), (N,)."""
     transformed = flow.system
     assert transformed is not None
-    end = flow.kernel_for(transformed).step(s, x)
+    end = flow.kernel_for(transformed).step(s, x).states
     held = end[:, system.ndof]
     y, start, t = projected(end), projected(x), held.copy()
     for _ in range(NEWTON_STEPS):
@@ -113,7 +113,7 @@ def clock_errors(flow: ClockedFlow, system: HamiltonianSystem, seed: int, points
     kernel = flow.kernel_for(flow.system)  # type: ignore[arg-type]
     errors = []
     for s in flow.dt * np.append((np.arange(FRACTIONAL_TIMES) + 0.5) / FRACTIONAL_TIMES, 1.0):
-        end = kernel.step(np.full(len(x), s), x)
+        end = kernel.step(np.full(len(x), s), x).states
         exact = _at(system, projected(x), end[:, system.ndof])
         errors.append(np.linalg.norm(projected(end) - exact, axis=-1))
     return {

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.training.collocation import Points
+from sympflow.training.points import Points
 
 Terms = tuple[Tensor | None, Tensor | None, Tensor | None]
 
@@ -108,37 +108,49 @@ class Objective:
     @torch.no_grad()
     def residuals(self) -> Tensor:
         """The residuals (m,)."""
-        return torch.cat([self._reduced(name, f(self.flow, *arguments)) for name, f, arguments in self._blocks()])
+        return torch.cat([self._reduced(b, b.function(self.flow, *b.points)) for b in self._blocks()])
 
     def linearized(self) -> tuple[Tensor, Tensor]:
         """The residuals (m,) and their Jacobian (m, n) by the parameters, in the order of `flow.parameters()`."""
         rows = []
-        for name, function, arguments in self._blocks():
-            r, J = jacobian(self.flow, function, arguments)
-            rows.append((self._reduced(name, r), self._reduced(name, J.movedim(-1, 0), 1).T))
+        for block in self._blocks():
+            r, J = jacobian(self.flow, block.function, block.points)
+            rows.append((self._reduced(block, r), self._reduced(block, J.movedim(-1, 0), 1).T))
         return torch.cat([r for r, _ in rows]), torch.cat([J for _, J in rows])
 
-    def _blocks(self) -> list[tuple[str, Callable[..., Tensor], tuple[Tensor, ...]]]:
-        """Of each loss that counts its name, its function and its points, one a row."""
+    def _blocks(self) -> list[_Block]:
+        """The losses that count."""
         loss, points = self.loss, self.points
-        blocks: list[tuple[str, Callable[..., Tensor], tuple[Tensor, ...]]] = []
+        blocks = []
         if loss.residual_weight:
-            blocks.append(("residual", loss.residual, (points.t, points.x)))
+            blocks.append(_Block(loss.residual_weight, loss.residual, (points.t, points.x)))
         if loss.matching_weight:
             t = points.matching_t.expand(points.matching_x.shape[:2]).reshape(-1)
-            blocks.append(("matching", loss.mismatch, (t, points.matching_x.flatten(0, 1))))
+            blocks.append(_Block(loss.matching_weight, loss.mismatch, (t, points.matching_x.flatten(0, 1)), True))
         if loss.label_weight:
             assert points.labels is not None
-            blocks.append(("label", loss.label_error, points.labels))
+            blocks.append(_Block(loss.label_weight, loss.label_error, points.labels))
         return blocks
 
-    def _reduced(self, name: str, values: Tensor, leading: int = 0) -> Tensor:
+    def _reduced(self, block: _Block, values: Tensor, leading: int = 0) -> Tensor:
         """(..., N, ...) after `leading` axes as (..., m), so weighted that the sum of squares is the loss."""
-        weight = (getattr(self.loss, f"{name}_weight") / values.shape[leading]) ** 0.5
-        if name == "matching":
-            grid = values.unflatten(leading, self.points.matching_x.shape[:2])
-            values = _less_mean(grid)
+        weight = (block.weight / values.shape[leading]) ** 0.5
+        if block.less_mean:
+            values = _less_mean(values.unflatten(leading, self.points.matching_x.shape[:2]))
         return weight * values.flatten(leading)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """A loss that counts: its weight, its function of the flow and points, the points, one a row.
+
+    With `less_mean` the values at each of the times of the points are taken less their mean.
+    """
+
+    weight: float
+    function: Callable[..., Tensor]
+    points: tuple[Tensor, ...]
+    less_mean: bool = False
 
 
 class _Evaluation(nn.Module):

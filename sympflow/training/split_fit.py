@@ -1,4 +1,8 @@
-"""The fit of a split flow's weights, filters and angles to labels, as a least-squares problem.
+"""The fit of a split flow: its weights, filters and angles, fitted to the exact flow of a system by Gauss–Newton.
+
+First the maps frozen at Δt, a dozen numbers, from many random starts. Then numbers are followed from equal steps at a
+small t up to Δt, each fit starting where the last ended (or down from the best at Δt, if those are much better);
+polynomials in t are put through them, and these are fitted to labels at all times together.
 
 Derivatives of a step by a number of its table are central differences of the compiled step, exact to 1e-10, which
 Gauss–Newton steps do not see.
@@ -7,23 +11,22 @@ Gauss–Newton steps do not see.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from sympflow.flow.columns import Column
+from sympflow.flow.coefficients import Column
 from sympflow.flow.split import SplitFlow
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.parts import Map
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.exact_maps import kernel_of
-from sympflow.kernels.parts import PartsKernel
-from sympflow.training.collocation import Stream, states, stream_seed
-from sympflow.training.labels import Labels
-from sympflow.training.levenberg_marquardt import Minimum, levenberg_marquardt
-from sympflow.training.search_config import SplitConfig
-from sympflow.training.weight_vector import put_weights
+from sympflow.kernels.parts_loops import parts_loops
+from sympflow.training.least_squares import Minimum, Stop, levenberg_marquardt, put_weights
+from sympflow.training.options import SplitOptions
+from sympflow.training.points import Labels, Stream, states, stream_seed
+from sympflow.training.runs import SearchRun
+from sympflow.training.session import Session
 
 DIFFERENCE = 1e-5  # of a coefficient, relative to its unit
 SPREAD = 0.3  # of random weights about those of equal steps
@@ -31,6 +34,47 @@ FOLLOWING = 40  # iterations at each time, on the way from one to the next
 WORSE = 30.0  # times the best error at Δt that numbers followed up from 0 may have there
 PULL = 0.3  # towards equal steps, as a share of the error: it chooses among coefficients that do as well
 ROUGHNESS = 1e-6  # how reluctantly polynomials are made to vary with t
+
+
+@dataclass
+class SplitRun(SearchRun):
+    """The state of a fit of a split flow, and what acts on it."""
+
+    flow: SplitFlow
+    options: SplitOptions
+    fit: SplitFit
+
+    @classmethod
+    def start(cls, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, options: SplitOptions) -> SplitRun:
+        """A run of a flow that is bound to its system.
+
+        Raises
+        ------
+        ValueError
+            If the system cannot be compiled, or no solution from the domain exists up to Δt.
+        """
+        return cls(flow, system, domain, None, options, SplitFit(flow, system, domain, options))
+
+    def next_minimum(self, stop: Stop) -> Minimum:
+        """At Δt, its x the numbers u: from the flow as it is, then from random ones."""
+        fit, restart, last = self.fit, len(self.minima), len(self.fit.t) - 1
+        u = fit.random(restart) if restart else fit.current(fit.t[last])
+        return fit.minimize(u, last, self.options.steps, stop)
+
+    def found(self, minimum: Minimum) -> dict[str, float]:
+        self.history.append({"step": len(self.minima), "loss": minimum.cost, "iterations": minimum.iterations})
+        return self.history[-1]
+
+    def complete(self, session: Session) -> None:
+        u = self.fit.current(self.fit.t[-1])  # if there was no time for a start
+        if self.minima:
+            best = min(self.minima, key=lambda m: m.cost)
+            if not math.isfinite(best.cost):
+                raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
+            u = best.x
+        whole = self.fit.whole(u, session.spent)
+        last = {"step": len(self.minima), "loss": whole.cost, "iterations": whole.iterations}
+        self.history.append(last | self.fit.errors())
 
 
 def _phases(share: np.ndarray) -> np.ndarray:
@@ -41,23 +85,22 @@ def _phases(share: np.ndarray) -> np.ndarray:
 class SplitFit:
     """Labels in modes, and the flow's coefficients as numbers: those of the first half of the palindrome."""
 
-    def __init__(self, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, config: SplitConfig) -> None:
-        self.flow, self.config, self.parts = flow, config, flow.parts
-        self.kernel: PartsKernel = kernel_of(self.parts, PartsKernel)
-        self.kernel.source()
+    def __init__(self, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, options: SplitOptions) -> None:
+        self.flow, self.options, self.parts = flow, options, flow.parts
+        self.kernel = parts_loops(self.parts)
         self.columns = flow.columns()
         ends = np.cumsum([(c.n + 1) // 2 for c in self.columns])
         self.slices = [slice(int(end) - (c.n + 1) // 2, int(end)) for c, end in zip(self.columns, ends, strict=True)]
         self.n = int(ends[-1]) if len(ends) else 0
-        t = flow.dt * _phases(np.arange(1, config.label_times + 1) / config.label_times)
-        x = states(domain, config.points, config.seed, Stream.RESIDUAL)
+        t = flow.dt * _phases(np.arange(1, options.label_times + 1) / options.label_times)
+        x = states(domain, options.points, options.seed, Stream.RESIDUAL)
         labels = Labels.of(system, x, t)
         if len(labels.x) == 0:
             raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
         self.t, self.z, self.labels = t, self._modes(labels.x), [self._modes(y) for y in labels.y]
         self.unit = self._unit(float(np.std(system.hamiltonian(labels.x))))
-        x = states(domain, config.reference_states, config.seed, Stream.REFERENCE)
-        between = _phases((np.arange(2 * config.label_times) + 1) / (2 * config.label_times))
+        x = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
+        between = _phases((np.arange(2 * options.label_times) + 1) / (2 * options.label_times))
         self.held_out = Labels.of(system, x, flow.dt * between)
 
     def _modes(self, y: np.ndarray) -> np.ndarray:
@@ -120,7 +163,7 @@ class SplitFit:
             blocks.append(block)
         return offset, np.concatenate(blocks, axis=1)
 
-    def minimize(self, u: np.ndarray, j: int, iterations: int, stop: Callable[[], bool], pull: float = 0.0) -> Minimum:
+    def minimize(self, u: np.ndarray, j: int, iterations: int, stop: Stop, pull: float = 0.0) -> Minimum:
         """The numbers at the j-th time that fit the labels best, pulled towards equal steps."""
         offset, design = self.frozen(self.t[j])
         unit, equal = self.units(self.t[j]), self.equal(self.t[j])
@@ -157,7 +200,7 @@ class SplitFit:
         return u
 
     def random(self, restart: int) -> np.ndarray:
-        rng = np.random.default_rng([stream_seed(self.config.seed, Stream.RESTARTS), restart])
+        rng = np.random.default_rng([stream_seed(self.options.seed, Stream.RESTARTS), restart])
         u, dt = np.empty(self.n), self.flow.dt
         for c, part in zip(self.columns, self.slices, strict=True):
             m = (c.n + 1) // 2
@@ -172,7 +215,7 @@ class SplitFit:
 
     # all times ----------------------------------------------------------------------------------------------
 
-    def whole(self, u: np.ndarray, stop: Callable[[], bool]) -> Minimum:
+    def whole(self, u: np.ndarray, stop: Stop) -> Minimum:
         """The polynomials, put through the numbers followed from the least time up, then fitted to all labels.
 
         Where that path ends far from the best numbers at Δt, these are followed down instead.
@@ -188,7 +231,7 @@ class SplitFit:
         b = ((np.array(followed) - offsets) / scale).ravel()
         A = np.concatenate([A, ROUGHNESS * np.eye(A.shape[1])])
         theta = np.linalg.lstsq(A, np.concatenate([b, np.zeros(A.shape[1])]), rcond=None)[0]
-        weight = np.where(np.arange(len(self.t)) == len(self.t) - 1, self.config.frozen_weight, 1.0)
+        weight = np.where(np.arange(len(self.t)) == len(self.t) - 1, self.options.frozen_weight, 1.0)
         weight /= math.sqrt(len(self.t))
 
         equal, bend = np.array([self.equal(t) for t in self.t]), (weight * pulls)[:, None] / scale
@@ -203,11 +246,11 @@ class SplitFit:
             data = [weight[j] * self.jacobian(u[j], j) @ designs[j] for j in range(len(self.t))]
             return residuals(theta), np.concatenate([*data, *(bend[..., None] * designs)])
 
-        m = levenberg_marquardt(residuals, linearized, theta, iterations=self.config.steps, stop=stop)
+        m = levenberg_marquardt(residuals, linearized, theta, iterations=self.options.steps, stop=stop)
         self.assign(m.x)
         return m
 
-    def follow(self, u: np.ndarray, order: range, stop: Callable[[], bool]) -> list[np.ndarray]:
+    def follow(self, u: np.ndarray, order: range, stop: Stop) -> list[np.ndarray]:
         """The numbers at the times in order, each from those at the time before, the first from u."""
         followed: list[np.ndarray] = []
         for j in order:

@@ -1,136 +1,207 @@
-"""How a training starts: the run of a flow and its optimizer, with the choices that it takes."""
+"""Flows to start a training from: their shapes, and the primed flow to fit where nothing else is said."""
 
 from __future__ import annotations
 
-import copy
-from typing import Any
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
 
+import numpy as np
 import torch
 
-from sympflow.flow.base import FlowMap
+from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.mlp import MLPFlow, matching_widths
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.split import SplitFlow
+from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.training.architecture import (
-    NOT_OF_SEARCHES,
-    OF_GRADIENTS,
-    OF_LOSSES,
-    OF_SEARCHES,
-    new_network,
-    refuse_options,
-)
-from sympflow.training.arguments import digest, labels_of, weights_of
-from sympflow.training.collocation import Stream, states
-from sympflow.training.config import TrainingConfig
-from sympflow.training.gauss_newton import GaussNewtonRun
-from sympflow.training.run import Labelled, Run
-from sympflow.training.search_config import SplitConfig, TableConfig
-from sympflow.training.split_run import SplitRun
+from sympflow.training.options import NewFlow
+from sympflow.training.points import Stream, states
+from sympflow.training.table_fit import take_over
 
 SCALING_SAMPLES = 4096
+SAMPLES, SEED = 1000, 0
+QUANTILE = 0.99
+PHASE = 1.0  # ω Δt of the default flow: energy errors of 1e-8 to 1e-5, where its gain in time is the largest
+KICK_PHASE = 0.25  # ω Δt for each kick of the kernel
+MOST_STAGES = 24
 
 
-def start(
-    system: HamiltonianSystem, domain: Domain, kind: str, flow: FlowMap | None, given: dict[str, Any]
-) -> Run | GaussNewtonRun | SplitRun:
-    """The run of a copy of a flow, or of a new network if there is none; `given` are the arguments of `train`."""
-    optimizer, dtype = given["optimizer"], given["dtype"]
-    if optimizer is None:
-        optimizer = "gauss-newton" if kind in ("primed", "split") else "adam"
-    single = dtype not in (None, torch.float64) or (flow is not None and flow.dtype != torch.float64)
-    if optimizer == "gauss-newton" and single:
-        raise TypeError("`optimizer` 'gauss-newton' fits flows in float64: leave out `dtype`, or use 'adam'.")
-    if flow is not None:
-        flow = copy.deepcopy(flow).bound(system)
-        flow.certified = None  # of the numbers as they were
-    if optimizer == "gauss-newton" and isinstance(flow, PrimedFlow):
-        return _of_primed(system, domain, flow, given)
-    if optimizer == "gauss-newton" and isinstance(flow, SplitFlow):
-        return _of_split(system, domain, flow, given)
-    return _of_gradients(system, domain, kind, flow, optimizer, given)
+class Start(Protocol):
+    """A flow before its training, of a `kind` that the command of the shipped flows knows."""
+
+    @property
+    def kind(self) -> str: ...
+
+    def flow(self, system: HamiltonianSystem, domain: Domain, earlier: FlowMap | None = None) -> FlowMap:
+        """The flow; `earlier` is one that was trained before, whose numbers it may take over."""
 
 
-def check_fit(given: dict[str, Any]) -> None:
-    """Raise if the fit of a new primed flow cannot be as the arguments of `train` say."""
-    if given["optimizer"] in (None, "gauss-newton"):
-        _table_config(given, None)
+# primed flows ---------------------------------------------------------------------------------------------------
 
 
-def _table_config(given: dict[str, Any], handed: Labelled | None) -> TableConfig:
-    what, loss = "optimizer 'gauss-newton' for primed flows", given["loss"]
-    refuse_options(given, NOT_OF_SEARCHES, what)
-    if loss is None:
-        refuse_options(given, OF_LOSSES, f"{what} without a `loss`")
-    names = ("points", "steps", "restarts", "label_times", "frozen_weight", "energy_weight", "matching_times")
-    return TableConfig(
-        **_chosen(given, (*names, "seed", "reference_states")),
-        **_weights("labels" if loss is None else loss, given),
-        data=None if handed is None else digest(handed),
-    )
+@dataclass(frozen=True)
+class Primed:
+    """A primed flow, see `SympFlow.primed`.
 
+    Parameters
+    ----------
+    dt : float
+        Δt.
+    stages : int
+        Kicks of the kernel K.
+    processor : int
+        Kicks of the processor χ.
+    curvature : bool
+        Whether kicks have curvature terms.
+    polynomial : int, optional
+        The degree of the polynomials in place of these.
+    first : {"drift", "kick"}
+    scheme : str, optional
+        A scheme of `stages` kicks, from which the search starts in place of equal leapfrog steps: one of a high order
+        leads to valleys that random tables, most of whose numbers are positive, do not lie near.
+    """
 
-def _of_primed(system: HamiltonianSystem, domain: Domain, flow: PrimedFlow, given: dict[str, Any]) -> GaussNewtonRun:
-    handed = None if given["data"] is None else labels_of(given["data"], system, flow.dt)
-    config = _table_config(given, handed)
-    return GaussNewtonRun.start(flow, system, domain, _scaling(domain, flow.dt, config.seed), config, handed)
+    dt: float
+    stages: int = 3
+    processor: int = 6
+    curvature: bool = False
+    polynomial: int | None = None
+    first: str = "drift"
+    scheme: str | None = None
 
+    kind: ClassVar[str] = "primed"
 
-def _of_split(system: HamiltonianSystem, domain: Domain, flow: SplitFlow, given: dict[str, Any]) -> SplitRun:
-    if given["loss"] not in (None, "labels"):
-        raise ValueError(f"`loss` {given['loss']!r} is not one that Gauss–Newton fits split flows by: use 'labels'.")
-    others = (*NOT_OF_SEARCHES, *OF_LOSSES, "data", "energy_weight")
-    refuse_options(given, others, "optimizer 'gauss-newton' for split flows")
-    names = ("points", "steps", "restarts", "label_times", "frozen_weight", "seed", "reference_states")
-    return SplitRun.start(flow, system, domain, SplitConfig(**_chosen(given, names)))
-
-
-def _of_gradients(
-    system: HamiltonianSystem,
-    domain: Domain,
-    kind: str,
-    flow: FlowMap | None,
-    optimizer: str,
-    given: dict[str, Any],
-) -> Run:
-    refuse_options(given, OF_SEARCHES, f"optimizer {optimizer!r} for flows of kind {kind!r}")
-    if optimizer != "adam":
-        refuse_options(given, OF_GRADIENTS, f"optimizer {optimizer!r}")
-    names = ("residual_weight", "matching_weight", "label_weight")
-    weights = {n: given[n] for n in names} if given["loss"] is None else _weights(given["loss"], given)
-    if kind == "mlp" and weights["matching_weight"]:
-        raise ValueError("`matching_weight` needs a Hamiltonian, which an MLP flow has not: leave it out.")
-    dt = flow.dt if flow is not None else 1.0 if given["dt"] is None else float(given["dt"])
-    labels = None if given["data"] is None else labels_of(given["data"], system, dt)
-    if weights["matching_weight"] is None:
-        weights["matching_weight"] = 0.0 if kind == "mlp" or optimizer == "gauss-newton" else 1.0
-    if weights["label_weight"] is None:
-        weights["label_weight"] = 0.0 if labels is None else 1.0
-    own = ["steps", "points", "refresh", "validate_every", "checkpoint_every", "matching_times", "label_times", "seed"]
-    own += ["validation_points", "reference_states", *OF_GRADIENTS]
-    choices = {**{name: given[name] for name in own}, **weights}
-    if choices["label_times"] is None:
-        del choices["label_times"]
-    config = TrainingConfig.of(optimizer, data=None if labels is None else digest(labels), **choices)
-    scaling = _scaling(domain, dt, config.seed)
-    if flow is None:
-        flow = new_network(system, kind, dt, scaling, given)
-    return Run.start(flow.requires_grad_(True), system, domain, scaling, config, labels)
-
-
-def _weights(loss: str, given: dict[str, Any]) -> dict[str, Any]:
-    names = ("residual_weight", "matching_weight", "label_weight")
-    if given["data"] is not None and isinstance(loss, str) and "labels" not in loss.split("+"):
-        raise ValueError(
-            f"`data` has labels, which `loss` {loss!r} does not use: add +labels to it, or leave `data` out."
+    def flow(
+        self, system: HamiltonianSystem, domain: Domain | None = None, earlier: FlowMap | None = None
+    ) -> PrimedFlow:
+        flow = SympFlow.primed(
+            system,
+            self.stages if self.scheme is None else None,
+            dt=self.dt,
+            scheme=self.scheme,
+            first=self.first,
+            processor=self.processor,
+            curvature=self.curvature,
+            polynomial=self.polynomial,
         )
-    return dict(zip(names, weights_of(loss, *(given[name] for name in names)), strict=True))
+        if earlier is not None:
+            assert isinstance(earlier, PrimedFlow)
+            take_over(flow, earlier)
+        return flow
 
 
-def _chosen(given: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
-    return {name: given[name] for name in names if given[name] is not None}
+def default_primed(
+    system: HamiltonianSystem, domain: Domain | None = None, dt: float | None = None, phase: float = PHASE
+) -> Primed:
+    """Three kicks and a processor of six, with Δt such that ω Δt is about 1; for a given Δt as many kicks as it needs.
+
+    ω is the fastest frequency of the linearized motion, √ of the largest eigenvalue of M⁻¹∇²V, that 99 % of the states
+    of the domain stay below. The processor costs nothing over a long run, and is larger than the kernel for that.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        Separable.
+    domain : Domain, optional
+        Ω; the default is that of the system.
+    dt : float, optional
+        Δt.
+    phase : float
+        Another ω Δt, where no Δt is given.
+    """
+    omega = frequency(system, system.domain if domain is None else domain)
+    if dt is None:
+        return Primed(_rounded(phase / omega))
+    return Primed(float(dt), min(max(2, math.ceil(omega * dt / KICK_PHASE - 1e-9)), MOST_STAGES))
 
 
-def _scaling(domain: Domain, dt: float, seed: int) -> Scaling:
+def frequency(system: HamiltonianSystem, domain: Domain | None) -> float:
+    """The fastest frequency of the linearized motion that 99 % of the states of the domain stay below."""
+    if domain is None:
+        raise ValueError(f"`domain` is not known for the system {system.name!r}: pass one.")
+    y = domain.sample(SAMPLES, SEED)
+    q, p = y[:, : system.ndof], y[:, system.ndof :]
+    product = system.kinetic_hessian(p) @ system.potential_hessian(q)
+    squares = np.linalg.eigvals(product).real.max(-1)
+    squares = squares[np.isfinite(squares)]
+    omega = math.sqrt(max(float(np.quantile(squares, QUANTILE)), 0.0)) if len(squares) else 0.0
+    if omega == 0.0:  # nowhere bound: what a state needs to cross the domain
+        speed = np.linalg.norm(system.velocity(p), axis=-1)
+        omega = float(np.quantile(speed, QUANTILE) / max(float(q.std(0).max()), np.finfo(float).tiny)) or 1.0
+    return omega
+
+
+def _rounded(dt: float) -> float:
+    """The largest of 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6 and 8 times a power of ten that is no longer, to 2 %."""
+    unit = 10.0 ** math.floor(math.log10(dt * 1.02))
+    return float(f"{max(m for m in (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8) if m * unit <= dt * 1.02) * unit:.3g}")
+
+
+# split flows and networks ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Split:
+    """A split flow of a stiff system, see `SympFlow.split`; `turn` is Δt times the fastest frequency."""
+
+    turn: float
+    stages: int
+    terms: int
+    force_gradient: bool | tuple[int, ...] | None = None
+
+    kind: ClassVar[str] = "split"
+
+    def flow(
+        self, system: HamiltonianSystem, domain: Domain | None = None, earlier: FlowMap | None = None
+    ) -> SplitFlow:
+        dt = self.turn / float(system.linear_part.frequencies.max())
+        return SympFlow.split(system, dt=dt, stages=self.stages, terms=self.terms, force_gradient=self.force_gradient)
+
+
+def scaling_of(domain: Domain, dt: float, seed: int) -> Scaling:
+    """The units of x and t, from samples of the domain."""
     return Scaling.of_samples(states(domain, SCALING_SAMPLES, seed, Stream.SCALING), dt)
+
+
+def new_network(system: HamiltonianSystem, new: NewFlow, dt: float, scaling: Scaling, seed: int) -> FlowMap:
+    """A SympFlow with MLP potentials, or the baseline of as many parameters.
+
+    Raises
+    ------
+    ValueError
+        If no baseline has as many parameters.
+    """
+    activation = "tanh" if new.activation is None else new.activation
+    flow = SympFlow(
+        system.ndof,
+        3 if new.pairs is None else new.pairs,
+        (10, 10) if new.hidden is None else new.hidden,
+        activation,
+        dt,
+        torch.float64 if new.dtype is None else new.dtype,
+        new.device,
+        seed,
+        scaling,
+    )
+    if new.kind != "mlp":
+        return flow
+    if matching_widths(flow.ndof, flow.n_parameters) is None:
+        raise ValueError(
+            f"`hidden` and `pairs` describe a SympFlow of only {flow.n_parameters} parameters, which no "
+            "MLPFlow matches within 2 %: give wider layers or more pairs."
+        )
+    return MLPFlow.matching(flow, seed, scaling, activation)
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network of the default widths, its `kind` "sympflow" or "mlp"."""
+
+    kind: str = "sympflow"
+    dt: float = 1.0
+
+    def flow(self, system: HamiltonianSystem, domain: Domain, earlier: FlowMap | None = None) -> FlowMap:
+        return new_network(system, NewFlow(self.kind), self.dt, scaling_of(domain, self.dt, SEED), SEED)

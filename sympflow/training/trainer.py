@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-import time
+import copy
+import difflib
+import inspect
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,17 +13,35 @@ import torch
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import plain
-from sympflow.flow.arguments import check_system
-from sympflow.flow.base import FlowMap
-from sympflow.hamiltonian.domain import Domain
+from sympflow.flow.flow_map import FlowMap, check_system
+from sympflow.flow.primed import PrimedFlow
+from sympflow.flow.split import SplitFlow
+from sympflow.flow.sympflow import SympFlow
+from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.training.architecture import check_flow, kind_of, new_primed
-from sympflow.training.arguments import check_surroundings, domain_for, refuse_unknown
-from sympflow.training.interruption import Interruption
-from sympflow.training.recipes import BUDGET
-from sympflow.training.run import Path
-from sympflow.training.search import SearchRun
-from sympflow.training.starts import check_fit, start
+from sympflow.training import checkpoint as checkpoints
+from sympflow.training import trials
+from sympflow.training.network_fit import LossRun
+from sympflow.training.options import (
+    KINDS,
+    OF_LOSSES,
+    OF_SEARCHES,
+    LossOptions,
+    NewFit,
+    NewFlow,
+    SplitOptions,
+    TableOptions,
+    is_number,
+    plain_numbers,
+)
+from sympflow.training.points import digest, handed_in
+from sympflow.training.runs import Run, SearchRun
+from sympflow.training.session import Path, Session
+from sympflow.training.split_fit import SplitRun
+from sympflow.training.starts import default_primed, new_network, scaling_of
+from sympflow.training.table_fit import TableRun
+
+BUDGET = 60.0  # seconds of a fit of which nothing else is said
 
 
 def train(
@@ -80,7 +101,7 @@ def train(
     system : HamiltonianSystem
     dt : float, optional
         Δt, the longest time of the map; the default is that of `flow`, for a new primed flow what suits the system's
-        frequencies on Ω (see `sympflow.training.recipes`) and gains most in trials, else 1.
+        frequencies on Ω (see `sympflow.training.starts`) and gains most in trials, else 1.
     kind : {"primed", "sympflow", "mlp"}, optional
         The architecture: a SympFlow primed with the system's V and T; one with MLP potentials; or the unconstrained
         baseline with as many parameters as the SympFlow that `pairs` and `hidden` describe. The default is "primed"
@@ -99,9 +120,9 @@ def train(
         better.
     steps, points, residual_weight, matching_weight, label_weight, matching_times, learning_rate, schedule, clip,
     refresh, seed, validate_every, validation_points, reference_states, checkpoint_every
-        See `TrainingConfig`. What is left out gets the optimizer's own default: 20,000 steps on 700 fresh points
-        for Adam, at most 200 on 1500 fixed points for Gauss–Newton. A baseline has no Hamiltonian, so its matching
-        weight is 0; Gauss–Newton leaves matching out as well, unless it is given a weight.
+        See `sympflow.training.options.LossOptions`. What is left out gets the optimizer's own default: 20,000 steps on
+        700 fresh points for Adam, at most 200 on 1500 fixed points for Gauss–Newton. A baseline has no Hamiltonian, so
+        its matching weight is 0; Gauss–Newton leaves matching out as well, unless it is given a weight.
     data : (array (n,), array (n, 2d), array (n, 2d)), optional
         Labels of a network: times in [0, dt], states, and where the exact flow takes them; a tenth is held out.
         `label_weight` is then 1. Without data, labels are made where `label_weight` is given.
@@ -110,7 +131,8 @@ def train(
         default is "labels" for primed flows with optimizer="gauss-newton", else what the weights say.
     restarts, label_times, frozen_weight
         Of "gauss-newton" on a primed or a split flow, which takes of those above `steps`, `points`, `seed` and
-        `reference_states`: see `search_config`. `label_times` counts for a network's `label_weight` too.
+        `reference_states`: see `sympflow.training.options.SearchOptions`. `label_times` counts for a network's
+        `label_weight` too.
     energy_weight : float, optional
         Of "gauss-newton" on a primed flow: how much an error in the energy counts beside those of the coordinates. 10
         by default; 1000 for runs of which only the energy matters, 0 for none.
@@ -154,30 +176,247 @@ def train(
     KeyboardInterrupt
         On Ctrl-C before there is anything to return, or twice.
     """
-    given, begin = {name: plain(value) for name, value in locals().items()}, time.perf_counter()
-    refuse_unknown(given.pop("unknown"))
+    _refuse_unknown(unknown)
     check_system(system)
-    check_surroundings(given)
-    dt, time_budget = given["dt"], given["time_budget"]
-    domain = domain_for(system, domain)
-    hurried = flow is None and time_budget is None and restarts is None and steps is None and resume is None
-    kind = kind_of(system, given)
-    with Interruption() as interruption:
+    dt = plain(dt)
+    if dt is not None and not (is_number(dt) and 0 < dt < math.inf):
+        raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
+    session = Session(checkpoint, resume, plain(time_budget), progress, callback)
+    new = NewFlow(kind, stages, processor, pairs, hidden, activation, dtype, device)
+    asked = NewFit(
+        optimizer=optimizer,
+        loss=loss,
+        steps=steps,
+        points=points,
+        learning_rate=learning_rate,
+        schedule=schedule,
+        clip=clip,
+        refresh=refresh,
+        validate_every=validate_every,
+        validation_points=validation_points,
+        checkpoint_every=checkpoint_every,
+        residual_weight=residual_weight,
+        matching_weight=matching_weight,
+        label_weight=label_weight,
+        matching_times=matching_times,
+        data=data,
+        seed=seed,
+        reference_states=reference_states,
+        restarts=restarts,
+        label_times=label_times,
+        frozen_weight=frozen_weight,
+        energy_weight=energy_weight,
+    )
+    return fit_flow(system, dt, flow, plain_numbers(new), plain_numbers(asked), domain, session)
+
+
+def fit_flow(
+    system: HamiltonianSystem,
+    dt: float | None,
+    flow: FlowMap | None,
+    new: NewFlow,
+    asked: NewFit,
+    domain: Domain | None,
+    session: Session,
+) -> Any:
+    """`train`, its arguments sorted: a new flow or a given one, its fit, and the surroundings of the run."""
+    domain = _domain_for(system, domain)
+    untold = flow is None and asked.restarts is None and asked.steps is None
+    hurried = untold and session.time_budget is None and session.resume is None
+    kind = _kind_of(system, flow, new, asked)
+    with session.interruption:
         tried = None
         if flow is not None:
-            check_flow(flow, system, dt)
+            _check_flow(flow, system, dt)
         elif kind == "primed":
-            check_fit(given)
-            flow, tried = new_primed(system, domain, given, interruption)
-        run = start(system, domain, kind, flow, given)
-        if resume is not None:
-            run.load(resume)
-        if isinstance(run, SearchRun):
-            run.interruption, run.tried = interruption, tried
+            if asked.searches:
+                TableOptions.of(asked)  # raises before trials
+            flow, tried = _new_primed(system, domain, dt, new, asked, session)
+        run = _run_of(system, domain, kind, flow, tried, dt, new, asked)
+        if session.resume is not None:
+            run.load(session.resume)
         hurried = hurried and isinstance(run, SearchRun)
-        passed = time.perf_counter() - begin  # trials, labels and their compilation
-        run.seconds += passed
-        if (seconds := BUDGET if hurried else time_budget) is not None:
-            time_budget = max(seconds - passed, min(seconds, 1.0))
-        reason = run.go(checkpoint, time_budget, progress, callback)
+        if hurried:
+            session.time_budget = BUDGET
+        run.seconds += session.begin_run()
+        reason = run.go(session)
     return run.finish(reason, expected=hurried)
+
+
+# arguments --------------------------------------------------------------------------------------------------------
+
+
+def _refuse_unknown(options: dict[str, Any]) -> None:
+    """Raise if there are options that `train` does not have, with what may be meant."""
+    known = [each for each in inspect.signature(train).parameters if each != "unknown"]
+    for name, value in options.items():
+        for maker in (SympFlow.primed, SympFlow.split):
+            if name in inspect.signature(maker).parameters:
+                by = maker.__qualname__
+                raise TypeError(f"`{name}` is an option of {by}: pass flow={by}(system, ..., {name}={value!r}).")
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"is `{close[0]}` meant?" if close else f"choose from {', '.join(known[1:])}."
+        raise TypeError(f"`{name}` is no option of train(): {hint}")
+
+
+def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
+    """Ω of a training: the domain that is given, else that of the system; checked."""
+    domain = system.domain if domain is None else domain
+    if domain is None:
+        raise ValueError(
+            f"`domain` is not known for the system {system.name!r}: pass the states to train on, as by "
+            "domain=sympflow.Box(low, high), sympflow.Ball(center, radius) or sympflow.EnergySublevel(energy, box)."
+        )
+    if not isinstance(domain, Domain):
+        raise TypeError(
+            f"`domain` must be a domain of phase space; got {domain!r}: use sympflow.Box(low, high), "
+            "sympflow.Ball(center, radius) or sympflow.EnergySublevel(energy, box)."
+        )
+    if isinstance(domain, EnergySublevel):
+        domain = domain.attach(system.hamiltonian)
+    width = domain.sample(1, 0).shape[-1]
+    if width != 2 * system.ndof:
+        raise ValueError(f"`domain` has states of length {width}, the system {2 * system.ndof}: give [q, p].")
+    return domain
+
+
+def _check_flow(flow: FlowMap, system: HamiltonianSystem, dt: float | None) -> None:
+    if dt is not None and dt != flow.dt:
+        raise ValueError(f"`dt` is {dt!r} but the flow has {flow.dt!r}: leave `dt` out to train it further.")
+    flow.check_system(system)
+
+
+# which flow -------------------------------------------------------------------------------------------------------
+
+
+def _kind_of(system: HamiltonianSystem, flow: FlowMap | None, new: NewFlow, asked: NewFit) -> str:
+    """The kind of the given flow, or of the new one that the arguments of `train` describe; these are checked."""
+    if flow is not None:
+        if not isinstance(flow, FlowMap):
+            raise TypeError(f"`flow` must be a SympFlow or an MLPFlow; got {flow!r}: leave it out for a new one.")
+        for name in new.given():
+            raise ValueError(f"`{name}` describes a new flow, but `flow` is given: leave out one of them.")
+        searched = {"primed": PrimedFlow, "split": SplitFlow}  # by Gauss–Newton; any other flow is fitted as a network
+        return next((kind for kind, family in searched.items() if isinstance(flow, family)), flow.kind)
+    kind = _meant(system, new, asked) if new.kind is None else new.kind
+    if kind not in KINDS:
+        raise ValueError(f"`kind` {kind!r} is unknown: choose one of {', '.join(KINDS)}.")
+    for name in new.given(NewFlow.OF_NETWORKS if kind == "primed" else NewFlow.OF_PRIMED):
+        raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
+    if kind == "primed":
+        _check_primable(system, new, asked)
+    return kind
+
+
+def _meant(system: HamiltonianSystem, new: NewFlow, asked: NewFit) -> str:
+    """The kind that is meant where none is named."""
+    searched = asked.given(OF_SEARCHES)
+    fits = system.separable and system.quadratic_kinetic
+    if searched and not fits:
+        raise ValueError(
+            f"`{searched[0]}` is of the search for primed flows by Gauss–Newton, which needs H = ½ pᵀM⁻¹p + V(q); "
+            f"{system.name!r} is of another form: leave it out for a network, or pass kind='primed', optimizer='bfgs'."
+        )
+    if searched or new.given(NewFlow.OF_PRIMED):
+        return "primed"
+    of_networks = asked.beside(TableOptions)
+    if asked.loss is None:
+        of_networks += asked.given((*OF_LOSSES, "data"))
+    wants_network = not asked.searches or of_networks or new.given(NewFlow.OF_NETWORKS)
+    return "primed" if fits and system.symbols is not None and not wants_network else "sympflow"
+
+
+def _check_primable(system: HamiltonianSystem, new: NewFlow, asked: NewFit) -> None:
+    """Raise if a new primed flow of the system cannot be made, or not be fitted by its optimizer."""
+    given = new.given(("kind", *NewFlow.OF_PRIMED)) + asked.given(OF_SEARCHES)
+    named = " and ".join(f"`{name}`" for name in given)
+    needs = f"{named} asks for a flow primed with V and T"
+    if not system.separable:
+        raise ValueError(
+            f"{needs}, but the system {system.name!r} has one function H, not known as T(p) + V(q): leave out {named} "
+            "for a network, or define the system with HamiltonianSystem.from_sympy."
+        )
+    if not system.quadratic_kinetic and asked.searches:
+        raise ValueError(
+            f"{needs}, whose table Gauss–Newton fits only where T = ½ pᵀM⁻¹p, as it is not in the system "
+            f"{system.name!r}: leave out {named} for a network, or pass optimizer='bfgs'."
+        )
+
+
+def _new_primed(
+    system: HamiltonianSystem, domain: Domain, dt: float | None, new: NewFlow, asked: NewFit, session: Session
+) -> tuple[PrimedFlow, PrimedFlow | None]:
+    """A new primed flow, and the one that was fitted in a trial if there were any.
+
+    Where nothing is said of the flow and its fit, trials choose it; of a run to go on with it is that one's, if it is
+    one of those that are tried. Else what is not given is as `default_primed` has it, Δt in proportion to the kicks.
+    """
+    stages, processor = new.stages, new.processor
+    can_try = dt is None and not new.given(("stages", "processor", "dtype", "device")) and trials.can_try(system)
+    if can_try and session.resume is not None:
+        theirs = checkpoints.read(session.resume)["architecture"]
+        for start in trials.tried_starts(system, domain):
+            flow = start.flow(system)
+            if checkpoints.identity(flow, system, {})["architecture"] == theirs:
+                return flow, None
+    elif can_try and _fit_is_untold(asked, session):
+        trial = trials.chosen_trial(system, domain, session)
+        return trial.start.flow(system), trial.flow
+    if system.separable and (dt is None or stages is None or processor is None):
+        default = default_primed(system, domain, dt)
+        if dt is None:
+            dt = default.dt if stages is None else float(f"{default.dt * stages / default.stages:.3g}")
+        stages = default.stages if stages is None else stages
+        processor = default.processor if processor is None else processor
+    flow = SympFlow.primed(
+        system,
+        stages,
+        dt=1.0 if dt is None else float(dt),
+        processor=0 if processor is None else processor,
+        dtype=torch.float64 if new.dtype is None else new.dtype,
+        device=new.device,
+    )
+    return flow, None
+
+
+def _fit_is_untold(asked: NewFit, session: Session) -> bool:
+    """Whether nothing is said of the fit of a new flow, and there is time for trials."""
+    hurried = session.time_budget is not None and session.time_budget < BUDGET
+    return asked.searches and not hurried and not set(asked.given()) - {"optimizer", "seed", "reference_states"}
+
+
+# which fit --------------------------------------------------------------------------------------------------------
+
+
+def _run_of(
+    system: HamiltonianSystem,
+    domain: Domain,
+    kind: str,
+    flow: FlowMap | None,
+    tried: PrimedFlow | None,
+    dt: float | None,
+    new: NewFlow,
+    asked: NewFit,
+) -> Run:
+    """The run of a copy of a flow, or of a new network if there is none."""
+    searched = kind in ("primed", "split") and asked.searches
+    double = new.dtype in (None, torch.float64) and (flow is None or flow.dtype == torch.float64)
+    if not double and (searched or asked.optimizer == "gauss-newton"):
+        raise TypeError("`optimizer` 'gauss-newton' fits flows in float64: leave out `dtype`, or use 'adam'.")
+    if flow is not None:
+        flow = copy.deepcopy(flow).bound(system)
+        flow.certified = None  # of the numbers as they were
+        dt = flow.dt
+    if searched and isinstance(flow, SplitFlow):
+        return SplitRun.start(flow, system, domain, SplitOptions.of(asked))
+    dt = 1.0 if dt is None else float(dt)
+    labels = None if asked.data is None else handed_in(asked.data, system, dt)
+    checksum = None if labels is None else digest(labels)
+    if searched and isinstance(flow, PrimedFlow):
+        table = TableOptions.of(asked, checksum)
+        return TableRun.start(flow, system, domain, scaling_of(domain, dt, table.seed), table, labels, tried)
+    options = LossOptions.of(asked, kind, checksum)
+    scaling = scaling_of(domain, dt, options.seed)
+    if flow is None:
+        flow = new_network(system, new, dt, scaling, options.seed)
+    return LossRun.start(flow.requires_grad_(True), system, domain, scaling, options, labels)

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
-from sympflow.training.collocation import Stream, states
-from sympflow.training.gauss_newton import GaussNewtonRun
-from sympflow.training.recipes import PHASE, PrimedRecipe, default_recipe
-from sympflow.training.search_config import TableConfig
-from sympflow.training.table_errors import USELESS, shares_missed
-from sympflow.training.watch import Watch
+from sympflow.training.options import TableOptions
+from sympflow.training.points import Stream, states
+from sympflow.training.session import Session
+from sympflow.training.starts import PHASE, SEED, Primed, default_primed
+from sympflow.training.table_fit import USELESS, TableRun, shares_missed
 
 PHASES = (PHASE, 1.25, 1.5)  # ω Δt of the flows that are tried
 STARTS, STEPS, FINAL_STEPS, POINTS = 6, 40, 160, 80  # of a trial's search, and what follows the best start
@@ -28,8 +28,22 @@ GOAL = 1e-5  # the energy error of a trial that a default flow shall not exceed,
 ALIKE = 2.0  # energy errors above that which differ by no more are the same
 
 
-def chosen_recipe(system: HamiltonianSystem, domain: Domain, watch: Watch | None = None) -> PrimedRecipe:
-    """The recipe of the flow that gains most: that of `default_recipe`, or one with a longer Δt or curvature terms.
+@dataclass(frozen=True)
+class Trial:
+    """The flow of a short fit, None if it leads nowhere, and its energy error."""
+
+    start: Primed
+    error: float
+    flow: PrimedFlow | None = None
+
+
+def can_try(system: HamiltonianSystem) -> bool:
+    """Whether trials apply to a system."""
+    return system.separable and system.quadratic_kinetic and system.symbols is not None and system.ndof <= MOST_NDOF
+
+
+def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | None = None) -> Trial:
+    """The flow that gains most: that of `default_primed`, or one with a longer Δt or curvature terms.
 
     Of each the table at Δt is fitted for a few seconds, and followed along held-out orbits. Where its energy error is
     e, the work of a classical scheme of order p is in proportion to e^(−1/p); so the flow gains most whose kicks take
@@ -42,85 +56,94 @@ def chosen_recipe(system: HamiltonianSystem, domain: Domain, watch: Watch | None
     system : HamiltonianSystem
         Separable, symbolic, T = ½ pᵀM⁻¹p.
     domain : Domain
-    watch : Watch, optional
-        It shows the trials, keeps their flows, and may end them: then it is the best so far.
+    session : Session, optional
+        It shows the trials, and may end them: then it is the best so far.
     """
     from sympflow.kernels.kicks import kick_cycles
 
     assert system.symbols is not None
-    recipes = tried_recipes(system, domain, curvature=False)
+    starts = tried_starts(system, domain, curvature=False)
     try:
         cycles = [kick_cycles(system.symbols, level) for level in (FORCE_GRADIENT, CURVATURE)]
     except ValueError:  # H has no compiled form
-        return recipes[0]
-    watch, errors = Watch() if watch is None else watch, dict[PrimedRecipe, float]()
+        return Trial(starts[0], math.inf)
+    session, found = Session() if session is None else session, dict[Primed, Trial]()
+    interruption = session.interruption
 
-    def best(tried: list[PrimedRecipe]) -> PrimedRecipe:
-        least = min(errors[recipe] for recipe in tried)
+    def best(tried: list[Primed]) -> Primed:
+        least = min(found[start].error for start in tried)
         worst = GOAL if least <= GOAL else ALIKE * least
         work = {
-            r: cycles[r.curvature] * r.stages / r.dt * errors[r] ** (1 / ORDER) for r in tried if errors[r] <= worst
+            start: cycles[start.curvature] * start.stages / start.dt * found[start].error ** (1 / ORDER)
+            for start in tried
+            if found[start].error <= worst
         }
         return min(work, key=work.__getitem__)
 
     bends = cycles[1] <= DEAREST * cycles[0]
-    with watch.bar(len(recipes) + bends, f"{system.name} trials") as bar:
+    with session.bar(len(starts) + bends, f"{system.name} trials") as bar:
 
-        def tried(recipe: PrimedRecipe) -> bool:
-            bar.tries(len(errors), f"Δt = {recipe.dt:g}{', with curvature terms' * recipe.curvature}")
-            error = trial_error(recipe, system, domain, watch)
-            if not watch.stopped():
-                errors[recipe] = error
-                watch.arm()
-            return recipe in errors
+        def tried(start: Primed) -> bool:
+            bar.tries(len(found), f"Δt = {start.dt:g}{', with curvature terms' * start.curvature}")
+            made = trial(start, system, domain, session)
+            if not interruption.asked:  # else it says nothing
+                found[start] = made
+                # from the first flow on Ctrl-C ends the trials
+                interruption.armed = interruption.armed or made.flow is not None
+            return start in found
 
-        plain = best([recipe for recipe in recipes if not watch.stopped() and tried(recipe)])
+        plain = best([start for start in starts if not interruption.asked and tried(start)])
         bent = replace(plain, curvature=True)
-        return best([plain, bent]) if bends and not watch.stopped() and tried(bent) else plain
+        more = bends and not interruption.asked and tried(bent)
+        return found[best([plain, bent]) if more else plain]
 
 
-def tried_recipes(system: HamiltonianSystem, domain: Domain, curvature: bool = True) -> list[PrimedRecipe]:
-    """Those that may be chosen, from the shortest Δt to the longest; with `curvature` those with such terms too."""
-    plain = list(dict.fromkeys(default_recipe(system, domain, phase=phase) for phase in PHASES))
-    return plain + [replace(recipe, curvature=True) for recipe in plain if curvature]
+def tried_starts(system: HamiltonianSystem, domain: Domain, curvature: bool = True) -> list[Primed]:
+    """The flows that may be chosen, from the shortest Δt to the longest; with `curvature` also with such terms."""
+    plain = list(dict.fromkeys(default_primed(system, domain, phase=phase) for phase in PHASES))
+    return plain + [replace(start, curvature=True) for start in plain if curvature]
 
 
-def trial_error(recipe: PrimedRecipe, system: HamiltonianSystem, domain: Domain, watch: Watch | None = None) -> float:
-    """The relative energy error of a short fit of the flow at its Δt, the median over held-out orbits.
+def trial(start: Primed, system: HamiltonianSystem, domain: Domain, session: Session | None = None) -> Trial:
+    """A short fit of the flow at its Δt, with its relative energy error, the median over held-out orbits.
 
     Infinite if there are no orbits, or the fit leads nowhere: where in the median it misses a tenth of what a step
     moves a state. The energy alone would be kept best by the identity.
     """
-    watch = Watch() if watch is None else watch
-    config = TableConfig(
-        points=POINTS, label_times=1, restarts=STARTS, steps=STEPS, reference_states=ORBITS, seed=recipe.seed
+    interruption = (Session() if session is None else session).interruption
+
+    def stopped() -> bool:
+        return interruption.asked
+
+    options = TableOptions(
+        points=POINTS, label_times=1, restarts=STARTS, steps=STEPS, reference_states=ORBITS, seed=SEED
     )
-    scaling = Scaling.of_samples(states(domain, 1000, recipe.seed, Stream.SCALING), recipe.dt)
+    scaling = Scaling.of_samples(states(domain, 1000, SEED, Stream.SCALING), start.dt)
     try:
-        run = GaussNewtonRun.start(recipe.flow(system), system, domain, scaling, config)
+        run = TableRun.start(start.flow(system), system, domain, scaling, options)
     except ValueError:  # of no state of Ω the solution exists up to Δt
-        return math.inf
+        return Trial(start, math.inf)
     fit = run.frozen
     assert fit is not None
     for _ in range(STARTS):
-        run.minima.append(run.next_minimum(watch.stopped))
+        run.minima.append(run.next_minimum(stopped))
     best = min(run.minima, key=lambda m: m.cost)
     for final in filter(None, (fit, run.weighted)):
-        best = final.minimize(best.x, FINAL_STEPS, watch.stopped, thorough=True)
+        best = final.minimize(best.x, FINAL_STEPS, stopped, thorough=True)
     table = fit.coefficients(best.x)[:, :1]
-    y = states(domain, ORBITS, recipe.seed, Stream.REFERENCE)
+    y = states(domain, ORBITS, SEED, Stream.REFERENCE)
     H, worst, y = system.hamiltonian(y), np.zeros(len(y)), y.T
     labels = run.held_out
     with np.errstate(all="ignore"):
         missed = run.step(table, labels.x.T).T - labels.y[-1]
         if not shares_missed(missed, labels, np.array(scaling.x))[1] < USELESS:
-            return math.inf
+            return Trial(start, math.inf)
         for _ in range(LENGTH):
             y = run.step(table, y)
             worst = np.maximum(worst, np.abs(system.hamiltonian(y.T) - H))
         worst /= np.abs(H) if system.energy_scale is None else system.energy_scale
     error = float(np.median(np.where(np.isnan(worst), np.inf, worst)))
-    if math.isfinite(error) and not watch.stopped():
-        run.table.assign(run.table.continued(table[:, 0]))
-        watch.flows[recipe] = run.flow
-    return error
+    if not math.isfinite(error) or interruption.asked:
+        return Trial(start, error)
+    run.table.assign(run.table.continued(table[:, 0]))
+    return Trial(start, error, run.flow)

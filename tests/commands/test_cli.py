@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sympflow.commands import app
-from sympflow.commands.arguments import method, scenes
+from sympflow.commands.words import method, scenes
 
 FAST = ["--t-end", "5", "--n-outputs", "40", "--repeats", "1"]
 

@@ -12,8 +12,8 @@ from safetensors.torch import load_file, save_file
 import sympflow
 from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, solve, systems
 from sympflow.flow.certificate import Certificate, Quantiles, upper_limit
-from sympflow.flow.io import KEY, load, shipped
-from sympflow.flow.shipped import named
+from sympflow.flow.files import KEY, load
+from sympflow.flow.shipped import named, shipped
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 QUICK = {"states": 300, "times": 9, "held_out": 20, "t_end": 100.0}
@@ -159,7 +159,7 @@ def test_the_measured_errors_are_those_of_solve():
 
 def test_long_runs_go_piece_by_piece(monkeypatch):
     whole = primed().certificate(HH, **QUICK)
-    monkeypatch.setattr("sympflow.flow.certification.SAVED_VALUES", 20 * 4 * 7)
+    monkeypatch.setattr("sympflow.flow.certificate.SAVED_VALUES", 20 * 4 * 7)
     pieces = primed().certificate(HH, **QUICK)
     assert pieces.left == whole.left
     # the rounding of a chaotic orbit differs where a piece begins

@@ -11,12 +11,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sympflow.flow.activations import ACTIVATIONS
+from sympflow.flow.flow_map import whole_steps
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.mlp import MLPFlow
-from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.potentials import ACTIVATIONS, MLPPotential
 from sympflow.flow.scaling import Scaling
-from sympflow.flow.steps import whole_steps
 from sympflow.flow.sympflow import SympFlow
 from sympflow.systems import harmonic_oscillator
 

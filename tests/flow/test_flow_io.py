@@ -8,13 +8,14 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from sympflow.flow.io import KEY, load, save
+from sympflow.flow.files import KEY, load
+from sympflow.flow.io import save
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.potentials import MLPPotential
-from sympflow.flow.record import checksum
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
+from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.domain import Ball, Box
 from sympflow.systems import harmonic_oscillator, henon_heiles
 

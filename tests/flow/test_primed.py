@@ -181,12 +181,12 @@ def test_tables_of_a_processed_flow():
     kernel, chi = flow.kernel_scheme(0.7), flow.processor_scheme(0.7)
     assert (kernel.force_evaluations, chi.force_evaluations, flow.scheme(0.7).force_evaluations) == (2, 2, 6)
     assert kernel.symmetric
-    from sympflow.kernels.splitting import splitting_kernel
+    from sympflow.kernels.splitting_loops import splitting_loops
 
-    loops, out = splitting_kernel(HH), y
+    loops, out = splitting_loops(HH), y
     for scheme in (chi.inverse(), kernel, chi):
-        out = loops.step(scheme, 0.7, out)
-    np.testing.assert_allclose(loops.step(flow.scheme(0.7), 0.7, y), out, atol=64 * EPS)
+        out = loops.kernel(scheme).step(0.7, out).states
+    np.testing.assert_allclose(loops.kernel(flow.scheme(0.7)).step(0.7, y).states, out, atol=64 * EPS)
     with pytest.raises(ValueError, match=r"^`flow` has no processor"):
         SympFlow.primed(HH, 2).processor_scheme()
 
@@ -250,12 +250,11 @@ def test_compiled_runs_agree_with_the_flow_to_rounding(flow, span, rows):
 
 
 def test_the_kernel_steps_each_state_by_its_own_time(flow):
-    from sympflow.kernels.primed_flow import PrimedFlowKernel
 
     y = flow.system.domain.sample(6, 2)
     h = flow.dt * np.array([1.0, 0.25, 0.0, -0.25, 0.25, -1.0])
     expected = flow(torch.tensor(h), torch.tensor(y)).numpy()
-    np.testing.assert_allclose(PrimedFlowKernel(flow, flow.system).step(h, y), expected, atol=1e3 * EPS)
+    np.testing.assert_allclose(flow.kernel_for(flow.system).step(h, y).states, expected, atol=1e3 * EPS)
 
 
 def test_trained_weights_are_never_compiled_in():
@@ -271,13 +270,12 @@ def test_trained_weights_are_never_compiled_in():
 
 
 def test_at_one_time_the_polynomials_are_the_table(flow):
-    from sympflow.kernels.primed_flow import PrimedFlowKernel
-    from sympflow.kernels.splitting import splitting_kernel
+    from sympflow.kernels.splitting_loops import splitting_loops
 
     y, t = flow.system.domain.sample(70, 3), 0.7 * flow.dt
     for h, scheme in ((t, flow.scheme(t)), (-t, flow.scheme(t).inverse())):
-        by_table = splitting_kernel(flow.system).step(scheme, t, y)
-        np.testing.assert_allclose(PrimedFlowKernel(flow, flow.system).step(h, y), by_table, atol=1e3 * EPS)
+        by_table = splitting_loops(flow.system).kernel(scheme).step(t, y).states
+        np.testing.assert_allclose(flow.kernel_for(flow.system).step(h, y).states, by_table, atol=1e3 * EPS)
 
 
 def test_evaluations_are_counted():

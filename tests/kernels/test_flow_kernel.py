@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from sympflow.flow.activations import ACTIVATIONS
 from sympflow.flow.layers import Drift, Kick
-from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.potentials import ACTIVATIONS, MLPPotential
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
-from sympflow.kernels.mlp_flow import mlp_flow_kernel
 from sympflow.kernels.modules import OPTIONS, load_module, template
 
 ROUNDING = 2e-14  # a few dozen operations on numbers up to 10
@@ -52,18 +50,18 @@ def flow():
 @pytest.mark.parametrize("h", [0.8, 0.3, -0.8, -0.1])
 def test_run_agrees_with_torch(flow, h):
     y0 = states(1, 2)[0]
-    Y, n_finite = mlp_flow_kernel(flow).run(h, y0, 20, np.arange(21))
+    Y, n_finite, _ = flow.kernel_for(None).run(h, y0, 20, np.arange(21))
     assert n_finite == 20
     assert np.array_equal(Y[0], y0)
     assert step_errors(flow, h, Y).max() < ROUNDING
-    sparse, _ = mlp_flow_kernel(flow).run(h, y0, 20, np.array([0, 3, 3, 20]))
+    sparse, *_ = flow.kernel_for(None).run(h, y0, 20, np.array([0, 3, 3, 20]))
     assert np.array_equal(sparse, Y[[0, 3, 3, 20]])
 
 
 @pytest.mark.parametrize("n", [1, 5, 32, 100])
 def test_batch_agrees_with_torch(flow, n):
     y0 = states(n, 2)
-    Y, n_finite = mlp_flow_kernel(flow).run_batch(0.8, y0, 5, np.arange(6), threads=2)
+    Y, n_finite, _ = flow.kernel_for(None).run_batch(0.8, y0, 5, np.arange(6), threads=2)
     assert (n_finite == 5).all()
     assert np.array_equal(Y[:, 0], y0)
     assert step_errors(flow, 0.8, Y.swapaxes(0, 1)).max() < ROUNDING
@@ -74,20 +72,20 @@ def test_each_state_can_have_its_own_time(flow):
     h = np.random.default_rng(1).uniform(-0.8, 0.8, 50)
     with torch.no_grad():
         expected = flow(torch.as_tensor(h), torch.as_tensor(y)).numpy()
-    assert np.abs(mlp_flow_kernel(flow).step(h, y) - expected).max() < ROUNDING
-    assert np.array_equal(mlp_flow_kernel(flow).step(0.0, y), y)
+    assert np.abs(flow.kernel_for(None).step(h, y).states - expected).max() < ROUNDING
+    assert np.array_equal(flow.kernel_for(None).step(0.0, y).states, y)
 
 
 def test_inverse_undoes_the_map(flow):
-    kernel, y = mlp_flow_kernel(flow), states(40, 2)
-    assert np.abs(kernel.step(-0.8, kernel.step(0.8, y)) - y).max() < ROUNDING
+    kernel, y = flow.kernel_for(None), states(40, 2)
+    assert np.abs(kernel.step(-0.8, kernel.step(0.8, y).states).states - y).max() < ROUNDING
 
 
 @pytest.mark.parametrize("name", ACTIVATIONS)
 def test_every_activation_and_its_slope(name):
     """The functions that the loops are compiled with."""
     header = f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': True}}"
-    compiled = load_module("\n\n\n".join([header, template("elementary"), template("activations")]))
+    compiled = load_module("\n\n\n".join([header, template("elementary"), template("activation_slopes")]))
     x = torch.linspace(-30, 30, 401, dtype=torch.float64, requires_grad=True)
     value = ACTIVATIONS[name].value(x)
     (slope,) = torch.autograd.grad(value.sum(), x)
@@ -99,9 +97,9 @@ def test_every_activation_and_its_slope(name):
 def test_any_depth_and_widths(hidden, activation):
     flow = lively(SympFlow(2, pairs=1, hidden=hidden, activation=activation))
     y0 = states(3, 2)
-    Y, _ = mlp_flow_kernel(flow).run_batch(1.0, y0, 2, np.array([2]))
+    Y, *_ = flow.kernel_for(None).run_batch(1.0, y0, 2, np.array([2]))
     assert np.abs(Y[:, 0] - torch_steps(flow, 1.0, y0, 2)[-1]).max() < ROUNDING
-    single, _ = mlp_flow_kernel(flow).run(1.0, y0[0], 2, np.array([2]))
+    single, *_ = flow.kernel_for(None).run(1.0, y0[0], 2, np.array([2]))
     assert np.abs(single[0] - Y[0, 0]).max() < ROUNDING
 
 
@@ -115,26 +113,26 @@ def test_layers_in_any_order():
         [Drift(potential(6)), Kick(potential(10)), Kick(potential(3)), Drift(potential(6))], dt=1
     )
     y0 = states(1, 2)[0]
-    Y, _ = mlp_flow_kernel(flow).run(-0.7, y0, 3, np.array([3]))
+    Y, *_ = flow.kernel_for(None).run(-0.7, y0, 3, np.array([3]))
     assert np.abs(Y[0] - torch_steps(flow, -0.7, y0, 3)[-1]).max() < ROUNDING
 
 
 def test_new_weights_are_noticed():
     flow = SympFlow(1, pairs=1)
     y = states(2, 1)
-    before, kernel = mlp_flow_kernel(flow).step(1.0, y), mlp_flow_kernel(flow)
-    assert mlp_flow_kernel(flow) is kernel
+    before, kernel = flow.kernel_for(None).step(1.0, y).states, flow.kernel_for()
+    assert flow.kernel_for(None) is kernel
     flow.layers[0].potential.weight_x.data.mul_(2)  # which leaves no trace in torch's version counter
-    after = mlp_flow_kernel(flow).step(1.0, y)
+    after = flow.kernel_for(None).step(1.0, y).states
     assert np.abs(after - before).max() > 1e-3
     flow.load_state_dict({k: 2 * v for k, v in flow.state_dict().items()}, assign=True)
-    assert np.abs(mlp_flow_kernel(flow).step(1.0, y) - torch_steps(flow, 1.0, y, 1)[1]).max() < ROUNDING
+    assert np.abs(flow.kernel_for(None).step(1.0, y).states - torch_steps(flow, 1.0, y, 1)[1]).max() < ROUNDING
 
 
 def test_states_that_are_not_finite(flow):
     y0 = states(40, 2)
     y0[3], y0[7, 0], y0[8, 2] = np.nan, np.inf, 1e308
-    Y, n_finite = mlp_flow_kernel(flow).run_batch(0.8, y0, 4, np.arange(5))
+    Y, n_finite, _ = flow.kernel_for(None).run_batch(0.8, y0, 4, np.arange(5))
     harmed = np.isin(np.arange(40), [3, 7])
     assert (n_finite[harmed] == 0).all()
     assert np.array_equal(Y[:, 0], y0, equal_nan=True)
@@ -146,7 +144,7 @@ def test_states_that_are_not_finite(flow):
 
 def test_refusals():
     with pytest.raises(ValueError, match="float64 on the CPU"):
-        mlp_flow_kernel(SympFlow(1, pairs=1, dtype=torch.float32))
+        SympFlow(1, pairs=1, dtype=torch.float32).kernel_for(None)
     mixed = SympFlow.from_layers([Kick(MLPPotential(1, (4,))), Drift(MLPPotential(1, (4, 4)))], dt=1.0)
     with pytest.raises(ValueError, match="one depth"):
-        mlp_flow_kernel(mixed)
+        mixed.kernel_for(None)

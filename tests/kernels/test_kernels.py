@@ -9,7 +9,7 @@ import pytest
 from numba import njit
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.splitting import splitting_kernel
+from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES, Scheme
 from sympflow.systems import harmonic_oscillator, henon_heiles
 
@@ -112,11 +112,11 @@ def systems():
 def test_kernel_agrees_with_numpy(systems, name, scheme, h):
     system = systems[name]
     expected = plain_run(system, scheme, h, system.y0, 40)
-    kernel = splitting_kernel(system)
-    Y, n_finite = kernel.run(scheme, h, system.y0, 40, np.arange(41))
+    loops = splitting_loops(system)
+    Y, n_finite, _ = loops.kernel(scheme).run(h, system.y0, 40, np.arange(41))
     assert n_finite == 40
     assert np.abs(Y - expected).max() < 2e-14 * len(scheme.kicks) ** 0.5
-    y = kernel.step(scheme, [h, h / 3], np.array([system.y0, system.y0]))
+    y = loops.kernel(scheme).step([h, h / 3], np.array([system.y0, system.y0])).states
     assert np.abs(y[0] - expected[1]).max() < 2e-15
     assert np.abs(y[1] - plain_run(system, scheme, h / 3, system.y0, 1)[1]).max() < 2e-15
 
@@ -131,7 +131,7 @@ def test_kernel_agrees_with_numpy(systems, name, scheme, h):
 )
 def test_kernel_agrees_with_numpy_on_every_kind_of_system(systems, name, scheme):
     system = systems[name]
-    Y, _ = splitting_kernel(system).run(scheme, 0.05, system.y0, 50, np.array([50]))
+    Y, *_ = splitting_loops(system).kernel(scheme).run(0.05, system.y0, 50, np.array([50]))
     assert np.abs(Y[0] - plain_run(system, scheme, 0.05, system.y0, 50)[-1]).max() < 3e-14
 
 
@@ -142,14 +142,14 @@ def test_functions_of_every_kind():
     )
     V += " + tanh(q2)"
     system = HamiltonianSystem.from_sympy(f"(p1**2 + p2**2/2)/2 + cosh(p1) + {V}", y0=[0.5, 0.4, 0.1, 0.2])
-    y = splitting_kernel(system).step(VERLET, 0.01, system.y0[None])[0]
+    y = splitting_loops(system).kernel(VERLET).step(0.01, system.y0[None]).states[0]
     assert np.abs(y - plain_run(system, VERLET, 0.01, system.y0, 1)[-1]).max() < 1e-14
 
 
 @pytest.mark.parametrize("mass", [None, [1.0, 2.0, 4.0]])
 def test_masses_of_numba_systems(mass):
     system = numba_chain(mass)
-    y = splitting_kernel(system).step(VERLET, 0.1, system.y0[None])
+    y = splitting_loops(system).kernel(VERLET).step(0.1, system.y0[None]).states
     assert np.abs(y[0] - plain_run(system, VERLET, 0.1, system.y0, 1)[-1]).max() < 2e-15
 
 
@@ -161,20 +161,20 @@ def test_masses_of_numba_systems(mass):
 @pytest.mark.parametrize("n_states", [1, 7, 64, 150])
 def test_batch_agrees_with_single_runs(systems, scheme, n_states, compensated):
     system = systems["henon_heiles"]
-    kernel, save = splitting_kernel(system), np.array([0, 3, 300, 600])
+    loops, save = splitting_loops(system), np.array([0, 3, 300, 600])
     y0 = system.y0 + np.random.default_rng(0).uniform(-0.02, 0.02, (n_states, 4))
-    Y, n_finite = kernel.run_batch(scheme, 0.1, y0, 600, save, compensated, threads=2)
+    Y, n_finite, _ = loops.kernel(scheme, compensated).run_batch(0.1, y0, 600, save, threads=2)
     assert Y.shape == (n_states, 4, 4)
     assert (n_finite == 600).all()
     for i in {0, n_states // 2, n_states - 1}:
-        single, _ = kernel.run(scheme, 0.1, y0[i], 600, save, compensated)
+        single, *_ = loops.kernel(scheme, compensated).run(0.1, y0[i], 600, save)
         assert np.abs(Y[i] - single).max() < 1e-12
 
 
 def test_batch_of_a_numba_system(systems):
     system = systems["numba_chain"]
     y0 = system.y0 * np.array([[1.0], [0.5]])
-    Y, _ = splitting_kernel(system).run_batch(VERLET, 0.1, y0, 10, np.array([10]))
+    Y, *_ = splitting_loops(system).kernel(VERLET).run_batch(0.1, y0, 10, np.array([10]))
     assert np.abs(Y[:, 0] - plain_run(system, VERLET, 0.1, y0, 10)[-1]).max() < 1e-14
 
 
@@ -185,33 +185,33 @@ def test_batch_of_a_numba_system(systems):
 @pytest.mark.parametrize("save", [[], [0], [0, 0, 5, 5], [1, 2, 3, 700], [999], [1000], [0, 255, 256, 257, 512]])
 def test_saving_never_changes_the_trajectory(systems, scheme, save):
     system = systems["henon_heiles"]
-    kernel, save = splitting_kernel(system), np.array(save, dtype=np.int64)
-    every, _ = kernel.run(scheme, 0.1, system.y0, 1000, np.arange(1001))
-    some, n_finite = kernel.run(scheme, 0.1, system.y0, 1000, save)
+    loops, save = splitting_loops(system), np.array(save, dtype=np.int64)
+    every, *_ = loops.kernel(scheme).run(0.1, system.y0, 1000, np.arange(1001))
+    some, n_finite, _ = loops.kernel(scheme).run(0.1, system.y0, 1000, save)
     assert n_finite == 1000
     assert np.array_equal(some, every[save])
 
 
 def test_no_steps(systems):
     system = systems["henon_heiles"]
-    Y, n_finite = splitting_kernel(system).run(VERLET, 0.1, system.y0, 0, np.array([0]))
+    Y, n_finite, _ = splitting_loops(system).kernel(VERLET).run(0.1, system.y0, 0, np.array([0]))
     assert np.array_equal(Y, system.y0[None])
     assert n_finite == 0
 
 
 def test_forth_and_back(systems):
-    system, kernel = systems["henon_heiles"], splitting_kernel(systems["henon_heiles"])
-    end, _ = kernel.run(KAHAN_LI8, 0.1, system.y0, 500, np.array([500]))
-    back, _ = kernel.run(KAHAN_LI8, -0.1, end[0], 500, np.array([500]))
+    system, loops = systems["henon_heiles"], splitting_loops(systems["henon_heiles"])
+    end, *_ = loops.kernel(KAHAN_LI8).run(0.1, system.y0, 500, np.array([500]))
+    back, *_ = loops.kernel(KAHAN_LI8).run(-0.1, end[0], 500, np.array([500]))
     assert np.abs(back[0] - system.y0).max() < 1e-12
 
 
 def test_compensated_summation_lowers_the_round_off(systems):
-    system, kernel = systems["henon_heiles"], splitting_kernel(systems["henon_heiles"])
+    system, loops = systems["henon_heiles"], splitting_loops(systems["henon_heiles"])
     save = np.arange(0, 100_001, 100)
 
     def energy_error(compensated):
-        Y, _ = kernel.run(KAHAN_LI8, 0.05, system.y0, 100_000, save, compensated)
+        Y, *_ = loops.kernel(KAHAN_LI8, compensated).run(0.05, system.y0, 100_000, save)
         H = system.hamiltonian(Y)
         return np.sqrt(np.mean((H / H[0] - 1) ** 2))
 
@@ -241,22 +241,22 @@ def test_the_last_finite_step_is_exact(runaway, scheme, stride):
     last = finite.argmin() - 1
     assert not finite[last + 1 :].any()
     save = np.arange(0, n_steps + 1, stride)
-    Y, n_finite = splitting_kernel(runaway).run(scheme, h, runaway.y0, n_steps, save)
+    Y, n_finite, _ = splitting_loops(runaway).kernel(scheme).run(h, runaway.y0, n_steps, save)
     assert n_finite == last
     assert np.isfinite(Y[save <= last]).all()
     assert np.isnan(Y[save > last]).all()
 
 
 def test_a_lane_that_overflows_leaves_the_others_unharmed(runaway):
-    kernel, save = splitting_kernel(runaway), np.array([0, 100, 400])
+    loops, save = splitting_loops(runaway), np.array([0, 100, 400])
     y0 = np.array([[1.0, 0.0], [1e-3, 0.0], [1e308, 0.0], [5e-324, 5e-324], [0.1, 0.0]])
-    Y, n_finite = kernel.run_batch(VERLET, 0.01, y0, 400, save)
-    singles = [kernel.run(VERLET, 0.01, y, 400, save) for y in y0]
-    assert n_finite.tolist() == [n for _, n in singles]
+    Y, n_finite, _ = loops.kernel(VERLET).run_batch(0.01, y0, 400, save)
+    singles = [loops.kernel(VERLET).run(0.01, y, 400, save) for y in y0]
+    assert n_finite.tolist() == [run.n_finite for run in singles]
     assert n_finite[0] < 400
     assert n_finite[2] == 0
     assert (n_finite[[1, 3, 4]] == 400).all()
-    for i, (single, n) in enumerate(singles):
+    for i, (single, n, _) in enumerate(singles):
         assert np.array_equal(np.isnan(Y[i]), np.isnan(single))
         rows = save <= n
         np.testing.assert_allclose(Y[i][rows], single[rows], rtol=1e-11, atol=0)
@@ -264,13 +264,15 @@ def test_a_lane_that_overflows_leaves_the_others_unharmed(runaway):
 
 def test_an_unstable_step_is_found_out():
     system = harmonic_oscillator(omega=100.0)
-    Y, n_finite = splitting_kernel(system).run(VERLET, 0.0201, np.array([1.0, 0.0]), 100_000, np.array([0, 100_000]))
+    Y, n_finite, _ = (
+        splitting_loops(system).kernel(VERLET).run(0.0201, np.array([1.0, 0.0]), 100_000, np.array([0, 100_000]))
+    )
     assert 0 < n_finite < 100_000
     assert np.isnan(Y[1]).all()
 
 
 def test_an_attractive_centre_divides_by_zero_without_an_exception(systems):
-    Y, n_finite = splitting_kernel(systems["kepler"]).run(VERLET, 0.1, np.zeros(4), 10, np.array([10]))
+    Y, n_finite, _ = splitting_loops(systems["kepler"]).kernel(VERLET).run(0.1, np.zeros(4), 10, np.array([10]))
     assert n_finite == 0
     assert np.isnan(Y).all()
 
@@ -280,18 +282,18 @@ def test_an_attractive_centre_divides_by_zero_without_an_exception(systems):
 
 def test_refusals(systems):
     with pytest.raises(ValueError, match="`scheme` has force gradients"):
-        splitting_kernel(systems["relativistic"]).run(SCHEMES["chin4a"], 0.1, np.zeros(2), 1, np.array([1]))
+        splitting_loops(systems["relativistic"]).kernel(SCHEMES["chin4a"]).run(0.1, np.zeros(2), 1, np.array([1]))
     with pytest.raises(ValueError, match="`system` is not separable"):
-        splitting_kernel(HamiltonianSystem.from_sympy("p**2*q**2/2 + q**2"))
+        splitting_loops(HamiltonianSystem.from_sympy("p**2*q**2/2 + q**2"))
     with pytest.raises(ValueError, match="no compiled function"):
-        splitting_kernel(HamiltonianSystem.from_sympy("p**2/2 + besselj(0, q)"))
+        splitting_loops(HamiltonianSystem.from_sympy("p**2/2 + besselj(0, q)"))
     plain = HamiltonianSystem(potential=lambda q: (q**2).sum(-1), ndof=1)
     with pytest.raises(ValueError, match="`system` cannot be compiled"):
-        splitting_kernel(plain)
+        splitting_loops(plain)
 
 
-def test_a_kernel_is_built_once_per_system(systems):
-    assert splitting_kernel(systems["pendulum"]) is splitting_kernel(systems["pendulum"])
+def test_loops_are_built_once_per_system(systems):
+    assert splitting_loops(systems["pendulum"]) is splitting_loops(systems["pendulum"])
 
 
 # --- the cache on disk -----------------------------------------------------------------------------------------
@@ -299,13 +301,13 @@ def test_a_kernel_is_built_once_per_system(systems):
 SCRIPT = """
 import numpy as np
 from sympflow.integrators.schemes import SCHEMES
-from sympflow.kernels.splitting import splitting_kernel
+from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.systems import pendulum
 
 system = pendulum()
-kernel = splitting_kernel(system)
-Y, n = kernel.run(SCHEMES["verlet"], 0.1, np.array([1.0, 0.0]), 10, np.array([10]))
-rollout = kernel._loops(False, False).rollout
+loops = splitting_loops(system)
+Y, n, _ = loops.kernel(SCHEMES["verlet"]).run(0.1, np.array([1.0, 0.0]), 10, np.array([10]))
+rollout = loops.functions(0, False).rollout
 print(repr(Y.tolist()), sum(rollout.stats.cache_hits.values()), sum(rollout.stats.cache_misses.values()))
 """
 

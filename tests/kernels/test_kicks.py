@@ -10,12 +10,8 @@ import sympy as sp
 from sympflow import SympFlow, systems
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import printed
-from sympflow.kernels.kick_shapes import shapes
-from sympflow.kernels.kicks import _function, _scheduled
-from sympflow.kernels.nested import nested
-from sympflow.kernels.pipeline import Operation, cycles_per_turn
-from sympflow.kernels.primed_flow import PrimedFlowKernel
-from sympflow.kernels.scheduling import ADD, FUSED, MULTIPLY, Schedule
+from sympflow.kernels.kicks import _function, _scheduled, shapes
+from sympflow.kernels.scheduling import ADD, FUSED, MULTIPLY, Operation, Schedule, cycles_per_turn, nested
 
 SCENES = {
     "henon_heiles": systems.henon_heiles,
@@ -149,16 +145,16 @@ def test_the_flow_steps_every_row_by_its_own_time():
     rng = np.random.default_rng(1)
     for parameter in flow.parameters():
         parameter.data += 0.02 * (parameter.data + 0.5)
-    kernel = PrimedFlowKernel(flow, system)
+    kernel = flow.kernel_for(system)
     y = system.y0 + rng.uniform(-0.05, 0.05, (40, 4))
     h = rng.uniform(0.05, 0.6, 40) * np.where(np.arange(40) % 3, 1.0, -1.0)
     h[7] = 0.0
-    together = kernel.step(h, y)
+    together = kernel.step(h, y).states
     assert np.array_equal(together[7], y[7])
-    apart = np.concatenate([kernel.step(h[i : i + 1], y[i : i + 1]) for i in range(40)])
+    apart = np.concatenate([kernel.step(h[i : i + 1], y[i : i + 1]).states for i in range(40)])
     assert np.abs(together - apart).max() < 1e-14
     assert np.abs(together - y).max() > 1e-3
-    assert np.abs(kernel.step(-h, together) - y).max() < 1e-13
+    assert np.abs(kernel.step(-h, together).states - y).max() < 1e-13
     with pytest.raises(ValueError, match="`t` must lie in"):
         kernel.step(np.linspace(0.1, 0.7, 40), y)
 
@@ -166,13 +162,13 @@ def test_the_flow_steps_every_row_by_its_own_time():
 def test_tables_follow_the_weights():
     system = systems.henon_heiles()
     flow = SympFlow.primed(system, 2, dt=0.6)
-    before, _ = PrimedFlowKernel(flow, system).run(0.6, system.y0, 10, np.array([10]))
+    before, *_ = flow.kernel_for(system).run(0.6, system.y0, 10, np.array([10]))
     flow.drifts.free.data.add_(0.01)
     flow.kicks.free.data = flow.kicks.free.data * 1.02
-    after, _ = PrimedFlowKernel(flow, system).run(0.6, system.y0, 10, np.array([10]))
+    after, *_ = flow.kernel_for(system).run(0.6, system.y0, 10, np.array([10]))
     expected = system.y0
     for _ in range(10):
-        expected = PrimedFlowKernel(flow, system).step(np.array([0.6]), expected[None])[0]
+        expected = flow.kernel_for(system).step(np.array([0.6]), expected[None]).states[0]
     assert np.abs(after - before).max() > 1e-4
     assert np.abs(after[0] - expected).max() < 1e-13
 

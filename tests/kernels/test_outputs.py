@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sympflow.integrators.grid import EPS, Grid
-from sympflow.kernels.outputs import all_between, all_finite, place
+from sympflow.kernels.output_loops import all_between, all_finite, place
 
 
 @pytest.mark.parametrize(("t0", "t1", "dt"), [(0.0, 10.0, 0.1), (3.0, -4.0, 0.3), (1e6, 1e6 + 7.0, 0.7)])

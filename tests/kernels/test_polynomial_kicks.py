@@ -11,9 +11,8 @@ import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, train
 from sympflow.hamiltonian.monomials import gradient, in_monomials, monomials, value
 from sympflow.integrators.splitting import Splitting
-from sympflow.kernels.kick_shapes import shapes
-from sympflow.kernels.kicks import _function, _scheduled
-from sympflow.kernels.splitting import splitting_kernel
+from sympflow.kernels.kicks import _function, _scheduled, shapes
+from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import Scheme
 from sympflow.training.ladder import Rung
 
@@ -159,20 +158,20 @@ def test_compiled_runs_are_the_steps_of_arrays(last, compensated):
     class Stepper(Splitting):
         name, scheme = "s", table
 
-    kernel, stepper, y = splitting_kernel(HH), Stepper(), HH.domain.sample(11, 0)
+    loops, stepper, y = splitting_loops(HH), Stepper(), HH.domain.sample(11, 0)
     expected = [y]
     for _ in range(3):
         expected.append(stepper.step(HH, 0.0, expected[-1], 0.2))
     save = np.array([0, 1, 3])
     expected = np.stack([expected[n] for n in save], axis=1)
-    many, _ = kernel.run_batch(table, 0.2, y, 3, save, compensated)
-    one, _ = kernel.run(table, 0.2, y[4], 3, save, compensated)
+    many = loops.kernel(table, compensated).run_batch(0.2, y, 3, save).states
+    one = loops.kernel(table, compensated).run(0.2, y[4], 3, save).states
     np.testing.assert_allclose(many, expected, atol=16 * EPS)
     np.testing.assert_allclose(one, expected[4], atol=16 * EPS)
     h = np.linspace(-0.2, 0.3, 11)
-    there = kernel.step(table, h, y)
+    there = loops.kernel(table).step(h, y).states
     np.testing.assert_allclose(there, stepper.step(HH, 0.0, y, h), atol=16 * EPS)
-    np.testing.assert_allclose(kernel.step(table.inverse(), h, there), y, atol=16 * EPS)
+    np.testing.assert_allclose(loops.kernel(table.inverse()).step(h, there).states, y, atol=16 * EPS)
     np.testing.assert_allclose(stepper.inverse(HH, 0.0, there, h), y, atol=16 * EPS)
     assert table.symmetric == (last == 0.3)
 

@@ -16,7 +16,7 @@ from sympflow import (
     systems,
     volume_error,
 )
-from sympflow.flow.io import shipped
+from sympflow.flow.shipped import shipped
 from sympflow.integrators.base import FixedStep
 from sympflow.metrics.symplectic import loop_area, natural_scale, step_tangents
 

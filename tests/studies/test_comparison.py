@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from sympflow import HamiltonianSystem, SympFlow, compare, get, reference_error, solve, stability, systems
-from sympflow.studies.comparison_report import combined_table
-from sympflow.studies.matching import match
-from sympflow.timing import interleaved
+from sympflow.studies.attempts import interleaved
+from sympflow.studies.comparison import combined_table, matched
 
 QUICK = {"n_outputs": 50, "repeats": 1}
 
@@ -132,10 +131,10 @@ def test_methods_are_matched_to_the_first(what):
 def test_matching_finds_the_step_of_a_power_law():
     system = systems.pendulum()
     for power, grows in ((2.0, True), (-1.0, False), (6.0, True)):
-        found, value = match(get("verlet")(dt=0.1), system, lambda m, n=power: m.dt**n, 0.003**power, grows)
+        found, value = matched(get("verlet")(dt=0.1), system, lambda m, n=power: m.dt**n, 0.003**power, grows)
         assert value == pytest.approx(0.003**power, rel=0.05)
         assert found.dt == pytest.approx(0.003, rel=0.06)
-    steps_back, _ = match(
+    steps_back, _ = matched(
         get("verlet")(dt=1.0), system, lambda m: math.inf if m.dt > 0.5 else m.dt**2, 0.2**2, grows=True
     )
     assert steps_back.dt == pytest.approx(0.2, rel=0.05)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sympflow import compare, get, poincare_section, systems
-from sympflow.studies.comparison_figure import _annotate, overview, save_comparison
 from sympflow.studies.figure_style import new_figure
+from sympflow.studies.figures import _annotate, overview, save_comparison
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 import sympflow
 from sympflow import HamiltonianSystem, max_energy_error, solve, stability, systems
 from sympflow.commands import app
-from sympflow.studies.singularities import blow_up
-from sympflow.studies.step_stability import initial_states
+from sympflow.studies.step_stability import blow_up, initial_states
 
 SINGULARITY = 5.450984210235402  # of Hénon–Heiles from q = 0, p = (0, 0.7)
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sympflow import solve, systems
-from sympflow.commands.arguments import scenes
+from sympflow.commands.words import scenes
 from sympflow.hamiltonian.domain import domain_from_dict
 from sympflow.systems import SYSTEMS, celestial, chains
 

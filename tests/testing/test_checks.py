@@ -10,8 +10,7 @@ import torch
 from sympflow import HamiltonianSystem, available, get
 from sympflow.arrays import concatenate, per_state, to_numpy
 from sympflow.integrators.base import FixedStep, Outcome
-from sympflow.integrators.tableaux import ADAPTIVE
-from sympflow.integrators.torchdiffeq_methods import MULTISTEP
+from sympflow.integrators.tableaux import ADAPTIVE, MULTISTEP
 from sympflow.testing import laws
 from sympflow.testing.checks import CHECKS, check_integrator, parametrize_with_checks
 

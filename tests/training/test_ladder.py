@@ -10,11 +10,11 @@ import torch
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, get, load, max_energy_error, shipped_flows, solve, systems
-from sympflow.domain_exit import domain_of
 from sympflow.flow import shipped as catalogue
 from sympflow.flow.shipped import ShippedFlow, choose
 from sympflow.hamiltonian.fingerprint import same_system
 from sympflow.integrators import flows
+from sympflow.integrators.domain_exit import domain_of
 from sympflow.training import ladder, pretrained
 from sympflow.training.clock_fit import clock_errors
 from sympflow.training.figures import one_step_errors

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from sympflow import max_energy_error, shipped_flows, solve
-from sympflow.flow.io import load, shipped
+from sympflow.flow.files import load
 from sympflow.flow.mlp import MLPFlow
+from sympflow.flow.shipped import shipped
 from sympflow.flow.sympflow import SympFlow
 from sympflow.systems import harmonic_oscillator, henon_heiles
 from sympflow.training import networks, pretrained

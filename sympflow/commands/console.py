@@ -1,0 +1,128 @@
+"""The console: errors as one line, progress, tables, and the files that commands write."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from sympflow.commands.words import Scene
+from sympflow.studies.reports import Column, text_table
+
+out = Console(soft_wrap=True, highlight=False)
+err = Console(stderr=True, soft_wrap=True, highlight=False)
+
+
+@contextlib.contextmanager
+def reporting() -> Iterator[None]:
+    """Errors as one line and an exit status: 2 for arguments, 1 for what failed, 130 for Ctrl-C."""
+    try:
+        yield
+    except typer.Exit:
+        raise
+    except (ValueError, TypeError) as error:
+        err.print(f"Error: {error}", style="red", markup=False)
+        raise typer.Exit(2) from error
+    except (RuntimeError, ImportError, OSError, ArithmeticError) as error:
+        err.print(f"Failed: {error}", style="red", markup=False)
+        raise typer.Exit(1) from error
+    except KeyboardInterrupt as error:
+        err.print("Interrupted.", style="red")
+        raise typer.Exit(130) from error
+
+
+@contextlib.contextmanager
+def progress() -> Iterator[Callable[[str], None]]:
+    """A line on the terminal that says what is being done; nothing where there is no terminal."""
+    if not err.is_terminal:
+        yield lambda text: None
+        return
+    with err.status("Starting") as status:
+        yield status.update
+
+
+def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """A table of strings, aligned left."""
+    columns = [Column(title, cells, left=True) for title, *cells in zip(titles, *rows, strict=True)]
+    out.print(text_table(columns), markup=False)
+
+
+def ready_folder(folder: Path) -> None:
+    """Make the folder of `--out`, and be sure that files and figures can be written there, before anything is computed.
+
+    Raises
+    ------
+    ValueError
+        If the folder cannot be made or written to.
+    ImportError
+        Without matplotlib, which draws the figures.
+    """
+    from sympflow.studies.figure_style import new_figure
+
+    new_figure(1, 1)
+    _ready(folder, folder, "a folder")
+
+
+def ready_file(path: Path) -> None:
+    """Make the folder of the file of `--out`, and be sure that it can be written, before anything is computed.
+
+    Raises
+    ------
+    ValueError
+        If it cannot.
+    """
+    if path.is_dir():
+        raise ValueError(f"`--out` {str(path)!r} is a folder: name a file in it.")
+    _ready(path.parent, path, "a file")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise ValueError(f"`--out` {str(path)!r} is write-protected: name another file.")
+
+
+def _ready(folder: Path, asked: Path, what: str) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ValueError(
+            f"`--out` {str(asked)!r} cannot be written ({error.strerror}): name {what} that can be."
+        ) from error
+
+
+def write_solution(sol: Any, path: Path) -> None:
+    """Columns t, q…, p… as text, or arrays t and y."""
+    if path.suffix == ".npz":
+        np.savez(path, t=sol.t, y=sol.y, system=sol.system.name, method=sol.integrator.name)
+        return
+    d = sol.system.ndof
+    names = ["t", *(f"{v}{i}" if d > 1 else v for v in "qp" for i in range(1, d + 1))]
+    np.savetxt(path, np.column_stack([sol.t, sol.y.T]), delimiter=",", header=",".join(names), comments="", fmt="%.17g")
+
+
+def write_comparisons(
+    comparisons: list[Any], found: list[Scene], folder: Path, say: Callable[[str], None]
+) -> list[Path]:
+    """For each system its CSV, JSON and figures; for several also one CSV and one figure of all."""
+    from sympflow.studies.figure_style import save
+    from sympflow.studies.figures import overview, save_comparison
+    from sympflow.studies.reports import write_csv
+
+    written: list[Path] = []
+    for comparison, scene in zip(comparisons, found, strict=True):
+        say(f"{scene.key}: figures")
+        written += [comparison.to_csv(folder / f"{scene.key}.csv"), comparison.to_json(folder / f"{scene.key}.json")]
+        written += save_comparison(comparison, folder, prefix=f"{scene.key}-")
+    drawable = [c for c in comparisons if {"error", "energy", "volume"} & set(c.metrics)]
+    if drawable:
+        written.append(save(overview(drawable), folder / "comparison.png"))
+    if len(comparisons) > 1:
+        rows = [row for c in comparisons for row in c.rows]
+        written.append(write_csv(rows, folder / "comparison.csv", comparisons[0].columns))
+    return written

@@ -1,0 +1,75 @@
+"""`sympflow systems`, `sympflow methods` and `sympflow flows`."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import Annotated
+
+import typer
+
+from sympflow.commands.console import print_table, reporting
+from sympflow.commands.words import SCENES, one_scene, parameters, shown
+
+
+def systems() -> None:
+    """List the built-in systems, their parameters and the flows that ship for them."""
+    with reporting():
+        from sympflow.flow.shipped import shipped_flows
+
+        rows = []
+        for name, factory in SCENES.items():
+            system = factory()
+            flows = shipped_flows(system)
+            primed = sum(f.stages is not None for f in flows)
+            trained = [f"{f.kind} (Δt = {f.dt:g})" for f in flows if f.stages is None]
+            trained += [f"{primed} primed"] if primed else []
+            rows.append(
+                (
+                    name,
+                    textwrap.shorten(str(system.symbols.H), 72, placeholder=" …") if system.symbols else "",
+                    ", ".join(f"{k} = {shown(v)}" for k, v in parameters(name).items()) or "–",
+                    f"{system.t_span[0]:g} … {system.t_span[1]:g}",
+                    f"{system.dt:g}",
+                    ", ".join(trained) or "–",
+                )
+            )
+        print_table(("name", "H", "parameters", "interval", "step", "trained flows"), rows)
+
+
+def flows(
+    ctx: typer.Context,
+    system: Annotated[str | None, typer.Argument(help="Those of one system. Default: all.")] = None,
+) -> None:
+    """List the flows that ship, the cheapest of a system first, with what each achieves.
+
+    The cost is that of a unit of time in force evaluations; the energy error is relative, the largest up to T, the 95 %
+    quantile over held-out states: `solve(system, tol=1e-6)` takes the cheapest that meets it.
+    """
+    with reporting():
+        from sympflow.flow.shipped import HEADINGS, shipped_flows
+
+        scene = None if system is None else one_scene([system, *ctx.args]).system
+        print_table(HEADINGS, list(shipped_flows(scene).rows()))
+
+
+def methods() -> None:
+    """List the methods, their orders, costs and options."""
+    with reporting():
+        from sympflow.integrators.registry import available, get
+
+        rows = []
+        for name in available():
+            try:
+                cls = get(name)
+            except ImportError as error:
+                rows.append((name, "", "", "", "", str(error)))
+                continue
+            scheme = cls.scheme
+            forces = "" if scheme is None else str(scheme.force_evaluations)
+            if scheme is not None and scheme.hessian_evaluations:
+                forces += f" + {scheme.hessian_evaluations} Hessian"
+            order = "trained" if cls.trained else str(cls.order or "–")
+            rows.append(
+                (name, order, "yes" if cls.symplectic else "no", forces, ", ".join(cls.options()), cls.summary())
+            )
+        print_table(("name", "order", "symplectic", "forces a step", "options", "source"), rows)

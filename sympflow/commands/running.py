@@ -1,0 +1,164 @@
+"""`sympflow solve` and `sympflow train`: one system, and a file of the result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from sympflow.commands.console import out, print_table, ready_file, reporting, write_solution
+from sympflow.commands.words import Backend, State, Step, TEnd, interval, method, one_scene, state, widths
+
+
+def solve(
+    ctx: typer.Context,
+    system: Annotated[str, typer.Argument(help="See `sympflow systems`; its parameters as --omega 100.")],
+    method_name: Annotated[
+        str, typer.Option("--method", help="A name, name:option=number, or a .safetensors file.")
+    ] = "sympflow",
+    t_end: TEnd = None,
+    y0: State = None,
+    dt: Step = None,
+    tol: Annotated[
+        float | None, typer.Option(help="Take the cheapest shipped flow with so small a relative energy error.")
+    ] = None,
+    n_outputs: Annotated[
+        int | None, typer.Option(help="Number of equal intervals between outputs. Default: every step.")
+    ] = None,
+    backend: Backend = "auto",
+    to: Annotated[Path | None, typer.Option("--out", help="File for the solution: .csv or .npz.")] = None,
+) -> None:
+    """Solve one system by one method.
+
+    Examples:
+
+      sympflow solve henon-heiles
+
+      sympflow solve henon-heiles --method verlet --t-end 1000 --dt 0.01 --out orbit.csv
+
+      sympflow solve harmonic-oscillator --omega 100 --out orbit.npz
+
+      sympflow solve kepler --tol 1e-6
+
+      sympflow solve pendulum --method rk45:rtol=1e-8 --y0 1.5,0
+    """
+    with reporting():
+        from sympflow.metrics.energy import max_energy_error
+        from sympflow.solver import solve as solve_system
+
+        if to is not None and to.suffix not in (".csv", ".npz"):
+            raise ValueError(f"`--out` must end in .csv or .npz; got {str(to)!r}.")
+        scene = one_scene([system, *ctx.args])
+        chosen = method(method_name)
+        chosen = chosen[1] if isinstance(chosen, tuple) else chosen
+        span = interval(scene, t_end)
+        times = None if n_outputs is None else np.linspace(*span, n_outputs + 1)
+        if to is not None:
+            ready_file(to)
+        options: dict[str, Any] = {name: value for name, value in (("dt", dt), ("tol", tol)) if value is not None}
+        sol = solve_system(scene.system, chosen, span, state(y0), t_eval=times, backend=backend, **options)
+        if to is not None:
+            write_solution(sol, to)
+        worst = max_energy_error(sol) if len(sol.t) else np.nan
+        out.print(sol.message)
+        out.print(f"{len(sol.t)} outputs, largest energy error {worst:.2e}")
+        out.print(", ".join(f"{k} = {v:.4g}" if isinstance(v, float) else f"{k} = {v}" for k, v in sol.stats.items()))
+        if len(sol.t):
+            print(f"y({sol.t[-1]:g}) = [{', '.join(f'{x:.12g}' for x in sol.y[:, -1])}]")
+        if to is not None:
+            out.print(f"Written: {to}")
+        if not sol.success:
+            raise typer.Exit(1)
+
+
+def train(
+    ctx: typer.Context,
+    system: Annotated[str, typer.Argument(help="See `sympflow systems`; its parameters as --omega 100.")],
+    dt: Annotated[float | None, typer.Option(help="Δt, the longest time of the map. Default: what suits it.")] = None,
+    kind: Annotated[
+        str | None,
+        typer.Option(help="primed (with V and T), sympflow (a network), or mlp (the baseline). Default: the best."),
+    ] = None,
+    stages: Annotated[int | None, typer.Option(help="Kicks of a primed flow.")] = None,
+    processor: Annotated[int | None, typer.Option(help="Kicks of a primed flow's processor; 0 for none.")] = None,
+    pairs: Annotated[int | None, typer.Option(help="Pairs of kick and drift of a network. Default: 3.")] = None,
+    hidden: Annotated[
+        str | None, typer.Option(help="Widths of the hidden layers of each potential of a network. Default: 10,10.")
+    ] = None,
+    activation: Annotated[str | None, typer.Option(help="Activation function of a network. Default: tanh.")] = None,
+    optimizer: Annotated[
+        str | None,
+        typer.Option(help="gauss-newton, adam, lbfgs or bfgs. Default: gauss-newton for primed flows, else adam."),
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option("--steps", "--epochs", help="Training steps. Default: the optimizer's.")
+    ] = None,
+    points: Annotated[int | None, typer.Option(help="Collocation points a step. Default: the optimizer's.")] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="Largest learning rate of adam. Default: 0.005.")] = None,
+    residual_weight: Annotated[float | None, typer.Option(help="Weight of the residual loss.")] = None,
+    matching_weight: Annotated[float | None, typer.Option(help="Weight of Hamiltonian matching.")] = None,
+    label_weight: Annotated[float | None, typer.Option(help="Weight of labels, the exact flow of states.")] = None,
+    restarts: Annotated[int | None, typer.Option(help="Starts of the search for a primed flow.")] = None,
+    time_budget: Annotated[
+        float | None,
+        typer.Option(help="Stop after so many seconds. Default: 60 for a primed flow without --restarts and --steps."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of points and initial weights.")] = 0,
+    to: Annotated[
+        Path | None, typer.Option("--out", help="File for the flow. Default: SYSTEM-KIND.safetensors.")
+    ] = None,
+    checkpoint: Annotated[
+        Path | None, typer.Option(help="File for the state of the run, written at intervals.")
+    ] = None,
+    resume: Annotated[Path | None, typer.Option(help="Go on from this checkpoint, given the same options.")] = None,
+) -> None:
+    """Train a flow for a system and save it.
+
+    With nothing else said, a system with separable H gets a flow primed with its own V and T, in at most
+    about a minute (--time-budget); any other, or where an option is one of networks, a SympFlow with neural potentials.
+
+    Examples:
+
+      sympflow train henon-heiles --out mine.safetensors
+
+      sympflow train kepler --stages 4 --dt 0.2 --processor 0
+
+      sympflow train pendulum --dt 0.5 --pairs 5 --epochs 50000 --checkpoint run.pt
+
+      sympflow train harmonic-oscillator --omega 100 --dt 0.01 --kind mlp
+    """
+    with reporting():
+        from sympflow.training.trainer import train as train_flow
+
+        scene = one_scene([system, *ctx.args])
+        chosen = {
+            "kind": kind,
+            "stages": stages,
+            "processor": processor,
+            "pairs": pairs,
+            "hidden": None if hidden is None else widths(hidden),
+            "activation": activation,
+            "optimizer": optimizer,
+            "steps": steps,
+            "points": points,
+            "learning_rate": learning_rate,
+            "residual_weight": residual_weight,
+            "matching_weight": matching_weight,
+            "label_weight": label_weight,
+            "restarts": restarts,
+            "time_budget": time_budget,
+        }
+        options: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None}
+        to = to or Path(f"{scene.key}-{kind or 'sympflow'}.safetensors")
+        if to.suffix != ".safetensors":
+            raise ValueError(f"`--out` must end in .safetensors; got {str(to)!r}.")
+        ready_file(to)
+        flow = train_flow(scene.system, dt, seed=seed, checkpoint=checkpoint, resume=resume, **options)
+        flow.save(to)
+        figures = [
+            (k.replace("_", " "), f"{v:.3g}" if isinstance(v, float) else str(v)) for k, v in flow.figures.items()
+        ]
+        print_table(("figure", "value"), figures)
+        out.print(f"Written: {to}. Use it with: sympflow compare {system} --methods {to},verlet")

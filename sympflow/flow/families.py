@@ -1,0 +1,44 @@
+"""The families of flow maps by name; their modules are imported when one is wanted.
+
+A family is one module and one line here. The class builds itself from the description in a file:
+`from_architecture(ndof, plan, dt, dtype)`, the reverse of `architecture()`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from sympflow.lazy import whole_import
+
+FAMILIES = {
+    "sympflow": "sympflow.flow.sympflow:SympFlow",
+    "primed": "sympflow.flow.primed:PrimedFlow",
+    "split": "sympflow.flow.split:SplitFlow",
+    "clocked": "sympflow.flow.clocked:ClockedFlow",
+    "mlp": "sympflow.flow.mlp:MLPFlow",
+}
+"""The module and the class of each."""
+
+KINDS = ("sympflow", "mlp")
+"""What a file says that its flow is, and the name of the method that runs it: of a SympFlow, or of its baseline."""
+
+_OF_SYMPFLOW = ("split", "clocked", "primed")
+
+
+def family(name: str) -> Any:
+    """Return the class of a family."""
+    module, _, attribute = FAMILIES[name].partition(":")
+    return getattr(whole_import(module), attribute)
+
+
+def family_of(kind: str, plan: Mapping[str, Any]) -> Any:
+    """Return the class that a flow of this kind and architecture is of: a SympFlow's plan names a special family."""
+    return family(kind if kind == "mlp" else next((name for name in _OF_SYMPFLOW if name in plan), "sympflow"))
+
+
+def is_flow(value: Any) -> bool:
+    """Return True for a flow map, without an import: where its module was never imported, there is none."""
+    module = sys.modules.get("sympflow.flow.flow_map")
+    return module is not None and isinstance(value, module.FlowMap)

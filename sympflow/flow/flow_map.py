@@ -1,0 +1,563 @@
+"""FlowMap: what every learned flow map ψ_t has in common, from its extension to all times to its file."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from sympflow.arguments import plain
+from sympflow.flow.certificate import Certificate, certify
+from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
+from sympflow.flow.weights import checksum
+from sympflow.hamiltonian.domain import Domain, EnergySublevel
+from sympflow.hamiltonian.fingerprint import same_system
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.protocol import Kernel
+
+MAX_STEPS = 10_000_000  # of one call
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The system in the physical time that a flow in another time is for: see `sympflow.time_transformed`."""
+
+    system: str
+    fingerprint: tuple[float, ...]
+    shift: float
+
+    def is_of(self, system: HamiltonianSystem) -> bool:
+        """Return True for that system, which is recognised by its H."""
+        return same_system(self.fingerprint, system.fingerprint)
+
+
+def check_system(system: Any) -> None:
+    """Raise TypeError unless `system` is a HamiltonianSystem."""
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(
+            f"`system` must be a HamiltonianSystem; got {type(system).__name__}: take a scene of sympflow.systems, or "
+            "define one with HamiltonianSystem.from_sympy."
+        )
+
+
+class FlowMap(nn.Module):
+    """A learned map ψ̄_t, t ∈ [0, Δt], of states [q, p], and its extension ψ_t to every t.
+
+    Duties of a subclass
+    --------------------
+    1. `_map(t, y)`: ψ̄_t on columns y (2d, N), for a time t that is a float or a tensor () or (N,).
+    2. `_map_inverse(t, y)`: ψ̄_t⁻¹, if it has one.
+    3. `_map_tangent(t, y)`: ψ̄_t(y) and d/dt ψ̄_t(y).
+    4. `architecture()`: a JSON-able description, and `from_architecture`, which builds it again.
+
+    A subclass may also have a Hamiltonian, compiled loops, a clock, or functions of its system:
+    `hamiltonian`, `kernel_for`, `clock_numbers`, `bound`, `evaluations`.
+
+    Attributes
+    ----------
+    ndof : int
+    dt : float
+        Δt, the longest time of the bare map.
+    domain : Domain or None
+        Ω, where it was trained.
+    fingerprint, system_name : tuple of float or None, str or None
+        The system it was trained for.
+    recipe, figures : dict
+        How it was trained, and what it achieved.
+    history : list of dict
+        Held-out figures over its training in this session; not saved.
+    certified : Certificate or None
+        What `certificate` found, or the file held that the flow was loaded from.
+    """
+
+    kind: ClassVar[str]
+    """The method of `solve` that runs it."""
+    symplectic: ClassVar[bool] = False
+    """True if ψ_t is the flow of a Hamiltonian, with an exact inverse."""
+
+    def __init__(self, ndof: int, dt: float) -> None:
+        super().__init__()
+        ndof, dt = plain(ndof), plain(dt)
+        if isinstance(ndof, bool) or not isinstance(ndof, int) or ndof < 1:
+            raise ValueError(f"`ndof` must be a positive integer, the degrees of freedom; got {ndof!r}.")
+        if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not 0 < dt < math.inf:
+            raise ValueError(f"`dt` must be a positive finite number, the Δt of the flow; got {dt!r}: 1.0 is usual.")
+        if not MIN_DT <= dt <= MAX_DT:
+            raise ValueError(
+                f"`dt` must lie between {MIN_DT:g} and {MAX_DT:g}; got {dt!r}: choose another unit of time."
+            )
+        self.ndof, self.dt = ndof, float(dt)
+        self.domain: Domain | None = None
+        self.fingerprint: tuple[float, ...] | None = None
+        self.system_name: str | None = None
+        self.recipe: dict[str, Any] = {}
+        self.figures: dict[str, Any] = {}
+        self.history: list[dict[str, float]] = []
+        self.certified: Certificate | None = None
+
+    def _map(self, t: float | Tensor, y: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def _map_inverse(self, t: float | Tensor, y: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def _map_tangent(self, t: float | Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        raise NotImplementedError
+
+    def architecture(self) -> dict[str, Any]:
+        raise NotImplementedError
+
+    @classmethod
+    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
+        """Return an untrained flow of an architecture that a file describes, all of which is checked.
+
+        Raises
+        ------
+        Refused, ValueError
+            If it is not admissible.
+        """
+        raise NotImplementedError
+
+    # the bare map on [0, Δt] --------------------------------------------------------------------------
+
+    def psi(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """ψ̄_t(x) for t ∈ [0, Δt], unchecked and without synchronising with the host: for inner loops.
+
+        `t` is a number or a tensor that broadcasts against the batch shape of `x` (..., 2d).
+        """
+        t, y, batch = self._columns(t, x)
+        return self._states(self._map(t, y), batch)
+
+    def psi_inverse(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """ψ̄_t⁻¹(x) for t ∈ [0, Δt], unchecked."""
+        t, y, batch = self._columns(t, x)
+        return self._states(self._map_inverse(t, y), batch)
+
+    def psi_and_velocity(self, t: float | Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """ψ̄_t(x) and d/dt ψ̄_t(x), each (..., 2d), for t ∈ [0, Δt], unchecked."""
+        t, y, batch = self._columns(t, x)
+        y, dy = self._map_tangent(t, y)
+        return self._states(y, batch), self._states(dy, batch)
+
+    def velocity(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """d/dt ψ̄_t(x), (..., 2d), for t ∈ [0, Δt], in closed form."""
+        return self.psi_and_velocity(self._bare_time(t, x), x)[1]
+
+    def initial_velocity(self, x: Tensor) -> Tensor:
+        """d/dt ψ̄_t(x) at t = 0, (..., 2d)."""
+        return self.velocity(0.0, x)
+
+    def hamiltonian(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """𝓗(ψ̄)(t, x), (...), for t ∈ [0, Δt]: the Hamiltonian of which ψ̄_t is the exact flow.
+
+        Raises
+        ------
+        TypeError
+            If this is an unconstrained network, which has none.
+        """
+        return self.hamiltonian_unchecked(self._bare_time(t, x), x)
+
+    def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """`hamiltonian` without checks, for inner loops."""
+        raise TypeError("`flow` is an unconstrained network, which is the flow of no Hamiltonian: use a SympFlow.")
+
+    # every t ------------------------------------------------------------------------------------------
+
+    def forward(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """ψ_t(x) for every t.
+
+        ψ_t = ψ̄_r ∘ (ψ̄_Δt)^k with k = ⌊t/Δt⌋, r = t − kΔt; for t < 0 it is (ψ̄_r)⁻¹ ∘ (ψ̄_Δt)⁻ᵏ with |t| for t.
+        k is an integer count: a t that is a multiple of Δt up to rounding is exactly k steps.
+
+        Parameters
+        ----------
+        t : float or tensor
+            One time, or a tensor that broadcasts against the batch shape of x.
+        x : tensor, shape (..., 2d)
+            In the dtype and on the device of the flow.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If an argument has the wrong type, shape, dtype or device, or t is not finite.
+        """
+        t = self._checked_time(t, x)
+        if isinstance(t, float):
+            return self._whole(whole_steps(abs(t), self.dt), t < 0, x)
+        k, r, back, x = self._split(t, x)
+        x = self._repeat(k * ~back, False, x)
+        x = self._repeat(k * back, True, x)
+        return self._remainder(r, back, x)
+
+    def inverse(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """The exact inverse of ψ_t, for every t: arguments as for the call."""
+        t = self._checked_time(t, x)
+        if isinstance(t, float):
+            return self._whole(whole_steps(abs(t), self.dt), t >= 0, x, remainder_first=True)
+        k, r, back, x = self._split(t, x)
+        x = self._remainder(r, ~back, x)
+        x = self._repeat(k * ~back, True, x)
+        return self._repeat(k * back, False, x)
+
+    def _whole(self, count: tuple[int, float], back: bool, x: Tensor, remainder_first: bool = False) -> Tensor:
+        """k steps and the remainder of one time for all states."""
+        k, r = count
+        _, y, batch = self._columns(self.dt, x)
+        step = self._map_inverse if back else self._map
+        if r and remainder_first:
+            y = step(r, y)
+        for _ in range(k):
+            y = step(self.dt, y)
+        if r and not remainder_first:
+            y = step(r, y)
+        return self._states(y, batch)
+
+    def _split(self, t: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Counts k, remainders r and directions of the times t, broadcast with the states x."""
+        batch = torch.broadcast_shapes(t.shape, x.shape[:-1])
+        k, r = whole_steps_of_each(torch.where(t < 0, -t, t), self.dt)
+        k, r, back = (v.expand(batch) for v in (k, r.to(x.dtype), t < 0))
+        return k, r, back, x.expand(*batch, x.shape[-1])
+
+    def _repeat(self, k: Tensor, back: bool, x: Tensor) -> Tensor:
+        """ψ̄_Δt, or its inverse, k times, with a count k for each state."""
+        step = self.psi_inverse if back else self.psi
+        for j in range(int(k.max()) if k.numel() else 0):
+            active = k > j
+            x = x.index_put((active,), step(self.dt, x[active]))
+        return x
+
+    def _remainder(self, r: Tensor, back: Tensor, x: Tensor) -> Tensor:
+        moving = (r > 0) | r.requires_grad  # at r = 0 the state stays, but has a derivative
+        for step, active in ((self.psi, moving & ~back), (self.psi_inverse, moving & back)):
+            if active.any():
+                x = x.index_put((active,), step(r[active], x[active]))
+        return x
+
+    # a run of many steps --------------------------------------------------------------------------------------
+
+    def prepare(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """χ_t⁻¹(x), unchecked, where ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹: the start of a run of steps of t by `kernel_step`."""
+        return x
+
+    def kernel_step(self, t: float | Tensor, x: Tensor, back: bool = False) -> Tensor:
+        """K_t(x), or its inverse, unchecked; K_t is ψ̄_t where there is no χ."""
+        return self.psi_inverse(t, x) if back else self.psi(t, x)
+
+    def finish(self, t: float | Tensor, x: Tensor) -> Tensor:
+        """χ_t(x), unchecked: the output of such a run."""
+        return x
+
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
+        """Return the compiled loops of the flow with its present weights, the same while these do not change.
+
+        Parameters
+        ----------
+        system : HamiltonianSystem
+            The one of the flow.
+        compensated : bool
+            True for runs that sum with Kahan's compensation.
+
+        Raises
+        ------
+        ValueError
+            If there are none, with the reason.
+        """
+        raise ValueError(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Count the evaluations of the system's own functions in a run; a network has none.
+
+        Parameters
+        ----------
+        n_steps, n_saved, n_extra : int
+            Steps, outputs at their ends, and shorter steps to other outputs.
+        backend : {"compiled", "numpy", "torch", "array"}
+        """
+        return {"force_evaluations": 0, "hessian_evaluations": 0}
+
+    # layout --------------------------------------------------------------------------------------------
+
+    def _columns(self, t: float | Tensor, x: Tensor) -> tuple[float | Tensor, Tensor, torch.Size]:
+        """States (..., 2d) as columns (2d, N), times to match, and the batch shape."""
+        batch = x.shape[:-1]
+        if isinstance(t, Tensor) and t.ndim:
+            batch = torch.broadcast_shapes(t.shape, batch)
+            x = x.expand(*batch, x.shape[-1])
+            t = t.expand(batch).reshape(-1)
+        return t, x.reshape(-1, x.shape[-1]).T.contiguous(), batch
+
+    @staticmethod
+    def _states(y: Tensor, batch: torch.Size) -> Tensor:
+        return y.T.reshape(*batch, y.shape[0])
+
+    # what it is --------------------------------------------------------------------------------------------
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """That of its numbers; float64 if it has none."""
+        return next((w.dtype for w in chain(self.parameters(), self.buffers())), torch.float64)
+
+    @property
+    def device(self) -> torch.device:
+        """Where its numbers are; the CPU if it has none."""
+        return next((w.device for w in chain(self.parameters(), self.buffers())), torch.device("cpu"))
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of trainable parameters."""
+        return sum(w.numel() for w in self.parameters())
+
+    @property
+    def description(self) -> Description:
+        """All that a file tells of it beside architecture and weights."""
+        return Description(
+            self.domain, self.system_name, self.fingerprint, self.recipe, self.figures, certificate=self.certified
+        )
+
+    def describe(self, description: Description) -> None:
+        """Take the description that a file holds."""
+        self.domain, self.system_name, self.fingerprint = (
+            description.domain, description.system, description.fingerprint,
+        )  # fmt: skip
+        self.recipe, self.figures, self.certified = description.recipe, description.figures, description.certificate
+
+    # its system ---------------------------------------------------------------------------------------------
+
+    @property
+    def origin(self) -> Origin | None:
+        """The system in the physical time, for a flow in another time; None for a flow in its system's own time."""
+        made = (self.recipe or {}).get("transforms")
+        return None if made is None else Origin(made["system"], tuple(made["fingerprint"]), made["shift"])
+
+    def matches(self, system: HamiltonianSystem) -> bool:
+        """Return True if the flow is of this system, and in its time; a bare flow fits any of its size."""
+        mine = self.fingerprint
+        return system.ndof == self.ndof and (mine is None or same_system(mine, system.fingerprint))
+
+    def check_system(self, system: HamiltonianSystem) -> None:
+        """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
+        check_system(system)
+        if self.fingerprint is not None and self.matches(system):
+            return
+        origin = self.origin
+        if origin is not None and origin.is_of(system):
+            raise ValueError(
+                f"`system` {system.name!r} is the one of this flow, but in another time: pass time_transformed(system, "
+                f"{origin.shift:g}) here; solve(system, 'sympflow', flow=flow) runs it in the physical time."
+            )
+        remedy = "pass the flow of this system, or train one with sympflow.train(system)."
+        if system.ndof != self.ndof:
+            raise ValueError(
+                f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: {remedy}"
+            )
+        if not self.matches(system):
+            raise ValueError(
+                f"`system` {system.name!r} is not the one that this flow was trained for ({self.system_name!r}, or its "
+                f"parameters differ): {remedy}"
+            )
+
+    def bound(self, system: HamiltonianSystem) -> Self:
+        """Return this flow, ready to be used on `system`: one that is made of the system's functions takes them."""
+        return self
+
+    def domain_for(self, system: HamiltonianSystem) -> Domain | None:
+        """Return Ω of the flow, or else of its system, ready to be asked for states; None if neither has one."""
+        domain = self.domain or system.domain
+        if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
+            return system.domain if domain == system.domain else domain.attach(system.hamiltonian)
+        return domain
+
+    def clock_numbers(self) -> tuple[float, ...]:
+        """Return the numbers of a trained clock, see `sympflow.flow.clocked`; () for a flow without one."""
+        return ()
+
+    def certificate(
+        self,
+        system: HamiltonianSystem,
+        *,
+        states: int = 2000,
+        times: int = 33,
+        held_out: int = 100,
+        t_end: float = 1000.0,
+        seed: int = 0,
+    ) -> Certificate:
+        """An a-posteriori statement on this flow's energy error, kept as `certified` and stored by `save`.
+
+        Over a seeded sample of Ω × [0, Δt] it estimates the defect, sup |𝓗 − H − c(t)|, and the δ with which
+        |H(ψ_kΔt(x)) − H(x)| ≤ kδ while the orbit is in Ω at every step; beside it stands the measured error of orbits
+        from held-out states. It is an estimate, not a proof: the suprema are the largest values in the sample.
+
+        Parameters
+        ----------
+        system : HamiltonianSystem
+        states, times : int
+            Size of the sample.
+        held_out : int
+            Number of held-out states.
+        t_end : float
+            How far their orbits are followed.
+        seed : int
+
+        Raises
+        ------
+        TypeError
+            If this is an unconstrained network, which has no Hamiltonian.
+        ValueError
+            If `system` is not that of the flow, there is no domain, or an argument is not admissible.
+
+        References
+        ----------
+        .. [1] E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration, 2006, section IX.8, for the argument.
+
+        Examples
+        --------
+        >>> print(flow.certificate(system))
+        """
+        if not self.symplectic:
+            raise TypeError(
+                "`flow` is an unconstrained network, which is the flow of no Hamiltonian, so nothing bounds its energy "
+                "error: use a SympFlow for a certificate."
+            )
+        counts = {"states": (states, 1), "times": (times, 2), "held_out": (held_out, 1), "seed": (seed, 0)}
+        for name, (value, least) in counts.items():
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise ValueError(f"`{name}` must be an integer and at least {least}; got {value!r}.")
+        if not self.dt <= t_end < math.inf:
+            raise ValueError(f"`t_end` must be finite and at least Δt = {self.dt:g}; got {t_end!r}.")
+        self.check_system(system)
+        domain = self.bound(system).domain_for(system)
+        if domain is None:
+            raise ValueError("`flow` has no domain and neither has its system: give the system a `domain`, say a Box.")
+        size: Any = {"states": states, "times": times, "held_out": held_out, "t_end": t_end, "seed": seed}
+        self.certified = certify(self, system, domain, checksum(self.state_dict()), **size)
+        return self.certified
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the flow to a safetensors file, atomically, with all that `sympflow.load` needs and its record.
+
+        A flow without a system (one that was never trained) is recorded as such, and fits any when it is loaded.
+
+        Raises
+        ------
+        TypeError
+            If `path` is not a path.
+        ValueError
+            If a weight is not finite, the record is one that `load` would refuse, or the file cannot be written.
+
+        Warns
+        -----
+        RuntimeWarning
+            If the flow's certificate is one of other weights: it is left out.
+        """
+        write(path, self.kind, self.architecture(), self.dt, self.state_dict(), self.description)
+
+    # arguments ----------------------------------------------------------------------------------------------
+
+    def _checked_time(self, t: Any, x: Any) -> float | Tensor:
+        """Return `t` as a finite float or tensor; `x` is checked to be a state for this flow.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If one of them has the wrong type, shape, dtype or device, or t is not finite.
+        """
+        if not isinstance(x, Tensor):
+            raise TypeError(f"`x` must be a torch tensor, not {type(x).__name__}: use torch.as_tensor(x).")
+        if x.dtype != self.dtype:
+            raise TypeError(f"`x` is {x.dtype} but the flow is {self.dtype}: convert one, as by x.to({self.dtype}).")
+        if x.device != self.device:
+            raise ValueError(f"`x` is on {x.device} but the flow on {self.device}: move one, as by x.to(flow.device).")
+        if x.ndim == 0 or x.shape[-1] != 2 * self.ndof:
+            raise ValueError(
+                f"`x` must have shape (..., {2 * self.ndof}), states [q, p]; got {tuple(x.shape)}: "
+                "put them on the last axis."
+            )
+        if isinstance(t, Tensor) and (t.ndim or t.requires_grad):
+            if t.dtype == torch.bool or t.is_complex():
+                raise TypeError(f"`t` must be real times; got {t.dtype}: use a floating-point tensor.")
+            if t.device != x.device:
+                raise ValueError(f"`t` is on {t.device} but `x` on {x.device}: move one of them.")
+            if not torch.isfinite(t).all():
+                raise ValueError("`t` must be finite: remove its NaN and infinite entries.")
+            try:
+                torch.broadcast_shapes(t.shape, x.shape[:-1])
+            except RuntimeError:
+                raise ValueError(
+                    f"`t` of shape {tuple(t.shape)} does not broadcast against the batch shape "
+                    f"{tuple(x.shape[:-1])} of `x`: add axes, as by t[:, None]."
+                ) from None
+            return t
+        try:
+            value = float(t)
+        except (TypeError, ValueError):
+            raise TypeError(
+                f"`t` must be a number or a tensor of times; got {type(t).__name__}: pass seconds."
+            ) from None
+        if not math.isfinite(value):
+            raise ValueError(f"`t` must be finite; got {value}: pass a finite time.")
+        return value
+
+    def _bare_time(self, t: Any, x: Any) -> float | Tensor:
+        """Return `t`, checked to lie in [0, Δt]."""
+        t = self._checked_time(t, x)
+        low, high, slack = 0.0, 0.0, 1e-14
+        if isinstance(t, float):
+            low = high = t
+        elif t.numel():
+            low, high = float(t.detach().min()), float(t.detach().max())
+            slack = 1e-6 if t.dtype == torch.float32 else slack
+        if low < 0 or high > self.dt * (1 + slack):
+            raise ValueError(f"`t` must lie in [0, dt] = [0, {self.dt:g}]; got {low} to {high}: reduce it modulo dt.")
+        return t.to(x.dtype) if isinstance(t, Tensor) else t
+
+    def __repr__(self) -> str:
+        system = f" of {self.system_name}" if self.system_name else ""
+        return f"<{type(self).__name__}{system}: ndof={self.ndof}, dt={self.dt:g}, {self.n_parameters} parameters>"
+
+
+def whole_steps(t: float, dt: float) -> tuple[int, float]:
+    """Return k = ⌊t/Δt⌋ and r = t − kΔt ∈ [0, Δt) for t ≥ 0.
+
+    k is an integer count, robust to rounding: a multiple of Δt up to rounding counts as one, 0.3/0.1 is 3.
+
+    Raises
+    ------
+    ValueError
+        If k would exceed ten million.
+    """
+    ratio = t / dt
+    if ratio > MAX_STEPS:
+        raise _too_many_steps(t, dt)
+    near = round(ratio)
+    if abs(ratio - near) <= 2 * np.finfo(float).eps * near:
+        return near, 0.0
+    k = math.floor(ratio)
+    return k, min(max(t - k * dt, 0.0), dt)
+
+
+def whole_steps_of_each(t: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    """Return the same for a tensor of times t ≥ 0, each to the rounding of its dtype: integer k and float64 r.
+
+    Gradients flow through r to t.
+    """
+    eps = torch.finfo(t.dtype).eps if t.is_floating_point() else 0.0
+    t = t.to(torch.float64)
+    ratio = t.detach() / dt
+    near = ratio.round()
+    exact = (ratio - near).abs() <= 2 * eps * near
+    k = torch.where(exact, near, ratio.floor())
+    if k.numel() and k.max() > MAX_STEPS:
+        raise _too_many_steps(float(t.detach().max()), dt)
+    r = t - k * dt
+    return k.to(torch.int64), torch.where(exact, r - r.detach(), r).clamp(0.0, dt)
+
+
+def _too_many_steps(t: float, dt: float) -> ValueError:
+    return ValueError(f"`t` = {t:g} needs more than {MAX_STEPS:,} steps of dt = {dt:g}: use sympflow.solve.")

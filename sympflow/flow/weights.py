@@ -1,0 +1,133 @@
+"""The weights of a flow: their precision and device, their checksum, and what is kept while they do not change."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+T = TypeVar("T")
+
+_DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+
+def checked_dtype(dtype: Any) -> torch.dtype:
+    """Return `dtype` as that of torch: float32 or float64, by torch's, NumPy's or a plain name.
+
+    Raises
+    ------
+    TypeError
+        If it is anything else.
+    """
+    name = str(dtype).removeprefix("torch.")
+    if not isinstance(dtype, (torch.dtype, str)) and dtype is not None:
+        try:
+            name = np.dtype(dtype).name
+        except TypeError:
+            name = ""
+    if name not in _DTYPES:
+        raise TypeError(f"`dtype` must be float32 or float64; got {dtype!r}: use torch.float32 or torch.float64.")
+    return _DTYPES[name]
+
+
+def checked_device(device: Any) -> torch.device | None:
+    """Return `device` as that of torch, once a tensor was put there; None stands for torch's default.
+
+    Raises
+    ------
+    TypeError
+        If it is not a device or the name of one.
+    ValueError
+        If torch knows no such device, or does not see it on this machine.
+    """
+    if device is None:
+        return None
+    if isinstance(device, bool) or not isinstance(device, (torch.device, str, int)):
+        raise TypeError(f"`device` must be a torch.device or its name; got {device!r}: use 'cpu' or 'cuda'.")
+    try:
+        there = torch.device(device)
+        torch.empty(0, device=there)
+    except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
+        reason = str(error).splitlines()[0].rstrip(". ") if str(error) else type(error).__name__
+        raise ValueError(f"`device` {str(device)!r} is not to be had here ({reason}): use device='cpu'.") from None
+    return there
+
+
+def check_compilable(dtype: torch.dtype, device: torch.device) -> None:
+    """Raise a ValueError unless the numbers of a flow are float64 on the CPU, which compiled loops need."""
+    if dtype != torch.float64 or device.type != "cpu":
+        raise ValueError(f"`flow` is {dtype} on {device}: compiled flows are float64 on the CPU.")
+
+
+def checksum(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of the tensors by name: their names, dtypes, shapes and little-endian bytes."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        array = tensors[name].detach().cpu().numpy()
+        digest.update(json.dumps([name, str(array.dtype), array.shape]).encode())
+        digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
+    return digest.hexdigest()
+
+
+class Contents:
+    """The values of tensors in some modules' dictionaries, read from memory in microseconds.
+
+    A tensor's version counter misses edits through `.data`, and a new tensor may stand in the dictionary.
+
+    Parameters
+    ----------
+    tensors : iterable of dict
+        `_parameters` or `_buffers` of modules.
+    """
+
+    def __init__(self, tensors: Iterable[Mapping[str, Tensor | None]]) -> None:
+        self._tensors = [d for d in tensors if d]
+        self._addresses: list[int] = []
+        self._views: list[np.ndarray] = []
+        self._shared = False  # True where the views are the memory of the tensors, which lie on the CPU
+
+    def first(self) -> Tensor:
+        """Return one of the tensors."""
+        return next(w for d in self._tensors for w in d.values() if w is not None)
+
+    def snapshot(self) -> bytes:
+        """Return the bytes of all numbers."""
+        addresses = [w.data_ptr() for d in self._tensors for w in d.values() if w is not None]
+        if addresses != self._addresses or not self._shared:
+            tensors = [w for d in self._tensors for w in d.values() if w is not None]
+            self._views = [np.ascontiguousarray(w.detach().cpu().numpy()) for w in tensors]
+            self._addresses, self._shared = addresses, all(w.device.type == "cpu" for w in tensors)
+        return b"".join(self._views)  # type: ignore[arg-type]
+
+
+class Kept(Generic[T]):
+    """Something that is made of the weights, and made anew when one of them has changed.
+
+    Parameters
+    ----------
+    tensors : iterable of dict
+        As for `Contents`.
+    """
+
+    def __init__(self, tensors: Iterable[Mapping[str, Tensor | None]]) -> None:
+        self._contents = Contents(tensors)
+        self._known: tuple[bytes, T] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_known": None}  # copies and pickles make their own
+
+    def first(self) -> Tensor:
+        """Return one of the tensors."""
+        return self._contents.first()
+
+    def current(self, make: Callable[[], T]) -> T:
+        """Return what `make` gave for the weights as they are now."""
+        snapshot = self._contents.snapshot()
+        if self._known is None or self._known[0] != snapshot:
+            self._known = snapshot, make()
+        return self._known[1]

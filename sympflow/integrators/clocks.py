@@ -1,0 +1,566 @@
+"""Clocks: the times in which the steps of a method are equal, and runs in the physical time t.
+
+On the physical clock the steps are those of the grid t0 + k·dt. On the logarithmic one they are equal in the time s of
+the logarithmic Hamiltonian; t is a coordinate of the transformed system, whose value at the end of a step is what the
+method makes it. A state at a time that is asked for is a shorter step from the last state before it, of the length σ
+that solves t(σ) = t, to rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Protocol
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
+from sympflow.integrators.base import FixedStep
+from sympflow.integrators.contract import FINISHED, Outcome, Problem, Steps
+from sympflow.integrators.grid import Grid
+
+LARGEST_CHUNK = 2**20  # numbers in one chunk of states
+FIRST_CHUNK = 2**16  # steps, at most, before it is known how fast time goes
+LONGEST_STRIDE = 64  # steps from one state that is kept to the next, where few outputs are wanted
+MOST_KEPT = 100_000_000  # numbers that a run may store where every step is an output
+FEW_EVALUATIONS = 20_000  # of forces on arrays, half a second, before a run whose time hardly advances is ended;
+EVALUATIONS_EACH = 50  # and these for each step of the physical length dt within the interval,
+STEPS_EACH = 6  # or as many as so many steps take
+COMPILED_FOR_ONE = 10  # compiled evaluations that are allowed for one on arrays, which takes a thousand times longer
+MOST_EXPECTED = 1e9  # steps, beyond which the run by chunks says whether they are too many
+
+BREAKDOWN = (
+    "T + B or c − V ceased to be positive and finite",
+    "Reduce `dt`, or raise `shift` above the energy",
+)
+_TRANSFORMED: WeakKeyDictionary[HamiltonianSystem, dict[float, HamiltonianSystem]] = WeakKeyDictionary()
+_SCALES: WeakKeyDictionary[HamiltonianSystem, dict[float, float]] = WeakKeyDictionary()
+
+
+def transformed_system(system: HamiltonianSystem, shift: float | None) -> HamiltonianSystem:
+    """Return the transformed system, made once for each c."""
+    c = default_shift(system) if shift is None else float(shift)
+    made = _TRANSFORMED.setdefault(system, {})
+    if c not in made:
+        made[c] = time_transformed(system, c)
+    return made[c]
+
+
+def scale_of(system: HamiltonianSystem, c: float) -> float:
+    """Return ds/dt where the kinetic energy is c − E, at the energy E of the system's y0; worked out once."""
+    known = _SCALES.setdefault(system, {})
+    if c not in known:
+        known[c] = time_scale(system, c)
+    return known[c]
+
+
+class TimedLoops(Protocol):
+    """A compiled pass in the physical time; see `kernels.timed.reach_times`."""
+
+    def __call__(
+        self,
+        transformed: HamiltonianSystem,
+        h: float,
+        start: np.ndarray,
+        times: np.ndarray,
+        stride: int,
+        expected: float,
+        backend: str,
+    ) -> tuple[np.ndarray, np.ndarray] | None: ...
+
+
+class Counts(Protocol):
+    """The evaluations of a method; see `FixedStep.evaluations`."""
+
+    def __call__(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]: ...
+
+
+@dataclass(frozen=True)
+class LogarithmicClock:
+    """A method with equal steps in s, on one system.
+
+    Attributes
+    ----------
+    name : str
+        The name of the method, for messages.
+    system, transformed : HamiltonianSystem
+    inner : FixedStep
+        The method that is applied to the transformed system.
+    dt : float
+        The physical length of a step where the kinetic energy is B = c − E.
+    new_step : float
+        The length of a step in s.
+    evaluations : callable
+    reach_times : callable
+    """
+
+    name: str
+    system: HamiltonianSystem
+    transformed: HamiltonianSystem
+    inner: FixedStep
+    dt: float
+    new_step: float
+    evaluations: Counts
+    reach_times: TimedLoops
+
+    @property
+    def shift(self) -> float:
+        """c, of the transformed system."""
+        return self.transformed.params["shift"]
+
+    # one step -------------------------------------------------------------------------------------
+
+    def step(self, y: Array, h: float | Array) -> Array:
+        """One step of the physical length h, with B = c − H(y)."""
+        rows, lengths = _rows(y, h)
+        return projected(self._reached(lifted(self.system, rows, self.shift), lengths)[0]).reshape(y.shape)
+
+    def inverse(self, y: Array, h: float | Array) -> Array:
+        """The states from which `step` leads to y."""
+        rows, lengths = _rows(y, h)
+        system, c = self.system, self.shift
+        x, B = rows, c - system.hamiltonian(rows)
+        for _ in range(100):  # B belongs to the state that is sought: a contraction, for the step changes H little
+            x = projected(self._reached(lifted(system, rows, c, B), -lengths)[0])
+            before, B = B, c - system.hamiltonian(x)
+            if not (np.abs(B - before) > 2 * np.finfo(rows.dtype).eps * (np.abs(B) + np.abs(c - B))).any():
+                break
+        return x.reshape(y.shape)
+
+    def tangent(self, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
+        """The step and its Jacobian in [q, p], the realised step in s and B held fixed."""
+        rows, lengths = _rows(to_numpy(y), h)
+        end, sigma = self._reached(start := lifted(self.system, rows, self.shift), lengths)
+        _, A = self.inner.tangent(self.transformed, 0.0, start, sigma)
+        d = self.system.ndof
+        keep = np.r_[0:d, d + 1 : 2 * d + 1]
+        return projected(end).reshape(y.shape), A[:, keep][:, :, keep].reshape(*y.shape, 2 * d)
+
+    def _reached(self, start: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The states a physical time h after `start` by one step each, and its length σ in s."""
+
+        def step(sigma: np.ndarray) -> np.ndarray:
+            return np.asarray(self.inner.step(self.transformed, 0.0, start, sigma))
+
+        d = self.system.ndof
+        with np.errstate(all="ignore"):
+            speed = self.shift - to_numpy(self.system.potential(start[:, :d]))
+            longest = h * speed
+            for _ in range(60):  # a length beyond the one that is sought
+                short = (step(longest)[:, d] - h) * np.sign(h) < 0
+                if not short.any():
+                    break
+                longest = np.where(short, 2 * longest, longest)
+            return reach(step, start, longest, h, h * speed)
+
+    # a run ----------------------------------------------------------------------------------------
+
+    def run(self, problem: Problem) -> Outcome:
+        """Solve the problem."""
+        if is_tensor(problem.y0):
+            raise TypeError(
+                f"`y0` is a tensor, but method {self.name!r} finds its outputs by root-finding on NumPy arrays: pass "
+                "y0.numpy(), or solve time_transformed(system), which takes tensors."
+            )
+        return timed_pass(self, problem) or PhysicalRun(self, problem).outcome()
+
+    def steps(self, t_span: tuple[float, float], y0: Array) -> Steps:
+        """The steps of the run, their physical lengths; in a batch one that has ended waits with length 0."""
+        run = PhysicalRun(self, Problem(self.system, *t_span, y0))
+        sign, batch = run.sign, y0.shape[:-1]
+        for states, last in run.chunks():
+            t = run.sign * states[..., self.system.ndof]
+            t = np.minimum(t, abs(t_span[1] - t_span[0]))
+            n = int(last.max())
+            index = np.minimum(np.arange(n + 1), last[:, None])
+            t, x = np.take_along_axis(t, index, 1), np.take_along_axis(states, index[..., None], 1)
+            shape = (n, *batch)
+            y = projected(x[:, :-1]).swapaxes(0, 1).reshape(*shape, -1)
+            yield t_span[0] + sign * t[:, :-1].T.reshape(shape), y, sign * np.diff(t, axis=1).T.reshape(shape)
+
+
+def _rows(y: Array, h: Any) -> tuple[np.ndarray, np.ndarray]:
+    """States as rows, and a length for each."""
+    if is_tensor(y):
+        raise TypeError("`y` is a tensor: the logarithmic methods step NumPy arrays; pass y.numpy().")
+    rows = np.asarray(y).reshape(-1, y.shape[-1])
+    return rows, np.broadcast_to(np.asarray(h, dtype=rows.dtype), y.shape[:-1]).reshape(-1)
+
+
+@lru_cache(maxsize=256)
+def physical_length(h: float, scale: float, clock: tuple[float, ...]) -> float:
+    """The physical length of a step h in the new time where the kinetic energy is B = scale/2: h/scale.
+
+    To it a trained clock adds Σ_k c_k h^(3+2k) B^k, of the numbers c_k, the last one first.
+    """
+    square, total = h * h * scale / 2, 0.0
+    for c in clock:
+        total = total * square + c
+    return h / scale + h * h * h * total
+
+
+@lru_cache(maxsize=256)
+def step_of_length(length: float, scale: float, clock: tuple[float, ...]) -> float:
+    """The step h of that `physical_length`, if it is at most the one for which the clock was trained."""
+    h = length * scale
+    for _ in range(100 if clock else 0):  # a contraction, for the clock adds little
+        before, h = h, h - scale * (physical_length.__wrapped__(h, scale, clock) - length)
+        if abs(h - before) <= 1e-15 * h:
+            break
+    return h
+
+
+def reach(
+    step: Callable[[np.ndarray], np.ndarray],
+    start: np.ndarray,
+    longest: np.ndarray,
+    target: np.ndarray,
+    guess: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The states step(σ), σ from 0 to `longest`, whose time is `target`, and σ: the secant method within brackets."""
+    d = start.shape[1] // 2 - 1
+    eps = float(np.finfo(start.dtype).eps)
+    tolerance = 2 * eps * np.maximum(np.abs(target), np.abs(start[:, d]))
+    low, high = np.zeros_like(longest), longest.copy()
+    sign = np.sign(longest)
+    sigma = np.where((guess - low) * sign < 0, low, np.where((guess - high) * sign > 0, high, guess))
+    best, best_sigma, best_residual = start.copy(), np.zeros_like(sigma), np.abs(start[:, d] - target)
+    last_sigma, last_t = np.zeros_like(sigma), start[:, d].copy()
+    for _ in range(80):
+        x = step(sigma)
+        residual = x[:, d] - target
+        better = np.abs(residual) < best_residual
+        best[better], best_sigma[better], best_residual[better] = x[better], sigma[better], np.abs(residual)[better]
+        if not (best_residual > tolerance).any():
+            break
+        beyond = ~(residual * sign < 0)  # NaN counts as too far
+        high, low = np.where(beyond, sigma, high), np.where(beyond, low, sigma)
+        slope = (x[:, d] - last_t) / (sigma - last_sigma)  # the first time of the chord of the step so far
+        rate = np.where(np.isfinite(slope) & (slope > 0), slope, np.inf)
+        secant = sigma - residual / rate
+        inside = ((secant - low) * sign > 0) & ((high - secant) * sign > 0)
+        last_sigma, last_t = sigma, x[:, d].copy()
+        sigma = np.where(inside & np.isfinite(secant), secant, (low + high) / 2)
+    best[best_residual > np.maximum(1e-3 * np.abs(target - start[:, d]), 100 * tolerance)] = np.nan  # no such σ
+    return best, best_sigma
+
+
+class PhysicalRun:
+    """One run: chunks of steps, equal in s, until the physical end is passed."""
+
+    def __init__(self, clock: LogarithmicClock, problem: Problem) -> None:
+        self.clock, self.problem = clock, problem
+        self.system = problem.system
+        self.transformed = clock.transformed
+        self.d, c = self.system.ndof, self.transformed.params["shift"]
+        rows = problem.y0.reshape(-1, problem.y0.shape[-1])
+        with np.errstate(all="ignore"):
+            gap = np.asarray(c - self.system.potential(rows[:, : self.d]))
+            self.start = lifted(self.system, rows, c)
+        if (gap <= 0).any():
+            i = int(np.argmax(gap <= 0))
+            with np.errstate(all="ignore"):
+                energy = float(self.system.hamiltonian(rows[i]))
+            if not np.isfinite(energy):
+                raise ValueError(f"`y0` has the energy {energy:g}: give a state of a finite one.")
+            raise ValueError(
+                f"`shift` {c:g} does not exceed the potential at `y0`, {c - gap[i]:g}: give one above the energy "
+                f"{energy:g}, so that c − V stays positive."
+            )
+        self.length = abs(problem.t1 - problem.t0)
+        self.sign = 1.0 if problem.t1 >= problem.t0 else -1.0
+        if self.length:
+            Grid(problem.t0, problem.t1, clock.dt)  # refuses a dt of too many steps
+        self.h = self.sign * clock.new_step
+        compiled = problem.backend != "array" and problem.y0.dtype == np.float64 and self.system.symbols is not None
+        self.most_steps = self._most_steps(COMPILED_FOR_ONE if compiled else 1)
+        self.n_steps = np.zeros(len(rows), dtype=int)
+        self.n_extra, self.backend = 0, ""
+        start = self.start[0] if len(rows) == 1 else self.start
+        self.stepper = clock.inner.stepper(Problem(clock.transformed, 0.0, self.h, start, backend=problem.backend))
+        self.failed_at = np.full(len(rows), np.nan)
+        self.stalled = np.zeros(len(rows), dtype=bool)
+        self.stride = 1
+
+    def _most_steps(self, allowance: int) -> int:
+        """Steps after which time hardly advances: before a collision they would never end, so it is evaluations."""
+        made = self.clock.evaluations(1000, 0, 0, "numpy")
+        stages = max(1, round(sum(made.values()) / 1000))
+        nominal = self.length / self.clock.dt
+        return int(allowance * (FEW_EVALUATIONS / stages + max(EVALUATIONS_EACH / stages, STEPS_EACH) * nominal))
+
+    def chunks(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Chunks of states (N, n + 1, 2d + 2), `stride` steps apart, and the last (N,) of a run, at or past its end."""
+        x, total = self.start, 0
+        n = self._chunk(1.1 * self.length / self.clock.dt + 2, FIRST_CHUNK)
+        running = np.full(len(x), self.length > 0)
+        while running.any():
+            if self.most_steps - total < self.stride:
+                self.stride = 1
+            n = min(n, max(1, (self.most_steps - total) // self.stride))
+            states, good = x[:, None].repeat(n + 1, axis=1), np.zeros(len(x), dtype=int)
+            states[running], finite = self._steps(x[running], n * self.stride, self.stride)
+            good[running] = np.minimum(finite // self.stride, n)
+            t = self.sign * states[..., self.d]
+            forward = np.isfinite(t) & (np.maximum.accumulate(np.where(np.isfinite(t), t, np.inf), axis=1) <= t)
+            good = np.minimum(good, np.where(forward.all(1), n, np.argmin(forward, axis=1) - 1))  # time must not turn
+            passed = (t >= self.length) & (np.arange(n + 1) <= good[:, None])
+            last = np.where(passed.any(1), passed.argmax(1), good)
+            last[~running] = 0
+            lost = running & ~passed.any(1) & (good < n)
+            if self.stride > 1 and lost.any():  # step by step, to see where
+                steps, self.stride = n * self.stride, 1
+                n = self._chunk(steps, FIRST_CHUNK)
+                continue
+            if total + n * self.stride >= self.most_steps:
+                self.stalled = running & ~passed.any(1) & ~lost
+                lost |= self.stalled
+            self.n_steps += self.stride * last
+            total += n * self.stride
+            rows = np.arange(len(x))
+            elapsed = np.where(np.isnan(t[rows, last]), 0, t[rows, last])  # of a start that is not finite
+            self.failed_at[lost] = self.problem.t0 + self.sign * elapsed[lost]
+            yield states, last
+            paces = np.where(running, (t[rows, last] - t[:, 0]) / np.maximum(last, 1), np.nan)
+            pace = np.fmin.reduce(paces) / self.stride  # of those that are numbers, if any is
+            running = running & ~passed.any(1) & ~lost
+            x = states[rows, last]
+            left = (self.length - t[rows, last][running]).max(initial=0.0)
+            n = self._chunk(1.02 * left / pace + 2 if pace > 0 else np.inf, 4 * n * self.stride)
+
+    def _chunk(self, steps: float, most: int) -> int:
+        """How many states of a chunk so many steps are, or the most that there may be."""
+        kept = max(16, LARGEST_CHUNK // self.start.size)
+        return int(min(max(16, steps if steps < most else most) / self.stride + 1, kept))
+
+    def _steps(self, x: np.ndarray, n: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
+        """Of n steps from the states x (N, 2d + 2) each `stride`-th, (N, 1 + n/stride, 2d + 2), and the last finite."""
+        alone = len(x) == 1
+        found, finite = self.stepper.rollout(x[0] if alone else x, self.h, n, np.arange(0, n + 1, stride))
+        self.backend = self.stepper.backend
+        return (found[None] if alone else np.moveaxis(found, 0, 1)), np.atleast_1d(finite)
+
+    def reach(self, before: np.ndarray, after: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """States [q, t, p, B] at the elapsed times `target`, within the steps from `before` to `after`."""
+
+        def step(sigma: np.ndarray) -> np.ndarray:
+            self.n_extra += len(sigma)
+            return np.asarray(self.stepper.shorter(before, sigma))
+
+        with np.errstate(all="ignore"):
+            advance = after[:, self.d] - before[:, self.d]
+            h = np.full(len(before), self.h, dtype=before.dtype)
+            guess = h * (target - before[:, self.d]) / np.where(advance == 0, 1, advance)
+            x, _ = reach(step, before, h, target, guess)
+        at_end = after[:, self.d] == target
+        x[at_end] = after[at_end]
+        return x
+
+    def outcome(self) -> Outcome:
+        problem = self.problem
+        single = problem.y0.ndim == 1
+        times = problem.t_eval
+        if times is None and not single:  # the trajectories take different steps: report on a common grid
+            times = Grid(problem.t0, problem.t1, self.clock.dt).outputs(None, problem.save_every)[0]
+        N = len(self.start)
+        wanted = np.empty(0) if times is None else (times - problem.t0).astype(self.start.dtype)
+        out = np.full((len(wanted), N, 2 * self.d), np.nan, dtype=self.start.dtype)
+        at_start = wanted == 0
+        out[at_start] = projected(self.start)
+        delivered = np.full(N, int(at_start.sum()))
+        kept: list[tuple[np.ndarray, np.ndarray]] = []
+        if times is not None and not problem.dense_output:  # what few outputs do not need is not kept
+            steps = self.length / self.clock.dt / (len(wanted) + 1)
+            self.stride = int(min(max(1.0, steps**0.5), LONGEST_STRIDE))
+        for states, last in self.chunks():
+            if problem.dense_output or times is None:
+                kept.append((states, last))
+                self._check_memory(kept)
+            if times is not None:
+                self._deliver(states, last, wanted, delivered, out)
+                if not problem.dense_output and (delivered == len(wanted)).all():
+                    break
+        path = _Path(self, kept) if kept or problem.dense_output else None
+        if times is None:
+            times, out = self._every_step(path)
+        elif single:
+            keep = int(delivered[0])
+            times, out = times[:keep], out[:keep]
+        y = out.reshape(len(times), *problem.y0.shape)
+        failed = np.isfinite(self.failed_at)
+        n_steps = int(self.n_steps.max(initial=0))
+        stats: dict[str, Any] = {
+            "dt": self.clock.dt,
+            "n_steps": n_steps,
+            **self.stepper.evaluations(n_steps, n_steps, self.n_extra),
+            "backend": self.backend or "numpy",
+        }
+        outcome = Outcome(times, y, 0 if single else np.where(failed, -1, 0).reshape(y.shape[1:-1]), FINISHED, stats)
+        if failed.any():
+            if single:
+                outcome.status = -1
+            stats["failed_at"] = float(self.failed_at[0]) if single else self.failed_at.reshape(y.shape[1:-1])
+            outcome.message = self._failure(int(np.argmax(failed)), int(failed.sum()))
+        if problem.dense_output:
+            outcome.sol = path
+        return outcome
+
+    @staticmethod
+    def _check_memory(kept: list[tuple[np.ndarray, np.ndarray]]) -> None:
+        if sum(states.size for states, _ in kept) > MOST_KEPT:
+            raise ValueError(
+                f"`t_eval` is not given, and the steps are so short that more than {MOST_KEPT:.0e} values would be "
+                "stored: choose the times with `t_eval`, leave dense_output out, or raise `dt`."
+            )
+
+    def _failure(self, i: int, count: int) -> str:
+        what, remedy = BREAKDOWN
+        if self.stalled[i]:
+            what = f"After {self.n_steps[i]} steps time hardly advances any more, as before a collision"
+            remedy = "End `t_span` earlier, or raise `dt`"
+        which = (
+            "" if len(self.start) == 1 else f"{count} of {len(self.start)} trajectories failed, the first (index {i}): "
+        )
+        return f"{which}{what}, after t = {self.failed_at[i]:.17g}. {remedy}."
+
+    def _deliver(
+        self, states: np.ndarray, last: np.ndarray, wanted: np.ndarray, delivered: np.ndarray, out: np.ndarray
+    ) -> None:
+        """The outputs that fall into a chunk."""
+        t = self.sign * states[..., self.d]
+        ahead = t[np.arange(len(t)), last]
+        end = np.where(last > 0, np.searchsorted(self.sign * wanted, ahead, side="right"), delivered)
+        count = np.maximum(end - delivered, 0)
+        ended = np.flatnonzero((last > 0) & (ahead >= self.length))
+        row = np.repeat(np.arange(len(t)), count)
+        output = np.arange(len(row)) - np.repeat(np.cumsum(count) - count - delivered, count)
+        due = self.sign * wanted[output]
+        if len(row) <= len(t):  # few outputs of many trajectories
+            k = (np.where(np.arange(t.shape[1]) <= last[row, None], t[row], np.inf) >= due[:, None]).argmax(1)
+        else:
+            k = np.concatenate([t[i, : last[i] + 1].searchsorted(due[row == i]) for i in np.flatnonzero(count)])
+        k = k.clip(1) - 1
+        delivered += count
+        target = wanted[output]
+        if self.stride > 1 and (len(row) or len(ended)):
+            rows, ks = np.append(row, ended).astype(int), np.append(k, last[ended] - 1).astype(int)
+            targets = np.append(target, np.full(len(ended), self.sign * self.length, target.dtype))
+            before, after, step = self._between(states[rows, ks], targets)
+            self.n_steps[ended] += step[len(row) :] + 1 - self.stride
+            before, after = before[: len(row)], after[: len(row)]
+        else:
+            before, after = states[row, k], states[row, k + 1]
+        if len(row):
+            out[output, row] = projected(self.reach(before, after, target))
+
+    def _between(self, x: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of `stride` steps from x (n, 2d + 2), the states before and after the one that passes a time, and which."""
+        states, _ = self._steps(x, self.stride, 1)
+        beyond = self.sign * (states[..., self.d] - target[:, None]) >= 0
+        k = np.where(beyond.any(1), beyond.argmax(1), self.stride).clip(1) - 1
+        rows = np.arange(len(x))
+        return states[rows, k], states[rows, k + 1], k
+
+    def _every_step(self, path: _Path | None) -> tuple[np.ndarray, np.ndarray]:
+        """Times and states (n, 1, 2d) of every `save_every`-th step of a single trajectory, and of the end."""
+        if path is None:
+            return np.array([self.problem.t0]), projected(self.start)[None]
+        x = path.states[0]
+        inside = self.sign * x[:, self.d] < self.length
+        count = int(np.count_nonzero(inside))
+        keep = np.arange(0, count, self.problem.save_every)
+        t = self.problem.t0 + x[keep, self.d].astype(float)
+        y = projected(x[keep])
+        if np.isnan(self.failed_at[0]):
+            t = np.append(t, self.problem.t1)
+            y = np.concatenate([y, path(self.problem.t1).reshape(1, -1)])
+        elif keep[-1] != count - 1:
+            t, y = np.append(t, self.problem.t0 + x[count - 1, self.d]), np.concatenate([y, projected(x[[count - 1]])])
+        return t, y[:, None]
+
+
+class _Path:
+    """Dense output in the physical time: sol(t) has shape (..., 2d) or (..., 2d, n)."""
+
+    def __init__(self, run: PhysicalRun, kept: list[tuple[np.ndarray, np.ndarray]]) -> None:
+        self.run = run
+        self.states = [
+            np.concatenate([run.start[i : i + 1], *(states[i, 1 : last[i] + 1] for states, last in kept)])
+            for i in range(len(run.start))
+        ]
+        self.t_min, self.t_max = sorted((run.problem.t0, run.problem.t1))
+
+    def __call__(self, t: Any) -> np.ndarray:
+        run, times = self.run, np.atleast_1d(np.asarray(t, dtype=float))
+        if times.size and not (times.min() >= self.t_min and times.max() <= self.t_max):
+            raise ValueError(f"`t` must lie in [{self.t_min:g}, {self.t_max:g}], the interval that was solved.")
+        target = (times - run.problem.t0).astype(run.start.dtype)
+        rows = []
+        for x in self.states:
+            if len(x) == 1:
+                rows.append(np.repeat(projected(x), len(times), axis=0))
+                continue
+            k = np.searchsorted(run.sign * x[:, run.d], run.sign * target, side="left").clip(1, len(x) - 1) - 1
+            found = projected(run.reach(x[k], x[k + 1], target))
+            found[target == 0] = projected(x[:1])
+            found[run.sign * target > run.sign * x[-1, run.d]] = np.nan
+            rows.append(found)
+        y = np.stack(rows).swapaxes(-1, -2).reshape(*run.problem.y0.shape, len(times))
+        return y[..., 0] if np.ndim(t) == 0 else y
+
+
+def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:
+    """The outcome of a run, or None where there is no compiled pass for it or it did not reach its end.
+
+    None for dense output, for outputs at every step, and for whatever is an error: `PhysicalRun` says what it is.
+    """
+    system, y0, times = problem.system, problem.y0, problem.t_eval
+    length, dt = abs(problem.t1 - problem.t0), clock.dt
+    if problem.dense_output or problem.backend == "array" or y0.dtype != np.float64 or system.symbols is None:
+        return None
+    far = max(abs(problem.t0), abs(problem.t1))
+    if not length or length > MOST_EXPECTED * dt or far + dt == far:
+        return None
+    if times is None:
+        if y0.ndim == 1:
+            return None
+        times = Grid(problem.t0, problem.t1, dt).outputs(None, problem.save_every)[0]
+    sign = 1.0 if problem.t1 > problem.t0 else -1.0
+    elapsed = sign * (times - problem.t0)
+    if not len(elapsed) or not elapsed[-1]:
+        return None
+    first = 0 if elapsed[0] else int(elapsed.searchsorted(0.0, "right"))
+
+    transformed = clock.transformed
+    from sympflow.kernels.timed_loops import lifted_rows
+
+    start = lifted_rows(system, y0.reshape(-1, y0.shape[-1]), transformed.params["shift"])
+    if start is None:
+        return None
+    expected = float(elapsed[-1]) / dt
+    stride = int(min(max(1.0, (length / dt / (len(elapsed) + 1)) ** 0.5), LONGEST_STRIDE))
+    h = sign * clock.new_step
+    found = clock.reach_times(transformed, h, start, elapsed[first:], stride, expected, problem.backend)
+    if found is None:
+        return None
+    Y, counts = found
+    if first:
+        initial = y0.reshape(1, -1, y0.shape[-1])
+        Y = np.concatenate([np.broadcast_to(initial, (first, *initial.shape[1:])), Y])
+    if y0.ndim == 1:
+        n_steps, n_extra = counts[0].tolist()
+        status: Any = 0
+    else:
+        n_steps, n_extra = int(counts[:, 0].max()), int(counts[:, 1].sum())
+        status = np.zeros(y0.shape[:-1], dtype=int)
+    stats = {
+        "dt": dt,
+        "n_steps": n_steps,
+        **clock.evaluations(n_steps, n_steps, n_extra, "compiled"),
+        "backend": "compiled",
+    }
+    return Outcome(times, Y.reshape(len(times), *y0.shape), status, FINISHED, stats, finite=True)

@@ -1,0 +1,363 @@
+"""Splittings: the ways to cut a vector field into exactly solvable parts, and a scheme composed of their flows.
+
+A composition is a scheme × a splitting on one system: `step`, `inverse`, compiled loops, counts. A splitting is a class
+here and a row of `SPLITTINGS`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, ClassVar
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
+from sympflow.hamiltonian.monomials import Monomials, gradient
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, like, linear_and_rest, map_evaluations
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import rollout
+from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, scheme_evaluations
+
+if TYPE_CHECKING:
+    from sympflow.kernels.protocol import Kernel
+
+_PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, ExactParts]] = WeakKeyDictionary()
+
+
+class Composition(ABC):
+    """A scheme composed of the exact flows of the parts of one system.
+
+    Parameters
+    ----------
+    method : str
+        The name of the method, for messages.
+    scheme : Scheme
+    system : HamiltonianSystem
+    parts : sequence of str, optional
+        Expressions that add up to H, for `SolvableParts`.
+
+    Raises
+    ------
+    ValueError
+        If the splitting, or the scheme with it, does not apply to the system.
+    """
+
+    compensates: ClassVar[bool] = False
+    """True if there are compensated sums."""
+
+    def __init__(
+        self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
+    ) -> None:
+        self.method, self.scheme, self.system = method, scheme, system
+
+    @abstractmethod
+    def step(self, y: Array, h: Any) -> Array:
+        """One step of length h, a number or one for each state, from y (..., 2d)."""
+
+    @abstractmethod
+    def inverse(self, y: Array, h: Any) -> Array:
+        """The states from which `step` leads to y."""
+
+    def tangent(self, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray] | None:
+        """The step and its Jacobian (..., 2d, 2d); None where `step` itself is to be differentiated."""
+        return None
+
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray]:
+        """Many steps by array operations, as `base.rollout`."""
+        return rollout(lambda k, y: self.step(y, h), y0, n_steps, save)
+
+    @abstractmethod
+    def kernel(self, compensated: bool) -> Kernel:
+        """The compiled loops; a ValueError says why there are none."""
+
+    @abstractmethod
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Evaluations of forces and their derivatives, as `FixedStep.evaluations`."""
+
+
+class KineticPotential(Composition):
+    """H = T(p) + V(q): drifts q += a h ∇T(p) and kicks p −= b h ∇V(q)."""
+
+    compensates: ClassVar[bool] = True
+
+    def __init__(
+        self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
+    ) -> None:
+        super().__init__(method, scheme, system)
+        if not system.separable:
+            raise ValueError(
+                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use a "
+                "Runge–Kutta method or train a SympFlow."
+            )
+        if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
+            raise ValueError(
+                f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.name!r} has not: use a scheme "
+                "for any separable system, such as 'kahan_li8'."
+            )
+
+    def step(self, y: Array, h: Any) -> Array:
+        system = self.system
+        q, p = y[..., : system.ndof], y[..., system.ndof :]
+        h = per_state(h, y)
+        for substep in self.scheme.substeps:
+            if substep.kind == "drift":
+                q = q + (substep.one * h) * system.velocity(p)
+            else:
+                p = p + _kick(system, q, substep, h, self.scheme.monomials)
+        return concatenate([q, p])
+
+    def inverse(self, y: Array, h: Any) -> Array:
+        system = self.system
+        q, p = y[..., : system.ndof], y[..., system.ndof :]
+        h = per_state(h, y)
+        for substep in reversed(self.scheme.substeps):
+            if substep.kind == "drift":
+                q = q - (substep.one * h) * system.velocity(p)
+            else:
+                p = p - _kick(system, q, substep, h, self.scheme.monomials)
+        return concatenate([q, p])
+
+    def tangent(self, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray] | None:
+        if self.scheme.level:  # would need third derivatives of V: differentiate the step itself
+            return None
+        system, d = self.system, self.system.ndof
+        y = to_numpy(y)
+        q, p, h = y[..., :d], y[..., d:], np.asarray(h, dtype=y.dtype)[..., None]
+        A = np.broadcast_to(np.eye(2 * d, dtype=y.dtype), (*y.shape, 2 * d)).copy()
+        for kind, c, *_ in self.scheme.substeps:
+            if kind == "drift":
+                q = q + c * h * system.velocity(p)
+                A[..., :d, :] += c * h[..., None] * (system.kinetic_hessian(p) @ A[..., d:, :])
+            else:
+                A[..., d:, :] -= c * h[..., None] * (system.potential_hessian(q) @ A[..., :d, :])
+                p = p + c * h * system.force(q)
+        return np.concatenate([q, p], axis=-1), A
+
+    def kernel(self, compensated: bool) -> Kernel:
+        from sympflow.kernels.splitting_loops import splitting_loops
+
+        return splitting_loops(self.system).kernel(self.scheme, compensated)
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
+
+
+def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials: Monomials) -> Array:
+    """The change of p by a kick, where the scheme has it the force gradient, the curvature or the polynomial too."""
+    force = system.force(q)
+    change = (kick.one * h) * force
+    if kick.three:
+        change = change - (kick.three * h**3) * system.hessian_vector(q, system.velocity(force))
+    if kick.five:
+        change = change - (kick.five * h**5) * system.curvature_gradient(q)
+    if kick.polynomial:
+        change = change - h**3 * gradient(monomials, kick.polynomial, q)
+    return change
+
+
+# exact flows of parts ------------------------------------------------------------------------------
+
+
+class ExactMaps(Composition):
+    """A step that is a list of exact flows of the parts of H; a subclass defines the list."""
+
+    parts: ExactParts
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ExactMaps) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def _key(self) -> tuple[Any, ...]:
+        return type(self), self.scheme, self.parts
+
+    @abstractmethod
+    def maps(self, h: Any) -> list[Map]:
+        """The maps of a step of length h, a number or an array (...)."""
+
+    def step(self, y: Array, h: Any) -> Array:
+        parts = self.parts
+        return parts.from_modes(*parts.apply(self.maps(h), *parts.to_modes(y)))
+
+    def inverse(self, y: Array, h: Any) -> Array:
+        parts = self.parts
+        back = [m.inverse() for m in reversed(self.maps(h))]
+        return parts.from_modes(*parts.apply(back, *parts.to_modes(y)))
+
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray]:
+        return rollout_in_modes(self.parts, self.maps(h), y0, n_steps, save)
+
+    def kernel(self, compensated: bool) -> Kernel:
+        from sympflow.kernels.parts_loops import parts_loops
+
+        return parts_loops(self.parts).kernel(lambda h: known_maps(self, float(h)) if h.ndim == 0 else self.maps(h))
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        return map_evaluations(known_maps(self, 1.0), n_steps, n_saved, n_extra, backend)
+
+
+@lru_cache(maxsize=64)
+def known_maps(composition: ExactMaps, h: float) -> Sequence[Map]:
+    """The maps of a step, the same object for the same step, whose table the kernel then knows."""
+    return composition.maps(h)
+
+
+def rollout_in_modes(
+    parts: ExactParts, maps: Sequence[Map], y0: Array, n_steps: int, save: np.ndarray
+) -> tuple[Array, np.ndarray]:
+    """`base.rollout` of exact flows, in the modes from beginning to end."""
+    d = parts.ndof
+    start = parts.to_modes(y0)
+    known = parts.prepared(maps, start[0])
+
+    def step(k: int, z: Array) -> Array:
+        return concatenate(parts.apply(known, z[..., :d], z[..., d:]))
+
+    modes, finite = rollout(step, concatenate(start), n_steps, save)
+    states = parts.from_modes(modes[..., :d], modes[..., d:])
+    if not (len(save) and save[0] == 0):
+        return states, finite
+    if is_tensor(states):
+        import torch
+
+        return torch.cat([y0[None], states[1:]]), finite
+    return np.concatenate([y0[None], states[1:]]), finite
+
+
+class LinearRest(ExactMaps):
+    """H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q): kicks by U, and drifts replaced by the exact linear flow.
+
+    The step is limited by U and by resonances of the linear frequencies with the step, not by the largest of them. The
+    system must have a `linear_part`.
+    """
+
+    label: ClassVar[str] = "linear"
+
+    def __init__(
+        self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
+    ) -> None:
+        super().__init__(method, scheme, system)
+        known = _PARTS.setdefault(system, {})
+        if "linear" not in known:
+            known["linear"] = linear_and_rest(system)
+        self.parts = known["linear"]
+        if scheme.level > FORCE_GRADIENT:
+            raise ValueError(
+                f"`splitting` {self.label!r} has no curvature terms, which the scheme of method {method!r} needs: use "
+                "another scheme."
+            )
+        if any(scheme.gradients) and not self.parts.has_force_gradient:
+            raise ValueError(f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p: use 'linear_srkn6b'.")
+
+    def maps(self, h: Any) -> list[Map]:
+        filters = self.filters(h)
+        maps = []
+        for kind, c, c3, *_ in self.scheme.substeps:
+            if kind == "drift":
+                maps.append(Map(LINEAR, self.times(c * h)))
+            elif self.parts.rest:
+                maps.append(Map(1, c * h, c3 * h**3 if c3 else 0.0, filters))
+        return maps
+
+    def filters(self, h: Any) -> Any:
+        """The factors of the kicks in a step of length h, (..., F); None for none."""
+        return None
+
+    def times(self, s: Any) -> Any:
+        """The time that each frequency turns in a drift of length s: (..., F)."""
+        return _each_class(s, self.parts)
+
+
+class MollifiedLinearRest(LinearRest):
+    """`LinearRest` with kicks filtered by φ = sin(hω)/(hω), 1 where nothing oscillates."""
+
+    label = "mollified"
+
+    def filters(self, h: Any) -> Any:
+        assert self.parts.linear is not None
+        representatives = self.parts.linear.representatives
+        times = _each_class(h, self.parts)
+        return _module(times).sinc(like(self.parts.linear.frequencies[representatives], times) * times / np.pi)
+
+
+class MidpointLinearRest(LinearRest):
+    """`LinearRest` with the angles by which the implicit midpoint rule turns an oscillator."""
+
+    label = "midpoint"
+
+    def times(self, s: Any) -> Any:
+        parts = self.parts
+        assert parts.linear is not None
+        times = _each_class(s, parts)
+        kinds = [parts.linear.kinds[j] for j in parts.linear.representatives]
+        rates = like(parts.linear.rates[parts.linear.representatives], times)
+        oscillates = like(np.array([kind == "oscillator" for kind in kinds]), times) != 0
+        module = _module(times)
+        angle = 2 * module.arctan(rates * times / 2)
+        return module.where(oscillates, angle / module.where(oscillates, rates, 1 + 0 * rates), times)
+
+
+def _each_class(s: Any, parts: ExactParts) -> Any:
+    """A time (...) for all F frequencies: (..., F)."""
+    if is_tensor(s):
+        return s[..., None] * s.new_ones(parts.n_classes)
+    return np.asarray(s)[..., None] * np.ones(parts.n_classes, dtype=getattr(s, "dtype", float))
+
+
+def _module(x: Any) -> Any:
+    if is_tensor(x):
+        import torch
+
+        return torch
+    return np
+
+
+class SolvableParts(ExactMaps):
+    """A symmetric composition of Strang steps over any number of parts of H that are solved exactly.
+
+    A Strang step of length h is φ₁(h/2) ∘ … ∘ φ_n(h) ∘ … ∘ φ₁(h/2).
+    """
+
+    def __init__(
+        self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
+    ) -> None:
+        super().__init__(method, scheme, system)
+        weights = scheme.strang_weights
+        if weights is None:
+            raise ValueError(
+                f"`splitting` 'parts' composes Strang steps, which the scheme of method {method!r} is not made of: use "
+                "'kahan_li8', 'kahan_li6', 'suzuki4' or 'verlet'."
+            )
+        self.weights: tuple[float, ...] = weights
+        known = _PARTS.setdefault(system, {})
+        if parts not in known:
+            known[parts] = exact_parts(system, parts)
+        self.parts = known[parts]
+
+    def maps(self, h: Any) -> list[Map]:
+        parts, maps = self.parts, list[Map]()
+        for weight in self.weights:
+            outer = [self._map(k, weight * h / 2) for k in parts.sequence[:-1]]
+            inner = self._map(parts.sequence[-1], weight * h)
+            for m in (*outer, inner, *reversed(outer)):
+                if maps and maps[-1].part == m.part:
+                    m = Map(m.part, maps.pop().length + m.length)  # noqa: PLW2901
+                maps.append(m)
+        return maps
+
+    def _map(self, k: int, h: Any) -> Map:
+        return Map(k, _each_class(h, self.parts) if k == LINEAR else h)
+
+
+SPLITTINGS: dict[str, type[Composition]] = {
+    "kinetic": KineticPotential,
+    "linear": LinearRest,
+    "mollified": MollifiedLinearRest,
+    "midpoint": MidpointLinearRest,
+    "parts": SolvableParts,
+}
+"""The splittings by the name that the option `splitting` takes."""

@@ -1,0 +1,165 @@
+"""The contract between `solve` and an integrator.
+
+An integrator is a frozen dataclass whose fields are its options (`dt`, `rtol`, …): the immutable choice of a method.
+Its duties:
+
+1. `step(system, t, y, h)` maps states y (..., 2d) over a step h, negative or not, of shape () or y.shape[:-1].
+2. `order` (None if trained), `symplectic`, `trained` and `source` are class attributes that tell the truth.
+3. `check(system)` raises a ValueError with the reason where the method does not apply.
+4. `run(problem)` produces the states that were asked for, and no others, as an `Outcome`.
+5. `steps(system, t_span, y0)` executes the same run again as a stream of the steps that it takes, and
+6. `tangent(system, t, y, h)` differentiates such a step, so that metrics judge the map that was really executed.
+7. `inverse(system, t, y, h)` undoes `step(system, t, y, h)` exactly, or raises a TypeError.
+8. `finds_events` is False, and `solve` seeks events on the dense output afterwards; or `run` hands every step to
+   `problem.events`, if there are any, and ends where that says.
+
+`FixedStep`, in `sympflow.integrators.base`, does 4, 5, 6 and 8 for any integrator that has a step: a new one needs
+duties 1 to 3 only. Whatever a run changes, such as its kernel and its counts, belongs to a `Stepper`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from sympflow.arrays import Array, jvp, to_numpy
+from sympflow.events import EventSearch
+from sympflow.hamiltonian.system import HamiltonianSystem
+
+if TYPE_CHECKING:
+    from sympflow.flow.flow_map import FlowMap
+    from sympflow.schemes import Scheme
+
+Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
+"""Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
+
+FINISHED = "The solver successfully reached the end of the integration interval."
+ENDED = "A termination event occurred."
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A validated initial value problem, and the outputs that `solve` asks an integrator for."""
+
+    system: HamiltonianSystem
+    t0: float
+    t1: float
+    y0: Array
+    t_eval: np.ndarray | None = None
+    save_every: int = 1
+    dense_output: bool = False
+    backend: str = "auto"
+    events: EventSearch | None = None
+
+
+@dataclass
+class Outcome:
+    """The answer of an integrator. `y` has time first: (n, ..., 2d)."""
+
+    t: np.ndarray
+    y: Array
+    status: int | np.ndarray
+    message: str
+    stats: dict[str, Any]
+    sol: Callable[[Any], Array] | None = None
+    finite: bool = False
+    """True if `y` has been looked at and is finite all over; `solve` looks again where this is not said."""
+
+
+class Integrator:
+    """Base class of all integrators. See the module's docstring for the contract."""
+
+    name: ClassVar[str]
+    order: ClassVar[int | None]
+    symplectic: ClassVar[bool]
+    trained: ClassVar[bool] = False
+    scheme: ClassVar[Scheme | None] = None
+    """The scheme of a splitting method."""
+    source: ClassVar[str] = ""
+    """The citation, or a line on the method, as lists of methods print it."""
+    compiles: ClassVar[bool] = False
+    finds_events: ClassVar[bool] = False
+    one_by_one: ClassVar[bool] = False
+    """True if the trajectories of a batch are run one after another, at the cost of as many single runs."""
+    on_grid: ClassVar[bool] = False
+    """True if the steps are those of the grid t0 + k·dt, as a peer that drives them presumes."""
+    in_another_time: ClassVar[bool] = False
+    """True if the steps are equal in a time that is not t."""
+    tangent_holds: ClassVar[str] = ""
+    """The quantity that `tangent` holds fixed though a step from a neighbouring state would change it."""
+
+    @classmethod
+    def options(cls) -> tuple[str, ...]:
+        """The names of the options that this method takes."""
+        return _field_names(cls)  # type: ignore[arg-type]
+
+    @classmethod
+    def summary(cls) -> str:
+        """Return the `source`, or the first line of the docstring of a method that gives none."""
+        return cls.source or (cls.__doc__ or "").partition("\n")[0]
+
+    def check(self, system: HamiltonianSystem) -> None:
+        """Raise a ValueError with the reason if the method does not apply to the system."""
+
+    def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> Integrator:
+        """Return the integrator that runs from y0 over a time `length`, where the method leaves a choice."""
+        return self
+
+    @property
+    def given_flow(self) -> FlowMap | None:
+        """The trained flow that was given as an option."""
+        return None
+
+    def flow_for(self, system: HamiltonianSystem) -> FlowMap | None:
+        """Return the trained flow that is used for a system, one in the system's own time; None if there is none."""
+        return None
+
+    def figures(self, system: HamiltonianSystem) -> Mapping[str, Any]:
+        """Return the figures of the trained flow that runs, such as `training_seconds`; {} without a flow."""
+        flow = self.flow_for(system)
+        return {} if flow is None else flow.figures
+
+    def step_length(self, system: HamiltonianSystem) -> float | None:
+        """Return the step that is used for a system; None where the method chooses its steps."""
+        return None
+
+    def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        """One step of signed length h from the states y (..., 2d)."""
+        raise TypeError(f"`method` {self.name!r} has no bare step: use solve().")
+
+    def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        """The state from which `step(system, t, ·, h)` leads to y."""
+        raise TypeError(f"`method` {self.name!r} has no exact inverse: use a symplectic method.")
+
+    def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
+        """The step from y (..., 2d) and its Jacobian A (..., 2d, 2d), by forward-mode differentiation of `step`."""
+        import torch
+
+        def step(x: torch.Tensor) -> torch.Tensor:
+            return self.step(system, t, x, torch.as_tensor(h, dtype=x.dtype))
+
+        x = torch.as_tensor(to_numpy(y))
+        columns = []
+        for i in range(x.shape[-1]):
+            direction = torch.zeros_like(x)
+            direction[..., i] = 1
+            y_next, column = jvp(step, x, direction)
+            columns.append(column)
+        return to_numpy(y_next), to_numpy(torch.stack(columns, dim=-1))
+
+    def run(self, problem: Problem) -> Outcome:
+        """Solve the problem."""
+        raise NotImplementedError(f"{type(self).__name__} must define run().")
+
+    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        """Execute the run again as a stream of its steps."""
+        raise NotImplementedError(f"{type(self).__name__} must define steps().")
+
+
+@cache
+def _field_names(cls: type) -> tuple[str, ...]:
+    return tuple(f.name for f in fields(cls))

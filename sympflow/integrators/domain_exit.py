@@ -1,0 +1,114 @@
+"""Exits of a solution from the domain Ω of a flow or of its system, and what is said of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
+from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.contract import Integrator, Outcome
+
+if TYPE_CHECKING:
+    from sympflow.flow.flow_map import FlowMap
+
+
+def _surely_within(flow: FlowMap | None, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:
+    """True if all states y (..., 2d) are in the domain of the flow and compiled code can tell."""
+    domain = (None if flow is None else flow.domain) or system.domain
+    if type(domain) is not EnergySublevel and type(domain) is not Box:
+        return False
+    return _compiled()(system, domain, y, slack)
+
+
+@cache
+def _compiled() -> Callable[..., bool]:
+    from sympflow.kernels.sublevel_loops import all_within
+
+    return all_within
+
+
+def _domain(flow: FlowMap | None, system: HamiltonianSystem) -> Domain | None:
+    return system.domain if flow is None else flow.domain_for(system)
+
+
+def check_start(flow: FlowMap, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:
+    """A flow that is taken for its accuracy must start where its accuracy was measured.
+
+    Raises
+    ------
+    ValueError
+        If a state of y0 is not in the domain of the flow.
+    """
+    if compiled and _surely_within(flow, system, y0, 0.0):
+        return
+    domain = _domain(flow, system)
+    if domain is None:
+        return
+    inside = np.asarray(domain.contains(y0))
+    if not inside.all():
+        which = f" (trajectory {', '.join(map(str, np.argwhere(~inside)[0].tolist()))})" if inside.ndim else ""
+        raise ValueError(
+            f"`y0` is outside the domain{which} that the flow with Δt = {flow.dt:g} was trained and measured on, so it "
+            "has no known accuracy to meet `tol` there: start inside, or train a flow there and pass flow=flow."
+        )
+
+
+def _meaning(flow: FlowMap | None) -> str:
+    """The worth of a trained flow outside its domain: a primed one still evaluates the system's own forces there."""
+    if flow is None or any(flow.evaluations(1, 1, 0, "array").values()):
+        return ""
+    return (
+        ", where its network was not trained: it stays finite, even past a singularity, and what it gives from that "
+        "time on means nothing. Start inside the domain, or use a classical method"
+    )
+
+
+def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:
+    """Note the first output outside the domain, or end the run there."""
+    flow = integrator.flow_for(system)
+    slack = 0.0 if flow is None else float(flow.figures.get("energy_error_max") or 0.0)
+    if outcome.stats.get("backend") == "compiled" and _surely_within(flow, system, outcome.y, slack):
+        return
+    domain = _domain(flow, system)
+    if domain is None or not len(outcome.t):
+        return
+    inside = np.asarray(domain.contains(outcome.y, slack=slack))  # (n, ...)
+    if inside.all():
+        return
+    with np.errstate(invalid="ignore"):
+        inside = inside | ~to_numpy(all_finite(outcome.y))  # what has become non-finite is reported as that
+    if inside.all():
+        return
+    first = int(np.argmin(inside.reshape(len(inside), -1).all(1)))
+    t = float(outcome.t[first])
+    outcome.stats["domain_exit"] = t
+    which = ""
+    if inside.ndim > 1:
+        index = tuple(np.argwhere(~inside[first])[0].tolist())
+        count = int((~inside).any(0).sum())
+        which = f" (trajectory {', '.join(map(str, index))}, the first of {count})"
+    note = f"The state left the domain at t = {t:.17g}{which}"
+    if action == "warn":
+        held = "the figures" if flow is None or flow.certified is None else "the figures and the certificate"
+        outcome.message += f" {note}: {held} of a trained flow do not hold there{_meaning(flow)}."
+        return
+    outcome.message = f"{note}. Start inside the domain, or pass on_domain_exit='warn'."
+    if inside.ndim == 1:
+        outcome.t, outcome.y = outcome.t[: first + 1], outcome.y[: first + 1]
+        outcome.status = -1
+        return
+    outside = np.logical_or.accumulate(~inside, axis=0)
+    after = np.concatenate([np.zeros_like(outside[:1]), outside[:-1]])  # the exit itself is kept
+    outcome.status = np.where(outside[-1], -1, outcome.status)
+    if is_tensor(outcome.y):
+        import torch
+
+        outcome.y = outcome.y.masked_fill(torch.as_tensor(after, device=outcome.y.device)[..., None], math.nan)
+    else:
+        outcome.y = np.where(after[..., None], np.nan, outcome.y).astype(outcome.y.dtype)

@@ -1,0 +1,273 @@
+"""Compiled loops of splitting schemes: any scheme on one system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
+from sympflow.kernels.protocol import Run, Steps
+from sympflow.kernels.stages import StageTable, kicks_of, lanes_source, run_table, stages_source, step_table
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+
+__all__ = ["SplittingKernel", "SplittingLoops", "compilable", "splitting_loops", "symbolic_module"]
+
+
+def splitting_loops(system: HamiltonianSystem) -> SplittingLoops:
+    """The compiled loops of splitting schemes on a separable system, made once per system.
+
+    Raises
+    ------
+    ValueError
+        If the system cannot be compiled, with the reason.
+    """
+    loops = _LOOPS.get(system)
+    if loops is None:
+        loops = _LOOPS[system] = SplittingLoops(system)
+    return loops
+
+
+_LOOPS: WeakKeyDictionary[HamiltonianSystem, SplittingLoops] = WeakKeyDictionary()
+
+
+def compilable(system: HamiltonianSystem) -> str | None:
+    """None if splitting schemes on this system can be compiled, else the reason why not."""
+    if system.symbols is None and system.numba_functions is None:
+        return f"`system` {system.name!r} is given by plain functions: use backend='array'."
+    try:
+        splitting_loops(system)
+    except ValueError as reason:  # H holds a function that has no compiled form, or is not separable
+        return str(reason)
+    return None
+
+
+class SplittingLoops:
+    """Compiled loops that run any `Scheme` on one system; states are [q, p], float64.
+
+    Force gradients and compensated sums are compiled when first used. A symbolic system's code is kept on disk for
+    the next process; that of a system given by Numba functions is not.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        Separable, and symbolic or given by Numba functions.
+    """
+
+    def __init__(self, system: HamiltonianSystem) -> None:
+        self.ndof = system.ndof
+        if not system.separable:
+            raise ValueError("`system` is not separable, so no splitting method applies: use a Runge–Kutta method.")
+        if system.symbols is not None:
+            from sympflow.kernels.codegen import algebra_source  # SymPy, which Numba functions do without
+
+            self._has_force_gradient = system.quadratic_kinetic
+            self._compile = partial(_symbolic_loops, system.symbols, algebra_source(system.symbols))
+        elif system.numba_functions is not None:
+            _, gradient, hessian_vector = system.numba_functions
+            self._has_force_gradient = hessian_vector is not None
+            self._compile = partial(_array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass)
+        else:
+            raise ValueError(
+                "`system` cannot be compiled: it is given by plain functions. Define it with "
+                "HamiltonianSystem.from_sympy or by Numba functions, or use backend='array'."
+            )
+        self._has_curvature = system.symbols is not None
+        self._variants: dict[tuple[int, bool, Monomials], LoopFunctions] = {}
+
+    def kernel(self, scheme: Scheme, compensated: bool = False) -> SplittingKernel:
+        """The loops of one scheme.
+
+        Parameters
+        ----------
+        scheme : Scheme
+        compensated : bool
+            Sum with Kahan's compensation, which lowers the growth of round-off, in runs.
+        """
+        return SplittingKernel(self, scheme, compensated)
+
+    def functions(self, level: int, compensated: bool, monomials: Monomials = ()) -> LoopFunctions:
+        """The compiled functions for kicks of a level, see `Scheme`.
+
+        Raises
+        ------
+        ValueError
+            If the system has no such kicks.
+        """
+        variant = (level, compensated, monomials)
+        if variant not in self._variants:
+            if level in (FORCE_GRADIENT, CURVATURE) and not self._has_force_gradient:
+                raise ValueError(
+                    "`scheme` has force gradients, which need a kinetic energy quadratic in p and, for a system of "
+                    "Numba functions, `hessian_vector`: take a scheme without them, for instance 'kahan_li8'."
+                )
+            if level > FORCE_GRADIENT and not self._has_curvature:
+                what = "curvature terms" if level == CURVATURE else "polynomials"
+                raise ValueError(f"`scheme` has {what}, which need a symbolic system: take one without them.")
+            self._variants[variant] = self._compile(*variant)
+        return self._variants[variant]
+
+    def step_rows(
+        self, table: StageTable, x: np.ndarray, h: np.ndarray, y: np.ndarray, monomials: Monomials = ()
+    ) -> np.ndarray:
+        """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
+
+        Parameters
+        ----------
+        table : StageTable
+            For h = 1, as coefficients (m, K) of polynomials: the kicks of row i are Σ_k kicks[:, k] x[i]^k. In a batch
+            K is 1 or at least 3.
+        x : ndarray of shape (N,)
+        h : ndarray of shape (N,)
+        y : ndarray of shape (N, 2d)
+        monomials
+            Of the polynomials, where kicks have them.
+        """
+        y = np.ascontiguousarray(y, dtype=np.float64)
+        out = np.empty(y.shape)
+        x, h = np.ascontiguousarray(x), np.ascontiguousarray(h)
+        self.functions(table.level, False, monomials).step_rows(table.packed, x, h, y, out)
+        return out
+
+
+class SplittingKernel:
+    """The compiled loops of one scheme on one system, a `Kernel`: see `SplittingLoops.kernel`."""
+
+    saves_finite = True
+
+    def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool = False) -> None:
+        self.loops, self.scheme, self.compensated = loops, scheme, compensated
+
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+        """`n_steps` steps of length `h` from one state: see `Kernel`."""
+        functions = self._functions()
+        table = run_table(self.scheme, h).packed
+        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+        out = np.empty((len(save), 2 * self.loops.ndof))
+        n_finite = run_one(
+            lambda stop: functions.rollout(table, y0, n_steps, save, out, stop),
+            n_steps * table.shape[1] * self.loops.ndof,
+        )
+        return Run(out, n_finite)
+
+    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
+        functions = self._functions()
+        table = run_table(self.scheme, h).packed
+        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+        out = np.empty((len(y0), len(save), 2 * self.loops.ndof))
+        n_finite = np.empty(len(y0), dtype=np.int64)
+
+        def rows(i: slice, stop: np.ndarray) -> None:
+            functions.rollout_batch(table, y0[i], n_steps, save, out[i], n_finite[i], stop)
+
+        run_rows(rows, len(y0), n_steps * table.shape[1] * self.loops.ndof, threads)
+        return Run(out, n_finite)
+
+    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+        """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
+        h = np.asarray(h, dtype=np.float64)
+        h = h.repeat(len(y)) if h.ndim == 0 else h
+        return Steps(self.loops.step_rows(step_table(self.scheme), h, h, y, self.scheme.monomials))
+
+    def _functions(self) -> LoopFunctions:
+        return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials)
+
+
+@dataclass(frozen=True)
+class LoopFunctions:
+    """The compiled functions of one variant (what kicks have, with or without compensated sums)."""
+
+    rollout: Callable[..., int]
+    rollout_batch: Callable[..., None]
+    rollout_processed: Callable[..., int]
+    rollout_processed_batch: Callable[..., None]
+    step_rows: Callable[..., None]
+
+
+def _header(compensated: bool, cache: bool, scheduled: bool) -> str:
+    return (
+        f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': cache}}\n"
+        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}"
+    )
+
+
+def _symbolic_loops(
+    symbols: SymbolicHamiltonian, algebra: str, level: int, compensated: bool, monomials: Monomials
+) -> LoopFunctions:
+    after = ("loops", "aligned", "lanes")
+    loops = symbolic_module(symbols, algebra, level, compensated, after, monomials)
+    processed = loops.rollout_processed, loops.rollout_processed_rows
+    return LoopFunctions(loops.rollout, loops.rollout_lanes, *processed, loops.step_lanes)
+
+
+def symbolic_module(
+    symbols: SymbolicHamiltonian,
+    algebra: str,
+    level: int,
+    compensated: bool,
+    after: Sequence[str],
+    monomials: Monomials = (),
+) -> ModuleType:
+    """The algebra of a symbolic system, its kicks and the texts of loops `after` them, as a module."""
+    from sympflow.kernels.codegen import curvature_kick_source, gradient_kick_source, polynomial_kick_source
+    from sympflow.kernels.kicks import kicks_source
+
+    kinds, scheduled = kicks_of(level, len(monomials)), not compensated
+    sources = [algebra, stages_source(kinds, scheduled), lanes_source(kinds, scheduled)]
+    if scheduled:
+        sources.append(kicks_source(symbols, level, monomials))
+    elif level == POLYNOMIAL:
+        sources.append(polynomial_kick_source(symbols, monomials))
+    elif level:
+        sources.append(gradient_kick_source(symbols))
+    if compensated and level == CURVATURE:
+        sources.append(curvature_kick_source(symbols))
+    algebra = "\n\n\n".join(sources)
+    before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
+    header = _header(compensated, cache=True, scheduled=scheduled)
+    return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
+
+
+_INVERSE_MASS_TIMES_V = {
+    0: "out[i] = v[i]",
+    1: "out[i] = INVERSE_MASS[i] * v[i]",
+    2: "out[i] = 0.0\n        for j in range(NDOF):\n            out[i] += INVERSE_MASS[i, j] * v[j]",
+}
+
+
+def _array_loops(
+    ndof: int,
+    gradient: Any,
+    hessian_vector: Any | None,
+    inverse_mass: np.ndarray | None,
+    level: int,
+    compensated: bool,
+    monomials: Monomials,
+) -> LoopFunctions:
+    """The loops around the user's Numba functions; compiled for this process only."""
+    rows = _INVERSE_MASS_TIMES_V[0 if inverse_mass is None else inverse_mass.ndim]
+    mass = f"@njit(**OPTIONS)\ndef apply_inverse_mass(v, out):\n    for i in range(NDOF):\n        {rows}"
+    header = _header(compensated, cache=False, scheduled=False)
+    stages = stages_source(kicks_of(level), scheduled=False)
+    functions: dict[str, Any] = {
+        "NDOF": ndof,
+        "INVERSE_MASS": inverse_mass,
+        "gradient": gradient,
+        "hessian_vector": hessian_vector,
+    }
+    texts = map(template, ("array_states", "loops"))
+    exec("\n\n\n".join([header, mass, stages, *texts]), functions)
+    names = ("rollout", "rollout_each", "rollout_processed", "rollout_processed_rows", "step_each")
+    return LoopFunctions(*(functions[name] for name in names))

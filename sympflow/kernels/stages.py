@@ -1,0 +1,292 @@
+"""Stages of splitting methods, a kick and a drift each: their numbers as tables, and the code that executes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
+
+__all__ = [
+    "Kick",
+    "StageTable",
+    "kicks_of",
+    "lanes_source",
+    "run_table",
+    "single_table",
+    "stages_source",
+    "step_table",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class StageTable:
+    """The numbers of m stages, for fixed steps (m,) or as coefficients of polynomials in a variable (m, K).
+
+    Attributes
+    ----------
+    level : int
+        The terms of kicks: see `sympflow.schemes.Scheme.level`.
+    kicks, drifts, gradients, curvatures : ndarray of shape (m,) or (m, K)
+        b, a, g and c.
+    polynomials : ndarray of shape (m, M) or (m, M, K)
+        e of the M monomials, none for other kicks.
+    """
+
+    level: int
+    kicks: np.ndarray
+    drifts: np.ndarray
+    gradients: np.ndarray
+    curvatures: np.ndarray
+    polynomials: np.ndarray
+
+    @cached_property
+    def packed(self) -> np.ndarray:
+        """The numbers that loops read, as rows of one array (1 + n, m) or (1 + n, m, K): a, then those of the kicks."""
+        of_kicks = [self.kicks, *self.polynomials.swapaxes(0, 1)]
+        if self.level != POLYNOMIAL:
+            of_kicks = [self.kicks, self.gradients, self.curvatures][: 1 + self.level]
+        return np.ascontiguousarray(np.stack([self.drifts, *of_kicks]))
+
+    def scaled(self, h: float) -> StageTable:
+        """The numbers of steps h, of those for h = 1."""
+        return StageTable(
+            self.level,
+            h * self.kicks,
+            h * self.drifts,
+            _times_power(self.gradients, h, 3),
+            _times_power(self.curvatures, h, 5),
+            _times_power(self.polynomials, h, 3),
+        )
+
+
+def _times_power(numbers: np.ndarray, h: float, n: int) -> np.ndarray:
+    """hⁿ times numbers, of which those that are 0 stay 0 even where hⁿ is beyond what a float can hold."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.where(numbers == 0, 0.0, np.float64(h) ** n * numbers)
+
+
+# the numbers of a scheme ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Stage:
+    kick: float = 0.0
+    gradient: float = 0.0
+    curvature: float = 0.0
+    polynomial: tuple[float, ...] = ()
+    drift: float = 0.0
+
+    @property
+    def kicks(self) -> bool:
+        return bool(self.kick or self.gradient or self.curvature or any(self.polynomial))
+
+    def kicked_by(self, other: _Stage) -> _Stage:
+        """This stage, whose kick is followed by that of the other one."""
+        return replace(
+            self,
+            kick=self.kick + other.kick,
+            gradient=self.gradient + other.gradient,
+            curvature=self.curvature + other.curvature,
+            polynomial=tuple(a + b for a, b in zip(self.polynomial, other.polynomial, strict=True)),
+        )
+
+
+def _stages(scheme: Scheme) -> list[_Stage]:
+    """The scheme as kick-drift pairs without idle maps, except a zero kick in front or a zero drift at the end."""
+    none = _Stage(polynomial=(0.0,) * len(scheme.monomials) if scheme.polynomials else ())
+    stages: list[_Stage] = []
+    for kind, one, three, five, e in scheme.substeps:
+        if kind == "kick":
+            stages.append(_Stage(one, three, five, e))
+        elif stages and stages[-1].drift == 0.0:
+            stages[-1] = replace(stages[-1], drift=one)
+        else:
+            stages.append(replace(none, drift=one))
+    return stages or [none]
+
+
+def _table(scheme: Scheme, stages: Sequence[_Stage]) -> StageTable:
+    columns = zip(*((s.kick, s.drift, s.gradient, s.curvature) for s in stages), strict=True)
+    kicks, drifts, gradients, curvatures = (np.array(column, dtype=float) for column in columns)
+    polynomials = np.array([s.polynomial for s in stages], dtype=float)
+    return StageTable(scheme.level, kicks, drifts, gradients, curvatures, polynomials)
+
+
+@lru_cache(maxsize=256)
+def step_table(scheme: Scheme) -> StageTable:
+    """The stages of one step by itself, for h = 1, as constant polynomials (m, 1)."""
+    table = _table(scheme, _stages(scheme))
+    kicks, drifts, gradients = (column[..., None] for column in (table.kicks, table.drifts, table.gradients))
+    return StageTable(table.level, kicks, drifts, gradients, table.curvatures[..., None], table.polynomials[..., None])
+
+
+def single_table(scheme: Scheme, h: float) -> StageTable:
+    """The stages of one step h by itself, (m,)."""
+    return _table(scheme, _stages(scheme)).scaled(h)
+
+
+@lru_cache(maxsize=256)
+def run_table(scheme: Scheme, h: float) -> StageTable:
+    """The table [opening, inner …, link, closing] of a run whose steps are h: see `text/loops.py`."""
+    stages = _stages(scheme)
+    first, last = stages[0], stages[-1]
+    opening = replace(
+        first, kick=0.0, gradient=0.0, curvature=0.0, drift=0.0, polynomial=(0.0,) * len(first.polynomial)
+    )
+    inner, link = stages[:-1], last
+    if len(stages) > 1 and last.drift == 0.0:  # kick … kick: the last kick and the next first stage are one
+        opening, inner, link = first, stages[1:-1], replace(last.kicked_by(first), drift=first.drift)
+    elif len(stages) > 1 and not first.kicks:  # drift … drift
+        opening, inner, link = first, stages[1:-1], replace(last, drift=last.drift + first.drift)
+    return _table(scheme, [opening, *inner, link, last]).scaled(h)
+
+
+# kinds of kick as code --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Kick:
+    """A kind of kick as code.
+
+    Attributes
+    ----------
+    name : str
+        Its function where kicks are scheduled: ``name(q, p, work, j)``, and for lanes ``name_lane(q, p, numbers)``.
+    numbers : tuple of str
+        Its numbers, the rows 1, 2, … of a table. A kick applies where the last one is not 0, else one with fewer.
+    powers : tuple of int
+        The powers of the step length with which they grow.
+    unscheduled : tuple of str
+        The lines of one application where kicks are not scheduled, with a workspace `{work}`.
+    """
+
+    name: str
+    numbers: tuple[str, ...]
+    powers: tuple[int, ...]
+    unscheduled: tuple[str, ...]
+
+    def application(self, scheduled: bool, lane: bool) -> list[str]:
+        """The lines that change p once, of a single trajectory or of a lane; q is left as it is."""
+        if scheduled:
+            return [f"p = {self.name}_lane(q, p, numbers)" if lane else f"p = {self.name}(q, p, work, j)"]
+        return [line.format(work="None" if lane else "work") for line in self.unscheduled]
+
+
+def _added(change: str) -> tuple[str, ...]:
+    return (f"p, p_error = move(p, p_error, {change}(q, numbers, {{work}}))",)
+
+
+PLAIN = Kick("kicked", ("b",), (1,), _added("kick"))
+GRADIENT = Kick(
+    "gradient_kicked",
+    ("b", "g"),
+    (1, 3),
+    (
+        "first, second = gradient_kick(q, numbers, {work})",
+        "p, p_error = move(p, p_error, first)",
+        "if COUPLED:",
+        "    p, p_error = move(p, p_error, second)",
+    ),
+)
+CURVED = Kick("curvature_kicked", ("b", "g", "c"), (1, 3, 5), _added("curvature_kick"))
+KICKS = {0: (PLAIN,), FORCE_GRADIENT: (GRADIENT, PLAIN), CURVATURE: (CURVED, GRADIENT, PLAIN)}
+"""The kinds of kick of a level, that with most numbers first."""
+
+
+def kicks_of(level: int, n_monomials: int = 0) -> tuple[Kick, ...]:
+    """The kinds of kick of a level, that with most numbers first; a polynomial of n monomials stands alone."""
+    if level != POLYNOMIAL:
+        return KICKS[level]
+    letters = tuple(f"e_{m}" for m in range(n_monomials))
+    powers = (1,) + (3,) * n_monomials
+    return (Kick("polynomial_kicked", ("b", *letters), powers, _added("polynomial_kick")),)
+
+
+def stages_source(kinds: Sequence[Kick], scheduled: bool) -> str:
+    """The functions of the text `loops` that depend on the kinds of kick.
+
+    ``numbers_of(table, j)`` are the numbers of kick j, ``numbers_at(table, j, x, h)`` those of a step h by polynomials
+    in x. ``stage`` is a kick and a drift of one trajectory.
+    """
+    rows = range(1, 1 + len(kinds[0].numbers))
+    numbers = "".join(f"table[{i}, j], " for i in rows)
+    steps = {1: "h", 3: "h ** 3", 5: "h ** 5"}
+    values = (f"{steps[n]} * polynomial(table[{i}, j], x), " for i, n in zip(rows, kinds[0].powers, strict=True))
+    end = ["q, q_error = drift_by(q, p, q_error, a, work)", "return q, p, q_error, p_error"]
+    return f"""@njit(**OPTIONS)
+def numbers_of(table, j):
+    return ({numbers})
+
+
+@njit(**OPTIONS)
+def numbers_at(table, j, x, h):
+    return ({"".join(values)})
+
+
+@njit(**OPTIONS, forceinline=True)
+def drift_by(q, p, q_error, a, work):
+    {"return drifted(q, p, a), q_error" if scheduled else "return move(q, q_error, drift(p, a, work))"}
+
+
+@njit(**OPTIONS, forceinline=True)
+def stage(q, p, q_error, p_error, numbers, a, j, work):
+    {_cases(kinds, "numbers[{0}] != 0.0", [[*kick.application(scheduled, lane=False), *end] for kick in kinds])}"""
+
+
+def lanes_source(kinds: Sequence[Kick], scheduled: bool) -> str:
+    """The functions of the text `lanes` that depend on the kinds of kick; not scheduled, sums are compensated.
+
+    ``stage_lanes`` is a kick and a drift of all lanes by the same numbers, ``stage_each`` of each lane by its own, by
+    column j of a table.
+    """
+
+    def together(kick: Kick) -> list[str]:
+        kicked = kick.application(scheduled, lane=True)
+        if scheduled:
+            return _over_lanes([*kicked, "q, _ = move(q, None, drift(p, a, None))"])
+        drifted = "q, q_error = move(q, q_error, drift(p, a, None))"
+        taken, stored = "q_error, p_error = unpack_lane(error, lane)", "pack_lane(q_error, p_error, error, lane)"
+        return _over_lanes([taken, *kicked, drifted, stored])
+
+    def each(kick: Kick) -> list[str]:
+        steps, places = {1: "H", 3: "H3", 5: "H5"}, range(len(kick.numbers))
+        filled = [f"fill_lanes(Y, width, NUMBERS + {i}, table[{i + 1}, j], {steps[kick.powers[i]]})" for i in places]
+        numbers = "".join(f"Y[NUMBERS + {i}, lane], " for i in places)
+        drifted = "q, _ = move(q, None, drift(p, Y[A, lane], None))"
+        return [*filled, *_over_lanes([f"numbers = ({numbers})", *kick.application(True, lane=True), drifted])]
+
+    # Kinds are told apart outside the loops: a loop with a branch in it, once it is long, is no longer made of vector
+    # instructions.
+    source = f"""@njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
+def stage_lanes(Y, error, width, numbers, a):
+    {_cases(kinds, "numbers[{0}] != 0.0", [together(kick) for kick in kinds])}"""
+    if not scheduled:
+        return source
+    return f"""N_NUMBERS = {len(kinds[0].numbers)}
+
+
+{source}
+
+
+@njit(**OPTIONS, inline="always")
+def stage_each(Y, width, table, j):
+    {_cases(kinds, "np.any(table[{1}, j] != 0.0)", [each(kick) for kick in kinds])}"""
+
+
+def _over_lanes(lines: Sequence[str]) -> list[str]:
+    body = ["q, p = unpack_lane(Y, lane)", *lines, "pack_lane(q, p, Y, lane)"]
+    return ["for lane in range(width):", *(f"    {line}" for line in body)]
+
+
+def _cases(kinds: Sequence[Kick], condition: str, bodies: Sequence[list[str]]) -> str:
+    """The body of the first kind whose condition holds, else that of the last one."""
+    lines: list[str] = []
+    for kick, body in zip(kinds[:-1], bodies, strict=False):
+        n = len(kick.numbers)
+        lines += [f"{'elif' if lines else 'if'} {condition.format(n - 1, n)}:", *(f"    {line}" for line in body)]
+    lines += ["else:", *(f"    {line}" for line in bodies[-1])] if lines else bodies[-1]
+    return "\n    ".join(lines)

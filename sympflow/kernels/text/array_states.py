@@ -1,0 +1,98 @@
+"""The algebra of a system given by Numba functions: q and p are arrays, changed in place. Source text for `loops`.
+
+What comes before defines `NDOF`, the constants of `loops`, the system's ``gradient(q, out)`` and
+``hessian_vector(q, v, out)``, and ``apply_inverse_mass(v, out)``.
+"""
+# ruff: noqa: F821
+# mypy: ignore-errors
+
+import numpy as np
+from numba import njit
+
+
+@njit(**OPTIONS)
+def unpack(y):
+    q, p = np.empty(NDOF), np.empty(NDOF)
+    for i in range(NDOF):
+        q[i], p[i] = y[i], y[NDOF + i]
+    return q, p
+
+
+@njit(**OPTIONS)
+def pack(q, p, y):
+    for i in range(NDOF):
+        y[i], y[NDOF + i] = q[i], p[i]
+
+
+@njit(**OPTIONS)
+def copy(x):
+    duplicate = np.empty(NDOF)
+    for i in range(NDOF):
+        duplicate[i] = x[i]
+    return duplicate
+
+
+@njit(**OPTIONS)
+def is_finite(q, p):
+    total = 0.0
+    for i in range(NDOF):
+        total += 0.0 * q[i] + 0.0 * p[i]
+    return total == 0.0
+
+
+@njit(**OPTIONS)
+def no_error(x):
+    return np.zeros(NDOF)
+
+
+@njit(**OPTIONS)
+def move(x, error, change):
+    """x + change; if `COMPENSATED` by Kahan's compensated sum."""
+    for i in range(NDOF):
+        if COMPENSATED:
+            corrected = change[i] - error[i]
+            total = x[i] + corrected
+            error[i] = (total - x[i]) - corrected
+            x[i] = total
+        else:
+            x[i] += change[i]
+    return x, error
+
+
+@njit(**OPTIONS)
+def workspace():
+    return np.empty(NDOF), np.empty(NDOF), np.empty(NDOF)
+
+
+COUPLED = True
+
+
+@njit(**OPTIONS)
+def kick(q, numbers, work):
+    slope = work[0]
+    gradient(q, slope)
+    for i in range(NDOF):
+        slope[i] *= -numbers[0]
+    return slope
+
+
+@njit(**OPTIONS)
+def gradient_kick(q, numbers, work):
+    b, g = numbers
+    slope, velocity, product = work
+    gradient(q, slope)
+    apply_inverse_mass(slope, velocity)
+    hessian_vector(q, velocity, product)
+    for i in range(NDOF):
+        slope[i] *= -b
+        product[i] *= g
+    return slope, product
+
+
+@njit(**OPTIONS)
+def drift(p, a, work):
+    velocity = work[0]
+    apply_inverse_mass(p, velocity)
+    for i in range(NDOF):
+        velocity[i] *= a
+    return velocity

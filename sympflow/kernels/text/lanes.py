@@ -1,0 +1,157 @@
+"""Many trajectories at once: their states side by side, so that one instruction moves several of them.
+
+Source text, pasted after the tuple algebra of a symbolic system, its kicks, `loops` and `aligned`. A block holds
+`LANES` trajectories, in a run `MANY_LANES`, component first, as an array (2d, LANES) that stays in the first-level
+cache; the compiler turns the loop over the lanes of a stage into vector instructions. Lanes never mix: one that
+overflows leaves the others as they are. `sympflow.kernels.stages` writes ``stage_lanes`` and ``stage_each``, a kick and
+a drift of all lanes.
+"""
+# ruff: noqa: F821
+# mypy: ignore-errors
+
+from numba import njit
+
+LANES = 64
+MANY_LANES = max(LANES, min(256, 512 // NDOF // LANES * LANES))  # the more, the less goes for the start of a stage
+VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
+
+
+@njit(**OPTIONS)
+def empty_lanes():
+    return aligned_zeros(2 * NDOF * MANY_LANES).reshape((2 * NDOF, MANY_LANES))
+
+
+@njit(**OPTIONS)
+def close_lane(Y, error, lane, table, work):
+    q, p = unpack_lane(Y, lane)
+    q_error, p_error = no_error(q), no_error(p)
+    if COMPENSATED:
+        q_error, p_error = unpack_lane(error, lane)
+    return close(q, p, q_error, p_error, table, work)
+
+
+@njit(**OPTIONS)
+def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop):
+    """`rollout` of every row of `y0` (N, 2d), `MANY_LANES` at a time; outputs as in `rollout_each`."""
+    link = table.shape[1] - 2
+    work = prepared(table)
+    Y, start, error = empty_lanes(), empty_lanes(), empty_lanes()
+    for block_start in range(0, y0.shape[0], MANY_LANES):
+        count = min(MANY_LANES, y0.shape[0] - block_start)
+        width = (count + VECTOR - 1) // VECTOR * VECTOR
+        for lane in range(width):
+            i = block_start + min(lane, count - 1)
+            q, p = unpack(y0[i])
+            pack_lane(q, p, Y, lane)
+            pack_lane(q, p, start, lane)
+            n_finite[i] = n_steps
+            for row in range(len(save)):
+                if save[row] > 0:
+                    break
+                pack(q, p, out[i, row])
+        error[:] = 0.0
+        n = saved = first = 0
+        while saved < len(save) and save[saved] <= 0:
+            saved += 1
+        n_alive = count
+        while n < n_steps and n_alive > 0 and stop[0] == 0:
+            block = min(CHECK_EVERY, n_steps - n)
+            if saved < len(save):
+                block = min(block, save[saved] - n)
+            numbers, a = numbers_of(table, first), table[0, first]
+            for _ in range(block):
+                stage_lanes(Y, error, width, numbers, a)
+                for j in range(1, link):
+                    stage_lanes(Y, error, width, numbers_of(table, j), table[0, j])
+                numbers, a = numbers_of(table, link), table[0, link]
+            next_saved = saved
+            while next_saved < len(save) and save[next_saved] == n + block:
+                next_saved += 1
+            for lane in range(count):
+                i = block_start + lane
+                if n_finite[i] < n_steps:
+                    continue
+                q, p = close_lane(Y, error, lane, table, work)
+                if not is_finite(q, p):
+                    q, p = unpack_lane(start, lane)
+                    before = first_non_finite(q, p, table, first, block, work) - 1
+                    n_finite[i] = n + before
+                    n_alive -= 1
+                    fill_with_nan(out[i], saved)
+                else:
+                    for row in range(saved, next_saved):
+                        pack(q, p, out[i, row])
+            copy_lanes(Y, start)
+            n, saved, first = n + block, next_saved, link
+
+
+# Rows of what a step of lanes needs beside the states: the variable of the polynomials, powers of the step length, the
+# drift and the numbers of the kick.
+X, H, H3, H5, A, NUMBERS = [2 * NDOF + i for i in range(6)]
+
+
+@njit(**OPTIONS, inline="always")
+def fill_lanes(Y, width, row, coefficients, factor):
+    """Σ_k coefficients[k] x^k, one or at least three, times a factor, into a row."""
+    if len(coefficients) == 1:
+        for lane in range(width):
+            Y[row, lane] = coefficients[0] * Y[factor, lane]
+        return
+    c0, c1, c2 = coefficients[0], coefficients[1], coefficients[2]
+    if len(coefficients) == 3:
+        for lane in range(width):
+            Y[row, lane] = ((c2 * Y[X, lane] + c1) * Y[X, lane] + c0) * Y[factor, lane]
+        return
+    last = coefficients[len(coefficients) - 1]
+    for lane in range(width):
+        Y[row, lane] = last
+    for k in range(len(coefficients) - 2, 2, -1):
+        for lane in range(width):
+            Y[row, lane] = Y[row, lane] * Y[X, lane] + coefficients[k]
+    for lane in range(width):
+        Y[row, lane] = (((Y[row, lane] * Y[X, lane] + c2) * Y[X, lane] + c1) * Y[X, lane] + c0) * Y[factor, lane]
+
+
+@njit(**OPTIONS)
+def step_lanes(table, x, h, y, out):
+    """`step_each`, `LANES` rows at a time.
+
+    All numbers lie in one array: of several the compiler would have to find out that they do not overlap.
+    """
+    rows = NUMBERS + N_NUMBERS
+    Y = aligned_zeros(rows * LANES).reshape((rows, LANES))
+    for block_start in range(0, y.shape[0], LANES):
+        count = min(LANES, y.shape[0] - block_start)
+        width = (count + VECTOR - 1) // VECTOR * VECTOR
+        for lane in range(width):
+            i = block_start + min(lane, count - 1)
+            q, p = unpack(y[i])
+            pack_lane(q, p, Y, lane)
+            Y[X, lane], Y[H, lane], Y[H3, lane], Y[H5, lane] = x[i], h[i], h[i] ** 3, h[i] ** 5
+        for j in range(table.shape[1]):
+            fill_lanes(Y, width, A, table[0, j], H)
+            stage_each(Y, width, table, j)
+        for lane in range(count):
+            q, p = unpack_lane(Y, lane)
+            pack(q, p, out[block_start + lane])
+
+
+@njit(**OPTIONS)
+def map_lanes(table, y, out):
+    """`map_each`, `MANY_LANES` rows at a time."""
+    Y, error = empty_lanes(), empty_lanes()
+    for block_start in range(0, y.shape[0], MANY_LANES):
+        count = min(MANY_LANES, y.shape[0] - block_start)
+        width = (count + VECTOR - 1) // VECTOR * VECTOR
+        error[:] = 0.0
+        for lane in range(width):
+            q, p = unpack(y[block_start + min(lane, count - 1)])
+            pack_lane(q, p, Y, lane)
+        for j in range(table.shape[1]):
+            stage_lanes(Y, error, width, numbers_of(table, j), table[0, j])
+        for lane in range(count):
+            q, p = unpack_lane(Y, lane)
+            pack(q, p, out[block_start + lane])
+
+
+map_rows, rollout_rows = map_lanes, rollout_lanes

@@ -1,0 +1,208 @@
+"""The loops of a splitting method: a step, a run. Source text, pasted after the algebra of a system and its kicks.
+
+The algebra says what a state is: q and p are tuples held in registers (a symbolic system) or arrays changed in place
+(Numba functions). It defines ``unpack``, ``pack``, ``copy``, ``is_finite``, ``move``, ``no_error``, ``drift``,
+``workspace``, and functions for each kind of kick. `sympflow.kernels.stages` writes what depends on the kinds of kick:
+``numbers_of`` and ``numbers_at``, which read the numbers of a kick from a table, and ``stage``, a kick and a drift.
+Where `SCHEDULED`, kicks and ``drifted`` run in an order of operations that is fast, and ``fill_coefficients`` prepares
+their coefficients.
+
+A table has a column for each stage; its first row holds the drifts, the others hold the numbers of the kicks. A run
+executes the columns [opening, inner …, link, closing]. A step is the link (the first step, the opening) and the inner
+stages; consecutive steps share their common kick or drift in the link, and an output is the closing stage applied to a
+copy, so that what is saved never changes the trajectory. The constants `COMPENSATED` and `SCHEDULED` are known when it
+is compiled: Numba leaves dead branches out.
+"""
+# ruff: noqa: F821
+# mypy: ignore-errors
+
+import math
+
+import numpy as np
+from numba import njit
+
+CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where nothing is saved
+
+
+@njit(**OPTIONS)
+def prepared(table):
+    """The workspace of the stages; where `SCHEDULED`, the products of their coefficients, which no state waits for."""
+    if SCHEDULED:
+        work = np.empty((table.shape[1], N_COEFFICIENTS))
+        for j in range(table.shape[1]):
+            fill_coefficients(numbers_of(table, j), work[j])
+        return work
+    return workspace()
+
+
+@njit(**OPTIONS)
+def called_stage(q, p, q_error, p_error, numbers, a, j, work):
+    """`stage` where few are run. In the loops of a run it stands as it is: a call costs as much as a small kick."""
+    return stage(q, p, q_error, p_error, numbers, a, j, work)
+
+
+@njit(**OPTIONS)
+def close(q, p, q_error, p_error, table, work):
+    """The end of a step, from the running state before its last stage, which is left as it is."""
+    q, p, q_error, p_error = copy(q), copy(p), copy(q_error), copy(p_error)
+    last = table.shape[1] - 1
+    q, p, _, _ = called_stage(q, p, q_error, p_error, numbers_of(table, last), table[0, last], last, work)
+    return q, p
+
+
+@njit(**OPTIONS)
+def first_non_finite(q, p, table, first, n_steps, work):
+    """The first of `n_steps` steps from a running state whose end is not finite; `n_steps` if none is."""
+    link = table.shape[1] - 2
+    q_error, p_error = no_error(q), no_error(p)
+    j = first
+    for n in range(1, n_steps):
+        for _ in range(link):
+            q, p, q_error, p_error = called_stage(q, p, q_error, p_error, numbers_of(table, j), table[0, j], j, work)
+            j = j + 1 if j < link else 1
+        end_q, end_p = close(q, p, q_error, p_error, table, work)
+        if not is_finite(end_q, end_p):
+            return n
+    return n_steps
+
+
+@njit(**OPTIONS)
+def fill_with_nan(rows, first):
+    for i in range(first, rows.shape[0]):
+        for j in range(rows.shape[1]):
+            rows[i, j] = math.nan
+
+
+@njit(**OPTIONS)
+def rollout(table, y0, n_steps, save, out, stop):
+    """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
+
+    Returns the index of the last step that ends in a finite state; rows of later steps are NaN. Ends early, with
+    rows unset, when another thread sets ``stop[0]``.
+    """
+    link = table.shape[1] - 2
+    work = prepared(table)
+    q, p = unpack(y0)
+    q_error, p_error = no_error(q), no_error(p)
+    n = saved = j = 0
+    while saved < len(save) and save[saved] <= 0:
+        pack(q, p, out[saved])
+        saved += 1
+    while n < n_steps and stop[0] == 0:
+        block = min(CHECK_EVERY, n_steps - n)
+        if saved < len(save):
+            block = min(block, save[saved] - n)
+        start_q, start_p, begin = copy(q), copy(p), j
+        for _ in range(block * link):
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, numbers_of(table, j), table[0, j], j, work)
+            j = j + 1 if j < link else 1
+        end_q, end_p = close(q, p, q_error, p_error, table, work)
+        if not is_finite(end_q, end_p):
+            fill_with_nan(out, saved)
+            return n - 1 + first_non_finite(start_q, start_p, table, begin, block, work)
+        n += block
+        while saved < len(save) and save[saved] == n:
+            pack(end_q, end_p, out[saved])
+            saved += 1
+    return n_steps
+
+
+@njit(**OPTIONS)
+def rollout_each(table, y0, n_steps, save, out, n_finite, stop):
+    """`rollout` of every row of `y0` (N, 2d) by itself."""
+    for i in range(y0.shape[0]):
+        n_finite[i] = rollout(table, y0[i], n_steps, save, out[i], stop)
+
+
+@njit(**OPTIONS)
+def polynomial(coefficients, x):
+    total = 0.0
+    for k in range(len(coefficients) - 1, -1, -1):
+        total = total * x + coefficients[k]
+    return total
+
+
+@njit(**OPTIONS)
+def step_each(table, x, h, y, out):
+    """One step of length ``h[i]`` from every row of `y` (N, 2d).
+
+    The numbers (1 + n, m, K) of stage j are those for h = 1, polynomials Σ_k table[:, j, k] x^k of ``x[i]``.
+    """
+    work = prepared(table[:, :, 0])
+    for i in range(y.shape[0]):
+        q, p = unpack(y[i])
+        q_error, p_error = no_error(q), no_error(p)
+        for j in range(table.shape[1]):
+            numbers, a = numbers_at(table, j, x[i], h[i]), h[i] * polynomial(table[0, j], x[i])
+            q, p, q_error, p_error = called_stage(q, p, q_error, p_error, numbers, a, j, work)
+        pack(q, p, out[i])
+
+
+@njit(**OPTIONS)
+def map_each(table, y, out):
+    """A map of fixed numbers, the columns of a table, of every row of `y`."""
+    work = prepared(table)
+    for i in range(y.shape[0]):
+        q, p = unpack(y[i])
+        q_error, p_error = no_error(q), no_error(p)
+        for j in range(table.shape[1]):
+            q, p, q_error, p_error = called_stage(q, p, q_error, p_error, numbers_of(table, j), table[0, j], j, work)
+        pack(q, p, out[i])
+
+
+map_rows, rollout_rows = map_each, rollout_each  # where there are lanes, theirs stand for these
+
+
+# Runs in other coordinates, χ ∘ Kⁿ ∘ χ⁻¹: χ⁻¹ is executed once, and χ for each output. The tables of χ⁻¹ and χ are
+# those of single maps, see `map_each`, that of K is that of a run.
+
+
+@njit(**OPTIONS)
+def up_to_finite(out, save, n_finite):
+    """Let a run end before an output (n, 2d) that is not finite though the state that it is made of is."""
+    finite = True
+    flat = out.reshape(-1)
+    for i in range(len(flat)):
+        finite &= abs(flat[i]) < math.inf
+    row = 0
+    while not finite and row < len(save) and save[row] <= n_finite:
+        finite_row = True
+        for j in range(out.shape[1]):
+            finite_row &= abs(out[row, j]) < math.inf
+        if not finite_row:
+            fill_with_nan(out, row)
+            return save[row] - 1
+        row += 1
+    return n_finite
+
+
+@njit(**OPTIONS)
+def rollout_processed(before, run, after, y0, n_steps, save, out, stop):
+    """`rollout` from `y0` (2d,) in other coordinates, `before` into them and `after` out of them."""
+    start = np.empty((1, len(y0)))
+    map_rows(before, y0.reshape((1, len(y0))), start)
+    n_finite = rollout(run, start[0], n_steps, save, out, stop)
+    first = 0
+    while first < len(save) and save[first] <= 0:
+        q, p = unpack(y0)
+        pack(q, p, out[first])
+        first += 1
+    map_rows(after, out[first:], out[first:])
+    return up_to_finite(out, save, n_finite)
+
+
+@njit(**OPTIONS)
+def rollout_processed_rows(before, run, after, y0, n_steps, save, out, n_finite, stop):
+    """The same of every row of `y0` (N, 2d)."""
+    start = np.empty(y0.shape)
+    map_rows(before, y0, start)
+    rollout_rows(run, start, n_steps, save, out, n_finite, stop)
+    outputs = out.reshape((-1, y0.shape[1]))
+    map_rows(after, outputs, outputs)
+    for i in range(len(y0)):
+        for row in range(len(save)):
+            if save[row] > 0:
+                break
+            q, p = unpack(y0[i])
+            pack(q, p, out[i, row])
+        n_finite[i] = up_to_finite(out[i], save, n_finite[i])

@@ -1,0 +1,214 @@
+"""The loops of a splitting into exactly solvable parts. Source text, pasted after the algebra of a system.
+
+The algebra that comes before defines tuples of normal modes x, y (``unpack``, ``pack``, …), ``to_modes`` and
+``from_modes``, ``apply_map`` and ``apply_map_lanes``. Where a run is asked to be `in_modes`, it takes and gives modes
+instead of states. A step is a list of maps, a code and a row of coefficients each. A run executes the rows
+[opening, inner …, link, closing]: a step is the link (the first step, the opening) and the inner maps, so that
+consecutive steps share their common map; an output is the closing map applied to a copy.
+"""
+# ruff: noqa: F821
+# mypy: ignore-errors
+
+import numpy as np
+from numba import njit
+
+CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where nothing is saved
+LANES = 64
+VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
+
+
+@njit(**OPTIONS, forceinline=True)  # called, it would take and give its states in memory
+def one_step(x, y, codes, table, first, link):
+    x, y = apply_map(x, y, codes[first], table, first)
+    for j in range(1, link):
+        x, y = apply_map(x, y, codes[j], table, j)
+    return x, y
+
+
+@njit(**OPTIONS, forceinline=True)
+def closed(x, y, codes, table, in_modes):
+    """What a step ends in."""
+    x, y = apply_map(x, y, codes[len(codes) - 1], table, len(codes) - 1)
+    return (x, y) if in_modes else from_modes(x, y)
+
+
+@njit(**OPTIONS)
+def first_non_finite(x, y, codes, table, first, n_steps, in_modes):
+    """The first of `n_steps` steps from a running state whose end is not finite; `n_steps` if none is."""
+    link = len(codes) - 2
+    for n in range(1, n_steps):
+        x, y = one_step(x, y, codes, table, first, link)
+        first = link
+        end_x, end_y = closed(x, y, codes, table, in_modes)
+        if not is_finite(end_x, end_y):
+            return n
+    return n_steps
+
+
+@njit(**OPTIONS)
+def rollout(codes, table, y0, in_modes, n_steps, save, out, stop):
+    """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
+
+    Returns the index of the last step that ends in a finite state; rows of later steps are NaN. Ends early, with
+    rows unset, when another thread sets ``stop[0]``.
+    """
+    link = len(codes) - 2
+    x, y = unpack(y0)
+    n = saved = first = 0
+    while saved < len(save) and save[saved] <= 0:
+        pack(x, y, out[saved])
+        saved += 1
+    if not in_modes:
+        x, y = to_modes(x, y)
+    while n < n_steps and stop[0] == 0:
+        block = min(CHECK_EVERY, n_steps - n)
+        if saved < len(save):
+            block = min(block, save[saved] - n)
+        start_x, start_y, start = x, y, first
+        for _ in range(block):
+            x, y = one_step(x, y, codes, table, first, link)
+            first = link
+        end_x, end_y = closed(x, y, codes, table, in_modes)
+        if not is_finite(end_x, end_y):
+            out[saved:] = np.nan
+            return n - 1 + first_non_finite(start_x, start_y, codes, table, start, block, in_modes)
+        n += block
+        while saved < len(save) and save[saved] == n:
+            pack(end_x, end_y, out[saved])
+            saved += 1
+    return n_steps
+
+
+@njit(**OPTIONS)
+def step_each(codes, tables, z, in_modes, out):
+    """One step from every row of `z` (N, 2d) by the maps `codes`, each row with its own table (N, n, W)."""
+    for i in range(z.shape[0]):
+        x, y = unpack(z[i])
+        if not in_modes:
+            x, y = to_modes(x, y)
+        for j in range(len(codes)):
+            x, y = apply_map(x, y, codes[j], tables[i], j)
+        if not in_modes:
+            x, y = from_modes(x, y)
+        pack(x, y, out[i])
+
+
+TABLE = 2 * NDOF  # lines of the row of a map, for each lane; then come its numbers, the time and the basis functions
+NUMBERS = TABLE + ROW_WIDTH
+TIME = NUMBERS + 2 + N_CLASSES
+BASIS = TIME + 1
+
+
+@njit(**OPTIONS, inline="always")
+def fill_number(Z, width, i, coefficients, power):
+    """t to a power, times the sum of the basis functions with these coefficients."""
+    for lane in range(width):
+        Z[NUMBERS + i, lane] = coefficients[0]
+    for k in range(1, len(coefficients)):
+        for lane in range(width):
+            Z[NUMBERS + i, lane] += coefficients[k] * Z[BASIS + k, lane]
+    for _ in range(power):
+        for lane in range(width):
+            Z[NUMBERS + i, lane] *= Z[TIME, lane]
+
+
+@njit(**OPTIONS)
+def step_lanes(codes, coefficients, dt, t, y, in_modes, out):
+    """One step from every row of `y` (N, 2d), each of its own length t[i] > 0, `LANES` rows at a time.
+
+    The numbers of the maps, coefficients (m, numbers, K), are sums of the functions 1 and τ² T_k(2τ² − 1), τ = t/dt,
+    with Chebyshev's T_k: lengths times t, force gradients times t³, and filters.
+    """
+    terms = coefficients.shape[2]
+    Z = aligned_zeros((BASIS + max(terms, 3)) * LANES).reshape((BASIS + max(terms, 3), LANES))
+    for block_start in range(0, y.shape[0], LANES):
+        count = min(LANES, y.shape[0] - block_start)
+        width = (count + VECTOR - 1) // VECTOR * VECTOR
+        for lane in range(width):
+            i = block_start + min(lane, count - 1)
+            q, p = unpack(y[i])
+            if not in_modes:
+                q, p = to_modes(q, p)
+            pack_lane(q, p, Z, lane)
+            square = (t[i] / dt) ** 2
+            Z[TIME, lane] = t[i]
+            Z[BASIS + 1, lane], Z[BASIS + 2, lane] = square, square * (2.0 * square - 1.0)
+        for k in range(3, terms):
+            for lane in range(width):
+                x = 2.0 * (2.0 * Z[BASIS + 1, lane] - 1.0)
+                Z[BASIS + k, lane] = x * Z[BASIS + k - 1, lane] - Z[BASIS + k - 2, lane]
+        for j in range(len(codes)):
+            if codes[j] == 0:
+                for f in range(N_CLASSES):
+                    fill_number(Z, width, f, coefficients[j, f], 1)
+                fill_turns(Z, width)
+            else:
+                fill_number(Z, width, 0, coefficients[j, 0], 1)
+                fill_number(Z, width, 1, coefficients[j, 1], 3)
+                for lane in range(width):
+                    Z[TABLE, lane], Z[TABLE + 1, lane] = Z[NUMBERS, lane], Z[NUMBERS + 1, lane]
+                if FILTERS:
+                    for f in range(N_CLASSES):
+                        fill_number(Z, width, 2 + f, coefficients[j, 2 + f], 0)
+                    fill_filters(Z, width)
+            apply_map_each(Z, width, codes[j])
+        for lane in range(count):
+            q, p = unpack_lane(Z, lane)
+            if not in_modes:
+                q, p = from_modes(q, p)
+            pack(q, p, out[block_start + lane])
+
+
+@njit(**OPTIONS)
+def rollout_lanes(codes, table, y0, in_modes, n_steps, save, out, n_finite, stop):
+    """`rollout` of every row of `y0` (N, 2d), `LANES` at a time."""
+    link = len(codes) - 2
+    Z = aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
+    start = aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
+    for block_start in range(0, y0.shape[0], LANES):
+        count = min(LANES, y0.shape[0] - block_start)
+        width = (count + VECTOR - 1) // VECTOR * VECTOR
+        for lane in range(width):
+            i = block_start + min(lane, count - 1)
+            x, y = unpack(y0[i])
+            n_finite[i] = n_steps
+            for row in range(len(save)):
+                if save[row] > 0:
+                    break
+                pack(x, y, out[i, row])
+            if not in_modes:
+                x, y = to_modes(x, y)
+            pack_lane(x, y, Z, lane)
+        n = saved = first = 0
+        while saved < len(save) and save[saved] <= 0:
+            saved += 1
+        n_alive = count
+        while n < n_steps and n_alive > 0 and stop[0] == 0:
+            copy_lanes(Z, start)
+            begin = first
+            block = min(CHECK_EVERY, n_steps - n)
+            if saved < len(save):
+                block = min(block, save[saved] - n)
+            for _ in range(block):
+                for k in range(link):
+                    j = first if k == 0 else k
+                    apply_map_lanes(Z, width, codes[j], table, j)
+                first = link
+            next_saved = saved
+            while next_saved < len(save) and save[next_saved] == n + block:
+                next_saved += 1
+            for lane in range(count):
+                i = block_start + lane
+                if n_finite[i] < n_steps:
+                    continue
+                x, y = unpack_lane(Z, lane)
+                x, y = closed(x, y, codes, table, in_modes)
+                if not is_finite(x, y):
+                    x, y = unpack_lane(start, lane)
+                    n_finite[i] = n - 1 + first_non_finite(x, y, codes, table, begin, block, in_modes)
+                    n_alive -= 1
+                    out[i, saved:] = np.nan
+                else:
+                    for row in range(saved, next_saved):
+                        pack(x, y, out[i, row])
+            n, saved = n + block, next_saved

@@ -1,0 +1,396 @@
+"""Attempts: a method run once under the conditions of a study, its failure caught, and a row of what was measured.
+
+Every study, `compare`, `work_precision` and `stability` alike, makes its rows of attempts. A metric is a function of an
+attempt that fills in its row, and a line in a study's table of metrics.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+
+from sympflow.integrators.base import FixedStep, Integrator
+from sympflow.integrators.registry import build, name_of, naming_plugin
+from sympflow.metrics.accuracy import reference_error, time_reversal_error
+from sympflow.metrics.energy import energy_drift, energy_error, failed, max_energy_error
+from sympflow.metrics.reference import Reference
+from sympflow.metrics.symplectic import symplecticity_defect, volume_error
+from sympflow.solution import Solution
+
+REFUSALS = (ValueError, TypeError, ImportError, NotImplementedError)
+"""Errors by which a method says that it does not apply; any other is a failure."""
+
+# methods ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A method under its label; `problem` says why it has no integrator, if so."""
+
+    label: str
+    method: str
+    integrator: Any
+    problem: str = ""
+
+
+def candidates(methods: Sequence[Any], dt: float | None = None) -> list[Candidate]:
+    """Make the candidates that a list of methods means; their labels are distinct.
+
+    Parameters
+    ----------
+    methods : sequence
+        Names, integrators, trained flows, or pairs (label, any of these).
+    dt : float, optional
+        Step of the fixed-step classical methods that are given by name.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For an unknown name, or no methods at all. A plug-in that cannot be loaded is a candidate with a problem.
+    """
+    if isinstance(methods, str) or not isinstance(methods, Sequence):
+        raise TypeError(f"`methods` must be a list of methods; got {methods!r}. Put it in brackets.")
+    if not methods:
+        raise ValueError("`methods` is empty: name at least one of sympflow.available().")
+    found: list[Candidate] = []
+    for entry in methods:
+        labelled = isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[0], str)
+        label, method = entry if labelled else (None, entry)
+        try:
+            integrator = build(method, {})
+        except ImportError as error:
+            name = str(method)
+            found.append(Candidate(_distinct(label or name, found), name, None, str(error)))
+            continue
+        if dt is not None and isinstance(method, str) and isinstance(integrator, FixedStep) and not integrator.trained:
+            integrator = replace(integrator, dt=dt)
+        name = method if isinstance(method, str) else name_of(integrator)
+        found.append(Candidate(_distinct(label or _label(name, method, integrator), found), name, integrator))
+    return found
+
+
+def _label(name: str, method: Any, integrator: Integrator) -> str:
+    """The name, with the step or tolerance if the caller configured one."""
+    if not isinstance(method, Integrator) or integrator.trained:
+        return name
+    if isinstance(integrator, FixedStep):
+        return name if integrator.dt is None else f"{name} (dt={integrator.dt:g})"
+    tolerance = tolerance_of(integrator)
+    return name if tolerance is None else f"{name} (rtol={tolerance:g})"
+
+
+def _distinct(label: str, found: list[Candidate]) -> str:
+    taken = {c.label for c in found}
+    if label not in taken:
+        return label
+    return next(f"{label} #{k}" for k in range(2, len(found) + 2) if f"{label} #{k}" not in taken)
+
+
+def tolerance_of(integrator: Any) -> float | None:
+    """The rtol of an adaptive method; None for a method without that option."""
+    return integrator.rtol if "rtol" in integrator.options() else None
+
+
+# rows -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, repr=False)
+class Row:
+    """The measurements of one method; None where a figure was not asked for, does not apply or could not be had.
+
+    Errors, drift and defect are inf where the run became non-finite or could not be continued. The repr shows the
+    figures that are there.
+
+    Attributes
+    ----------
+    system, method, label : str
+    status : str
+        "ok"; "failed", if the run did not reach the end, or the method broke; "not applicable", if it could not run.
+        In work and precision also "uncertain", if the error is not 100 times the reference's own. In a study of
+        stability instead of "ok": "stable"; "bounded", as stable, but the energy error exceeds 1: the result says
+        nothing; "outside", if a run of a trained flow left the domain that the flow was trained on, where it says
+        nothing either; "unstable", if a run became non-finite, could not go on, or its energy error exceeded the bound.
+    reason : str
+        Why it failed, and whatever else should be known.
+    dt : float or None
+        Step of a fixed-step method; for an adaptive one see `tolerance`.
+    tolerance : float or None
+        rtol of an adaptive method.
+    trajectories : int
+        Size of the batch that was run, or 1.
+    dtype : str
+        Precision of the states, "float64" or "float32", where a study compares them.
+    parameter, value : str, float
+        The system's first parameter, such as its stiffness, where a study compares systems.
+    t_end : float
+        End of the run, where it depends on the step.
+    n_steps : int
+        Steps that were taken.
+    backend : str
+        The code that ran: "compiled", "numpy", "torch", "scipy" or "torchdiffeq".
+    run_time, run_time_spread : float
+        Median and interquartile range of the repeats, of all trajectories together, in seconds.
+    repeats : int
+        Runs that were timed, where their number depends on the row.
+    force_evaluations, hessian_evaluations : int or float
+        Of one run, all trajectories of a SciPy batch together; in work and precision those of one trajectory.
+    error : float
+        max over the instants of ‖y − y_ref‖; of a batch the median over its trajectories.
+    energy_error : float
+        max |ΔH| over the instants, relative as in `sympflow.energy_error`; of a batch the median, in a study of
+        stability the largest over all initial states.
+    energy_drift, energy_drift_error : float
+        Slope of the energy error per unit time, and its standard error by batch means; of a batch, those of the median
+        slope.
+    blow_up : float
+        Time at which a run failed: that of the singularity if the solution has one, else of its last finite state.
+    singular : bool
+        True if it is a singularity of the solution, rather than an instability of the method.
+    domain_exit : float
+        Time at which the first trajectory left the domain Ω of the flow, or of the system.
+    volume_error : float
+        Σ log|det| over the steps; of a batch the one that is largest in magnitude. In a study of stability its
+        magnitude, over the first 256 steps.
+    symplecticity_defect : float
+        max ‖AᵀJA − J‖/‖A‖² over the steps and trajectories; in a study of stability over the first 256 steps.
+    time_reversal_error : float
+        ‖y − y0‖ after there and back; of a batch the median.
+    training_time : float
+        Seconds that training the flow took.
+    break_even : float
+        Of a trained flow in work and precision: how many units of time must be solved until its training has paid for
+        itself, against the cheapest untrained method that is as accurate in energy. inf if it never does.
+    """
+
+    system: str
+    method: str
+    label: str
+    status: str = "ok"
+    reason: str = ""
+    dt: float | None = None
+    tolerance: float | None = None
+    trajectories: int = 1
+    dtype: str = ""
+    parameter: str | None = None
+    value: float | None = None
+    t_end: float | None = None
+    n_steps: int | None = None
+    backend: str | None = None
+    run_time: float | None = None
+    run_time_spread: float | None = None
+    repeats: int = 0
+    force_evaluations: float | None = None
+    hessian_evaluations: float | None = None
+    error: float | None = None
+    energy_error: float | None = None
+    energy_drift: float | None = None
+    energy_drift_error: float | None = None
+    blow_up: float | None = None
+    singular: bool | None = None
+    domain_exit: float | None = None
+    volume_error: float | None = None
+    symplecticity_defect: float | None = None
+    time_reversal_error: float | None = None
+    training_time: float | None = None
+    break_even: float | None = None
+
+    def __repr__(self) -> str:
+        figures = ((f.name, getattr(self, f.name), f.default) for f in fields(self))
+        filled = (f"{name}={value!r}" for name, value, default in figures if name == "status" or value != default)
+        return f"Row({', '.join(filled)})"
+
+
+# attempts ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Attempt:
+    """A candidate on its way to a row: its solutions, and the figures over time that are drawn.
+
+    Attributes
+    ----------
+    candidate : Candidate
+    row : Row
+    sols : tuple of Solution
+        The runs, of one method under one set of conditions; empty if it does not apply or broke.
+    energy, volume : ndarray or None
+        |energy error| (..., n) and volume error (..., n) at the times of the solution, where these were measured.
+    """
+
+    candidate: Candidate
+    row: Row
+    sols: tuple[Solution, ...] = field(default=(), repr=False)
+    energy: np.ndarray | None = field(default=None, repr=False)
+    volume: np.ndarray | None = field(default=None, repr=False)
+
+    @property
+    def sol(self) -> Solution | None:
+        """The solution, the first if there are several; None if there is none."""
+        return self.sols[0] if self.sols else None
+
+    @property
+    def lost(self) -> bool:
+        """Whether no trajectory reached its end."""
+        return all(failed(sol).all() for sol in self.sols)
+
+    def note(self, text: str) -> None:
+        """Add a sentence to the reason."""
+        self.fill(reason=f"{self.row.reason} {text}".strip())
+
+    def fill(self, **figures: Any) -> None:
+        """Enter figures in the row."""
+        self.row = replace(self.row, **figures)
+
+    def run(self, run: Callable[[Any], Solution | Sequence[Solution]]) -> None:
+        """Run the candidate's integrator once, and enter its counts; or the reason why there is no solution."""
+        integrator = self.candidate.integrator
+        try:
+            if self.candidate.problem:
+                raise ImportError(self.candidate.problem)
+            found = run(integrator)
+            self.sols = (found,) if isinstance(found, Solution) else tuple(found)
+            sol = self.sols[0]  # `sol.integrator` may be another than was asked for: see `Integrator.resolved`
+            trained = sol.integrator.figures(sol.system).get("training_seconds") if sol.integrator.trained else None
+        except REFUSALS as error:
+            self.sols = ()
+            self.fill(status="not applicable", reason=str(error))
+            return
+        except Exception as error:
+            self.sols = ()
+            self.fill(status="failed", reason=f"{type(error).__name__}: {error}")
+            return
+        stats = sol.stats
+        self.fill(
+            status="failed" if self.lost or (sol.y.ndim == 2 and not sol.success) else "ok",
+            reason=next((s.message for s in self.sols if not s.success), ""),
+            dt=stats.get("dt"),
+            tolerance=tolerance_of(sol.integrator),
+            n_steps=max(int(s.stats["n_steps"]) for s in self.sols),
+            backend=stats.get("backend"),
+            force_evaluations=int(stats["force_evaluations"]),
+            hessian_evaluations=int(stats["hessian_evaluations"]),
+            training_time=trained,
+        )
+        if sol.success and "domain_exit" in stats:
+            self.note(f"The state left the flow's domain at t = {stats['domain_exit']:.4g}.")
+
+    def measure(self, metrics: Mapping[str, Metric], asked: Sequence[str]) -> None:
+        """Fill in the metrics asked for; one that cannot be had leaves a note, and so does a RuntimeWarning."""
+        if self.sol is None:
+            return
+        for name in asked:
+            with self.noting_warnings():
+                try:
+                    with naming_plugin(self.sol.integrator, passes=(TypeError, ValueError)):  # these say that it cannot
+                        metrics[name](self)
+                except Exception as error:
+                    self.note(f"No {name}: {error}")
+
+    @contextmanager
+    def noting_warnings(self) -> Iterator[None]:
+        """Turn RuntimeWarnings into notes, each once; NumPy's of overflow and the like are not raised."""
+        with warnings.catch_warnings(record=True) as caught, np.errstate(all="ignore"):
+            warnings.simplefilter("always", RuntimeWarning)
+            yield
+        for message in dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, RuntimeWarning)):
+            if message not in self.row.reason:
+                self.note(message)
+
+
+def largest(series: np.ndarray, sol: Solution) -> np.ndarray:
+    """Maxima over time of a non-negative series, inf for trajectories that failed."""
+    worst = np.where(np.isnan(series), np.inf, series).max(axis=-1, initial=0.0)
+    return np.where(failed(sol), np.inf, worst)
+
+
+# metrics ----------------------------------------------------------------------------------------------------------
+
+Metric = Callable[[Attempt], None]
+"""A function that measures an attempt which has run, and fills in its row."""
+
+
+def accuracy(attempt: Attempt, truth: Reference) -> None:
+    """The distance from a reference; of a batch of which fewer trajectories were run, from their part of it."""
+    (sol,) = attempt.sols
+    states = truth if sol.y.shape[:-1] == truth.y.shape[:-1] else truth.y[: len(sol.y0)]
+    attempt.fill(error=float(np.median(largest(reference_error(sol, states), sol))))
+
+
+def energy(attempt: Attempt) -> None:
+    """The energy error over time, and its maximum."""
+    (sol,) = attempt.sols
+    attempt.energy = np.abs(energy_error(sol))
+    attempt.fill(energy_error=float(np.median(max_energy_error(sol))))
+
+
+def drift(attempt: Attempt) -> None:
+    """The trend of the energy error: the median slope over all trajectories, with its own standard error."""
+    if attempt.lost:
+        attempt.fill(energy_drift=np.inf, energy_drift_error=np.inf)
+        return
+    drifts = [energy_drift(sol) for sol in attempt.sols]
+    slope = np.concatenate([np.ravel(d.slope) for d in drifts])
+    uncertainty = np.concatenate([np.ravel(d.standard_error) for d in drifts])
+    middle = int(np.argsort(slope)[len(slope) // 2])
+    attempt.fill(energy_drift=float(slope[middle]), energy_drift_error=float(uncertainty[middle]))
+
+
+def volume(attempt: Attempt) -> None:
+    """The volume error over time, and the last value that is largest in magnitude."""
+    (sol,) = attempt.sols
+    if attempt.lost:
+        attempt.fill(volume_error=np.inf)
+        return
+    attempt.volume = series = np.asarray(volume_error(sol, over_time=True))
+    last = np.ravel(np.where(failed(sol), np.inf, series[..., -1]))
+    attempt.fill(volume_error=float(last[np.argmax(np.abs(last))]))
+
+
+def symplecticity(attempt: Attempt) -> None:
+    """The largest defect of a step, relative to the step's norm."""
+    (sol,) = attempt.sols
+    lost = attempt.lost
+    attempt.fill(symplecticity_defect=np.inf if lost else float(np.max(symplecticity_defect(sol, relative=True))))
+
+
+def reversal(attempt: Attempt) -> None:
+    """The error of returning to the start."""
+    (sol,) = attempt.sols
+    try:
+        attempt.fill(time_reversal_error=float(np.median(time_reversal_error(sol))))
+    except TypeError:
+        attempt.note(f"No reversal: method {attempt.row.method!r} cannot run backwards in time.")
+
+
+# run times --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RunTime:
+    """Median and interquartile range of the repeats, in seconds."""
+
+    median: float
+    spread: float
+
+
+def interleaved(calls: Sequence[Callable[[], object]], repeats: int) -> list[RunTime]:
+    """Time every call `repeats` times, going round over all of them, so that a slow spell of the machine hits each.
+
+    The calls should have run before: nothing is warmed up here.
+    """
+    if not calls:
+        return []
+    seconds = np.empty((repeats, len(calls)))
+    for r in range(repeats):
+        for i, call in enumerate(calls):
+            start = time.perf_counter()
+            call()
+            seconds[r, i] = time.perf_counter() - start
+    low, median, high = np.quantile(seconds, [0.25, 0.5, 0.75], axis=0)
+    return [RunTime(float(m), float(h - lo)) for lo, m, h in zip(low, median, high, strict=True)]

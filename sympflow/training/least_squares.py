@@ -1,0 +1,385 @@
+"""Levenberg–Marquardt: least squares by Gauss–Newton steps, damped where the linear model fails.
+
+`levenberg_marquardt` minimizes a function of a few numbers in NumPy, `GaussNewton` trains the weights of a flow, one
+step at a time. Both take the steps of `damped_step`; they differ in how they solve the linear problem of a step.
+
+References
+----------
+.. [1] J. J. Moré, The Levenberg–Marquardt algorithm: implementation and theory, Lect. Notes Math. 630 (1978).
+.. [2] H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05 (1999).
+.. [3] M. K. Transtrum, J. P. Sethna, Improvements to the Levenberg–Marquardt algorithm for nonlinear least-squares
+   minimization, arXiv:1201.5885 (2012).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.linalg import solve_triangular
+from torch import Tensor
+
+from sympflow.flow.flow_map import FlowMap
+from sympflow.training.losses import Objective
+from sympflow.training.options import LossOptions
+
+PROBE = 0.1  # share of a step over which the residuals' curvature is measured
+CURVED = 0.75  # largest ratio of the second-order correction to the step
+FIRST_DAMPING = 1e-3
+STOPPED = "it was stopped"
+
+Stop = Callable[[], bool]
+
+
+# one step ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Damping:
+    """λ, which follows the gain ratio of the steps, actual over predicted decrease, as in [2]_."""
+
+    value: float = FIRST_DAMPING
+    least: float = 0.0
+    growth: float = 2.0
+
+    def accepted(self, gain: float) -> None:
+        self.value = max(self.value * max(1 / 5, 1 - (2 * min(gain, 1.0) - 1) ** 3), self.least)
+        self.growth = 2.0
+
+    def rejected(self) -> None:
+        self.value, self.growth = self.value * self.growth, self.growth * 2
+
+
+class Linearized(ABC):
+    """Residuals r with their Jacobian J at a point x, and the scales D of the parameters: arrays or tensors.
+
+    Duties of a subclass
+    --------------------
+    1. `damp(damping)`: get ready to solve with JᵀJ + λD².
+    2. `newton()`: the s that minimizes ‖J s + r‖² + λ‖D s‖², and the decrease of ‖r‖² that the linear model predicts.
+    3. `solve(w)`: (JᵀJ + λD²)⁻¹ w.
+    4. `norm(v)`: ‖v‖.
+    """
+
+    x: Any
+    r: Any
+    J: Any
+    D: Any
+
+    @abstractmethod
+    def damp(self, damping: float) -> None: ...
+
+    @abstractmethod
+    def newton(self) -> tuple[Any, float]: ...
+
+    @abstractmethod
+    def solve(self, w: Any) -> Any: ...
+
+    @abstractmethod
+    def norm(self, v: Any) -> Any: ...
+
+    @abstractmethod
+    def moved(self, step: Any, bend: Any) -> Any:
+        """x + step + bend."""
+
+    def bend(self, residuals: Callable[[Any], Any], step: Any) -> Any:
+        """The geodesic acceleration of [3]_, by which a step follows a curved valley; 0 where it would lead astray."""
+        curvature = (residuals(self.x + PROBE * step) - self.r - PROBE * (self.J @ step)) / PROBE**2
+        bend = -self.solve(self.J.T @ curvature)
+        small = 2 * self.norm(self.D * bend) <= CURVED * self.norm(self.D * step)
+        return bend if small else 0 * step  # NaN is not small
+
+
+def damped_step(
+    model: Linearized,
+    residuals: Callable[[Any], Any],
+    cost: Callable[[Any], float],
+    before: float,
+    damping: Damping,
+    tries: int,
+) -> tuple[Any, float] | None:
+    """The point after a step that lowers the cost, and the cost there; None if no step of so many does.
+
+    Parameters
+    ----------
+    model : Linearized
+    residuals, cost : callable
+        At any point; the cost is not finite where a point is not admissible.
+    before : float
+        The cost at the point of the model.
+    damping : Damping
+        It grows until a step is accepted.
+    tries : int
+    """
+    for _ in range(tries):
+        model.damp(damping.value)
+        step, predicted = model.newton()
+        trial = model.moved(step, model.bend(residuals, step))
+        after = cost(trial)
+        gain = (before - after) / predicted if predicted > 0 and math.isfinite(after) else -1.0
+        if gain > 0:
+            damping.accepted(gain)
+            return trial, after
+        damping.rejected()
+    return None
+
+
+# a few numbers ----------------------------------------------------------------------------------------------------
+
+MAX_REJECTED = 30
+LEAST_DAMPING = 1e-20
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """The end of a search: parameters (n,), sum of squares, iterations, and why it ended."""
+
+    x: np.ndarray
+    cost: float
+    iterations: int
+    reason: str
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of trials that go too far; what is not finite is rejected
+def levenberg_marquardt(
+    residuals: Callable[[np.ndarray], np.ndarray],
+    linearized: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    x: np.ndarray,
+    *,
+    iterations: int = 200,
+    patience: int = 10,
+    gain: float = 1e-2,
+    damping: float = FIRST_DAMPING,
+    stop: Stop = lambda: False,
+) -> Minimum:
+    """Minimize ‖r(x)‖².
+
+    A step solves min ‖J s + r‖² + λ‖D s‖² by QR factorizations, never by normal equations; D holds the largest norms
+    that the columns of J had. The step is bent by the geodesic acceleration of [3]_, which follows the curved valleys
+    of such problems.
+
+    Parameters
+    ----------
+    residuals : callable
+        r(x), (m,); not finite where x is not admissible.
+    linearized : callable
+        r(x) and its Jacobian J(x), (m, n).
+    x : ndarray, shape (n,)
+        The start.
+    iterations : int
+        The most accepted steps.
+    patience, gain : int, float
+        The search ends when `patience` steps together lower the cost by less than this share of it.
+    damping : float
+        The first λ.
+    stop : callable
+        Asked before each step whether to end here.
+    """
+
+    def cost_at(x: np.ndarray) -> float:
+        r = residuals(x)
+        return float(r @ r)
+
+    cost = cost_at(x)
+    if not math.isfinite(cost):
+        return Minimum(x, math.inf, 0, "the residuals are not finite at the start")
+    costs, scale, level = [cost], np.zeros(len(x)), Damping(damping, LEAST_DAMPING)
+    for iteration in range(iterations):
+        if stop():
+            return Minimum(x, cost, iteration, STOPPED)
+        model = _Factored(x, *linearized(x), scale)
+        scale = model.scale
+        found = damped_step(model, residuals, cost_at, cost, level, MAX_REJECTED)
+        if found is None:
+            return Minimum(x, cost, iteration, "no step lowers the cost")
+        x, cost = found
+        costs.append(cost)
+        if len(costs) > patience and cost > (1 - gain) * costs[-1 - patience]:
+            return Minimum(x, cost, iteration + 1, "it has converged")
+    return Minimum(x, cost, iterations, "the iterations were used up")
+
+
+class _Factored(Linearized):
+    """A linear model in NumPy, by QR factorizations of [J r] and, for each λ, of [R; √λ D]."""
+
+    def __init__(self, x: np.ndarray, r: np.ndarray, J: np.ndarray, scale: np.ndarray) -> None:
+        self.x, self.r, self.J = x, r, J
+        R = _qr(np.column_stack([J, r]), "r")[1]
+        self._R, self._projected = R[: len(x), : len(x)], R[: len(x), -1]
+        self.scale = np.maximum(scale, np.linalg.norm(self._R, axis=0))
+        self.D = np.where(self.scale > 0, self.scale, 1.0)
+
+    def damp(self, damping: float) -> None:
+        Q, self._damped = _qr(np.concatenate([self._R, np.diag(np.sqrt(damping) * self.D)]), "reduced")
+        self._Q = Q[: len(self._R)]
+
+    def newton(self) -> tuple[np.ndarray, float]:
+        projected = self._projected
+        step = -self._back(self._Q.T @ projected)
+        linear = projected + self._R @ step
+        return step, projected @ projected - linear @ linear
+
+    def solve(self, w: np.ndarray) -> np.ndarray:
+        return self._back(self._back(w, "T"))
+
+    def norm(self, v: np.ndarray) -> Any:
+        return np.linalg.norm(v)
+
+    def moved(self, step: np.ndarray, bend: np.ndarray) -> np.ndarray:
+        return self.x + step + bend
+
+    def _back(self, v: np.ndarray, trans: str = "N") -> np.ndarray:
+        return solve_triangular(self._damped, v, trans=trans, check_finite=False)
+
+
+def _qr(A: np.ndarray, mode: str) -> tuple[np.ndarray, np.ndarray]:
+    """Q and R, on one thread: where others are at work too, several wait for each other a hundred times as long."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        Q, R = torch.linalg.qr(torch.from_numpy(A), mode=mode)
+    finally:
+        torch.set_num_threads(threads)
+    return Q.numpy(), R.numpy()
+
+
+# the weights of a flow --------------------------------------------------------------------------------------------
+
+MAX_PARAMETERS = 8000
+TRIES = 20
+LEAST_DAMPING_OF_WEIGHTS = 1e-16
+WELL_CONDITIONED = 1e-8  # damping above which (JᵀJ + λD²)s = −Jᵀr loses no more than half the digits
+PATIENCE = 20
+GAIN = 1e-2
+PULL = 1e-16  # towards 0, per squared weight: it costs nothing until a weight runs away
+
+
+def weight_vector(parameters: Sequence[Tensor]) -> Tensor:
+    """A copy of the parameters, one after another: (n,)."""
+    return torch.cat([w.detach().reshape(-1) for w in parameters])
+
+
+@torch.no_grad()
+def put_weights(parameters: Sequence[Tensor], x: Tensor) -> None:
+    """Give the parameters the values x (n,)."""
+    for w, part in zip(parameters, x.split([w.numel() for w in parameters]), strict=True):
+        w.copy_(part.view_as(w))
+
+
+class GaussNewton:
+    """Levenberg–Marquardt on the residuals of a flow, one accepted step at a time; it trains networks best.
+
+    A step s minimizes ‖J s + r‖² + λ‖D s‖², D the largest norms that the columns of J have had, so that λ bounds
+    the condition number: by the normal equations where it is large, else by a QR factorization of J. To r belongs a
+    tiny multiple of the weights: a neuron that is saturated at all points may else run off to a step of any slope,
+    which no held-out point sees, but an orbit meets after some ten thousand steps. The steps end where `PATIENCE` of
+    them on the same points lower the loss by less than 1 %, or none does.
+
+    Attributes
+    ----------
+    finished : str or None
+        Why no more steps are worth while.
+    """
+
+    def __init__(self, flow: FlowMap, options: LossOptions) -> None:
+        if flow.n_parameters > MAX_PARAMETERS:
+            raise ValueError(
+                f"`optimizer` 'gauss-newton' keeps a dense Jacobian and takes at most {MAX_PARAMETERS} parameters; the "
+                f"flow has {flow.n_parameters}: use 'lbfgs' or 'adam'."
+            )
+        self.parameters = list(flow.parameters())
+        self.damping = Damping(FIRST_DAMPING, LEAST_DAMPING_OF_WEIGHTS)
+        self.scale: Tensor | None = None  # D²
+        self.costs: list[float] = []
+        self.draw: int | None = None
+        self.finished: str | None = None
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "damping": self.damping.value,
+            "growth": self.damping.growth,
+            "scale": self.scale,
+            "costs": self.costs,
+            "draw": self.draw,
+            "finished": self.finished,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        n, scale = sum(w.numel() for w in self.parameters), state["scale"]
+        if scale is not None and scale.shape != (n,):
+            raise ValueError(f"`state` has a scale of shape {tuple(scale.shape)}, not {(n,)}: start afresh.")
+        self.scale = None if scale is None else scale.to(self.parameters[0])
+        self.damping = Damping(state["damping"], LEAST_DAMPING_OF_WEIGHTS, state["growth"])
+        self.costs, self.draw, self.finished = list(state["costs"]), state["draw"], state["finished"]
+
+    def step(self, index: int, objective: Objective) -> float:
+        """Take a step; the loss before it."""
+        x = weight_vector(self.parameters)
+        r, J = objective.linearized()
+        loss = float(r @ r)
+        r, J = torch.cat([r, PULL**0.5 * x]), torch.cat([J, PULL**0.5 * torch.eye(len(x)).to(J)])
+        cost = float(r @ r)
+        if not math.isfinite(cost):
+            return cost
+        if objective.draw != self.draw:
+            self.draw, self.costs = objective.draw, []
+
+        def residuals(x: Tensor) -> Tensor:
+            put_weights(self.parameters, x)
+            return torch.cat([objective.residuals(), PULL**0.5 * x])
+
+        def cost_at(x: Tensor) -> float:
+            put_weights(self.parameters, x)
+            with torch.no_grad():
+                return float(objective()) + PULL * float(x @ x)
+
+        model = _Normal(x, r, J, self.scale)
+        self.scale = model.scale
+        found = damped_step(model, residuals, cost_at, cost, self.damping, TRIES)
+        if found is None:
+            put_weights(self.parameters, x)
+            self.damping = Damping(FIRST_DAMPING, LEAST_DAMPING_OF_WEIGHTS)
+            self.finished = "no step lowers the loss"
+            return loss
+        self.costs = [*self.costs[-PATIENCE:], found[1]]
+        if len(self.costs) > PATIENCE and found[1] > (1 - GAIN) * self.costs[0]:
+            self.finished = "it has converged"
+        return loss
+
+
+class _Normal(Linearized):
+    """A linear model in torch, by Cholesky's factors of JᵀJ + λD²; where λ is small, by a QR factorization of J."""
+
+    def __init__(self, x: Tensor, r: Tensor, J: Tensor, scale: Tensor | None) -> None:
+        self.x, self.r, self.J = x, r, J
+        self._G, self._g = J.T @ J, J.T @ r
+        squares = self._G.diagonal()
+        self.scale = squares.clone() if scale is None else torch.maximum(scale, squares)
+        self.D = torch.where(self.scale > 0, self.scale, 1.0).sqrt()
+
+    def damp(self, damping: float) -> None:
+        D = self.D
+        identity = torch.eye(len(D), dtype=D.dtype, device=D.device)
+        if damping > WELL_CONDITIONED:
+            R, failed = torch.linalg.cholesky_ex(self._G / torch.outer(D, D) + damping * identity, upper=True)
+        if damping <= WELL_CONDITIONED or failed:
+            R = torch.linalg.qr(torch.cat([self.J / D, damping**0.5 * identity]), mode="r")[1]
+        self._R = R
+
+    def newton(self) -> tuple[Tensor, float]:
+        s = -self.solve(self._g)
+        return s, -float(s @ (self._G @ s + 2 * self._g))
+
+    def solve(self, w: Tensor) -> Tensor:
+        return torch.cholesky_solve((w / self.D)[:, None], self._R, upper=True)[:, 0] / self.D
+
+    def norm(self, v: Tensor) -> Tensor:
+        return torch.linalg.vector_norm(v)
+
+    def moved(self, step: Tensor, bend: Tensor) -> Tensor:
+        return self.x + (step + bend)

@@ -1,0 +1,203 @@
+"""The points of a fit: a function of the seed and the step alone, so that a run resumes; and labels at them.
+
+Labels say where the exact flow takes sampled states, at several times. They are made on the spot, or handed in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sympflow.arrays import to_numpy
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.exact_flow import reference_step
+from sympflow.hamiltonian.system import HamiltonianSystem
+
+BLOCK = 32  # steps drawn at once: a rejection-sampled domain then costs little
+LABEL_TOLERANCE = 1e-13
+HELD_OUT_SHARE = 0.1  # of the labels that are handed in
+
+Labelled = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Times (n,), states (n, 2d), and where the flow takes them (n, 2d)."""
+
+
+class Stream(IntEnum):
+    """Independent random streams of one seed."""
+
+    RESIDUAL = 0
+    MATCHING = 1
+    VALIDATION = 2
+    REFERENCE = 3
+    SCALING = 4
+    RESTARTS = 5
+    LABELS = 6
+
+
+@dataclass(frozen=True)
+class Points:
+    """Collocation points.
+
+    Attributes
+    ----------
+    t, x : (N,), (N, 2d)
+        Of the residual loss L1.
+    matching_t, matching_x : (m, 1), (m, n, 2d)
+        Of the matching loss L2: few times with many states each.
+    labels : (n,), (n, 2d), (n, 2d), or None
+        Times, states and where the exact flow takes them, of the loss L3.
+    """
+
+    t: Tensor
+    x: Tensor
+    matching_t: Tensor
+    matching_x: Tensor
+    labels: tuple[Tensor, Tensor, Tensor] | None = None
+
+
+def stream_seed(seed: int, stream: Stream, block: int = 0) -> int:
+    """An integer seed of its own for each stream and block."""
+    return int(np.random.SeedSequence([seed, int(stream), block]).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def states(domain: Domain, n: int, seed: int, stream: Stream, block: int = 0) -> np.ndarray:
+    """n states (n, 2d) of the domain."""
+    return domain.sample(n, stream_seed(seed, stream, block))
+
+
+class PointSource:
+    """Draws the points of a step: uniform in Ω, and in [0, Δt] one time from each of equal cells."""
+
+    def __init__(
+        self,
+        domain: Domain,
+        dt: float,
+        points: int,
+        matching_times: int,
+        seed: int,
+        dtype: torch.dtype,
+        device: torch.device,
+        streams: tuple[Stream, Stream] = (Stream.RESIDUAL, Stream.MATCHING),
+        block: int = BLOCK,
+        labels: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    ) -> None:
+        self.domain, self.dt, self.seed, self.streams = domain, dt, seed, streams
+        self.points, self.times = points, matching_times
+        self.block_length = block
+        self._like = {"dtype": dtype, "device": device}
+        self._labels = None if labels is None else tuple(torch.as_tensor(a, **self._like) for a in labels)  # type: ignore[arg-type]
+        self._block = -1
+        self._arrays: tuple[Tensor, ...] = ()
+
+    def __call__(self, index: int) -> Points:
+        """The points of the `index`-th draw."""
+        block, i = divmod(index, self.block_length)
+        if block != self._block:
+            self._draw(block)
+        t, x, matching_t, matching_x = self._arrays
+        return Points(t[i], x[i], matching_t[i], matching_x[i], self._labelled(index))
+
+    def _labelled(self, index: int) -> Any:
+        """All labels, or as many as there are points, drawn anew for each index."""
+        if self._labels is None or len(self._labels[0]) <= self.points:
+            return self._labels
+        rng = np.random.default_rng([stream_seed(self.seed, Stream.LABELS), index])
+        rows = torch.as_tensor(rng.permutation(len(self._labels[0]))[: self.points], device=self._labels[0].device)
+        return tuple(a[rows] for a in self._labels)
+
+    def _draw(self, block: int) -> None:
+        m, k = self.times, self.block_length
+        n = self.points // m
+        x = states(self.domain, k * self.points, self.seed, self.streams[0], block).reshape(k, self.points, -1)
+        xm = states(self.domain, k * m * n, self.seed, self.streams[1], block).reshape(k, m, n, -1)
+        # A stream of its own for the times: the domain's generator started from the same integer.
+        rng = np.random.default_rng([stream_seed(self.seed, self.streams[0], block), 1])
+        t = self.dt * (np.arange(self.points) + rng.random((k, self.points))) / self.points
+        tm = self.dt * (np.arange(m) + rng.random((k, m))) / m
+        self._arrays = tuple(torch.as_tensor(a, **self._like) for a in (t, x, tm[..., None], xm))  # type: ignore[arg-type]
+        self._block = block
+
+
+# labels ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Labels:
+    """φ_H,t(x) of N states at J times.
+
+    Attributes
+    ----------
+    t : (J,), ascending, positive
+    x : (N, 2d)
+    y : (J, N, 2d)
+    """
+
+    t: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+
+    @classmethod
+    def of(cls, system: HamiltonianSystem, x: np.ndarray, t: np.ndarray) -> Labels:
+        """Made by DOP853 at rtol = 1e-13, all states in one integration from each time to the next.
+
+        States whose solution ends before the last time are left out.
+        """
+        y, reached = [x], 0.0
+        for time in t:
+            after = reference_step(system, y[-1], float(time - reached), LABEL_TOLERANCE)
+            exists = np.isfinite(after).all(-1)
+            y, reached = [states[exists] for states in (*y, after)], time
+        return cls(np.asarray(t), y[0], np.stack(y[1:]))
+
+    def at(self, j: int) -> Labels:
+        """Those at the j-th time alone."""
+        return Labels(self.t[[j]], self.x, self.y[[j]])
+
+    def first(self, n: int) -> Labels:
+        """Those of the first n states."""
+        return Labels(self.t, self.x[:n], self.y[:, :n])
+
+
+def handed_in(data: Any, system: HamiltonianSystem, dt: float) -> Labelled:
+    """The labels that were handed in, as float64 arrays."""
+    if not isinstance(data, tuple | list) or len(data) != 3:
+        raise TypeError(
+            "`data` must be three arrays, times (n,), states (n, 2d) and where they go (n, 2d): pass a tuple."
+        )
+    t, x, y = (np.asarray(to_numpy(a), dtype=float) for a in data)
+    width = 2 * system.ndof
+    if t.ndim != 1 or x.shape != (len(t), width) or y.shape != x.shape or len(t) < 2:
+        raise ValueError(
+            f"`data` must have shapes (n,), (n, {width}) and (n, {width}), n ≥ 2; got {t.shape}, {x.shape} and "
+            f"{y.shape}: give one row for each label."
+        )
+    if not (np.isfinite(t).all() and np.isfinite(x).all() and np.isfinite(y).all()):
+        raise ValueError("`data` must be finite: remove the labels with NaN or infinity.")
+    if t.min() < 0 or t.max() > dt * (1 + 1e-12):
+        raise ValueError(
+            f"`data` has times from {t.min():g} to {t.max():g}, beyond [0, dt] = [0, {dt:g}]: change `dt`."
+        )
+    return t, x, y
+
+
+def digest(labels: Labelled) -> str:
+    """The checksum of labels."""
+    content = hashlib.sha256()
+    for array in labels:
+        content.update(np.ascontiguousarray(array).tobytes())
+    return content.hexdigest()
+
+
+def parted(data: Labelled, seed: int) -> tuple[Labelled, Labelled]:
+    """Labels that were handed in: those to train on, and the held-out ones."""
+    order = np.random.default_rng([stream_seed(seed, Stream.LABELS), 0]).permutation(len(data[0]))
+    first = math.ceil(HELD_OUT_SHARE * len(order))
+    t, x, y = data
+    held, rest = order[:first], order[first:]
+    return (t[rest], x[rest], y[rest]), (t[held], x[held], y[held])

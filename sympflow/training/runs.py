@@ -1,0 +1,259 @@
+"""The loop of every training: steps or starts, one after another, with its checkpoints, its history and its end."""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.scaling import Scaling
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.training import checkpoint as checkpoints
+from sympflow.training.least_squares import STOPPED, Minimum, Stop
+from sympflow.training.options import LossOptions, SearchOptions
+from sympflow.training.session import Path, Session
+
+OUT_OF_TIME = "the time budget was used up"
+INTERRUPTED = "it was interrupted"
+
+
+@dataclass(frozen=True)
+class Advance:
+    """A step, or a start, of a run: its loss, the held-out figures after it if it was validated, whether it is kept."""
+
+    loss: float
+    figures: dict[str, float] | None
+    keep: bool
+
+
+@dataclass
+class Run(ABC):
+    """The state of a run, and the loop that acts on it.
+
+    Duties of a subclass
+    --------------------
+    1. `done`, `planned`: steps (or what else `UNIT` names) taken, and the most there may be.
+    2. `begin(session)`: get ready for the first; an exception ends the run.
+    3. `over(session)`: whether to take no more.
+    4. `advance(session)`: take one.
+    5. `end(session)`: make the flow that is returned; why the run ended early, if it did.
+    6. `achieved()`, `remarks(reason)`: the figures of the flow, and what its recipe says of the run.
+    7. `kept()`, `restore(state)`: the state that a checkpoint keeps, `best` and `optimizer`.
+
+    Attributes
+    ----------
+    history : list of dict
+        The figures of each validation.
+    seconds : float
+        Wall time of the run, and of those that it goes on with.
+    """
+
+    flow: FlowMap
+    system: HamiltonianSystem
+    domain: Domain
+    scaling: Scaling | None
+    options: LossOptions | SearchOptions
+    history: list[dict[str, float]] = field(default_factory=list, kw_only=True)
+    seconds: float = field(default=0.0, kw_only=True)
+
+    UNIT: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def done(self) -> int: ...
+
+    @property
+    @abstractmethod
+    def planned(self) -> int: ...
+
+    @abstractmethod
+    def begin(self, session: Session) -> None: ...
+
+    @abstractmethod
+    def over(self, session: Session) -> bool: ...
+
+    @abstractmethod
+    def advance(self, session: Session) -> Advance: ...
+
+    @abstractmethod
+    def end(self, session: Session) -> str | None: ...
+
+    @abstractmethod
+    def achieved(self) -> dict[str, float]: ...
+
+    @abstractmethod
+    def remarks(self, reason: str | None) -> dict[str, Any]: ...
+
+    @abstractmethod
+    def kept(self) -> dict[str, Any]: ...
+
+    @abstractmethod
+    def restore(self, state: dict[str, Any]) -> None: ...
+
+    def go(self, session: Session) -> str | None:
+        """Run to the end; why it ended early, if it did. The flow is then the best that was found."""
+        before = self.seconds
+        self.begin(session)
+        try:
+            with session.bar(self.planned, f"{self.system.name} {self.flow.kind}", self.done) as bar:
+                while self.done < self.planned and not self.over(session):
+                    advance = self.advance(session)
+                    self.seconds = before + session.passed
+                    bar.advance(self.done, advance.loss)
+                    if advance.figures is not None:
+                        bar.validated(self.done, advance.figures)
+                        if session.callback is not None:
+                            session.callback(self.done, dict(advance.figures))
+                    if session.checkpoint is not None and advance.keep:
+                        self.save(session.checkpoint)
+        except KeyboardInterrupt:  # of the callback, a handler of the program's own, or a second one
+            session.interruption.asked = True
+        reason = self.end(session)
+        self.seconds = before + session.passed
+        return reason
+
+    def finish(self, reason: str | None, expected: bool = False) -> Any:
+        """The flow with the record of its training, its parameters without gradient; an expected end does not warn."""
+        if reason is not None and not (expected and reason == OUT_OF_TIME):
+            done, planned = self.done, self.planned
+            when = f"after {done} of {planned} {self.UNIT}"
+            if done >= planned:
+                when = f"in its last fits, after all {planned} {self.UNIT},"
+            warnings.warn(
+                f"Training ended {when} because {reason}. The best state so far is returned.",
+                RuntimeWarning,
+                stacklevel=4,
+            )
+        flow, figures = self.flow, self.achieved()
+        flow.requires_grad_(False)
+        flow.zero_grad(set_to_none=True)
+        flow.domain, flow.fingerprint, flow.system_name = self.domain, self.system.fingerprint, self.system.name
+        earlier = float(flow.figures.get("training_seconds", 0.0))
+        stage = {**self.options.to_dict(), **self.remarks(reason)}
+        flow.recipe = {
+            "stages": [*flow.recipe.get("stages", []), stage],
+            **({} if self.scaling is None else {"scaling": self.scaling.to_dict()}),
+            "torch": torch.__version__,
+        }
+        flow.figures = {name: value for name, value in figures.items() if name not in ("step", "loss", "iterations")}
+        flow.figures["training_seconds"] = round(earlier + self.seconds, 3)
+        flow.history = self.history
+        return flow
+
+    # checkpoints ------------------------------------------------------------------------------------------
+
+    def save(self, path: Path) -> None:
+        """Write the state of the run."""
+        run = {"step": self.done, "flow": self.flow.state_dict(), **self.kept()}
+        run |= {"history": self.history, "seconds": self.seconds}
+        checkpoints.write(path, checkpoints.identity(self.flow, self.system, self.options.to_dict()) | run)
+
+    def load(self, path: Path) -> None:
+        """Take over the state of a run with the same flow, system and options.
+
+        Raises
+        ------
+        ValueError
+            If the file is not a checkpoint, or one of another run.
+        """
+        state = checkpoints.read_same(path, checkpoints.identity(self.flow, self.system, self.options.to_dict()))
+        try:
+            self.restore(state)
+        except (RuntimeError, KeyError, ValueError) as error:
+            raise ValueError(f"`resume` {str(path)!r} does not fit the flow: start afresh.") from error
+        self.seconds, self.history = state["seconds"], state["history"]
+
+
+@dataclass
+class SearchRun(Run):
+    """Many starts, each followed to a minimum, and a flow that is made of the best of them.
+
+    Duties of a subclass
+    --------------------
+    1. `next_minimum(stop)`: follow the next start, of number len(minima).
+    2. `found(minimum)`: note it; its figures.
+    3. `complete(session)`: make the flow of the minima, and its last entry in `history`; it may be called again after
+       an interruption.
+    """
+
+    options: SearchOptions
+    minima: list[Minimum] = field(default_factory=list, kw_only=True)
+
+    UNIT: ClassVar[str] = "starts"
+    SEARCH_SHARE: ClassVar[float] = 1.0  # of a time budget
+
+    @abstractmethod
+    def next_minimum(self, stop: Stop) -> Minimum: ...
+
+    @abstractmethod
+    def found(self, minimum: Minimum) -> dict[str, float]: ...
+
+    @abstractmethod
+    def complete(self, session: Session) -> None: ...
+
+    @property
+    def done(self) -> int:
+        return len(self.minima)
+
+    @property
+    def planned(self) -> int:
+        return self.options.restarts
+
+    def begin(self, session: Session) -> None:
+        if session.checkpoint is not None and not self.minima:  # a first search may be long
+            self.save(session.checkpoint)
+        session.interruption.armed = True
+
+    def over(self, session: Session) -> bool:
+        return session.spent(self.SEARCH_SHARE)
+
+    def advance(self, session: Session) -> Advance:
+        minimum = self.next_minimum(lambda: session.spent(self.SEARCH_SHARE))
+        self.minima.append(minimum)
+        # a start that was stopped is followed to its end another time
+        return Advance(minimum.cost, self.found(minimum), minimum.reason != STOPPED)
+
+    def end(self, session: Session) -> str | None:
+        interruption = session.interruption
+        try:
+            try:
+                self.complete(session)
+            except KeyboardInterrupt:
+                if interruption.asked:
+                    raise
+                interruption.asked = True
+                self.complete(session)  # at once: all that is left to do is to take the best
+        except FloatingPointError:
+            if interruption.asked:  # before there was anything
+                raise KeyboardInterrupt from None
+            raise
+        return INTERRUPTED if interruption.asked else OUT_OF_TIME if session.cut else None
+
+    def achieved(self) -> dict[str, float]:
+        return self.history[-1]
+
+    def remarks(self, reason: str | None) -> dict[str, Any]:
+        iterations = sum(int(figures["iterations"]) for figures in self.history)
+        return {"restarts_taken": len(self.minima), "iterations": iterations, "ended_early": reason}
+
+    def kept(self) -> dict[str, Any]:
+        """The searches so far, each with its end; `best` is the flow that the best of them gives."""
+        searches = {
+            "x": torch.as_tensor(np.stack([m.x for m in self.minima]) if self.minima else np.empty((0, 0))),
+            "cost": [m.cost for m in self.minima],
+            "iterations": [m.iterations for m in self.minima],
+        }
+        return {"best": self.flow.state_dict(), "optimizer": searches}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        searches = state["optimizer"]
+        self.minima = [
+            Minimum(x.numpy(), cost, iterations, "it was resumed")
+            for x, cost, iterations in zip(searches["x"], searches["cost"], searches["iterations"], strict=True)
+        ]

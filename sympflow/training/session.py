@@ -1,0 +1,213 @@
+"""One call of `train`: Ctrl-C, the time that it may take, the file that keeps it, and the progress that is shown."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import Any
+
+from sympflow.training.checkpoint import check_writable
+from sympflow.training.options import is_number
+
+Path = str | os.PathLike[str]
+Callback = Callable[[int, dict[str, float]], None]
+
+LEAST_BUDGET = 1.0  # seconds that are left to a run, however long trials and labels took
+
+
+class Interruption:
+    """A context in which Ctrl-C asks for an end where there is something to return, and raises where there is not.
+
+    A second one raises KeyboardInterrupt in any case. In another thread than the main one, or where the program has a
+    handler of its own, nothing is changed.
+
+    Attributes
+    ----------
+    armed : bool
+        Whether there is something to return.
+    asked : bool
+        Whether the end was asked for; what runs looks at it.
+    """
+
+    def __init__(self) -> None:
+        self.armed = self.asked = False
+        self._installed = False
+
+    def __enter__(self) -> Interruption:
+        in_main = threading.current_thread() is threading.main_thread()
+        self._installed = in_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        if self._installed:
+            signal.signal(signal.SIGINT, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._installed:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.asked or not self.armed:
+            raise KeyboardInterrupt
+        self.asked = True
+
+
+@dataclass
+class Session:
+    """The surroundings of a run, and the clock that began with it.
+
+    Parameters
+    ----------
+    checkpoint, resume : path, optional
+        Files to keep the state of the run in, and to go on from.
+    time_budget : float, optional
+        Seconds.
+    progress : bool, optional
+        Whether to show a bar; None means on a terminal only.
+    callback : callable, optional
+        callback(step, figures) after each validation.
+    interruption : Interruption
+        Asks the run to end.
+
+    Attributes
+    ----------
+    cut : bool
+        Whether the time was up when it was looked at.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not admissible, or no checkpoint can be written.
+    """
+
+    checkpoint: Path | None = None
+    resume: Path | None = None
+    time_budget: float | None = None
+    progress: bool | None = False
+    callback: Callback | None = None
+    interruption: Interruption = field(default_factory=Interruption)
+    cut: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        self._began = time.perf_counter()
+        budget, callback = self.time_budget, self.callback
+        if budget is not None and not (is_number(budget) and 0 < budget < float("inf")):
+            raise ValueError(f"`time_budget` must be a positive number of seconds; got {budget!r}: leave it out.")
+        if callback is not None and not callable(callback):
+            raise TypeError(
+                f"`callback` must be a function of the step and the figures; got {callback!r}: leave it out."
+            )
+        for name, path in (("checkpoint", self.checkpoint), ("resume", self.resume)):
+            if path is not None and not isinstance(path, (str, os.PathLike)):
+                raise TypeError(f"`{name}` must be the path of a file; got {path!r}: pass a string or leave it out.")
+        if self.checkpoint is not None:
+            check_writable(self.checkpoint)
+
+    @property
+    def passed(self) -> float:
+        """Seconds since the session, or its run, began."""
+        return time.perf_counter() - self._began
+
+    def begin_run(self) -> float:
+        """Start the clock of the run; the seconds that went by before, which count as part of the budget."""
+        before = self.passed
+        if self.time_budget is not None:
+            self.time_budget = max(self.time_budget - before, min(self.time_budget, LEAST_BUDGET))
+        self._began = time.perf_counter()
+        return before
+
+    def spent(self, share: float = 1.0) -> bool:
+        """Whether this share of the time is used up, or the run is to end at once."""
+        over = self.interruption.asked or (self.time_budget is not None and self.passed > share * self.time_budget)
+        self.cut = self.cut or over
+        return over
+
+    def bar(self, total: int, label: str, start: int = 0) -> Silent:
+        """The display of so many steps, as a context."""
+        if not (sys.stderr.isatty() if self.progress is None else self.progress):
+            return Silent()
+        try:
+            return Bar(total, label, start)
+        except ImportError:
+            return Lines(total, label)
+
+
+# progress -------------------------------------------------------------------------------------------------------
+
+
+class Silent:
+    """Shows nothing."""
+
+    def __enter__(self) -> Silent:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def advance(self, step: int, loss: float) -> None:
+        pass
+
+    def validated(self, step: int, figures: dict[str, float]) -> None:
+        pass
+
+    def tries(self, done: int, what: str) -> None:
+        pass
+
+
+class Lines(Silent):
+    """One line for each validation: the fallback where rich is not installed."""
+
+    def __init__(self, total: int, label: str) -> None:
+        self.total, self.label = total, label
+
+    def validated(self, step: int, figures: dict[str, float]) -> None:
+        self.tries(step, _text(figures))
+
+    def tries(self, done: int, what: str) -> None:
+        print(f"{self.label} {done}/{self.total}  {what}", file=sys.stderr, flush=True)
+
+
+class Bar(Silent):
+    """A bar with the losses, the one-step error and the time left."""
+
+    def __init__(self, total: int, label: str, start: int) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self.bar = Progress(
+            TextColumn("[bold]{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[figures]}"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+        )
+        self.task: Any = self.bar.add_task(label, total=total, completed=start, figures="")
+        self.figures = ""
+
+    def __enter__(self) -> Bar:
+        self.bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.stop()
+
+    def advance(self, step: int, loss: float) -> None:
+        if step % 10 == 0:
+            self.bar.update(self.task, completed=step, figures=f"loss {loss:.1e}  {self.figures}")
+
+    def validated(self, step: int, figures: dict[str, float]) -> None:
+        self.figures = _text(figures)
+        self.bar.update(self.task, completed=step, figures=self.figures)
+
+    def tries(self, done: int, what: str) -> None:
+        self.bar.update(self.task, completed=done, figures=what)
+
+
+def _text(figures: dict[str, float]) -> str:
+    names = {"loss": "held-out", "residual_loss": "L1", "matching_loss": "L2", "one_step_error": "one-step"}
+    return "  ".join(f"{short} {figures[name]:.1e}" for name, short in names.items() if name in figures)

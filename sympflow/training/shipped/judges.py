@@ -1,0 +1,274 @@
+"""The figures of a flow: errors of steps, energy errors over long runs, and cost, by which the shipped are chosen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from sympflow.flow.certificate import upper_limit
+from sympflow.flow.clocked import ClockedFlow
+from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.primed import PrimedFlow
+from sympflow.flow.split import SplitFlow
+from sympflow.flow.sympflow import SympFlow
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.exact_flow import reference_step
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.metrics.energy import max_energy_error
+from sympflow.solver import solve
+from sympflow.training.clock_fit import energy_errors
+from sympflow.training.points import Labels
+
+FRACTIONAL_TIMES = 50
+HELD_OUT = 1000  # states of the certificate
+OUTPUTS = 1000  # at which an energy error is looked at, where it is not the certificate that does
+CLOCK_SEED = 1_000_003  # of the held-out states of flows without a certificate
+
+
+# cost ---------------------------------------------------------------------------------------------------------------
+
+OF_A_GRADIENT, OF_A_CURVATURE, OF_A_MONOMIAL, OF_A_PARAMETER = 0.3, 0.4, 0.05, 0.4  # forces
+OF_A_LOGARITHM = 2.0  # forces: a kick and a drift of the logarithmic Hamiltonian, a division in each
+
+Cost = Callable[[Any], float]
+"""Force evaluations in a unit of time, by count: a figure that no other load on the machine disturbs."""
+
+
+def primed_cost(flow: PrimedFlow) -> float:
+    """A force gradient counts as 0.3 of a force, a curvature term as 0.4, each monomial of a polynomial as 0.05.
+
+    These shares were measured in the compiled loops for polynomial potentials.
+    """
+    kernel = flow.kernel_scheme()
+    beside = OF_A_GRADIENT * kernel.hessian_evaluations + OF_A_CURVATURE * kernel.curvature_evaluations
+    beside += OF_A_MONOMIAL * len(kernel.monomials) * kernel.force_evaluations
+    return (kernel.force_evaluations + beside) / flow.dt
+
+
+def split_cost(flow: SplitFlow) -> float:
+    """As of a primed flow; exact linear flows count nothing."""
+    one, two = (flow.evaluations(n, 0, 0, "compiled") for n in (1, 2))
+    more = {name: two[name] - one[name] for name in one}
+    return (more["force_evaluations"] + OF_A_GRADIENT * more["hessian_evaluations"]) / flow.dt
+
+
+def network_cost(flow: FlowMap) -> float:
+    """The parameters of a network count as many forces as make up for its multiplications."""
+    return OF_A_PARAMETER * flow.n_parameters / flow.dt
+
+
+def clocked_cost(flow: ClockedFlow) -> float:
+    return OF_A_LOGARITHM * flow.scheme.force_evaluations / flow.figures["step"]
+
+
+# errors -------------------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def measure(
+    flow: FlowMap, system: HamiltonianSystem, x: np.ndarray, *, steps: int = 1000, omega: float = 1.0
+) -> dict[str, Any]:
+    """Figures of a flow from the initial states x (n, 2d), as the published checkpoints were measured.
+
+    Parameters
+    ----------
+    flow, system
+    x : ndarray, shape (n, 2d)
+    steps : int
+        Over which the energy is followed.
+    omega : float
+        Frequency of the system: states are measured as [q, p/ω], energies in H's own units.
+
+    Returns
+    -------
+    dict
+        `error_1`, `error_10`, `error_100`: mean over the states of ‖ψ_kΔt(x) − φ_H,kΔt(x)‖, the reference by DOP853;
+        `energy_error`: of each state the largest |H − H0| over the steps, then the mean over the states;
+        `energy_error_max`: the largest of all. None where a state is not finite.
+    """
+    units = np.repeat([1.0, omega], system.ndof)
+    y = torch.as_tensor(x, dtype=flow.dtype, device=flow.device)
+    H0 = system.hamiltonian(y)
+    largest = torch.zeros_like(H0)
+    reference, reached = x, 0
+    figures: dict[str, Any] = {}
+    for k in range(1, steps + 1):
+        y = flow.psi(flow.dt, y)
+        # torch.maximum keeps a NaN, so a blow-up is not reported as a small error
+        largest = torch.maximum(largest, (system.hamiltonian(y) - H0).abs())
+        if k in (1, 10, 100):
+            reference, reached = reference_step(system, reference, (k - reached) * flow.dt), k
+            with np.errstate(all="ignore"):
+                figures[f"error_{k}"] = _mean(np.linalg.norm((y.cpu().numpy() - reference) / units, axis=-1))
+    energy = largest.cpu().numpy()
+    figures["energy_error"] = _mean(energy)
+    figures["energy_error_max"] = float(energy.max()) if np.isfinite(energy).all() else None
+    return figures
+
+
+def _mean(values: np.ndarray) -> float | None:
+    mean = float(values.mean())
+    return mean if math.isfinite(mean) else None
+
+
+@torch.no_grad()
+def one_step_errors(
+    flow: FlowMap, system: HamiltonianSystem, x: np.ndarray, *, times: int = FRACTIONAL_TIMES, omega: float = 1.0
+) -> tuple[float, float]:
+    """Means of ‖ψ̄_t(x) − φ_H,t(x)‖ over the states x (n, 2d): at Δt, and over as many times spread over (0, Δt).
+
+    A flow of which the second is far larger than the first is a map for Δt only. States are measured as [q, p/ω].
+    """
+    units = np.repeat([1.0, omega], system.ndof)
+    t = flow.dt * (np.arange(times) + 0.5) / times
+    labels = Labels.of(system, x, np.append(t, flow.dt))
+    start = torch.as_tensor(labels.x, dtype=flow.dtype, device=flow.device)
+    psi = np.stack([flow.psi(s, start).cpu().numpy() for s in labels.t.tolist()])
+    error = np.linalg.norm((psi - labels.y) / units, axis=-1).mean(-1)
+    return float(error[-1]), float(error[:-1].mean())
+
+
+# judges -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ByCertificate:
+    """The certificate over T = t_end, and from it the figures by which flows are chosen.
+
+    `energy_error_95` is an upper 99 % confidence limit of the 95 % quantile over Ω, so that a `tol` holds for other
+    states than those that were measured. The one-step error has a heavy tail where orbits come close to a singularity:
+    hence its median and its largest value beside the mean.
+    """
+
+    t_end: float = 1000.0
+    cost: Cost = primed_cost
+
+    def __call__(self, flow: SympFlow, system: HamiltonianSystem) -> None:
+        certificate = flow.certificate(system, t_end=self.t_end, held_out=HELD_OUT)
+        flow.figures |= {
+            "one_step_error_median": certificate.one_step_error.median,
+            "one_step_error_max": certificate.one_step_error.largest,
+            "energy_error_median": certificate.relative_energy_error.median,
+            "energy_error_95": certificate.relative_limit,
+            "t_end": self.t_end,
+            "cost": round(self.cost(flow), 3),
+        }
+
+
+@dataclass(frozen=True)
+class ByRuns:
+    """Energy errors of runs from given states over T = t_end, at steps and between them; a certificate beside.
+
+    Parameters
+    ----------
+    held_out : callable
+        The states (n, 2d) of a system.
+    t_end, t_certified : float
+        T of the energy errors and of the certificate.
+    """
+
+    held_out: Callable[[HamiltonianSystem], np.ndarray]
+    t_end: float
+    t_certified: float
+    cost: Cost = primed_cost
+
+    def __call__(self, flow: SympFlow, system: HamiltonianSystem) -> None:
+        y0, times = self.held_out(system), np.linspace(0.0, self.t_end, OUTPUTS + 1)
+        run = solve(system, flow, (0.0, self.t_end), y0, t_eval=times, on_domain_exit="ignore")
+        flow.certificate(system, t_end=self.t_certified)
+        flow.figures |= _of_runs(max_energy_error(run), self.t_end) | {"cost": round(self.cost(flow), 8)}
+
+
+@dataclass(frozen=True)
+class ByClock:
+    """Energy errors of runs in the physical time, of a flow in another time; it has no certificate."""
+
+    t_end: float = 1000.0
+    cost: Cost = clocked_cost
+
+    def __call__(self, flow: ClockedFlow, system: HamiltonianSystem) -> None:
+        assert system.domain is not None
+        errors = energy_errors(flow, system, system.domain.sample(HELD_OUT, CLOCK_SEED), self.t_end, OUTPUTS)
+        flow.figures |= _of_runs(errors, self.t_end) | {"cost": round(self.cost(flow), 3)}
+
+
+def _of_runs(errors: Any, t_end: float) -> dict[str, float]:
+    return {
+        "energy_error_median": float(np.quantile(errors, 0.5, method="higher")),
+        "energy_error_95": upper_limit(np.asarray(errors)),
+        "t_end": t_end,
+    }
+
+
+@dataclass(frozen=True)
+class AsPublished:
+    """`measure` of a network, `one_step_errors`, and a certificate if it is symplectic.
+
+    Parameters
+    ----------
+    initial : callable
+        The 100 initial states of the figures, drawn with seed 0.
+    omega : float
+        The frequency in whose units the figures are.
+    """
+
+    initial: Callable[[], np.ndarray]
+    omega: float = 1.0
+    cost: Cost = network_cost
+
+    def measured(self, flow: FlowMap, system: HamiltonianSystem, steps: int = 1000) -> dict[str, Any]:
+        """`measure` from the initial states."""
+        return measure(flow, system, self.initial(), steps=steps, omega=self.omega)
+
+    def __call__(self, flow: FlowMap, system: HamiltonianSystem) -> None:
+        flow.figures |= self.measured(flow, system)
+        at_end, between = one_step_errors(flow, system, self.initial(), omega=self.omega)
+        flow.figures |= {"error_at_dt": at_end, "fractional_error": between}
+        if flow.kind == "sympflow":
+            ByCertificate(cost=self.cost)(flow, system)  # type: ignore[arg-type]
+
+
+PHASES = (*(k / 20 for k in range(1, 20)), 0.97, 0.98, 0.99, 0.995)  # of a step, for figures between steps
+STIFF_STATES, STIFF_SEED = 20, 20_261_121  # of the energy figure, from a seed that no training uses
+
+
+@dataclass(frozen=True)
+class OfStiff:
+    """Largest energy errors over the system's interval, which is `t_end`; and a certificate of few states.
+
+    `orbit_energy_error` from y0 at every step, `between_steps` the largest at `PHASES` of 500 steps, relative; of
+    held-out states of Ω at every tenth step, `energy_error` and `energy_error_max` in units of H, the mean over the
+    states and the largest, and `energy_error_95`, the 95 % quantile, relative, by which a flow is chosen.
+    """
+
+    domain: Callable[[HamiltonianSystem], Domain]
+    cost: Cost = split_cost
+
+    def __call__(self, flow: SplitFlow, system: HamiltonianSystem) -> None:
+        bound = flow.bound(system)
+        on_grid = solve(system, bound, on_domain_exit="ignore")
+        n = round((system.t_span[1] - system.t_span[0]) / flow.dt) - 1
+        t = np.unique(np.linspace(0, n, 500).round())[:, None] + np.array(PHASES)
+        between = solve(system, bound, on_domain_exit="ignore", t_eval=t.ravel() * flow.dt + system.t_span[0])
+        x = self.domain(system).sample(STIFF_STATES, STIFF_SEED)
+        steps = np.arange(0.0, system.t_span[1] + flow.dt / 2, flow.dt)[::10]
+        many = solve(system, bound, y0=x, t_eval=steps[steps <= system.t_span[1]], on_domain_exit="ignore")
+        H = np.asarray(many.energy())
+        drift = np.abs(H - H[..., :1]).max(-1)
+        scale = np.abs(H[..., 0]) if system.energy_scale is None else system.energy_scale
+        bound.figures |= {
+            "orbit_energy_error": float(np.abs(on_grid.energy_error()).max()),
+            "between_steps": float(np.abs(between.energy() / system.hamiltonian(system.y0) - 1).max()),
+            "energy_error": float(drift.mean()),
+            "energy_error_max": float(drift.max()),
+            "energy_error_95": float(np.quantile(drift / scale, 0.95, method="higher")),
+            "t_end": system.t_span[1],
+            "cost": round(self.cost(bound), 3),
+        }
+        # fewer states than the default: one costs dear
+        bound.certificate(system, t_end=system.t_span[1], states=500, times=17, held_out=20)

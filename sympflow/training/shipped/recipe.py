@@ -1,0 +1,128 @@
+"""Recipe: how a flow that ships is made and judged."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from sympflow.flow.flow_map import FlowMap
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.training.options import NewFit, NewFlow
+from sympflow.training.session import Session
+from sympflow.training.starts import Start
+from sympflow.training.trainer import fit_flow
+
+
+class Judge(Protocol):
+    """A measurement of a trained flow."""
+
+    def __call__(self, flow: Any, system: HamiltonianSystem) -> None:
+        """Put the figures by which flows are chosen, and a certificate, into the flow."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A flow that ships.
+
+    Parameters
+    ----------
+    scene, name : str
+        Its file is SCENE-NAME.safetensors.
+    system : callable
+        The system.
+    start : Start
+        The flow before its training.
+    judge : Judge
+        Measures it when it is trained.
+    fits : tuple of NewFit
+        The options of `train`, one fit after another.
+    domain : callable, optional
+        Ω of a system; the default is its own.
+    after : str, optional
+        The name of the recipe with the same kicks and the same processor whose table, continued to this Δt, is where
+        the search starts: deep valleys are found at a long Δt, and followed to a short one; and found without
+        polynomials, and followed with them.
+    """
+
+    scene: str
+    name: str
+    system: Callable[[], HamiltonianSystem]
+    start: Start
+    judge: Judge
+    fits: tuple[NewFit, ...] = ()
+    domain: Callable[[HamiltonianSystem], Domain] | None = None
+    after: str | None = None
+
+    @property
+    def kind(self) -> str:
+        """The kind of flow, by which the command chooses."""
+        return self.start.kind
+
+    def domain_of(self, system: HamiltonianSystem) -> Domain:
+        """The states that are trained on."""
+        domain = system.domain if self.domain is None else self.domain(system)
+        assert domain is not None
+        return domain
+
+    def fitted(
+        self, system: HamiltonianSystem, earlier: FlowMap | None = None, progress: bool | None = None
+    ) -> FlowMap:
+        """The trained flow, not judged yet; `earlier` is that of the recipe `after` which it comes."""
+        before = time.process_time()
+        domain = self.domain_of(system)
+        flow = self.start.flow(system, domain, earlier)
+        for fit in self.fits:
+            flow = fit_flow(system, None, flow, NewFlow(), fit, domain, Session(progress=progress))
+        flow.figures["training_cpu_seconds"] = round(time.process_time() - before, 3)
+        return flow
+
+    def measure(self, flow: FlowMap) -> dict[str, Any]:
+        """The figures by which flows are chosen, measured again."""
+        self.judge(flow, self.system())
+        return flow.figures
+
+
+def made(
+    recipes: Sequence[Recipe], earlier: Callable[[Recipe, str], FlowMap] | None = None, progress: bool | None = None
+) -> Iterator[tuple[Recipe, FlowMap]]:
+    """The recipes and their flows, trained and judged, as they are made; those of a scene share its system.
+
+    `earlier` gives, by a recipe and the name of the one that it comes after, a flow that was made before.
+
+    Raises
+    ------
+    ValueError
+        If a recipe comes after one that is neither made nor given.
+    """
+    systems: dict[Callable[[], HamiltonianSystem], HamiltonianSystem] = {}
+    flows: dict[tuple[str, str], FlowMap] = {}
+    for recipe in recipes:
+        if recipe.system not in systems:
+            systems[recipe.system] = recipe.system()
+        system, before = systems[recipe.system], None
+        if recipe.after is not None:
+            before = flows.get((recipe.scene, recipe.after))
+            if before is None:
+                if earlier is None:
+                    raise ValueError(
+                        f"`rung` {recipe.name!r} starts from {recipe.after!r}: make that first, or all of them."
+                    )
+                before = earlier(recipe, recipe.after).bound(system)
+        flow = recipe.fitted(system, before, progress)
+        recipe.judge(flow, system)
+        flows[recipe.scene, recipe.name] = flow
+        yield recipe, flow
+
+
+def file_of(recipe: Recipe, folder: Path) -> Path:
+    """The file of a recipe's flow."""
+    return folder / f"{recipe.scene}-{recipe.name}.safetensors"
+
+
+def scenes(recipes: Iterable[Recipe]) -> list[str]:
+    """The names of the scenes."""
+    return list(dict.fromkeys(recipe.scene for recipe in recipes))
