@@ -40,40 +40,30 @@ from sympflow import HamiltonianSystem, SympFlow, systems, time_transformed, tra
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.hamiltonian.fingerprint import same_system
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A primed flow to be fitted."""
-
-    dt: float
-    stages: int
-    processor: int = 6
-    restarts: int = 24
-
+from sympflow.training.starts import Primed
 
 TARGETS = (1e-4, 1e-6, 1e-8)
 SHIPPED = Path(sympflow.__file__).parent / "pretrained"
 MEASURES = {"energy": 1000.0, "state": 100.0}
 FLOWS = {
     "henon_heiles": (
-        Fit(1.1, 2), Fit(0.65, 2), Fit(0.9, 3), Fit(0.55, 3, restarts=48),
+        (Primed(1.1, 2), 24), (Primed(0.65, 2), 24), (Primed(0.9, 3), 24), (Primed(0.55, 3), 48),
     ),
     "pendulum": (
-        Fit(0.8, 1), Fit(1.2, 2, 4), Fit(0.5, 2), Fit(0.5, 3, restarts=48),
+        (Primed(0.8, 1), 24), (Primed(1.2, 2, 4), 24), (Primed(0.5, 2), 24), (Primed(0.5, 3), 48),
     ),
-    "quartic": (Fit(0.8, 2), Fit(0.5, 3), Fit(0.3, 3, restarts=48)),
-    "kepler": (Fit(0.15, 2), Fit(0.1, 3), Fit(0.045, 3, restarts=48)),
+    "quartic": ((Primed(0.8, 2), 24), (Primed(0.5, 3), 24), (Primed(0.3, 3), 48)),
+    "kepler": ((Primed(0.15, 2), 24), (Primed(0.1, 3), 24), (Primed(0.045, 3), 48)),
 }  # fmt: skip
+"""Starts of trainings, and how many tables their searches begin from."""
 
 
-def fitted(system: HamiltonianSystem, fit: Fit, folder: Path, **options: Any) -> PrimedFlow:
-    """The fitted flow, from the folder if it is there."""
-    path = folder / f"{system.name}-{fit.dt:g}-{fit.stages}-{fit.processor}.safetensors"
+def fitted(system: HamiltonianSystem, start: Primed, tables: int, folder: Path, **options: Any) -> PrimedFlow:
+    """The flow that comes of a start, from the folder if it is there."""
+    path = folder / f"{system.name}-{start.dt:g}-{start.stages}-{start.processor}.safetensors"
     if path.exists():
         return sympflow.load(path, system=system)
-    start = SympFlow.primed(system, fit.stages, dt=fit.dt, processor=fit.processor)
-    flow = train(system, flow=start, progress=False, **({"restarts": fit.restarts} | options))
+    flow = train(system, flow=start.flow(system), progress=False, **({"restarts": tables} | options))
     folder.mkdir(parents=True, exist_ok=True)
     flow.save(path)
     return flow
@@ -229,7 +219,9 @@ def run(options: argparse.Namespace) -> str:
     for name in options.system or FLOWS:
         system = getattr(systems, name)()
         if options.fit:
-            flows = [fitted(system, fit, options.flows, **quick) for fit in FLOWS[name][: 1 if options.quick else None]]
+            flows = [
+                fitted(system, *row, options.flows, **quick) for row in FLOWS[name][: 1 if options.quick else None]
+            ]
         else:
             flows = stored(system, options.flows)
         if not flows:

@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from typing import Any
 
 from measuring.machine import pin_to_one_thread
@@ -110,10 +111,6 @@ def row(system: HamiltonianSystem, flow: PrimedFlow, t_end: float, *cells: str) 
     return line
 
 
-def _trained(system: HamiltonianSystem, start: PrimedFlow, **options: Any) -> PrimedFlow:
-    return train(system, flow=start, progress=False, **({"restarts": 12} | options))
-
-
 def polynomial(t_end: float, scenes: Any, **options: Any) -> str:
     """The gain by polynomials in place of force gradients, and their cost."""
     lines = [
@@ -124,14 +121,16 @@ def polynomial(t_end: float, scenes: Any, **options: Any) -> str:
         stages, processor, dt, first, degree = POLYNOMIALS[name]
         system = getattr(systems, name.partition(",")[0])()
         shape = f"{dt:g}, {stages} + {processor}"
-        plain, kicks = Primed(dt, stages, processor, first=first), Primed(dt, stages, processor, False, degree, first)
-        gradients = _trained(system, plain.flow(system), **options)
+        start = Primed(dt, stages, processor, first=first)
+        fit: dict[str, Any] = {"restarts": 12, "progress": False, **options}
+        plain = train(system, flow=start.flow(system), **fit)
+        bent = replace(start, polynomial=degree)
         kinds = {
-            "force gradients": gradients,
-            f"degree {degree}, from these": _trained(
-                system, kicks.flow(system, None, gradients), **(options | {"restarts": 1})
+            "force gradients": plain,
+            f"degree {degree}, from these": train(
+                system, flow=bent.flow(system, earlier=plain), **(fit | {"restarts": 1})
             ),
-            f"degree {degree}": _trained(system, kicks.flow(system), **options),
+            f"degree {degree}": train(system, flow=bent.flow(system), **fit),
         }
         lines += [row(system, flow, t_end, name, shape, kind) for kind, flow in kinds.items()]
     return "\n".join(lines)

@@ -32,9 +32,9 @@ import torch
 from measuring import fragments
 
 from sympflow import train
+from sympflow.training.shipped import rows
 from sympflow.training.shipped.judges import AsPublished, one_step_errors
 from sympflow.training.shipped.recipe import Recipe
-from sympflow.training.shipped.rows import networks
 from sympflow.training.starts import Network
 
 PUBLISHED = {
@@ -63,19 +63,20 @@ class Result:
 
 
 def recipe_of(scene: str, kind: str) -> Recipe:
-    """The recipe by which a network ships."""
-    return next(recipe for recipe in networks() if (recipe.scene, recipe.kind) == (scene, kind))
+    """The recipe of a network that ships."""
+    return next(recipe for recipe in rows.networks() if (recipe.scene, recipe.kind) == (scene, kind))
 
 
 def trained(recipe: Recipe, optimizer: str, seconds: float) -> Result:
     """A flow that was trained for so many seconds of processor time, and what it achieves."""
-    system, judge = recipe.system(), recipe.judge
-    assert isinstance(recipe.start, Network)
+    system, start, judge = recipe.system(), recipe.start, recipe.judge
+    assert isinstance(start, Network)
     assert isinstance(judge, AsPublished)
-    first, second = (fit.points for fit in recipe.fits)
+    points = [fit.points for fit in recipe.fits]
     options: dict[str, Any] = {"optimizer": optimizer, "domain": recipe.domain_of(system), "matching_weight": 0.0}
-    options |= {"steps": MANY, "progress": False, "validate_every": 1}
-    new = {"dt": recipe.start.dt, "kind": recipe.kind}
+    options["steps"] = MANY
+    options |= {"progress": False, "validate_every": 1}
+    new: dict[str, Any] = {"dt": start.dt, "kind": start.kind}
     if optimizer == "adam":
         for _ in range(2):  # the first sets up what later steps find
             begin = time.process_time()
@@ -83,9 +84,9 @@ def trained(recipe: Recipe, optimizer: str, seconds: float) -> Result:
         options["steps"] = max(TRIAL, int(TRIAL * seconds / (time.process_time() - begin)))
         options["validate_every"] = max(1, options["steps"] // 40)
     elif optimizer == "gauss-newton":
-        options |= {"validate_every": 5, "points": first}
+        options |= {"validate_every": 5, "points": points[0]}
     else:
-        options["points"] = second
+        options["points"] = points[1]
     begin = time.process_time()
 
     def until(share: float) -> Callable[[int, dict[str, float]], None]:
@@ -99,7 +100,7 @@ def trained(recipe: Recipe, optimizer: str, seconds: float) -> Result:
         warnings.simplefilter("ignore", RuntimeWarning)  # that a run was stopped is what is meant
         if optimizer == "gauss-newton":
             flow = train(system, **new, callback=until(0.5), **options)
-            flow = train(system, flow=flow, callback=until(1.0), **(options | {"points": second}), seed=1)
+            flow = train(system, flow=flow, callback=until(1.0), **(options | {"points": points[1]}), seed=1)
         else:
             flow = train(system, **new, callback=until(1.0), **options)
     spent = time.process_time() - begin

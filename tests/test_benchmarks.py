@@ -279,7 +279,7 @@ def test_a_tiny_race_of_primed_flows(tmp_path, monkeypatch):
         assert all(value > 0 for value in row["faster"].values())
     assert len(list(tmp_path.glob("*.safetensors"))) == 1
     system = pendulum()
-    again = primed.fitted(system, primed.FLOWS["pendulum"][0], tmp_path)  # not fitted again, but read
+    again = primed.fitted(system, *primed.FLOWS["pendulum"][0], tmp_path)  # not fitted again, but read
     assert again.recipe["stages"][0]["restarts"] == 2
 
 
@@ -341,9 +341,10 @@ def test_on_kepler_the_logarithmic_methods_race():
 
 @pytest.mark.parametrize("optimizer", training_optimizers.OPTIMIZERS)
 def test_each_optimizer_stops_when_its_time_is_over(optimizer):
-    recipe = training_optimizers.recipe_of("harmonic_oscillator", "sympflow")
-    fits = tuple(dataclasses.replace(fit, points=n) for fit, n in zip(recipe.fits, (40, 60), strict=True))
-    result = training_optimizers.trained(dataclasses.replace(recipe, fits=fits), optimizer, 0.05)
+    made = training_optimizers.recipe_of("harmonic_oscillator", "sympflow")
+    fits = tuple(dataclasses.replace(fit, points=n) for fit, n in zip(made.fits, (40, 60), strict=True))
+    quick = dataclasses.replace(made, fits=fits)
+    result = training_optimizers.trained(quick, optimizer, 0.05)
     assert result.steps >= 1
     assert 0 < result.at_dt < 10
     assert training_optimizers.row(result).count("|") == 9

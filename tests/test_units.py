@@ -37,18 +37,18 @@ def test_trials_and_the_choice_by_them_are_alike_in_all_units(monkeypatch):
     """The order of sums differs in rounding alone, which some tens of steps along a valley enlarge."""
     for name, value in QUICK.items():
         monkeypatch.setattr(trials, name, value)
-    found, trial_error = [], trials.trial_error
+    found, trial = [], trials.trial
 
     def noted(*arguments):
-        found.append(trial_error(*arguments))
+        found.append(trial(*arguments))
         return found[-1]
 
-    monkeypatch.setattr(trials, "trial_error", noted)
+    monkeypatch.setattr(trials, "trial", noted)
     systems = [oscillator(*unit) for unit in UNITS[:2]]
-    chosen = [trials.chosen_recipe(system, system.domain) for system in systems]
-    assert [recipe.curvature for recipe in chosen] == [True, True]
-    np.testing.assert_allclose([recipe.dt / T for recipe, T in zip(chosen, PERIODS, strict=False)], 0.8, rtol=1e-12)
-    np.testing.assert_allclose(*np.log10(found).reshape(2, 2), atol=0.5)
+    chosen = [trials.chosen_trial(system, system.domain).start for system in systems]
+    assert [start.curvature for start in chosen] == [True, True]
+    np.testing.assert_allclose([start.dt / T for start, T in zip(chosen, PERIODS, strict=False)], 0.8, rtol=1e-12)
+    np.testing.assert_allclose(*np.log10([one.error for one in found]).reshape(2, 2), atol=0.5)
 
 
 @pytest.mark.parametrize("options", [{"curvature": True}, {"polynomial": 6, "first": "kick"}], ids=["curved", "poly"])

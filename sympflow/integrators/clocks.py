@@ -59,7 +59,7 @@ def scale_of(system: HamiltonianSystem, c: float) -> float:
 
 
 class TimedLoops(Protocol):
-    """A compiled pass in the physical time; see `kernels.timed.reach_times`."""
+    """A compiled pass in the physical time; see `timed_loops.reach_times`."""
 
     def __call__(
         self,

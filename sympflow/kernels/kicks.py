@@ -26,7 +26,7 @@ MOST_TERMS = 120  # of a sum multiplied out
 MOST_NESTED = 12  # of a momentum's sum that is nested
 B, G, C = sp.symbols("b g c", real=True)
 UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
-"""What holds one of these is taken as it is."""
+"""Functions of which an expression is left as it is."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def kick_cycles(symbols: SymbolicHamiltonian, level: int) -> float:
 
 
 _SOURCES: dict[tuple[sp.Expr, int, Monomials], str] = {}
-"""By H: systems are often made again, and the search takes a tenth of a second or more."""
+"""Sources by H: systems are often made again, and the search takes a tenth of a second or more."""
 
 
 def _source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> str:

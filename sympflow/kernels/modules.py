@@ -34,7 +34,7 @@ _CALLED = {"rollout", "rollout_rows"}  # functions that others call, and Python 
 _BLOCK = 64  # a thread takes a multiple of so many rows
 LONG = 100_000_000  # units of work from which a run can be interrupted
 NEVER = np.zeros(1, dtype=np.int64)
-"""The `stop` of what is not."""
+"""The `stop` of runs that are not stopped."""
 _WORTH_A_THREAD = 500_000  # units of work, about a nanosecond each, below which another thread does not pay
 
 
@@ -89,14 +89,15 @@ def load_module(source: str) -> ModuleType:
 
 
 def _callable_part(module: ModuleType) -> ModuleType:
-    """The constants and those compiled functions that Python may call: of `_CALLED`, or what no other function names.
+    """The constants, and the compiled functions that Python may call: those of `_CALLED` or that no other one names.
 
     The others are compiled without an entry from Python, which for functions as small as these is a third of the time
     that compilation takes. Such a function must not be called: so the part has none.
     """
     functions = {name: f for name, f in vars(module).items() if isinstance(f, CPUDispatcher)}
     part = ModuleType(module.__name__)
-    vars(part).update({name: value for name, value in vars(module).items() if name not in functions})
+    for name in vars(module).keys() - functions.keys():
+        setattr(part, name, getattr(module, name))
     inner = {name for f in functions.values() for name in f.py_func.__code__.co_names if name != f.__name__}
     for name, f in functions.items():
         if name in inner - _CALLED:
@@ -149,7 +150,7 @@ def run_rows(rows: Callable[[slice, np.ndarray], None], n_rows: int, work_per_ro
     """
     n_blocks = -(-n_rows // _BLOCK)
     if threads is None:
-        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        threads = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
         threads = min(threads, 1 + n_rows * work_per_row // _WORTH_A_THREAD)
     threads = max(1, min(threads, n_blocks))
     if threads == 1:

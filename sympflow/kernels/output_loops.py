@@ -30,10 +30,10 @@ def place(t: np.ndarray, t0: float, h: float, rounding: float) -> tuple[np.ndarr
 
 
 def all_finite(y: np.ndarray) -> bool:
-    """Whether all of an array of float64, contiguous in either order, is finite."""
+    """True if all of an array of float64, contiguous in either order, is finite."""
     return _loops().all_finite((y if y.flags.c_contiguous else y.T).reshape(-1))
 
 
 def all_between(x: np.ndarray, low: np.ndarray, high: np.ndarray) -> bool:
-    """Whether all of x (w, N), contiguous, lies between `low` and `high` (w,)."""
+    """True if all of x (w, N), contiguous, lies between `low` and `high` (w,)."""
     return _loops().all_between(x, low, high)

@@ -237,7 +237,7 @@ def _dispatch_each(flows: Sequence[PartFlow]) -> str:
 
 
 def _turns_each(parts: ExactParts) -> str:
-    """What turns each frequency by Ω s, as `shears` and the kernel's tables have it, s in the lines from `NUMBERS` on.
+    """Six numbers that turn each frequency by Ω s, as `PartsLoops.table` has them, s in the lines from `NUMBERS` on.
 
     θ = Ω s is reduced with the rounding of the product added again, tan(r/2) is sin r/(1 + cos r).
     """

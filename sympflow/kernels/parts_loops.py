@@ -130,12 +130,12 @@ class PartsLoops:
         return out[:, 0]
 
     def modes(self, y: np.ndarray) -> np.ndarray:
-        """What the loops take: modes where these are mixed, else states."""
+        """The input of the loops: modes where these are mixed, else states."""
         y = np.ascontiguousarray(y, dtype=np.float64)
         return np.ascontiguousarray(np.concatenate(self.parts.to_modes(y), axis=-1)) if self.mixed else y
 
     def states(self, out: np.ndarray, save: np.ndarray | None = None, y0: np.ndarray | None = None) -> np.ndarray:
-        """States of what the loops gave."""
+        """The output of the loops as states."""
         if not self.mixed:
             return out
         d = self.parts.ndof
@@ -181,7 +181,7 @@ class PartsLoops:
         return codes, tables
 
     def _turns(self, s: np.ndarray) -> np.ndarray:
-        """What turns each frequency by Ω s, (..., F, 6): t, σ, c and d of `shears`, c − td and d + tc."""
+        """Six numbers that turn each frequency by Ω s, (..., F, 6): t, σ, c and d of `shears`, c − td and d + tc."""
         linear = self.parts.linear
         assert linear is not None
         kinds = [linear.kinds[j] for j in linear.representatives]

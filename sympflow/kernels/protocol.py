@@ -1,4 +1,4 @@
-"""Kernel: the one protocol of compiled loops, whatever a step of them is."""
+"""Kernel: the one protocol of compiled loops, for steps of every kind."""
 
 from __future__ import annotations
 

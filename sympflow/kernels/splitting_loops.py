@@ -22,7 +22,7 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = ["SplittingKernel", "SplittingLoops", "compilable", "splitting_loops", "symbolic_module"]
+__all__ = ["SplittingKernel", "SplittingLoops", "splitting_loops", "symbolic_module"]
 
 
 def splitting_loops(system: HamiltonianSystem) -> SplittingLoops:
@@ -40,17 +40,6 @@ def splitting_loops(system: HamiltonianSystem) -> SplittingLoops:
 
 
 _LOOPS: WeakKeyDictionary[HamiltonianSystem, SplittingLoops] = WeakKeyDictionary()
-
-
-def compilable(system: HamiltonianSystem) -> str | None:
-    """None if splitting schemes on this system can be compiled, else the reason why not."""
-    if system.symbols is None and system.numba_functions is None:
-        return f"`system` {system.name!r} is given by plain functions: use backend='array'."
-    try:
-        splitting_loops(system)
-    except ValueError as reason:  # H holds a function that has no compiled form, or is not separable
-        return str(reason)
-    return None
 
 
 class SplittingLoops:

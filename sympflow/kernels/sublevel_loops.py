@@ -1,4 +1,4 @@
-"""Whether many states lie in a box or an energy sublevel, in one compiled pass."""
+"""A compiled pass that tells if many states lie in a box or an energy sublevel."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _KERNELS: WeakKeyDictionary[SymbolicHamiltonian, Callable[..., bool]] = WeakKeyD
 
 
 def all_within(system: HamiltonianSystem, domain: Box | EnergySublevel, states: np.ndarray, slack: float) -> bool:
-    """Whether every one of the states (..., 2d) is in the domain, as its `contains` with this slack.
+    """True if every one of the states (..., 2d) is in the domain, as its `contains` with this slack tells.
 
-    A sublevel without an H is that of the system's. False says nothing of one with another H, or where the system
-    cannot be compiled.
+    A sublevel without an H is one of the system's. False says nothing where a sublevel has another H, or where the
+    system cannot be compiled.
     """
     low, high = domain.bounds if isinstance(domain, Box) else domain.limits(slack)
     width = states.shape[-1]
@@ -50,7 +50,7 @@ def _compiled(symbols: SymbolicHamiltonian) -> Callable[..., bool]:
 
 
 def sublevel_source(symbols: SymbolicHamiltonian) -> str:
-    """``all_within(x, low, high)``: whether the states x (2d, N), H and, where d = 2, |L| keep to these limits.
+    """``all_within(x, low, high)``: True if the states x (2d, N), H and, where d = 2, |L| keep to these limits.
 
     Raises
     ------

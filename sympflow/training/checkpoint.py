@@ -30,7 +30,7 @@ FIELDS = {
 
 
 def identity(flow: FlowMap, system: HamiltonianSystem, config: dict[str, Any]) -> dict[str, Any]:
-    """What a run must share with the one that it goes on with."""
+    """The description that a run must share with the one that it goes on with."""
     return {
         "config": json.dumps(config),
         "architecture": json.dumps({"kind": flow.kind, "dt": flow.dt, **flow.architecture()}),

@@ -20,7 +20,7 @@ from sympflow.hamiltonian.time_transformation import default_shift, lifted, proj
 from sympflow.integrators.flows import LogSympFlow
 from sympflow.metrics.energy import max_energy_error
 from sympflow.solver import solve
-from sympflow.training.points import Stream, states
+from sympflow.training.points import Stream, states, step_errors
 
 TOLERANCE = 1e-13
 NEWTON_STEPS = 5  # to the nearest point of an orbit
@@ -111,17 +111,12 @@ def clock_errors(flow: ClockedFlow, system: HamiltonianSystem, seed: int, points
     shift = flow.recipe["transforms"]["shift"]
     x = lifted(system, states(system.domain, points, seed, Stream.REFERENCE), shift)
     kernel = flow.kernel_for(flow.system)  # type: ignore[arg-type]
-    errors = []
+    differences = []
     for s in flow.dt * np.append((np.arange(FRACTIONAL_TIMES) + 0.5) / FRACTIONAL_TIMES, 1.0):
         end = kernel.step(np.full(len(x), s), x).states
         exact = _at(system, projected(x), end[:, system.ndof])
-        errors.append(np.linalg.norm(projected(end) - exact, axis=-1))
-    return {
-        "one_step_error": float(errors[-1].mean()),
-        "one_step_error_median": float(np.median(errors[-1])),
-        "one_step_error_max": float(errors[-1].max()),
-        "fractional_error": float(np.mean(errors[:-1])),
-    }
+        differences.append(projected(end) - exact)
+    return step_errors(np.stack(differences))
 
 
 def _at(system: HamiltonianSystem, x: np.ndarray, t: np.ndarray) -> np.ndarray:

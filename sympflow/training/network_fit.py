@@ -180,9 +180,7 @@ def _labels(system: HamiltonianSystem, domain: Domain, dt: float, options: LossO
     unseen = max(1, options.validation_points // options.label_times)
     sets = []
     for n, stream in ((options.points, Stream.LABELS), (unseen, Stream.VALIDATION)):
-        labels = Labels.of(system, states(domain, n, options.seed, stream), t)
-        if not len(labels.x):
-            raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
+        labels = Labels.needed(system, states(domain, n, options.seed, stream), t)
         x = np.broadcast_to(labels.x, labels.y.shape).reshape(-1, labels.x.shape[1])
         sets.append((np.repeat(t, len(labels.x)), x, labels.y.reshape(x.shape)))
     return sets[0], sets[1]

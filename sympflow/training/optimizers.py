@@ -93,7 +93,7 @@ class LBFGS:
             self.method.zero_grad()
             value = loss()
             value.backward()
-            return value
+            return value.detach()
 
         return float(self.method.step(closure))
 

@@ -302,7 +302,7 @@ class SplitOptions(SearchOptions):
 
 @dataclass(frozen=True)
 class Habit:
-    """What an optimizer does if not told otherwise, in the terms of `LossOptions`."""
+    """The choices of an optimizer for which nothing is said, in the terms of `LossOptions`."""
 
     steps: int
     points: int

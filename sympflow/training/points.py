@@ -144,7 +144,7 @@ class Labels:
 
     @classmethod
     def of(cls, system: HamiltonianSystem, x: np.ndarray, t: np.ndarray) -> Labels:
-        """Made by DOP853 at rtol = 1e-13, all states in one integration from each time to the next.
+        """Make labels by DOP853 at rtol = 1e-13, all states in one integration from each time to the next.
 
         States whose solution ends before the last time are left out.
         """
@@ -155,13 +155,39 @@ class Labels:
             y, reached = [states[exists] for states in (*y, after)], time
         return cls(np.asarray(t), y[0], np.stack(y[1:]))
 
+    @classmethod
+    def needed(cls, system: HamiltonianSystem, x: np.ndarray, t: np.ndarray) -> Labels:
+        """`of`, for a fit, which cannot do without.
+
+        Raises
+        ------
+        ValueError
+            If there are none.
+        """
+        labels = cls.of(system, x, t)
+        if not len(labels.x):
+            raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
+        return labels
+
     def at(self, j: int) -> Labels:
-        """Those at the j-th time alone."""
+        """The labels at the j-th time alone."""
         return Labels(self.t[[j]], self.x, self.y[[j]])
 
     def first(self, n: int) -> Labels:
-        """Those of the first n states."""
+        """The labels of the first n states."""
         return Labels(self.t, self.x[:n], self.y[:, :n])
+
+
+@np.errstate(all="ignore")
+def step_errors(difference: np.ndarray) -> dict[str, float]:
+    """Figures of ψ̄_t(x) − φ_H,t(x), (J, N, 2d): mean, median and largest norm at Δt, the last time; mean before it."""
+    error = np.linalg.norm(difference, axis=-1)
+    return {
+        "one_step_error": float(error[-1].mean()),
+        "one_step_error_median": float(np.median(error[-1])),
+        "one_step_error_max": float(error[-1].max()),
+        "fractional_error": float(error[:-1].mean()),
+    }
 
 
 def handed_in(data: Any, system: HamiltonianSystem, dt: float) -> Labelled:

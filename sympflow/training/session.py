@@ -121,7 +121,7 @@ class Session:
         return before
 
     def spent(self, share: float = 1.0) -> bool:
-        """Whether this share of the time is used up, or the run is to end at once."""
+        """Return whether this share of the time is used up, or the run is to end at once."""
         over = self.interruption.asked or (self.time_budget is not None and self.passed > share * self.time_budget)
         self.cut = self.cut or over
         return over

@@ -94,9 +94,7 @@ class SplitFit:
         self.n = int(ends[-1]) if len(ends) else 0
         t = flow.dt * _phases(np.arange(1, options.label_times + 1) / options.label_times)
         x = states(domain, options.points, options.seed, Stream.RESIDUAL)
-        labels = Labels.of(system, x, t)
-        if len(labels.x) == 0:
-            raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
+        labels = Labels.needed(system, x, t)
         self.t, self.z, self.labels = t, self._modes(labels.x), [self._modes(y) for y in labels.y]
         self.unit = self._unit(float(np.std(system.hamiltonian(labels.x))))
         x = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
@@ -107,7 +105,7 @@ class SplitFit:
         return np.ascontiguousarray(np.concatenate(self.parts.to_modes(y), axis=-1))
 
     def _unit(self, energy: float) -> np.ndarray:
-        """What errors are measured in: the spread over Ω, but for an oscillator what changes its energy as H varies.
+        """The units of the errors: the spread over Ω, but for an oscillator what changes its energy as H varies.
 
         A fast mode that is hardly excited would else count as much as the slow ones that carry the energy.
         """
@@ -120,7 +118,7 @@ class SplitFit:
         return unit
 
     def units(self, t: float) -> np.ndarray:
-        """What the coefficients are measured in: t^m / n for weights and angles, 1 for filters."""
+        """The units of the coefficients: t^m / n for weights and angles, 1 for filters."""
         out = np.empty(self.n)
         for c, part in zip(self.columns, self.slices, strict=True):
             out[part] = t**c.power / (c.n**c.power if c.power else 1)

@@ -31,7 +31,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.least_squares import Minimum, Stop, levenberg_marquardt, put_weights
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.options import TableOptions
-from sympflow.training.points import Labelled, Labels, PointSource, Stream, states, stream_seed
+from sympflow.training.points import Labelled, Labels, PointSource, Stream, states, step_errors, stream_seed
 from sympflow.training.runs import SearchRun
 from sympflow.training.session import Session
 from sympflow.training.table_step import TableStep
@@ -114,9 +114,7 @@ class TableRun(SearchRun):
             points = options.points or max(enough, min(MOST_POINTS, max(FEWEST_POINTS, COORDINATES // system.ndof)))
             x = states(domain, points, options.seed, Stream.RESIDUAL)
             t = flow.dt * np.arange(1, options.label_times + 1) / options.label_times
-            labels = Labels.of(system, x, t)
-            if len(labels.x) == 0:
-                raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
+            labels = Labels.needed(system, x, t)
             slope = energy_slope(system, labels, options.energy_weight)
             frozen, weighted = _with_and_without(step, labels.at(-1), table.frozen(flow.dt), unit, slope)
             weight = np.where(t < t[-1], 1.0, options.frozen_weight)
@@ -176,7 +174,7 @@ class TableRun(SearchRun):
         warn_of_useless_flow(shares, self.flow.dt, stacklevel=6)
 
     def _frozen_cost(self, theta: np.ndarray) -> float:
-        """What parameters cost at Δt; infinite if they lead to no finite states."""
+        """The cost of parameters at Δt; infinite if they lead to no finite states."""
         fit = self.weighted or self.frozen
         assert fit is not None
         offset, design = self.table.polynomial(np.array([self.table.dt]))
@@ -209,7 +207,7 @@ class TableRun(SearchRun):
         )
 
     def _start(self) -> np.ndarray:
-        """Where the next search begins: the flow as it was given, then random tables."""
+        """The start of the next search: the flow as it was given, then random tables."""
         restart, table, given = len(self.minima), self.table, self.given
         offset, design = table.polynomial(np.array([table.dt]))
         coefficients = offset[0] + design[0] @ given
@@ -226,7 +224,7 @@ class TableRun(SearchRun):
         return minimum.x if self.frozen is None else self.table.continued(self.frozen.design[0] @ minimum.x)
 
     def _differences(self) -> np.ndarray:
-        """From the exact flow, at the held-out states and times."""
+        """The differences from the exact flow, at the held-out states and times."""
         return differences(self.flow, self.step, self.held_out)
 
     def _record(self, minimum: Minimum) -> dict[str, float]:
@@ -234,7 +232,7 @@ class TableRun(SearchRun):
             "step": len(self.minima),
             "loss": minimum.cost,
             "iterations": minimum.iterations,
-            **errors(self._differences()),
+            **step_errors(self._differences()),
         }
         self.history.append(figures)
         return figures
@@ -372,7 +370,7 @@ class TableFit(Fit):
         return self._rows(self._errors(y - self._y)).ravel(), J
 
     def _errors(self, change: np.ndarray) -> np.ndarray:
-        """Of each coordinate and, with a slope, of the energy: (..., 2d + 1, P), without one (..., 2d, P)."""
+        """The errors of each coordinate and, with a slope, of the energy: (..., 2d + 1, P), without one (..., 2d, P)."""
         scaled = change * self._scale
         if self._slope is None:
             return scaled
@@ -544,28 +542,16 @@ def differences(flow: PrimedFlow, step: TableStep, labels: Labels) -> np.ndarray
 
 
 @np.errstate(all="ignore")
-def errors(difference: np.ndarray) -> dict[str, float]:
-    """Of `differences`, ‖·‖: mean, median and largest at Δt, the last time; mean before it."""
-    error = np.linalg.norm(difference, axis=-1)
-    return {
-        "one_step_error": float(error[-1].mean()),
-        "one_step_error_median": float(np.median(error[-1])),
-        "one_step_error_max": float(error[-1].max()),
-        "fractional_error": float(error[:-1].mean()),
-    }
-
-
-@np.errstate(all="ignore")
 def distance(difference: np.ndarray, unit: np.ndarray) -> float:
-    """Of a flow from the exact one, in units (2d,), at Δt and before it; infinite if anything is not a number."""
-    figures = errors(difference / unit)
+    """The mean error of a flow at Δt and before it, in units (2d,); infinite if anything is not a number."""
+    figures = step_errors(difference / unit)
     both = figures["one_step_error"] + figures["fractional_error"]
     return both if math.isfinite(both) else math.inf
 
 
 @np.errstate(all="ignore")
 def shares_missed(difference: np.ndarray, labels: Labels, unit: np.ndarray) -> tuple[float, float]:
-    """How much of what a step of Δt moves a state is missed, mean of all states over mean, and median over median.
+    """The share that is missed of what a step of Δt moves a state: mean of all states over mean, median over median.
 
     They are 1 for the identity, and the same in all units of q, p and t; infinite if anything is not a number.
 
@@ -588,7 +574,7 @@ def _share(error: Any, of: Any) -> float:
 
 
 def warn_of_useless_flow(shares: tuple[float, float], dt: float, stacklevel: int) -> None:
-    """If in the mean over the states a tenth or more of what a step moves them is missed."""
+    """Warn if in the mean over the states a tenth or more of what a step moves them is missed."""
     mean, median = shares
     if mean < USELESS:
         return

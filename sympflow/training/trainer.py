@@ -380,7 +380,7 @@ def _new_primed(
 
 
 def _fit_is_untold(asked: NewFit, session: Session) -> bool:
-    """Whether nothing is said of the fit of a new flow, and there is time for trials."""
+    """Return whether nothing is said of the fit of a new flow, and there is time for trials."""
     hurried = session.time_budget is not None and session.time_budget < BUDGET
     return asked.searches and not hurried and not set(asked.given()) - {"optimizer", "seed", "reference_states"}
 

@@ -38,7 +38,7 @@ class Trial:
 
 
 def can_try(system: HamiltonianSystem) -> bool:
-    """Whether trials apply to a system."""
+    """Return whether trials apply to a system."""
     return system.separable and system.quadratic_kinetic and system.symbols is not None and system.ndof <= MOST_NDOF
 
 

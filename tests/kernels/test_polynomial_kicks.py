@@ -14,7 +14,7 @@ from sympflow.integrators.splitting import Splitting
 from sympflow.kernels.kicks import _function, _scheduled, shapes
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import Scheme
-from sympflow.training.ladder import Rung
+from sympflow.training.starts import Primed
 
 EPS = np.finfo(float).eps
 HH, QUARTIC = systems.henon_heiles(), systems.quartic()
@@ -193,8 +193,8 @@ def test_a_rung_takes_over_the_force_gradients():
     """Where a polynomial holds ½|∇V|², the search begins at the table without one; and comes nearer than that."""
     options = {"restarts": 1, "points": 60, "label_times": 2, "reference_states": 50}
     before = train(QUARTIC, flow=SympFlow.primed(QUARTIC, 3, dt=0.5, processor=2), **{**options, "restarts": 3})
-    start, after = Rung(3, 0.5, 2, 1, polynomial=6, after="primed-3-0.5"), {}
-    flow = start.train(QUARTIC, before, steps=1, callback=lambda n, figures: after.update(figures), **options)
+    start, after = Primed(0.5, 3, 2, polynomial=6).flow(QUARTIC, earlier=before), {}
+    flow = train(QUARTIC, flow=start, steps=1, callback=lambda n, figures: after.update(figures), **options)
     assert flow.monomials == monomials(QUARTIC.symbols, 6)
     assert after["one_step_error"] < before.figures["one_step_error"]
     assert flow.kernel_scheme().symmetric

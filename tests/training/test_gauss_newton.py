@@ -11,14 +11,12 @@ import sympflow
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems, train
 from sympflow.flow.scaling import Scaling
 from sympflow.training import checkpoint as checkpoints
-from sympflow.training.collocation import Stream, states
-from sympflow.training.gauss_newton import GaussNewtonRun
-from sympflow.training.labels import Labels
-from sympflow.training.levenberg_marquardt import levenberg_marquardt
-from sympflow.training.recipes import default_recipe
-from sympflow.training.search_config import TableConfig
-from sympflow.training.table_fit import Table, TableFit
-from sympflow.training.table_jacobian import TableStep
+from sympflow.training import trainer
+from sympflow.training.least_squares import levenberg_marquardt
+from sympflow.training.options import TableOptions
+from sympflow.training.points import Labels, Stream, states
+from sympflow.training.table_fit import Table, TableFit, TableRun
+from sympflow.training.table_step import TableStep
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
 MASSES = HamiltonianSystem.from_sympy(
@@ -110,7 +108,7 @@ def test_derivatives_by_the_table(system, force_gradient, first):
         np.testing.assert_allclose(J[:, :, k].T, expected.numpy(), rtol=1e-12, atol=1e-13)
 
 
-FEW = TableConfig(points=5, label_times=3, frozen_weight=1.0, energy_weight=7.0)
+FEW = TableOptions(points=5, label_times=3, frozen_weight=1.0, energy_weight=7.0)
 
 
 def errors_of(run, psi):
@@ -125,7 +123,7 @@ def errors_of(run, psi):
 def test_the_fits_derivatives(palindromic):
     """Residuals and Jacobian by the flow's parameters, against the flow itself."""
     flow = SympFlow.primed(PENDULUM, 2, degree=3, palindromic=palindromic, dt=0.8).requires_grad_(False)
-    run = GaussNewtonRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), FEW)
+    run = TableRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), FEW)
     table, labels_x = Table(flow), torch.as_tensor(run.whole._x[:, :5].T)
     theta = table.parameters() + 0.02 * np.random.default_rng(0).normal(size=flow.n_parameters)
     r, J = run.whole.linearized(theta)
@@ -275,7 +273,7 @@ def test_a_degenerate_direction_does_no_harm():
 
 def test_the_fits_derivatives_with_a_processor():
     flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=2, dt=0.8)
-    run = GaussNewtonRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), FEW)
+    run = TableRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), FEW)
     table = Table(flow)
     theta = table.parameters() + np.random.default_rng(0).normal(0, 0.05, flow.n_parameters)
     table.assign(theta)
@@ -337,8 +335,8 @@ def test_other_losses_train_too(loss):
 def test_residuals_of_a_loss_are_those_of_the_flow():
     """Of the whole fit, against Loss: the sum of squares is the loss, and the Jacobian its derivative."""
     flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=1)
-    config = TableConfig(label_weight=0.0, residual_weight=2.0, matching_weight=3.0, loss_points=20)
-    run = GaussNewtonRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), config)
+    config = TableOptions(label_weight=0.0, residual_weight=2.0, matching_weight=3.0, loss_points=20)
+    run = TableRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), config)
     theta = Table(flow).parameters() + np.random.default_rng(0).normal(0, 0.02, flow.n_parameters)
     r, J = run.whole.linearized(theta)
     objective = run.whole.objective
@@ -573,9 +571,10 @@ def test_nothing_said_means_at_most_a_minute(monkeypatch):
     assert stage["ended_early"] == "the time budget was used up"
     assert flow.figures["one_step_error"] < 1e-3
     seen = {}
-    monkeypatch.setattr(GaussNewtonRun, "go", lambda self, _, budget, *__: seen.update(budget=budget) or 1 / 0)
+    monkeypatch.setattr(TableRun, "go", lambda self, session: seen.update(budget=session.time_budget) or 1 / 0)
     for options, budget in (({"restarts": 1}, None), ({"steps": 1}, None), ({"time_budget": 7.0}, 7.0)):
         with pytest.raises(ZeroDivisionError):
             train(PENDULUM, points=30, reference_states=5, **options)
         assert seen["budget"] is None if budget is None else 0 < seen["budget"] <= budget  # labels are part of it
-    assert default_recipe(PENDULUM).time_budget == 60.0
+    monkeypatch.undo()
+    assert trainer.BUDGET == 60.0

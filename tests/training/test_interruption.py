@@ -13,13 +13,12 @@ import torch
 from sympflow import SympFlow, systems, train
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.training import checkpoint as checkpoints
+from sympflow.training import session as sessions
 from sympflow.training import trainer, trials
-from sympflow.training.gauss_newton import GaussNewtonRun
-from sympflow.training.interruption import Interruption
-from sympflow.training.levenberg_marquardt import STOPPED, Minimum
-from sympflow.training.recipes import default_recipe
-from sympflow.training.table_fit import TableFit
-from sympflow.training.watch import Watch
+from sympflow.training.least_squares import STOPPED, Minimum
+from sympflow.training.session import Interruption
+from sympflow.training.starts import default_primed
+from sympflow.training.table_fit import TableFit, TableRun
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends the process there")
 PENDULUM = systems.pendulum()
@@ -109,7 +108,7 @@ def test_in_the_search_the_best_so_far_is_returned(monkeypatch, tmp_path, start)
     """The start that is cut short counts, but is followed to its end when the run is resumed."""
     path, whole = tmp_path / "run.ckpt", train(PENDULUM, flow=FLOW, **QUICK)
     with monkeypatch.context() as patch:
-        then(patch, GaussNewtonRun, "next_minimum", interrupt, at=start)
+        then(patch, TableRun, "next_minimum", interrupt, at=start)
         steps = then(patch, TableFit, "linearized", lambda: None)
         with pytest.warns(
             RuntimeWarning, match=rf"after {start + 1} of 4 starts because it was interrupted\. The best"
@@ -152,14 +151,14 @@ def test_a_second_one_raises_and_the_checkpoint_stays(monkeypatch, tmp_path):
         interrupt()
         interrupt()
 
-    then(monkeypatch, GaussNewtonRun, "complete", twice)
+    then(monkeypatch, TableRun, "complete", twice)
     with pytest.raises(KeyboardInterrupt):
         train(PENDULUM, flow=FLOW, checkpoint=path, **QUICK)
     assert checkpoints.read(path)["step"] == QUICK["restarts"]
 
 
 def test_before_there_is_anything_it_raises(monkeypatch):
-    then(monkeypatch, GaussNewtonRun, "start", interrupt)
+    then(monkeypatch, TableRun, "start", interrupt)
     with pytest.raises(KeyboardInterrupt):
         train(PENDULUM, flow=FLOW, **QUICK)
 
@@ -167,7 +166,7 @@ def test_before_there_is_anything_it_raises(monkeypatch):
 def test_where_no_residuals_are_finite_it_raises(monkeypatch):
     """Not that the domain be made smaller: nobody knows."""
     monkeypatch.setattr(TableFit, "minimize", lambda self, theta, *_, **__: Minimum(theta, np.inf, 0, STOPPED))
-    then(monkeypatch, GaussNewtonRun, "next_minimum", interrupt)
+    then(monkeypatch, TableRun, "next_minimum", interrupt)
     with pytest.raises(KeyboardInterrupt):
         train(PENDULUM, flow=FLOW, **QUICK)
 
@@ -175,46 +174,46 @@ def test_where_no_residuals_are_finite_it_raises(monkeypatch):
 def short_trials(monkeypatch):
     for name, value in SHORT.items():
         monkeypatch.setattr(trials, name, value)
-    first, *_ = recipes = [replace(default_recipe(PENDULUM, phase=x), stages=2, processor=2) for x in (0.8, 1.0, 1.25)]
-    monkeypatch.setattr(trials, "tried_recipes", lambda *_, **__: recipes)
+    first, *_ = starts = [replace(default_primed(PENDULUM, phase=x), stages=2, processor=2) for x in (0.8, 1.0, 1.25)]
+    monkeypatch.setattr(trials, "tried_starts", lambda *_, **__: starts)
     return first
 
 
 @pytest.mark.parametrize("where", ["next trial", "labels", "search"])
 def test_once_a_trial_is_done_its_flow_is_there(monkeypatch, where):
     """The result is the flow that the trial fitted: a start that was cut short found nothing that is nearer."""
-    recipe, watch = short_trials(monkeypatch), Watch()
-    trials.trial_error(recipe, PENDULUM, PENDULUM.domain, watch)
+    start = short_trials(monkeypatch)
+    tried = trials.trial(start, PENDULUM, PENDULUM.domain)
     if where == "next trial":
-        then(monkeypatch, trials, "trial_error", interrupt, at=1)
+        then(monkeypatch, trials, "trial", interrupt, at=1)
     else:
-        monkeypatch.setattr(trials, "tried_recipes", lambda *_, **__: [recipe])
+        monkeypatch.setattr(trials, "tried_starts", lambda *_, **__: [start])
         monkeypatch.setattr(trials, "DEAREST", 0.0)
         name = {"labels": "start", "search": "next_minimum"}[where]
-        then(monkeypatch, GaussNewtonRun, name, interrupt, at=1 if where == "labels" else SHORT["STARTS"])
+        then(monkeypatch, TableRun, name, interrupt, at=1 if where == "labels" else SHORT["STARTS"])
     with pytest.warns(RuntimeWarning, match=r"after [01] of 24 starts because it was interrupted"):
         flow = train(PENDULUM, reference_states=10, progress=False)
-    assert flow.dt == recipe.dt
-    for name, value in watch.flows[recipe].state_dict().items():
+    assert flow.dt == start.dt
+    for name, value in tried.flow.state_dict().items():
         torch.testing.assert_close(flow.state_dict()[name], value, rtol=0, atol=1e-12)
 
 
 def test_before_a_trial_is_done_it_raises(monkeypatch):
     short_trials(monkeypatch)
-    then(monkeypatch, trials, "trial_error", interrupt)
+    then(monkeypatch, trials, "trial", interrupt)
     with pytest.raises(KeyboardInterrupt):
         train(PENDULUM, progress=False)
 
 
 def test_trials_say_what_they_try(monkeypatch, capsys):
     short_trials(monkeypatch)
-    monkeypatch.setattr("sympflow.training.progress.Bar", lambda *_: (_ for _ in ()).throw(ImportError()))
-    then(monkeypatch, GaussNewtonRun, "go", interrupt)
+    monkeypatch.setattr("sympflow.training.session.Bar", lambda *_: (_ for _ in ()).throw(ImportError()))
+    then(monkeypatch, TableRun, "go", interrupt)
     with pytest.warns(RuntimeWarning, match="it was interrupted"):
         train(PENDULUM, reference_states=5, progress=True)
     said = capsys.readouterr().err
-    for recipe in trials.tried_recipes():
-        assert f"Δt = {recipe.dt:g}" in said
+    for start in trials.tried_starts():
+        assert f"Δt = {start.dt:g}" in said
     assert "pendulum trials" in said
     assert ", with curvature terms" in said
 
@@ -231,18 +230,18 @@ class Clock:
 
 def test_a_budget_and_the_training_time_count_the_trials(monkeypatch):
     clock, seen = Clock(), {}
-    monkeypatch.setattr(trainer, "time", clock)
+    monkeypatch.setattr(sessions, "time", clock)
 
-    def chosen(system, domain, watch):
+    def chosen(system, domain, session):
         clock.now += 25.0
-        return default_recipe(system)
+        return trials.Trial(default_primed(system), 1e-6)
 
-    def go(self, _, budget, *__):
-        seen.update(budget=budget, seconds=self.seconds)
+    def go(self, session):
+        seen.update(budget=session.time_budget, seconds=self.seconds)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trials, "chosen_recipe", chosen)
-    monkeypatch.setattr(GaussNewtonRun, "go", go)
+    monkeypatch.setattr(trials, "chosen_trial", chosen)
+    monkeypatch.setattr(TableRun, "go", go)
     for options, whole in (({"time_budget": 70.0}, 70.0), ({}, trainer.BUDGET)):
         clock.now = 0.0
         with pytest.raises(KeyboardInterrupt):
@@ -252,12 +251,12 @@ def test_a_budget_and_the_training_time_count_the_trials(monkeypatch):
 
 def test_a_budget_that_cuts_the_last_fits_is_reported(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr("sympflow.training.search.time", clock)
+    monkeypatch.setattr(sessions, "time", clock)
 
     def pass_by():
         clock.now += 100.0
 
-    then(monkeypatch, GaussNewtonRun, "complete", pass_by)
+    then(monkeypatch, TableRun, "complete", pass_by)
     with pytest.warns(RuntimeWarning, match=r"in its last fits, after all 4 starts, because the time budget was used"):
         flow = train(PENDULUM, flow=FLOW, time_budget=50.0, **QUICK)
     assert flow.recipe["stages"][-1]["ended_early"] == "the time budget was used up"

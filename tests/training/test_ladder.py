@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,15 +16,19 @@ from sympflow.flow.shipped import ShippedFlow, choose
 from sympflow.hamiltonian.fingerprint import same_system
 from sympflow.integrators import flows
 from sympflow.integrators.domain_exit import domain_of
-from sympflow.training import ladder, pretrained
+from sympflow.training import pretrained
 from sympflow.training.clock_fit import clock_errors
-from sympflow.training.figures import one_step_errors
-from sympflow.training.ladder import Ladder, Rung, certify
+from sympflow.training.options import NewFit
+from sympflow.training.shipped import rows
+from sympflow.training.shipped.judges import ByCertificate, one_step_errors, primed_cost
+from sympflow.training.shipped.recipe import Recipe, made
+from sympflow.training.starts import Primed
+from sympflow.training.table_fit import take_over
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 QUARTIC = HamiltonianSystem.from_sympy("p**2/2 + q**4/4", name="plain_quartic", domain=sympflow.Ball([0.0, 0.0], 1.0))
-QUICK = {"restarts": 2, "points": 40, "reference_states": 10, "steps": 20, "progress": False}
-LADDERS = ladder.ladders()
+QUICK = NewFit(restarts=2, points=40, reference_states=10, steps=20)
+LADDERS = {scene: [r for r in rows.ladders() if r.scene == scene] for scene in {r.scene: 0 for r in rows.ladders()}}
 FILES = [f for f in shipped_flows() if f.stages is not None or f.shift is not None]
 
 
@@ -187,8 +192,8 @@ def test_listing_loads_no_weights():
 
 
 def test_the_command_builds_a_ladder(tmp_path, monkeypatch, capsys):
-    rungs = tuple(Rung(s, 0.5, 0, options=QUICK) for s in (1, 2))
-    monkeypatch.setattr(pretrained, "ladders", lambda: {"pendulum": Ladder(systems.pendulum, rungs, t_end=50.0)})
+    rungs = [rows.rung("pendulum", s, 0.5, 0, QUICK, judge=ByCertificate(50.0)) for s in (1, 2)]
+    monkeypatch.setattr(rows, "recipes", lambda: rungs)
     pretrained.main(["pendulum", "--kind", "primed", "--out", str(tmp_path)])
     assert capsys.readouterr().out.count("energy_error_95") == 2
     one, two = (load(tmp_path / f"pendulum-primed-{s}-0.5.safetensors", system=PENDULUM) for s in (1, 2))
@@ -206,8 +211,8 @@ def test_the_command_builds_a_ladder(tmp_path, monkeypatch, capsys):
 
 
 def test_rebuilding_gives_the_same_weights():
-    rung = Rung(2, 0.5, 1, options=QUICK)
-    flows = [rung.train(PENDULUM) for _ in range(2)]
+    recipe = rows.rung("pendulum", 2, 0.5, 1, QUICK)
+    flows = [recipe.fitted(PENDULUM, progress=False) for _ in range(2)]
     assert flows[0].figures["training_cpu_seconds"] > 0
     one, two = (flow.state_dict() for flow in flows)
     assert all(torch.equal(one[name], two[name]) for name in one)
@@ -215,7 +220,7 @@ def test_rebuilding_gives_the_same_weights():
 
 def test_the_figures_are_those_of_the_certificate():
     flow = SympFlow.primed(HH, 2, dt=0.5).requires_grad_(False)
-    certify(flow, HH, 100.0)
+    ByCertificate(100.0)(flow, HH)
     sample = HH.domain.sample(400, 77)
     errors = max_energy_error(solve(HH, flow, (0.0, 100.0), y0=sample, on_domain_exit="ignore"))
     # another sample of states: quantiles agree to the noise of 100 draws
@@ -236,16 +241,18 @@ def test_the_figure_is_met_by_95_per_cent_of_other_states(name):
 
 def test_a_rung_starts_from_the_one_with_a_longer_step():
     """Up to its own Δt it begins as the same map; alone it needs the other."""
-    rungs = (Rung(2, 0.5, 1, 1, options=QUICK), Rung(2, 0.25, 1, 1, None, "primed-2-0.5", options=QUICK))
-    (_, longer), (_, shorter) = Ladder(lambda: PENDULUM, rungs, t_end=5.0).flows()
+    fit = replace(QUICK, restarts=1)
+    first = Recipe("pendulum", "first", lambda: PENDULUM, Primed(0.5, 2, 1), ByCertificate(5.0), (fit,))
+    second = replace(first, name="second", start=Primed(0.25, 2, 1), after="first")
+    (_, longer), (_, shorter) = made([first, second], progress=False)
     start = SympFlow.primed(PENDULUM, 2, dt=0.25, processor=1)
-    ladder._restrict(start, longer)
+    take_over(start, longer)
     x = torch.from_numpy(PENDULUM.domain.sample(5, 0))
     torch.testing.assert_close(start.psi(0.2, x), longer.psi(0.2, x), rtol=1e-14, atol=1e-14)
     both = lambda flow: flow.figures["one_step_error"] + flow.figures["fractional_error"]  # noqa: E731
     assert both(shorter) < both(longer)
-    with pytest.raises(ValueError, match=r"^`rung` 'primed-2-0.25' starts from 'primed-2-0.5'"):
-        list(Ladder(lambda: PENDULUM, rungs).flows("primed-2-0.25"))
+    with pytest.raises(ValueError, match=r"^`rung` 'second' starts from 'first'"):
+        list(made([second]))
 
 
 # what ships ----------------------------------------------------------------------------------------------------
@@ -254,7 +261,7 @@ def test_a_rung_starts_from_the_one_with_a_longer_step():
 @pytest.mark.parametrize("name", LADDERS)
 def test_every_rung_ships(name):
     names = {f.name for f in FILES}
-    assert {f"{name}-{rung.name}" for rung in LADDERS[name].rungs} <= names
+    assert {f"{name}-{recipe.name}" for recipe in LADDERS[name]} <= names
 
 
 @pytest.mark.parametrize("flow", FILES, ids=lambda f: f.name)
@@ -293,9 +300,9 @@ def test_every_flow_is_a_map_for_all_times(listed):
 @pytest.mark.parametrize("name", LADDERS)
 def test_shipped_figures_hold(name):
     """Measured again, on states of another seed, over a tenth of the time: no rung is worse than its file says."""
-    system = LADDERS[name].make()
-    t_end = LADDERS[name].t_end / (100 if name == "outer_solar_system" else 10)
-    along = ladder.along_the_orbit(system, 4, t_end, seed=1) if name == "outer_solar_system" else None
+    system = LADDERS[name][0].system()
+    t_end = LADDERS[name][0].judge.t_end / (100 if name == "outer_solar_system" else 10)
+    along = rows.along_the_orbit(system, 4, t_end, seed=1) if name == "outer_solar_system" else None
     for listed in shipped_flows(system):
         if listed.stages is None:
             continue
@@ -310,18 +317,16 @@ def test_shipped_figures_hold(name):
 
 @pytest.mark.parametrize("name", LADDERS)
 def test_what_costs_more_is_more_accurate(name):
-    rungs = [f for f in shipped_flows(LADDERS[name].make()) if f.stages]
+    rungs = [f for f in shipped_flows(LADDERS[name][0].system()) if f.stages]
     errors = [f.energy_error for f in rungs]  # the cheapest first
     assert errors[-1] < (0.1 if name == "outer_solar_system" else 1e-3) * errors[0]
     of_state = {  # polynomials that are fitted to the state alone, beside flows for the energy
-        f"{name}-{r.name}"
-        for r in LADDERS[name].rungs
-        if isinstance(r, Rung) and r.polynomial is not None and r.options.get("energy_weight") == 0.0
+        f"{name}-{r.name}" for r in LADDERS[name] if r.name.startswith("polynomial") and r.fits[0].energy_weight == 0.0
     }
     cheaper = [(f, g) for f in rungs for g in rungs if g.cost <= f.cost and g.energy_error < f.energy_error]
     assert not [(f.name, g.name) for f, g in cheaper if f.name not in of_state]  # no rung is dominated by another
     assert not [(f.name, g.name) for f, g in cheaper if g.one_step_error / g.dt < f.one_step_error / f.dt]
-    assert all(f.cost == pytest.approx(ladder.cost(f.load()), rel=1e-3) for f in rungs)
+    assert all(f.cost == pytest.approx(primed_cost(f.load()), rel=1e-3) for f in rungs)
 
 
 def test_no_torch_to_choose_a_classical_method():

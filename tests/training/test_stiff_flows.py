@@ -4,11 +4,11 @@ import copy
 
 import numpy as np
 import pytest
-from sympflow.training.stiff import PHASES
 
 from sympflow import solve
 from sympflow.flow.shipped import shipped
 from sympflow.systems import fput
+from sympflow.training.shipped.judges import PHASES
 
 
 @pytest.mark.parametrize("omega", [50.0, 1000.0])

@@ -19,11 +19,10 @@ from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.systems import harmonic_oscillator, henon_heiles
 from sympflow.training import checkpoint as checkpoints
-from sympflow.training.collocation import Points, PointSource, Stream, states
-from sympflow.training.config import OPTIMIZERS, TrainingConfig
-from sympflow.training.line_search import Trial, strong_wolfe
 from sympflow.training.losses import Loss
-from sympflow.training.quasi_newton import BFGS, LBFGS
+from sympflow.training.optimizers import BFGS, LBFGS
+from sympflow.training.options import OPTIMIZERS, LossOptions
+from sympflow.training.points import Points, PointSource, Stream, states
 from sympflow.training.trainer import train
 
 QUICK = {"pairs": 1, "hidden": (5,), "points": 60, "validation_points": 60, "reference_states": 5, "progress": False}
@@ -411,31 +410,13 @@ def test_a_flow_of_another_system_is_refused():
 
 
 def test_schedules():
-    rates = [TrainingConfig(steps=100, learning_rate=1.0, schedule="one-cycle").rate(k) for k in range(100)]
+    rates = [LossOptions(steps=100, learning_rate=1.0, schedule="one-cycle").rate(k) for k in range(100)]
     assert max(rates) == pytest.approx(1.0, rel=1e-3)
     assert rates[0] < 0.3
     assert rates[-1] == pytest.approx(1e-3)
-    assert TrainingConfig(schedule="constant", learning_rate=0.1).rate(7) == 0.1
-    cosine = TrainingConfig(steps=100, schedule="cosine", learning_rate=1.0)
+    assert LossOptions(schedule="constant", learning_rate=0.1).rate(7) == 0.1
+    cosine = LossOptions(steps=100, schedule="cosine", learning_rate=1.0)
     assert [cosine.rate(k) for k in range(100)] == sorted((cosine.rate(k) for k in range(100)), reverse=True)
-
-
-@pytest.mark.parametrize("guess", [1e-3, 1.0, 50.0])
-@pytest.mark.parametrize(
-    "function",
-    [lambda a: (a - 2) ** 2, lambda a: -a / (a**2 + 2), lambda a: torch.exp(a) - 5 * a, lambda a: (a - 1) ** 4 - a],
-)
-def test_line_search_meets_the_wolfe_conditions(function, guess):
-    def along(length):
-        a = torch.tensor(length, dtype=torch.float64, requires_grad=True)
-        value = function(a)
-        value.backward()
-        return Trial(length, float(value.detach()), float(a.grad), a.grad)
-
-    start = along(0.0)
-    found = strong_wolfe(along, start, guess)
-    assert found.loss <= start.loss + 1e-4 * found.length * start.slope
-    assert abs(found.slope) <= 0.9 * abs(start.slope)
 
 
 @pytest.mark.parametrize("method", [BFGS, LBFGS])
@@ -444,7 +425,7 @@ def test_quasi_newton_methods_find_a_minimum(method):
     module = torch.nn.Module()
     module.x = torch.nn.Parameter(torch.tensor([-1.2, 1.0], dtype=torch.float64))
     module.n_parameters = 2
-    method = method(module, TrainingConfig())
+    method = method(module, LossOptions())
 
     def rosenbrock():
         x, y = module.x

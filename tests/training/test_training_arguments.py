@@ -9,8 +9,8 @@ import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, train
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
-from sympflow.training.gauss_newton import GaussNewtonRun
-from sympflow.training.search_config import TableConfig
+from sympflow.training.options import NewFit, NewFlow, TableOptions, plain_numbers
+from sympflow.training.table_fit import TableRun
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
 BOX = sympflow.Box([-1.0, -1.0], [1.0, 1.0])
@@ -68,8 +68,8 @@ def test_numbers_may_be_numpys(tmp_path):
     flow = SympFlow.primed(PENDULUM, np.int64(2), dt=np.float32(0.5), processor=np.int32(1))
     assert (flow.dt, flow.architecture()) == (0.5, SympFlow.primed(PENDULUM, 2, dt=0.5, processor=1).architecture())
     assert SympFlow(np.int64(1), pairs=np.int64(2), hidden=(np.int64(3), 4), dt=np.float32(0.5)).dt == 0.5
-    config = TableConfig(points=np.int64(30), restarts=np.int64(1), steps=np.int64(2), energy_weight=np.float32(10))
-    assert config.to_dict() == TableConfig(points=30, restarts=1, steps=2).to_dict()
+    asked = NewFit(points=np.int64(30), restarts=np.int64(1), steps=np.int64(2), energy_weight=np.float32(10))
+    assert TableOptions.of(plain_numbers(asked)) == TableOptions(points=30, restarts=1, steps=2)
     plain = {"dt": 0.5, "stages": 2, "points": 30, "restarts": 1, "steps": 2, "reference_states": 5}
     path = tmp_path / "run.ckpt"
     train(PENDULUM, checkpoint=path, progress=False, **{k: np.asarray(v)[()] for k, v in plain.items()})
@@ -103,22 +103,30 @@ def test_the_remedies_work():
     assert train(WHOLE, pairs=1, hidden=(3,), **quick).kind == "sympflow"
 
 
+def test_the_defaults_of_the_options_are_those_of_train():
+    arguments = inspect.signature(train).parameters
+    for asked in (NewFlow(), NewFit()):
+        assert {name: arguments[name].default for name in vars(asked)} == vars(asked)
+    surroundings = {"system", "dt", "flow", "domain", "checkpoint", "resume", "time_budget", "progress", "callback"}
+    assert set(arguments) == {*vars(NewFlow()), *vars(NewFit()), *surroundings, "unknown"}
+
+
 class Started(Exception):
     pass
 
 
 def test_a_run_of_trials_is_resumed_whatever_else_is_said_now(monkeypatch, tmp_path):
     """That its budget is short, and what its fit is by default, say nothing of its flow."""
-    path, recipe = tmp_path / "run.ckpt", trials.tried_recipes(HH, HH.domain)[-1]
+    path, start = tmp_path / "run.ckpt", trials.tried_starts(HH, HH.domain)[-1]
 
     def kill(*_):
         raise Started
 
     with monkeypatch.context() as patch, pytest.raises(Started):
-        patch.setattr(GaussNewtonRun, "next_minimum", kill)
-        train(HH, flow=recipe.flow(HH), checkpoint=path, progress=False)
+        patch.setattr(TableRun, "next_minimum", kill)
+        train(HH, flow=start.flow(HH), checkpoint=path, progress=False)
     assert checkpoints.read(path)["step"] == 0
-    monkeypatch.setattr(GaussNewtonRun, "go", kill)
+    monkeypatch.setattr(TableRun, "go", kill)
     for options in ({}, {"time_budget": 30.0}, {"time_budget": 30.0, "loss": "labels"}, {"time_budget": 90.0}):
         with pytest.raises(Started):
             train(HH, resume=path, progress=False, **options)
@@ -137,6 +145,6 @@ def test_a_run_of_trials_is_resumed_whatever_else_is_said_now(monkeypatch, tmp_p
     ],
 )
 def test_options_are_checked_before_trials(monkeypatch, arguments, error, message):
-    monkeypatch.setattr(trials, "chosen_recipe", None)
+    monkeypatch.setattr(trials, "chosen_trial", None)
     with pytest.raises(error, match=message):
         train(HH, **arguments)

@@ -9,10 +9,9 @@ from sympflow import SympFlow, max_energy_error, solve, systems, train
 from sympflow.kernels.kicks import kick_cycles
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
-from sympflow.training.gauss_newton import GaussNewtonRun
-from sympflow.training.levenberg_marquardt import Minimum
-from sympflow.training.recipes import default_recipe
-from sympflow.training.table_fit import TableFit
+from sympflow.training.least_squares import Minimum
+from sympflow.training.starts import default_primed
+from sympflow.training.table_fit import TableFit, TableRun
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
 QUICK = {"STARTS": 2, "STEPS": 20, "FINAL_STEPS": 20, "POINTS": 40, "LENGTH": 50}
@@ -26,27 +25,29 @@ def test_each_term_makes_a_kick_dearer(system):
 
 def law(monkeypatch, error):
     """Trials whose errors are those of a law, error(ω Δt, curvature)."""
-    omega = 1.0 / default_recipe(HH).dt
-    monkeypatch.setattr(trials, "trial_error", lambda recipe, *_: error(recipe.dt * omega, recipe.curvature))
-    return trials.chosen_recipe(HH, HH.domain)
+    omega = 1.0 / default_primed(HH).dt
+    monkeypatch.setattr(
+        trials, "trial", lambda start, *_: trials.Trial(start, error(start.dt * omega, start.curvature))
+    )
+    return trials.chosen_trial(HH, HH.domain).start
 
 
 def test_the_order_of_the_error_decides_between_short_and_long_steps(monkeypatch):
     """Work e^(1/8) is Δt⁻¹ e^(1/8): an error of order 8 gains as much at every Δt, a lower one at the longest."""
-    first, *_, last = trials.tried_recipes(HH, HH.domain, curvature=False)
+    first, *_, last = trials.tried_starts(HH, HH.domain, curvature=False)
     assert first.dt < last.dt
     assert law(monkeypatch, lambda x, c: 1e-9 * x**4) == last
     assert law(monkeypatch, lambda x, c: 1e-9 * x**12) == first
 
 
 def test_a_long_step_that_misses_the_goal_is_not_taken(monkeypatch):
-    first, *_ = trials.tried_recipes(HH, HH.domain, curvature=False)
+    first, *_ = trials.tried_starts(HH, HH.domain, curvature=False)
     assert law(monkeypatch, lambda x, c: 9e-6 if x == 1.0 else 1.1e-5) == first
 
 
 def test_where_all_miss_the_goal_the_least_error_is_taken(monkeypatch):
     """Of errors that are alike the longest step's; curvature terms where they alone meet the goal."""
-    first, *_, last = trials.tried_recipes(HH, HH.domain, curvature=False)
+    first, *_, last = trials.tried_starts(HH, HH.domain, curvature=False)
     assert law(monkeypatch, lambda x, c: 1e-3 if x == 1.0 else 2.1e-3) == first
     assert law(monkeypatch, lambda x, c: 1e-3 if x == 1.0 else 1.9e-3) == last
     assert law(monkeypatch, lambda x, c: 1e-6 if c else 1.0) == replace(last, curvature=True)
@@ -57,9 +58,9 @@ def test_a_map_that_keeps_the_energy_alone_is_no_candidate(monkeypatch):
     """The identity keeps it exactly, and misses all of what a step moves a state."""
     monkeypatch.setattr(TableFit, "coefficients", lambda self, theta: np.zeros((self.design.shape[1], 1)))
     monkeypatch.setattr(TableFit, "minimize", lambda self, theta, *_, **__: Minimum(theta, 0.0, 0, ""))
-    assert trials.trial_error(default_recipe(PENDULUM), PENDULUM, PENDULUM.domain) == np.inf
+    assert trials.trial(default_primed(PENDULUM), PENDULUM, PENDULUM.domain).error == np.inf
     monkeypatch.setattr(trials, "USELESS", 1.1)
-    assert trials.trial_error(default_recipe(PENDULUM), PENDULUM, PENDULUM.domain) == 0.0
+    assert trials.trial(default_primed(PENDULUM), PENDULUM, PENDULUM.domain).error == 0.0
 
 
 def test_curvature_is_taken_where_its_error_is_worth_its_cycles(monkeypatch):
@@ -75,12 +76,12 @@ def test_the_error_of_a_trial_is_that_of_its_orbits(monkeypatch):
     """A whole fit of the same flow is as near, or nearer by what a longer search finds."""
     for name, value in QUICK.items():
         monkeypatch.setattr(trials, name, value)
-    recipe = replace(default_recipe(PENDULUM), stages=2, processor=2)
-    error = trials.trial_error(recipe, PENDULUM, PENDULUM.domain)
-    assert error == trials.trial_error(recipe, PENDULUM, PENDULUM.domain)
+    start = replace(default_primed(PENDULUM), stages=2, processor=2)
+    error = trials.trial(start, PENDULUM, PENDULUM.domain).error
+    assert error == trials.trial(start, PENDULUM, PENDULUM.domain).error
     options = {"restarts": 2, "steps": 20, "points": 40, "label_times": 2, "reference_states": 1, "progress": False}
-    flow = train(PENDULUM, flow=recipe.flow(PENDULUM), **options)
-    y0, t_span = PENDULUM.domain.sample(20, 1), (0, trials.LENGTH * recipe.dt)
+    flow = train(PENDULUM, flow=start.flow(PENDULUM), **options)
+    y0, t_span = PENDULUM.domain.sample(20, 1), (0, trials.LENGTH * start.dt)
     sol = solve(PENDULUM, flow, t_span, y0=y0, on_domain_exit="ignore", backend="array")
     assert 0.1 < error / np.median(max_energy_error(sol)) < 10
 
@@ -89,9 +90,9 @@ def test_a_domain_without_solutions_has_no_trial(monkeypatch):
     def start(*_):
         raise ValueError("`domain` holds no states whose solution exists up to `dt`")
 
-    monkeypatch.setattr(GaussNewtonRun, "start", start)
-    assert trials.trial_error(default_recipe(HH), HH, HH.domain) == np.inf
-    assert trials.chosen_recipe(HH, HH.domain) == default_recipe(HH)
+    monkeypatch.setattr(TableRun, "start", start)
+    assert trials.trial(default_primed(HH), HH, HH.domain).error == np.inf
+    assert trials.chosen_trial(HH, HH.domain).start == default_primed(HH)
 
 
 class Started(Exception):
@@ -101,9 +102,9 @@ class Started(Exception):
 def test_only_where_nothing_is_said_there_are_trials(monkeypatch, tmp_path):
     made = []
 
-    def chosen(system, domain, watch):
+    def chosen(system, domain, session):
         made.append(system)
-        return replace(default_recipe(system), dt=1.25, curvature=True)
+        return trials.Trial(replace(default_primed(system), dt=1.25, curvature=True), 1e-6)
 
     def start(self, *_):
         raise Started(self.flow)
@@ -113,8 +114,8 @@ def test_only_where_nothing_is_said_there_are_trials(monkeypatch, tmp_path):
             train(HH, progress=False, **options)
         return started.value.args[0]
 
-    monkeypatch.setattr(trials, "chosen_recipe", chosen)
-    monkeypatch.setattr(GaussNewtonRun, "go", start)
+    monkeypatch.setattr(trials, "chosen_trial", chosen)
+    monkeypatch.setattr(TableRun, "go", start)
     flow = flow_of(seed=3)
     assert (flow.dt, flow.curvatures is not None, made) == (1.25, True, [HH])
     for options in ({"dt": 1.0}, {"restarts": 2}, {"points": 60}, {"time_budget": 5.0}, {"stages": 2}):
@@ -124,9 +125,9 @@ def test_only_where_nothing_is_said_there_are_trials(monkeypatch, tmp_path):
 
 def test_a_run_is_resumed_without_trials(monkeypatch, tmp_path):
     """The checkpoint says which of the flows that are tried it is of."""
-    path, recipe = tmp_path / "run.ckpt", trials.tried_recipes(HH, HH.domain)[-1]
-    assert recipe.curvature
-    monkeypatch.setattr(trials, "chosen_recipe", lambda *_: recipe)
+    path, start = tmp_path / "run.ckpt", trials.tried_starts(HH, HH.domain)[-1]
+    assert start.curvature
+    monkeypatch.setattr(trials, "chosen_trial", lambda *_: trials.Trial(start, 1e-6))
 
     def kill(*_):
         raise Started
@@ -134,9 +135,9 @@ def test_a_run_is_resumed_without_trials(monkeypatch, tmp_path):
     with pytest.raises(Started):
         train(HH, checkpoint=path, callback=kill, progress=False)
     assert checkpoints.read(path)["step"] == 0
-    monkeypatch.setattr(trials, "chosen_recipe", None)
-    monkeypatch.setattr(GaussNewtonRun, "complete", lambda self, spent: kill())
-    monkeypatch.setattr(GaussNewtonRun, "SEARCH_SHARE", 0.0)
+    monkeypatch.setattr(trials, "chosen_trial", None)
+    monkeypatch.setattr(TableRun, "complete", lambda self, session: kill())
+    monkeypatch.setattr(TableRun, "SEARCH_SHARE", 0.0)
     with pytest.raises(Started):
         train(HH, resume=path, time_budget=100.0, progress=False)
     with pytest.raises(ValueError, match="`resume` is a run with another architecture"):

@@ -111,7 +111,7 @@ def stages(y, h, work):
 
 @njit(**OPTIONS)
 def advance(y, error, K):
-    """y + Σ b_i K_i in place; if `COMPENSATED` by Kahan's compensated sum. Whether the result is finite."""
+    """y + Σ b_i K_i in place; if `COMPENSATED` by Kahan's compensated sum. True if the result is finite."""
     total = 0.0
     for m in range(SIZE):
         change = 0.0

@@ -27,7 +27,7 @@ def one_step(x, y, codes, table, first, link):
 
 @njit(**OPTIONS, forceinline=True)
 def closed(x, y, codes, table, in_modes):
-    """What a step ends in."""
+    """The end of a step, from the running state before its last map."""
     x, y = apply_map(x, y, codes[len(codes) - 1], table, len(codes) - 1)
     return (x, y) if in_modes else from_modes(x, y)
 

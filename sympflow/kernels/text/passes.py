@@ -51,7 +51,7 @@ def all_finite(y):
 
 @njit(**OPTIONS)
 def all_between(x, low, high):
-    """Whether all of x (w, N) lies between `low` and `high`."""
+    """True if all of x (w, N) lies between `low` and `high`."""
     inside = True
     for j in range(x.shape[0]):
         least, most = low[j], high[j]
