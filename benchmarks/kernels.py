@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from contenders.loops import composition, composition_batch, composition_table, verlet, verlet_batch
 from measuring import fragments
-from measuring.compiled import last, network_loops, scheme_loops
+from measuring.compiled import flow_loops, last, scheme_loops
 from training_step import autodiff_map, published_value
 
 import sympflow
@@ -139,7 +139,7 @@ def start_up_rows() -> list[Row]:
 
 def flow_rows(repeats: int) -> list[Row]:
     flow, y0 = SympFlow(2, pairs=5), henon_heiles().y0
-    loops, batch = network_loops(flow), np.tile(y0, (1000, 1))
+    loops, batch = flow_loops(henon_heiles(), flow), np.tile(y0, (1000, 1))
     x, t = torch.as_tensor(y0)[None].requires_grad_(), torch.ones(1, dtype=torch.float64)
     n, m = 1000, 20
     calls: list[Call] = [

@@ -22,11 +22,12 @@ pin_to_one_thread()
 
 import numpy as np
 from measuring.fragments import add_out, number, table, write
-from sympflow.studies.stability_report import StabilityReport, StabilityRow
 
 import sympflow
 from sympflow import HamiltonianSystem, energy_growth, get, max_energy_error, solve, stability, systems
 from sympflow.integrators.flows import LogSympFlow
+from sympflow.studies.attempts import Row
+from sympflow.studies.step_stability import StabilityReport
 from sympflow.systems import oscillatory_energies
 
 CLASSICAL = ("verlet", "leapfrog", "blanes_moan4", "srkn11b", "kahan_li8", "implicit_midpoint", "gauss_legendre4")
@@ -109,7 +110,7 @@ def lines(report: StabilityReport) -> list[list[str]]:
     return found
 
 
-def happening(row: StabilityRow) -> str:
+def happening(row: Row) -> str:
     parts = []
     if row.blow_up is not None:
         parts.append(f"{'singular' if row.singular else 'ends'} at t = {row.blow_up:.6g}")

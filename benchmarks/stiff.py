@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -28,7 +28,7 @@ pin_to_one_thread()
 
 import numpy as np
 from measuring import fragments
-from measuring.compiled import flow_loops, linear_loops, with_linear_flow, with_step
+from measuring.compiled import flow_loops, method_loops
 from measuring.fragments import table
 from scipy.integrate import solve_ivp
 
@@ -92,8 +92,8 @@ def dense_invariant(r: Run) -> float:
 def run_scheme(system: HamiltonianSystem, method: Any, n: int) -> Run:
     """n steps over T, 1000 outputs on the grid."""
     save = np.linspace(0, n, INSTANTS + 1).round().astype(np.int64)
-    loops = partial(linear_loops(system, method), T_END / n, system.y0, n, save)
-    call = partial(solve, system, with_step(method, T_END / n), t_eval=T_END / n * save)
+    loops = partial(method_loops(system, method), T_END / n, system.y0, n, save)
+    call = partial(solve, system, replace(method, dt=T_END / n), t_eval=T_END / n * save)
     scheme = method.scheme
     forces, hessians = n * scheme.force_evaluations, n * scheme.hessian_evaluations
     turn = T_END / n * system.params["omega"]
@@ -115,7 +115,7 @@ def candidates(system: HamiltonianSystem) -> list[Run]:
     """Every scheme at many steps, and those that the goal or less needs."""
     omega, runs = system.params["omega"], []
     for name in SCHEMES:
-        method = with_linear_flow(name)
+        method = get(name)(splitting="linear")
         for turn in np.geomspace(1.2, 6.0, 15) if omega <= 50 else np.geomspace(1.5, 14.0, 18):
             n = INSTANTS * max(1, round(T_END * omega / turn / INSTANTS))
             runs.append(run_scheme(system, method, n))
@@ -158,20 +158,21 @@ def fput_section(omega: float, repeats: int) -> dict[str, str]:
     tried = candidates(system)
     rows = [adaptive(system, name, IMPLICIT_TIME.get(omega, 2.0)) for name in ("Radau", "DOP853")]
     rows += [verlet(system, turn) for turn in (0.05, 1.0)]
-    plain, mollified = with_linear_flow("verlet"), with_linear_flow("verlet", "mollified")
-    midpoint = with_linear_flow("verlet", "midpoint")
-    same = [(plain, "impulse"), (mollified, "mollified_impulse"), (midpoint, "implicit_explicit")]
-    for name in ("srkn6b", "srkn11b", "srkn14a"):
-        same.append((with_linear_flow(name), f"linear_{name}"))
-    for method, label in same:
+    for label in (
+        "impulse",
+        "mollified_impulse",
+        "implicit_explicit",
+        "linear_srkn6b",
+        "linear_srkn11b",
+        "linear_srkn14a",
+    ):
         n = n_flow if omega > 50 else 2 * n_flow
-        run = run_scheme(system, method, n)
-        rows.append(Run(label, *list(vars(run).values())[1:]))
+        rows.append(replace(run_scheme(system, get(label)(), n), name=label))
     best = [(goal, cheapest(tried, goal)) for goal in (GOAL, max(ours.energy_error, 1e-12))]
     labels = ("fastest untrained of all, to 1e-4", "fastest untrained of all, as good as the flow")
     for label, (_, run) in zip(labels, best, strict=True):
         if run is not None:
-            rows.append(Run(f"{label}: linear {run.name}", *list(vars(run).values())[1:]))
+            rows.append(replace(run, name=f"{label}: linear {run.name}"))
     rows.append(ours)
     timed = [r for r in rows if r.call is not None]
     medians = cpu_seconds([r.call for r in timed], repeats)  # type: ignore[misc]

@@ -30,9 +30,9 @@ pin_to_one_thread()
 
 import numpy as np
 from measuring import fragments
-from measuring.compiled import flow_loops, last, linear_loops, scheme_loops, with_linear_flow, with_step
+from measuring.compiled import flow_loops, last, method_loops, scheme_loops
 
-from sympflow import HamiltonianSystem, Solution, solve, systems
+from sympflow import HamiltonianSystem, Solution, get, solve, systems
 from sympflow.flow.shipped import shipped
 
 DT = 0.625  # of srkn11b
@@ -111,7 +111,7 @@ def fput(omega: float, quick: bool) -> Iterator[Pair]:
     system = systems.fput(omega=omega)
     flow, t_end, outputs = shipped(system), 2.0 if quick else 200.0, 10 if quick else 1000
     n = outputs * round(t_end * omega / TURN[omega] / outputs)
-    method = with_step(with_linear_flow("chin4a"), t_end / n)
+    method = get("chin4a")(splitting="linear", dt=t_end / n)
     m = round(t_end / flow.dt)
     saves = [np.linspace(0, k, outputs + 1).round().astype(np.int64) for k in (m, n)]
     calls = (
@@ -122,7 +122,7 @@ def fput(omega: float, quick: bool) -> Iterator[Pair]:
     print(f"\nFPUT, ω = {omega:g}: energy error of the flow {errors[0]:.1e}, of linear chin4a {errors[1]:.1e}\n")
     loops = (
         partial(flow_loops(system, flow).one, flow.dt, system.y0, m, saves[0]),
-        partial(linear_loops(system, method), t_end / n, system.y0, n, saves[1]),
+        partial(method_loops(system, method), t_end / n, system.y0, n, saves[1]),
     )
     yield Pair(f"T = {t_end:g}, {outputs} outputs", calls, loops)
 

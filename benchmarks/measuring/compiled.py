@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from sympflow import HamiltonianSystem, get
+from sympflow import HamiltonianSystem
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES
-
-# What belongs to flows and to linear parts is imported where it is used: the start-up of a scheme, which kernels.py
-# times, imports neither.
 
 Run = Callable[..., Any]
 
@@ -37,30 +34,15 @@ def scheme_loops(system: HamiltonianSystem, name: str) -> Loops:
     return Loops(kernel.run, partial(kernel.run_batch, threads=1))
 
 
-def flow_loops(system: HamiltonianSystem | None, flow: Any) -> Loops:
-    """The loops that `solve` takes for a trained flow, which keep its numbers from call to call."""
+def flow_loops(system: HamiltonianSystem, flow: Any) -> Loops:
+    """The loops of a trained flow, which keep its numbers from call to call."""
     kernel = flow.kernel_for(system)
-    return Loops(kernel.run, lambda h, y0, n, save: kernel.run_batch(h, y0, n, save, 1))
+    return Loops(kernel.run, partial(kernel.run_batch, threads=1))
 
 
-def network_loops(flow: Any) -> Loops:
-    """The loops of a SympFlow with MLP potentials."""
-    return flow_loops(None, flow)
-
-
-def with_linear_flow(name: str, splitting: str = "linear") -> Any:
-    """The integrator of a scheme whose drift is replaced by the exact linear flow."""
-    return get(name)(splitting=splitting)
-
-
-def linear_loops(system: HamiltonianSystem, method: Any) -> Run:
-    """The loops of a method `with_linear_flow`, one state: (h, y0, n, save)."""
+def method_loops(system: HamiltonianSystem, method: Any) -> Run:
+    """The loops of any splitting method, a scheme × a splitting, of one state: (h, y0, n, save)."""
     return method.composed(system).kernel(False).run
-
-
-def with_step(method: Any, dt: float) -> Any:
-    """The method with another step."""
-    return replace(method, dt=dt)
 
 
 def last(n: int) -> np.ndarray:

@@ -5,15 +5,16 @@ import json
 import numpy as np
 import pytest
 import torch
+from conftest import KINDS
 
 import sympflow
-from sympflow import available, poincare_section, solve, systems
+from sympflow import poincare_section, solve, systems
 from sympflow.integrators.tableaux import ADAPTIVE
 
 HH, OSCILLATOR = systems.henon_heiles(), systems.harmonic_oscillator()
 
 
-@pytest.mark.parametrize("method", available())
+@pytest.mark.parametrize("method", KINDS)
 def test_the_crossings_are_those_that_events_find(method):
     def g(t, y):
         return y[0]

@@ -21,7 +21,7 @@ from sympflow.studies.step_stability import blow_up, initial_states
 SINGULARITY = 5.450984210235402  # of Hénon–Heiles from q = 0, p = (0, 0.7)
 
 
-@pytest.mark.parametrize(("method", "omega"), [("verlet", 1.0), ("leapfrog", 100.0), ("verlet", 1e6)])
+@pytest.mark.parametrize(("method", "omega"), [("verlet", 1.0), ("leapfrog", 1e3), ("verlet", 1e6)])
 def test_the_limit_of_an_oscillator_is_two_at_every_frequency(method, omega):
     report = stability(systems.harmonic_oscillator(omega), [method], steps=[1 / omega, 3 / omega], metrics=("energy",))
     (limit,) = report.limits
