@@ -28,10 +28,11 @@ pytest: export OMP_NUM_THREADS = 1
 pytest: .venv/installed-test  ## The tests alone
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-lint: .venv/installed-test  ## Lint and types
+lint: .venv/installed-test  ## Lint, types and the direction of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
 
 docs: .venv/installed-test  ## The documentation, into site/
 	$(BIN)/python docs/diagrams.py
