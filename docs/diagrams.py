@@ -38,7 +38,7 @@ SOLVE: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (
         "Stepper",
         "integrator.stepper(problem)",
-        ("one run: compiled kernel or arrays, decided here", "step, rollout, inverse; counts of evaluations"),
+        ("one run: compiled kernel or arrays, decided when it is made", "rollout, shorter steps; counts of evaluations"),
     ),
     (
         "GridRun",
