@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench docs clean
+.PHONY: help demo test pytest lint bench docs clean
 
 help:  ## Show the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -20,15 +20,19 @@ help:  ## Show the targets
 demo: .venv/installed  ## Solve and compare on Hénon–Heiles with the shipped flow; figures in out/
 	$(BIN)/sympflow compare henon-heiles --methods sympflow,sympflow:flow=henon_heiles-sympflow,mlp,verlet,leapfrog,srkn11b,rk45 --t-end 1000 --out out/
 
+test: .venv/installed-test  ## Lint, types and tests, side by side
+	$(MAKE) --no-print-directory --jobs=2 lint pytest
+
 # One thread for each of the two workers: on arrays as small as the tests' those of BLAS and torch only wait, spinning.
-test: export OMP_NUM_THREADS = 1
-test: .venv/installed-test lint  ## Lint, types and tests
+pytest: export OMP_NUM_THREADS = 1
+pytest: .venv/installed-test  ## The tests alone
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-lint: .venv/installed-test  ## Lint and types
+lint: .venv/installed-test  ## Lint, types and the direction of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
 
 docs: .venv/installed-test  ## The documentation, into site/
 	$(BIN)/python docs/diagrams.py

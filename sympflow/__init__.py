@@ -7,9 +7,8 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from sympflow._version import __version__
 from sympflow.lazy import FORMER_PATHS, whole_import
-
-__version__ = "0.1.0"
 
 _HOME = {
     "HamiltonianSystem": "hamiltonian.system",

@@ -31,6 +31,7 @@ FORMER = {
     "numba_functions": "hamiltonian.callables",
     "parts": "hamiltonian.parts",
     "studies.comparison_report": "studies.comparison",
+    "studies.measurements": "studies.attempts",
     "studies.stability_report": "studies.step_stability",
     "symbolic": "hamiltonian.symbolic",
     "system": "hamiltonian.system",

@@ -7,6 +7,16 @@ import pytest
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
+KINDS = (
+    *("verlet", "leapfrog", "srkn6b", "chin4a"),  # begins with a kick, a drift; for quadratic T; with force gradients
+    *("implicit_midpoint", "gauss_legendre4", "log_leapfrog"),
+    *("impulse", "mollified_impulse", "implicit_explicit", "linear_omelyan4", "strang_parts", "kahan_li6_parts"),
+    *("euler", "rk4", "explicit_adams", "implicit_adams"),
+    *("rk45", "dop853", "dopri5", "adaptive_heun"),
+    *("sympflow", "mlp"),
+)
+"""A method of each kind: for tests of what methods of one kind share. That each alone is sound, `test_checks` shows."""
+
 
 def load_example(name):
     """The module examples/<name>.py."""

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from sympflow import __version__
+from sympflow._version import __version__
 from sympflow.commands import listings, running, studying
 from sympflow.commands.console import out
 

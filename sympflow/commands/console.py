@@ -40,7 +40,7 @@ def reporting() -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress() -> Iterator[Callable[[str], None]]:
-    """A line on the terminal that says what is being done; nothing where there is no terminal."""
+    """A line on the terminal on the work in progress; nothing where there is no terminal."""
     if not err.is_terminal:
         yield lambda text: None
         return

@@ -1,4 +1,4 @@
-"""What is known of a flow a posteriori: because its Hamiltonian 𝓗 is known, its energy error has a bound.
+"""A-posteriori statements on a flow: because its Hamiltonian 𝓗 is known, its energy error has a bound.
 
     |H(ψ_kΔt(x)) − H(x)| ≤ k δ,    δ = ∫₀^Δt sup_x |∇Hᵀ J ∇(𝓗 − H)|(ψ̄_t(x)) dt,
 

@@ -186,12 +186,12 @@ class ClockedFlow(SympFlow):
         return self._numbers.current(lambda: tuple(self.clock.numbers.detach().cpu().double().numpy()[::-1].tolist()))
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> ClockedFlowKernel:
-        from sympflow.kernels.flow_loops import ClockedFlowKernel
-
         if compensated:
             raise ValueError(UNCOMPENSATED)
         check_compilable(self.dtype, self.device)
         if self._loops is None or self._loops.system is not system:
+            from sympflow.kernels.flow_loops import ClockedFlowKernel
+
             self._loops = ClockedFlowKernel(self.scheme, system, self.advance, self.clock_numbers)
         return self._loops
 

@@ -21,7 +21,7 @@ class FreeTable(nn.Module):
     n, terms : int
         n and K.
     palindromic : bool
-        Whether c_ik = c_(n+1−i)k.
+        True for c_ik = c_(n+1−i)k.
     bound : int
         For how many k, from 0, the sum over i is fixed, whatever the parameters: Σ_i c_i0 = total, the others 0. The
         middle (or else the last) c_ik is what the others leave.
@@ -166,7 +166,7 @@ class Column(FreeTable):
     power : int
         m.
     total : {"always", "start", None}
-        Whether Σ c_i(τ) = 1 for every τ, or Σ c_i(0) = 1, whatever the parameters.
+        "always" for Σ c_i(τ) = 1 at every τ, "start" for Σ c_i(0) = 1, whatever the parameters.
     """
 
     def __init__(

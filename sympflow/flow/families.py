@@ -6,7 +6,6 @@ A family is one module and one line here. The class builds itself from the descr
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,7 +21,7 @@ FAMILIES = {
 """The module and the class of each."""
 
 KINDS = ("sympflow", "mlp")
-"""What a file says that its flow is, and the name of the method that runs it: of a SympFlow, or of its baseline."""
+"""The kinds that files name, which are the methods that run the flows: SympFlows, and their baseline."""
 
 _OF_SYMPFLOW = ("split", "clocked", "primed")
 
@@ -36,9 +35,3 @@ def family(name: str) -> Any:
 def family_of(kind: str, plan: Mapping[str, Any]) -> Any:
     """Return the class that a flow of this kind and architecture is of: a SympFlow's plan names a special family."""
     return family(kind if kind == "mlp" else next((name for name in _OF_SYMPFLOW if name in plan), "sympflow"))
-
-
-def is_flow(value: Any) -> bool:
-    """Return True for a flow map, without an import: where its module was never imported, there is none."""
-    module = sys.modules.get("sympflow.flow.flow_map")
-    return module is not None and isinstance(value, module.FlowMap)

@@ -23,7 +23,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
-import sympflow
+from sympflow._version import __version__
 from sympflow.arguments import naming_path, writable
 from sympflow.flow.certificate import Certificate
 from sympflow.flow.families import KINDS, family_of
@@ -123,7 +123,7 @@ def write(
             raise ValueError(f"`flow` has weights that are not finite ({name}): train it again before saving.")
     record = {
         "format": FORMAT,
-        "version": sympflow.__version__,
+        "version": __version__,
         "kind": kind,
         "architecture": architecture,
         "dt": dt,

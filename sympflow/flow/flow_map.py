@@ -297,16 +297,16 @@ class FlowMap(nn.Module):
     def _states(y: Tensor, batch: torch.Size) -> Tensor:
         return y.T.reshape(*batch, y.shape[0])
 
-    # what it is --------------------------------------------------------------------------------------------
+    # its numbers -------------------------------------------------------------------------------------------
 
     @property
     def dtype(self) -> torch.dtype:
-        """That of its numbers; float64 if it has none."""
+        """The dtype of its numbers; float64 if it has none."""
         return next((w.dtype for w in chain(self.parameters(), self.buffers())), torch.float64)
 
     @property
     def device(self) -> torch.device:
-        """Where its numbers are; the CPU if it has none."""
+        """The device of its numbers; the CPU if it has none."""
         return next((w.device for w in chain(self.parameters(), self.buffers())), torch.device("cpu"))
 
     @property

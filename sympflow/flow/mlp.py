@@ -74,7 +74,7 @@ class MLPFlow(FlowMap):
             return torch.as_tensor(value, dtype=dtype, device=device)
 
         self.register_buffer("scale", constant(list(scale.x)))
-        self.register_buffer("center", constant([*(scale.q_center or ()), *(scale.p_center or ())]))
+        self.register_buffer("center", constant([*scale.q_center, *scale.p_center]))
         self.register_buffer("tau", constant(scale.t))
 
     @classmethod

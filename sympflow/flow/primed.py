@@ -537,7 +537,7 @@ class PrimedFlow(SympFlow):
 
     @property
     def terms(self) -> int:
-        """How many terms a kick has beside V."""
+        """The number of terms that a kick has beside V."""
         return len(self.monomials) or sum(c is not None for c in (self.gradients, self.curvatures))
 
     def _layer(self, substep: Substep) -> Kick | Drift:
@@ -588,15 +588,16 @@ class PrimedFlow(SympFlow):
         return self.tables.evaluations(n_steps, n_saved, n_extra, backend)
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> PrimedFlowKernel:
+        tables = self.tables
+        if tables.kernel is not None and tables.kernel.system is system and not compensated:
+            return tables.kernel
         from sympflow.kernels.flow_loops import PrimedFlowKernel
 
-        tables = self.tables
         for placement in tables.placements:
             check_compilable(*placement)
         if compensated:
             return PrimedFlowKernel(tables, system, compensated=True)
-        if tables.kernel is None or tables.kernel.system is not system:
-            tables.kernel = PrimedFlowKernel(tables, system)
+        tables.kernel = PrimedFlowKernel(tables, system)
         return tables.kernel
 
     # kernel and processor as maps ---------------------------------------------------------------------------

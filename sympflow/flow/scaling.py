@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 
-@dataclass(frozen=True)
-class Scaling:
+class _Units(NamedTuple):
+    q: tuple[float, ...]
+    p: tuple[float, ...]
+    t: float
+    q_center: tuple[float, ...]
+    p_center: tuple[float, ...]
+
+
+class Scaling(_Units):
     """Units of q, p and t in which the states of a domain are of size one.
 
     The change of variables q/s_q, p/s_p multiplies dq∧dp by 1/(s_q s_p), a constant where all the products agree
@@ -18,40 +25,45 @@ class Scaling:
 
     Parameters
     ----------
-    q, p : tuple of d floats
+    q, p : sequence of d floats
         Spread (standard deviation) of each coordinate and momentum over the domain.
     t : float
         Unit of time, Δt.
-    q_center, p_center : tuple of d floats, optional
-        Mean of each over the domain; it enters the first biases at initialisation.
+    q_center, p_center : sequence of d floats, optional
+        Mean of each over the domain, 0 by default; it enters the first biases at initialisation.
+
+    Raises
+    ------
+    ValueError
+        If a length differs, a unit is not positive, or a number is not finite.
     """
 
-    q: tuple[float, ...]
-    p: tuple[float, ...]
-    t: float = 1.0
-    q_center: tuple[float, ...] | None = None
-    p_center: tuple[float, ...] | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("q", "p", "q_center", "p_center"):
-            value = getattr(self, name)
-            if value is None:
-                value = (0.0,) * len(self.q)
-            value = tuple(float(v) for v in value)
-            if len(value) != len(self.q) or not np.isfinite(value).all():
-                raise ValueError(f"`{name}` must be {len(self.q)} finite numbers; got {value}.")
-            object.__setattr__(self, name, value)
-        if min(*self.q, *self.p, self.t) <= 0 or not np.isfinite(self.t):
-            raise ValueError(f"`q`, `p` and `t` must be positive units; got {self.q}, {self.p}, {self.t}.")
+    def __new__(
+        cls,
+        q: Sequence[float],
+        p: Sequence[float],
+        t: float = 1.0,
+        q_center: Sequence[float] | None = None,
+        p_center: Sequence[float] | None = None,
+    ) -> Self:
+        vectors = {"q": q, "p": p, "q_center": q_center, "p_center": p_center}
+        made: dict[str, tuple[float, ...]] = {}
+        for name, value in vectors.items():
+            made[name] = (0.0,) * len(q) if value is None else tuple(float(v) for v in value)
+            if len(made[name]) != len(q) or not np.isfinite(made[name]).all():
+                raise ValueError(f"`{name}` must be {len(q)} finite numbers; got {made[name]}.")
+        if min(*made["q"], *made["p"], t) <= 0 or not np.isfinite(t):
+            raise ValueError(f"`q`, `p` and `t` must be positive units; got {made['q']}, {made['p']}, {t}.")
+        return super().__new__(cls, t=t, **made)
 
     @classmethod
     def unit(cls, ndof: int, t: float = 1.0) -> Scaling:
-        """q, p in the units they come in."""
+        """Return the units in which q and p come."""
         return cls((1.0,) * ndof, (1.0,) * ndof, t)
 
     @classmethod
     def of_samples(cls, x: np.ndarray, t: float) -> Scaling:
-        """The scaling of states x (n, 2d) of a domain, and a time step t."""
+        """Return the scaling of states x (n, 2d) of a domain, and a time step t."""
         ndof = x.shape[-1] // 2
         center, spread = x.mean(0), x.std(0)
         spread = np.where(spread > 0, spread, 1.0)
@@ -75,8 +87,8 @@ class Scaling:
             "q": list(self.q),
             "p": list(self.p),
             "t": self.t,
-            "q_center": list(self.q_center or ()),
-            "p_center": list(self.p_center or ()),
+            "q_center": list(self.q_center),
+            "p_center": list(self.p_center),
         }
 
     @classmethod

@@ -1,4 +1,4 @@
-"""The flows that ship with the package: what there is, and which of them a system, and an accuracy, calls for.
+"""The flows that ship with the package: their catalogue, and the choice among them by system and accuracy.
 
 Only the headers of the files are read, once in a process: a flow's weights when it is wanted.
 """
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
 
 DEFAULT_TOL = 1e-6
-"""What the default flow of a system reaches, if one does."""
+"""The relative energy error that the default flow of a system meets, if one does."""
 
 
 @dataclass(frozen=True)
 class ShippedFlow:
-    """A file in the package, and what is told in it.
+    """A flow in the package, as the header of its file describes it.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class ShippedFlow:
 
     @classmethod
     def of(cls, path: Path) -> ShippedFlow:
-        """What the header of a file tells."""
+        """Return the description in the header of a file."""
         record = _record(path)
         figures, plan = record["figures"], record["architecture"].get("primed")
         origin = record["recipe"].get("transforms")  # of a flow in another time, the system that it is for
@@ -268,7 +268,7 @@ def named(name: str) -> ShippedFlow:
 
 
 def forces_saved(flow: ShippedFlow, system: HamiltonianSystem, tol: float) -> float:
-    """How many forces a unit of time less a flow takes than the cheapest of those in the system's own time."""
+    """Return how many forces a unit of time less a flow takes than the cheapest one in the system's own time."""
     try:
         plain = choose(system, flow.kind, tol)
     except ValueError:

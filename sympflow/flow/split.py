@@ -384,14 +384,14 @@ class SplitFlow(SympFlow):
         return parts.from_modes(*parts.apply(maps, *parts.to_modes(y.T))).T
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> SplitFlowKernel:
-        from sympflow.kernels.flow_loops import SplitFlowKernel
-
         if compensated:
             raise ValueError(UNCOMPENSATED)
         flow = self.bound(system)
         frozen = flow.frozen()
-        check_compilable(*frozen.placement)
         if frozen.kernel is None or frozen.kernel.parts is not flow.parts:
+            from sympflow.kernels.flow_loops import SplitFlowKernel
+
+            check_compilable(*frozen.placement)
             frozen.kernel = SplitFlowKernel(frozen, flow.parts, flow.dt)
         return frozen.kernel
 

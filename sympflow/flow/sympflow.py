@@ -164,19 +164,19 @@ class SympFlow(FlowMap):
         dt : float
             Δt.
         palindromic : bool
-            Whether it is time-reversible, with half the parameters.
+            True for a time-reversible flow, with half the parameters.
         scheme : Scheme or str, optional
             A table, or its name in `sympflow.schemes.SCHEMES`, to start from in place of leapfrog.
         degree : int, optional
             Of the polynomials that multiply V and T; 7 by default, 5 with a processor, which has more of them.
         force_gradient : bool, optional
-            Whether the kicks have a term in ½|∇V|²_{M⁻¹}; by default they do where T is quadratic.
+            True for a term in ½|∇V|²_{M⁻¹} in the kicks, which is the default where T is quadratic.
         processor : int
             Number of kicks of χ in ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹, 0 for none. A run executes χ⁻¹ once, the kernel K of
             `stages` kicks in every step, and χ for every output.
         curvature : bool
-            Whether the kicks also have a term in ½ v·∇²V v, v = M⁻¹∇V, which takes third derivatives of V: for symbolic
-            systems. A trained kick with it comes tens of times nearer, and takes 1.1 to 1.5 times as long.
+            True for a further term in ½ v·∇²V v, v = M⁻¹∇V, which takes third derivatives of V: for symbolic systems. A
+            trained kick with it comes tens of times nearer, and takes 1.1 to 1.5 times as long.
         polynomial : int, optional
             In place of force gradients and curvatures every kick has a trained polynomial in q of this total degree,
             t³ Σ_m e_m(t) q^m: for symbolic systems in few degrees of freedom. Its monomials are those of V and of what
@@ -238,14 +238,14 @@ class SympFlow(FlowMap):
         terms : int
             Number of even polynomials in t of each coefficient.
         filters : bool
-            Whether the parts see the fast modes through trained filters.
+            True if the parts see the fast modes through trained filters.
         force_gradient : bool or sequence of int, optional
-            Whether kicks have a term in ½|∇U|²_{M⁻¹}, or which of them, counted from 0, the same from either end; by
-            default all do where H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q).
+            True for a term in ½|∇U|²_{M⁻¹} in the kicks, or the numbers of those that have it, counted from 0, the
+            same from either end; by default all have it where H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q).
         parts : sequence of str, optional
             The parts, as for the method "strang_parts".
         linear_outside : bool
-            Whether the linear part begins and ends the flow; else it is innermost in each Strang step.
+            True if the linear part begins and ends the flow; else it is innermost in each Strang step.
         dtype, device
             Of the parameters.
 

@@ -1,1 +1,1 @@
-"""What is asked of several runs: comparisons, work–precision, stability, sections, with their tables and figures."""
+"""Studies of several runs: comparisons, work and precision, stability, sections, each with its report."""

@@ -1,4 +1,4 @@
-"""Attempts: a method run once under the conditions of a study, its failure caught, and a row of what was measured.
+"""Attempts: a method run once under the conditions of a study, its failure caught, its measurements a row.
 
 Every study, `compare`, `work_precision` and `stability` alike, makes its rows of attempts. A metric is a function of an
 attempt that fills in its row, and a line in a study's table of metrics.
@@ -236,7 +236,7 @@ class Attempt:
 
     @property
     def lost(self) -> bool:
-        """Whether no trajectory reached its end."""
+        """True if no trajectory reached its end."""
         return all(failed(sol).all() for sol in self.sols)
 
     def note(self, text: str) -> None:

@@ -253,7 +253,7 @@ def _match(
 
 
 def tunable(integrator: Integrator) -> bool:
-    """Tell whether the method has a step or a tolerance that may be changed; a trained flow is what it is."""
+    """Tell whether the method has a step or a tolerance that may be changed; a trained flow has none."""
     return not integrator.trained and (isinstance(integrator, FixedStep) or tolerance_of(integrator) is not None)
 
 
@@ -334,7 +334,7 @@ class Comparison(Report):
     repeats : int
     match : str or None
     reference : Reference or None
-        What the errors are against, if they were asked for.
+        The reference of the errors, if they were asked for.
     rows : tuple of Row
     runs : tuple
         Behind each row: its solution (`.sol`) and the energy and volume errors over time (`.energy`, `.volume`).
@@ -366,7 +366,7 @@ class Comparison(Report):
         return title(self.system)
 
     def table(self, width: int | None = None) -> str:
-        """The rows as text, with what was done above and the reasons below.
+        """The rows as text, with the settings above and the reasons below.
 
         Where `width` characters do not hold them, the methods are columns.
         """
@@ -399,7 +399,7 @@ class Comparison(Report):
         kind : str
             As for `figure`.
         prefix : str
-            What the names of the files in a folder begin with; the kinds follow.
+            Beginning of the names of the files in a folder; the kinds follow.
         """
         from sympflow.studies.figures import save_comparison
 

@@ -1,4 +1,4 @@
-"""Where trajectories cross a plane: in steps on a grid for all of them at once, else by events of each."""
+"""Crossings of a plane: in steps on a grid those of all trajectories at once, else by events of each."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class _Search:
         return Crossings(*self._located(rows.shape[-1], grid.h), status, message)
 
     def _failure(self, t_span: tuple[float, float], rows: np.ndarray) -> tuple[np.ndarray, str]:
-        """What `solve` says of the run that could not go on: the status (N,), and words."""
+        """The status (N,) and the message that `solve` gives the run that could not go on."""
         y0 = rows[0] if len(rows) == 1 else rows
         sol = solve(self.system, self.integrator, t_span, y0, t_eval=[t_span[1]], on_domain_exit="ignore")
         return np.broadcast_to(np.asarray(sol.status), len(rows)), sol.message
@@ -158,7 +158,7 @@ class _Search:
         return self.integrator.step(self.system, 0.0, y, h)
 
     def _located(self, width: int, direction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What was found: by trajectory, and along the run."""
+        """The crossings that were found, by trajectory and along the run."""
         if not self.found:
             return np.empty(0, dtype=int), np.empty(0), np.empty((0, width))
         trajectory, t, states = (np.concatenate(parts) for parts in zip(*self.found, strict=True))

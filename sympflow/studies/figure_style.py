@@ -30,7 +30,8 @@ _STYLES = {
 _OTHER_COLOURS = ("#E69F00", "#000000", "#7F3C8D", "#8C6D31", "#666666", "#A5AA99")
 _OTHER_MARKERS = ("P", "X", "*", "<", ">", "h")
 TEXT = "#333333"
-LETTER = 0.55  # mean width of a letter, in units of the font size
+LETTER_WIDTH = 0.55  # of a mean letter, in units of the font size
+LONGEST_LABEL, TWO_LINES = 2.6, 0.5  # width of a line of a legend, and height of two lines of it, in inches
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -83,19 +84,27 @@ def labelled(axes: Iterable[Axes]) -> list[Any]:
 
 
 def legend_above(figure: Figure, handles: Sequence[Any], columns: int) -> None:
-    """One legend above all panels, in at most so many columns and in as few as the width of the figure needs."""
+    """One legend above all panels, in at most so many columns, within the width of the figure.
+
+    Long labels are broken. The figure grows by the lines of the legend beyond the second, so that these take nothing
+    from the panels.
+    """
+    longest = min(LONGEST_LABEL, figure.get_figwidth() - 0.8)  # a line takes its part
+    labels = [filled(str(h.get_label()), longest, 9) for h in handles]
     for n in range(min(len(handles), columns), 0, -1):
         legend = figure.legend(
-            handles=list(handles), loc="outside upper center", ncols=n, frameon=False, fontsize=9, labelcolor=TEXT
+            list(handles), labels, loc="outside upper center", ncols=n, frameon=False, fontsize=9, labelcolor=TEXT
         )
-        if n == 1 or legend.get_window_extent().width <= 0.98 * figure.bbox.width:
+        box = legend.get_window_extent()
+        if n == 1 or box.width <= 0.98 * figure.bbox.width:
+            figure.set_figheight(figure.get_figheight() + max(0.0, box.height / figure.dpi - TWO_LINES))
             return
         legend.remove()
 
 
 def filled(text: str, inches: float, size: float) -> str:
     """Break the lines of a text that are longer than a width in inches at a font size in points."""
-    width = max(12, int(72 * inches / (LETTER * size)))
+    width = max(12, int(72 * inches / (LETTER_WIDTH * size)))
     return "\n".join(textwrap.fill(line, width, break_long_words=False) for line in text.splitlines())
 
 

@@ -174,7 +174,7 @@ def _energy_panel(ax: Axes, comparison: Compared, styles: dict[str, tuple[str, s
 
 
 def _volume_panel(ax: Axes, comparison: Compared, styles: dict[str, tuple[str, str]]) -> None:
-    """|Σ log|det|| over time; shaded, what the rounding of the steps can amount to."""
+    """|Σ log|det|| over time; shaded, the amount that rounding of the steps explains."""
     n_steps = 0
     for run, sol, series in _series(comparison, "volume"):
         n_steps = max(n_steps, int(sol.stats["n_steps"]))

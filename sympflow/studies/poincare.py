@@ -154,7 +154,7 @@ class PoincareSection(Report):
 
     @property
     def success(self) -> bool:
-        """Whether every trajectory reached the end."""
+        """True if every trajectory reached the end."""
         return bool(np.all(np.asarray(self.status) >= 0))
 
     def __len__(self) -> int:

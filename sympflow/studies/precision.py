@@ -292,7 +292,7 @@ class WorkPrecision(Report):
     Attributes
     ----------
     system, t_span, n_outputs, repeats
-        What was run.
+        The scene.
     references : tuple of (Reference or None)
         For one trajectory, and for the batch if there is one.
     rows : tuple of Row

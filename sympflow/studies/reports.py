@@ -28,7 +28,7 @@ _NAMES = {"henon_heiles": "Hénon–Heiles"}
 
 
 class Report(ABC):
-    """The result of a study. A subclass has `rows`, and says what its settings, table and figure are."""
+    """The result of a study. A subclass gives its rows, settings, table and figure."""
 
     columns: ClassVar[tuple[str, ...]]
     """The fields of the rows that files hold, in this order."""
@@ -45,7 +45,7 @@ class Report(ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """The problem and what was asked, in JSON's types."""
+        """The problem and the options of the study, in JSON's types."""
 
     @abstractmethod
     def figure(self) -> Figure:

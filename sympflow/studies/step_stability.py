@@ -35,7 +35,7 @@ STEPS = tuple(2.0**k for k in range(-1, 7))
 """Default steps of classical methods, times the system's; those of a trained flow are fractions of its Δt."""
 FRACTIONS = (0.25, 0.5, 1.0)
 PHASES = (0.0, 3.0, 10.0, 31.0)
-"""Where the initial states lie along the orbit, in the system's steps: several, for one may hide an instability."""
+"""Places of the initial states along the orbit, in the system's steps: several, for one may hide an instability."""
 PRECISION = 1.002  # the shortest unstable step found, in units of the longest stable one
 STABLE = ("stable", "bounded")
 MOST_OUTPUTS, TANGENT_STEPS, FEWEST_FOR_DRIFT = 20_000, 256, 40
@@ -275,7 +275,7 @@ class Study:
         return one
 
     def verdict(self, one: Attempt) -> tuple[str, str]:
-        """The status of runs with their largest energy error, and what is to be said."""
+        """The status of runs, by their largest energy error, and a remark."""
         worst = one.row.energy_error if one.row.energy_error is not None else math.inf
         exit_time = domain_exit(one.sols) if self.integrator.trained else None
         left = (

@@ -370,7 +370,7 @@ class TableFit(Fit):
         return self._rows(self._errors(y - self._y)).ravel(), J
 
     def _errors(self, change: np.ndarray) -> np.ndarray:
-        """The errors of each coordinate and, with a slope, of the energy: (..., 2d + 1, P), without one (..., 2d, P)."""
+        """The errors of each coordinate and, with a slope, of the energy: (..., 2d + 1, P), else (..., 2d, P)."""
         scaled = change * self._scale
         if self._slope is None:
             return scaled

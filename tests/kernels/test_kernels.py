@@ -76,14 +76,12 @@ def numba_chain(mass=MASS):
     )
 
 
-def symbolic_chain(mass=MASS):
-    """The same system, from symbols; or a shorter one, of as many masses."""
-    M, d = np.linalg.inv(mass), len(mass)
-    kinetic = " + ".join(f"{float(M[i, j]) / 2!r}*p{i + 1}*p{j + 1}" for i in range(d) for j in range(d))
-    stretches = [f"(q{i + 1}-q{i})" for i in range(1, d)]
-    potential = " + ".join(["q1**4/4", *(f"{r}**2/2 + {r}**4/4" for r in stretches)])
-    q, p = [0.3, -0.2, 0.1], [0.0, 0.4, -0.1]
-    return HamiltonianSystem.from_sympy(f"{kinetic} + {potential}", y0=[*q[:d], *p[:d]])
+def symbolic_pair():
+    """A chain of two, from symbols; its mass matrix is full."""
+    M = np.linalg.inv(MASS[:2, :2])
+    kinetic = " + ".join(f"{float(M[i, j]) / 2!r}*p{i + 1}*p{j + 1}" for i in range(2) for j in range(2))
+    potential = "q1**4/4 + (q2-q1)**2/2 + (q2-q1)**4/4"
+    return HamiltonianSystem.from_sympy(f"{kinetic} + {potential}", y0=[0.3, -0.2, 0.0, 0.4])
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +91,7 @@ def systems():
         "henon_heiles": henon_heiles(),
         "pendulum": HamiltonianSystem.from_sympy("p**2/2 - cos(q)", y0=[1.0, 0.3]),
         "numba_chain": numba_chain(),
-        "symbolic_chain": symbolic_chain(),
-        "symbolic_pair": symbolic_chain(MASS[:2, :2]),
+        "symbolic_pair": symbolic_pair(),
         "relativistic": HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**2/2 + q**4/4", y0=[0.5, 0.4]),
         "kepler": HamiltonianSystem.from_sympy(
             "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)",
@@ -124,8 +121,8 @@ def test_kernel_agrees_with_numpy(systems, name, scheme, h):
 @pytest.mark.parametrize(
     ("name", "scheme"),
     [
-        *((name, KAHAN_LI8) for name in ("pendulum", "symbolic_chain", "relativistic", "kepler")),
-        ("symbolic_pair", SCHEMES["omelyan6"]),  # a product with M⁻¹ in full, at a third of the chain's compile time
+        *((name, KAHAN_LI8) for name in ("pendulum", "relativistic", "kepler")),
+        ("symbolic_pair", SCHEMES["omelyan6"]),  # a product with M⁻¹ in full
     ],
     ids=lambda x: getattr(x, "name", x),
 )
@@ -263,9 +260,9 @@ def test_a_lane_that_overflows_leaves_the_others_unharmed(runaway):
 
 
 def test_an_unstable_step_is_found_out():
-    system = harmonic_oscillator(omega=100.0)
+    system = harmonic_oscillator(omega=1e3)
     Y, n_finite, _ = (
-        splitting_loops(system).kernel(VERLET).run(0.0201, np.array([1.0, 0.0]), 100_000, np.array([0, 100_000]))
+        splitting_loops(system).kernel(VERLET).run(0.00201, np.array([1.0, 0.0]), 100_000, np.array([0, 100_000]))
     )
     assert 0 < n_finite < 100_000
     assert np.isnan(Y[1]).all()

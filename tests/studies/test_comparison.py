@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sympflow import HamiltonianSystem, SympFlow, compare, get, reference_error, solve, stability, systems
-from sympflow.studies.attempts import interleaved
+from sympflow.studies.attempts import Row, interleaved
 from sympflow.studies.comparison import combined_table, matched
 
 QUICK = {"n_outputs": 50, "repeats": 1}
@@ -207,7 +207,7 @@ def test_writers_name_the_path_that_they_cannot_write(tmp_path):
     study = stability(systems.harmonic_oscillator(), ["verlet"], steps=[0.1], metrics=("energy",), limits=False)
     flow = SympFlow(1, hidden=(3,))
     (tmp_path / "file").write_text("")
-    for write in (report.to_csv, report.to_json, study.to_csv, study.plot, flow.save):
+    for write in (report.to_csv, report.to_json, study.to_csv, study.to_json, study.plot, flow.save):
         with pytest.raises(ValueError, match=r"^`path` .* is a folder: name a file"):
             write(tmp_path)
         with pytest.raises(ValueError, match=r"^`path` .* cannot be written \(.*\): name a file that can be"):
@@ -218,3 +218,10 @@ def test_writers_name_the_path_that_they_cannot_write(tmp_path):
         assert (tmp_path / f"new_{write.__name__}" / "folder" / "x.png").is_file()
     with pytest.raises(ValueError, match=r"^`path` 'x.xyz' ends in '.xyz', which is no format of figures"):
         study.plot(tmp_path / "x.xyz")
+
+
+def test_the_repr_of_a_row_shows_what_is_filled_in():
+    row = Row("pendulum", "verlet", "verlet", energy_error=0.0, run_time=1.5)
+    assert repr(row) == (
+        "Row(system='pendulum', method='verlet', label='verlet', status='ok', run_time=1.5, energy_error=0.0)"
+    )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sympflow import compare, get, poincare_section, systems
-from sympflow.studies.figure_style import new_figure
+from sympflow.studies.figure_style import labelled, legend_above, new_figure
 from sympflow.studies.figures import _annotate, overview, save_comparison
 
 
@@ -118,3 +118,28 @@ else:
     raise AssertionError
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_portrait_of_a_flow_in_another_time_is_that_of_its_physical_time():
+    system = systems.kepler(0.6)
+    flow = get("sympflow")(flow="kepler-log-1")
+    report = compare(system, [flow], ["energy"], t_span=(0, 50), n_outputs=40, repeats=1)
+    points = report.figure("portrait").axes[0].lines[1].get_xydata()
+    section = poincare_section(system, flow, (0, 50))
+    np.testing.assert_allclose(points, section.states[:, [1, 3]], atol=1e-10)
+    np.testing.assert_allclose(section.states[:, 1], -0.64, atol=1e-6)  # every orbit crosses at the same place
+
+
+@pytest.mark.parametrize("number", [1, 3, 12])
+@pytest.mark.parametrize("width", [3.0, 12.0])
+def test_legends_are_as_wide_as_the_figure_at_most_and_take_nothing_from_the_panels(number, width):
+    figure = new_figure(width, 3.0)
+    ax = figure.subplots()
+    for k in range(number):
+        ax.plot([0, 1], [k, k], label=f"sympflow:flow=henon_heiles-sympflow number {k}")
+    legend_above(figure, labelled([ax]), 7)
+    figure.canvas.draw()
+    box, panel = figure.legends[0].get_window_extent(), ax.get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.width
+    assert 0 <= box.y0 < box.y1 <= figure.bbox.height
+    assert panel.height > 1.7 * figure.dpi

@@ -1,17 +1,20 @@
 """Poincaré sections: the crossings are on the plane, on the method's map, and all of them."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
+from conftest import KINDS
 
 import sympflow
-from sympflow import available, poincare_section, solve, systems
+from sympflow import poincare_section, solve, systems
 from sympflow.integrators.tableaux import ADAPTIVE
 
 HH, OSCILLATOR = systems.henon_heiles(), systems.harmonic_oscillator()
 
 
-@pytest.mark.parametrize("method", available())
+@pytest.mark.parametrize("method", KINDS)
 def test_the_crossings_are_those_that_events_find(method):
     def g(t, y):
         return y[0]
@@ -113,7 +116,11 @@ def test_rows_table_csv_and_figure(tmp_path):
     assert section.table(3).splitlines()[-1] == f"… {len(section) - 3} more"
     read = np.genfromtxt(section.to_csv(tmp_path / "section.csv"), delimiter=",", names=True)
     np.testing.assert_array_equal(read["p2"], section.states[:, 3])
-    figure = section.plot()
+    content = json.loads(section.to_json(tmp_path / "section.json").read_text())
+    assert (content["system"]["name"], content["method"], content["coordinate"]) == ("henon_heiles", "verlet", "q1")
+    assert content["rows"][0] == {"trajectory": 0, "t": row.t, "q1": row.q1, "q2": row.q2, "p1": row.p1, "p2": row.p2}
+    figure = section.plot(path=tmp_path / "section.png")
+    assert (tmp_path / "section.png").stat().st_size > 5000
     (ax,) = figure.axes
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("q2", "p2")
     np.testing.assert_array_equal(ax.collections[0].get_offsets(), section.states[:, [1, 3]])

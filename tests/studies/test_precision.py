@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from sympflow import HamiltonianSystem, SympFlow, get, systems, work_precision
+from sympflow import HamiltonianSystem, SympFlow, compare, get, systems, work_precision
 from sympflow.studies.attempts import Row
 from sympflow.studies.precision import break_even, cost_at
 
@@ -118,3 +118,13 @@ def test_methods_that_do_not_apply_and_unstable_steps_are_rows():
 def test_bad_arguments_are_refused_at_once(arguments, message):
     with pytest.raises((ValueError, TypeError), match=message):
         work_precision(systems.pendulum(), ["verlet"], **arguments)
+
+
+def test_a_flow_in_another_time_is_a_point_as_it_is_a_row_of_compare():
+    flow = get("sympflow")(flow="kepler-log-1")
+    few = {"t_span": (0, 20), "n_outputs": 20, "repeats": 1}
+    verlet, point = work_precision(systems.kepler(0.6), ["verlet", flow], steps=[0.05], **few).rows
+    (row,) = compare(systems.kepler(0.6), [flow], ["error", "energy"], **few).rows
+    assert (point.label, point.status, point.dt) == ("sympflow", "uncertain", row.dt)  # better than the reference
+    assert point.training_time == row.training_time > 0
+    assert point.energy_error == row.energy_error < 1e-6 * verlet.energy_error
