@@ -19,7 +19,7 @@ ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("metrics",), "energy, symplecticity, accuracy: of the map as executed"),
     (("solver",), "solve(): checks, picks the integrator, returns a Solution"),
     (("solution", "interop"), "the result; SciPy, torchdiffeq, torchode: our methods there"),
-    (("integrators",), "scheme × splitting × clock; the one driver; the registry of names"),
+    (("integrators",), "scheme × splitting × clock; the driver; the registry"),
     (("flow",), "trained maps ψ̄ and their families; files; certificates"),
     (("kernels",), "compiled loops behind one protocol"),
     (("systems",), "the built-in scenes"),
