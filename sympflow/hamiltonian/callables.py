@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from sympflow.arrays import Array, is_tensor, stack, to_numpy
+from sympflow.hamiltonian.definition import Definition
 
 
-class CallableHamiltonian:
+class CallableHamiltonian(Definition):
     """The functions of a system given by V(q) or H(q, p). See `HamiltonianSystem` for the arguments."""
 
     def __init__(
@@ -36,7 +37,6 @@ class CallableHamiltonian:
             raise TypeError("`gradient` and `hessian_vector` only go with `potential`: leave them out.")
         self.ndof = ndof
         self.separable = potential is not None
-        self.numba_functions: tuple[Any, Any, Any] | None = None
         if gradient is not None and hasattr(gradient, "py_func"):
             _check_numba(potential, gradient, hessian_vector)
             self.numba_functions = (potential, gradient, hessian_vector)
@@ -45,6 +45,7 @@ class CallableHamiltonian:
             hessian_vector = None if hessian_vector is None else arrays.hessian_vector
         self._potential, self._hamiltonian = potential, hamiltonian
         self._gradient, self._hessian_vector = gradient, hessian_vector
+        self.differentiates_itself = gradient is None and hessian_vector is None
 
     def hamiltonian(self, y: Array) -> Array:
         return _with_torch(self._H, y, "hamiltonian", ())
@@ -92,16 +93,10 @@ class CallableHamiltonian:
                 raise
             raise ValueError(f"{refused}, q.copy() ({error}).") from error
 
-    @property
-    def differentiates_itself(self) -> bool:
-        """Whether all derivatives are automatic ones of a function that is written with torch."""
-        return self._gradient is None and self._hessian_vector is None
-
-    @property
-    def hessian_vector(self) -> Callable[..., Array] | None:
-        """The user's ∇²V(q)·v, if given."""
-        product = self._hessian_vector
-        return None if product is None else lambda q, v: self._protected(product, "hessian_vector", q, v)
+    def hessian_vector(self, q: Array, v: Array) -> Array:
+        if self._hessian_vector is None:
+            return super().hessian_vector(q, v)
+        return self._protected(self._hessian_vector, "hessian_vector", q, v)
 
     def potential_hessian(self, q: Array) -> Array:
         if self._hessian_vector is not None:

@@ -108,8 +108,7 @@ class Hamiltonian:
 
     def hessian_vector(self, q: Array, v: Array) -> Array:
         """∇²V(q)·v, by the function given for it if there is one: (..., d), (..., d) to (..., d)."""
-        product = getattr(self._separable()._definition, "hessian_vector", None)
-        return (self.potential_hessian(q) @ v[..., None])[..., 0] if product is None else product(q, v)
+        return self._separable()._definition.hessian_vector(self._positions(q), v)
 
     def curvature(self, q: Array) -> Array:
         """½ v·∇²V(q) v, the curvature of V along the acceleration v = M⁻¹∇V(q): (..., d) to (...).
@@ -139,8 +138,7 @@ class Hamiltonian:
 
     def third_derivative(self, q: Array, v: Array, w: Array) -> Array:
         """∇³V(q)(v, w), for a system without symbols: (..., d), each, to (..., d)."""
-        itself = getattr(self._definition, "differentiates_itself", False)
-        if self.numba_functions is None and (itself or is_tensor(q)):
+        if self.numba_functions is None and (self._definition.differentiates_itself or is_tensor(q)):
             import torch
 
             from sympflow.arrays import jvp
@@ -200,7 +198,7 @@ class Hamiltonian:
     @property
     def numba_functions(self) -> tuple[Any, Any, Any] | None:
         """(potential, gradient, hessian_vector) if the system was given by Numba functions, else None."""
-        return getattr(self._definition, "numba_functions", None)
+        return self._definition.numba_functions
 
 
 def _rows(left: Array, right: Array) -> Array:

@@ -65,6 +65,10 @@ class PartFunctions(SymbolicHamiltonian):
         """Whether it is a potential, H_k(q)."""
         return not self.H.has(*self.p)
 
+    def hessian_vector(self, y: Array, v: Array) -> Array:
+        """∇²_q H_k(y)·v: (..., 2d), (..., d) to (..., d)."""
+        return (self.hessian(y)[..., : self.ndof, : self.ndof] @ v[..., None])[..., 0]
+
 
 class RestOfPotential:
     """U(q) = V(q) − ½ (q − c)ᵀK(q − c) of a system given by functions."""
@@ -196,11 +200,7 @@ class ExactParts:
         phi = 1.0 if filters is None else self.by_class(matching(filters, X))
         v = self.inverse_masses(X) * phi * self._times(self.C.T, functions.gradient(y)[..., :d])
         v = self._times(self.C, phi * v)
-        if hasattr(functions, "hessian_vector"):
-            product = functions.hessian_vector(y, v)
-        else:
-            product = (functions.hessian(y)[..., :d, :d] @ v[..., None])[..., 0]
-        return phi * self._times(self.C.T, product)
+        return phi * self._times(self.C.T, functions.hessian_vector(y, v))
 
     def inverse_masses(self, X: Array) -> Array:
         """The diagonal M⁻¹ of the modes: Ω of each."""

@@ -12,10 +12,11 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from sympflow.arrays import Array, assemble, concatenate, is_tensor
+from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.expression import Unreadable, read
 
 
-class SymbolicHamiltonian:
+class SymbolicHamiltonian(Definition):
     """H(q, p) as a SymPy expression; its derivatives; array functions of them.
 
     Parameters

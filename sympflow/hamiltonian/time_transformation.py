@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor
+from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -154,7 +155,7 @@ def _expression(system: HamiltonianSystem, c: float) -> Any:
     return sp.log(symbols.T + B) - sp.log(numbered - symbols.V)
 
 
-class _Logarithmic:
+class _Logarithmic(Definition):
     """log(T(p) + B) and −log(c − V(q)), with derivatives, for a system that is given by functions."""
 
     separable = True

@@ -135,8 +135,16 @@ def test_every_evaluation_of_a_force_is_counted(method, arguments, counting):
 
 
 def test_a_flow_of_networks_evaluates_no_force():
-    arguments = {"method": as_scipy("sympflow", HH), "events": lambda t, y: y[0]}
+    arguments = {"method": as_scipy("sympflow", HH, flow="henon_heiles-sympflow"), "events": lambda t, y: y[0]}
     assert solve_ivp(HH, (0, 50), HH.y0, **arguments).nfev == 1
+
+
+def test_a_primed_flow_counts_its_forces():
+    """Those of the steps, as `solve` counts them; one state's velocity is compared, by `fun` and by the flow."""
+    steps = solve(HH, "sympflow", (0, 50), t_eval=[50.0]).stats["force_evaluations"]
+    alone = get("sympflow")().flow_for(HH).evaluations(0, 0, 1, "array")["force_evaluations"]
+    nfev = solve_ivp(HH, (0, 50), HH.y0, method=as_scipy("sympflow", HH), t_eval=[50.0]).nfev
+    assert steps < nfev - alone - 1 <= 2 * steps  # SciPy's steps are outputs, each with a processor of its own
 
 
 def test_the_exact_flow_finds_all_zeros(rotation):

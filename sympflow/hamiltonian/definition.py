@@ -1,0 +1,37 @@
+"""Definition: the functions that define H, whether from symbols or a user's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sympflow.arrays import Array
+
+
+class Definition:
+    """The functions of H(q, p); a subclass has, by `separable`, those of V and T or those of H itself.
+
+    If `separable`, `potential(q)`, `potential_gradient(q)` and `potential_hessian(q)`, and where T is not quadratic
+    `kinetic(p)`, `kinetic_gradient(p)` and `kinetic_hessian(p)`; else `hamiltonian(y)`, `gradient(y)` and `hessian(y)`.
+
+    Attributes
+    ----------
+    ndof : int
+    separable : bool
+    numba_functions : tuple of three functions or None
+        (potential, gradient, hessian_vector), if they are Numba's.
+    differentiates_itself : bool
+        True if all derivatives are automatic ones of a function that is written with torch.
+    """
+
+    ndof: int
+    separable: bool
+    numba_functions: tuple[Any, Any, Any] | None = None
+    differentiates_itself: bool = False
+
+    def potential_hessian(self, q: Array) -> Array:
+        """∇²V(q): (..., d) to (..., d, d)."""
+        raise NotImplementedError(f"{type(self).__name__} must define potential_hessian().")
+
+    def hessian_vector(self, q: Array, v: Array) -> Array:
+        """∇²V(q)·v: (..., d), each, to (..., d)."""
+        return (self.potential_hessian(q) @ v[..., None])[..., 0]
