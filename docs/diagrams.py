@@ -15,17 +15,20 @@ INK, SOFT, RULE, FILL = "#1d2433", "#5b6478", "#8a93a8", "#eef1fb"
 
 ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("commands",), "the command line"),
-    (("studies", "training"), "questions to several runs; fits, and the recipes of what ships"),
-    (("metrics", "testing"), "energy, symplecticity, accuracy; what every integrator must pass"),
+    (("studies", "training", "testing"), "several runs; fits and what ships; checks of integrators"),
+    (("metrics",), "energy, symplecticity, accuracy: of the map as executed"),
     (("solver",), "solve(): checks, picks the integrator, returns a Solution"),
-    (("interop",), "SciPy, torchdiffeq, torchode: our methods there, their systems here"),
-    (("integrators",), "scheme × splitting × clock; the one driver; the registry of names"),
+    (("solution", "interop"), "the result; SciPy, torchdiffeq, torchode: our methods there"),
+    (("integrators",), "scheme × splitting × clock; the driver; the registry"),
     (("flow",), "trained maps ψ̄ and their families; files; certificates"),
     (("kernels",), "compiled loops behind one protocol"),
-    (("hamiltonian", "systems"), "H, its structure and derivatives, domains; the built-in scenes"),
-    (("schemes", "solution", "events", "arrays", "arguments"), "used by every room above"),
+    (("systems",), "the built-in scenes"),
+    (("hamiltonian",), "H, its structure and derivatives; domains"),
+    (("schemes", "events"), "tables of numbers; zeros along a run"),
+    (("arguments",), "checks of what users give"),
+    (("arrays",), "operations that NumPy and torch spell differently"),
 )
-"""The rooms from the top down: each row imports from the rows below it only."""
+"""The rooms from the top down, as the layers of import-linter: each row imports from the rows below it only."""
 
 SOLVE: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("solve(system, method, t_span, y0, …)", "", ("checks every argument before anything runs",)),
@@ -38,7 +41,10 @@ SOLVE: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (
         "Stepper",
         "integrator.stepper(problem)",
-        ("one run: compiled kernel or arrays, decided here", "step, rollout, inverse; counts of evaluations"),
+        (
+            "one run: compiled kernel or arrays, decided when it is made",
+            "rollout, shorter steps; counts of evaluations",
+        ),
     ),
     (
         "GridRun",
@@ -84,18 +90,18 @@ def picture(title: str, height: float, parts: list[str]) -> str:
 
 def rooms() -> str:
     """The rooms of the package, arrows down."""
-    parts, height, y = [], 34, float(MARGIN)
+    parts, height, gap, y = [], 32, 20, float(MARGIN)
     for i, (names, words) in enumerate(ROOMS):
-        x, width = float(MARGIN), 100.0 if len(names) > 2 else 118.0
+        x, width = float(MARGIN), 118.0
         for name in names:
             parts.append(box(x, y, width, height))
-            parts.append(text(x + 10, y + 22, name, 14, INK, "600"))
+            parts.append(text(x + 10, y + 21, name, 14, INK, "600"))
             x += width + 8
-        parts.append(text(max(x + 10, 300.0), y + 22, words, 14, SOFT))
+        parts.append(text(420, y + 21, words, 14, SOFT))
         if i < len(ROOMS) - 1:
-            parts.append(arrow(MARGIN + 46, y + height + 2, GAP - 6))
-        y += height + GAP
-    return picture("The rooms of sympflow: imports point down", y - GAP + MARGIN, parts)
+            parts.append(arrow(MARGIN + 46, y + height + 2, gap - 4))
+        y += height + gap
+    return picture("The rooms of sympflow: imports point down", y - gap + MARGIN, parts)
 
 
 def solve() -> str:

@@ -6,6 +6,7 @@ import re
 import runpy
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -139,12 +140,13 @@ def test_the_diagrams_are_those_of_the_package():
     for name in ("rooms", "solve"):
         drawn = (ROOT / "docs" / "figures" / f"{name}.svg").read_text(encoding="utf-8")
         assert drawn == diagrams[name](), f"python docs/diagrams.py draws another {name}.svg"
-    rooms = [room for row, _ in diagrams["ROOMS"] for room in row]
-    package = ROOT / "sympflow"
-    for room in rooms:
-        assert (package / room / "__init__.py").exists() or (package / f"{room}.py").exists(), room
-    for folder in package.glob("*/__init__.py"):
-        assert folder.parent.name in rooms, folder.parent.name
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
+        "contracts"
+    ]
+    layers = [tuple(layer.split(" | ")) for layer in contracts[0]["layers"] if layer not in ("cli", "lazy", "_version")]
+    assert [row for row, _ in diagrams["ROOMS"]] == layers, (
+        "docs/diagrams.py draws other layers than pyproject.toml has"
+    )
 
 
 def test_every_fragment_is_included_and_says_where_it_is_from():
