@@ -333,14 +333,23 @@ class MLPIntegrator(FlowIntegrator):
     symplectic: ClassVar[bool] = False
 
     def run(self, problem: Problem) -> Outcome:
-        if problem.t1 < problem.t0:
-            raise ValueError(
-                "`t_span` runs backwards, but method 'mlp' has no inverse: use a symplectic method for backward time."
-            )
+        _check_forwards(problem.t0, problem.t1)
         return super().run(problem)
+
+    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        _check_forwards(*t_span)
+        return super().steps(system, t_span, y0)
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         raise TypeError("`method` 'mlp' has no exact inverse: use a symplectic method.")
+
+
+def _check_forwards(t0: float, t1: float) -> None:
+    """Raise a ValueError for a run backward in time."""
+    if t1 < t0:
+        raise ValueError(
+            "`t_span` runs backwards, but method 'mlp' has no inverse: use a symplectic method for backward time."
+        )
 
 
 @dataclass(frozen=True)
@@ -430,6 +439,8 @@ class LogSympFlow(FixedStep):
             expected: float,
             backend: str,
         ) -> Any:
+            if not numbers:  # only a trained clock tells without a search what times its steps reach
+                return None
             bound = flow.bound(transformed)
             kernel = compiled_loops(lambda: bound.kernel_for(transformed), start, backend)
             if kernel is None:

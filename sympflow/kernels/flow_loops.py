@@ -13,7 +13,7 @@ from sympflow.hamiltonian.parts import ExactParts, Map
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import run_one, run_rows
 from sympflow.kernels.parts_loops import parts_loops
-from sympflow.kernels.protocol import Run, Steps
+from sympflow.kernels.protocol import Kernel, Run, Steps
 from sympflow.kernels.splitting_loops import LoopFunctions, SplittingKernel, splitting_loops
 from sympflow.kernels.stages import StageTable, run_table, single_table
 from sympflow.kernels.timed_loops import reach_times
@@ -62,7 +62,7 @@ class TableSource(Protocol):
         ...
 
 
-class PrimedFlowKernel:
+class PrimedFlowKernel(Kernel):
     """Compiled loops of a primed flow on its system, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
 
     A flow with a processor, ψ̄ = χ ∘ K ∘ χ⁻¹, starts a run by χ⁻¹, makes its steps by K, and applies χ to each output.
@@ -175,7 +175,7 @@ class MapSource(Protocol):
         ...
 
 
-class SplitFlowKernel:
+class SplitFlowKernel(Kernel):
     """Compiled loops of a flow made of exact flows of parts, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
 
     Parameters
@@ -222,7 +222,7 @@ def _as_batch(run: Run) -> Run:
     return Run(run.states[None], np.array([run.n_finite]))
 
 
-class ClockedFlowKernel:
+class ClockedFlowKernel(Kernel):
     """Compiled loops of a flow with a trained clock, a `Kernel`; states are [q, t, p, B].
 
     B is constant and nothing depends on t, so n steps of the clock are n times one, added where a state is kept.

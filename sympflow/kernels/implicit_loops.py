@@ -14,7 +14,7 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import statements
 from sympflow.kernels.modules import load_algebra, run_rows
-from sympflow.kernels.protocol import Run, Steps
+from sympflow.kernels.protocol import Kernel, Run, Steps
 
 __all__ = ["ImplicitKernel", "implicit_kernel"]
 
@@ -38,7 +38,7 @@ def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bo
 _KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], ImplicitKernel]] = WeakKeyDictionary()
 
 
-class ImplicitKernel:
+class ImplicitKernel(Kernel):
     """Compiled loops of an implicit Runge–Kutta method on one system, a `Kernel`.
 
     Parameters

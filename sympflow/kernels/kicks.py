@@ -12,15 +12,13 @@ import sympy as sp
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
 from sympflow.kernels.codegen import printed
-from sympflow.kernels.scheduling import FUSED, PRODUCTS, Operation, Schedule, cycles_per_turn, nested
+from sympflow.kernels.scheduling import FUSED, PRODUCTS, Schedule, nested
 from sympflow.kernels.stages import kicks_of
 
 __all__ = ["kick_cycles", "kicks_source", "shapes"]
 
 PRODUCT = "fused_multiply_add"  # of `elementary`
 MOST_KEPT = 200  # sources
-BEST, MOST_MIXED = 3, 2  # shapes that are mixed, and momenta up to which they are
-BEFORE = "before_"  # the name of a position before a drift begins with it
 MOST_OPERATIONS = 400  # of a kick whose shapes are tried: rewriting longer ones takes longer than it saves
 MOST_TERMS = 120  # of a sum multiplied out
 MOST_NESTED = 12  # of a momentum's sum that is nested
@@ -33,8 +31,8 @@ UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
 class _Kick:
     """One shape of a kick: the body of its function without the lines of its coefficients, and its costs.
 
-    These are the cycles from one kick of a single trajectory to the next, a drift between them, and the operations, in
-    units of an addition, that a batch pays.
+    These are the cycles that a single trajectory pays for it and a drift, and the operations, in units of an addition,
+    that a batch pays.
     """
 
     coefficients: list[str]
@@ -169,39 +167,17 @@ def _scheduled(symbols: SymbolicHamiltonian, shape: Sequence[sp.Expr], prefix: s
         for symbol, expression in shared:
             schedule.define(symbol, expression)
     results = [schedule.value(f)[1] for f in shape]
-    turn = [*_drift(symbols), *schedule.steps]
-    carried = {f"{BEFORE}{s}": s.name for s in symbols.q} | dict(zip((s.name for s in symbols.p), results, strict=True))
-    return _Kick(schedule.early, schedule.lines, results, cycles_per_turn(turn, carried), schedule.operations)
-
-
-def _drift(symbols: SymbolicHamiltonian) -> list[Operation]:
-    """The drift that comes before a kick."""
-    operations = []
-    for q, p in zip(symbols.q, symbols.p, strict=True):
-        velocity = sp.diff(symbols.T, p)
-        moving = [s.name for s in symbols.p if s == p or velocity.has(s)]
-        at = f"{BEFORE}{q}"
-        for i, moved in enumerate(moving, 1):
-            name = q.name if i == len(moving) else f"{BEFORE}{q}_{i}"
-            operations.append(Operation(name, (at, moved), FUSED, PRODUCTS))
-            at = name
-    return operations
+    schedule.busy[PRODUCTS] += sum(sp.diff(symbols.T, p).has(s) or s == p for p in symbols.p for s in symbols.p)
+    cycles = schedule.cycles(results) + FUSED  # the drift waits for the kick
+    return _Kick(schedule.early, schedule.lines, results, cycles, schedule.operations)
 
 
 def _tried(symbols: SymbolicHamiltonian, terms: int, prefix: str, monomials: Monomials) -> list[_Kick]:
-    """Every shape; and of the best, every choice of one for each momentum."""
-
-    def both(shape: Sequence[sp.Expr]) -> list[_Kick]:
-        return [_scheduled(symbols, shape, prefix, common) for common in (True, False)]
-
-    made = [(shape, both(shape)) for shape in shapes(symbols, terms, monomials)]
-    made.sort(key=lambda entry: min((kick.cycles, kick.operations) for kick in entry[1]))
-    kicks = [kick for _, each in made for kick in each]
-    best = [shape for shape, _ in made[:BEST]]
-    if 1 < symbols.ndof <= MOST_MIXED:
-        mixed = dict.fromkeys(itertools.product(*zip(*best, strict=True)))  # a set in order
-        kicks += [kick for shape in mixed if list(shape) not in best for kick in both(shape)]
-    return kicks
+    return [
+        _scheduled(symbols, shape, prefix, common)
+        for shape in shapes(symbols, terms, monomials)
+        for common in (True, False)
+    ]
 
 
 def _numbered(f: sp.Expr, states: set[sp.Symbol], numbers: dict[sp.Expr, sp.Symbol]) -> sp.Expr:

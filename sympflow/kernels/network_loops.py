@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.kernels.modules import OPTIONS, load_module, run_rows, template
-from sympflow.kernels.protocol import Run, Steps
+from sympflow.kernels.protocol import Kernel, Run, Steps
 
 __all__ = ["MLPFlowKernel", "NetworkLayer"]
 
@@ -64,7 +64,7 @@ class _Architecture:
         return load_module(source).rollout
 
 
-class MLPFlowKernel:
+class MLPFlowKernel(Kernel):
     """Compiled loops of one SympFlow with the weights given, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
 
     Parameters

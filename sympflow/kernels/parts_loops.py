@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
 from sympflow.kernels.modules import NEVER, load_algebra, run_one, run_rows
 from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
-from sympflow.kernels.protocol import Run, Steps
+from sympflow.kernels.protocol import Kernel, Run, Steps
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 
@@ -205,7 +205,7 @@ class PartsLoops:
         return self._tables[id(sequence)][1]
 
 
-class PartsKernel:
+class PartsKernel(Kernel):
     """The compiled loops of one splitting of a system into parts, a `Kernel`: see `PartsLoops.kernel`."""
 
     saves_finite = True

@@ -68,3 +68,18 @@ class Kernel(Protocol):
     def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
         ...
+
+    def reach_times(
+        self,
+        h: float,
+        y0: np.ndarray,
+        times: np.ndarray,
+        stride: int,
+        expected: float,
+        numbers: tuple[float, ...] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """The states of rows of `y0` (N, 2d) at elapsed times, of steps that are equal in another time.
+
+        See `timed_loops.reach_times`. None where there is no such pass.
+        """
+        return None

@@ -1,8 +1,7 @@
 """Expressions as straight-line code in an order that suits the machine: short chains for one trajectory.
 
 A single trajectory waits for its longest chain of operations that need each other's results, not for their number; a
-batch, whose lanes fill the machine, for their number; on machines that add on units of their own, for the number of
-multiplications. `Schedule` writes sums and products, which SymPy holds without
+batch, whose lanes fill the machine, for their number. `Schedule` writes sums and products, which SymPy holds without
 an order, so that what is known early is used early, sums of products as multiplications fused with additions; it
 estimates both costs, by which the shapes that one expression may take are compared.
 """
@@ -12,43 +11,25 @@ from __future__ import annotations
 import bisect
 import heapq
 import itertools
-import re
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-import llvmlite.binding
 import sympy as sp
 
-__all__ = ["Operation", "Schedule", "cycles_per_turn", "nested"]
+__all__ = ["Schedule", "nested"]
 
 ADD, MULTIPLY, FUSED = 3.0, 3.0, 4.0  # cycles from operands to result, on current x86-64 and AArch64 cores
 DIVIDE, ROOT, FUNCTION, OTHER = 13.0, 17.0, 60.0, 80.0
 THROUGHPUT = {DIVIDE: 10.0, ROOT: 12.0, FUNCTION: 30.0, OTHER: 60.0}
-"""What these cost in a batch, in units of an addition."""
+"""Their cost in a batch, in units of an addition."""
 SUMS, PRODUCTS, DIVISIONS = "sums", "products", "divisions"  # units
-SUMS_ASIDE = llvmlite.binding.get_host_cpu_name().startswith("znver")
-"""Whether additions have units of their own, so that beside as many multiplications they cost nothing: AMD's Zen."""
 ALWAYS = -1000.0  # when constants are known
+UNITS = 2  # that start a multiplication each cycle, and as many for additions, on current x86-64 cores
 MOST_CHAINS = 3  # sums are split into up to so many chains, added at their ends
-
-NAME = re.compile(r"[A-Za-z_]\w*")
+FEW_TERMS = 8  # of a polynomial, of which more ways to split it are tried
+MOST_FORMS = 1000  # of sums and parts of them; after so many the next ones are split in one way only
 
 _Item = tuple[float, str]  # when a value is known, and its name or literal
-FEW_TERMS = 8  # of which more ways to split them are tried
-MOST_FORMS = 1000  # of sums and parts of them; after so many the next ones are split in one way only
-UNITS = 2  # that start a multiplication each cycle, and as many for additions, on current x86-64 cores
-TURNS, SETTLED = 24, 8  # simulated, and left out at the beginning
-
-
-class Operation(NamedTuple):
-    """A value that is computed: from which others, how many cycles after them, on which units and for how long."""
-
-    name: str
-    operands: tuple[str, ...]
-    latency: float
-    unit: str
-    occupied: int = 1
 
 
 class Schedule:
@@ -70,10 +51,8 @@ class Schedule:
     ----------
     early, lines : list of str
         The assignments: of what is known always, and of the rest.
-    operations : float
-        Of the rest, in a batch, in units of an addition; see `SUMS_ASIDE`.
-    steps : list of Operation
-        The rest.
+    busy : dict of str to float
+        How long the rest occupies units of each kind, in cycles of one unit.
     """
 
     def __init__(
@@ -85,8 +64,7 @@ class Schedule:
     ) -> None:
         self.early: list[str] = []
         self.lines: list[str] = []
-        self._occupied = {SUMS: 0.0, PRODUCTS: 0.0}
-        self.steps: list[Operation] = []
+        self.busy = {SUMS: 0.0, PRODUCTS: 0.0, DIVISIONS: 0.0}
         self.ready: dict[str, float] = {symbol.name: time for symbol, time in known.items()}
         self._printed, self._prefix = printed, prefix
         self._fused = "{2} + {0}*{1}" if fused is None else fused + "({0}, {1}, {2})"
@@ -95,7 +73,12 @@ class Schedule:
 
     @property
     def operations(self) -> float:
-        return max(self._occupied.values()) if SUMS_ASIDE else sum(self._occupied.values())
+        """The cost of the lines in a batch, in units of an addition."""
+        return sum(self.busy.values())
+
+    def cycles(self, results: Iterable[str]) -> float:
+        """The cost of the lines in one trajectory: the time that these results wait, or that units are busy."""
+        return max([*(self.ready.get(name, ALWAYS) for name in results), *(n / UNITS for n in self.busy.values())])
 
     def define(self, symbol: sp.Symbol, expression: sp.Expr) -> None:
         """Let the symbol, of a common subexpression, stand for the value of the expression."""
@@ -212,10 +195,7 @@ class Schedule:
             self._names[text] = name
             self.ready[name] = start + latency if start > ALWAYS else ALWAYS
             if start > ALWAYS:  # the compiler takes the rest out of loops over lanes
-                occupied = THROUGHPUT.get(latency, 1.0)
-                self._occupied[SUMS if unit == SUMS else PRODUCTS] += occupied
-                operands = tuple(x for x in NAME.findall(text) if x in self.ready)
-                self.steps.append(Operation(name, operands, latency, unit, int(occupied)))
+                self.busy[unit] += THROUGHPUT.get(latency, 1.0)
         name = self._names[text]
         return self.ready[name], name
 
@@ -254,35 +234,6 @@ def _chains(items: Sequence[tuple[float, tuple[_Item, ...]]], n: int) -> tuple[f
     return ends[0], chains
 
 
-def cycles_per_turn(operations: Sequence[Operation], carried: Mapping[str, str]) -> float:
-    """Cycles from one turn of a loop to the next, once they repeat.
-
-    Parameters
-    ----------
-    operations : sequence of Operation
-        Of one turn, as the program has them: of two that could start, the one that comes first does.
-    carried : mapping
-        Of the arguments of a turn, the names of the values of the turn before that they take. Whatever is neither an
-        argument nor computed is known always.
-    """
-    known = dict.fromkeys(carried, 0.0)
-    busy: dict[str, Counter[int]] = {}
-    ends = []
-    for _ in range(TURNS):
-        values = dict(known)
-        for name, operands, latency, unit, occupied in operations:
-            start = int(max((values[x] for x in operands if x in values), default=0))
-            taken = busy.setdefault(unit, Counter())
-            while taken[start] >= UNITS:
-                start += 1
-            for cycle in range(start, start + occupied):
-                taken[cycle] += 1
-            values[name] = start + latency
-        known = {argument: values.get(name, 0.0) for argument, name in carried.items()}
-        ends.append(max(known.values()))
-    return (ends[-1] - ends[SETTLED - 1]) / (TURNS - SETTLED)
-
-
 # polynomials in the form that is known soonest: nested, what is known late taken in last -------------------------
 
 _Powers = tuple[int, ...]
@@ -312,7 +263,7 @@ def nested(first: sp.Symbol, terms: Iterable[sp.Expr], known: dict[sp.Symbol, fl
     known : dict of Symbol to float
         When `first` and the arguments are known, in cycles; what is not in it is a coefficient, known always.
     last : bool
-        Which of equally good forms: the first found, or the last. They share different products with other sums.
+        Take the last of equally good forms, not the first. They share different products with other sums.
     """
     x = [symbol for symbol in known if symbol != first]
     coefficients: list[sp.Expr] = []

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
-from sympflow.kernels.protocol import Run, Steps
+from sympflow.kernels.protocol import Kernel, Run, Steps
 from sympflow.kernels.stages import StageTable, kicks_of, lanes_source, run_table, stages_source, step_table
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 
@@ -130,7 +130,7 @@ class SplittingLoops:
         return out
 
 
-class SplittingKernel:
+class SplittingKernel(Kernel):
     """The compiled loops of one scheme on one system, a `Kernel`: see `SplittingLoops.kernel`."""
 
     saves_finite = True

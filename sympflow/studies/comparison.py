@@ -22,7 +22,7 @@ from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
 from sympflow.solver import check_y0, solve
 from sympflow.studies import attempts
-from sympflow.studies.attempts import Attempt, Metric, Row, candidates, interleaved, tolerance_of
+from sympflow.studies.attempts import Attempt, Candidate, Metric, Row, candidates, interleaved, tolerance_of
 from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table, title
 
 if TYPE_CHECKING:
@@ -226,8 +226,10 @@ def _match(
     """Tune every method that can be to the first one that ran and has the figure."""
 
     def figure(integrator: Any) -> float:
-        sol = run(integrator)
-        if not sol.success:
+        trial = Attempt(Candidate("", "", integrator), Row(system.name, "", ""))
+        trial.run(run)
+        sol = trial.sol
+        if sol is None or not sol.success:
             return math.inf
         if what == "energy_error":
             return float(np.median(max_energy_error(sol)))

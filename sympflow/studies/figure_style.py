@@ -123,6 +123,13 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
     return path
 
 
+def saved(figure: Figure, path: str | os.PathLike[str] | None) -> Figure:
+    """The figure, which is also saved where a path is given."""
+    if path is not None:
+        save(figure, path)
+    return figure
+
+
 def dress(ax: Axes, x_label: str, y_label: str) -> None:
     """Labels, grid and frame, the same in every panel."""
     ax.set_xlabel(x_label, fontsize=9, color=TEXT)

@@ -19,6 +19,7 @@ from sympflow.integrators.base import Integrator
 from sympflow.integrators.registry import build, check_applies, name_of
 from sympflow.solver import check_y0
 from sympflow.studies.crossings import Plane, crossings
+from sympflow.studies.figure_style import saved
 from sympflow.studies.reports import Column, Report, described, text_table, title
 
 if TYPE_CHECKING:
@@ -241,12 +242,7 @@ class PoincareSection(Report):
         self, x: int | str | None = None, y: int | str | None = None, path: str | os.PathLike[str] | None = None
     ) -> Figure:
         """The figure, as `figure`; with a path it is also saved."""
-        figure = self.figure(x, y)
-        if path is not None:
-            from sympflow.studies.figure_style import save
-
-            save(figure, path)
-        return figure
+        return saved(self.figure(x, y), path)
 
 
 def names(ndof: int) -> list[str]:

@@ -23,6 +23,7 @@ from sympflow.solution import Solution
 from sympflow.solver import check_y0, solve
 from sympflow.studies import attempts
 from sympflow.studies.attempts import Attempt, Candidate, Row, candidates, interleaved, tolerance_of
+from sympflow.studies.figure_style import saved
 from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table, title
 
 if TYPE_CHECKING:
@@ -391,12 +392,7 @@ class WorkPrecision(Report):
 
     def plot(self, path: str | os.PathLike[str] | None = None, measure: str = "energy_error") -> Figure:
         """The figure, as `figure`; with a path it is also saved."""
-        from sympflow.studies.figure_style import save
-
-        figure = self.figure(measure)
-        if path is not None:
-            save(figure, path)
-        return figure
+        return saved(self.figure(measure), path)
 
 
 def _size(n: int) -> str:

@@ -23,7 +23,8 @@ from sympflow.metrics.symplectic import symplecticity_defect, volume_error
 from sympflow.solution import Solution
 from sympflow.solver import check_y0, solve
 from sympflow.studies import attempts
-from sympflow.studies.attempts import REFUSALS, Attempt, Candidate, Metric, Row, candidates
+from sympflow.studies.attempts import Attempt, Candidate, Metric, Row, candidates
+from sympflow.studies.figure_style import saved
 from sympflow.studies.reports import Column, Report, described, number, plain, records, text_table, title
 
 if TYPE_CHECKING:
@@ -198,7 +199,7 @@ class Study:
             return None
         try:
             return asked.resolved(self.system, self.starts[0], abs(self.t_span[1] - self.t_span[0]))
-        except REFUSALS:  # the rows say so
+        except Exception:  # the rows say why
             return asked
 
     @property
@@ -221,7 +222,7 @@ class Study:
             return [*asked]
         try:
             own = self.integrator.step_length(self.system)
-        except ValueError:  # there is no flow: the row says so
+        except Exception:  # there is no flow, most likely: the row says so
             return [self.system.dt]
         if asked is not None:
             return [*asked]
@@ -241,8 +242,7 @@ class Study:
     def runs(self, integrator: Any, h: float | None, span: tuple[float, float]) -> list[Solution]:
         """Solutions that hold every step, or equally many of them, of each state."""
         y0 = self.starts
-        together = isinstance(integrator, FixedStep) and integrator.on_grid
-        together &= not (self.compiled and len(y0) <= FEW_STARTS)
+        together = integrator.on_grid and not (self.compiled and len(y0) <= FEW_STARTS)
         width = y0.size if together else y0.shape[1]
         most = min(MOST_OUTPUTS, MAX_SAVED_VALUES // (2 * width))
         every = 1 if h is None else max(1, math.ceil(abs(span[1] - span[0]) / h / most))
@@ -422,15 +422,14 @@ def blow_up(sol: Solution, i: int = 0) -> BlowUp:
 
 
 def _growth(sol: Solution, y0: np.ndarray, failed_at: float) -> float | None:
-    if not (isinstance(sol.integrator, FixedStep) and sol.integrator.on_grid):
+    if not sol.integrator.on_grid:
         return None
     t0, h = sol.t_span[0], np.copysign(sol.stats["dt"], sol.t_span[1] - sol.t_span[0])
     n = int(np.rint((failed_at - t0) / h))
     if n < 1:
         return 1.0
     times = np.clip(t0 + h * np.arange(max(0, n - TAIL), n + 1), min(t0, failed_at), max(t0, failed_at))
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with _quiet():
         tail = solve(sol.system, sol.integrator, (t0, failed_at), y0, t_eval=times, on_domain_exit="ignore").y
         change = np.diff(np.log(np.abs(tail).max(0)))
     return float(np.exp(np.median(change))) if len(change) and np.isfinite(change).all() else 1.0
@@ -647,12 +646,7 @@ class StabilityReport(Report):
 
     def plot(self, path: str | os.PathLike[str] | None = None, kind: str | None = None) -> Figure:
         """The figure, as `figure`; with a path it is also saved."""
-        figure = self.figure(kind)
-        if path is not None:
-            from sympflow.studies.figure_style import save
-
-            save(figure, path)
-        return figure
+        return saved(self.figure(kind), path)
 
     def _limit_columns(self) -> list[Column]:
         return [

@@ -23,37 +23,14 @@ from sympflow.training.runs import INTERRUPTED, OUT_OF_TIME, Advance, Run
 from sympflow.training.session import Session
 
 
-class Validation:
-    """Held-out points and reference steps of one run."""
-
-    def __init__(
-        self, system: HamiltonianSystem, loss: Loss, points: Points, x: np.ndarray, dt: float, flow: FlowMap
-    ) -> None:
-        self.loss, self.points, self.dt = loss, points, dt
-        y = reference_step(system, x, dt)
-        exists = np.isfinite(y).all(-1)
-        self.x, self.y = (torch.as_tensor(a[exists], dtype=flow.dtype, device=flow.device) for a in (x, y))
-
-    @torch.no_grad()
-    def __call__(self, flow: FlowMap) -> dict[str, float]:
-        """Losses on the held-out points; mean and largest ‖ψ̄_Δt(x) − φ_H,Δt(x)‖ over the held-out states."""
-        terms = self.loss.terms(flow, self.points)
-        figures = {"loss": float(self.loss.total(terms))}
-        for name, term in zip(("residual_loss", "matching_loss", "label_loss"), terms, strict=True):
-            if term is not None:
-                figures[name] = float(term)
-        if len(self.x):
-            error = torch.linalg.vector_norm(flow.psi(self.dt, self.x) - self.y, dim=-1)
-            figures |= {"one_step_error": float(error.mean()), "one_step_error_max": float(error.max())}
-        return figures
-
-
 @dataclass
 class LossRun(Run):
     """The state of such a fit, and what acts on it.
 
     Attributes
     ----------
+    held_out, reference
+        Points of the losses that are never trained on; states, and where the exact flow takes them in Δt.
     step : int
         Steps taken.
     best : dict
@@ -63,8 +40,9 @@ class LossRun(Run):
     scaling: Scaling
     options: LossOptions
     loss: Loss
-    validation: Validation
     source: PointSource
+    held_out: Points
+    reference: tuple[Tensor, Tensor]
     optimizer: Optimizer
     step: int = 0
     best: dict[str, Tensor] = field(default_factory=dict)
@@ -94,10 +72,12 @@ class LossRun(Run):
         streams = (Stream.VALIDATION, Stream.VALIDATION)
         held_out = PointSource(
             domain, flow.dt, options.validation_points, *common, streams=streams, block=1, labels=unseen
-        )
-        x = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
-        validation = Validation(system, loss, held_out(0), x, flow.dt, flow)
-        return cls(flow, system, domain, scaling, options, loss, validation, source, optimizer(flow, options))
+        )(0)
+        start = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
+        end = reference_step(system, start, flow.dt)
+        exists = np.isfinite(end).all(-1)
+        x, y = (torch.as_tensor(a[exists], dtype=flow.dtype, device=flow.device) for a in (start, end))
+        return cls(flow, system, domain, scaling, options, loss, source, held_out, (x, y), optimizer(flow, options))
 
     @property
     def done(self) -> int:
@@ -161,10 +141,24 @@ class LossRun(Run):
         self.step = state["step"]
 
     def _validate(self) -> dict[str, float]:
-        figures = {"step": self.step, **self.validation(self.flow)}
+        figures = {"step": self.step, **self._figures()}
         if math.isfinite(figures["loss"]) and figures["loss"] < min(self._losses(), default=math.inf):
             self.best = {name: value.detach().clone() for name, value in self.flow.state_dict().items()}
         self.history.append(figures)
+        return figures
+
+    @torch.no_grad()
+    def _figures(self) -> dict[str, float]:
+        """Losses on the held-out points; mean and largest ‖ψ̄_Δt(x) − φ_H,Δt(x)‖ over the held-out states."""
+        terms = self.loss.terms(self.flow, self.held_out)
+        figures = {"loss": float(self.loss.total(terms))}
+        for name, term in zip(("residual_loss", "matching_loss", "label_loss"), terms, strict=True):
+            if term is not None:
+                figures[name] = float(term)
+        x, y = self.reference
+        if len(x):
+            error = torch.linalg.vector_norm(self.flow.psi(self.flow.dt, x) - y, dim=-1)
+            figures |= {"one_step_error": float(error.mean()), "one_step_error_max": float(error.max())}
         return figures
 
     def _losses(self) -> list[float]:

@@ -132,6 +132,10 @@ def test_energy_slack_widens_an_energy_domain():
     just_outside = np.array([1.7 * np.sqrt(1 + 1e-3), 0.0])
     assert not domain.contains(just_outside)
     assert domain.contains(just_outside, slack=2e-3 * domain.energy)
+    shell = EnergySublevel(domain.energy, domain.box, domain.hamiltonian, above=0.5)
+    just_below = np.array([np.sqrt(1 - 1e-3), 0.0])
+    assert not shell.contains(just_below)
+    assert shell.contains(just_below, slack=1e-3)
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=lambda d: type(d).__name__)

@@ -144,13 +144,12 @@ def test_the_transformed_functions_are_the_derivatives_of_each_other():
 def test_one_compiled_pass_makes_what_the_run_by_chunks_makes(method, t_end, clocked):
     kepler = systems.kepler()
     integrator = LogSympFlow(flow=clocked, shift=0.0, dt=0.3) if method == "clocked" else get(method)(dt=0.3)
-    many = kepler.domain.sample(
-        150, 2
-    )  # more than the lanes of a block, of energies that take different numbers of steps
+    clock = integrator.on_clock(kepler)
+    many = kepler.domain.sample(150, 2)  # more than the lanes of a block, of energies of different numbers of steps
     few, dense = np.array([0.0, 0.0, t_end]), np.linspace(0.0, t_end, 301)
     for y0, times in ((many[0], few), (many[0], dense), (many, few), (many[:70], dense[:50]), (many[:1], None)):
         problem = Problem(kepler, 0.0, t_end, y0, times)
-        made, expected = timed_pass(integrator, problem), PhysicalRun(integrator, problem).outcome()
+        made, expected = timed_pass(clock, problem), PhysicalRun(clock, problem).outcome()
         assert made.y.shape == expected.y.shape
         np.testing.assert_array_equal(made.t, expected.t)
         # rounding enters at each of about 140 steps, and moves the phase linearly in time
@@ -164,9 +163,9 @@ def test_the_compiled_pass_leaves_to_the_run_by_chunks_what_does_not_end():
     system, integrator, end = systems.henon_heiles(), get("log_leapfrog")(dt=0.2), np.array([10.0])
     staying, escaping = np.array([0.0, 0.0, 0.0, 0.1]), np.array([0.0, 0.0, 0.0, 0.7])
     for y0 in (escaping, np.stack([staying, escaping])):
-        assert timed_pass(integrator, Problem(system, 0.0, 10.0, y0, end)) is None
+        assert timed_pass(integrator.on_clock(system), Problem(system, 0.0, 10.0, y0, end)) is None
         assert (np.asarray(solve(system, integrator, (0, 10), y0, t_eval=end).status) < 0).sum() == 1
-    assert timed_pass(integrator, Problem(system, 0.0, 10.0, staying, end)) is not None
+    assert timed_pass(integrator.on_clock(system), Problem(system, 0.0, 10.0, staying, end)) is not None
 
 
 def test_a_collision_ends_the_run_with_its_time():

@@ -11,7 +11,7 @@ from sympflow import SympFlow, systems
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import printed
 from sympflow.kernels.kicks import _function, _scheduled, shapes
-from sympflow.kernels.scheduling import ADD, FUSED, MULTIPLY, Operation, Schedule, cycles_per_turn, nested
+from sympflow.kernels.scheduling import ADD, FUSED, MULTIPLY, Schedule, nested
 
 SCENES = {
     "henon_heiles": systems.henon_heiles,
@@ -85,15 +85,6 @@ def test_a_sum_begins_with_what_is_known_first():
     assert schedule.operations == 1
 
 
-@pytest.mark.parametrize(("aside", "operations"), [(True, 1), (False, 2)])
-def test_sums_cost_a_batch_nothing_where_they_have_units_of_their_own(monkeypatch, aside, operations):
-    monkeypatch.setattr("sympflow.kernels.scheduling.SUMS_ASIDE", aside)
-    x, y = sp.symbols("x y", real=True)
-    schedule = Schedule({x: 0.0, y: 0.0}, printed)
-    schedule.value(x * (x + y))
-    assert schedule.operations == operations
-
-
 def test_coefficients_wait_for_nothing():
     x, b, g = sp.symbols("x b g", real=True)
     schedule = Schedule({x: 0.0}, printed)
@@ -123,20 +114,19 @@ def test_nested_forms_end_with_what_is_known_last():
     assert Schedule({p: -FUSED, x: 50.0, y: 0.0}, printed).value(late)[0] == 50.0 + FUSED
 
 
-def test_a_loop_takes_its_slowest_circle():
-    """x waits for a chain of 4 + 3 cycles of its own, y only for the last value of x."""
-    chain = [Operation("a", ("x",), 4.0, "products"), Operation("b", ("a",), 3.0, "sums")]
-    assert cycles_per_turn(chain, {"x": "b"}) == 7.0
-    aside = [*chain, Operation("c", ("y", "x"), 4.0, "products")]
-    assert cycles_per_turn(aside, {"x": "b", "y": "c"}) == 7.0
-
-
-def test_a_loop_of_many_operations_waits_for_units():
-    """Two products start in each cycle: 20 that need nothing take ten."""
-    many = [Operation(f"a{i}", ("c",), 4.0, "products") for i in range(20)]
-    assert cycles_per_turn([*many, Operation("b", ("x", "a19"), 4.0, "products")], {"x": "b"}) == 10.5
-    divisions = [Operation(f"a{i}", (), 13.0, "divisions", 10) for i in range(4)]
-    assert cycles_per_turn([*divisions, Operation("b", ("x", "a3"), 3.0, "sums")], {"x": "b"}) == 20.0
+def test_one_trajectory_waits_for_the_longest_chain_or_for_units():
+    """Two products start in each cycle: a chain of three takes as long as 18 of them beside one another."""
+    x, y = sp.symbols("x y", real=True)
+    schedule = Schedule({x: 0.0, y: 0.0}, printed)
+    results = [schedule.value(x**8)[1]]
+    assert schedule.cycles(results) == 3 * MULTIPLY
+    assert schedule.operations == 3
+    results += [schedule.value(sp.Mul(n, y, evaluate=False))[1] for n in range(2, 22)]
+    assert schedule.cycles(results) == 23 / 2
+    schedule.value(1 / x)
+    schedule.value(1 / y)
+    schedule.value(1 / (x + y))
+    assert schedule.cycles(results) == 15.0
 
 
 def test_the_flow_steps_every_row_by_its_own_time():

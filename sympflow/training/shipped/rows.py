@@ -129,24 +129,13 @@ def along_the_orbit(system: HamiltonianSystem, n: int = 10, span: float = 1e5 * 
 
 def stiff() -> list[Recipe]:
     """SympFlows of the exact flows of the parts of stiff systems."""
+    polar = partial(spring_pendulum, 1e6, coordinates="polar")
     return [
+        _stiff("fput_50", partial(fput, omega=50.0), Split(10.0, 6, 10, (0, 5)), 24, partial(low_energies, omega=50.0)),
         _stiff(
-            "fput_50",
-            _fput_50,
-            Split(10.0, 6, 10, (0, 5)),
-            NewFit(label_times=24, frozen_weight=3.0),
-            partial(low_energies, omega=50.0),
+            "fput_1000", partial(fput, omega=1000.0), Split(20.0, 4, 16, False), 40, partial(low_energies, omega=1000.0)
         ),
-        _stiff(
-            "fput_1000",
-            _fput_1000,
-            Split(20.0, 4, 16, False),
-            NewFit(label_times=40, frozen_weight=3.0),
-            partial(low_energies, omega=1000.0),
-        ),
-        _stiff(
-            "spring_pendulum_1e6", _spring_pendulum, Split(10.0, 1, 8), NewFit(label_times=20, frozen_weight=3.0), _own
-        ),
+        _stiff("spring_pendulum_1e6", polar, Split(10.0, 1, 8), 20, own_domain),
     ]
 
 
@@ -154,25 +143,15 @@ def _stiff(
     scene: str,
     system: Callable[[], HamiltonianSystem],
     start: Split,
-    fit: NewFit,
+    label_times: int,
     domain: Callable[[HamiltonianSystem], Domain],
 ) -> Recipe:
+    fit = NewFit(label_times=label_times, frozen_weight=3.0)
     return Recipe(scene, "sympflow", system, start, OfStiff(domain), (fit,), domain)
 
 
-def _fput_50() -> HamiltonianSystem:
-    return fput(omega=50.0)
-
-
-def _fput_1000() -> HamiltonianSystem:
-    return fput(omega=1000.0)
-
-
-def _spring_pendulum() -> HamiltonianSystem:
-    return spring_pendulum(1e6, coordinates="polar")
-
-
-def _own(system: HamiltonianSystem) -> Domain:
+def own_domain(system: HamiltonianSystem) -> Domain:
+    """The domain of the system itself."""
     assert system.domain is not None
     return system.domain
 
@@ -251,4 +230,4 @@ def _well() -> np.ndarray:
 
 def _swing() -> np.ndarray:
     """States of the pendulum's own domain."""
-    return _own(pendulum()).sample(100, 0)
+    return own_domain(pendulum()).sample(100, 0)

@@ -1,0 +1,85 @@
+"""A method is a scheme × a splitting × a clock: the rows of the table, and triples that a user writes himself."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from sympflow import available, get, reference_error, solve, systems
+from sympflow.integrators.compositions import SPLITTINGS
+from sympflow.integrators.methods import TRIPLES
+from sympflow.integrators.splitting import CLOCKS
+from sympflow.schemes import SCHEMES
+
+FPUT, PENDULUM, KEPLER = systems.fput(m=2, omega=20.0), systems.spring_pendulum(), systems.kepler(0.3)
+
+
+@pytest.mark.parametrize("name", TRIPLES)
+def test_every_row_is_a_scheme_a_splitting_and_a_clock_of_the_tables(name):
+    row, method = TRIPLES[name], get(name)()
+    assert name in available()
+    assert (row.scheme in SCHEMES, row.splitting in SPLITTINGS, row.clock in CLOCKS) == (True, True, True)
+    assert (method.name, method.order) == (name, SCHEMES[row.scheme].order)
+    assert (method.splitting, method.clock) == (row.splitting, row.clock)
+    assert method.source
+    assert method.on_grid == method.finds_events == (row.clock == "physical")
+    assert pickle.loads(pickle.dumps(method)) == method
+
+
+@pytest.mark.parametrize(
+    ("system", "name", "triple"),
+    [
+        (FPUT, "impulse", ("verlet", {"splitting": "linear"})),
+        (FPUT, "mollified_impulse", ("verlet", {"splitting": "mollified"})),
+        (FPUT, "implicit_explicit", ("verlet", {"splitting": "midpoint"})),
+        (FPUT, "linear_srkn6b", ("srkn6b", {"splitting": "linear"})),
+        (PENDULUM, "suzuki4_parts", ("suzuki4", {"splitting": "parts"})),
+        (KEPLER, "log_leapfrog", ("leapfrog", {"clock": "logarithmic"})),
+        (KEPLER, "log_kahan_li8", ("kahan_li8", {"clock": "logarithmic"})),
+    ],
+)
+def test_a_triple_written_out_is_the_method_of_that_name(system, name, triple):
+    scheme, options = triple
+    named = solve(system, name, (0, 2), t_eval=[0.7, 2.0])
+    written = solve(system, scheme, (0, 2), t_eval=[0.7, 2.0], **options)
+    np.testing.assert_array_equal(written.y, named.y)
+    assert named.stats["force_evaluations"] == written.stats["force_evaluations"]
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.05])
+def test_a_triple_without_a_name_has_the_order_of_its_scheme(dt):
+    """Kahan–Li 8 with the exact linear flow is no row of the table: its error falls by 2⁸ where it is not rounding."""
+    errors = [reference_error(solve(FPUT, get("kahan_li8")(dt=h, splitting="linear"), (0, 2))) for h in (dt, dt / 2)]
+    worst = [float(np.max(e)) for e in errors]
+    assert worst[1] < max(worst[0] / 2**7, 1e-12)
+
+
+def test_the_array_form_of_a_written_triple_is_the_compiled_one():
+    method = get("kahan_li8")(dt=0.1, splitting="linear")
+    arrays, compiled = (solve(FPUT, method, (0, 2), backend=backend) for backend in ("array", "compiled"))
+    np.testing.assert_allclose(arrays.y, compiled.y, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"splitting": "linear", "clock": "logarithmic"}, r"^`clock` 'logarithmic' needs the splitting 'kinetic'"),
+        ({"splitting": "linear"}, r"^`system` 'kepler' has no"),
+        ({"splitting": "oblique"}, r"^`splitting` must be one of 'kinetic', 'linear', .*; got 'oblique'"),
+        ({"clock": ["physical"]}, r"^`clock` must be one of 'physical', 'logarithmic'; got \['physical'\]"),
+        ({"shift": 1.0}, r"^`shift` is for the clock 'logarithmic'"),
+        ({"parts": ["p**2/2"]}, r"^`parts` are for the splitting 'parts'"),
+        ({"splitting": "parts", "compensated": True}, r"^`compensated` sums are for the splitting 'kinetic'"),
+    ],
+)
+def test_a_triple_without_meaning_is_a_value_error(options, message):
+    with pytest.raises(ValueError, match=message):
+        solve(KEPLER, "kahan_li8", (0, 1), **options)
+
+
+def test_strang_steps_are_what_parts_compose():
+    with pytest.raises(ValueError, match=r"^`splitting` 'parts' composes Strang steps, .* 'blanes_moan4' is not made"):
+        solve(PENDULUM, "blanes_moan4", (0, 1), splitting="parts")
+    for name in ("verlet", "leapfrog", "suzuki4", "kahan_li6", "kahan_li8", "yoshida4"):
+        assert sum(SCHEMES[name].strang_weights) == pytest.approx(1.0, abs=1e-14)
+    assert SCHEMES["srkn11b"].strang_weights is None
