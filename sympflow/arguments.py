@@ -16,7 +16,7 @@ from sympflow.arrays import is_tensor, to_numpy
 
 MAX_SAVED_VALUES = 10_000_000
 MAX_ASKED_VALUES = 1_000_000_000
-"""Of a batch, or of outputs that were asked for one by one: 8 GB."""
+"""Values of a batch, or of outputs that were asked for one by one: 8 GB."""
 LONGEST_STEP = 1e100
 """Beyond it the powers of dt in a step are no floating-point numbers."""
 _FLOAT64 = np.dtype(np.float64)
@@ -86,7 +86,7 @@ def check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
 
 
 def _proper(times: np.ndarray, t0: float, t1: float) -> bool:
-    """Whether times lie between t0 and t1, in this order."""
+    """True if times lie between t0 and t1, in this order."""
     first, last = float(times[0]), float(times[-1])
     if not (t0 <= first <= last <= t1 if t0 <= t1 else t0 >= first >= last >= t1):
         return False
@@ -206,7 +206,7 @@ def writable(path: Any) -> Path:
 
 @contextmanager
 def naming_path(path: Path) -> Iterator[None]:
-    """What the system refuses about a file as a ValueError that names the argument."""
+    """Turn an error of the operating system about a file into a ValueError that names the argument."""
     try:
         yield
     except OSError as error:

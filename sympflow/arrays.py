@@ -17,7 +17,7 @@ Array = Any
 
 
 def is_tensor(x: object) -> bool:
-    """Whether `x` is a torch tensor, decided without importing torch."""
+    """Return True for a torch tensor, decided without importing torch."""
     kind = type(x)
     return kind is not np.ndarray and kind.__module__.partition(".")[0] == "torch" and hasattr(x, "requires_grad")
 
@@ -53,7 +53,7 @@ def assemble(values: Sequence[Any], like: Array) -> Array:
 
 
 def is_number(x: object) -> bool:
-    """Whether `x` is a Python scalar rather than an array (generated code returns these for constants)."""
+    """Return True for a Python scalar rather than an array (generated code returns these for constants)."""
     return isinstance(x, int | float)
 
 
@@ -68,7 +68,7 @@ def to_numpy(x: Array) -> np.ndarray:
 
 
 def all_finite(y: Array) -> Array:
-    """Whether the states y (..., k) are finite: (...) booleans."""
+    """Return True for each of the states y (..., k) that is finite: (...) booleans."""
     if is_tensor(y):
         import torch
 

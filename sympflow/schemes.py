@@ -141,7 +141,7 @@ class Scheme:
 
     @cached_property
     def symmetric(self) -> bool:
-        """Whether the step is its own adjoint, Φ(−h) = Φ(h)⁻¹ (the coefficients read the same backwards)."""
+        """True if the step is its own adjoint, Φ(−h) = Φ(h)⁻¹ (the coefficients read the same backwards)."""
         forwards, backwards = self.substeps, self.substeps[::-1]
         return len(forwards) > 0 and all(
             one.kind == other.kind
@@ -151,12 +151,12 @@ class Scheme:
 
     @cached_property
     def first_same_as_last(self) -> bool:
-        """Whether a step ends with the kind of map that it begins with, so that successive steps share it."""
+        """True if a step ends with the kind of map that it begins with, so that successive steps share it."""
         return len(self.substeps) > 1 and self.substeps[0][0] == self.substeps[-1][0]
 
     @cached_property
     def level(self) -> int:
-        """What the kicks have: 0 the force alone, `FORCE_GRADIENT`, or `CURVATURE` terms as well, or a `POLYNOMIAL`."""
+        """The terms of kicks: 0 for the force alone, `FORCE_GRADIENT`, `CURVATURE` terms as well, or a `POLYNOMIAL`."""
         if self.polynomials:
             return POLYNOMIAL
         return CURVATURE if any(self.curvatures) else FORCE_GRADIENT if any(self.gradients) else 0
@@ -500,5 +500,5 @@ def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int,
 
 @lru_cache(maxsize=256)
 def _kicks(scheme: Scheme) -> tuple[tuple[bool, bool], ...]:
-    """Whether each of its kicks has a Hessian, and a curvature term."""
+    """For each of its kicks, True if it has a Hessian, and True if it has a curvature term."""
     return tuple((s.three != 0 or s.five != 0, s.five != 0) for s in scheme.substeps if s.kind == "kick")

@@ -70,7 +70,7 @@ class Solution:
 
     @property
     def success(self) -> bool:
-        """Whether every trajectory reached the end (or an event that ends it)."""
+        """True if every trajectory reached the end (or an event that ends it)."""
         return bool(np.all(np.asarray(self.status) >= 0))
 
     @property

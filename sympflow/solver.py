@@ -159,7 +159,7 @@ def _time_last(y: np.ndarray) -> np.ndarray:
 
 
 def _fits(outcome: Outcome, y0: Array) -> bool:
-    """Whether status, t and y are what they must be."""
+    """True if status, t and y have the types and shapes that they must have."""
     t, y, status = outcome.t, outcome.y, outcome.status
     if type(t) is type(y) is np.ndarray and type(status) is int:
         return t.ndim == 1 and y.shape == (t.size, *y0.shape)

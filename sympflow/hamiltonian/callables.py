@@ -183,7 +183,7 @@ def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[in
 
 
 def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
-    """What the user's function returned for x: real numbers of the right shape, in the library and dtype of x."""
+    """Return the user's result for x, checked: real numbers of the right shape, in the library and dtype of x."""
     expected = (*x.shape[:-1], *tail)
     if isinstance(value, int | float) and not is_tensor(x):
         value = np.asarray(value)

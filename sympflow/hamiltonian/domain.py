@@ -22,7 +22,7 @@ class Domain(Protocol):
         """Draw `n` states uniformly: (n, 2d)."""
 
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
-        """Whether the states x (..., 2d) lie in Ω: (...) booleans. `slack` widens an energy bound."""
+        """Return True for each state x (..., 2d) that lies in Ω: (...) booleans. `slack` widens an energy bound."""
 
     def to_dict(self) -> dict[str, Any]:
         """A description that `domain_from_dict` turns back into the domain."""
@@ -179,7 +179,7 @@ class EnergySublevel:
         return attached
 
     def _within(self, x: np.ndarray, slack: float) -> np.ndarray:
-        """Whether the energy, and the angular momentum if it is bounded, are within their bounds."""
+        """True where the energy, and the angular momentum if it is bounded, are within their bounds."""
         if self.hamiltonian is None:
             raise ValueError(
                 "`hamiltonian` is not known to this EnergySublevel: pass the domain to a HamiltonianSystem, "

@@ -23,7 +23,7 @@ def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
 
 
 def same_system(a: Sequence[float], b: Sequence[float]) -> bool:
-    """Whether two fingerprints agree to nine digits of the largest."""
+    """Return True if two fingerprints agree to nine digits of the largest."""
     return a == b or _agree(tuple(a), tuple(b))
 
 

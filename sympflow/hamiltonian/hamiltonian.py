@@ -228,7 +228,7 @@ def third_derivative(system: Hamiltonian, q: Array, v: Array, w: Array) -> Array
 
 
 def derivative(f: Callable[[Array], Array], q: Array, along: Array, h: Array) -> Array:
-    """That of f at q along unit vectors, by the central difference of order 4 with steps h (..., 1)."""
+    """The derivative of f at q along unit vectors, by the central difference of order 4 with steps h (..., 1)."""
     near = f(q + h * along) - f(q - h * along)
     far = f(q + 2 * h * along) - f(q - 2 * h * along)
     return (8 * near - far) / (12 * h)

@@ -118,7 +118,7 @@ class LinearPart:
 
     @cached_property
     def kinds(self) -> tuple[str, ...]:
-        """Of each mode: "oscillator", "hyperbolic", "free" or "idle"."""
+        """The kind of each mode: "oscillator", "hyperbolic", "free" or "idle"."""
         names = {1.0: "oscillator", -1.0: "hyperbolic", 0.0: "free"}
         return tuple("idle" if np.isnan(s) else names[float(np.sign(s))] for s in self.squared_frequencies)
 

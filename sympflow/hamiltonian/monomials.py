@@ -24,7 +24,7 @@ Monomials = tuple[tuple[int, ...], ...]
 
 
 def monomials(symbols: SymbolicHamiltonian, degree: int) -> Monomials:
-    """Those up to a total degree that a kick of a trained flow can make use of, H being ½ pᵀM⁻¹p + V(q).
+    """Return the monomials up to a total degree that a kick of a trained flow can use, for H = ½ pᵀM⁻¹p + V(q).
 
     The flows that kicks and drifts compose to are, by the formula of Baker, Campbell and Hausdorff, those of T, V and
     their commutators. Of these the ones that are potentials again are V, |∇V|²_{M⁻¹}, and whatever products ∇fᵀM⁻¹∇g of
@@ -50,7 +50,7 @@ def monomials(symbols: SymbolicHamiltonian, degree: int) -> Monomials:
 
 
 def _generated(symbols: SymbolicHamiltonian, degree: int) -> set[tuple[int, ...]]:
-    """Those of V, and of products ∇fᵀM⁻¹∇g, until there are no more up to the degree, or too many."""
+    """The monomials of V, and of products ∇fᵀM⁻¹∇g, until there are no more up to the degree, or too many."""
     import sympy as sp
 
     M = symbols.inverse_mass
@@ -74,7 +74,7 @@ def _product(f: Sequence[int], g: Sequence[int], i: int, j: int) -> tuple[int, .
 
 
 def _as_even(symbols: SymbolicHamiltonian, degree: int) -> list[tuple[int, ...]]:
-    """Those that are as even as V."""
+    """The monomials that are as even as V."""
     mirrored = [signs for signs in _signs(symbols.ndof) if _is_even(symbols, signs)]
     all_of_them = itertools.product(range(degree + 1), repeat=symbols.ndof)
     return [m for m in all_of_them if 1 <= sum(m) <= degree and all(_sign(signs, m) == 1 for signs in mirrored)]

@@ -62,7 +62,7 @@ class PartFunctions(SymbolicHamiltonian):
 
     @property
     def of_positions(self) -> bool:
-        """Whether it is a potential, H_k(q)."""
+        """True for a potential, H_k(q)."""
         return not self.H.has(*self.p)
 
     def hessian_vector(self, y: Array, v: Array) -> Array:
@@ -212,7 +212,7 @@ class ExactParts:
 
     @cached_property
     def has_force_gradient(self) -> bool:
-        """Whether kicks may carry force gradients: every momentum must enter by the linear part."""
+        """True if kicks may carry force gradients: every momentum must enter by the linear part."""
         return (
             self.linear is not None
             and "idle" not in self.linear.kinds
@@ -302,7 +302,7 @@ def _reduced(theta: Array, low: Any, module: Any) -> tuple[Array, Array]:
 
 
 def _low(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> np.ndarray:
-    """What rounding took from the product a·b, exactly [Dekker 1971]; 0 where it overflows, or in float32."""
+    """The part that rounding took from the product a·b, exactly [Dekker 1971]; 0 where it overflows, or in float32."""
     if product.dtype != np.float64:
         return np.zeros_like(product)
     with np.errstate(all="ignore"):

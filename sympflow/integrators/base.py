@@ -133,6 +133,8 @@ class Stepper:
 
     compiled: bool = False
     saves_finite: bool = False
+    counts_itself: ClassVar[bool] = False
+    """True if `evaluations` tells those that were made so far, whatever the steps."""
 
     def __init__(self, integrator: FixedStep, problem: Problem) -> None:
         self.integrator, self.system, self.asked = integrator, problem.system, problem.backend

@@ -334,7 +334,7 @@ class PhysicalRun:
         return int(min(max(16, steps if steps < most else most) / self.stride + 1, kept))
 
     def _steps(self, x: np.ndarray, n: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of n steps from the states x (N, 2d + 2) each `stride`-th, (N, 1 + n/stride, 2d + 2), and the last finite."""
+        """Each `stride`-th of n steps from the states x (N, 2d + 2): (N, 1 + n/stride, 2d + 2), and the last finite."""
         alone = len(x) == 1
         found, finite = self.stepper.rollout(x[0] if alone else x, self.h, n, np.arange(0, n + 1, stride))
         self.backend = self.stepper.backend
@@ -452,7 +452,7 @@ class PhysicalRun:
             out[output, row] = projected(self.reach(before, after, target))
 
     def _between(self, x: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of `stride` steps from x (n, 2d + 2), the states before and after the one that passes a time, and which."""
+        """The states before and after the step that passes a time, of `stride` steps from x (n, 2d + 2), and which."""
         states, _ = self._steps(x, self.stride, 1)
         beyond = self.sign * (states[..., self.d] - target[:, None]) >= 0
         k = np.where(beyond.any(1), beyond.argmax(1), self.stride).clip(1) - 1

@@ -37,7 +37,7 @@ _KNOWN: dict[tuple[Any, ...], Any] = {}
 
 
 def known(key: tuple[Any, ...], make: Callable[[], T]) -> T:
-    """What `make` gives, made once in a process for each key: flows that ship are read from their files once."""
+    """Return the result of `make`, made once in a process for each key: files that ship are read once."""
     if key not in _KNOWN:
         _KNOWN[key] = make()
     return _KNOWN[key]

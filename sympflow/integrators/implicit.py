@@ -139,6 +139,7 @@ class _Counts:
 
     gauss: Gauss
     iterations: int
+    counts_itself: ClassVar[bool] = True
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         n = self.iterations * len(self.gauss.tableau[1])

@@ -139,7 +139,7 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
 
 
 def _made(method: Any, make: Callable[[], T]) -> T:
-    """What `make` gives; if it fails in the code of a plug-in, with the name of its distribution."""
+    """Return the result of `make`; a failure in the code of a plug-in names its distribution."""
     try:
         return make()
     except (Exception, SystemExit) as error:
@@ -198,7 +198,7 @@ def _load(point: EntryPoint) -> type[Integrator]:
 
 
 def named(integrator: Integrator | type[Integrator]) -> bool:
-    """Whether the class has the `name` that messages and reports call it by."""
+    """Return True if the class has the `name` that messages and reports call it by."""
     return isinstance(getattr(integrator, "name", None), str)
 
 
@@ -234,7 +234,7 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem) -> None:
 
 
 def name_of(integrator: Integrator) -> str:
-    """What `get` knows the integrator's class by: plug-ins and registered classes may have another `name`."""
+    """Return the name by which `get` knows the class: plug-ins and registered classes may have another `name`."""
     cls = type(integrator)
     if cls in _loaded:
         return _loaded[cls].name

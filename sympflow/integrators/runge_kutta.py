@@ -1,4 +1,4 @@
-"""What the explicit Runge–Kutta methods share: one step and its derivative, from the tableau."""
+"""Explicit Runge–Kutta methods: one step and its derivative, from the tableau."""
 
 from __future__ import annotations
 

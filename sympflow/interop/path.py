@@ -84,7 +84,7 @@ class Path:
         return torch.is_grad_enabled() and (self.y0.requires_grad or self._learns())
 
     def _learns(self) -> bool:
-        """Whether the flow has weights that require gradients."""
+        """True if the flow has weights that require gradients."""
         flow = self.integrator.flow_for(self.system)
         return flow is not None and any(w.requires_grad for w in flow.parameters())
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -192,7 +192,7 @@ class FlowSolver(OdeSolver):
             self._block = min(2 * self._block, LOOK_AHEAD)
             with naming_plugin(self.integrator):
                 states, _ = self._stepper.rollout(self._anchor, self._grid.h, n, np.arange(1, n + 1), self._t_anchor)
-            self._counts.steps += n
+            self._counts.pieces[n] += 1
             self._ahead.extend(states)
         return self._ahead.popleft()
 
@@ -210,15 +210,18 @@ class _Counts:
     """Steps, shorter steps and other evaluations so far; those of the dense outputs of a solver too."""
 
     def __init__(self) -> None:
-        self.steps = self.shorter = self.others = 0
+        self.pieces: Counter[int] = Counter()  # runs of so many steps, each with its own beginning and saved states
+        self.shorter = self.others = 0
         self.stepper: Stepper | None = None
 
     def total(self) -> int:
         """Evaluations of the force."""
-        if self.stepper is None or not (self.steps or self.shorter):
+        if self.stepper is None:
             return self.others
-        made = self.stepper.evaluations(self.steps, self.steps, self.shorter)
-        return self.others + made["force_evaluations"]
+        runs = [(0, 0, self.shorter, 1)]
+        if not self.stepper.counts_itself:
+            runs += [(n, n, 0, times) for n, times in self.pieces.items()]
+        return self.others + sum(times * self.stepper.evaluations(*run)["force_evaluations"] for *run, times in runs)
 
 
 class FlowOutput(DenseOutput):

@@ -216,5 +216,5 @@ def _clean(M: np.ndarray, units: np.ndarray) -> np.ndarray:
 
 
 def _close(a: Tensor, b: Tensor, tolerance: float) -> bool:
-    """Whether a is b (n, 2d) within the tolerance, beside the largest of each component."""
+    """True if a is b (n, 2d) within the tolerance, relative to the largest of each component."""
     return bool(((a - b).abs() <= tolerance * b.abs().amax(0, keepdim=True)).all())

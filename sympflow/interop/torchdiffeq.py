@@ -280,7 +280,7 @@ def _no_adjoint(method: Any) -> ValueError:
 
 
 def _within_adjoint() -> bool:
-    """Whether torchdiffeq's `odeint_adjoint` is among the callers: it hands its solvers no other sign of itself."""
+    """True if torchdiffeq's `odeint_adjoint` is among the callers: it hands its solvers no other sign of itself."""
     frame = sys._getframe()
     while frame is not None:
         if frame.f_globals.get("__name__") == "torchdiffeq._impl.adjoint":
@@ -290,7 +290,7 @@ def _within_adjoint() -> bool:
 
 
 class _Solver:
-    """What torchdiffeq asks of a solver: times come increasing, states flat; `func` knows what they were."""
+    """A solver as torchdiffeq asks for it: times come increasing, states flat; `func` knows what they were."""
 
     method: str
 

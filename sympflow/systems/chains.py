@@ -147,7 +147,7 @@ SIGMA = 0.341
 """Where the potential is zero, in nanometres."""
 
 MASS = 66.34e-27 / 1.380658e-23
-"""Of an atom, in K·ns²/nm²: kilograms over Boltzmann's constant, 1 nm/ns being 1 m/s."""
+"""The mass of an atom, in K·ns²/nm²: kilograms over Boltzmann's constant, 1 nm/ns being 1 m/s."""
 
 POSITIONS = np.array(
     [[0.0, 0.0], [0.02, 0.39], [0.34, 0.17], [0.36, -0.21], [-0.02, -0.40], [-0.35, -0.16], [-0.31, 0.21]]

@@ -1,4 +1,4 @@
-"""What every integrator must pass, ours and those of third parties."""
+"""The checks that every integrator must pass, ours and those of third parties."""
 
 from sympflow.testing.checks import check_integrator
 

@@ -59,7 +59,7 @@ CHECKS = tuple(map(Check, (*laws.OF_STEPS, *laws.OF_RUNS, *laws.OF_CONSISTENCY))
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What `check_integrator` did; iterating gives the names of the checks that passed.
+    """The result of `check_integrator`; iterating gives the names of the checks that passed.
 
     Attributes
     ----------

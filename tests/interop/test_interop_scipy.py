@@ -140,11 +140,12 @@ def test_a_flow_of_networks_evaluates_no_force():
 
 
 def test_a_primed_flow_counts_its_forces():
-    """Those of the steps, as `solve` counts them; one state's velocity is compared, by `fun` and by the flow."""
-    steps = solve(HH, "sympflow", (0, 50), t_eval=[50.0]).stats["force_evaluations"]
-    alone = get("sympflow")().flow_for(HH).evaluations(0, 0, 1, "array")["force_evaluations"]
-    nfev = solve_ivp(HH, (0, 50), HH.y0, method=as_scipy("sympflow", HH), t_eval=[50.0]).nfev
-    assert steps < nfev - alone - 1 <= 2 * steps  # SciPy's steps are outputs, each with a processor of its own
+    """Those of the steps, each of which SciPy reports, and those of the one velocity that is compared with `fun`."""
+    flow = get("sympflow")().flow_for(HH)
+    alone = flow.evaluations(0, 0, 1, "array")["force_evaluations"]
+    least = flow.evaluations(35, 35, 0, "compiled")["force_evaluations"]  # T = 49 is 35 steps of Δt = 1.4
+    nfev = solve_ivp(HH, (0, 49), HH.y0, method=as_scipy("sympflow", HH), t_eval=[49.0]).nfev
+    assert least <= nfev - alone - 1 <= least + 6 * alone  # computed in up to six pieces, each with a start of its own
 
 
 def test_the_exact_flow_finds_all_zeros(rotation):
