@@ -16,7 +16,7 @@ from sympflow.integrators.tableaux import ADAPTIVE as TORCHDIFFEQ_ADAPTIVE
 OSCILLATOR, HH = systems.harmonic_oscillator(), systems.henon_heiles()
 ADAPTIVE = ["rk45", "dop853", *TORCHDIFFEQ_ADAPTIVE]
 MULTISTEP = ["explicit_adams", "implicit_adams"]
-METHODS = ["verlet", "srkn6b", "chin4a", "euler", "rk4", *ADAPTIVE, *MULTISTEP]  # every kind
+METHODS = ["verlet", "srkn6b", "euler", "rk4", *ADAPTIVE, *MULTISTEP]  # every kind
 START = [1.0, 0.0]  # q = cos t, p = −sin t
 T_STAR = 5.450984210235402  # where this orbit of Hénon–Heiles becomes singular
 EPS = np.finfo(float).eps

@@ -250,7 +250,7 @@ def test_henon_heiles_stays_in_the_well_below_the_escape_energy():
 @pytest.mark.parametrize("n", [2, 3, 5])
 def test_the_toda_lattice_keeps_the_eigenvalues_of_laxs_matrix(n):
     system = systems.toda_lattice(n)
-    sol = solve(system, "kahan_li8", (0, 50), backend="compiled" if n == 5 else "array")
+    sol = solve(system, "kahan_li8", (0, 50), backend="compiled" if n == 2 else "array")
     eigenvalues = systems.lax_eigenvalues(sol.states)
     assert np.ptp(sol.y[:n], axis=1).min() > 0.5  # it moves
     np.testing.assert_allclose(eigenvalues, np.broadcast_to(eigenvalues[0], eigenvalues.shape), atol=1e-11)
