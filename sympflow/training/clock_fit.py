@@ -43,7 +43,7 @@ def train_clock(
     system : HamiltonianSystem
         With a domain.
     dt : float
-        The physical length of the longest step, as of `sympflow.integrators.logarithmic.Logarithmic`.
+        The physical length of the longest step, as the `dt` of methods by the clock "logarithmic".
     scheme, terms
         See `ClockedFlow`.
     points, label_times, seed : int

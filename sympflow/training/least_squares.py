@@ -56,15 +56,7 @@ class Damping:
 
 
 class Linearized(ABC):
-    """Residuals r with their Jacobian J at a point x, and the scales D of the parameters: arrays or tensors.
-
-    Duties of a subclass
-    --------------------
-    1. `damp(damping)`: get ready to solve with JᵀJ + λD².
-    2. `newton()`: the s that minimizes ‖J s + r‖² + λ‖D s‖², and the decrease of ‖r‖² that the linear model predicts.
-    3. `solve(w)`: (JᵀJ + λD²)⁻¹ w.
-    4. `norm(v)`: ‖v‖.
-    """
+    """Residuals r with their Jacobian J at a point x, and the scales D of the parameters: arrays or tensors."""
 
     x: Any
     r: Any
@@ -72,16 +64,20 @@ class Linearized(ABC):
     D: Any
 
     @abstractmethod
-    def damp(self, damping: float) -> None: ...
+    def damp(self, damping: float) -> None:
+        """Get ready to solve with JᵀJ + λD²."""
 
     @abstractmethod
-    def newton(self) -> tuple[Any, float]: ...
+    def newton(self) -> tuple[Any, float]:
+        """The s that minimizes ‖J s + r‖² + λ‖D s‖², and the decrease of ‖r‖² that the linear model predicts."""
 
     @abstractmethod
-    def solve(self, w: Any) -> Any: ...
+    def solve(self, w: Any) -> Any:
+        """(JᵀJ + λD²)⁻¹ w."""
 
     @abstractmethod
-    def norm(self, v: Any) -> Any: ...
+    def norm(self, v: Any) -> Any:
+        """‖v‖."""
 
     @abstractmethod
     def moved(self, step: Any, bend: Any) -> Any:

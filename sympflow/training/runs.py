@@ -36,16 +36,6 @@ class Advance:
 class Run(ABC):
     """The state of a run, and the loop that acts on it.
 
-    Duties of a subclass
-    --------------------
-    1. `done`, `planned`: steps (or what else `UNIT` names) taken, and the most there may be.
-    2. `begin(session)`: get ready for the first; an exception ends the run.
-    3. `over(session)`: whether to take no more.
-    4. `advance(session)`: take one.
-    5. `end(session)`: make the flow that is returned; why the run ended early, if it did.
-    6. `achieved()`, `remarks(reason)`: the figures of the flow, and what its recipe says of the run.
-    7. `kept()`, `restore(state)`: the state that a checkpoint keeps, `best` and `optimizer`.
-
     Attributes
     ----------
     history : list of dict
@@ -66,35 +56,45 @@ class Run(ABC):
 
     @property
     @abstractmethod
-    def done(self) -> int: ...
+    def done(self) -> int:
+        """Steps, or what else `UNIT` names, that were taken."""
 
     @property
     @abstractmethod
-    def planned(self) -> int: ...
+    def planned(self) -> int:
+        """The most there may be."""
 
     @abstractmethod
-    def begin(self, session: Session) -> None: ...
+    def begin(self, session: Session) -> None:
+        """Get ready for the first; an exception ends the run."""
 
     @abstractmethod
-    def over(self, session: Session) -> bool: ...
+    def over(self, session: Session) -> bool:
+        """Return whether to take no more."""
 
     @abstractmethod
-    def advance(self, session: Session) -> Advance: ...
+    def advance(self, session: Session) -> Advance:
+        """Take one."""
 
     @abstractmethod
-    def end(self, session: Session) -> str | None: ...
+    def end(self, session: Session) -> str | None:
+        """Make the flow that is returned; why the run ended early, if it did."""
 
     @abstractmethod
-    def achieved(self) -> dict[str, float]: ...
+    def achieved(self) -> dict[str, float]:
+        """The figures of that flow."""
 
     @abstractmethod
-    def remarks(self, reason: str | None) -> dict[str, Any]: ...
+    def remarks(self, reason: str | None) -> dict[str, Any]:
+        """The record of the run, beside its options, in the recipe of the flow."""
 
     @abstractmethod
-    def kept(self) -> dict[str, Any]: ...
+    def kept(self) -> dict[str, Any]:
+        """The state that a checkpoint keeps: `best` and `optimizer`."""
 
     @abstractmethod
-    def restore(self, state: dict[str, Any]) -> None: ...
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take over the state that a checkpoint kept."""
 
     def go(self, session: Session) -> str | None:
         """Run to the end; why it ended early, if it did. The flow is then the best that was found."""
@@ -172,15 +172,7 @@ class Run(ABC):
 
 @dataclass
 class SearchRun(Run):
-    """Many starts, each followed to a minimum, and a flow that is made of the best of them.
-
-    Duties of a subclass
-    --------------------
-    1. `next_minimum(stop)`: follow the next start, of number len(minima).
-    2. `found(minimum)`: note it; its figures.
-    3. `complete(session)`: make the flow of the minima, and its last entry in `history`; it may be called again after
-       an interruption.
-    """
+    """Many starts, each followed to a minimum, and a flow that is made of the best of them."""
 
     options: SearchOptions
     minima: list[Minimum] = field(default_factory=list, kw_only=True)
@@ -189,13 +181,16 @@ class SearchRun(Run):
     SEARCH_SHARE: ClassVar[float] = 1.0  # of a time budget
 
     @abstractmethod
-    def next_minimum(self, stop: Stop) -> Minimum: ...
+    def next_minimum(self, stop: Stop) -> Minimum:
+        """Follow the next start, of number len(minima)."""
 
     @abstractmethod
-    def found(self, minimum: Minimum) -> dict[str, float]: ...
+    def found(self, minimum: Minimum) -> dict[str, float]:
+        """Note a minimum; its figures."""
 
     @abstractmethod
-    def complete(self, session: Session) -> None: ...
+    def complete(self, session: Session) -> None:
+        """Make the flow of the minima, and its last entry in `history`; may be called again when interrupted."""
 
     @property
     def done(self) -> int:
