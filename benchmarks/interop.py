@@ -193,8 +193,8 @@ def main() -> None:
         (
             row["method"],
             f"{row['error']:.1e}",
-            f"{row['dopri5_time'] / row['time']:.2g}",
-            f"{row['dopri5_time_with_gradient'] / row['time_with_gradient']:.2g}",
+            fragments.three(row["dopri5_time"] / row["time"]),
+            fragments.three(row["dopri5_time_with_gradient"] / row["time_with_gradient"]),
         )
         for row in rows
     ]

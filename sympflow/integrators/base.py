@@ -16,7 +16,7 @@ from sympflow.arguments import check_dt
 from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.contract import ENDED, FINISHED, Integrator, Outcome, Problem, Steps
+from sympflow.integrators.contract import ENDED, FINISHED, Failure, Integrator, Outcome, Problem, Steps
 from sympflow.integrators.grid import EPS, Grid
 
 if TYPE_CHECKING:
@@ -61,8 +61,8 @@ class FixedStep(Integrator):
 
     finds_events: ClassVar[bool] = True
     on_grid: ClassVar[bool] = True
-    breakdown: ClassVar[tuple[str, str]] = ("The solution became non-finite", "Reduce `dt`")
-    """The meaning of a run that cannot go on, and the remedy: for the message of status −1."""
+    breakdown: ClassVar[Failure] = Failure.NON_FINITE
+    """The meaning of a run that cannot go on."""
 
     def __post_init__(self) -> None:
         check_dt(self.dt)
@@ -474,7 +474,7 @@ class GridRun:
     # failures -----------------------------------------------------------------------------------------------------
 
     def _failure(self, t: float, step: int) -> str:
-        what, remedy = self.integrator.breakdown
+        what, remedy = self.integrator.breakdown.value
         return f"{what} after t = {t:.17g} (step {step + 1} of {self.grid.n_steps}). {remedy}, or end `t_span` earlier."
 
     def _report_failures(self, outcome: Outcome, finite: np.ndarray, n_run: int) -> None:
@@ -484,7 +484,7 @@ class GridRun:
         that reached their end.
         """
         grid = self.grid
-        what, remedy = self.integrator.breakdown
+        what, remedy = self.integrator.breakdown.value
         done = bool((finite >= n_run).all()) if finite.ndim else int(finite) >= n_run
         outcome.finite = done and (outcome.finite or _all_finite(outcome.y, self.stepper.compiled))
         if outcome.finite:

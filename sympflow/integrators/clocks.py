@@ -20,7 +20,7 @@ from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
 from sympflow.integrators.base import FixedStep
-from sympflow.integrators.contract import FINISHED, Outcome, Problem, Steps
+from sympflow.integrators.contract import FINISHED, Failure, Outcome, Problem, Steps
 from sympflow.integrators.grid import Grid
 
 LARGEST_CHUNK = 2**20  # numbers in one chunk of states
@@ -33,10 +33,6 @@ STEPS_EACH = 6  # or as many as so many steps take
 COMPILED_FOR_ONE = 10  # compiled evaluations that are allowed for one on arrays, which takes a thousand times longer
 MOST_EXPECTED = 1e9  # steps, beyond which the run by chunks says whether they are too many
 
-BREAKDOWN = (
-    "T + B or c − V ceased to be positive and finite",
-    "Reduce `dt`, or raise `shift` above the energy",
-)
 _TRANSFORMED: WeakKeyDictionary[HamiltonianSystem, dict[float, HamiltonianSystem]] = WeakKeyDictionary()
 _SCALES: WeakKeyDictionary[HamiltonianSystem, dict[float, float]] = WeakKeyDictionary()
 
@@ -418,10 +414,8 @@ class PhysicalRun:
             )
 
     def _failure(self, i: int, count: int) -> str:
-        what, remedy = BREAKDOWN
-        if self.stalled[i]:
-            what = f"After {self.n_steps[i]} steps time hardly advances any more, as before a collision"
-            remedy = "End `t_span` earlier, or raise `dt`"
+        what, remedy = (Failure.STALLED if self.stalled[i] else Failure.CLOCK).value
+        what = what.format(n_steps=self.n_steps[i])
         which = (
             "" if len(self.start) == 1 else f"{count} of {len(self.start)} trajectories failed, the first (index {i}): "
         )

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
+from enum import Enum
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -39,6 +40,18 @@ Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
 
 FINISHED = "The solver successfully reached the end of the integration interval."
 ENDED = "A termination event occurred."
+
+
+class Failure(Enum):
+    """The reasons for which a run of steps cannot go on. Each is its message: what happened, and the remedy."""
+
+    NON_FINITE = "The solution became non-finite", "Reduce `dt`"
+    UNSOLVED = "The implicit step could not be solved: Newton's iteration did not converge", "Reduce `dt`"
+    CLOCK = "T + B or c − V ceased to be positive and finite", "Reduce `dt`, or raise `shift` above the energy"
+    STALLED = (
+        "After {n_steps} steps time hardly advances any more, as before a collision",
+        "End `t_span` earlier, or raise `dt`",
+    )
 
 
 @dataclass(frozen=True)

@@ -20,14 +20,13 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep, GridRun, KernelStepper, Stepper, compiled_loops, rollout
 from sympflow.integrators.clocks import (
-    BREAKDOWN,
     LogarithmicClock,
     physical_length,
     scale_of,
     step_of_length,
     transformed_system,
 )
-from sympflow.integrators.contract import Outcome, Problem, Steps
+from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
 
 T = TypeVar("T")
@@ -381,7 +380,7 @@ class LogSympFlow(FixedStep):
     on_grid: ClassVar[bool] = False
     in_another_time: ClassVar[bool] = True
     tangent_holds: ClassVar[str] = "the realised step in s, and B,"
-    breakdown: ClassVar[tuple[str, str]] = BREAKDOWN
+    breakdown: ClassVar[Failure] = Failure.CLOCK
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -12,6 +12,7 @@ from sympflow.arguments import check_flag
 from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, KernelStepper, Problem, Stepper, compiled_loops, rollout
+from sympflow.integrators.contract import Failure
 
 if TYPE_CHECKING:
     from sympflow.kernels.implicit_loops import ImplicitKernel, Tableau
@@ -46,10 +47,7 @@ class Gauss(FixedStep):
 
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
-    breakdown: ClassVar[tuple[str, str]] = (
-        "The implicit step could not be solved: Newton's iteration did not converge",
-        "Reduce `dt`",
-    )
+    breakdown: ClassVar[Failure] = Failure.UNSOLVED
     tableau: ClassVar[Tableau]
 
     def __post_init__(self) -> None:

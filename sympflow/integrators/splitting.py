@@ -13,9 +13,9 @@ from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep, KernelStepper, Stepper, compiled_loops
-from sympflow.integrators.clocks import BREAKDOWN, LogarithmicClock, scale_of, transformed_system
+from sympflow.integrators.clocks import LogarithmicClock, scale_of, transformed_system
 from sympflow.integrators.compositions import SPLITTINGS, Composition
-from sympflow.integrators.contract import Outcome, Problem, Steps
+from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.methods import TRIPLES
 from sympflow.schemes import SCHEMES, Scheme
 
@@ -88,7 +88,7 @@ class Splitting(FixedStep):
     on_grid: ClassVar[Any] = OfClock(True, False)
     in_another_time: ClassVar[Any] = OfClock(False, True)
     tangent_holds: ClassVar[Any] = OfClock("", "the realised step in s, and B,")
-    breakdown: ClassVar[Any] = OfClock(FixedStep.breakdown, BREAKDOWN)
+    breakdown: ClassVar[Any] = OfClock(Failure.NON_FINITE, Failure.CLOCK)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -15,7 +15,6 @@ from sympflow.flow import shipped as catalogue
 from sympflow.flow.shipped import ShippedFlow, choose
 from sympflow.hamiltonian.fingerprint import same_system
 from sympflow.integrators import flows
-from sympflow.integrators.domain_exit import domain_of
 from sympflow.training import pretrained
 from sympflow.training.clock_fit import clock_errors
 from sympflow.training.options import NewFit
@@ -290,7 +289,7 @@ def test_every_flow_is_a_map_for_all_times(listed):
         figures = clock_errors(flow, system, 987, 6)
         assert max(figures.values()) <= 10 * flow.figures["one_step_error_max"]
         return
-    x = domain_of(flow, system).sample(6, 987)
+    x = flow.domain_for(system).sample(6, 987)
     omega = system.params.get("omega", 1.0) if system.ndof == 1 else 1.0
     at_end, between = one_step_errors(flow, system, x, times=8, omega=omega)
     assert between <= 10 * at_end
@@ -307,7 +306,7 @@ def test_shipped_figures_hold(name):
         if listed.stages is None:
             continue
         flow = listed.load(system)
-        y0 = domain_of(flow, system).sample(40, 4321) if along is None else along
+        y0 = flow.domain_for(system).sample(40, 4321) if along is None else along
         t_eval = np.linspace(0.0, t_end, 201)
         sol = solve(system, flow, (0.0, t_end), y0=y0, t_eval=t_eval, on_domain_exit="ignore")
         errors = np.sort(max_energy_error(sol))
