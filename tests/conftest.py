@@ -17,6 +17,10 @@ KINDS = (
 )
 """A method of each kind: for tests of what methods of one kind share. That each alone is sound, `test_checks` shows."""
 
+FULL_MASS_MATRIX = "p1**2/4 + p1*p2/5 + p2**2 + q1**4/4 + q1*q2/3 + q2**2/2"
+RELATIVISTIC = "sqrt(1 + p**2) + q**2/2 + q**4/4"
+"""Hamiltonians that several modules compile: the same text is compiled once for all of them."""
+
 
 def load_example(name):
     """The module examples/<name>.py."""

@@ -7,6 +7,8 @@ import pickle
 import numpy as np
 import pytest
 import torch
+from conftest import FULL_MASS_MATRIX
+from conftest import RELATIVISTIC as RELATIVISTIC_H
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load as load_tensors
@@ -19,12 +21,12 @@ from sympflow.schemes import SCHEMES
 EPS = np.finfo(float).eps
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
 MASSES = HamiltonianSystem.from_sympy(
-    "p1**2/4 + p1*p2/5 + p2**2 + q1**4/4 + q1*q2/3 + q2**2/2",
+    FULL_MASS_MATRIX,
     name="masses",
     domain=sympflow.Ball([0.0] * 4, 1.0),
     y0=[0.3, 0.1, -0.2, 0.4],
 )
-RELATIVISTIC = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**2/2", domain=sympflow.Ball([0.0, 0.0], 1.0))
+RELATIVISTIC = HamiltonianSystem.from_sympy(RELATIVISTIC_H, domain=sympflow.Ball([0.0, 0.0], 1.0))
 
 
 def random_flow(system, *, size=0.05, seed=0, **options):
