@@ -19,6 +19,7 @@ FORMER = {
     "flow.base": "flow.flow_map",
     "imports": "lazy",
     "integrators.checks": "testing.checks",
+    "integrators.grid_solution": "integrators.base",
     "integrators.linear_splitting": "integrators.splitting",
     "integrators.log_sympflow": "integrators.flows",
     "integrators.logarithmic": "integrators.splitting",

@@ -11,12 +11,13 @@ from watchdog import watched
 import sympflow
 from sympflow import HamiltonianSystem, MLPFlow, SympFlow, get, load, solve, systems
 from sympflow.integrators.grid import Grid
-from sympflow.integrators.registry import _NAMES
+from sympflow.integrators.methods import NAMES
+from sympflow.schemes import SCHEMES
 
 PENDULUM = systems.pendulum()
 OSCILLATOR = systems.harmonic_oscillator()
 HENON_HEILES = systems.henon_heiles()
-METHODS = sorted(_NAMES)
+METHODS = sorted(NAMES)
 FIXED = [m for m in METHODS if "dt" in get(m).options() and getattr(get(m), "on_grid", True) and not get(m).trained]
 SPLITTINGS = [m for m in FIXED if get(m).symplectic]
 few = settings(max_examples=15, deadline=None)
@@ -112,9 +113,7 @@ def test_a_batch_is_a_loop(method, y0, dt):
 @few
 @given(y0=states, dt=steps)
 def test_symplecticity(method, y0, dt):
-    _, A = get(method)(dt=dt).tangent(
-        PENDULUM if method in sympflow.integrators.schemes.SCHEMES else OSCILLATOR, 0.0, y0, np.array(dt)
-    )
+    _, A = get(method)(dt=dt).tangent(PENDULUM if method in SCHEMES else OSCILLATOR, 0.0, y0, np.array(dt))
     J = np.array([[0.0, 1.0], [-1.0, 0.0]])
     np.testing.assert_allclose(A.T @ J @ A, J, atol=1e-11)
 

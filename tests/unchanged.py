@@ -405,12 +405,11 @@ SLOW = ("adaptive_heun", "fehlberg2", "bosh3")  # at their usual tolerances
 
 def own(method: str) -> tuple[str, str]:
     """The systems on which a method is looked at more closely."""
-    options = get(method).options()
     if method in FLOWS:
         return "henon_heiles", "kepler" if method == "sympflow" else "pendulum"
-    if "shift" in options:
+    if method.startswith("log_"):
         return "kepler", "functions"
-    if "parts" in options:
+    if method.endswith("_parts"):
         return "henon_heiles", "polar"
     if method.startswith("linear_") or method in ("impulse", "mollified_impulse", "implicit_explicit"):
         return "stiff", "fput"

@@ -525,6 +525,23 @@ class GridSolution:
         self.stepper, self.grid, self.states = stepper, grid, states
         self.t_min, self.t_max = sorted((grid.t0, grid.t1))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The choice of the method in place of its run, whose compiled loops belong to a process."""
+        stepper = self.stepper
+        return {
+            "integrator": stepper.integrator,
+            "system": stepper.system,
+            "grid": self.grid,
+            "states": self.states,
+            "backend": stepper.backend,
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        integrator, grid, states = state["integrator"], state["grid"], state["states"]
+        backend = "auto" if state["backend"] == "compiled" else "array"
+        problem = Problem(state["system"], grid.t0, grid.t1, states[0], backend=backend)
+        GridSolution.__init__(self, integrator.stepper(problem), grid, states)
+
     def __call__(self, t: float | np.ndarray) -> Array:
         times = np.atleast_1d(np.asarray(t, dtype=float))
         count, remainder = self.grid.locate(times)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -19,7 +19,7 @@ import numpy as np
 from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
-from sympflow.integrators.base import FixedStep
+from sympflow.integrators.base import FixedStep, Stepper
 from sympflow.integrators.contract import FINISHED, Failure, Outcome, Problem, Steps
 from sympflow.integrators.grid import Grid
 
@@ -54,10 +54,12 @@ def scale_of(system: HamiltonianSystem, c: float) -> float:
     return known[c]
 
 
-class TimedLoops(Protocol):
-    """A compiled pass in the physical time; see `timed_loops.reach_times`."""
+class OnClock(Protocol):
+    """A method that is run on the logarithmic clock."""
 
-    def __call__(
+    name: ClassVar[str]
+
+    def reach_times(
         self,
         transformed: HamiltonianSystem,
         h: float,
@@ -66,13 +68,13 @@ class TimedLoops(Protocol):
         stride: int,
         expected: float,
         backend: str,
-    ) -> tuple[np.ndarray, np.ndarray] | None: ...
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Run in one compiled pass: see `kernels.timed_loops.reach_times`. None where there is none."""
+        ...
 
-
-class Counts(Protocol):
-    """The evaluations of a method; see `FixedStep.evaluations`."""
-
-    def __call__(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]: ...
+    def clock_evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Count evaluations on the transformed system, as `FixedStep.evaluations`."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,7 @@ class LogarithmicClock:
 
     Attributes
     ----------
-    name : str
-        The name of the method, for messages.
+    method : OnClock
     system, transformed : HamiltonianSystem
     inner : FixedStep
         The method that is applied to the transformed system.
@@ -90,18 +91,14 @@ class LogarithmicClock:
         The physical length of a step where the kinetic energy is B = c − E.
     new_step : float
         The length of a step in s.
-    evaluations : callable
-    reach_times : callable
     """
 
-    name: str
+    method: OnClock
     system: HamiltonianSystem
     transformed: HamiltonianSystem
     inner: FixedStep
     dt: float
     new_step: float
-    evaluations: Counts
-    reach_times: TimedLoops
 
     @property
     def shift(self) -> float:
@@ -159,8 +156,8 @@ class LogarithmicClock:
         """Solve the problem."""
         if is_tensor(problem.y0):
             raise TypeError(
-                f"`y0` is a tensor, but method {self.name!r} finds its outputs by root-finding on NumPy arrays: pass "
-                "y0.numpy(), or solve time_transformed(system), which takes tensors."
+                f"`y0` is a tensor, but method {self.method.name!r} finds its outputs by root-finding on NumPy arrays: "
+                "pass y0.numpy(), or solve time_transformed(system), which takes tensors."
             )
         return timed_pass(self, problem) or PhysicalRun(self, problem).outcome()
 
@@ -276,15 +273,28 @@ class PhysicalRun:
         self.most_steps = self._most_steps(COMPILED_FOR_ONE if compiled else 1)
         self.n_steps = np.zeros(len(rows), dtype=int)
         self.n_extra, self.backend = 0, ""
-        start = self.start[0] if len(rows) == 1 else self.start
-        self.stepper = clock.inner.stepper(Problem(clock.transformed, 0.0, self.h, start, backend=problem.backend))
+        self.stepper = self._stepper()
         self.failed_at = np.full(len(rows), np.nan)
         self.stalled = np.zeros(len(rows), dtype=bool)
         self.stride = 1
 
+    def _stepper(self) -> Stepper:
+        clock, start = self.clock, self.start[0] if len(self.start) == 1 else self.start
+        return clock.inner.stepper(Problem(clock.transformed, 0.0, self.h, start, backend=self.problem.backend))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the stepper, whose compiled loops belong to a process."""
+        return {name: value for name, value in self.__dict__.items() if name != "stepper"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for name, value in state.items():
+            setattr(self, name, value)
+        self.stepper = self._stepper()
+        self.stepper.backend = self.backend or self.stepper.backend
+
     def _most_steps(self, allowance: int) -> int:
         """Steps after which time hardly advances: before a collision they would never end, so it is evaluations."""
-        made = self.clock.evaluations(1000, 0, 0, "numpy")
+        made = self.clock.method.clock_evaluations(1000, 0, 0, "numpy")
         stages = max(1, round(sum(made.values()) / 1000))
         nominal = self.length / self.clock.dt
         return int(allowance * (FEW_EVALUATIONS / stages + max(EVALUATIONS_EACH / stages, STEPS_EACH) * nominal))
@@ -538,7 +548,7 @@ def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:
     expected = float(elapsed[-1]) / dt
     stride = int(min(max(1.0, (length / dt / (len(elapsed) + 1)) ** 0.5), LONGEST_STRIDE))
     h = sign * clock.new_step
-    found = clock.reach_times(transformed, h, start, elapsed[first:], stride, expected, problem.backend)
+    found = clock.method.reach_times(transformed, h, start, elapsed[first:], stride, expected, problem.backend)
     if found is None:
         return None
     Y, counts = found
@@ -554,7 +564,7 @@ def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:
     stats = {
         "dt": dt,
         "n_steps": n_steps,
-        **clock.evaluations(n_steps, n_steps, n_extra, "compiled"),
+        **clock.method.clock_evaluations(n_steps, n_steps, n_extra, "compiled"),
         "backend": "compiled",
     }
     return Outcome(times, Y.reshape(len(times), *y0.shape), status, FINISHED, stats, finite=True)

@@ -180,6 +180,8 @@ class FlowStepper(Stepper):
                 states, finite = self.rollout(torch.from_numpy(np.ascontiguousarray(y0)), h, n_steps, save)
             return states.numpy(), finite
         flow, t = self.flow, abs(h)
+        if not flow.symplectic:  # without an inverse: the call says so where h < 0
+            return rollout(lambda k, y: flow(h, y), y0, n_steps, save)
         states, finite = rollout(lambda k, y: flow.kernel_step(t, y, h < 0), flow.prepare(t, y0), n_steps, save)
         states = flow.finish(t, states)
         start = int(np.count_nonzero(save == 0))  # `save` is sorted
@@ -427,26 +429,29 @@ class LogSympFlow(FixedStep):
             dt, new_step = physical_length(flow.dt, scale, clock), flow.dt
         else:
             dt, new_step = float(self.dt), step_of_length(float(self.dt), scale, clock)
-        inner = SympFlowIntegrator(flow=flow)
+        return LogarithmicClock(self, system, transformed, SympFlowIntegrator(flow=flow), dt, new_step)
 
-        def reach_times(
-            transformed: HamiltonianSystem,
-            h: float,
-            start: np.ndarray,
-            times: np.ndarray,
-            stride: int,
-            expected: float,
-            backend: str,
-        ) -> Any:
-            if not numbers:  # only a trained clock tells without a search what times its steps reach
-                return None
-            bound = flow.bound(transformed)
-            kernel = compiled_loops(lambda: bound.kernel_for(transformed), start, backend)
-            if kernel is None:
-                return None
-            return kernel.reach_times(h, start, times, stride, expected, numbers)
+    def reach_times(
+        self,
+        transformed: HamiltonianSystem,
+        h: float,
+        start: np.ndarray,
+        times: np.ndarray,
+        stride: int,
+        expected: float,
+        backend: str,
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Run in one compiled pass: see `clocks.OnClock`. Only a trained clock tells what times its steps reach."""
+        numbers = self.flow.clock_numbers()
+        if not numbers:
+            return None
+        bound = self.flow.bound(transformed)
+        kernel = compiled_loops(lambda: bound.kernel_for(transformed), start, backend)
+        return None if kernel is None else kernel.reach_times(h, start, times, stride, expected, numbers)
 
-        return LogarithmicClock(self.name, system, transformed, inner, dt, new_step, flow.evaluations, reach_times)
+    def clock_evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Count evaluations on the transformed system: see `clocks.OnClock`."""
+        return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
 
     def figures(self, system: HamiltonianSystem) -> Mapping[str, Any]:
         return {} if self.flow is None else self.flow.figures

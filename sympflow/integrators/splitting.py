@@ -17,7 +17,7 @@ from sympflow.integrators.clocks import LogarithmicClock, scale_of, transformed_
 from sympflow.integrators.compositions import SPLITTINGS, Composition
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.methods import TRIPLES
-from sympflow.schemes import SCHEMES, Scheme
+from sympflow.schemes import SCHEMES, Scheme, scheme_evaluations
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
@@ -132,33 +132,33 @@ class Splitting(FixedStep):
         transformed = transformed_system(system, self.shift)
         inner = _plain(self.scheme.name, bool(self.compensated))
         dt = self.step_length(system)
-
-        def reach_times(
-            transformed: HamiltonianSystem,
-            h: float,
-            start: np.ndarray,
-            times: np.ndarray,
-            stride: int,
-            expected: float,
-            backend: str,
-        ) -> Any:
-            no_loops = self.compensated or transformed.symbols is None
-            if no_loops or compiled_loops(lambda: inner.composed(transformed).kernel(False), start, backend) is None:
-                return None
-            from sympflow.kernels.timed_loops import reach_times
-
-            return reach_times(transformed, self.scheme, h, start, times, stride, expected)
-
         return LogarithmicClock(
-            self.name,
-            system,
-            transformed,
-            inner,
-            dt,
-            dt * scale_of(system, transformed.params["shift"]),
-            inner.composed(transformed).evaluations,
-            reach_times,
+            self, system, transformed, inner, dt, dt * scale_of(system, transformed.params["shift"])
         )
+
+    def reach_times(
+        self,
+        transformed: HamiltonianSystem,
+        h: float,
+        start: np.ndarray,
+        times: np.ndarray,
+        stride: int,
+        expected: float,
+        backend: str,
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Run on the logarithmic clock in one compiled pass: see `clocks.OnClock`."""
+        if self.compensated or transformed.symbols is None:
+            return None
+        inner = _plain(self.scheme.name, False)
+        if compiled_loops(lambda: inner.composed(transformed).kernel(False), start, backend) is None:
+            return None
+        from sympflow.kernels.timed_loops import reach_times
+
+        return reach_times(transformed, self.scheme, h, start, times, stride, expected)
+
+    def clock_evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Count evaluations on the transformed system: see `clocks.OnClock`."""
+        return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
 
     def check(self, system: HamiltonianSystem) -> None:
         if self.clock == "physical":

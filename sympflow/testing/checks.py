@@ -54,7 +54,7 @@ class Check:
             raise AssertionError(f"{self.name} of {integrator!r}: {what}") from error
 
 
-CHECKS = tuple(map(Check, (*laws.OF_STEPS, *laws.OF_RUNS, *laws.OF_CONSISTENCY)))
+CHECKS = tuple(map(Check, (*laws.OF_RUNS, *laws.OF_STEPS, *laws.OF_CONSISTENCY)))
 
 
 @dataclass(frozen=True)
