@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import FrameType, ModuleType
 
@@ -23,6 +20,7 @@ FORMER = {
     "integrators.linear_splitting": "integrators.splitting",
     "integrators.log_sympflow": "integrators.flows",
     "integrators.logarithmic": "integrators.splitting",
+    "integrators.physical_time": "integrators.clocks",
     "integrators.scheme": "schemes",
     "integrators.schemes": "schemes",
     "integrators.sympflow": "integrators.flows",
@@ -42,14 +40,18 @@ FORMER = {
 """Former module paths, of documented modules and of classes in pickles, and those of today, both below `sympflow`."""
 
 
-class _FormerPaths(MetaPathFinder, Loader):
+class _FormerPaths:
     """Finder of modules by their former paths: each is the module of today itself."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         package, _, name = fullname.partition(".")
-        return ModuleSpec(fullname, self) if package == "sympflow" and name in FORMER else None
+        found = package == "sympflow" and name in FORMER
+        return ModuleSpec(fullname, self) if found else None  # type: ignore[arg-type]
+
+    def create_module(self, spec: ModuleSpec) -> None:
+        """Leave the module to Python."""
 
     def exec_module(self, module: ModuleType) -> None:
         sys.modules[module.__name__] = import_module(f"sympflow.{FORMER[module.__name__.partition('.')[2]]}")
@@ -64,6 +66,9 @@ def whole_import(name: str) -> ModuleType:
     A compiled library that is left half initialized, as torch within the second that its import takes, cannot be
     imported again: the process crashes.
     """
+    import signal
+    import threading
+
     handler = signal.getsignal(signal.SIGINT)
     if name in sys.modules or not callable(handler) or threading.current_thread() is not threading.main_thread():
         return import_module(name)

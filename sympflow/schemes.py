@@ -483,22 +483,27 @@ SCHEMES: dict[str, Scheme] = {scheme.name: scheme for scheme in _TABLE}
 
 def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
     """Evaluations of the force, of force gradients and of curvature terms in a run, as `FixedStep.evaluations`."""
-    kicks = _kicks(scheme)
-    counts = {"force_evaluations": (scheme.force_evaluations, [1] * len(kicks))}
-    counts["hessian_evaluations"] = scheme.hessian_evaluations, [g for g, _ in kicks]
-    if any(scheme.curvatures):
-        counts["curvature_evaluations"] = scheme.curvature_evaluations, [c for _, c in kicks]
-    if backend != "compiled" or not kicks:
-        return {name: (n_steps + n_extra) * sum(each) for name, (_, each) in counts.items()}
+    if backend != "compiled":
+        return {name: (n_steps + n_extra) * whole for name, _, whole, _ in _costs(scheme)}
     # compiled, the last kick of a step is merged with the next step's first, except where a state is saved
-    closed = n_saved if len(kicks) > scheme.force_evaluations else 0
     return {
-        name: n_steps * of_a_step + closed * each[-1] + n_extra * sum(each)
-        for name, (of_a_step, each) in counts.items()
+        name: n_steps * of_a_step + n_saved * closing + n_extra * whole
+        for name, of_a_step, whole, closing in _costs(scheme)
     }
 
 
 @lru_cache(maxsize=256)
-def _kicks(scheme: Scheme) -> tuple[tuple[bool, bool], ...]:
-    """For each of its kicks, True if it has a Hessian, and True if it has a curvature term."""
-    return tuple((s.three != 0 or s.five != 0, s.five != 0) for s in scheme.substeps if s.kind == "kick")
+def _costs(scheme: Scheme) -> tuple[tuple[str, int, int, int], ...]:
+    """Names of evaluations, with those of a step in a long run, of a step alone, and of the last kick if it is shared.
+
+    Where it is shared, it is executed once more for each state that is saved.
+    """
+    kicks = [(True, s.three != 0 or s.five != 0, s.five != 0) for s in scheme.substeps if s.kind == "kick"]
+    shared = len(kicks) > scheme.force_evaluations
+    counts = [("force_evaluations", scheme.force_evaluations), ("hessian_evaluations", scheme.hessian_evaluations)]
+    if any(scheme.curvatures):
+        counts.append(("curvature_evaluations", scheme.curvature_evaluations))
+    return tuple(
+        (name, of_a_step, sum(kick[i] for kick in kicks), int(shared and kicks[-1][i]))
+        for i, (name, of_a_step) in enumerate(counts)
+    )

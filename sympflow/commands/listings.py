@@ -64,12 +64,15 @@ def methods() -> None:
             except ImportError as error:
                 rows.append((name, "", "", "", "", str(error)))
                 continue
-            scheme = cls.scheme
-            forces = "" if scheme is None else str(scheme.force_evaluations)
-            if scheme is not None and scheme.hessian_evaluations:
-                forces += f" + {scheme.hessian_evaluations} Hessian"
             order = "trained" if cls.trained else str(cls.order or "–")
             rows.append(
-                (name, order, "yes" if cls.symplectic else "no", forces, ", ".join(cls.options()), cls.summary())
+                (
+                    name,
+                    order,
+                    "yes" if cls.symplectic else "no",
+                    cls.forces_a_step(),
+                    ", ".join(cls.options()),
+                    cls.summary(),
+                )
             )
         print_table(("name", "order", "symplectic", "forces a step", "options", "source"), rows)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
@@ -174,9 +174,7 @@ class EnergySublevel:
 
     def attach(self, hamiltonian: Callable[[Array], Array]) -> EnergySublevel:
         """The same domain with the H of a system."""
-        attached = object.__new__(EnergySublevel)  # the fields have been checked
-        vars(attached).update(vars(self), _limits=self._limits, hamiltonian=hamiltonian)
-        return attached
+        return replace(self, hamiltonian=hamiltonian)
 
     def _within(self, x: np.ndarray, slack: float) -> np.ndarray:
         """True where the energy, and the angular momentum if it is bounded, are within their bounds."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -28,6 +29,7 @@ __all__ = [
     "Integrator",
     "KernelStepper",
     "Outcome",
+    "OwnStepper",
     "Problem",
     "Recorder",
     "Stepper",
@@ -113,6 +115,37 @@ class FixedStep(Integrator):
             yield np.array([grid.time(k)]), y[None], np.array([grid.remainder])
 
 
+@dataclass(frozen=True)
+class OwnStepper(FixedStep):
+    """A fixed-step integrator with a stepper of its own; a subclass that overrides a duty of `FixedStep` is asked."""
+
+    def own_stepper(self, problem: Problem) -> Stepper:
+        """Return the stepper of one run, for states such as the problem's y0."""
+        raise NotImplementedError(f"{type(self).__name__} must define own_stepper().")
+
+    def stepper(self, problem: Problem) -> Stepper:
+        return self.own_stepper(problem) if _has_its_own(type(self)) else Stepper(self, problem)  # type: ignore[arg-type]
+
+    def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
+        stepper = self.own_stepper(problem)
+        states, finite = stepper.rollout(problem.y0, h, n_steps, save, problem.t0)
+        return states, finite, stepper.backend
+
+    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
+        asked = "auto" if backend == "compiled" else "array"
+        return self.own_stepper(Problem(system, 0.0, 0.0, y, backend=asked)).shorter(y, h)
+
+
+@cache
+def _has_its_own(cls: type[OwnStepper]) -> bool:
+    """True unless a subclass of a built-in class overrides what its stepper would not ask for."""
+    for name in ("step", "rollout", "substep", "evaluations"):
+        definer = next(base for base in cls.__mro__ if name in vars(base))
+        if not definer.__module__.startswith("sympflow."):
+            return False
+    return True
+
+
 # one run of a method -------------------------------------------------------------------------------
 
 
@@ -137,7 +170,7 @@ class Stepper:
     """True if `evaluations` tells those that were made so far, whatever the steps."""
 
     def __init__(self, integrator: FixedStep, problem: Problem) -> None:
-        self.integrator, self.system, self.asked = integrator, problem.system, problem.backend
+        self.integrator, self.system, self.problem = integrator, problem.system, problem
         self.backend = "torch" if is_tensor(problem.y0) else "numpy"
 
     def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
@@ -145,7 +178,8 @@ class Stepper:
 
         Also the index of the last finite state of each trajectory, of shape y0.shape[:-1].
         """
-        piece = Problem(self.system, t0, t0 + n_steps * h, y0, backend=self.asked)
+        whole = y0 is self.problem.y0 and t0 == self.problem.t0
+        piece = self.problem if whole else Problem(self.system, t0, t0 + n_steps * h, y0, backend=self.problem.backend)
         states, finite, self.backend = self.integrator.rollout(piece, h, n_steps, save)
         return states, finite
 
@@ -168,7 +202,7 @@ class KernelStepper(Stepper):
     compiled = True
 
     def __init__(self, integrator: FixedStep, problem: Problem, kernel: Kernel) -> None:
-        self.integrator, self.system, self.asked = integrator, problem.system, problem.backend
+        self.integrator, self.system, self.problem = integrator, problem.system, problem
         self.kernel, self.backend, self.saves_finite = kernel, "compiled", kernel.saves_finite
         self.iterations = 0
 
@@ -486,7 +520,6 @@ class GridRun:
         that reached their end.
         """
         grid = self.grid
-        what, remedy = self.integrator.breakdown.value
         done = bool((finite >= n_run).all()) if finite.ndim else int(finite) >= n_run
         outcome.finite = done and (outcome.finite or _all_finite(outcome.y, self.stepper.compiled))
         if outcome.finite:
@@ -498,6 +531,7 @@ class GridRun:
             outcome.status = np.where((finite < n_run) | ~ok.all(0), -1, 0)
             failed = np.argwhere(outcome.status)
             if failed.size:
+                what, remedy = self.integrator.breakdown.value
                 i = tuple(failed[0].tolist())
                 times = grid.t0 + np.minimum(finite, grid.n_steps) * grid.h
                 outcome.stats["failed_at"] = np.where(outcome.status < 0, times, np.nan)

@@ -72,7 +72,7 @@ class OnClock(Protocol):
         """Run in one compiled pass: see `kernels.timed_loops.reach_times`. None where there is none."""
         ...
 
-    def clock_evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count evaluations on the transformed system, as `FixedStep.evaluations`."""
         ...
 
@@ -287,6 +287,9 @@ class PhysicalRun:
         return {name: value for name, value in self.__dict__.items() if name != "stepper"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        if "integrator" in state:  # of a former version
+            integrator, _ = state.pop("integrator"), state.pop("inner")
+            state["clock"] = integrator.on_clock(state["system"])
         for name, value in state.items():
             setattr(self, name, value)
         self.stepper = self._stepper()
@@ -294,7 +297,7 @@ class PhysicalRun:
 
     def _most_steps(self, allowance: int) -> int:
         """Steps after which time hardly advances: before a collision they would never end, so it is evaluations."""
-        made = self.clock.method.clock_evaluations(1000, 0, 0, "numpy")
+        made = self.clock.method.evaluations(1000, 0, 0, "numpy")
         stages = max(1, round(sum(made.values()) / 1000))
         nominal = self.length / self.clock.dt
         return int(allowance * (FEW_EVALUATIONS / stages + max(EVALUATIONS_EACH / stages, STEPS_EACH) * nominal))
@@ -564,7 +567,7 @@ def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:
     stats = {
         "dt": dt,
         "n_steps": n_steps,
-        **clock.method.clock_evaluations(n_steps, n_steps, n_extra, "compiled"),
+        **clock.method.evaluations(n_steps, n_steps, n_extra, "compiled"),
         "backend": "compiled",
     }
     return Outcome(times, Y.reshape(len(times), *y0.shape), status, FINISHED, stats, finite=True)

@@ -7,8 +7,8 @@ here and a row of `SPLITTINGS`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 from weakref import WeakKeyDictionary
 
@@ -23,6 +23,7 @@ from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, scheme_evaluations
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
+    from sympflow.kernels.splitting_loops import SplittingLoops
 
 _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, ExactParts]] = WeakKeyDictionary()
 
@@ -51,7 +52,7 @@ class Composition(ABC):
     def __init__(
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
     ) -> None:
-        self.method, self.scheme, self.system = method, scheme, system
+        self.method, self.scheme = method, scheme
 
     @abstractmethod
     def step(self, y: Array, h: Any) -> Array:
@@ -86,7 +87,7 @@ class KineticPotential(Composition):
     def __init__(
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
     ) -> None:
-        super().__init__(method, scheme, system)
+        self.method, self.scheme, self.system = method, scheme, system
         if not system.separable:
             raise ValueError(
                 f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use a "
@@ -137,12 +138,18 @@ class KineticPotential(Composition):
         return np.concatenate([q, p], axis=-1), A
 
     def kernel(self, compensated: bool) -> Kernel:
-        from sympflow.kernels.splitting_loops import splitting_loops
-
-        return splitting_loops(self.system).kernel(self.scheme, compensated)
+        return _splitting_loops()(self.system).kernel(self.scheme, compensated)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
+
+
+@cache
+def _splitting_loops() -> Callable[[HamiltonianSystem], SplittingLoops]:
+    """The maker of compiled loops, imported once."""
+    from sympflow.kernels.splitting_loops import splitting_loops
+
+    return splitting_loops
 
 
 def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials: Monomials) -> Array:

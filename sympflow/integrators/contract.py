@@ -110,6 +110,16 @@ class Integrator:
         """The names of the options that this method takes."""
         return _field_names(cls)  # type: ignore[arg-type]
 
+    @property
+    def label(self) -> str:
+        """The name in rows and legends, which tells apart what the options make another method."""
+        return self.name
+
+    @classmethod
+    def forces_a_step(cls) -> str:
+        """Return the evaluations of a step, for tables of methods; "" where they depend on the system or the run."""
+        return ""
+
     @classmethod
     def summary(cls) -> str:
         """Return the `source`, or the first line of the docstring of a method that gives none."""

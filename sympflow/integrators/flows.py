@@ -18,7 +18,7 @@ from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.shipped import choose, forces_saved, named, shipped, shipped_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
-from sympflow.integrators.base import FixedStep, GridRun, KernelStepper, Stepper, compiled_loops, rollout
+from sympflow.integrators.base import FixedStep, GridRun, KernelStepper, OwnStepper, Stepper, compiled_loops, rollout
 from sympflow.integrators.clocks import (
     LogarithmicClock,
     physical_length,
@@ -49,7 +49,7 @@ def flow_named(name: str) -> FlowMap:
 
 
 @dataclass(frozen=True)
-class FlowIntegrator(FixedStep):
+class FlowIntegrator(OwnStepper):
     """A trained flow ψ̄ on the grid t0 + k·Δt: ψ_t = ψ̄_{t−kΔt} ∘ (ψ̄_Δt)^k, and its exact inverse for t < t0.
 
     Parameters
@@ -138,7 +138,7 @@ class FlowIntegrator(FixedStep):
         """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
         return compiled_loops(lambda: flow.kernel_for(problem.system), problem.y0, problem.backend)
 
-    def stepper(self, problem: Problem) -> FlowStepper | CompiledFlowStepper:
+    def own_stepper(self, problem: Problem) -> FlowStepper | CompiledFlowStepper:
         flow = self.flow_for(problem.system)
         if type(problem.y0) is np.ndarray and problem.y0.dtype == np.float64:  # a kernel tells the flow's own dtype
             kernel = self.kernel(flow, problem)
@@ -157,7 +157,7 @@ class FlowIntegrator(FixedStep):
         return run.outcome()
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        return self.stepper(Problem(system, t, t, y)).shorter(y, h)
+        return self.own_stepper(Problem(system, t, t, y)).shorter(y, h)
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         return _apply(self.flow_like(system, y).inverse, y, h)
@@ -202,7 +202,8 @@ class CompiledFlowStepper(KernelStepper):
         self.flow = flow
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
-        return self.flow.evaluations(n_steps, n_saved, n_extra, "compiled")
+        counted = self.kernel.evaluations(n_steps, n_saved, n_extra)
+        return self.flow.evaluations(n_steps, n_saved, n_extra, "compiled") if counted is None else counted
 
 
 def _apply(function: Any, y: Array, h: float | Array) -> Array:
@@ -397,8 +398,13 @@ class LogSympFlow(FixedStep):
             raise TypeError(
                 f"`flow` must be a SympFlow of the transformed system, or the name of one; got {type(flow).__name__}."
             )
-        if self.shift is None and flow.origin is not None:
-            object.__setattr__(self, "shift", checked_shift(flow.origin.shift))
+
+    @property
+    def clock_shift(self) -> float | None:
+        """c: the one given, else the one of the system that the flow was trained on."""
+        if self.shift is not None or self.flow is None or self.flow.origin is None:
+            return self.shift
+        return checked_shift(self.flow.origin.shift)
 
     def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> LogSympFlow:
         """Return the integrator with the flow that ships for the system unless one is given, and its shift."""
@@ -422,7 +428,7 @@ class LogSympFlow(FixedStep):
             raise ValueError(
                 "`flow` is needed: train one on sympflow.time_transformed(system), or prime one with it, and pass it."
             )
-        transformed = transformed_system(system, self.shift)
+        transformed = transformed_system(system, self.clock_shift)
         scale, numbers = scale_of(system, transformed.params["shift"]), flow.clock_numbers()
         clock = () if system.y0 is None else numbers
         if self.dt is None:
@@ -449,7 +455,7 @@ class LogSympFlow(FixedStep):
         kernel = compiled_loops(lambda: bound.kernel_for(transformed), start, backend)
         return None if kernel is None else kernel.reach_times(h, start, times, stride, expected, numbers)
 
-    def clock_evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count evaluations on the transformed system: see `clocks.OnClock`."""
         return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
 

@@ -11,7 +11,7 @@ import numpy as np
 from sympflow.arguments import check_flag
 from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, KernelStepper, Problem, Stepper, compiled_loops, rollout
+from sympflow.integrators.base import KernelStepper, OwnStepper, Problem, Stepper, compiled_loops, rollout
 from sympflow.integrators.contract import Failure
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ MOST_ITERATIONS = 50
 
 
 @dataclass(frozen=True)
-class Gauss(FixedStep):
+class Gauss(OwnStepper):
     """A Gauss method: K_i = h f(y + Σ_j a_ij K_j), y + Σ_i b_i K_i, solved by Newton's method with the Hessian of H.
 
     The iteration runs until the increments are rounding, so that a step is symplectic and reversible to rounding; an
@@ -76,7 +76,7 @@ class Gauss(FixedStep):
         dK = _solved(M, (h[..., None, None] * D).reshape(*y.shape[:-1], s * n, n)).reshape(*y.shape[:-1], s, n, n)
         return self._advanced(y, K), np.eye(n, dtype=y.dtype) + np.einsum("i,...ijk->...jk", b, dK)
 
-    def stepper(self, problem: Problem) -> CompiledGauss | ArrayGauss:
+    def own_stepper(self, problem: Problem) -> CompiledGauss | ArrayGauss:
         from sympflow.kernels.implicit_loops import implicit_kernel
 
         kernel = compiled_loops(

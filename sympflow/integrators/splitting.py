@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -12,7 +13,7 @@ from sympflow.arguments import check_flag
 from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
-from sympflow.integrators.base import FixedStep, KernelStepper, Stepper, compiled_loops
+from sympflow.integrators.base import FixedStep, KernelStepper, OwnStepper, Stepper, compiled_loops
 from sympflow.integrators.clocks import LogarithmicClock, scale_of, transformed_system
 from sympflow.integrators.compositions import SPLITTINGS, Composition
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
@@ -22,22 +23,75 @@ from sympflow.schemes import SCHEMES, Scheme, scheme_evaluations
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
 
-CLOCKS = ("physical", "logarithmic")
+
+@dataclass(frozen=True)
+class Clock:
+    """A time in which steps are equal, with the traits of the contract that depend on it.
+
+    Attributes
+    ----------
+    on : callable, optional
+        Makes of a method and a system the method on the clock; None for the physical time, which needs none.
+    """
+
+    on: Callable[[Splitting, HamiltonianSystem], LogarithmicClock] | None = None
+    finds_events: bool = True
+    on_grid: bool = True
+    in_another_time: bool = False
+    tangent_holds: str = ""
+    breakdown: Failure = Failure.NON_FINITE
+
+
+@cache
+def _on_the_physical_clock(cls: type[Splitting], compensated: bool) -> Splitting:
+    """The scheme of a method with the splitting and the clock that need none."""
+    return cls(compensated=compensated, splitting="kinetic", clock="physical")
+
+
+def _logarithmic(method: Splitting, system: HamiltonianSystem) -> LogarithmicClock:
+    """The method on the logarithmic Hamiltonian of a system, whose two parts have exact flows."""
+    if method.splitting != "kinetic":
+        raise ValueError(
+            f"`clock` 'logarithmic' needs the splitting 'kinetic', as log(T + B) − log(c − V) has exact flows; "
+            f"method {method.name!r} has {method.splitting!r}: leave one of them out."
+        )
+    if system.separable and (method.scheme.nystrom or method.scheme.level):
+        raise ValueError(
+            f"`clock` 'logarithmic' needs a scheme for any separable system, which that of method {method.name!r} is "
+            "not: use 'kahan_li8'."
+        )
+    transformed, dt = transformed_system(system, method.shift), method.step_length(system)
+    inner = _on_the_physical_clock(type(method), bool(method.compensated))  # type: ignore[arg-type]
+    new_step = dt * scale_of(system, transformed.params["shift"])
+    return LogarithmicClock(method, system, transformed, inner, dt, new_step)
+
+
+CLOCKS = {
+    "physical": Clock(),
+    "logarithmic": Clock(
+        _logarithmic,
+        finds_events=False,  # they are sought on the dense output
+        on_grid=False,
+        in_another_time=True,
+        tangent_holds="the realised step in s, and B,",
+        breakdown=Failure.CLOCK,
+    ),
+}
 """The clocks by the name that the option `clock` takes."""
 
 
 class OfClock:
-    """A trait of the contract that depends on the clock of the method: one value for each."""
+    """A trait of the contract that depends on the clock of the method."""
 
-    def __init__(self, physical: Any, logarithmic: Any) -> None:
-        self.values = {"physical": physical, "logarithmic": logarithmic}
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
 
     def __get__(self, method: Splitting | None, cls: type[Splitting]) -> Any:
-        return self.values[cls.clock if method is None else method.clock]
+        return getattr(CLOCKS[cls.clock if method is None else method.clock], self.name)
 
 
 @dataclass(frozen=True, repr=False)
-class Splitting(FixedStep):
+class Splitting(OwnStepper):
     """A scheme, a table of numbers, composed of the exact flows of the parts of H.
 
     Parameters
@@ -84,14 +138,19 @@ class Splitting(FixedStep):
     scheme: ClassVar[Scheme]
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
-    finds_events: ClassVar[Any] = OfClock(True, False)  # on the other clock they are sought on the dense output
-    on_grid: ClassVar[Any] = OfClock(True, False)
-    in_another_time: ClassVar[Any] = OfClock(False, True)
-    tangent_holds: ClassVar[Any] = OfClock("", "the realised step in s, and B,")
-    breakdown: ClassVar[Any] = OfClock(Failure.NON_FINITE, Failure.CLOCK)
+    finds_events: ClassVar[Any] = OfClock()
+    on_grid: ClassVar[Any] = OfClock()
+    in_another_time: ClassVar[Any] = OfClock()
+    tangent_holds: ClassVar[Any] = OfClock()
+    breakdown: ClassVar[Any] = OfClock()
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        cls = type(self)
+        if (self.compensated, self.splitting, self.clock) == (False, cls.splitting, cls.clock) and (
+            self.parts is None and self.shift is None
+        ):
+            return
         check_flag("compensated", self.compensated)
         for name, known in (("splitting", SPLITTINGS), ("clock", CLOCKS)):
             value = getattr(self, name)
@@ -122,19 +181,8 @@ class Splitting(FixedStep):
 
     def on_clock(self, system: HamiltonianSystem) -> LogarithmicClock | None:
         """Return the method on its clock, where that is not the physical one."""
-        if self.clock == "physical":
-            return None
-        if self.splitting != "kinetic":
-            raise ValueError(
-                f"`clock` 'logarithmic' needs the splitting 'kinetic', as log(T + B) − log(c − V) has exact flows; "
-                f"method {self.name!r} has {self.splitting!r}: leave one of them out."
-            )
-        transformed = transformed_system(system, self.shift)
-        inner = _plain(self.scheme.name, bool(self.compensated))
-        dt = self.step_length(system)
-        return LogarithmicClock(
-            self, system, transformed, inner, dt, dt * scale_of(system, transformed.params["shift"])
-        )
+        on = CLOCKS[self.clock].on
+        return None if on is None else on(self, system)
 
     def reach_times(
         self,
@@ -149,16 +197,29 @@ class Splitting(FixedStep):
         """Run on the logarithmic clock in one compiled pass: see `clocks.OnClock`."""
         if self.compensated or transformed.symbols is None:
             return None
-        inner = _plain(self.scheme.name, False)
+        inner = _on_the_physical_clock(type(self), False)  # type: ignore[arg-type]
         if compiled_loops(lambda: inner.composed(transformed).kernel(False), start, backend) is None:
             return None
         from sympflow.kernels.timed_loops import reach_times
 
         return reach_times(transformed, self.scheme, h, start, times, stride, expected)
 
-    def clock_evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Count evaluations on the transformed system: see `clocks.OnClock`."""
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Count those of a scheme of kicks and drifts; a stepper counts those of other parts too."""
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
+
+    @classmethod
+    def forces_a_step(cls) -> str:
+        if cls.splitting == "parts" or cls.clock != "physical":
+            return ""
+        hessians = cls.scheme.hessian_evaluations
+        return f"{cls.scheme.force_evaluations}{f' + {hessians} Hessian' if hessians else ''}"
+
+    @property
+    def label(self) -> str:
+        cls = type(self)
+        other = [mine for mine, own in ((self.splitting, cls.splitting), (self.clock, cls.clock)) if mine != own]
+        return f"{self.name} ({', '.join(other)})" if other else self.name
 
     def check(self, system: HamiltonianSystem) -> None:
         if self.clock == "physical":
@@ -176,7 +237,7 @@ class Splitting(FixedStep):
         known = (self.on_clock(system) or self.composed(system)).tangent(y, h)
         return super().tangent(system, t, y, h) if known is None else known
 
-    def stepper(self, problem: Problem) -> Stepper:
+    def own_stepper(self, problem: Problem) -> Stepper:
         composition = self.composed(problem.system)
         kernel = compiled_loops(
             lambda: composition.kernel(bool(self.compensated)), problem.y0, problem.backend, self.compensated
@@ -220,12 +281,6 @@ class CompiledComposition(KernelStepper):
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         return self.composition.evaluations(n_steps, n_saved, n_extra, "compiled")
-
-
-@cache
-def _plain(scheme: str, compensated: bool) -> Splitting:
-    """The scheme with the default splitting and clock."""
-    return splitting_method(scheme)(compensated=compensated)
 
 
 @cache

@@ -61,6 +61,10 @@ class TableSource(Protocol):
         """The result of `make`, made once for each key."""
         ...
 
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Count forces, force gradients and curvature terms of a run."""
+        ...
+
 
 class PrimedFlowKernel(Kernel):
     """Compiled loops of a primed flow on its system, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
@@ -87,6 +91,10 @@ class PrimedFlowKernel(Kernel):
             )
         self.system = system
         self._tables, self._splitting, self._compensated = tables, splitting_loops(system), compensated
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
+        """Count those of the numbers that the kernel has: see `Kernel`."""
+        return self._tables.evaluations(n_steps, n_saved, n_extra, "compiled")
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
         """`n_steps` times ψ̄_h from one state: see `Kernel`."""

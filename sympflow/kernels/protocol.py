@@ -69,6 +69,10 @@ class Kernel(Protocol):
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
         ...
 
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int] | None:
+        """Count the evaluations of the system's functions in a run; None where the method itself counts them."""
+        return None
+
     def reach_times(
         self,
         h: float,

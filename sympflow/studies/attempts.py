@@ -79,6 +79,7 @@ def _label(name: str, method: Any, integrator: Integrator) -> str:
     """The name, with the step or tolerance if the caller configured one."""
     if not isinstance(method, Integrator) or integrator.trained:
         return name
+    name = name if integrator.label == integrator.name else integrator.label
     if isinstance(integrator, FixedStep):
         return name if integrator.dt is None else f"{name} (dt={integrator.dt:g})"
     tolerance = tolerance_of(integrator)

@@ -1,15 +1,19 @@
 """A method is a scheme × a splitting × a clock: the rows of the table, and triples that a user writes himself."""
 
+import gc
 import pickle
+import weakref
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from sympflow import available, get, reference_error, solve, systems
+from sympflow import available, compare, get, reference_error, solve, systems
 from sympflow.integrators.compositions import SPLITTINGS
 from sympflow.integrators.methods import TRIPLES
-from sympflow.integrators.splitting import CLOCKS
-from sympflow.schemes import SCHEMES
+from sympflow.integrators.splitting import CLOCKS, Splitting
+from sympflow.schemes import SCHEMES, Scheme
 
 FPUT, PENDULUM, KEPLER = systems.fput(m=2, omega=20.0), systems.spring_pendulum(), systems.kepler(0.3)
 
@@ -83,3 +87,59 @@ def test_strang_steps_are_what_parts_compose():
     for name in ("verlet", "leapfrog", "suzuki4", "kahan_li6", "kahan_li8", "yoshida4"):
         assert sum(SCHEMES[name].strang_weights) == pytest.approx(1.0, abs=1e-14)
     assert SCHEMES["srkn11b"].strang_weights is None
+
+
+# classes of a user's own ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, repr=False)
+class OwnScheme(Splitting):
+    """A scheme that no table has: Verlet's under another name."""
+
+    name: ClassVar[str] = "own"
+    order: ClassVar[int | None] = 2
+    scheme: ClassVar[Scheme] = replace(SCHEMES["verlet"], name="own")
+
+
+@pytest.mark.parametrize(
+    ("system", "options"), [(KEPLER, {}), (KEPLER, {"clock": "logarithmic"}), (FPUT, {"splitting": "linear"})]
+)
+def test_a_scheme_of_a_users_own_runs_with_every_splitting_and_clock(system, options):
+    own, known = (solve(system, cls(**options), (0, 2), t_eval=[1.3]).y for cls in (OwnScheme, get("verlet")))
+    np.testing.assert_array_equal(own, known)
+
+
+@pytest.mark.parametrize("name", ["verlet", "gauss_legendre4", "impulse"])
+def test_what_a_subclass_overrides_is_asked(name):
+    calls = []
+
+    class Watching(get(name)):
+        def rollout(self, *arguments):
+            calls.append("rollout")
+            return super().rollout(*arguments)
+
+        def evaluations(self, *arguments):
+            return {"force_evaluations": 7, "hessian_evaluations": 0}
+
+    watched, plain = (solve(FPUT, cls(), (0, 0.5), t_eval=[0.2, 0.5]) for cls in (Watching, get(name)))
+    np.testing.assert_array_equal(watched.y, plain.y)
+    assert calls == ["rollout"]
+    assert watched.stats["force_evaluations"] == 7
+    assert watched.stats["backend"] == plain.stats["backend"] == "compiled"
+
+
+@pytest.mark.parametrize("name", ["verlet", "linear_srkn6b", "strang_parts", "log_leapfrog"])
+def test_no_method_keeps_a_system_alive(name):
+    system = systems.kepler(0.3) if name == "log_leapfrog" else systems.fput(m=1, omega=10.0)
+    solve(system, name, (0, 0.3), t_eval=[0.3])
+    alive = weakref.ref(system)
+    del system
+    gc.collect()
+    assert alive() is None
+
+
+def test_triples_are_told_apart_in_reports():
+    kahan = get("kahan_li8")
+    report = compare(KEPLER, [kahan(), kahan(clock="logarithmic"), kahan(splitting="parts")], t_span=(0, 1), repeats=1)
+    assert [row.label for row in report.rows] == ["kahan_li8", "kahan_li8 (logarithmic)", "kahan_li8 (parts)"]
+    assert [get(name).forces_a_step() for name in ("kahan_li8", "kahan_li8_parts", "log_kahan_li8")] == ["17", "", ""]
