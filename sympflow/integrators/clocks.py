@@ -9,9 +9,8 @@ that solves t(σ) = t, to rounding.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -61,7 +60,7 @@ class OnClock(Protocol):
 
     def reach_times(
         self,
-        transformed: HamiltonianSystem,
+        clock: LogarithmicClock,
         h: float,
         start: np.ndarray,
         times: np.ndarray,
@@ -72,33 +71,37 @@ class OnClock(Protocol):
         """Run in one compiled pass: see `kernels.timed_loops.reach_times`. None where there is none."""
         ...
 
+    @property
+    def inner(self) -> FixedStep:
+        """The method that is applied to the transformed system."""
+        ...
+
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count evaluations on the transformed system, as `FixedStep.evaluations`."""
         ...
 
 
-@dataclass(frozen=True)
-class LogarithmicClock:
+class LogarithmicClock(NamedTuple):
     """A method with equal steps in s, on one system.
 
     Attributes
     ----------
     method : OnClock
     system, transformed : HamiltonianSystem
-    inner : FixedStep
-        The method that is applied to the transformed system.
     dt : float
         The physical length of a step where the kinetic energy is B = c − E.
     new_step : float
         The length of a step in s.
+    numbers : tuple of float
+        Those of a trained clock; () without one.
     """
 
     method: OnClock
     system: HamiltonianSystem
     transformed: HamiltonianSystem
-    inner: FixedStep
     dt: float
     new_step: float
+    numbers: tuple[float, ...] = ()
 
     @property
     def shift(self) -> float:
@@ -128,7 +131,7 @@ class LogarithmicClock:
         """The step and its Jacobian in [q, p], the realised step in s and B held fixed."""
         rows, lengths = _rows(to_numpy(y), h)
         end, sigma = self._reached(start := lifted(self.system, rows, self.shift), lengths)
-        _, A = self.inner.tangent(self.transformed, 0.0, start, sigma)
+        _, A = self.method.inner.tangent(self.transformed, 0.0, start, sigma)
         d = self.system.ndof
         keep = np.r_[0:d, d + 1 : 2 * d + 1]
         return projected(end).reshape(y.shape), A[:, keep][:, :, keep].reshape(*y.shape, 2 * d)
@@ -137,7 +140,7 @@ class LogarithmicClock:
         """The states a physical time h after `start` by one step each, and its length σ in s."""
 
         def step(sigma: np.ndarray) -> np.ndarray:
-            return np.asarray(self.inner.step(self.transformed, 0.0, start, sigma))
+            return np.asarray(self.method.inner.step(self.transformed, 0.0, start, sigma))
 
         d = self.system.ndof
         with np.errstate(all="ignore"):
@@ -280,7 +283,7 @@ class PhysicalRun:
 
     def _stepper(self) -> Stepper:
         clock, start = self.clock, self.start[0] if len(self.start) == 1 else self.start
-        return clock.inner.stepper(Problem(clock.transformed, 0.0, self.h, start, backend=self.problem.backend))
+        return clock.method.inner.stepper(Problem(clock.transformed, 0.0, self.h, start, backend=self.problem.backend))
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the stepper, whose compiled loops belong to a process."""
@@ -551,7 +554,7 @@ def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:
     expected = float(elapsed[-1]) / dt
     stride = int(min(max(1.0, (length / dt / (len(elapsed) + 1)) ** 0.5), LONGEST_STRIDE))
     h = sign * clock.new_step
-    found = clock.method.reach_times(transformed, h, start, elapsed[first:], stride, expected, problem.backend)
+    found = clock.method.reach_times(clock, h, start, elapsed[first:], stride, expected, problem.backend)
     if found is None:
         return None
     Y, counts = found

@@ -435,11 +435,11 @@ class LogSympFlow(FixedStep):
             dt, new_step = physical_length(flow.dt, scale, clock), flow.dt
         else:
             dt, new_step = float(self.dt), step_of_length(float(self.dt), scale, clock)
-        return LogarithmicClock(self, system, transformed, SympFlowIntegrator(flow=flow), dt, new_step)
+        return LogarithmicClock(self, system, transformed, dt, new_step, numbers)
 
     def reach_times(
         self,
-        transformed: HamiltonianSystem,
+        clock: LogarithmicClock,
         h: float,
         start: np.ndarray,
         times: np.ndarray,
@@ -448,12 +448,16 @@ class LogSympFlow(FixedStep):
         backend: str,
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Run in one compiled pass: see `clocks.OnClock`. Only a trained clock tells what times its steps reach."""
-        numbers = self.flow.clock_numbers()
-        if not numbers:
+        if not clock.numbers:
             return None
-        bound = self.flow.bound(transformed)
-        kernel = compiled_loops(lambda: bound.kernel_for(transformed), start, backend)
-        return None if kernel is None else kernel.reach_times(h, start, times, stride, expected, numbers)
+        bound = self.flow.bound(clock.transformed)
+        kernel = compiled_loops(lambda: bound.kernel_for(clock.transformed), start, backend)
+        return None if kernel is None else kernel.reach_times(h, start, times, stride, expected, clock.numbers)
+
+    @property
+    def inner(self) -> FixedStep:
+        """The flow on the transformed system."""
+        return SympFlowIntegrator(flow=self.flow)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count evaluations on the transformed system: see `clocks.OnClock`."""
@@ -466,8 +470,11 @@ class LogSympFlow(FixedStep):
         return self.on_clock(system).dt
 
     def check(self, system: HamiltonianSystem) -> None:
+        if self.flow is not None:
+            self.flow.check_system(transformed_system(system, self.clock_shift))
+            if self.dt is None:
+                return
         clock = self.on_clock(system)
-        self.flow.check_system(clock.transformed)
         if not clock.new_step <= self.flow.dt * (1 + 1e-12):
             longest = replace(self, dt=None).on_clock(system).dt
             raise ValueError(f"`dt` must be at most {longest:g}, where the step in s is the flow's Δ; got {self.dt:g}.")

@@ -61,9 +61,8 @@ def _logarithmic(method: Splitting, system: HamiltonianSystem) -> LogarithmicClo
             "not: use 'kahan_li8'."
         )
     transformed, dt = transformed_system(system, method.shift), method.step_length(system)
-    inner = _on_the_physical_clock(type(method), bool(method.compensated))  # type: ignore[arg-type]
     new_step = dt * scale_of(system, transformed.params["shift"])
-    return LogarithmicClock(method, system, transformed, inner, dt, new_step)
+    return LogarithmicClock(method, system, transformed, dt, new_step)
 
 
 CLOCKS = {
@@ -186,7 +185,7 @@ class Splitting(OwnStepper):
 
     def reach_times(
         self,
-        transformed: HamiltonianSystem,
+        clock: LogarithmicClock,
         h: float,
         start: np.ndarray,
         times: np.ndarray,
@@ -195,14 +194,19 @@ class Splitting(OwnStepper):
         backend: str,
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Run on the logarithmic clock in one compiled pass: see `clocks.OnClock`."""
+        transformed = clock.transformed
         if self.compensated or transformed.symbols is None:
             return None
-        inner = _on_the_physical_clock(type(self), False)  # type: ignore[arg-type]
-        if compiled_loops(lambda: inner.composed(transformed).kernel(False), start, backend) is None:
+        if compiled_loops(lambda: self.inner.composed(transformed).kernel(False), start, backend) is None:
             return None
         from sympflow.kernels.timed_loops import reach_times
 
         return reach_times(transformed, self.scheme, h, start, times, stride, expected)
+
+    @property
+    def inner(self) -> Splitting:
+        """The scheme with the splitting and the clock that need none: on the logarithmic clock that is what runs."""
+        return _on_the_physical_clock(type(self), bool(self.compensated))  # type: ignore[arg-type]
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count those of a scheme of kicks and drifts; a stepper counts those of other parts too."""
