@@ -140,7 +140,7 @@ def test_a_flow_of_networks_evaluates_no_force():
 
 
 def test_a_primed_flow_counts_its_forces():
-    """Those of the steps, each of which SciPy reports, and those of the one velocity that is compared with `fun`."""
+    """The forces of the steps, each of which SciPy reports, and of the one velocity that is compared with `fun`."""
     flow = get("sympflow")().flow_for(HH)
     alone = flow.evaluations(0, 0, 1, "array")["force_evaluations"]
     least = flow.evaluations(35, 35, 0, "compiled")["force_evaluations"]  # T = 49 is 35 steps of Δt = 1.4
