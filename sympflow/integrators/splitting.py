@@ -146,8 +146,11 @@ class Splitting(OwnStepper):
     def __post_init__(self) -> None:
         super().__post_init__()
         cls = type(self)
-        if (self.compensated, self.splitting, self.clock) == (False, cls.splitting, cls.clock) and (
-            self.parts is None and self.shift is None
+        if (
+            self.compensated is False
+            and self.splitting is cls.splitting
+            and self.clock is cls.clock
+            and (self.parts is None and self.shift is None)
         ):
             return
         check_flag("compensated", self.compensated)
