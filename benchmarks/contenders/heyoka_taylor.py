@@ -24,7 +24,7 @@ class Taylor:
 
     @classmethod
     def of_system(cls, system: HamiltonianSystem) -> Taylor:
-        """Those of a symbolic system."""
+        """Return the Taylor solver of a symbolic system."""
         symbols = system.symbols
         if symbols is None:
             raise ValueError(f"`system` {system.name!r} has no symbols: leave heyoka out.")

@@ -124,26 +124,29 @@ class OwnStepper(FixedStep):
         raise NotImplementedError(f"{type(self).__name__} must define own_stepper().")
 
     def stepper(self, problem: Problem) -> Stepper:
-        return self.own_stepper(problem) if _has_its_own(type(self)) else Stepper(self, problem)  # type: ignore[arg-type]
+        asked = _overridden(type(self))  # type: ignore[arg-type]
+        return Stepper(self, problem) if asked else self.own_stepper(problem)
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
+        if "step" in _overridden(type(self)):  # type: ignore[arg-type]
+            return super().rollout(problem, h, n_steps, save)
         stepper = self.own_stepper(problem)
         states, finite = stepper.rollout(problem.y0, h, n_steps, save, problem.t0)
         return states, finite, stepper.backend
 
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
+        if "step" in _overridden(type(self)):  # type: ignore[arg-type]
+            return super().substep(system, y, h, backend)
         asked = "auto" if backend == "compiled" else "array"
         return self.own_stepper(Problem(system, 0.0, 0.0, y, backend=asked)).shorter(y, h)
 
 
 @cache
-def _has_its_own(cls: type[OwnStepper]) -> bool:
-    """True unless a subclass of a built-in class overrides what its stepper would not ask for."""
-    for name in ("step", "rollout", "substep", "evaluations"):
-        definer = next(base for base in cls.__mro__ if name in vars(base))
-        if not definer.__module__.startswith("sympflow."):
-            return False
-    return True
+def _overridden(cls: type[OwnStepper]) -> frozenset[str]:
+    """Return the duties that a subclass of a built-in class defines anew: its stepper must ask them."""
+    duties = ("step", "rollout", "substep", "evaluations")
+    definers = ((name, next(base for base in cls.__mro__ if name in vars(base))) for name in duties)
+    return frozenset(name for name, base in definers if not base.__module__.startswith("sympflow."))
 
 
 # one run of a method -------------------------------------------------------------------------------

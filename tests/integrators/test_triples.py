@@ -128,6 +128,17 @@ def test_what_a_subclass_overrides_is_asked(name):
     assert watched.stats["backend"] == plain.stats["backend"] == "compiled"
 
 
+@pytest.mark.parametrize("name", ["verlet", "gauss_legendre4", "impulse"])
+def test_a_step_that_a_subclass_overrides_is_the_one_that_runs(name):
+    class Standing(get(name)):
+        def step(self, system, t, y, h):
+            return y + 0 * y
+
+    sol = solve(FPUT, Standing(), (0, 0.5), t_eval=[0.2, 0.5])
+    np.testing.assert_array_equal(sol.y, np.repeat(FPUT.y0[:, None], 2, axis=1))
+    assert sol.stats["backend"] == "numpy"
+
+
 @pytest.mark.parametrize("name", ["verlet", "linear_srkn6b", "strang_parts", "log_leapfrog"])
 def test_no_method_keeps_a_system_alive(name):
     system = systems.kepler(0.3) if name == "log_leapfrog" else systems.fput(m=1, omega=10.0)
