@@ -28,6 +28,10 @@ class Definition:
     numba_functions: tuple[Any, Any, Any] | None = None
     differentiates_itself: bool = False
 
+    def learns(self, y: Array) -> bool:
+        """Return True if torch follows numbers within the functions at the states y (..., 2d), such as weights."""
+        return False
+
     def potential_hessian(self, q: Array) -> Array:
         """∇²V(q): (..., d) to (..., d, d)."""
         raise NotImplementedError(f"{type(self).__name__} must define potential_hessian().")

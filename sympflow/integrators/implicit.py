@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
+from sympflow.arrays import Array, concatenate, is_tensor, library, per_state, to_numpy, values
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import KernelStepper, OwnStepper, Problem, Stepper, compiled_loops, rollout
 from sympflow.integrators.contract import Failure
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from sympflow.kernels.implicit_loops import ImplicitKernel, Tableau
 
 MOST_ITERATIONS = 50
+TRACED_ITERATIONS = 8
+"""Newton's iterations in a graph that `torch.compile` traces; from K = 0 some five converge where dt is sensible."""
 
 
 @dataclass(frozen=True)
@@ -122,16 +124,40 @@ class Gauss(OwnStepper):
         """
         import torch
 
-        constant = h.detach() if is_tensor(h) else h
-        with torch.no_grad():
-            flat = to_numpy(y.detach())
-            K0, iterations = self._stages(system, flat, to_numpy(constant) if is_tensor(h) else h)
-        K = torch.as_tensor(K0, dtype=y.dtype, device=y.device)
         A = torch.as_tensor(self.tableau[0], dtype=y.dtype, device=y.device)
+        with torch.no_grad():
+            K, iterations = _solved_tensors(system, y.detach(), h.detach() if is_tensor(h) else h, A)
         for _ in range(2):
             M, residual = _equations(system, y, K, h, A)
             K = K - torch.linalg.solve_ex(M, residual[..., None])[0][..., 0].reshape(K.shape)
         return K, iterations
+
+
+def _solved_tensors(system: HamiltonianSystem, y: Any, h: Any, A: Any) -> tuple[Any, int]:
+    """The K of `Gauss._stages` for tensors, by the same iteration, and its count over all states.
+
+    Under `torch.func.vmap` it runs until the last lane has converged; where a graph is traced, which cannot depend on
+    values, `TRACED_ITERATIONS` times.
+    """
+    import torch
+
+    eps = torch.finfo(y.dtype).eps
+    K = y[..., None, :] * torch.zeros_like(A[:, :1])
+    before = y[..., 0] * 0 + torch.inf
+    done = before < 0
+    for iteration in range(1, MOST_ITERATIONS + 1):  # noqa: B007
+        M, residual = _equations(system, y, K, h, A)
+        change = torch.linalg.solve_ex(M, residual[..., None])[0][..., 0].reshape(K.shape)
+        K = torch.where(done[..., None, None], K, K - change)
+        size = _relative_size(change, y, K, system.ndof)
+        small = (size <= eps**0.7) | ((size <= eps**0.57) & (size >= before / 2))
+        lost = ~(size < torch.inf) & ~done
+        K = torch.where(lost[..., None, None], torch.nan, K)
+        done, before = done | small | lost, size
+        found = values(done)
+        if iteration == TRACED_ITERATIONS if found is None else found.all():
+            break
+    return torch.where(done[..., None, None], K, torch.nan), iteration * done.numel()
 
 
 class _Counts:
@@ -209,14 +235,15 @@ def _solved(M: np.ndarray, x: np.ndarray) -> np.ndarray:
         return out
 
 
-def _relative_size(change: np.ndarray, y: np.ndarray, K: np.ndarray, d: int) -> np.ndarray:
+def _relative_size(change: Array, y: Array, K: Array, d: int) -> Array:
     """The larger of ‖ΔK_q‖/(‖q‖ + ‖K_q‖) and ‖ΔK_p‖/(‖p‖ + ‖K_p‖), (...)."""
+    xp = library(y)
     ratios = []
     for part in (slice(0, d), slice(d, None)):
-        top = np.abs(change[..., part]).max((-2, -1))
-        scale = (np.abs(y[..., part]) + np.abs(K[..., part]).max(-2)).max(-1)
-        ratios.append(np.where(top == 0, 0.0, top / np.where(scale == 0, 1, scale)))
-    return np.maximum(*ratios)
+        top = xp.amax(abs(change[..., part]), (-2, -1))
+        scale = xp.amax(abs(y[..., part]) + xp.amax(abs(K[..., part]), -2), -1)
+        ratios.append(xp.where(top == 0, 0 * top, top / xp.where(scale == 0, 1 + 0 * scale, scale)))
+    return xp.maximum(*ratios)
 
 
 @dataclass(frozen=True)

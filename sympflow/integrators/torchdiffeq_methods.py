@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt
-from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
+from sympflow.arrays import Array, differentiable, finite_states, full_of_nan, is_tensor, stack, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Recorder
 from sympflow.integrators.contract import ENDED, FINISHED, Integrator, Outcome, Problem, Steps
@@ -387,7 +387,7 @@ class _Stages(Trace):
 
     def callback_accept_step(self, s: Any, y: Any, dt: Any) -> None:
         K, y = [self.array(f) for f in (self.first, *self.slopes)], self.array(y)
-        if not (s.requires_grad or dt.requires_grad):
+        if not differentiable(s, dt):
             s, dt = float(s), float(dt)
         t0, t1 = (self.t_span[0] + self.direction * x for x in (s, s + dt))
         h = self.direction * dt
@@ -552,7 +552,7 @@ class FixedGrid(ExplicitStep, FixedStep):
                 wanted = save[(save > k) & (save <= k + n)] - k
                 if (finite == n_steps).any():
                     block = odeint(scaled, y, torch.arange(n + 1, dtype=y.dtype, device=y.device), method=self.name)
-                    ok = to_numpy(all_finite(block))
+                    ok = finite_states(block)
                     finite = np.where((finite == n_steps) & ~ok[-1], k + np.argmin(ok, axis=0) - 1, finite)
                     y = block[-1]
                     states += [block[i] for i in wanted.tolist()]
