@@ -110,7 +110,9 @@ def values(x: Any) -> np.ndarray | None:
     plain, order = _behind(x)
     if plain is None:
         return None
-    with untransformed():
+    import torch
+
+    with torch._C._DisableFuncTorch():
         return plain.cpu().numpy().transpose(order)
 
 
@@ -129,9 +131,9 @@ def readable(x: Array) -> bool:
 
 def untransformed() -> AbstractContextManager[Any]:
     """Return a context in which tensors are made outside of the transforms of `torch.func` that may be under way."""
-    import torch
+    from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
 
-    return torch._C._DisableFuncTorch()
+    return temporarily_clear_interpreter_stack()
 
 
 def _behind(x: Any) -> tuple[Any, list[int]]:
@@ -141,7 +143,7 @@ def _behind(x: Any) -> tuple[Any, list[int]]:
     if torch.compiler.is_dynamo_compiling():
         return None, []
     functorch, axes = torch._C._functorch, list(range(x.ndim))
-    with untransformed():
+    with torch._C._DisableFuncTorch():
         while functorch.is_functorch_wrapped_tensor(x):
             if functorch.is_batchedtensor(x):
                 axes.insert(functorch.maybe_get_bdim(x), min([0, *axes]) - 1)
@@ -150,15 +152,24 @@ def _behind(x: Any) -> tuple[Any, list[int]]:
         return (None if _is_symbolic(x) else x.detach()), order
 
 
+def transformed(*arrays: Any) -> bool:
+    """Return True if torch follows one of these tensors by other means than a graph for reverse mode."""
+    return any(is_tensor(x) and _is_transformed(x) for x in arrays)
+
+
 def _is_followed(x: Any) -> bool:
+    import torch
+
+    return bool(x.requires_grad and torch.is_grad_enabled()) or _is_transformed(x)
+
+
+def _is_transformed(x: Any) -> bool:
     import torch
     from torch.autograd import forward_ad
 
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x) or _is_symbolic(x):
         return True
-    if (x.requires_grad and torch.is_grad_enabled()) or torch._C._functorch.is_functorch_wrapped_tensor(x):
-        return True
-    return forward_ad.unpack_dual(x).tangent is not None or _is_symbolic(x)
+    return forward_ad.unpack_dual(x).tangent is not None
 
 
 def _is_symbolic(x: Any) -> bool:
@@ -180,7 +191,7 @@ def finite_states(y: Array, *, in_any_lane: bool = False) -> np.ndarray:
     if finite is None:
         return np.ones(y.shape[:-1], dtype=bool)
     hidden = tuple(range(finite.ndim - y.ndim + 1))
-    return finite.any(hidden) if in_any_lane else finite.all(hidden)
+    return np.asarray(finite.any(hidden) if in_any_lane else finite.all(hidden))
 
 
 def all_finite(y: Array) -> Array:
@@ -202,11 +213,20 @@ def full_of_nan(y: Array) -> Array:
 
 
 def jvp(f: Callable[[Array], Array], x: Array, v: Array) -> tuple[Array, Array]:
-    """Return f(x) and its derivative at the tensor x along v, by torch, without the warnings that its set-up gives."""
+    """Return f(x) and its derivative at the tensor x along v, by torch, without the warnings that its set-up gives.
+
+    By forward mode; inside `torch.autograd.forward_ad`, which cannot be nested, by reverse mode twice.
+    """
     import torch
 
     _set_up()
-    y, dy = torch.func.jvp(f, (x,), (v,))[:2]
+    try:
+        y, dy = torch.func.jvp(f, (x,), (v,))[:2]
+    except RuntimeError as error:
+        if "Nested forward mode" not in str(error):
+            raise
+        y, pull = torch.func.vjp(f, x)[:2]
+        dy = torch.func.vjp(lambda u: pull(u)[0], torch.zeros_like(y))[1](v)[0]
     return y, dy
 
 

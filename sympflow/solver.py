@@ -136,11 +136,11 @@ def solve(
         )
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
-    if outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0):
-        if readable(y_start):
-            from sympflow.integrators.diagnosis import note_singularities
+    failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
+    if failed and readable(y_start):
+        from sympflow.integrators.diagnosis import note_singularities
 
-            note_singularities(outcome, integrator, problem)
+        note_singularities(outcome, integrator, problem)
     if action != "ignore" and readable(outcome.y):
         check_domain(outcome, integrator, system, action)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)

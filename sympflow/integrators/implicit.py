@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from sympflow.kernels.implicit_loops import ImplicitKernel, Tableau
 
 MOST_ITERATIONS = 50
+DIFFERENTIATED = 3
+"""Iterations in the graph, and so the orders of derivatives that are right."""
 TRACED_ITERATIONS = 8
 """Newton's iterations in a graph that `torch.compile` traces; from K = 0 some five converge where dt is sensible."""
 
@@ -117,19 +119,20 @@ class Gauss(OwnStepper):
         return K, iteration * done.size
 
     def _tensor_stages(self, system: HamiltonianSystem, y: Array, h: Any) -> tuple[Array, int]:
-        """`_stages` of tensors: solved without a graph, then two more iterations in it, which give it derivatives.
+        """`_stages` of tensors: solved without a graph, then three more iterations in it, which give it derivatives.
 
-        At the solution each differentiable iteration of Newton's method doubles the order of the derivatives that are
-        right, so first and second ones are.
+        They are Newton's with the matrix of the solution held fixed: each makes derivatives of one more order right.
         """
         import torch
 
         A = torch.as_tensor(self.tableau[0], dtype=y.dtype, device=y.device)
         with torch.no_grad():
-            K, iterations = _solved_tensors(system, y.detach(), h.detach() if is_tensor(h) else h, A)
-        for _ in range(2):
-            M, residual = _equations(system, y, K, h, A)
-            K = K - torch.linalg.solve_ex(M, residual[..., None])[0][..., 0].reshape(K.shape)
+            start, length = y.detach(), h.detach() if is_tensor(h) else h
+            K, iterations = _solved_tensors(system, start, length, A)
+            M, _ = _newton_matrix(system, start[..., None, :] + A @ K, length, A)
+            inverse = torch.linalg.inv_ex(M)[0]
+        for _ in range(DIFFERENTIATED):
+            K = K - (inverse @ _residual(system, y, K, h, A)[..., None])[..., 0].reshape(K.shape)
         return K, iterations
 
 
@@ -145,7 +148,7 @@ def _solved_tensors(system: HamiltonianSystem, y: Any, h: Any, A: Any) -> tuple[
     K = y[..., None, :] * torch.zeros_like(A[:, :1])
     before = y[..., 0] * 0 + torch.inf
     done = before < 0
-    for iteration in range(1, MOST_ITERATIONS + 1):  # noqa: B007
+    for iteration in range(1, MOST_ITERATIONS + 1):
         M, residual = _equations(system, y, K, h, A)
         change = torch.linalg.solve_ex(M, residual[..., None])[0][..., 0].reshape(K.shape)
         K = torch.where(done[..., None, None], K, K - change)
@@ -201,11 +204,14 @@ class ArrayGauss(_Counts, Stepper):
 
 def _equations(system: HamiltonianSystem, y: Array, K: Array, h: Any, A: Array) -> tuple[Array, Array]:
     """Newton's matrix (..., s·2d, s·2d) and the residuals K_i − h f(Y_i), (..., s·2d)."""
-    Y = y[..., None, :] + A @ K
-    M, _ = _newton_matrix(system, Y, h, A)
+    M, _ = _newton_matrix(system, y[..., None, :] + A @ K, h, A)
+    return M, _residual(system, y, K, h, A)
+
+
+def _residual(system: HamiltonianSystem, y: Array, K: Array, h: Any, A: Array) -> Array:
     outer = h[..., None] if getattr(h, "ndim", 0) else h
-    residual = K - outer * system.vector_field(Y)
-    return M, residual.reshape(*residual.shape[:-2], -1)
+    residual = K - outer * system.vector_field(y[..., None, :] + A @ K)
+    return residual.reshape(*residual.shape[:-2], -1)
 
 
 def _newton_matrix(system: HamiltonianSystem, Y: Array, h: Any, A: Array) -> tuple[Array, Array]:

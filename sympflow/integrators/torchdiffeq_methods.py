@@ -16,7 +16,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt
-from sympflow.arrays import Array, differentiable, finite_states, full_of_nan, is_tensor, stack, to_numpy
+from sympflow.arrays import (
+    Array,
+    differentiable,
+    finite_states,
+    full_of_nan,
+    is_tensor,
+    readable,
+    stack,
+    to_numpy,
+    transformed,
+)
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Recorder
 from sympflow.integrators.contract import ENDED, FINISHED, Integrator, Outcome, Problem, Steps
@@ -116,6 +126,13 @@ class Watched(Integrator):
                 failure = f"torchdiffeq stopped after t = {trace.reached:.17g} ({error}). End `t_span` earlier."
             except TooManyStepsError as error:
                 failure, trace.spent = str(error), True
+            except RuntimeError as error:  # their own autograd.Function has derivatives in reverse mode only
+                if not transformed(y):
+                    raise
+                raise TypeError(
+                    f"`method` {self.name!r} of torchdiffeq cannot be run in forward mode or inside torch.func: use "
+                    "torch.autograd.grad, or a method of fixed steps, such as 'rk4'."
+                ) from error
         return trace, failure
 
     @property
@@ -127,6 +144,11 @@ class Watched(Integrator):
         raise NotImplementedError
 
     def run(self, problem: Problem) -> Outcome:
+        if not readable(problem.y0):
+            raise TypeError(
+                f"`method` {self.name!r} chooses its steps by the values of the states, which torch.func.vmap and "
+                "torch.compile hide: pass the states as a batch y0, or use a method of fixed steps, such as 'rk4'."
+            )
         times, stats = self.outputs(problem)
         outcome, trace = self.run_jointly(problem, times)
         if trace.failed and problem.y0.ndim > 1 and not trace.spent:
@@ -534,7 +556,12 @@ class FixedGrid(ExplicitStep, FixedStep):
     tableau: ClassVar[Tableau]
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
-        """Calls of `odeint` for 64 steps each, in the time s = (t − t0)/h, where h is exact."""
+        """Calls of `odeint` for 64 steps each, in the time s = (t − t0)/h, where h is exact.
+
+        Under `torch.func.vmap` or `torch.compile`, which torchdiffeq's loop does not allow, the same steps by `step`.
+        """
+        if not readable(problem.y0):
+            return super().rollout(problem, h, n_steps, save)
         import torch
         from torchdiffeq import odeint
 

@@ -82,10 +82,7 @@ class Path:
         return count.to(torch.int64), torch.where(on_grid, r - r.detach(), r)
 
     def rollout(self, save: np.ndarray, start: Tensor | None = None) -> Tensor:
-        """The states after the steps `save` (sorted counts) from y0, or from another start.
-
-        They are compiled where nothing is to be differentiated.
-        """
+        """The states after the steps `save` (sorted counts) from y0, or `start`: compiled if torch follows nothing."""
         y: Any = self.y0 if start is None else start
         if self.before_step is not None:
             return self._one_by_one(save)
@@ -165,7 +162,7 @@ class Path:
             value = self._bracket(g)
         s = zero = torch.tensor(value, dtype=torch.float64, device=self.y0.device)
         count, r = self.located(zero[None])
-        start, inside = self(count * self.h)[0], float(r[0])
+        start, inside = self(count.to(torch.float64) * self.h)[0], float(r[0])
 
         def state(time: Tensor) -> Tensor:
             remainder = (time - zero + inside).to(start.dtype)
@@ -243,6 +240,37 @@ class Path:
         return b if g_b == 0 else float(brentq(f, a, b, xtol=_EPS, rtol=_EPS))
 
 
+class DensePath(Path):
+    """A path to a known end whose states on the grid are computed once.
+
+    Parameters
+    ----------
+    integrator, system, y0, direction
+        As for `Path`.
+    times : tensor of shape (2,)
+        Its beginning and end.
+    """
+
+    def __init__(
+        self, integrator: FixedStep, system: HamiltonianSystem | None, y0: Tensor, direction: int, times: Tensor
+    ) -> None:
+        super().__init__(integrator, system, y0, direction)
+        count, _ = self.located(times[1:] - times[0])
+        self.times = numbers(times)
+        self.states = super().rollout(np.arange(int(numbers(count).max()) + 1))
+
+    def __call__(self, s: Tensor) -> Tensor:
+        found, length, slack = numbers(s), self.times[1] - self.times[0], _EPS * np.abs(self.times).max()
+        if found.size and not (found.min() >= min(0.0, length) - slack and found.max() <= max(0.0, length) + slack):
+            raise ValueError(
+                f"`t` must lie between {self.times[0]:g} and {self.times[1]:g}, the interval that was solved."
+            )
+        return super().__call__(s)
+
+    def rollout(self, save: np.ndarray, start: Tensor | None = None) -> Tensor:
+        return self.states[torch.as_tensor(save, device=self.states.device)]
+
+
 class AdjointPath(Path):
     """A path whose derivatives are pulled back step by step, along the states that the inverse of the map steps to.
 
@@ -285,11 +313,12 @@ class AdjointPath(Path):
 
     def _run_again(self, y: Tensor, first: int, last: int) -> Iterator[tuple[int, Tensor]]:
         """The same for the steps between two counts, of a map without an inverse."""
+        path = Path(self.integrator, self.system, y, 1 if self.h > 0 else -1)
         stride = math.isqrt(last - first) + 1
         marks = np.arange(0, last - first, stride)
-        for mark, start in zip(marks[::-1].tolist(), self.rollout(marks, y).flip(0), strict=True):
+        for mark, start in zip(marks[::-1].tolist(), path.rollout(marks).flip(0), strict=True):
             n = min(stride, last - first - mark)
-            for j, state in zip(range(n - 1, -1, -1), self.rollout(np.arange(n), start).flip(0), strict=True):
+            for j, state in zip(range(n - 1, -1, -1), path.rollout(np.arange(n), start).flip(0), strict=True):
                 if mark + j:
                     yield first + mark + j, state
 
@@ -300,10 +329,10 @@ class AdjointPath(Path):
             inputs = [y, h, *self.parameters] if isinstance(h, Tensor) and h.requires_grad else [y, *self.parameters]
             end = self.integrator.step(self.system, 0.0, y, h)
             # what is retained is freed with `end`; the part of a graph that lies outside of the step has to stay
-            found = list(torch.autograd.grad(end, inputs, a, allow_unused=True, retain_graph=True))
+            found: list[Tensor | None] = list(torch.autograd.grad(end, inputs, a, allow_unused=True, retain_graph=True))
         of_y = torch.zeros_like(y) if found[0] is None else found[0]
         n = len(self.parameters)
-        return of_y, (found[1] if len(inputs) > 1 + n else None), found[len(found) - n :] if n else []
+        return of_y, (found[1] if len(inputs) > 1 + n else None), found[len(found) - n :]
 
 
 class _PulledBack(torch.autograd.Function):
@@ -330,9 +359,9 @@ class _PulledBack(torch.autograd.Function):
         a, top = torch.zeros_like(grid[0]), int(saved[-1])
 
         def add(found: list[Tensor | None]) -> None:
-            for total, part in zip(of_parameters, found, strict=True):
+            for i, part in enumerate(found):
                 if part is not None:
-                    total += part
+                    of_parameters[i] += part
 
         for k, y in path.backwards(grid, saved):
             if k < top:
@@ -367,6 +396,24 @@ def numbers(t: Tensor) -> np.ndarray:
             "`t` is a tensor without values where torch.compile traces, but it says how many steps are made: use "
             "sympflow.solve, whose times are numbers."
         )
+    return found
+
+
+def leaves(system: HamiltonianSystem, y: Tensor) -> list[Tensor]:
+    """The leaves of the graph on which the vector field at y depends, other than y: such as a network's weights."""
+    y = y.detach()
+    if not system.learns(y):
+        return []
+    found: list[Tensor] = []
+    waiting, seen = [system.vector_field(y).grad_fn], set()
+    while waiting:
+        node = waiting.pop()
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        if isinstance(leaf := getattr(node, "variable", None), Tensor):
+            found.append(leaf)
+        waiting += [parent for parent, _ in node.next_functions]
     return found
 
 
