@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from fractions import Fraction
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -167,7 +168,7 @@ def _windows(p: Polynomial, points: list[Decimal], values: list[Decimal]) -> tup
     start, peak = None, Decimal(0)
     if len(p) < 2 or p[1] >= 0:  # unstable from the beginning
         start, peak = Decimal(0), abs(values[1])
-    for (a, b), (u, v) in zip(_pairs(points), _pairs(values), strict=True):
+    for (a, b), (u, v) in zip(pairwise(points), pairwise(values), strict=True):
         for level in sorted((Decimal(1), Decimal(-1)), reverse=u > v):
             if start is None and (u - level) * level <= 0 < (v - level) * level:  # leaves through this level
                 start, peak = _crossing(p, level, a, b), abs(v)
@@ -184,10 +185,6 @@ def _windows(p: Polynomial, points: list[Decimal], values: list[Decimal]) -> tup
 def _window(start: Decimal, stop: Decimal, peak: Decimal) -> Window:
     growth = peak + (peak * peak - 1).sqrt()
     return Window(math.sqrt(start), math.sqrt(stop), float(growth))
-
-
-def _pairs(items: list[Decimal]) -> list[tuple[Decimal, Decimal]]:
-    return list(zip(items[:-1], items[1:], strict=True))
 
 
 # polynomials ----------------------------------------------------------------------------------------------------------
@@ -267,7 +264,7 @@ def _positive_roots(p: Polynomial) -> list[Decimal]:
     points = [Decimal(0), *_positive_roots(_derivative(p)), bound]
     values = [_value(p, x) for x in points]
     found = []
-    for (a, b), (u, v) in zip(_pairs(points), _pairs(values), strict=True):
+    for (a, b), (u, v) in zip(pairwise(points), pairwise(values), strict=True):
         if u * v < 0:
             found.append(_crossing(p, Decimal(0), a, b))
         elif v == 0 and b != bound:
@@ -316,23 +313,27 @@ class SmallOscillations:
         return float(self.frequencies.max(initial=0.0))
 
 
-def small_oscillations(system: HamiltonianSystem, states: np.ndarray) -> SmallOscillations | None:
+def small_oscillations(
+    system: HamiltonianSystem, y0: np.ndarray, orbit: Callable[[], np.ndarray]
+) -> SmallOscillations | None:
     """Return the frequencies about a stable equilibrium, else the largest along an orbit; None if there are none.
 
     Parameters
     ----------
     system : HamiltonianSystem
-    states : ndarray (n, 2d)
-        Of the orbit. The equilibrium is sought from the origin and from the first of them.
+    y0 : ndarray (2d,)
+        The equilibrium, of no higher energy, is sought from the origin and from there.
+    orbit : callable
+        Gives states (n, 2d) along the orbit, which are looked at where there is no equilibrium.
     """
     with np.errstate(all="ignore"):
         try:
-            center = _equilibrium(system, states[0])
+            center = _equilibrium(system, y0)
             if center is not None:
-                return SmallOscillations(_frequencies(system, center), center, _quadratic(system, states[0]))
-            rates = [_frequencies(system, y) for y in states]
-        except (TypeError, ValueError, np.linalg.LinAlgError, NotImplementedError, RuntimeError):
-            return None  # no second derivatives
+                return SmallOscillations(_frequencies(system, center), center, _quadratic(system, y0))
+            rates = [_frequencies(system, y) for y in orbit()]
+        except Exception:  # the system's functions have no second derivatives there
+            return None
     fastest = max(rates, key=lambda w: float(w.max(initial=0.0)))
     return SmallOscillations(fastest, None) if fastest.max(initial=0.0) > 0 else None
 
@@ -431,4 +432,3 @@ def _found(growth: np.ndarray, steps: np.ndarray, at: Callable[[np.ndarray], np.
         top = float(growth[edges[i] : last].max())
         windows.append(Window(ends[i], ends[i + 1], math.inf if ends[i + 1] == math.inf else top))
     return windows
-

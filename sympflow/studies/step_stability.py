@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import MAX_SAVED_VALUES, check_counts, check_t_span
+from sympflow.arguments import MAX_SAVED_VALUES, check_counts, check_t_span, positive_numbers
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
@@ -129,9 +129,8 @@ def stability(
     real = isinstance(bound, int | float | np.number) and not isinstance(bound, bool)
     if not real or np.iscomplexobj(bound) or not 0 < bound < math.inf:
         raise ValueError(f"`bound` must be positive and finite, a relative energy error; got {bound!r}.")
-    if progress is not None and not callable(progress):
-        raise TypeError(f"`progress` must be a function of one line of text; got {progress!r}.")
-    lengths = None if steps is None else _checked_steps(steps)
+    attempts.check_progress(progress)
+    lengths = None if steps is None else positive_numbers("steps", steps)
     unknown = [d for d in dtypes if d not in ("float32", "float64")]
     if isinstance(dtypes, str) or unknown or not len(dtypes):
         raise ValueError(f"`dtypes` must be a list of 'float32' and 'float64'; got {dtypes!r}.")
@@ -142,11 +141,13 @@ def stability(
         if span[0] == span[1]:
             raise ValueError("`t_span` has length zero, so there is nothing to run: choose a later end.")
         starts = initial_states(one, y0)
-        small = small_oscillations(one, _orbit(one, starts[0], span)) if limits else None
+        small = small_oscillations(one, starts[0], partial(_orbit, one, starts[0], span)) if limits else None
         for candidate in candidates(methods):
             for dtype in dtypes:
                 say = partial(_say, progress, f"{title(one)}: {candidate.label}, {dtype}")
-                study = Study(one, candidate, dtype, span, starts, tuple(metrics), bound, min_steps, max_steps, say, small)
+                study = Study(
+                    one, candidate, dtype, span, starts, tuple(metrics), bound, min_steps, max_steps, say, small
+                )
                 say("")
                 own = [study.row(h) for h in study.lengths(lengths)]
                 rows += own
@@ -181,18 +182,6 @@ def _orbit(system: HamiltonianSystem, y0: np.ndarray, t_span: tuple[float, float
     with _quiet():
         states = solve(system, "dop853", (0.0, length), y0, t_eval=times, rtol=1e-6, atol=1e-8).states
     return states if len(states) else y0[None]
-
-
-def _checked_steps(steps: Sequence[float]) -> list[float]:
-    try:
-        if any(isinstance(h, bool | np.bool_ | str) for h in steps):
-            raise TypeError("no step lengths")
-        lengths = sorted(float(h) for h in steps)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"`steps` must be a list of step lengths; got {steps!r}.") from error
-    if not lengths or not all(0 < h < math.inf for h in lengths):
-        raise ValueError(f"`steps` must be positive and finite; got {steps!r}.")
-    return lengths
 
 
 # one method with a range of steps -------------------------------------------------------------------------------------
