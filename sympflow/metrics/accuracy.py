@@ -63,8 +63,8 @@ def check_problem(reference: object, system: HamiltonianSystem, t0: float, y0: n
             raise ValueError(
                 f"`reference` is a solution of another system, {reference.system.name!r}: pass one of {system.name!r}."
             )
-        start = to_numpy(reference.y0).astype(float)
-        eps = max(1e-12, 4 * float(np.finfo(to_numpy(reference.y0).dtype).eps))
+        start = to_numpy(reference.y0)
+        eps = max(1e-12, *(4 * float(np.finfo(y.dtype).eps) for y in (start, y0)))
         same = start.shape == y0.shape and np.allclose(start, y0, rtol=eps, atol=eps * np.abs(y0).max(initial=0.0))
         if reference.t_span[0] == t0 and not same:
             raise ValueError("`reference` is a solution from another `y0`: solve from the one that is compared.")

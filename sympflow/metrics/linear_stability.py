@@ -83,8 +83,8 @@ class LinearStability:
         return tuple((a, b) for a, b in zip(starts, stops, strict=True) if a < b)
 
     def window_of(self, step: float) -> Window | None:
-        """Return the window that holds a step; None for a stable one."""
-        return next((w for w in self.windows if w.start < step < w.stop), None)
+        """Return the window that holds a step, its ends included; None for a stable one."""
+        return next((w for w in self.windows if w.start <= step <= w.stop), None)
 
     def in_steps(self, frequencies: Sequence[float] | np.ndarray) -> LinearStability:
         """Return the steps h for oscillations of several frequencies ω, from those in z = hω."""
