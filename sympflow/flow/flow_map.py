@@ -331,6 +331,11 @@ class FlowMap(nn.Module):
     # its system ---------------------------------------------------------------------------------------------
 
     @property
+    def system(self) -> HamiltonianSystem | None:
+        """The system whose functions the flow evaluates; None for networks, and for a flow loaded without it."""
+        return None
+
+    @property
     def origin(self) -> Origin | None:
         """The system in the physical time, for a flow in another time; None for a flow in its system's own time."""
         made = (self.recipe or {}).get("transforms")
