@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import sys
 from collections.abc import Callable, Mapping
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -286,3 +287,69 @@ class HamiltonianSystem(Hamiltonian):
         params = ", ".join(f"{k}={v:g}" for k, v in self.params.items())
         kind = "separable" if self.separable else "not separable"
         return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
+
+
+# a view that counts -------------------------------------------------------------------------------
+
+COUNTED = {
+    "force": "force_evaluations",
+    "gradient": "force_evaluations",
+    "vector_field": "force_evaluations",
+    "potential_hessian": "hessian_evaluations",
+    "hessian_vector": "hessian_evaluations",
+    "hessian": "hessian_evaluations",
+    "third_derivative": "curvature_evaluations",
+    "curvature_gradient": "curvature_evaluations",
+}
+"""The functions of a system that are counted, and as what."""
+
+
+def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]) -> HamiltonianSystem:
+    """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    count : callable
+        Called with what is evaluated, a value of `COUNTED`, and the states or positions (..., k).
+
+    Returns
+    -------
+    HamiltonianSystem
+        Equal to `system`, so that whatever is kept by system is found by the view too.
+    """
+    view = copy.copy(system)
+    view.__class__ = _counting_class(type(system))  # type: ignore[arg-type]
+    view._original, view._count, view._inside = system, count, False  # type: ignore[attr-defined]
+    return view
+
+
+@lru_cache(maxsize=64)
+def _counting_class(cls: type[HamiltonianSystem]) -> type[HamiltonianSystem]:
+    def counted(name: str) -> Callable[..., Array]:
+        def evaluate(self: Any, x: Array, *more: Array) -> Array:
+            function = getattr(super(view, self), name)
+            if self._inside:  # one of them may call another
+                return function(x, *more)
+            self._inside = True
+            try:
+                value = function(x, *more)
+            finally:
+                self._inside = False
+            self._count(COUNTED[name], x)
+            return value
+
+        return evaluate
+
+    view: Any = type(
+        cls.__name__,
+        (cls,),
+        {
+            **{name: counted(name) for name in COUNTED},
+            "__hash__": lambda self: hash(self._original),
+            "__eq__": lambda self, other: other is self or other is self._original,
+            "__reduce__": lambda self: (copy.copy, (self._original,)),
+            "__doc__": cls.__doc__,
+        },
+    )
+    return view
