@@ -116,6 +116,18 @@ def values(x: Any) -> np.ndarray | None:
         return plain.cpu().numpy().transpose(order)
 
 
+def one_lane(x: Array) -> np.ndarray:
+    """Return the values of `x`, under `torch.func.vmap` those of the first lane.
+
+    Raises
+    ------
+    TypeError
+        If there are none, in a graph that `torch.compile` traces.
+    """
+    found = values(x) if is_tensor(x) else np.asarray(x)
+    return to_numpy(x) if found is None else found[(0,) * (found.ndim - x.ndim)]
+
+
 def lanes(x: Array) -> int:
     """Return the number of axes, hidden in the shape of `x`, over which `torch.func.vmap` maps it."""
     return len(_behind(x)[1]) - x.ndim if is_tensor(x) else 0
