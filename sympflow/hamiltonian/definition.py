@@ -21,12 +21,15 @@ class Definition:
         (potential, gradient, hessian_vector), if they are Numba's.
     differentiates_itself : bool
         True if all derivatives are automatic ones of a function that is written with torch.
+    has_hessian_vector : bool
+        False if ∇²V·v of arrays is not to be had: a gradient was given without it.
     """
 
     ndof: int
     separable: bool
     numba_functions: tuple[Any, Any, Any] | None = None
     differentiates_itself: bool = False
+    has_hessian_vector: bool = True
 
     def potential_hessian(self, q: Array) -> Array:
         """∇²V(q): (..., d) to (..., d, d)."""
