@@ -20,7 +20,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.options import NewFlow
 from sympflow.training.points import Stream, states
 from sympflow.training.table_fit import take_over
-from sympflow.training.table_step import forces_of
+from sympflow.training.table_step import DENSE, forces_of
 
 SCALING_SAMPLES = 4096
 SAMPLES, SEED = 1000, 0
@@ -29,8 +29,7 @@ PHASE = 1.0  # ω Δt of the default flow: energy errors of 1e-8 to 1e-5, where 
 KICK_PHASE = 0.25  # ω Δt for each kick of the kernel
 MOST_STAGES = 24
 MOST_PERIODS = 30  # of most states, that Δt may hold
-DENSE = 32  # degrees of freedom up to which all eigenvalues are computed
-ITERATIONS, FEWER_SAMPLES = 40, 100  # of the power method beyond
+ITERATIONS, FEWER_SAMPLES = 40, 100  # of the power method, for many degrees of freedom
 
 
 class Start(Protocol):

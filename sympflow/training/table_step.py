@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, Protocol
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 ALONG = 1e-4  # length of the difference, relative to q, that gives the third derivative of V along M⁻¹∇V
+DENSE = 16  # degrees of freedom up to which third derivatives of a symbolic V are generated
 PRODUCT = 1e-3  # length of the difference, relative to q, that gives ∇²V·v where it is not known
 
 Check = Callable[[], None]
@@ -171,7 +173,7 @@ class Forces(Protocol):
 
 def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = ()) -> Forces:
     """The forces of a separable system with T = ½ pᵀM⁻¹p: from its symbols, its Numba functions, or its own arrays."""
-    if system.symbols is not None:
+    if system.symbols is not None and (system.ndof <= DENSE or level == CURVATURE or monomials):
         return SymbolicForces(system.symbols, level, monomials)
     return ArrayForces(system, level)
 
@@ -182,7 +184,7 @@ class SymbolicForces:
     def __init__(self, symbols: Any, level: int, monomials: Monomials) -> None:
         import sympy as sp
 
-        slope = sp.Matrix([sp.diff(symbols.V, s) for s in symbols.q])
+        slope = sp.Matrix(symbols.slope)
         terms = [-slope]
         if level in (FORCE_GRADIENT, CURVATURE):
             v = symbols.inverse_mass * slope
@@ -280,7 +282,8 @@ class ArrayForces:
 
     def _hessian(self, rows: np.ndarray) -> np.ndarray:
         """∇²V: (P, d) to (P, d, d)."""
-        if self.system.numba_functions is None and self.system.has_hessian_vector:
+        given = self.system.symbols is not None or self.system.numba_functions is not None
+        if not given and self.system.has_hessian_vector:
             return self.system.potential_hessian(rows)
         basis = np.broadcast_to(np.eye(rows.shape[1])[:, None], (rows.shape[1], *rows.shape))
         return np.moveaxis(self._product(rows, basis), 0, -1)
@@ -293,44 +296,71 @@ def _ends(rows: np.ndarray, v: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray
     return (rows + length * v, rows - length * v), length
 
 
-def product_of(system: HamiltonianSystem) -> Product:
-    """∇²V(q)·v of arrays (..., d): the system's own, or a difference of ∇V along v where it has none."""
-    if system.has_hessian_vector:
-        return system.hessian_vector
-
-    def product(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        q, v = np.broadcast_arrays(q, v)
-        largest = np.abs(v).max(-1, keepdims=True)
-        length = PRODUCT * np.maximum(np.abs(q).max(-1, keepdims=True), 1e-300)
-        return largest * derivative(lambda x: -system.force(x), q, v / np.where(largest > 0, largest, 1.0), length)
-
-    return product
-
-
 def _row_functions(system: HamiltonianSystem) -> tuple[Callable[[np.ndarray], np.ndarray], Product]:
-    """∇V of rows (P, d), and ∇²V·v of rows and v (..., P, d): of Numba functions in one compiled loop each."""
-    product = product_of(system)
+    """∇V of rows (..., P, d), and ∇²V·v of rows and v: of Numba functions in one compiled loop each.
+
+    Where a gradient was given without products, these are differences of it along v.
+    """
+
+    def slopes(rows: np.ndarray) -> np.ndarray:
+        return -system.force(rows)
+
+    if system.symbols is not None:
+        return slopes, _symbolic_product(system.symbols)
     if system.numba_functions is None:
-        return lambda rows: -system.force(rows), product
+        return slopes, system.hessian_vector if system.has_hessian_vector else _differences_of(slopes)
     _, gradient, hessian_vector = system.numba_functions
     slope_loop, product_loop = _compiled(gradient, hessian_vector)
 
-    def slopes(rows: np.ndarray) -> np.ndarray:
+    def compiled_slopes(q: np.ndarray) -> np.ndarray:
+        rows = np.array(q).reshape(-1, q.shape[-1])
         out = np.empty_like(rows)
         slope_loop(rows, out)
-        return out
+        return out.reshape(q.shape)
 
     if product_loop is None:
-        return slopes, product
+        return compiled_slopes, _differences_of(compiled_slopes)
 
-    def products(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def compiled_products(q: np.ndarray, v: np.ndarray) -> np.ndarray:
         shape = np.broadcast_shapes(q.shape, v.shape)
         q, v = (np.array(np.broadcast_to(a, shape)).reshape(-1, shape[-1]) for a in (q, v))
         out = np.empty_like(v)
         product_loop(q, v, out)
         return out.reshape(shape)
 
-    return slopes, products
+    return compiled_slopes, compiled_products
+
+
+_PRODUCTS: WeakKeyDictionary[Any, Product] = WeakKeyDictionary()
+
+
+def _symbolic_product(symbols: Any) -> Product:
+    """∇²V·v, generated once from the derivatives that do not vanish."""
+    import sympy as sp
+
+    if symbols in _PRODUCTS:
+        return _PRODUCTS[symbols]
+    directions = sp.symbols(f"v1:{symbols.ndof + 1}", real=True)
+    changes = [_derivative(f, symbols.q, directions) for f in symbols.slope]
+    d, function = symbols.ndof, _generated((*symbols.q, *directions), changes)
+
+    def product(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        both = np.concatenate(np.broadcast_arrays(q, v), axis=-1)
+        rows = np.ascontiguousarray(both.reshape(-1, both.shape[-1]).T)
+        return function(rows).T.reshape(*both.shape[:-1], d)
+
+    _PRODUCTS[symbols] = product
+    return product
+
+
+def _differences_of(slopes: Callable[[np.ndarray], np.ndarray]) -> Product:
+    def product(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        q, v = np.broadcast_arrays(q, v)
+        largest = np.abs(v).max(-1, keepdims=True)
+        length = PRODUCT * np.maximum(np.abs(q).max(-1, keepdims=True), 1e-300)
+        return largest * derivative(slopes, q, v / np.where(largest > 0, largest, 1.0), length)
+
+    return product
 
 
 def _compiled(gradient: Any, hessian_vector: Any) -> tuple[Callable[..., None], Callable[..., None] | None]:
