@@ -77,6 +77,8 @@ CLASSES: dict[str, str] = {
     "mlp": "flows:MLPIntegrator",
     "implicit_midpoint": "implicit:ImplicitMidpoint",
     "gauss_legendre4": "implicit:GaussLegendre4",
+    "gauss_legendre6": "implicit:GaussLegendre6",
+    "gauss_legendre8": "implicit:GaussLegendre8",
 }
 """The other methods: module and class."""
 UNLISTED = {"log_sympflow": "flows:LogSympFlow"}
