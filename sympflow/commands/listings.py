@@ -8,17 +8,21 @@ from typing import Annotated
 import typer
 
 from sympflow.commands.console import print_table, reporting
-from sympflow.commands.words import SCENES, one_scene, parameters, shown
+from sympflow.commands.words import made, one_scene, parameters, scene_names, shown
 
 
 def systems() -> None:
-    """List the built-in systems, their parameters and the flows that ship for them."""
+    """List the systems, those of plug-ins too, their parameters and the flows that ship for them."""
     with reporting():
         from sympflow.flow.shipped import shipped_flows
 
         rows = []
-        for name, factory in SCENES.items():
-            system = factory()
+        for name in scene_names():
+            try:
+                system = made(name)
+            except Exception as error:  # of a plug-in, which must not take all others with it
+                rows.append((name, str(error), "", "", "", ""))
+                continue
             flows = shipped_flows(system)
             primed = sum(f.stages is not None for f in flows)
             trained = [f"{f.kind} (Δt = {f.dt:g})" for f in flows if f.stages is None]

@@ -9,15 +9,16 @@ import typer
 
 from sympflow.commands.console import out, progress, ready_folder, reporting, write_comparisons
 from sympflow.commands.words import (
-    SCENES,
     Backend,
     State,
     Step,
     Systems,
     TEnd,
     interval,
+    made,
     methods,
     parameters,
+    scene_names,
     scenes,
     state,
 )
@@ -179,7 +180,7 @@ def stability(
             family = [scene.system]
             if vary is not None:
                 name, values = _varied(scene.key, vary)
-                family = [SCENES[scene.key](**{name: value}) for value in values]
+                family = [made(scene.key, **{name: value}) for value in values]
             span = None if scene.t_end is None and t_end is None else interval(scene, t_end)
             with progress() as say:
                 report = find_stability(
@@ -206,7 +207,7 @@ def _varied(key: str, words: str) -> tuple[str, list[float]]:
     name, equals, values = words.partition("=")
     if not (equals and values):
         raise ValueError(f"`--vary` must be a parameter and its values, such as omega=1,10,100; got {words!r}.")
-    if key not in SCENES:
+    if key not in scene_names():
         raise ValueError(f"`--vary` goes with a scene without parameters of its own; got {key}: leave those out.")
     if name not in parameters(key):
         takes = ", ".join(parameters(key)) or "none"

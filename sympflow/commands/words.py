@@ -15,6 +15,8 @@ import typer
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.systems import SYSTEMS, harmonic_oscillator
+from sympflow.systems import available as available_systems
+from sympflow.systems import get as system_named
 
 Systems = Annotated[
     list[str],
@@ -31,8 +33,33 @@ def _stiff_oscillator(omega: float = 100.0) -> HamiltonianSystem:
     return harmonic_oscillator(omega)
 
 
-SCENES: dict[str, Callable[..., HamiltonianSystem]] = {**SYSTEMS, "stiff-oscillator": _stiff_oscillator}
-"""The systems by the names of the command line."""
+_ALIASES: dict[str, Callable[..., HamiltonianSystem]] = {"stiff-oscillator": _stiff_oscillator}
+"""The scenes that only the command line has."""
+
+
+def scene_names() -> list[str]:
+    """The names of all scenes, those of installed plug-ins among them; none is imported."""
+    return list(dict.fromkeys([*SYSTEMS, *_ALIASES, *available_systems()]))
+
+
+def factory_of(scene: str) -> Callable[..., HamiltonianSystem]:
+    """The function that makes a scene."""
+    return _ALIASES[scene] if scene in _ALIASES else system_named(scene)
+
+
+def made(scene: str, **params: Any) -> HamiltonianSystem:
+    """The system of a scene; one of a plug-in may fail.
+
+    Raises
+    ------
+    ImportError
+        If a plug-in's cannot be loaded or makes something else.
+    """
+    system = factory_of(scene)(**params)
+    if not isinstance(system, HamiltonianSystem):
+        what = type(system).__name__
+        raise ImportError(f"`system` {scene!r} makes no HamiltonianSystem but a {what}: report it where it is from.")
+    return system
 
 
 @dataclass(frozen=True)
@@ -46,7 +73,7 @@ class Scene:
 
 def parameters(scene: str) -> dict[str, Any]:
     """Parameters of a scene with their default values."""
-    return {name: p.default for name, p in inspect.signature(SCENES[scene]).parameters.items()}
+    return {name: p.default for name, p in inspect.signature(factory_of(scene)).parameters.items()}
 
 
 def scenes(words: Sequence[str]) -> list[Scene]:
@@ -61,7 +88,7 @@ def scenes(words: Sequence[str]) -> list[Scene]:
     """
     names, shared = _split(words)
     if not names:
-        raise ValueError(f"`system` is missing: name one or more of {', '.join(SCENES)}.")
+        raise ValueError(f"`system` is missing: name one or more of {', '.join(scene_names())}.")
     found = [_scene(name, shared) for name in names]
     known = {p for name in names for p in parameters(_key(name))}
     for name in shared:
@@ -73,7 +100,7 @@ def scenes(words: Sequence[str]) -> list[Scene]:
 
 def shown(value: Any) -> str:
     """A parameter's value as it is written on a command line."""
-    return value if isinstance(value, str) else f"{value:g}"
+    return f"{value:g}" if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
 
 
 def one_scene(words: Sequence[str]) -> Scene:
@@ -117,10 +144,10 @@ def _key(word: str) -> str:
 def _scene(word: str, shared: dict[str, str]) -> Scene:
     _, *pairs = word.split(":")
     name = _key(word)
-    if name not in SCENES:
-        close = difflib.get_close_matches(name, SCENES, n=1)
+    if name not in scene_names():
+        close = difflib.get_close_matches(name, scene_names(), n=1)
         hint = f"Did you mean {close[0]!r}? " if close else ""
-        raise ValueError(f"`system` {name!r} is unknown. {hint}Choose from {', '.join(SCENES)}.")
+        raise ValueError(f"`system` {name!r} is unknown. {hint}Choose from {', '.join(scene_names())}.")
     own = dict(_pairs(pairs))
     t_end = _float("t_end", own.pop("t_end")) if "t_end" in own else None
     known = parameters(name)
@@ -133,7 +160,7 @@ def _scene(word: str, shared: dict[str, str]) -> Scene:
         for key, value in asked.items()
     }
     key = "-".join([name, *(f"{k}={shown(v)}" for k, v in params.items())])
-    return Scene(key, SCENES[name](**params), t_end)
+    return Scene(key, made(name, **params), t_end)
 
 
 def methods(words: str) -> list[Any]:

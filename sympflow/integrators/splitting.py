@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cache
@@ -17,8 +18,8 @@ from sympflow.integrators.base import FixedStep, KernelStepper, OwnStepper, Step
 from sympflow.integrators.clocks import LogarithmicClock, scale_of, transformed_system
 from sympflow.integrators.compositions import SPLITTINGS, Composition
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
-from sympflow.integrators.methods import TRIPLES
-from sympflow.schemes import SCHEMES, Scheme, scheme_evaluations
+from sympflow.integrators.methods import NAMES, TRIPLES
+from sympflow.schemes import SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
@@ -290,27 +291,114 @@ class CompiledComposition(KernelStepper):
         return self.composition.evaluations(n_steps, n_saved, n_extra, "compiled")
 
 
+# classes of triples -------------------------------------------------------------------------------
+
+
+def splitting_method(
+    scheme: Scheme | str, splitting: str = "kinetic", clock: str = "physical", *, name: str | None = None
+) -> type[Splitting]:
+    """Return the integrator class of a scheme × a splitting × a clock; it runs compiled as the built-in ones do.
+
+    Parameters
+    ----------
+    scheme : Scheme or str
+        A table of your own, or the name of a known one.
+    splitting, clock : str
+        The defaults of the options of these names: see `Splitting`.
+    name : str, optional
+        By which reports call the method. The default is that of the triple if it is a built-in one, else the scheme's,
+        with the splitting and the clock where they are not "kinetic" and "physical".
+
+    Returns
+    -------
+    type
+        The same class for the same arguments. Call it with options to get an integrator, or give it to
+        `sympflow.register`. It pickles by its table.
+
+    Raises
+    ------
+    TypeError
+        If `scheme` is no scheme, or `name` no string.
+    ValueError
+        If there is no such scheme, splitting or clock; if the scheme is not consistent; or if the name is that of
+        another, built-in method.
+
+    Examples
+    --------
+    >>> from sympflow.systems import pendulum
+    >>> Ruth3 = splitting_method(Scheme("ruth3", 3, kicks=(7 / 24, 3 / 4, -1 / 24), drifts=(2 / 3, -2 / 3, 1.0)))
+    >>> method = Ruth3(dt=0.05)
+    >>> method, method.order
+    (ruth3(dt=0.05), 3)
+    """
+    table = checked_scheme(scheme_named(scheme) if isinstance(scheme, str) else scheme)
+    for argument, value, known in (("splitting", splitting, SPLITTINGS), ("clock", clock, CLOCKS)):
+        if not isinstance(value, str) or value not in known:
+            raise ValueError(f"`{argument}` must be one of {', '.join(map(repr, known))}; got {value!r}.")
+    if name is None:
+        row = _row_of(table, splitting, clock)
+        if row is not None:
+            return method_of_row(row)
+        name = "_".join([table.name, *(part for part in (splitting, clock) if part not in ("kinetic", "physical"))])
+    elif not isinstance(name, str):
+        raise TypeError(f"`name` must be a string, such as 'my_method'; got {type(name).__name__}.")
+    if not name.strip() or name in NAMES:
+        taken = "is a built-in method of another table" if name in NAMES else "is empty"
+        raise ValueError(f"`name` {name!r} {taken}: choose another one, as by name='my_method'.")
+    return _method_of(name, table, splitting, clock)
+
+
+def _row_of(scheme: Scheme, splitting: str, clock: str) -> str | None:
+    """Return the name of a triple in `TRIPLES`, if it is there."""
+    if SCHEMES.get(scheme.name) != scheme:
+        return None
+    triple = (scheme.name, splitting, clock)
+    return next((name for name, row in TRIPLES.items() if (row.scheme, row.splitting, row.clock) == triple), None)
+
+
 @cache
-def splitting_method(name: str) -> type[Splitting]:
+def method_of_row(name: str) -> type[Splitting]:
     """Return the integrator class of a row of `TRIPLES`."""
     row = TRIPLES[name]
-    scheme = SCHEMES[row.scheme]
+    return _new_class(type, name, SCHEMES[row.scheme], row.splitting, row.clock, row.source)
+
+
+@cache
+def _method_of(name: str, scheme: Scheme, splitting: str, clock: str) -> type[Splitting]:
+    cls = _new_class(_ByTable, name, scheme, splitting, clock, scheme.source)
+    cls._made_of = (name, scheme, splitting, clock)  # type: ignore[attr-defined]
+    return cls
+
+
+class _ByTable(type):
+    """The type of classes that no module holds: they pickle as the table that they are made of."""
+
+
+def _reduced(cls: _ByTable) -> Any:
+    made_of = vars(cls).get("_made_of")
+    return cls.__qualname__ if made_of is None else (_method_of, made_of)  # a subclass is found by its name
+
+
+copyreg.pickle(_ByTable, _reduced)
+
+
+def _new_class(kind: type[type], name: str, scheme: Scheme, splitting: str, clock: str, source: str) -> type[Splitting]:
     namespace: dict[str, Any] = {
         "name": name,
         "order": scheme.order,
         "scheme": scheme,
-        "source": row.source,
-        "splitting": row.splitting,
-        "clock": row.clock,
+        "source": source,
+        "splitting": splitting,
+        "clock": clock,
         "__annotations__": {"splitting": str, "clock": str},
-        "__doc__": f"{name}: order {scheme.order}, {row.source}\n\n{Splitting.__doc__}",
+        "__doc__": f"{name}: order {scheme.order}, {source}\n\n{Splitting.__doc__}",
         "__module__": __name__,
     }
-    return dataclass(frozen=True, repr=False)(type(name, (Splitting,), namespace))
+    return dataclass(frozen=True, repr=False)(kind(name, (Splitting,), namespace))
 
 
 def __getattr__(name: str) -> type[Splitting]:
     """The integrator classes as attributes of the module, where pickle looks for them."""
     if name in TRIPLES:
-        return splitting_method(name)
+        return method_of_row(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

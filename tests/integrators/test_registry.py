@@ -1,6 +1,7 @@
 """The registry: listing without importing, built-ins that cannot be shadowed, plug-ins that break on use only."""
 
 from dataclasses import dataclass
+from importlib import metadata
 from importlib.metadata import EntryPoint
 from typing import ClassVar
 
@@ -101,7 +102,7 @@ def plugins(monkeypatch):
         EntryPoint("declining_check", f"{__name__}:DecliningCheck", registry.GROUP),
         EntryPoint("nameless", f"{__name__}:Nameless", registry.GROUP),
     ]
-    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [p for p in points if p.group == group])
     monkeypatch.setattr(registry, "_loaded", {})
     monkeypatch.setattr(registry, "_registered", {})
     registry._plugins.cache_clear()
