@@ -114,8 +114,7 @@ def check_counts(**values: Any) -> None:
 
 def check_dt(dt: Any) -> None:
     """Raise unless `dt` is None or a step length."""
-    number = isinstance(dt, int | float | np.number) and not isinstance(dt, bool)
-    if dt is not None and not (number and 0 < dt <= LONGEST_STEP):
+    if dt is not None and not (real_number(dt) and 0 < dt <= LONGEST_STEP):
         raise ValueError(f"`dt` must be a positive and finite number, at most {LONGEST_STEP:g}; got {dt!r}.")
 
 
@@ -136,9 +135,14 @@ def floats(name: str, value: Any) -> np.ndarray:
     return array.astype(float)
 
 
+def real_number(value: Any) -> bool:
+    """Return True for a real number of Python's or NumPy's, however large; False for a bool."""
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
 def check_number(name: str, value: Any) -> None:
     """A TypeError unless `value` is a real number."""
-    if not isinstance(value, int | float | np.number) or isinstance(value, bool) or np.iscomplexobj(value):
+    if not real_number(value):
         raise TypeError(f"`{name}` must be a number; got {value!r}.")
 
 

@@ -44,6 +44,8 @@ class Hamiltonian:
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
         self.inverse_mass = inverse_mass
+        if inverse_mass is not None:
+            inverse_mass.setflags(write=False)  # a part of H, of which code is generated
         self.quadratic_kinetic = quadratic_kinetic
         self.stiffness_matrix: np.ndarray | None = None
 
@@ -210,7 +212,7 @@ def _like(constant: np.ndarray, x: Array) -> Array:
     if is_tensor(x):
         import torch
 
-        return torch.as_tensor(constant, dtype=x.dtype, device=x.device)
+        return torch.tensor(constant, dtype=x.dtype, device=x.device)
     return constant.astype(x.dtype, copy=False)
 
 

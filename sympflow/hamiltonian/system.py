@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.arguments import floats, real_number
 from sympflow.arrays import Array
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
@@ -21,6 +24,22 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.linear_part import LinearPart
 
 MOST_DEGREES = 1_000_000
+
+
+class Parameters(dict[str, float]):
+    """The parameters of a system: a dictionary that cannot be changed, for the code of H holds their values."""
+
+    def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
+        raise TypeError(
+            "`params` of a system are to be read only, for its forces would not change: make a system with other "
+            "parameters, by its scene's function or by HamiltonianSystem.from_sympy(..., params=...)."
+        )
+
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    update = setdefault = pop = popitem = clear = _refuse
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Parameters, (dict(self),)
 
 
 class HamiltonianSystem(Hamiltonian):
@@ -111,6 +130,7 @@ class HamiltonianSystem(Hamiltonian):
             if not definition.separable:
                 raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
             self.stiffness_matrix = matrices.stiffness_matrix(stiffness_matrix, definition.ndof)
+            self.stiffness_matrix.setflags(write=False)
         self._set_scene({}, domain, y0, t_span, dt, energy_scale)
 
     @classmethod
@@ -133,8 +153,11 @@ class HamiltonianSystem(Hamiltonian):
         Parameters
         ----------
         expression : str or sympy.Expr
+            In a text `pi` is a constant and every other name that is no function a symbol: so are `E` and `I`;
+            Euler's number is exp(1).
         params : mapping of str to float, optional
-            Values of the other symbols.
+            Values of the other symbols: finite real numbers. A name that is given here is a symbol whatever it means
+            otherwise. `system.params` holds them, to be read only.
         name, domain, y0, t_span, dt, energy_scale
             As for the class.
 
@@ -143,15 +166,16 @@ class HamiltonianSystem(Hamiltonian):
         ValueError, TypeError
             If the expression cannot be parsed, has symbols without a value, or depends on t.
         """
-        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, checked_params
 
+        params = checked_params(params)
         symbols = SymbolicHamiltonian(expression, params)
         self = cls.__new__(cls)
         M = symbols.inverse_mass
         inverse_mass = None if M is None else matrices.simplest(np.array(M.tolist(), dtype=float))
         Hamiltonian.__init__(self, name, symbols, inverse_mass, M is not None)
         self.symbols = symbols
-        self._set_scene(dict(params or {}), domain, y0, t_span, dt, energy_scale)
+        self._set_scene(params, domain, y0, t_span, dt, energy_scale)
         return self
 
     def _set_scene(
@@ -163,26 +187,43 @@ class HamiltonianSystem(Hamiltonian):
         dt: float,
         energy_scale: float | None,
     ) -> None:
-        self.params = params
-        if not (isinstance(dt, int | float | np.number) and 0 < dt < 1e100):
+        self._params = Parameters(params)
+        if not real_number(dt) or not 0 < dt < 1e100:
             raise ValueError(f"`dt` must be positive and finite; got {dt!r}.")
         try:
-            self.t_span = (float(t_span[0]), float(t_span[1]))
-        except (TypeError, ValueError, IndexError, KeyError) as error:
-            raise ValueError(f"`t_span` must be two numbers, start and end; got {t_span!r}.") from error
-        self.dt = float(dt)
-        scale = isinstance(energy_scale, int | float | np.number)
-        if energy_scale is not None and not (scale and 0 < energy_scale < np.inf):
+            t0, t1 = (float(t) for t in t_span)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"`t_span` must be two finite numbers, start and end; got {t_span!r}.") from error
+        if not math.isfinite(t1 - t0):
+            raise ValueError(f"`t_span` must be two finite numbers, start and end; got {t_span!r}.")
+        self.t_span, self.dt = (t0, t1), float(dt)
+        if energy_scale is not None and not (real_number(energy_scale) and 0 < energy_scale <= sys.float_info.max):
             raise ValueError(f"`energy_scale` must be positive and finite; got {energy_scale!r}.")
         self.energy_scale = energy_scale
-        self.y0 = None if y0 is None else np.array(y0, dtype=float)
-        if self.y0 is not None and self.y0.shape != (2 * self.ndof,):
-            raise ValueError(f"`y0` must have shape ({2 * self.ndof},), [q, p]; got {self.y0.shape}.")
+        self.y0 = None if y0 is None else self._checked_y0(y0)
         if domain is not None and not isinstance(domain, Domain):
             raise TypeError(f"`domain` must be a domain such as sympflow.Box(low, high); got {type(domain).__name__}.")
         self.domain = domain.attach(self.hamiltonian) if isinstance(domain, EnergySublevel) else domain
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
+
+    def _checked_y0(self, y0: ArrayLike) -> np.ndarray:
+        """The default initial state: a copy of floats."""
+        try:
+            state = floats("y0", y0)
+        except OverflowError:
+            raise ValueError("`y0` must be finite: it has an integer that no float is near.") from None
+        if state.shape != (2 * self.ndof,):
+            raise ValueError(f"`y0` must have shape ({2 * self.ndof},), [q, p]; got {state.shape}.")
+        return state
+
+    @property
+    def params(self) -> Mapping[str, float]:
+        """The values of the parameters, to be read only: they are part of H, from which all code is generated.
+
+        A system with others is made by `HamiltonianSystem.from_sympy`, or by the function of its scene.
+        """
+        return self._params
 
     # structure --------------------------------------------------------------------------------------
 
