@@ -1,51 +1,119 @@
-"""The console: errors as one line, progress, tables, and the files that commands write."""
+"""The console: errors as one line and in the words of the command line, progress, tables, and the files of `--out`."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 from rich.console import Console
 
-from sympflow.commands.words import Scene
+from sympflow.commands.words import Scene, Usage
 from sympflow.studies.reports import Column, text_table
 
 out = Console(soft_wrap=True, highlight=False)
 err = Console(stderr=True, soft_wrap=True, highlight=False)
 
 
+OPTIONS = {
+    "t_span": "t_end",
+    "t_eval": "n_outputs",
+    "n_saved": "n_outputs",
+    "method": "method_name",
+    "methods": "method_names",
+    "path": "to",
+    "dtype": "dtypes",
+}
+"""Arguments of the library that a command has by another name."""
+PHRASES = {
+    "train one by flow = sympflow.train(system) and pass flow=flow": "train one by `sympflow train`, and name its file",
+    "train a flow and pass flow=flow": "train one by `sympflow train`, and name its file",
+    "flow.certificate(system)": "`sympflow certificate`",
+    "poincare_section": "`sympflow section`",
+    "pass at least one state": "give one",
+    "H does not depend on time": "H does not depend on time",
+}
+"""Remedies in Python, and what they are on the command line."""
+
+
+def in_options(message: str, context: typer.Context) -> str:
+    """A message of the library in the options of the command that runs: `t_span` is `--t-end`, backend='array' too.
+
+    Arguments that the command has no option for stay as they are.
+    """
+    parameters = context.command.params
+    named = {
+        str(p.name): max(p.opts, key=lambda word: (word.startswith("--"), -p.opts.index(word))) for p in parameters
+    }
+    options = {name: option for name, option in named.items() if option.startswith("-")}
+    options |= {name: options[other] for name, other in OPTIONS.items() if other in options and name not in options}
+    for phrase, here in PHRASES.items():
+        message = message.replace(phrase, here)
+    message = re.sub(r"`(\w+)`", lambda m: f"`{options.get(m[1], m[1])}`", message)
+    given = re.compile(r"`?(?<![\w:.-])(\w+)=('[^']*'|[\d.eE+-]*\d)`?")
+    return given.sub(lambda m: f"`{options[m[1]]} {m[2].strip(chr(39))}`" if m[1] in options else m[0], message)
+
+
 @contextlib.contextmanager
-def reporting() -> Iterator[None]:
-    """Errors as one line and an exit status: 2 for arguments, 1 for what failed, 130 for Ctrl-C."""
+def reporting(context: typer.Context) -> Iterator[None]:
+    """Errors as one line and an exit status: 2 for arguments, 1 for what failed, 130 for Ctrl-C; warnings as a line."""
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *where, **more: err.print(
+                f"Warning: {in_options(str(message), context)}", style="yellow", markup=False
+            )
+            yield
     except typer.Exit:
         raise
     except (ValueError, TypeError) as error:
-        err.print(f"Error: {error}", style="red", markup=False)
+        said = str(error) if isinstance(error, Usage) else in_options(str(error), context)
+        err.print(f"Error: {said}", style="red", markup=False)
         raise typer.Exit(2) from error
     except (RuntimeError, ImportError, OSError, ArithmeticError) as error:
-        err.print(f"Failed: {error}", style="red", markup=False)
+        err.print(f"Failed: {in_options(str(error), context)}", style="red", markup=False)
+        raise typer.Exit(1) from error
+    except MemoryError as error:
+        err.print(f"Failed: the memory is full ({error}): ask for less.", style="red", markup=False)
         raise typer.Exit(1) from error
     except KeyboardInterrupt as error:
         err.print("Interrupted.", style="red")
         raise typer.Exit(130) from error
 
 
+def _set_quiet(quiet: bool) -> bool:
+    out.quiet = quiet
+    return quiet
+
+
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "--quiet", "-q", callback=_set_quiet, is_eager=True, help="Print errors and warnings alone; files as ever."
+    ),
+]
+
+
 @contextlib.contextmanager
 def progress() -> Iterator[Callable[[str], None]]:
-    """A line on the terminal on the work in progress; nothing where there is no terminal."""
-    if not err.is_terminal:
+    """A line on the terminal on the work in progress; nothing where there is no terminal, or with --quiet."""
+    if not err.is_terminal or out.quiet:
         yield lambda text: None
         return
     with err.status("Starting") as status:
         yield status.update
+
+
+def show(text: str) -> None:
+    """Print a text as it is, unless --quiet is on."""
+    if not out.quiet:
+        print(text)
 
 
 def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -143,12 +143,12 @@ def test_a_blow_up_prints_no_warnings_of_numpy(tmp_path):
         (["compare", "harmonic-oscillator:mass=2"], "`mass` is not a parameter of harmonic-oscillator"),
         (["compare", "pendulum", "--methods", "vertel"], "Did you mean 'verlet'"),
         (["compare", "pendulum", "--methods", "verlet:rtol=1"], "`rtol` is not an option of method 'verlet'"),
-        (["compare", "pendulum", "--metrics", "beauty"], "`metrics` has no 'beauty'"),
+        (["compare", "pendulum", "--metrics", "beauty"], "`--metrics` has no 'beauty'"),
         (["compare", "pendulum", "--methods", "none.safetensors"], "none.safetensors"),
         (["solve", "pendulum", "--method", "verlet", "--y0", "1,a"], "`--y0` must be a number"),
         (["solve", "pendulum", "--method", "verlet", "--out", "y.txt"], "`--out` must end in .csv or .npz"),
         (["solve", "pendulum", "henon-heiles", "--method", "verlet"], "`system` must be one"),
-        (["solve", "pendulum", "--method", "verlet", "--dt", "-1"], "`dt` must be a positive"),
+        (["solve", "pendulum", "--method", "verlet", "--dt", "-1"], "`--dt` must be a positive"),
         (["train", "pendulum", "--hidden", "ten"], "`--hidden` must be whole numbers"),
         (["train", "pendulum", "--out", "flow.pt"], "`--out` must end in .safetensors"),
     ],
@@ -169,7 +169,7 @@ def test_train_makes_a_primed_flow_unless_told_otherwise(tmp_path):
     assert run("solve", "pendulum", "--method", path, "--t-end", 1).exit_code == 0
     refused = run("train", "pendulum", *small, "--pairs", 2, "--out", path)
     assert refused.exit_code == 2
-    assert "`pairs` is not an option of flows of kind 'primed'" in refused.stderr
+    assert "`--pairs` is not an option of flows of kind 'primed'" in refused.stderr
 
 
 def test_flows_are_listed():
@@ -231,4 +231,4 @@ def test_solve_takes_a_tolerance():
     assert float(re.search(r"largest energy error (\S+)", result.output)[1]) <= 1e-5
     refused = run("solve", "kepler", "--method", "verlet", "--tol", 1e-5)
     assert refused.exit_code != 0
-    assert "`tol` is not an option of" in refused.output
+    assert "`--tol` is not an option of" in refused.output
