@@ -23,22 +23,26 @@ err = Console(stderr=True, soft_wrap=True, highlight=False)
 
 
 OPTIONS = {
-    "t_span": "t_end",
-    "t_eval": "n_outputs",
-    "n_saved": "n_outputs",
-    "method": "method_name",
-    "methods": "method_names",
-    "path": "to",
-    "dtype": "dtypes",
+    "t_span": ("t_end",),
+    "t_eval": ("n_outputs",),
+    "method": ("method_name", "method_names"),
+    "methods": ("method_names",),
+    "flow": ("flow_name",),
+    "path": ("flow_name", "method_name", "method_names"),
+    "dtype": ("dtypes",),
 }
-"""Arguments of the library that a command has by another name."""
+"""Arguments of the library that commands have by other names: the first one counts that the command has."""
 PHRASES = {
     "train one by flow = sympflow.train(system) and pass flow=flow": "train one by `sympflow train`, and name its file",
     "train a flow and pass flow=flow": "train one by `sympflow train`, and name its file",
+    "pass the path of a flow saved with flow.save(path)": "name a file that `sympflow train` wrote",
+    "flows from other files are read by sympflow.load": "flows from other files are named by their path",
+    "pass the states to train on, as by domain=sympflow.Box(low, high), sympflow.Ball(center, radius) or "
+    "sympflow.EnergySublevel(energy, box)": "define the system with one, under [domain] of a .toml file for instance",
+    "Pass the states themselves": "Give --batch 0",
+    "sympflow.train(system)": "`sympflow train`",
     "flow.certificate(system)": "`sympflow certificate`",
     "poincare_section": "`sympflow section`",
-    "pass at least one state": "give one",
-    "H does not depend on time": "H does not depend on time",
 }
 """Remedies in Python, and what they are on the command line."""
 
@@ -53,12 +57,20 @@ def in_options(message: str, context: typer.Context) -> str:
         str(p.name): max(p.opts, key=lambda word: (word.startswith("--"), -p.opts.index(word))) for p in parameters
     }
     options = {name: option for name, option in named.items() if option.startswith("-")}
-    options |= {name: options[other] for name, other in OPTIONS.items() if other in options and name not in options}
+    for name, others in OPTIONS.items():
+        option = next((options[other] for other in others if other in options), None)
+        if option is not None:
+            options.setdefault(name, option)
     for phrase, here in PHRASES.items():
         message = message.replace(phrase, here)
     message = re.sub(r"`(\w+)`", lambda m: f"`{options.get(m[1], m[1])}`", message)
-    given = re.compile(r"`?(?<![\w:.-])(\w+)=('[^']*'|[\d.eE+-]*\d)`?")
-    return given.sub(lambda m: f"`{options[m[1]]} {m[2].strip(chr(39))}`" if m[1] in options else m[0], message)
+    given = re.compile(r"`?(?<![\w:.-])(?P<name>\w+)=(?P<value>'[^']*'|[\d.eE+-]*\d|(?=\W|$))`?")
+
+    def as_option(found: re.Match[str]) -> str:
+        option, value = options.get(found["name"]), found["value"].strip("'")
+        return found[0] if option is None else f"`{option} {value}`" if value else f"`{option}`"
+
+    return given.sub(as_option, message)
 
 
 @contextlib.contextmanager
@@ -138,8 +150,8 @@ def ready_folder(folder: Path) -> None:
     _ready(folder, folder, "a folder")
 
 
-def ready_file(path: Path) -> None:
-    """Make the folder of the file of `--out`, and be sure that it can be written, before anything is computed.
+def ready_file(path: Path, option: str = "--out") -> None:
+    """Make the folder of the file of an option, and be sure that it can be written, before anything is computed.
 
     Raises
     ------
@@ -147,20 +159,20 @@ def ready_file(path: Path) -> None:
         If it cannot.
     """
     if path.is_dir():
-        raise ValueError(f"`--out` {str(path)!r} is a folder: name a file in it.")
-    _ready(path.parent, path, "a file")
+        raise ValueError(f"`{option}` {str(path)!r} is a folder: name a file in it.")
+    _ready(path.parent, path, "a file", option)
     if path.exists() and not os.access(path, os.W_OK):
-        raise ValueError(f"`--out` {str(path)!r} is write-protected: name another file.")
+        raise ValueError(f"`{option}` {str(path)!r} is write-protected: name another file.")
 
 
-def _ready(folder: Path, asked: Path, what: str) -> None:
+def _ready(folder: Path, asked: Path, what: str, option: str = "--out") -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         raise ValueError(
-            f"`--out` {str(asked)!r} cannot be written ({error.strerror}): name {what} that can be."
+            f"`{option}` {str(asked)!r} cannot be written ({error.strerror}): name {what} that can be."
         ) from error
 
 

@@ -193,6 +193,8 @@ def train(
         if to.suffix != ".safetensors":
             raise ValueError(f"`--out` must end in .safetensors; got {str(to)!r}.")
         ready_file(to)
+        if checkpoint is not None:
+            ready_file(checkpoint, "--checkpoint")
         flow = train_flow(scene.system, dt, seed=seed, checkpoint=checkpoint, resume=resume, **options)
         flow.save(to)
         figures = [

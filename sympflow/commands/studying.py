@@ -120,7 +120,12 @@ def bench(
     method_names: Methods = "verlet,leapfrog,blanes_moan4,srkn11b,kahan_li8,rk45,dop853,sympflow,mlp",
     t_end: TEnd = None,
     y0: State = None,
-    batch: Annotated[int, typer.Option(help="Also a batch of this many states of the domain; 0 for none.")] = 1000,
+    batch: Annotated[
+        int | None,
+        typer.Option(
+            help="Also a batch of this many states of the domain; 0 for none. Default: 1000 if there is a domain."
+        ),
+    ] = None,
     n_outputs: Annotated[int, typer.Option(help="Number of instants at which errors are measured.")] = 100,
     repeats: Annotated[int, typer.Option(help="Timed runs of each point, interleaved.")] = 5,
     budget: Annotated[float, typer.Option(help="Seconds that the repeats of one point may take.")] = 20.0,
@@ -150,7 +155,7 @@ def bench(
                     chosen,
                     t_span=interval(scene, t_end),
                     y0=start,
-                    batch=batch or None,
+                    batch=(1000 if batch is None and scene.system.domain is not None else batch) or None,
                     n_outputs=n_outputs,
                     repeats=repeats,
                     budget=budget,
@@ -278,15 +283,16 @@ def section(
     """
     with reporting(ctx):
         from sympflow.studies.figure_style import save
-        from sympflow.studies.poincare import poincare_section
+        from sympflow.studies.poincare import names, poincare_section
 
         scene, chosen = one_scene(system, own), configured(method_name)
         span, start = interval(scene, t_end), _starts(scene, y0, orbits, seed)
         if direction not in DIRECTIONS:
             raise ValueError(f"`--direction` must be one of {', '.join(DIRECTIONS)}; got {direction!r}.")
         pair = [word.strip() for word in axes.split(",")] if axes is not None else [None, None]
-        if len(pair) != 2:
-            raise ValueError(f"`--axes` must be two coordinates separated by a comma, such as q2,p2; got {axes!r}.")
+        if len(pair) != 2 or not {*pair} <= {None, *names(scene.system.ndof)}:
+            known = ", ".join(names(scene.system.ndof))
+            raise ValueError(f"`--axes` must be two of {known}, separated by a comma; got {axes!r}.")
         check_counts(limit=limit)
         if to is not None:
             ready_folder(to)

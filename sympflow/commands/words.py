@@ -60,8 +60,17 @@ Method = Annotated[
 TEnd = Annotated[float | None, typer.Option(help="End of the interval. Default: the system's.")]
 State = Annotated[str | None, typer.Option("--y0", help="Initial state q,p: 0.3,-0.3,0.3,0.15. Default: the system's.")]
 Step = Annotated[float | None, typer.Option(help="Step of fixed-step methods. Default: the system's, the flow's Δt.")]
+BACKENDS = ("auto", "compiled", "array")
+
+
+def _backend(word: str) -> str:
+    if word not in BACKENDS:
+        raise typer.BadParameter(f"{word!r} is none of {', '.join(BACKENDS)}.")
+    return word
+
+
 Backend = Annotated[
-    str, typer.Option(help="auto, compiled or array.", autocompletion=completion.of(("auto", "compiled", "array")))
+    str, typer.Option(help="auto, compiled or array.", callback=_backend, autocompletion=completion.of(BACKENDS))
 ]
 
 
@@ -156,17 +165,20 @@ def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> lis
     names, shared = _split(words or ())
     names += own or ()
     if not names:
-        raise ValueError(
+        raise Usage(
             f"`system` is missing: name one of {', '.join(scene_names())}, or an own one, file.py:name or file.toml."
         )
-    parted = [_parted(name) for name in names]
-    known = {p for _, factory, _ in parted for p in _defaults(factory)}
-    for name in shared:
-        if name not in known:
-            takes = f"its parameters are {', '.join(sorted(known))}" if known else "it has no parameters"
-            option = name.replace("_", "-")
-            raise ValueError(f"`--{option}` is no option, nor a parameter of {', '.join(names)} ({takes}): see --help.")
-    return [_scene(name, factory, pairs, shared) for name, factory, pairs in parted]
+    try:
+        parted = [_parted(name) for name in names]
+        known = {p for _, factory, _ in parted for p in _defaults(factory)}
+        for name in shared:
+            if name not in known:
+                takes = f"its parameters are {', '.join(sorted(known))}" if known else "it has no parameters"
+                option = name.replace("_", "-")
+                raise Usage(f"`--{option}` is no option, nor a parameter of {', '.join(names)} ({takes}): see --help.")
+        return [_scene(name, factory, pairs, shared) for name, factory, pairs in parted]
+    except (ValueError, TypeError) as error:  # of what the system is made of, which is no option of the command
+        raise Usage(str(error)) from error
 
 
 def shown(value: Any) -> str:

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from sympflow.kernels.implicit_loops import ImplicitKernel, Tableau
 
 MOST_ITERATIONS = 50
+_BUTCHER = "J. C. Butcher, Implicit Runge–Kutta processes, Math. Comp. 18 (1964) 50–64"
+_SYMPLECTIC = (
+    "symplectic by J. M. Sanz-Serna, Runge–Kutta schemes for Hamiltonian systems, BIT 28 (1988) 877–883; any H"
+)
 
 
 @dataclass(frozen=True)
@@ -271,9 +275,7 @@ class ImplicitMidpoint(Gauss):
     """
 
     name: ClassVar[str] = "implicit_midpoint"
-    source: ClassVar[str] = (
-        "The implicit midpoint rule, y₁ = y + h f((y + y₁)/2): order 2, symplectic, symmetric, A-stable."
-    )
+    source: ClassVar[str] = f"The implicit midpoint rule, y₁ = y + h f((y + y₁)/2); {_SYMPLECTIC}"
     order: ClassVar[int | None] = 2
     tableau: ClassVar[Tableau] = gauss_legendre(1)
 
@@ -293,7 +295,7 @@ class GaussLegendre4(Gauss):
     """
 
     name: ClassVar[str] = "gauss_legendre4"
-    source: ClassVar[str] = "The Gauss–Legendre method of two stages: order 4, symplectic, symmetric, A-stable."
+    source: ClassVar[str] = f"{_BUTCHER}, the Gauss method of two stages; {_SYMPLECTIC}"
     order: ClassVar[int | None] = 4
     tableau: ClassVar[Tableau] = gauss_legendre(2)
 
@@ -314,7 +316,7 @@ class GaussLegendre6(Gauss):
     """
 
     name: ClassVar[str] = "gauss_legendre6"
-    source: ClassVar[str] = "The Gauss–Legendre method of three stages: order 6, symplectic, symmetric, A-stable."
+    source: ClassVar[str] = f"{_BUTCHER}, the Gauss method of three stages; {_SYMPLECTIC}"
     order: ClassVar[int | None] = 6
     tableau: ClassVar[Tableau] = gauss_legendre(3)
 
@@ -335,6 +337,6 @@ class GaussLegendre8(Gauss):
     """
 
     name: ClassVar[str] = "gauss_legendre8"
-    source: ClassVar[str] = "The Gauss–Legendre method of four stages: order 8, symplectic, symmetric, A-stable."
+    source: ClassVar[str] = f"{_BUTCHER}, the Gauss method of four stages; {_SYMPLECTIC}"
     order: ClassVar[int | None] = 8
     tableau: ClassVar[Tableau] = gauss_legendre(4)

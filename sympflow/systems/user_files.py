@@ -72,7 +72,7 @@ def from_toml(path: str | os.PathLike[str], **params: float) -> HamiltonianSyste
     try:
         return HamiltonianSystem.from_sympy(expression, name=name, **table)
     except (ValueError, TypeError) as error:
-        said = str(error).replace("`expression`", "`hamiltonian`", 1)
+        said = str(error).replace("`expression`", "`hamiltonian`", 1).replace(", or pass a SymPy expression", "")
         raise ValueError(f"{said.rstrip('.')} (in {str(file)!r}).") from error
 
 
@@ -113,8 +113,8 @@ def factory(path: str | os.PathLike[str], name: str | None = None) -> Callable[.
         return lambda: found
     if not callable(found):
         raise ValueError(
-            f"`system` {name!r} in {str(file)!r} is a {type(found).__name__}: name a HamiltonianSystem, or a function "
-            "that returns one."
+            f"`system` {name!r} in {str(file)!r} must be a HamiltonianSystem, or a function that returns one; it is "
+            f"{type(found).__name__}: name another."
         )
     return _answering(found, name, file)
 
@@ -139,7 +139,7 @@ def _answering(function: Callable[..., Any], name: str, file: Path) -> Callable[
         except (Exception, SystemExit) as error:
             raise ValueError(f"{where} failed ({_described(error, file)}): mend it.") from error
         if not isinstance(system, HamiltonianSystem):
-            raise ValueError(f"{where} returns a {type(system).__name__}: let it return a HamiltonianSystem.")
+            raise ValueError(f"{where} must return a HamiltonianSystem; it returns {type(system).__name__}: mend it.")
         return system
 
     return make
@@ -216,7 +216,10 @@ def _text(file: Path) -> str:
 
 def _module(file: Path) -> ModuleType:
     _text(file)
-    return _run(file.resolve())
+    try:
+        return _run(file.resolve())
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"`system` {str(file)!r} cannot be run ({_described(error, file)}): mend it.") from error
 
 
 @cache
@@ -224,23 +227,25 @@ def _run(file: Path) -> ModuleType:
     """The module of a Python file, run once, with its folder on the path as for a script."""
     name = f"sympflow_user_file_{file.stem}"
     spec = importlib.util.spec_from_file_location(name, file)
-    if spec is None or spec.loader is None:
-        raise ValueError(f"`system` {str(file)!r} is no Python file: it must end in .py.")
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # pickles and dataclasses look it up
     if str(file.parent) not in sys.path:
         sys.path.insert(0, str(file.parent))
     try:
         spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
+    except BaseException:
         del sys.modules[name]
-        raise ValueError(f"`system` {str(file)!r} cannot be run ({_described(error, file)}): mend it.") from error
+        raise
     return module
 
 
 def _described(error: BaseException, file: Path) -> str:
     """An exception with the last line of the file that it passed."""
-    line = error.lineno if isinstance(error, SyntaxError) else None
+    if isinstance(error, SyntaxError):
+        return f"SyntaxError: {error.msg}, line {error.lineno}"
+    line = None
     trace = error.__traceback__
     while trace is not None:
         if Path(trace.tb_frame.f_code.co_filename).name == file.name:
