@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 import sys
-import warnings
 from collections.abc import Container, Iterable, Sequence
 from importlib import import_module
 from importlib.machinery import ModuleSpec
@@ -103,6 +101,7 @@ def announced(group: str, what: str, taken: Container[str], others: Iterable[Ent
     others : iterable of EntryPoint
         Those of other groups, to stand beside them.
     """
+    import warnings
     from importlib.metadata import entry_points
 
     found: dict[str, EntryPoint] = {}
@@ -112,6 +111,8 @@ def announced(group: str, what: str, taken: Container[str], others: Iterable[Ent
             try:
                 warnings.warn(message, RuntimeWarning, stacklevel=5)
             except RuntimeWarning:  # where warnings are errors, it must not take all others with it
+                import logging
+
                 logging.getLogger(__name__).warning(message)
         else:
             found[point.name] = point

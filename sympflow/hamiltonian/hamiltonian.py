@@ -35,6 +35,8 @@ class Hamiltonian:
         The symbolic definition, if there is one.
     stiffness_matrix : ndarray of shape (d, d) or None
         A quadratic part ½ qᵀKq of V that was named, of a definition without symbols.
+    functions_given : bool
+        True if H is given by functions of a user, which are to be checked.
     """
 
     def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
@@ -48,6 +50,8 @@ class Hamiltonian:
             inverse_mass.setflags(write=False)  # a part of H, of which code is generated
         self.quadratic_kinetic = quadratic_kinetic
         self.stiffness_matrix: np.ndarray | None = None
+        self.functions_given: bool = definition.given
+        self._checked: frozenset[tuple[type, Any]] = frozenset()
 
     def hamiltonian(self, y: Array) -> Array:
         """H(y): (..., 2d) to (...)."""

@@ -13,8 +13,11 @@ Its duties:
 8. `finds_events` is False, and `solve` seeks events on the dense output afterwards; or `run` hands every step to
    `problem.events`, if there are any, and ends where that says.
 
+9. `arrays_only` says so, where `step` and `run` take NumPy arrays only.
+
 `FixedStep`, in `sympflow.integrators.base`, does 4, 5, 6 and 8 for any integrator that has a step: a new one needs
-duties 1 to 3 only. Whatever a run changes, such as its kernel and its counts, belongs to a `Stepper`.
+duties 1 to 3 only, and its forces are counted. Whatever a run changes, such as its kernel and its counts, belongs to a
+`Stepper`.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arrays import Array, jvp, to_numpy
+from sympflow.arrays import Array, is_tensor, jvp, to_numpy
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -102,6 +105,9 @@ class Integrator:
     """True if the steps are those of the grid t0 + k·dt, as a peer that drives them presumes."""
     in_another_time: ClassVar[bool] = False
     """True if the steps are equal in a time that is not t."""
+    arrays_only: ClassVar[str] = ""
+    """Why the method takes NumPy arrays only, and what to do: "runs on NumPy arrays: pass y0.numpy()"; "" if it takes
+    tensors too."""
     tangent_holds: ClassVar[str] = ""
     """The quantity that `tangent` holds fixed though a step from a neighbouring state would change it."""
 
@@ -127,6 +133,11 @@ class Integrator:
 
     def check(self, system: HamiltonianSystem) -> None:
         """Raise a ValueError with the reason if the method does not apply to the system."""
+
+    def check_library(self, y0: Array) -> None:
+        """Raise a TypeError with the reason if y0 is a tensor and the method takes NumPy arrays only."""
+        if is_tensor(y0) and self.arrays_only:
+            raise TypeError(f"`y0` is a tensor, but method {self.name!r} {self.arrays_only}.")
 
     def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> Integrator:
         """Return the integrator that runs from y0 over a time `length`, where the method leaves a choice."""
@@ -160,6 +171,11 @@ class Integrator:
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         """The step from y (..., 2d) and its Jacobian A (..., 2d, 2d), by forward-mode differentiation of `step`."""
+        if self.arrays_only:
+            raise TypeError(
+                f"`method` {self.name!r} {self.arrays_only}; so its step cannot be differentiated: write it with the "
+                "functions of sympflow.arrays, or define tangent()."
+            )
         import torch
 
         def step(x: torch.Tensor) -> torch.Tensor:

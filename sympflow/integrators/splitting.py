@@ -15,7 +15,7 @@ from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep, KernelStepper, OwnStepper, Stepper, compiled_loops
-from sympflow.integrators.clocks import LogarithmicClock, scale_of, transformed_system
+from sympflow.integrators.clocks import ARRAYS_ONLY, LogarithmicClock, scale_of, transformed_system
 from sympflow.integrators.compositions import SPLITTINGS, Composition
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.methods import NAMES, TRIPLES
@@ -39,6 +39,7 @@ class Clock:
     finds_events: bool = True
     on_grid: bool = True
     in_another_time: bool = False
+    arrays_only: str = ""
     tangent_holds: str = ""
     breakdown: Failure = Failure.NON_FINITE
 
@@ -73,6 +74,7 @@ CLOCKS = {
         finds_events=False,  # they are sought on the dense output
         on_grid=False,
         in_another_time=True,
+        arrays_only=ARRAYS_ONLY,
         tangent_holds="the realised step in s, and B,",
         breakdown=Failure.CLOCK,
     ),
@@ -141,6 +143,7 @@ class Splitting(OwnStepper):
     finds_events: ClassVar[Any] = OfClock()
     on_grid: ClassVar[Any] = OfClock()
     in_another_time: ClassVar[Any] = OfClock()
+    arrays_only: ClassVar[Any] = OfClock()
     tangent_holds: ClassVar[Any] = OfClock()
     breakdown: ClassVar[Any] = OfClock()
 

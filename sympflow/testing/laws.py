@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arrays import to_numpy
-from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
 from sympflow.integrators.base import FixedStep, Integrator, Problem
 from sympflow.solution import Solution
 from sympflow.solver import solve
@@ -249,12 +250,20 @@ def dtype_device_and_gradient_of_tensors(integrator: Integrator, system: Hamilto
     import torch
 
     y0 = torch.from_numpy(states(system, 2))
-    try:
-        run(integrator, system, (0.0, 0.01), y0)
-    except TypeError as error:
-        raise NotApplicable(f"it takes no tensors ({error})") from error
+    if integrator.arrays_only:
+        try:
+            run(integrator, system, (0.0, 0.01), y0)
+        except TypeError as error:
+            raise NotApplicable(f"it takes NumPy arrays only, as it says ({error})") from error
+        raise AssertionError("`arrays_only` is declared, but tensors are taken: leave it out")
     y0.requires_grad_(True)
-    sol = run(integrator, system, (0.0, 0.1), y0, t_eval=[0.05, 0.1])
+    try:
+        sol = run(integrator, system, (0.0, 0.1), y0, t_eval=[0.05, 0.1])
+    except (TypeError, RuntimeError, AttributeError) as error:
+        raise AssertionError(
+            f"it fails on tensors ({error}): write the step with the functions of sympflow.arrays, or declare "
+            "`arrays_only`"
+        ) from error
     assert isinstance(sol.y, torch.Tensor), f"y is a {type(sol.y).__name__} for a tensor"
     assert (sol.y.dtype, sol.y.device) == (y0.dtype, y0.device), f"y is {sol.y.dtype} on {sol.y.device}"
     (gradient,) = torch.autograd.grad(sol.y.sum(), y0)
@@ -370,7 +379,10 @@ def events_are_zeros_of_the_dense_output(integrator: Integrator, system: Hamilto
 
 
 def statistics(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """n_steps, force_evaluations, hessian_evaluations and backend are reported, as counts and a word."""
+    """n_steps, force_evaluations, hessian_evaluations and backend are reported, as counts and a word.
+
+    Only a trained flow evaluates no forces. The count for one step is that of the step on the system's own functions.
+    """
     stats = run(integrator, system, (0.0, T_END)).stats
     for key in ("n_steps", "force_evaluations", "hessian_evaluations", "backend"):
         assert key in stats, f"stats lack {key!r}"
@@ -383,9 +395,26 @@ def statistics(integrator: Integrator, system: HamiltonianSystem) -> None:
     if isinstance(integrator, FixedStep) and integrator.on_grid:
         expected = math.ceil(T_END / integrator.step_length(system))
         assert stats["n_steps"] == expected, f"stats count {stats['n_steps']} steps of {expected}"
+    if not integrator.trained:
+        assert stats["force_evaluations"] > 0, "stats count no force: let them be counted, or mend `evaluations`"
+        _the_count_of_a_step(integrator, system)
     longer = run(integrator, system, (0.0, 3 * T_END)).stats
     for key in ("n_steps", "force_evaluations", "hessian_evaluations"):
         assert longer[key] >= stats[key], f"stats count fewer {key} in a longer run"
+
+
+def _the_count_of_a_step(integrator: Integrator, system: HamiltonianSystem) -> None:
+    """`evaluations` counts for a single step the forces that the step evaluates, where it has them from the system."""
+    if not isinstance(integrator, FixedStep) or bare_step(integrator, system) is not None:
+        return
+    y, made = states(system, 1)[0], Counter[str]()
+    if integrator.stepper(Problem(system, 0.0, 0.1, y)).counts_itself:
+        return
+    with np.errstate(all="ignore"):
+        integrator.step(counting_view(system, lambda what, x: made.update([what])), 0.0, y, 0.1)
+    told = integrator.evaluations(0, 0, 1, "numpy")["force_evaluations"]
+    n = made["force_evaluations"]
+    assert n in (0, told), f"`evaluations` tells {told} forces a step, but step() evaluates {n}"
 
 
 OF_RUNS: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (
