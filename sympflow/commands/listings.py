@@ -6,11 +6,11 @@ import textwrap
 
 import typer
 
-from sympflow.commands.console import print_table, reporting
+from sympflow.commands.console import Quiet, print_table, reporting
 from sympflow.commands.words import Own, Systems, made, one_scene, parameters, scene_names, shown
 
 
-def systems(ctx: typer.Context) -> None:
+def systems(ctx: typer.Context, quiet: Quiet = False) -> None:
     """List the systems, those of plug-ins too, their parameters and the flows that ship for them."""
     with reporting(ctx):
         from sympflow.flow.shipped import shipped_flows
@@ -43,6 +43,7 @@ def flows(
     ctx: typer.Context,
     system: Systems = None,
     own: Own = None,
+    quiet: Quiet = False,
 ) -> None:
     """List the flows that ship, all or those of one system, the cheapest of a system first, with what each achieves.
 
@@ -56,7 +57,7 @@ def flows(
         print_table(HEADINGS, list(shipped_flows(scene).rows()))
 
 
-def methods(ctx: typer.Context) -> None:
+def methods(ctx: typer.Context, quiet: Quiet = False) -> None:
     """List the methods, their orders, costs and options."""
     with reporting(ctx):
         from sympflow.integrators.registry import available, get
