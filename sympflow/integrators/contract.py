@@ -121,6 +121,11 @@ class Integrator:
         """The name in rows and legends, which tells apart what the options make another method."""
         return self.name
 
+    @property
+    def kicks_and_drifts(self) -> Scheme | None:
+        """The table of a method whose steps are kicks by −∇V and drifts by ∇T in the physical time; else None."""
+        return None
+
     @classmethod
     def forces_a_step(cls) -> str:
         """Return the evaluations of a step, for tables of methods; "" where they depend on the system or the run."""

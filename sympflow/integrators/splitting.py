@@ -215,6 +215,11 @@ class Splitting(OwnStepper):
         """The scheme with the splitting and the clock that need none: on the logarithmic clock that is what runs."""
         return _on_the_physical_clock(type(self), bool(self.compensated))  # type: ignore[arg-type]
 
+    @property
+    def kicks_and_drifts(self) -> Scheme | None:
+        plain = self.splitting == "kinetic" and self.clock == "physical" and not self.overrides("step")
+        return self.scheme if plain else None
+
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count those of a scheme of kicks and drifts; a stepper counts those of other parts too."""
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
