@@ -31,6 +31,10 @@ _MOLLIFIED = (
     "B. García-Archilla, J. M. Sanz-Serna and R. D. Skeel, Long-time-step methods for oscillatory differential "
     "equations, SIAM J. Sci. Comput. 20 (1998) 930–963, φ = sinc"
 )
+_LINEAR = (
+    "R. I. McLachlan and G. R. W. Quispel, Splitting methods, Acta Numerica 11 (2002) 341–434, for Nyström schemes on "
+    "parts that are quadratic"
+)
 _MIDPOINT = (
     "A. Stern and E. Grinspun, Implicit-explicit variational integration of highly oscillatory problems, Multiscale "
     "Model. Simul. 7 (2009) 1779–1794; R. I. McLachlan and A. Stern, Modified trigonometric integrators, SIAM J. "
@@ -56,7 +60,7 @@ TRIPLES: dict[str, Triple] = {
     "mollified_impulse": Triple("verlet", "mollified", source=_MOLLIFIED),
     "implicit_explicit": Triple("verlet", "midpoint", source=_MIDPOINT),
     **{
-        f"linear_{name}": Triple(name, "linear", source=_of(name, ", with the exact linear flow"))
+        f"linear_{name}": Triple(name, "linear", source=_of(name, f", with the exact linear flow; {_LINEAR}"))
         for name in ("srkn6b", "srkn11b", "srkn14a", "omelyan4")
     },
     "strang_parts": Triple(
@@ -85,6 +89,8 @@ CLASSES: dict[str, str] = {
     "mlp": "flows:MLPIntegrator",
     "implicit_midpoint": "implicit:ImplicitMidpoint",
     "gauss_legendre4": "implicit:GaussLegendre4",
+    "gauss_legendre6": "implicit:GaussLegendre6",
+    "gauss_legendre8": "implicit:GaussLegendre8",
 }
 """The other methods: module and class."""
 UNLISTED = {"log_sympflow": "flows:LogSympFlow"}
