@@ -197,7 +197,7 @@ class Hamiltonian:
         if not self.separable:
             raise ValueError(
                 f"`system` {self.name!r} is not separable: H does not split into T(p) + V(q), so splitting methods do "
-                "not apply. Use a Runge–Kutta method or train a SympFlow."
+                "not apply. Use an implicit method such as 'gauss_legendre6', or a Runge–Kutta method."
             )
         return self
 
