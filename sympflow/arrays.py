@@ -116,6 +116,11 @@ def values(x: Any) -> np.ndarray | None:
         return plain.cpu().numpy().transpose(order)
 
 
+def has_values(x: Array) -> bool:
+    """Return True unless `x` is a tensor without values, in a graph that `torch.compile` traces."""
+    return not is_tensor(x) or _behind(x)[0] is not None
+
+
 def one_lane(x: Array) -> np.ndarray:
     """Return the values of `x`, under `torch.func.vmap` those of the first lane.
 
