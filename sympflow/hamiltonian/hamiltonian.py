@@ -197,9 +197,14 @@ class Hamiltonian:
         if not self.separable:
             raise ValueError(
                 f"`system` {self.name!r} is not separable: H does not split into T(p) + V(q), so splitting methods do "
-                "not apply. Use a Runge–Kutta method or train a SympFlow."
+                "not apply. Use an implicit method such as 'gauss_legendre6', or a Runge–Kutta method."
             )
         return self
+
+    @property
+    def has_hessian_vector(self) -> bool:
+        """False if ∇²V·v of arrays is not to be had, as for a gradient that was given without it."""
+        return self._definition.has_hessian_vector
 
     @property
     def numba_functions(self) -> tuple[Any, Any, Any] | None:
