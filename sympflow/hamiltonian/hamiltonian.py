@@ -202,6 +202,11 @@ class Hamiltonian:
         return self
 
     @property
+    def has_hessian_vector(self) -> bool:
+        """False if ∇²V·v of arrays is not to be had, as for a gradient that was given without it."""
+        return self._definition.has_hessian_vector
+
+    @property
     def numba_functions(self) -> tuple[Any, Any, Any] | None:
         """(potential, gradient, hessian_vector) if the system was given by Numba functions, else None."""
         return self._definition.numba_functions

@@ -40,6 +40,10 @@ _MIDPOINT = (
     "Model. Simul. 7 (2009) 1779–1794; R. I. McLachlan and A. Stern, Modified trigonometric integrators, SIAM J. "
     "Numer. Anal. 52 (2014) 1378–1397"
 )
+_COPIES = (
+    "; on two coupled copies of phase space, for any H: M. Tao, Phys. Rev. E 94 (2016) 043303; P. Pihajoki, Celest. "
+    "Mech. Dyn. Astron. 121 (2015) 211–231"
+)
 _LOGARITHMIC = (
     "S. Mikkola and K. Tanikawa, Celest. Mech. Dyn. Astron. 74 (1999) 287–295; M. Preto and S. Tremaine, Astron. J. "
     "118 (1999) 2532–2541"
@@ -67,12 +71,16 @@ TRIPLES: dict[str, Triple] = {
         for name in ("suzuki4", "kahan_li6", "kahan_li8")
     },
     **{
+        f"tao{order}": Triple(name, "copies", source=_of(name, _COPIES))
+        for order, name in ((2, "verlet"), (4, "suzuki4"), (6, "kahan_li6"), (8, "kahan_li8"))
+    },
+    **{
         f"log_{name}": Triple(name, clock="logarithmic", source=f"{_of(name, '')}; {_LOGARITHMIC}")
         for name in ("leapfrog", "blanes_moan4", "kahan_li8")
     },
 }
-"""The splitting methods. `linear_*` have the exact linear flow, `*_parts` any number of parts, `log_*` steps that are
-equal on the logarithmic Hamiltonian."""
+"""The splitting methods. `linear_*` have the exact linear flow, `*_parts` any number of parts, `tao*` are for any H, on
+two copies of phase space, `log_*` have steps that are equal on the logarithmic Hamiltonian."""
 
 CLASSES: dict[str, str] = {
     "rk45": "scipy_methods:RK45",
