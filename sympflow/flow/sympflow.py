@@ -19,9 +19,9 @@ from sympflow.flow.files import (
 )
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.layers import LAYERS, Drift, Kick, Layer
-from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.potentials import MLPPotential, count_weights, hidden_widths
 from sympflow.flow.scaling import Scaling
-from sympflow.flow.weights import Kept, check_compilable
+from sympflow.flow.weights import Kept, check_compilable, check_memory
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 from sympflow.schemes import Scheme
@@ -95,6 +95,10 @@ class SympFlow(FlowMap):
         if len(scale.q) != ndof:
             raise ValueError(f"`scale` is for {len(scale.q)} degrees of freedom, not {ndof}: give one entry for each.")
         generator = torch.Generator().manual_seed(seed)
+        if 2 * pairs > MAX_LAYERS:
+            raise ValueError(f"`pairs` must be at most {MAX_LAYERS // 2}, as many as a file may hold; got {pairs!r}.")
+        weights = 2 * pairs * count_weights(ndof, widths := hidden_widths(hidden))
+        check_memory(f"`hidden` {widths!r} with `pairs` {pairs}", weights, "take narrower layers, or fewer pairs")
 
         def potential(unit: tuple[float, ...], center: tuple[float, ...] | None) -> MLPPotential:
             return MLPPotential(
@@ -166,7 +170,7 @@ class SympFlow(FlowMap):
         palindromic : bool
             True for a time-reversible flow, with half the parameters.
         scheme : Scheme or str, optional
-            A table, or its name in `sympflow.schemes.SCHEMES`, to start from in place of leapfrog.
+            A table, or its name as `sympflow.schemes.scheme_named` knows it, to start from in place of leapfrog.
         degree : int, optional
             Of the polynomials that multiply V and T; 7 by default, 5 with a processor, which has more of them.
         force_gradient : bool, optional

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import sys
 from collections.abc import Callable, Mapping
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import floats, real_number
-from sympflow.arrays import Array
+from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import fingerprint
@@ -51,7 +52,7 @@ class HamiltonianSystem(Hamiltonian):
         V(q), q of shape (..., d), returning (...). Then H = ½ pᵀM⁻¹p + V(q) is separable. Without `gradient`
         it must be written with torch functions, and is differentiated automatically. With Numba functions
         (`potential`, `gradient` and `hessian_vector`) the system runs compiled. A function that writes into q is a
-        ValueError; of a Numba function that cannot be told, and it would corrupt the run: it may write into `out` only.
+        ValueError; so is a gradient that is none of V: see `check_functions`.
     hamiltonian : callable, optional
         H(q, p), written with torch functions, for a system that is not separable. Give this or `potential`.
     ndof : int
@@ -76,6 +77,8 @@ class HamiltonianSystem(Hamiltonian):
         Default step of the fixed-step classical methods.
     energy_scale : float, optional
         What energy errors are relative to; the default is |H(y0)|.
+    check : bool
+        False leaves out the test of the functions, see `check_functions`, that the first use of the system makes.
 
     Attributes
     ----------
@@ -111,6 +114,7 @@ class HamiltonianSystem(Hamiltonian):
         t_span: tuple[float, float] = (0.0, 100.0),
         dt: float = 0.05,
         energy_scale: float | None = None,
+        check: bool = True,
     ) -> None:
         from sympflow.hamiltonian.callables import CallableHamiltonian
 
@@ -119,7 +123,7 @@ class HamiltonianSystem(Hamiltonian):
             raise ValueError(
                 f"`ndof` must be a positive integer, at most {MOST_DEGREES:,}, the degrees of freedom; got {ndof!r}."
             )
-        definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector)
+        definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector, check)
         if definition.separable:
             super().__init__(name, definition, matrices.inverse_mass(mass, int(ndof)), True)
         elif mass is not None:
@@ -225,6 +229,38 @@ class HamiltonianSystem(Hamiltonian):
         """
         return self._params
 
+    def check_functions(self, y0: Array | None = None) -> None:
+        """Test once that the functions of a user agree with each other: `solve`, `train` and their like call it.
+
+        At a few states, y0 (the system's if it is None), near these and of the domain, the gradient, given or
+        automatic, is compared with differences of H, and `hessian_vector` with those of the gradient; a batch with
+        single states; a value with the same once more. Nothing is said of states where H is not finite, and of those
+        next to a kink. It costs milliseconds; `check=False` of the system leaves it out.
+
+        Parameters
+        ----------
+        y0 : array or tensor of shape (..., 2d), optional
+            Its library and dtype are those in which the functions are called.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If a function is wrong: the message names it, the component, the state and both values.
+        """
+        if not self.functions_given:
+            return
+        like = np.empty(0) if y0 is None else y0
+        kind = type(like), like.dtype
+        if kind in self._checked:
+            return
+        from sympflow.hamiltonian.function_checks import FEW, probe_states
+
+        given = to_numpy(like) if math.prod(like.shape) else self.y0
+        probes = probe_states(given, self.domain, 2 * self.ndof)
+        n_given = min(FEW, math.prod(like.shape) // (2 * self.ndof))
+        self._definition.check(probes, like, n_given)
+        self._checked |= {kind}
+
     # structure --------------------------------------------------------------------------------------
 
     @cached_property
@@ -251,3 +287,69 @@ class HamiltonianSystem(Hamiltonian):
         params = ", ".join(f"{k}={v:g}" for k, v in self.params.items())
         kind = "separable" if self.separable else "not separable"
         return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
+
+
+# a view that counts -------------------------------------------------------------------------------
+
+COUNTED = {
+    "force": "force_evaluations",
+    "gradient": "force_evaluations",
+    "vector_field": "force_evaluations",
+    "potential_hessian": "hessian_evaluations",
+    "hessian_vector": "hessian_evaluations",
+    "hessian": "hessian_evaluations",
+    "third_derivative": "curvature_evaluations",
+    "curvature_gradient": "curvature_evaluations",
+}
+"""The functions of a system that are counted, and as what."""
+
+
+def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]) -> HamiltonianSystem:
+    """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    count : callable
+        Called with what is evaluated, a value of `COUNTED`, and the states or positions (..., k).
+
+    Returns
+    -------
+    HamiltonianSystem
+        Equal to `system`, so that whatever is kept by system is found by the view too.
+    """
+    view = copy.copy(system)
+    view.__class__ = _counting_class(type(system))  # type: ignore[arg-type]
+    view._original, view._count, view._inside = system, count, False  # type: ignore[attr-defined]
+    return view
+
+
+@lru_cache(maxsize=64)
+def _counting_class(cls: type[HamiltonianSystem]) -> type[HamiltonianSystem]:
+    def counted(name: str) -> Callable[..., Array]:
+        def evaluate(self: Any, x: Array, *more: Array) -> Array:
+            function = getattr(super(view, self), name)
+            if self._inside:  # one of them may call another
+                return function(x, *more)
+            self._inside = True
+            try:
+                value = function(x, *more)
+            finally:
+                self._inside = False
+            self._count(COUNTED[name], x)
+            return value
+
+        return evaluate
+
+    view: Any = type(
+        cls.__name__,
+        (cls,),
+        {
+            **{name: counted(name) for name in COUNTED},
+            "__hash__": lambda self: hash(self._original),
+            "__eq__": lambda self, other: other is self or other is self._original,
+            "__reduce__": lambda self: (copy.copy, (self._original,)),
+            "__doc__": cls.__doc__,
+        },
+    )
+    return view
