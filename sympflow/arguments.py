@@ -112,6 +112,21 @@ def check_counts(**values: Any) -> None:
             raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
 
 
+def positive_numbers(name: str, values: Any) -> list[float]:
+    """Return a list of positive and finite numbers, sorted; raise if it is none, or is empty."""
+    try:
+        if isinstance(values, str) or any(isinstance(x, bool | np.bool_ | str) for x in values):
+            raise TypeError("no numbers")
+        numbers = sorted(float(x) for x in values)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise TypeError(f"`{name}` must be a list of positive numbers; got {values!r}.") from error
+    if not numbers:
+        raise ValueError(f"`{name}` is empty: give at least one number, or leave it out.")
+    if not all(0 < x < math.inf for x in numbers):
+        raise ValueError(f"`{name}` must be positive and finite; got {values!r}.")
+    return numbers
+
+
 def check_dt(dt: Any) -> None:
     """Raise unless `dt` is None or a step length."""
     if dt is not None and not (real_number(dt) and 0 < dt <= LONGEST_STEP):

@@ -38,12 +38,13 @@ class Origin:
 
 
 def check_system(system: Any) -> None:
-    """Raise TypeError unless `system` is a HamiltonianSystem."""
+    """Raise TypeError unless `system` is a HamiltonianSystem; ValueError where functions of its user are wrong."""
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(
             f"`system` must be a HamiltonianSystem; got {type(system).__name__}: take a scene of sympflow.systems, or "
             "define one with HamiltonianSystem.from_sympy."
         )
+    system.check_functions(torch.empty(0, dtype=torch.float64))
 
 
 class FlowMap(nn.Module):

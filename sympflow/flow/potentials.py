@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from sympflow.arguments import plain
 from sympflow.arrays import jvp
-from sympflow.flow.weights import checked_device, checked_dtype
+from sympflow.flow.weights import check_memory, checked_device, checked_dtype
 from sympflow.lazy import announced, distribution, load_announced
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
@@ -396,6 +396,7 @@ class MLPPotential(Potential):
     ) -> None:
         super().__init__()
         hidden, dtype, device = hidden_widths(hidden), checked_dtype(dtype), checked_device(device)
+        check_memory(f"`hidden` {hidden!r}", count_weights(ndof, hidden), "take narrower layers")
         self.ndof, self.hidden, self.activation = int(ndof), hidden, activation
         self._sigma = activation_named(activation)
 
@@ -625,6 +626,12 @@ def _backward_weights(W: list[Tensor], w: Tensor) -> list[Tensor]:
 def outer(k: Tensor, t: Time) -> Tensor:
     """k t: (h, 1) for one time, (h, N) for a time for each point."""
     return k[:, None] * t
+
+
+def count_weights(inputs: int, hidden: Sequence[int]) -> int:
+    """The number of weights of a network of these widths with one output, with those of the time."""
+    fans = (inputs + 1, *hidden[:-1])
+    return sum(h * fan + h for h, fan in zip(hidden, fans, strict=True)) + hidden[-1]
 
 
 def hidden_widths(hidden: Sequence[int]) -> tuple[int, ...]:

@@ -20,9 +20,17 @@ from sympflow.flow.files import (
 )
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.layers import LAYERS, Drift, Kick, Layer
-from sympflow.flow.potentials import MLPPotential, Potential, Unregistered, module_weights, potential_named
+from sympflow.flow.potentials import (
+    MLPPotential,
+    Potential,
+    Unregistered,
+    count_weights,
+    hidden_widths,
+    module_weights,
+    potential_named,
+)
 from sympflow.flow.scaling import Scaling
-from sympflow.flow.weights import Kept, check_compilable
+from sympflow.flow.weights import Kept, check_compilable, check_memory
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 from sympflow.schemes import Scheme
@@ -96,6 +104,10 @@ class SympFlow(FlowMap):
         if len(scale.q) != ndof:
             raise ValueError(f"`scale` is for {len(scale.q)} degrees of freedom, not {ndof}: give one entry for each.")
         generator = torch.Generator().manual_seed(seed)
+        if 2 * pairs > MAX_LAYERS:
+            raise ValueError(f"`pairs` must be at most {MAX_LAYERS // 2}, as many as a file may hold; got {pairs!r}.")
+        weights = 2 * pairs * count_weights(ndof, widths := hidden_widths(hidden))
+        check_memory(f"`hidden` {widths!r} with `pairs` {pairs}", weights, "take narrower layers, or fewer pairs")
 
         def potential(unit: tuple[float, ...], center: tuple[float, ...] | None) -> MLPPotential:
             return MLPPotential(

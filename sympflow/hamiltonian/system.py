@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import floats, real_number
-from sympflow.arrays import Array
+from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import fingerprint
@@ -52,7 +52,7 @@ class HamiltonianSystem(Hamiltonian):
         V(q), q of shape (..., d), returning (...). Then H = ½ pᵀM⁻¹p + V(q) is separable. Without `gradient`
         it must be written with torch functions, and is differentiated automatically. With Numba functions
         (`potential`, `gradient` and `hessian_vector`) the system runs compiled. A function that writes into q is a
-        ValueError; of a Numba function that cannot be told, and it would corrupt the run: it may write into `out` only.
+        ValueError; so is a gradient that is none of V: see `check_functions`.
     hamiltonian : callable, optional
         H(q, p), written with torch functions, for a system that is not separable. Give this or `potential`.
     ndof : int
@@ -77,6 +77,8 @@ class HamiltonianSystem(Hamiltonian):
         Default step of the fixed-step classical methods.
     energy_scale : float, optional
         What energy errors are relative to; the default is |H(y0)|.
+    check : bool
+        False leaves out the test of the functions, see `check_functions`, that the first use of the system makes.
 
     Attributes
     ----------
@@ -112,6 +114,7 @@ class HamiltonianSystem(Hamiltonian):
         t_span: tuple[float, float] = (0.0, 100.0),
         dt: float = 0.05,
         energy_scale: float | None = None,
+        check: bool = True,
     ) -> None:
         from sympflow.hamiltonian.callables import CallableHamiltonian
 
@@ -120,7 +123,7 @@ class HamiltonianSystem(Hamiltonian):
             raise ValueError(
                 f"`ndof` must be a positive integer, at most {MOST_DEGREES:,}, the degrees of freedom; got {ndof!r}."
             )
-        definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector)
+        definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector, check)
         if definition.separable:
             super().__init__(name, definition, matrices.inverse_mass(mass, int(ndof)), True)
         elif mass is not None:
@@ -225,6 +228,38 @@ class HamiltonianSystem(Hamiltonian):
         A system with others is made by `HamiltonianSystem.from_sympy`, or by the function of its scene.
         """
         return self._params
+
+    def check_functions(self, y0: Array | None = None) -> None:
+        """Test once that the functions of a user agree with each other: `solve`, `train` and their like call it.
+
+        At a few states, y0 (the system's if it is None), near these and of the domain, the gradient, given or
+        automatic, is compared with differences of H, and `hessian_vector` with those of the gradient; a batch with
+        single states; a value with the same once more. Nothing is said of states where H is not finite, and of those
+        next to a kink. It costs milliseconds; `check=False` of the system leaves it out.
+
+        Parameters
+        ----------
+        y0 : array or tensor of shape (..., 2d), optional
+            Its library and dtype are those in which the functions are called.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If a function is wrong: the message names it, the component, the state and both values.
+        """
+        if not self.functions_given:
+            return
+        like = np.empty(0) if y0 is None else y0
+        kind = type(like), like.dtype
+        if kind in self._checked:
+            return
+        from sympflow.hamiltonian.function_checks import FEW, probe_states
+
+        given = to_numpy(like) if math.prod(like.shape) else self.y0
+        probes = probe_states(given, self.domain, 2 * self.ndof)
+        n_given = min(FEW, math.prod(like.shape) // (2 * self.ndof))
+        self._definition.check(probes, like, n_given)
+        self._checked |= {kind}
 
     # structure --------------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from sympflow.arguments import real_number
 from sympflow.arrays import Array, concatenate, is_tensor
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.function_checks import as_like
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
 
@@ -162,6 +163,10 @@ class _Logarithmic(Definition):
 
     def __init__(self, system: HamiltonianSystem, c: float) -> None:
         self.ndof, self._system, self._c = system.ndof + 1, system, c
+        self.given = system.functions_given
+
+    def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
+        self._system.check_functions(projected(as_like(states[:n_given], like)) if n_given else None)
 
     def kinetic(self, P: Array) -> Array:
         return _log(self._system.kinetic(P[..., :-1]) + P[..., -1])

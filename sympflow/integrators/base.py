@@ -142,19 +142,24 @@ class OwnStepper(FixedStep):
         """Return the stepper of one run, for states such as the problem's y0."""
         raise NotImplementedError(f"{type(self).__name__} must define own_stepper().")
 
+    @classmethod
+    def overrides(cls, duty: str) -> bool:
+        """Tell whether a subclass of a built-in class defines a duty anew, such as "step"."""
+        return duty in _overridden(cls)  # type: ignore[arg-type]
+
     def stepper(self, problem: Problem) -> Stepper:
         asked = _overridden(type(self))  # type: ignore[arg-type]
         return super().stepper(problem) if asked else self.own_stepper(problem)
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
-        if "step" in _overridden(type(self)):  # type: ignore[arg-type]
+        if self.overrides("step"):
             return super().rollout(problem, h, n_steps, save)
         stepper = self.own_stepper(problem)
         states, finite = stepper.rollout(problem.y0, h, n_steps, save, problem.t0)
         return states, finite, stepper.backend
 
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
-        if "step" in _overridden(type(self)):  # type: ignore[arg-type]
+        if self.overrides("step"):
             return super().substep(system, y, h, backend)
         asked = "auto" if backend == "compiled" else "array"
         return self.own_stepper(Problem(system, 0.0, 0.0, y, backend=asked)).shorter(y, h)

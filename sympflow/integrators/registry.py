@@ -8,6 +8,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
 from sympflow.integrators.methods import CLASSES, NAMES, TORCHDIFFEQ, TRIPLES, UNLISTED
@@ -232,8 +233,12 @@ class naming_plugin:
         ) from error
 
 
-def check_applies(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named."""
+def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array | None = None) -> None:
+    """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named.
+
+    The functions of a user's system are tested too, for states such as y0.
+    """
+    system.check_functions(y0)
     if type(integrator) not in _loaded:
         integrator.check(system)
         return

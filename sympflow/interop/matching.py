@@ -269,8 +269,8 @@ def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
     Raises
     ------
     TypeError
-        If the method chooses its own steps: the peer has such methods itself; or if its steps, or those of a flow, are
-        not on a grid.
+        If the method chooses its own steps: the peer has such methods itself; if its steps, or those of a flow, are not
+        on a grid; or if a run keeps more than the state.
     """
     from sympflow.integrators.registry import build
 
@@ -284,6 +284,11 @@ def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
         raise TypeError(
             f"`flow` runs in another time, so that its steps are not equal in t, which {peer} cannot drive: use "
             "solve(), or a flow in the system's own time (sympflow.shipped_flows() lists them, `shift` is None)."
+        )
+    if integrator.keeps:
+        raise TypeError(
+            f"`method` {integrator.name!r} keeps {integrator.keeps} from step to step, which {peer} cannot hand on: "
+            "use solve(), or another method."
         )
     if not integrator.on_grid:
         raise TypeError(

@@ -18,7 +18,10 @@ from sympflow.kernels.protocol import Kernel, Run, Steps
 
 __all__ = ["ImplicitKernel", "implicit_kernel"]
 
-Tableau = tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]
+Tableau = tuple[tuple[tuple[float, ...], ...], tuple[float, ...], tuple[float, ...]]
+"""A, B and scale of the increments K_i = h scale_i f(y + Σ_j A_ij K_j) and the step y + Σ_i B_i K_i.
+
+In Butcher's letters a_ij = A_ij scale_j and b_i = B_i scale_i."""
 
 
 def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> ImplicitKernel:
@@ -45,8 +48,8 @@ class ImplicitKernel(Kernel):
     ----------
     system : HamiltonianSystem
         Symbolic.
-    tableau : (A, b)
-        As tuples of numbers.
+    tableau : (A, B, scale)
+        As tuples of numbers: see `Tableau`.
     compensated : bool
         Sum with Kahan's compensation in runs.
     """
@@ -92,8 +95,8 @@ class ImplicitKernel(Kernel):
 
 @lru_cache(maxsize=256)
 def _load(algebra: str, tableau: Tableau, compensated: bool) -> ModuleType:
-    A, b = tableau
-    return load_algebra(algebra, ["newton"], COMPENSATED=compensated, STAGES=len(b), A=A, B=b)
+    A, B, scale = tableau
+    return load_algebra(algebra, ["newton"], COMPENSATED=compensated, STAGES=len(B), A=A, B=B, SCALE=scale)
 
 
 def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:

@@ -21,6 +21,7 @@ from sympflow.systems.textbook import (
     quartic,
     spring_pendulum,
 )
+from sympflow.systems.user_files import from_toml
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -151,5 +152,6 @@ def _key(name: str) -> str:
     return name.replace("_", "-")
 
 
-__all__ = ["SYSTEMS", "available", "get", "kepler_ellipse", "lax_eigenvalues", "oscillatory_energies", "register"]
+__all__ = ["SYSTEMS", "available", "from_toml", "get", "register"]
+__all__ += ["kepler_ellipse", "lax_eigenvalues", "oscillatory_energies"]
 __all__ += [factory.__name__ for factory in SYSTEMS.values()]

@@ -163,7 +163,9 @@ def the_tangent_is_the_derivative_of_the_step(integrator: Integrator, system: Ha
             f"tangent() fails, so volume and symplecticity cannot be measured ({type(error).__name__}: {error})"
         ) from error
     assert_close(y_next, step(y, h), 1e3 * EPS, "the state that tangent() gives differs from step()")
-    assert_close(A, _jacobian(step, y, h), 1e-7, "tangent() differs from the finite differences of step()")
+    differences = [_jacobian(step, y, h, reach) for reach in (0.02, 0.004)]  # the shorter for a step that bends much
+    nearest = min(differences, key=lambda one: float(np.abs(one - A).max()))
+    assert_close(A, nearest, 1e-7, "tangent() differs from the finite differences of step()")
 
 
 def symplecticity_as_declared(integrator: Integrator, system: HamiltonianSystem) -> None:
@@ -171,13 +173,14 @@ def symplecticity_as_declared(integrator: Integrator, system: HamiltonianSystem)
     if bare_step(integrator, system) is not None:
         assert not integrator.symplectic, "declared symplectic, but there is no bare step that could show it"
     step = _step(integrator, system)
-    d, y = system.ndof, states(system, 16)
+    y = states(system, 16)
     y = np.concatenate([scale * y for scale in ((1.0,) if integrator.trained else (1.0, 0.3, 1.7, 2.5))])
     h = np.resize([H] if integrator.trained else [H, 0.11, H / 2], len(y))
     try:
-        A, low, high = integrator.tangent(system, 0.0, y, h)[1], 1e3 * EPS, 1e3 * EPS
+        A, low, high = integrator.jacobian(system, 0.0, y, h), 1e3 * EPS, 1e3 * EPS
     except Exception:  # whatever keeps it from being differentiated: the step itself can still tell
         A, low, high = _jacobian(step, y, h), 1e-11, 1e-9
+    d = A.shape[-1] // 2
     J = np.block([[np.zeros((d, d)), np.eye(d)], [-np.eye(d), np.zeros((d, d))]])
     defect = float(np.abs(A.swapaxes(-1, -2) @ J @ A - J).max() / np.abs(A).max() ** 2)
     if integrator.symplectic:
@@ -186,12 +189,14 @@ def symplecticity_as_declared(integrator: Integrator, system: HamiltonianSystem)
         assert defect > low, f"AᵀJA = J to {defect:.1e}: declare `symplectic = True`"
 
 
-def _jacobian(step: Callable[[np.ndarray, np.ndarray], np.ndarray], y: np.ndarray, h: np.ndarray) -> np.ndarray:
+def _jacobian(
+    step: Callable[[np.ndarray, np.ndarray], np.ndarray], y: np.ndarray, h: np.ndarray, reach: float = 0.02
+) -> np.ndarray:
     """The Jacobians (n, 2d, 2d) of steps from y (n, 2d), by differences of order 8: to about 1e-12."""
     columns = []
     for i, scale in enumerate(np.abs(y).max(0)):
         e = np.zeros(y.shape[-1])
-        e[i] = 0.02 * (scale or 1.0)
+        e[i] = reach * (scale or 1.0)
         columns.append(sum(c * (step(y + k * e, h) - step(y - k * e, h)) for k, c in DIFFERENCES) / e[i])
     return np.stack(columns, axis=-1)
 
@@ -447,7 +452,7 @@ def the_run_is_its_steps(integrator: Integrator, system: HamiltonianSystem) -> N
     assert_close(t[1:], (t + h)[:-1], 1e3 * EPS, "a step of steps() does not begin where the last ended, but away")
     assert t[0] == 0.0 and t[-1] + h[-1] > T_END - 1e3 * EPS, f"steps() runs from {t[0]} to {t[-1] + h[-1]}"
     assert_close(y, np.moveaxis(np.asarray(sol.sol(t)), -1, 0), 1e4 * EPS, "states of steps() differ from the run's")
-    if bare_step(integrator, system) is not None or integrator.tangent_holds:
+    if bare_step(integrator, system) is not None or integrator.tangent_holds or integrator.keeps:
         return
     with np.errstate(all="ignore"):
         stepped = np.asarray(integrator.step(system, 0.0, y, h))

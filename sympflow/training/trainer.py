@@ -37,10 +37,10 @@ from sympflow.training.options import (
     plain_numbers,
 )
 from sympflow.training.points import digest, handed_in
-from sympflow.training.runs import Run, SearchRun
-from sympflow.training.session import Path, Session
+from sympflow.training.runs import Run, Unstarted
+from sympflow.training.session import Deadline, OutOfTime, Path, Session
 from sympflow.training.split_fit import SplitRun
-from sympflow.training.starts import default_primed, new_network, scaling_of
+from sympflow.training.starts import check_step, default_primed, new_network, scaling_of
 from sympflow.training.table_fit import TableRun
 
 BUDGET = 60.0  # seconds of a fit of which nothing else is said
@@ -225,23 +225,27 @@ def fit_flow(
     """`train`, its arguments sorted: a new flow or a given one, its fit, and the surroundings of the run."""
     domain = _domain_for(system, domain)
     untold = flow is None and asked.restarts is None and asked.steps is None
-    hurried = untold and session.time_budget is None and session.resume is None
     kind = _kind_of(system, flow, new, asked)
+    hurried = untold and session.time_budget is None and session.resume is None and kind == "primed" and asked.searches
+    if hurried:
+        session.time_budget = BUDGET
     with session.interruption:
         tried = None
+        if dt is not None and flow is None:
+            check_step(system, domain, dt)
         if flow is not None:
             _check_flow(flow, system, dt)
+            if kind in ("primed", "sympflow", "mlp"):  # the others have exact parts, however fast
+                check_step(system, domain, flow.dt)
         elif kind == "primed":
             if asked.searches:
                 TableOptions.of(asked)  # raises before trials
             flow, tried = _new_primed(system, domain, dt, new, asked, session)
-        run = _run_of(system, domain, kind, flow, tried, dt, new, asked)
+            session.cut = session.interruption.asked  # what trials were left out does not end the run
+        system.vector_field(domain.sample(1, 0))  # what is compiled for it counts, but not as labels
+        run = _run_of(system, domain, kind, flow, tried, dt, new, asked, session.deadline)
         if session.resume is not None:
             run.load(session.resume)
-        hurried = hurried and isinstance(run, SearchRun)
-        if hurried:
-            session.time_budget = BUDGET
-        run.seconds += session.begin_run()
         reason = run.go(session)
     return run.finish(reason, expected=hurried)
 
@@ -343,7 +347,7 @@ def _meant(system: HamiltonianSystem, new: NewFlow, asked: NewFit) -> str:
     if asked.loss is None:
         of_networks += asked.given((*OF_LOSSES, "data"))
     wants_network = not asked.searches or of_networks or new.given(NewFlow.OF_NETWORKS)
-    return "primed" if fits and system.symbols is not None and not wants_network else "sympflow"
+    return "primed" if fits and not wants_network else "sympflow"
 
 
 def _check_primable(system: HamiltonianSystem, new: NewFlow, asked: NewFit) -> None:
@@ -417,6 +421,7 @@ def _run_of(
     dt: float | None,
     new: NewFlow,
     asked: NewFit,
+    deadline: Deadline,
 ) -> Run:
     """The run of a copy of a flow, or of a new network if there is none."""
     searched = kind in ("primed", "split") and asked.searches
@@ -428,15 +433,26 @@ def _run_of(
         flow.certified = None  # of the numbers as they were
         dt = flow.dt
     if searched and isinstance(flow, SplitFlow):
-        return SplitRun.start(flow, system, domain, SplitOptions.of(asked))
+        split = SplitOptions.of(asked)
+        try:
+            return SplitRun.start(flow, system, domain, split, deadline)
+        except OutOfTime as cut:
+            return Unstarted(flow, system, domain, None, split, str(cut))
     dt = 1.0 if dt is None else float(dt)
     labels = None if asked.data is None else handed_in(asked.data, system, dt)
     checksum = None if labels is None else digest(labels)
     if searched and isinstance(flow, PrimedFlow):
         table = TableOptions.of(asked, checksum)
-        return TableRun.start(flow, system, domain, scaling_of(domain, dt, table.seed), table, labels, tried)
+        scaling = scaling_of(domain, dt, table.seed)
+        try:
+            return TableRun.start(flow, system, domain, scaling, table, labels, tried, deadline)
+        except OutOfTime as cut:
+            return Unstarted(flow if tried is None else tried, system, domain, scaling, table, str(cut))
     options = LossOptions.of(asked, kind, checksum)
     scaling = scaling_of(domain, dt, options.seed)
     if flow is None:
         flow = new_network(system, new, dt, scaling, options.seed)
-    return LossRun.start(flow.requires_grad_(True), system, domain, scaling, options, labels)
+    try:
+        return LossRun.start(flow.requires_grad_(True), system, domain, scaling, options, labels, deadline)
+    except OutOfTime as cut:
+        return Unstarted(flow, system, domain, scaling, options, str(cut))

@@ -102,7 +102,7 @@ def counting():
         evaluated.append(math.prod(q.shape) // 2)
         return stack([q[..., 0] + 2 * q[..., 0] * q[..., 1], q[..., 1] + q[..., 0] ** 2 - q[..., 1] ** 2])
 
-    system = HamiltonianSystem(lambda q: 0 * q[..., 0], ndof=2, gradient=gradient, y0=HH.y0)
+    system = HamiltonianSystem(lambda q: 0 * q[..., 0], ndof=2, gradient=gradient, y0=HH.y0, check=False)
     return system, lambda: sum(evaluated)
 
 

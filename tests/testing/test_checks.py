@@ -20,7 +20,7 @@ NO_STEP = {check.__name__ for check in laws.OF_STEPS} - {"the_order_is_the_slope
 def not_applicable(integrator):
     """The checks that have nothing to check, from what a method is."""
     name, skipped = integrator.name, set()
-    if not integrator.symplectic:
+    if not integrator.symplectic or integrator.keeps:
         skipped.add("the_inverse_undoes_the_step")
     if integrator.trained:
         skipped.add("the_order_is_the_slope")
