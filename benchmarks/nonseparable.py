@@ -1,10 +1,10 @@
-"""A network against Gauss methods where H does not split: the double pendulum.
+"""A network, Gauss methods and explicit ones on two copies where H does not split: the double pendulum.
 
     python benchmarks/nonseparable.py                  two and a half minutes of training, on one core
     python benchmarks/nonseparable.py --seconds 10     a look
 
-A SympFlow is trained on states below an energy for so many seconds, by Gauss–Newton. Then it and the Gauss methods,
-dop853 beside them, run to T = 100 from the same state, compiled where they compile. The state error is the largest
+A SympFlow is trained on states below an energy for so many seconds, by Gauss–Newton. Then it, the Gauss methods and
+Tao's, dop853 beside them, run to T = 100 from the same state, compiled where they compile. The state error is the largest
 against gauss_legendre8 with dt = 0.01, the energy error the largest relative one, both over 1000 outputs. The run time
 is that of a call of `solve` with the final state as the only output, the shortest of nine.
 """
@@ -34,6 +34,9 @@ RUNS = (
     *(("gauss_legendre4", dt) for dt in (0.2, 0.1)),
     *(("gauss_legendre6", dt) for dt in (0.4, 0.2)),
     *(("gauss_legendre8", dt) for dt in (0.5, 0.25)),
+    *(("tao4", dt) for dt in (0.1, 0.05)),
+    *(("tao6", dt) for dt in (0.1, 0.05)),
+    *(("tao8", dt) for dt in (0.2, 0.1)),
 )
 
 
