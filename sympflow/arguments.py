@@ -69,6 +69,17 @@ def check_not_followed(name: str, times: Any) -> None:
         )
 
 
+def check_not_traced(function: str) -> None:
+    """Raise a TypeError in a graph that `torch.compile` traces, into which a whole run does not go."""
+    import torch
+
+    if torch.compiler.is_dynamo_compiling():
+        raise TypeError(
+            f"`{function}` looks at values, which torch.compile hides: compile the steps, "
+            'sympflow.get("verlet")().step(system, t, y, h), or a flow, flow(t, y) with a number t.'
+        )
+
+
 def _real(x: Any) -> float:
     if type(x) is float or type(x) is int:
         return float(x)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import (
     MAX_ASKED_VALUES,
     MAX_SAVED_VALUES,
+    check_not_traced,
     check_save_every,
     check_t_eval,
     check_t_span,
@@ -110,6 +111,8 @@ def solve(
     >>> sol.y.shape
     (4, 101)
     """
+    if is_tensor(y0):
+        check_not_traced("solve")
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     integrator = build(method, options)

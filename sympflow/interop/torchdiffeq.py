@@ -19,6 +19,7 @@ import torch
 import torchdiffeq
 from torch import Tensor
 
+from sympflow.arguments import check_not_traced
 from sympflow.arrays import differentiable, finite_states, one_lane, readable, transformed
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
@@ -334,6 +335,8 @@ def _their_table() -> dict[str, Any]:
 
 def _is_ours(method: Any, func: Any, options: Any) -> bool:
     """True if `method` is one of ours; a name that both have is theirs for a `func` of which we know no system."""
+    if method is not None and method not in _THEIRS:
+        check_not_traced("odeint")
     if not isinstance(method, str):
         return method is not None
     if method in _THEIRS or method not in available():
