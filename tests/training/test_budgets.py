@@ -122,7 +122,9 @@ def test_labels_that_take_too_long_are_a_message_with_what_was_reached(clock, ki
         ):
             flow = train(PENDULUM, flow=FLOW, time_budget=20.0, **QUICK)
         assert all(torch.equal(v, FLOW.state_dict()[k]) for k, v in flow.state_dict().items())
-        assert ended_early(flow).startswith("the time budget was used up: the exact solution was followed from 40 states")
+        assert ended_early(flow).startswith(
+            "the time budget was used up: the exact solution was followed from 40 states"
+        )
         assert "missed_share" not in flow.figures
     else:
         with pytest.warns(RuntimeWarning, match=r"^There was no time to follow 5 held-out states to dt = 1"):
