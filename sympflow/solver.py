@@ -15,7 +15,7 @@ from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import run_and_search
 from sympflow.integrators.contract import Integrator, Outcome, Problem
-from sympflow.integrators.domain_exit import check_domain
+from sympflow.integrators.domain_exit import check_domain, check_system_along
 from sympflow.integrators.registry import build, check_applies, naming_plugin
 from sympflow.solution import Solution
 
@@ -136,6 +136,8 @@ def solve(
         from sympflow.integrators.diagnosis import note_singularities
 
         note_singularities(outcome, integrator, problem)
+    if integrator.trained:
+        check_system_along(outcome, integrator, system, y_start)
     if action != "ignore":
         check_domain(outcome, integrator, system, action)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)

@@ -1,7 +1,8 @@
 """Files of flows: safetensors with a JSON record, never pickle. A file is taken for hostile until all of it is checked.
 
 The metadata entry "sympflow" is a JSON object: format, version (of the package), kind, architecture, dt, domain,
-system, fingerprint, recipe, figures, checksum (of the tensors), and certificate, if one was computed.
+system, fingerprint, recipe, figures, checksum (of the tensors), and, where there are any, certificate and identity
+(the H of the system, at states of the domain and as an expression).
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from sympflow.flow.families import KINDS, family_of
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.weights import checked_device, checksum
 from sympflow.hamiltonian.domain import Domain, domain_from_dict
+from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 FORMAT = 1
@@ -67,6 +69,8 @@ class Description:
     ----------
     domain, system, fingerprint, recipe, figures, certificate
         `FlowMap`'s domain, system_name, fingerprint, recipe, figures, certified.
+    identity
+        `FlowMap`'s own.
     """
 
     domain: Domain | None = None
@@ -75,6 +79,7 @@ class Description:
     recipe: dict[str, Any] = field(default_factory=dict)
     figures: dict[str, Any] = field(default_factory=dict)
     certificate: Certificate | None = None
+    identity: Identity | None = None
 
     @classmethod
     def of_record(cls, record: dict[str, Any], ndof: int) -> Self:
@@ -97,11 +102,11 @@ class Description:
         for name, value in record["figures"].items():
             if value is not None and not _is_number(value):
                 raise Refused(f"its figures have a {name} that is neither a number nor None: {value!r}")
-        certificate = _certificate(record)
+        certificate, identity = _certificate(record), _identity(record, ndof)
         domain = None if record["domain"] is None else _domain(record["domain"], ndof)
         if fingerprint is not None:
             fingerprint = tuple(math.nan if v is None else float(v) for v in fingerprint)
-        return cls(domain, system, fingerprint, record["recipe"], record["figures"], certificate)
+        return cls(domain, system, fingerprint, record["recipe"], record["figures"], certificate, identity)
 
 
 # writing ---------------------------------------------------------------------------------------------------
@@ -134,6 +139,8 @@ def write(
         "figures": description.figures,
         "checksum": checksum(tensors),
     }
+    if description.identity is not None:
+        record["identity"] = description.identity.to_dict()
     if description.certificate is not None:
         if description.certificate.weights == record["checksum"]:
             record["certificate"] = description.certificate.to_dict()
@@ -382,6 +389,16 @@ def _certificate(record: dict[str, Any]) -> Certificate | None:
     if certificate.weights != record.get("checksum"):
         raise Refused("its certificate is one of other weights")
     return certificate
+
+
+def _identity(record: dict[str, Any], ndof: int) -> Identity | None:
+    """Return the identity of the system in the record, if there is one; a text in it is not read yet."""
+    if record.get("identity") is None:
+        return None
+    try:
+        return Identity.from_dict(record["identity"], ndof)
+    except ValueError as error:
+        raise Refused(f"its identity of the system is not admissible: {error}") from None
 
 
 def _check_system(name: Any, fingerprint: Any) -> None:

@@ -430,7 +430,7 @@ class PrimedFlow(SympFlow):
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(self._layer(substep) for substep in self.substeps)  # type: ignore[assignment]
         if system is not None:
-            self.fingerprint, self.system_name = system.fingerprint, system.name
+            self.identify(system)
 
     @classmethod
     def untrained(

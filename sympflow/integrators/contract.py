@@ -37,6 +37,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
+    from sympflow.hamiltonian.fingerprint import Identity
     from sympflow.schemes import Scheme
 
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
@@ -159,6 +160,11 @@ class Integrator:
     def flow_for(self, system: HamiltonianSystem) -> FlowMap | None:
         """Return the trained flow that is used for a system, one in the system's own time; None if there is none."""
         return None
+
+    def identity_for(self, system: HamiltonianSystem) -> Identity | None:
+        """Return the H that the trained flow for a system was made for; None without a flow, or where it is unknown."""
+        flow = self.flow_for(system)
+        return None if flow is None else flow.identity
 
     def figures(self, system: HamiltonianSystem) -> Mapping[str, Any]:
         """Return the figures of the trained flow that runs, such as `training_seconds`; {} without a flow."""

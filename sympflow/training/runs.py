@@ -150,7 +150,8 @@ class Run(ABC):
         flow, figures = self.flow, self.achieved()
         flow.requires_grad_(False)
         flow.zero_grad(set_to_none=True)
-        flow.domain, flow.fingerprint, flow.system_name = self.domain, self.system.fingerprint, self.system.name
+        flow.domain = self.domain
+        flow.identify(self.system, self.domain)
         earlier = float(flow.figures.get("training_seconds", 0.0))
         stage = {**self.options.to_dict(), **self.remarks(reason)}
         flow.recipe = {
