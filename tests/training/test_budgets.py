@@ -20,6 +20,7 @@ from sympflow.training.least_squares import STOPPED, levenberg_marquardt
 from sympflow.training.losses import Loss
 from sympflow.training.points import Labels
 from sympflow.training.session import OutOfTime, Session
+from sympflow.training.table_fit import TableRun
 from sympflow.training.table_step import ArrayForces, SymbolicForces, TableStep
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
@@ -292,17 +293,34 @@ def pendulum_by(what):
 
 
 @pytest.mark.parametrize("what", ["torch", "a gradient alone", "NumPy"])
-def test_functions_are_primed_by_default(what):
-    """A gradient alone has no force gradients; ∇²V·v of the fit are differences then."""
-    system = pendulum_by(what)
-    with pytest.warns(RuntimeWarning, match="because the time budget was used up"):
-        flow = train(system, time_budget=1.5, progress=False)
+def test_functions_are_primed_by_default(monkeypatch, what):
+    """A gradient alone has no force gradients."""
+    few = {"points": 5, "label_times": 1, "reference_states": 2, "progress": False}
+
+    def began(self, session):
+        raise Began(self.flow)
+
+    monkeypatch.setattr(TableRun, "go", began)
+    with pytest.raises(Began) as run:
+        train(pendulum_by(what), **few)
+    flow = run.value.args[0]
     assert isinstance(flow, PrimedFlow)
     assert (flow.gradients is None) == (what == "a gradient alone")
     assert flow.dt == starts.default_primed(PENDULUM).dt
+
+
+@pytest.mark.parametrize("what", ["a gradient alone", "NumPy"])
+def test_primed_flows_of_functions_of_arrays_are_fitted_and_run(what):
+    """∇²V·v are differences where a gradient is all there is."""
+    system = pendulum_by(what)
+    flow = train(system, points=20, restarts=2, steps=6, label_times=1, reference_states=5, progress=False)
     assert flow.figures["missed_share"] < 0.02
-    sol = sympflow.solve(system, flow, (0.0, 5.0), y0=np.array([1.0, 0.0]))
-    assert sol.status == 0
+    y0 = np.array([1.0, 0.0])
+    end = sympflow.solve(system, flow, (0.0, 5.0), y0=y0).y[:, -1]
+    exact = sympflow.solve(PENDULUM, "kahan_li8", (0.0, 5.0), y0=y0, dt=0.1).y[:, -1]
+    np.testing.assert_allclose(end, exact, atol=0.1)
+    with pytest.raises(TypeError, match=r"^`system` .* has functions of NumPy arrays, through which no gradient flows"):
+        flow(flow.dt, torch.tensor(y0, requires_grad=True))
 
 
 @pytest.mark.parametrize("force_gradient", [True, False])
