@@ -28,6 +28,7 @@ from sympflow._version import __version__
 from sympflow.arguments import naming_path, writable
 from sympflow.flow.certificate import Certificate
 from sympflow.flow.families import KINDS, family_of
+from sympflow.flow.potentials import Unregistered
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.weights import checked_device, checksum
 from sympflow.hamiltonian.domain import Domain, domain_from_dict
@@ -58,7 +59,17 @@ STAGE: dict[str, Any] = {
 
 
 class Refused(Exception):
-    """The reason for which a file is refused."""
+    """The reason for which a file is refused, and what to do.
+
+    Parameters
+    ----------
+    reason : str
+    remedy : str
+    """
+
+    def __init__(self, reason: str, remedy: str = "Save it again with flow.save(path)") -> None:
+        super().__init__(reason)
+        self.remedy = remedy
 
 
 @dataclass(frozen=True)
@@ -223,9 +234,9 @@ def load(
         _fill(flow, content, header, record)
         flow.describe(Description.of_record(record, flow.ndof))
     except Refused as reason:
-        raise _refusal(file, str(reason)) from None
+        raise _refusal(file, str(reason), reason.remedy) from None
     except OverflowError:
-        raise _refusal(file, "a number in its record is too large") from None
+        raise _refusal(file, "a number in its record is too large", Refused("").remedy) from None
     if system is not None:
         flow.check_system(system)
         flow.bound(system)
@@ -238,8 +249,8 @@ def _path(path: Any) -> Path:
     return Path(path)
 
 
-def _refusal(path: Path, reason: str) -> ValueError:
-    return ValueError(f"`path` {str(path)!r} is not a usable flow: {reason}. Save it again with flow.save(path).")
+def _refusal(path: Path, reason: str, remedy: str) -> ValueError:
+    return ValueError(f"`path` {str(path)!r} is not a usable flow: {reason}. {remedy}.")
 
 
 def _read(path: Path) -> tuple[bytes, dict[str, Any], dict[str, Any]]:
@@ -323,6 +334,9 @@ def _build(record: dict[str, Any], dtype: torch.dtype) -> Any:
     ndof = checked_integer(plan.get("ndof"), "ndof", MAX_WIDTH)
     try:
         return family_of(record["kind"], plan).from_architecture(ndof, plan, dt, dtype)
+    except Unregistered as error:
+        remedy = f"Import the package that it is from, or {error.remedy}, before you load the file"
+        raise Refused(f"it needs the {error.what}, which is not known here", remedy) from None
     except ValueError as error:
         raise Refused(f"its architecture is not admissible ({error})") from None
 

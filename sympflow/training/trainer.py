@@ -9,10 +9,12 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import plain
+from sympflow.arrays import is_tensor
 from sympflow.flow.flow_map import FlowMap, check_system
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
@@ -45,7 +47,7 @@ BUDGET = 60.0  # seconds of a fit of which nothing else is said
 
 
 def train(
-    system: HamiltonianSystem,
+    system: HamiltonianSystem | None = None,
     dt: float | None = None,
     *,
     kind: str | None = None,
@@ -99,6 +101,7 @@ def train(
     Parameters
     ----------
     system : HamiltonianSystem
+        H, which a flow is fitted to, with `data` as well.
     dt : float, optional
         Δt, the longest time of the map; the default is that of `flow`, for a new primed flow what suits the system's
         frequencies on Ω (see `sympflow.training.starts`) and gains most in trials, else 1.
@@ -177,7 +180,7 @@ def train(
         On Ctrl-C before there is anything to return, or twice.
     """
     _refuse_unknown(unknown)
-    check_system(system)
+    system = _known_system(system, data)
     dt = plain(dt)
     if dt is not None and not (is_number(dt) and 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
@@ -261,6 +264,23 @@ def _refuse_unknown(options: dict[str, Any]) -> None:
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"is `{close[0]}` meant?" if close else f"choose from {', '.join(known[1:])}."
         raise TypeError(f"`{name}` is no option of train(): {hint}")
+
+
+def _known_system(system: Any, data: Any) -> HamiltonianSystem:
+    """Return H, of which data alone tell nothing."""
+    if not isinstance(system, HamiltonianSystem) and (data is not None or system is None or _is_data(system)):
+        raise TypeError(
+            f"`system` must be a HamiltonianSystem, the H of the flow; got {type(system).__name__}: train() fits a "
+            "flow to an H that is known, and `data` adds labels to that; it finds no H in data. Define H by "
+            "HamiltonianSystem.from_sympy, or where you have its vector field by "
+            "sympflow.interop.systems.from_module, and pass data=(t, x, y) beside it."
+        )
+    check_system(system)
+    return system
+
+
+def _is_data(value: Any) -> bool:
+    return isinstance(value, list | tuple | dict | np.ndarray) or is_tensor(value)
 
 
 def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
