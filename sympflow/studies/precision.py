@@ -34,9 +34,7 @@ TOLERANCES = tuple(10.0**-k for k in range(3, 13))
 LARGEST_STEP, N_STEPS = 32, 14  # the default sweep: from 32·system.dt, halving
 LEVELS = (1e-3, 1e-6, 1e-9)  # energy errors for which the table gives the costs
 FLOOR = 1e-12  # energy error from which smaller steps only cost more
-NEAR_FLOOR = (
-    1e-6  # and of the point before: an error that is small by chance, at outputs where the orbit closes, is no end
-)
+NEAR_FLOOR = 1e-6  # and of the point before it: an error that is small by chance is no end
 SAMPLE = 4  # trajectories of a batch that are run by a method that takes them one by one
 MARGIN = 100.0  # by which a reference must be better than an error
 
