@@ -2,7 +2,7 @@
 
 The metadata entry "sympflow" is a JSON object: format, version (of the package), kind, architecture, dt, domain,
 system, fingerprint, recipe, figures, checksum (of the tensors), and, where there are any, certificate and identity
-(the H of the system, at states of the domain and as an expression).
+(the H of the system, at states of the domain and as an expression) and unfitted (intervals of t without labels).
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from sympflow._version import __version__
 from sympflow.arguments import naming_path, writable
 from sympflow.flow.certificate import Certificate
 from sympflow.flow.families import KINDS, family_of
+from sympflow.flow.potentials import Unregistered
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.weights import checked_device, checksum
 from sympflow.hamiltonian.domain import Domain, domain_from_dict
@@ -58,7 +59,17 @@ STAGE: dict[str, Any] = {
 
 
 class Refused(Exception):
-    """The reason for which a file is refused."""
+    """The reason for which a file is refused, and what to do.
+
+    Parameters
+    ----------
+    reason : str
+    remedy : str
+    """
+
+    def __init__(self, reason: str, remedy: str = "Save it again with flow.save(path)") -> None:
+        super().__init__(reason)
+        self.remedy = remedy
 
 
 @dataclass(frozen=True)
@@ -69,7 +80,7 @@ class Description:
     ----------
     domain, system, fingerprint, recipe, figures, certificate
         `FlowMap`'s domain, system_name, fingerprint, recipe, figures, certified.
-    identity
+    identity, unfitted
         `FlowMap`'s own.
     """
 
@@ -80,6 +91,7 @@ class Description:
     figures: dict[str, Any] = field(default_factory=dict)
     certificate: Certificate | None = None
     identity: Identity | None = None
+    unfitted: tuple[tuple[float, float], ...] = ()
 
     @classmethod
     def of_record(cls, record: dict[str, Any], ndof: int) -> Self:
@@ -106,7 +118,8 @@ class Description:
         domain = None if record["domain"] is None else _domain(record["domain"], ndof)
         if fingerprint is not None:
             fingerprint = tuple(math.nan if v is None else float(v) for v in fingerprint)
-        return cls(domain, system, fingerprint, record["recipe"], record["figures"], certificate, identity)
+        unfitted = _intervals(record.get("unfitted", []))
+        return cls(domain, system, fingerprint, record["recipe"], record["figures"], certificate, identity, unfitted)
 
 
 # writing ---------------------------------------------------------------------------------------------------
@@ -139,6 +152,8 @@ def write(
         "figures": description.figures,
         "checksum": checksum(tensors),
     }
+    if description.unfitted:
+        record["unfitted"] = description.unfitted
     if description.identity is not None:
         record["identity"] = description.identity.to_dict()
     if description.certificate is not None:
@@ -223,9 +238,9 @@ def load(
         _fill(flow, content, header, record)
         flow.describe(Description.of_record(record, flow.ndof))
     except Refused as reason:
-        raise _refusal(file, str(reason)) from None
+        raise _refusal(file, str(reason), reason.remedy) from None
     except OverflowError:
-        raise _refusal(file, "a number in its record is too large") from None
+        raise _refusal(file, "a number in its record is too large", Refused("").remedy) from None
     if system is not None:
         flow.check_system(system)
         flow.bound(system)
@@ -238,8 +253,8 @@ def _path(path: Any) -> Path:
     return Path(path)
 
 
-def _refusal(path: Path, reason: str) -> ValueError:
-    return ValueError(f"`path` {str(path)!r} is not a usable flow: {reason}. Save it again with flow.save(path).")
+def _refusal(path: Path, reason: str, remedy: str) -> ValueError:
+    return ValueError(f"`path` {str(path)!r} is not a usable flow: {reason}. {remedy}.")
 
 
 def _read(path: Path) -> tuple[bytes, dict[str, Any], dict[str, Any]]:
@@ -323,6 +338,9 @@ def _build(record: dict[str, Any], dtype: torch.dtype) -> Any:
     ndof = checked_integer(plan.get("ndof"), "ndof", MAX_WIDTH)
     try:
         return family_of(record["kind"], plan).from_architecture(ndof, plan, dt, dtype)
+    except Unregistered as error:
+        remedy = f"Import the package that it is from, or {error.remedy}, before you load the file"
+        raise Refused(f"it needs the {error.what}, which is not known here", remedy) from None
     except ValueError as error:
         raise Refused(f"its architecture is not admissible ({error})") from None
 
@@ -399,6 +417,15 @@ def _identity(record: dict[str, Any], ndof: int) -> Identity | None:
         return Identity.from_dict(record["identity"], ndof)
     except ValueError as error:
         raise Refused(f"its identity of the system is not admissible: {error}") from None
+
+
+def _intervals(pairs: Any) -> tuple[tuple[float, float], ...]:
+    """Return the intervals of times in a record; else they are refused."""
+    if not isinstance(pairs, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in pairs):
+        raise Refused("its unfitted times are not a list of pairs")
+    if not all(_is_number(v) for pair in pairs for v in pair):
+        raise Refused("its unfitted times are not numbers")
+    return tuple((float(low), float(high)) for low, high in pairs)
 
 
 def _check_system(name: Any, fingerprint: Any) -> None:

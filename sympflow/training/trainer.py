@@ -9,10 +9,12 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import plain
+from sympflow.arrays import is_tensor
 from sympflow.flow.flow_map import FlowMap, check_system
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
@@ -34,7 +36,7 @@ from sympflow.training.options import (
     is_number,
     plain_numbers,
 )
-from sympflow.training.points import digest, handed_in
+from sympflow.training.points import digest, handed_in, unlabelled, warn_of_another_system
 from sympflow.training.runs import Run, Unstarted
 from sympflow.training.session import Deadline, OutOfTime, Path, Session
 from sympflow.training.split_fit import SplitRun
@@ -45,7 +47,7 @@ BUDGET = 60.0  # seconds of a fit of which nothing else is said
 
 
 def train(
-    system: HamiltonianSystem,
+    system: HamiltonianSystem | None = None,
     dt: float | None = None,
     *,
     kind: str | None = None,
@@ -100,6 +102,7 @@ def train(
     Parameters
     ----------
     system : HamiltonianSystem
+        H, which a flow is fitted to, with `data` as well.
     dt : float, optional
         Δt, the longest time of the map; the default is that of `flow`, for a new primed flow what suits the system's
         frequencies on Ω (see `sympflow.training.starts`) and gains most in trials, else 1. At most thirty periods of
@@ -185,7 +188,7 @@ def train(
         On Ctrl-C before there is anything to return, or twice.
     """
     _refuse_unknown(unknown)
-    check_system(system)
+    system = _known_system(system, data)
     dt = plain(dt)
     if dt is not None and not (is_number(dt) and 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
@@ -269,6 +272,23 @@ def _refuse_unknown(options: dict[str, Any]) -> None:
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"is `{close[0]}` meant?" if close else f"choose from {', '.join(known[1:])}."
         raise TypeError(f"`{name}` is no option of train(): {hint}")
+
+
+def _known_system(system: Any, data: Any) -> HamiltonianSystem:
+    """Return H, of which data alone tell nothing."""
+    if not isinstance(system, HamiltonianSystem) and (data is not None or system is None or _is_data(system)):
+        raise TypeError(
+            f"`system` must be a HamiltonianSystem, the H of the flow; got {type(system).__name__}: train() fits a "
+            "flow to an H that is known, and `data` adds labels to that; it finds no H in data. Define H by "
+            "HamiltonianSystem.from_sympy, or where you have its vector field by "
+            "sympflow.interop.systems.from_module, and pass data=(t, x, y) beside it."
+        )
+    check_system(system)
+    return system
+
+
+def _is_data(value: Any) -> bool:
+    return isinstance(value, list | tuple | dict | np.ndarray) or is_tensor(value)
 
 
 def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
@@ -429,18 +449,27 @@ def _run_of(
     dt = 1.0 if dt is None else float(dt)
     labels = None if asked.data is None else handed_in(asked.data, system, dt)
     checksum = None if labels is None else digest(labels)
+    if labels is not None:
+        warn_of_another_system(labels, system)
     if searched and isinstance(flow, PrimedFlow):
         table = TableOptions.of(asked, checksum)
         scaling = scaling_of(domain, dt, table.seed)
         try:
-            return TableRun.start(flow, system, domain, scaling, table, labels, tried, deadline)
+            run: Run = TableRun.start(flow, system, domain, scaling, table, labels, tried, deadline)
         except OutOfTime as cut:
             return Unstarted(flow if tried is None else tried, system, domain, scaling, table, str(cut))
+        if labels is not None and table.loss == "labels":
+            run.unfitted = unlabelled(labels[0], dt)
+        return run
     options = LossOptions.of(asked, kind, checksum)
     scaling = scaling_of(domain, dt, options.seed)
     if flow is None:
         flow = new_network(system, new, dt, scaling, options.seed)
     try:
-        return LossRun.start(flow.requires_grad_(True), system, domain, scaling, options, labels, deadline)
+        run = LossRun.start(flow.requires_grad_(True), system, domain, scaling, options, labels, deadline)
     except OutOfTime as cut:
         return Unstarted(flow, system, domain, scaling, options, str(cut))
+    if not (options.residual_weight or options.matching_weight):
+        made = dt * np.arange(1, options.label_times + 1) / options.label_times
+        run.unfitted = unlabelled(made if labels is None else labels[0], dt)
+    return run
