@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any, ClassVar, Self
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.arguments import plain
+from sympflow.arrays import differentiable, finite_states, readable, values
 from sympflow.flow.certificate import Certificate, certify
 from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
@@ -236,17 +238,14 @@ class FlowMap(nn.Module):
     def _repeat(self, k: Tensor, back: bool, x: Tensor) -> Tensor:
         """ψ̄_Δt, or its inverse, k times, with a count k for each state."""
         step = self.psi_inverse if back else self.psi
-        for j in range(int(k.max()) if k.numel() else 0):
-            active = k > j
-            x = x.index_put((active,), step(self.dt, x[active]))
+        for j in range(int(to_values(k).max(initial=0))):
+            x = _where(k > j, lambda t, y: step(self.dt, y), k, x)
         return x
 
     def _remainder(self, r: Tensor, back: Tensor, x: Tensor) -> Tensor:
-        moving = (r > 0) | r.requires_grad  # at r = 0 the state stays, but has a derivative
-        for step, active in ((self.psi, moving & ~back), (self.psi_inverse, moving & back)):
-            if active.any():
-                x = x.index_put((active,), step(r[active], x[active]))
-        return x
+        moving = (r > 0) | differentiable(r)  # at r = 0 the state stays, but has a derivative
+        x = _where(moving & ~back, self.psi, r, x)
+        return _where(moving & back, self.psi_inverse, r, x)
 
     # a run of many steps --------------------------------------------------------------------------------------
 
@@ -514,12 +513,12 @@ class FlowMap(nn.Module):
                 f"`x` must have shape (..., {2 * self.ndof}), states [q, p]; got {tuple(x.shape)}: "
                 "put them on the last axis."
             )
-        if isinstance(t, Tensor) and (t.ndim or t.requires_grad):
+        if isinstance(t, Tensor) and (t.ndim or differentiable(t)):
             if t.dtype == torch.bool or t.is_complex():
                 raise TypeError(f"`t` must be real times; got {t.dtype}: use a floating-point tensor.")
             if t.device != x.device:
                 raise ValueError(f"`t` is on {t.device} but `x` on {x.device}: move one of them.")
-            if not torch.isfinite(t).all():
+            if not finite_states(t[..., None]).all():
                 raise ValueError("`t` must be finite: remove its NaN and infinite entries.")
             try:
                 torch.broadcast_shapes(t.shape, x.shape[:-1])
@@ -545,8 +544,8 @@ class FlowMap(nn.Module):
         low, high, slack = 0.0, 0.0, 1e-14
         if isinstance(t, float):
             low = high = t
-        elif t.numel():
-            low, high = float(t.detach().min()), float(t.detach().max())
+        elif t.numel() and (times := values(t)) is not None:
+            low, high = float(times.min()), float(times.max())
             slack = 1e-6 if t.dtype == torch.float32 else slack
         if low < 0 or high > self.dt * (1 + slack):
             raise ValueError(f"`t` must lie in [0, dt] = [0, {self.dt:g}]; got {low} to {high}: reduce it modulo dt.")
@@ -555,6 +554,32 @@ class FlowMap(nn.Module):
     def __repr__(self) -> str:
         system = f" of {self.system_name}" if self.system_name else ""
         return f"<{type(self).__name__}{system}: ndof={self.ndof}, dt={self.dt:g}, {self.n_parameters} parameters>"
+
+
+def to_values(t: Tensor) -> np.ndarray:
+    """Return the values of times, with those of all lanes of `torch.func.vmap`.
+
+    Raises
+    ------
+    TypeError
+        If there are none, in a graph that `torch.compile` traces.
+    """
+    found = values(t)
+    if found is None:
+        raise TypeError(
+            "`t` is a tensor without values where torch.compile traces, but it says how many steps of Δt are made: "
+            "pass a number, or call psi(t, x), for t in [0, Δt]."
+        )
+    return found
+
+
+def _where(active: Tensor, step: Callable[[Tensor, Tensor], Tensor], t: Tensor, x: Tensor) -> Tensor:
+    """step(t, x) where `active`, which is of the batch shape of x, and x elsewhere."""
+    if not to_values(active).any():
+        return x
+    if active.ndim and readable(active) and readable(x):
+        return x.index_put((active,), step(t[active], x[active]))
+    return torch.where(active[..., None], step(t, x), x)  # under vmap each lane chooses its own
 
 
 def whole_steps(t: float, dt: float) -> tuple[int, float]:
@@ -588,8 +613,8 @@ def whole_steps_of_each(t: Tensor, dt: float) -> tuple[Tensor, Tensor]:
     near = ratio.round()
     exact = (ratio - near).abs() <= 2 * eps * near
     k = torch.where(exact, near, ratio.floor())
-    if k.numel() and k.max() > MAX_STEPS:
-        raise _too_many_steps(float(t.detach().max()), dt)
+    if to_values(k).max(initial=0) > MAX_STEPS:
+        raise _too_many_steps(float(to_values(t).max()), dt)
     r = t - k * dt
     return k.to(torch.int64), torch.where(exact, r - r.detach(), r).clamp(0.0, dt)
 
