@@ -120,7 +120,10 @@ class FlowIntegrator(OwnStepper):
     def check(self, system: HamiltonianSystem) -> None:
         if self.flow is not None:
             self.flow.check_system(system)
-        self._check_dt(self.flow_for(system))
+        flow = self.flow_for(system)
+        self._check_dt(flow)
+        if self.dt is not None:
+            flow.warn_of_times(self.dt)
 
     def step_length(self, system: HamiltonianSystem) -> float:
         return float(self.dt if self.dt is not None else self.flow_for(system).dt)
@@ -216,6 +219,10 @@ class CompiledFlowStepper(KernelStepper):
     def __init__(self, integrator: FlowIntegrator, problem: Problem, flow: FlowMap, kernel: Any) -> None:
         super().__init__(integrator, problem, kernel)
         self.flow = flow
+
+    def shorter(self, y: Array, h: Any) -> Array:
+        self.flow.warn_of_times(h)
+        return super().shorter(y, h)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         counted = self.kernel.evaluations(n_steps, n_saved, n_extra)
