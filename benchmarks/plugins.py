@@ -3,10 +3,10 @@
     python benchmarks/plugins.py                      # a table; seconds on one core
     python benchmarks/plugins.py --out docs/measured
 
-The two forms are those of `examples/plugin`: a `Scheme`, which `splitting_method` makes a method that runs compiled, and a
-`FixedStep` with a `step`, which runs by array operations. Hénon–Heiles, whole calls of `solve` that report the end only:
-one trajectory over 2000 steps, and 1000 trajectories over 200. The best of five calls each, in turn, after a first one
-that compiles and is not counted. One thread.
+The two forms are those of `examples/plugin`: a `Scheme`, which runs compiled by `splitting_method`, and a
+`FixedStep` with a `step`, which runs by array operations. Hénon–Heiles, whole calls of `solve` that report the end
+only: one trajectory over 2000 steps, and 1000 trajectories over 200. The best of five calls each, in turn, after a
+first one that compiles and is not counted. One thread.
 """
 
 # ruff: noqa: E402

@@ -1,4 +1,4 @@
-"""The same method written as a step: the way for what is no scheme of kicks and drifts, a hundred times slower and more."""
+"""The same method written as a step: the way for what is no scheme of kicks and drifts. It is far slower."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
