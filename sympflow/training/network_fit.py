@@ -36,7 +36,7 @@ from sympflow.training.session import Deadline, OutOfTime, Session
 
 PROBE = 32  # held-out points whose time tells how many there is time for
 VALIDATION_SHARE = 0.1  # of the time left, that a validation may take
-BACKWARD = 3.0  # times what a point takes in a validation, that it takes in a step
+BACKWARD = 2.0  # times what a point takes in a validation, that it takes in a step at least
 
 
 @dataclass
@@ -128,8 +128,12 @@ class LossRun(Run):
         self._validate()
         self.closing = session.passed - began
         self.work_end = session.deadline.before(self.closing)
-        points = len(self.held_out.t)
-        self.step_seconds = BACKWARD * self.closing * self.options.points / points if points > PROBE else 0.0
+        if self.work_end.end < math.inf:
+            began, few = session.passed, _first(self.held_out, PROBE)
+            with torch.no_grad():
+                self.loss.terms(self.flow, few)
+            each = (session.passed - began) / len(few.t)
+            self.step_seconds = BACKWARD * each * max(self.options.points - PROBE, 0)
         if not math.isfinite(self.history[0]["loss"]):
             raise FloatingPointError(
                 "The loss is not finite at the first validation: the system's H or its gradient is not finite "
