@@ -143,11 +143,14 @@ class LossRun(Run):
     def over(self, session: Session) -> bool:
         if self.step == 0 and not self._fits():
             self.ended, self.reason = True, OUT_OF_TIME
+            if not session.cut:
+                self.reason = f"a step takes about {self.step_seconds:.2g} s, for which the time budget is too short"
         return self.ended
 
     def _fits(self) -> bool:
-        """Return whether there is time for another step."""
-        return not self.work_end.over() and self.step_seconds <= self.work_end.left
+        """Return whether there is time for another step; those of Adam are one piece, others can be cut."""
+        in_time = self.options.optimizer != "adam" or self.step_seconds <= self.work_end.left
+        return not self.work_end.over() and in_time
 
     def advance(self, session: Session) -> Advance:
         options = self.options
