@@ -129,10 +129,10 @@ class LossRun(Run):
         self.closing = session.passed - began
         self.work_end = session.deadline.before(self.closing)
         if self.work_end.end < math.inf:
-            began, few = session.passed, _first(self.held_out, PROBE)
+            began = session.passed
             with torch.no_grad():
-                self.loss.terms(self.flow, few)
-            each = (session.passed - began) / len(few.t)
+                self.loss.terms(self.flow, self.held_out)
+            each = (session.passed - began) / len(self.held_out.t)
             self.step_seconds = BACKWARD * each * max(self.options.points - PROBE, 0)
         if not math.isfinite(self.history[0]["loss"]):
             raise FloatingPointError(
