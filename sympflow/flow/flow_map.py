@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.arguments import plain
-from sympflow.arrays import differentiable, finite_states, readable, values
+from sympflow.arrays import differentiable, finite_states, has_values, is_tensor, readable, values
 from sympflow.flow.certificate import Certificate, certify
 from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
@@ -49,7 +50,7 @@ def check_system(system: Any) -> None:
             f"`system` must be a HamiltonianSystem; got {type(system).__name__}: take a scene of sympflow.systems, or "
             "define one with HamiltonianSystem.from_sympy."
         )
-    system.check_functions(torch.empty(0, dtype=torch.float64))
+    system.check_functions(torch.empty(0, dtype=torch.float64) if system.takes_tensors else None)
 
 
 class FlowMap(nn.Module):
@@ -76,6 +77,9 @@ class FlowMap(nn.Module):
         The system it was trained for.
     identity : Identity or None
         H of that system, all over Ω; None for a flow without a system, or from a file that was written before.
+    unfitted : tuple of (float, float)
+        Open intervals of t in which it was never compared with anything: those between the times of labels, if these
+        were few and it was fitted to nothing else. Results there come with a warning.
     recipe, figures : dict
         How it was trained, and what it achieved.
     history : list of dict
@@ -105,6 +109,7 @@ class FlowMap(nn.Module):
         self.fingerprint: tuple[float, ...] | None = None
         self.system_name: str | None = None
         self.identity: Identity | None = None
+        self.unfitted: tuple[tuple[float, float], ...] = ()
         self._origin: tuple[dict[str, Any], Origin] | None = None
         self.recipe: dict[str, Any] = {}
         self.figures: dict[str, Any] = {}
@@ -198,6 +203,7 @@ class FlowMap(nn.Module):
             If an argument has the wrong type, shape, dtype or device, or t is not finite.
         """
         t = self._checked_time(t, x)
+        self.warn_of_times(t)
         if isinstance(t, float):
             return self._whole(whole_steps(abs(t), self.dt), t < 0, x)
         k, r, back, x = self._split(t, x)
@@ -208,12 +214,40 @@ class FlowMap(nn.Module):
     def inverse(self, t: float | Tensor, x: Tensor) -> Tensor:
         """The exact inverse of ψ_t, for every t: arguments as for the call."""
         t = self._checked_time(t, x)
+        self.warn_of_times(t)
         if isinstance(t, float):
             return self._whole(whole_steps(abs(t), self.dt), t >= 0, x, remainder_first=True)
         k, r, back, x = self._split(t, x)
         x = self._remainder(r, ~back, x)
         x = self._repeat(k * ~back, True, x)
         return self._repeat(k * back, False, x)
+
+    def warn_of_times(self, t: Any) -> None:
+        """Warn where a time, or one of several, is k·Δt + r with an r at which the flow was fitted to nothing.
+
+        Warns
+        -----
+        UserWarning
+        """
+        if not self.unfitted:
+            return
+        seen = values(t) if is_tensor(t) else np.asarray(t)
+        if seen is None:  # in a graph that torch.compile traces
+            return
+        times = np.abs(seen.astype(float)).reshape(-1)
+        slack = 1e-9 * self.dt
+        for low, high in self.unfitted:
+            r = times % self.dt  # a multiple of Δt, up to rounding, is at one end or the other
+            inside = (r > low + slack) & (r < high - slack) & (r > slack) & (r < self.dt - slack)
+            if inside.any():
+                warnings.warn(
+                    f"The flow was fitted to labels, of which none is at a time between {low:g} and {high:g}: what it "
+                    f"gives at t = {times[inside][0]:g} was compared with nothing. Ask for results at multiples of its "
+                    f"Δt = {self.dt:g}, or train it with labels at more times, or by loss='labels+residual'.",
+                    UserWarning,
+                    stacklevel=3,
+                )
+                return
 
     def _whole(self, count: tuple[int, float], back: bool, x: Tensor, remainder_first: bool = False) -> Tensor:
         """k steps and the remainder of one time for all states."""
@@ -332,6 +366,7 @@ class FlowMap(nn.Module):
             self.figures,
             certificate=self.certified,
             identity=self.identity,
+            unfitted=self.unfitted,
         )
 
     def describe(self, description: Description) -> None:
@@ -340,7 +375,7 @@ class FlowMap(nn.Module):
             description.domain, description.system, description.fingerprint,
         )  # fmt: skip
         self.recipe, self.figures, self.certified = description.recipe, description.figures, description.certificate
-        self.identity = description.identity
+        self.identity, self.unfitted = description.identity, description.unfitted
 
     # its system ---------------------------------------------------------------------------------------------
 
@@ -518,7 +553,7 @@ class FlowMap(nn.Module):
                 raise TypeError(f"`t` must be real times; got {t.dtype}: use a floating-point tensor.")
             if t.device != x.device:
                 raise ValueError(f"`t` is on {t.device} but `x` on {x.device}: move one of them.")
-            if not finite_states(t[..., None]).all():
+            if has_values(t) and not finite_states(t[..., None]).all():
                 raise ValueError("`t` must be finite: remove its NaN and infinite entries.")
             try:
                 torch.broadcast_shapes(t.shape, x.shape[:-1])
@@ -534,7 +569,7 @@ class FlowMap(nn.Module):
             raise TypeError(
                 f"`t` must be a number or a tensor of times; got {type(t).__name__}: pass seconds."
             ) from None
-        if not math.isfinite(value):
+        if not -math.inf < value < math.inf:
             raise ValueError(f"`t` must be finite; got {value}: pass a finite time.")
         return value
 

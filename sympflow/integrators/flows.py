@@ -6,14 +6,13 @@ import copy
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from numbers import Real
 from typing import Any, ClassVar, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 
-from sympflow.arguments import check_flag
+from sympflow.arguments import as_float, check_flag
 from sympflow.arrays import Array, is_tensor, to_numpy, untransformed
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.shipped import choose, forces_saved, named, shipped, shipped_flows
@@ -121,7 +120,10 @@ class FlowIntegrator(OwnStepper):
     def check(self, system: HamiltonianSystem) -> None:
         if self.flow is not None:
             self.flow.check_system(system)
-        self._check_dt(self.flow_for(system))
+        flow = self.flow_for(system)
+        self._check_dt(flow)
+        if self.dt is not None:
+            flow.warn_of_times(self.dt)
 
     def step_length(self, system: HamiltonianSystem) -> float:
         return float(self.dt if self.dt is not None else self.flow_for(system).dt)
@@ -218,6 +220,10 @@ class CompiledFlowStepper(KernelStepper):
         super().__init__(integrator, problem, kernel)
         self.flow = flow
 
+    def shorter(self, y: Array, h: Any) -> Array:
+        self.flow.warn_of_times(h)
+        return super().shorter(y, h)
+
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         counted = self.kernel.evaluations(n_steps, n_saved, n_extra)
         return self.flow.evaluations(n_steps, n_saved, n_extra, "compiled") if counted is None else counted
@@ -268,7 +274,7 @@ class SympFlowIntegrator(FlowIntegrator):
         check_flag("compensated", self.compensated)
         if self.tol is None:
             return
-        if not isinstance(self.tol, Real) or isinstance(self.tol, bool) or not 0 < self.tol < math.inf:
+        if not 0 < as_float(self.tol) < math.inf:
             raise ValueError(
                 f"`tol` must be a positive number, a relative energy error; got {self.tol!r}: take 1e-6, for instance."
             )
