@@ -86,7 +86,7 @@ def _warn_of_distance(extension: Extension, x: np.ndarray, outcome: Outcome) -> 
         apart, size = np.asarray(extension.distance(x)), np.abs(x).max(-1)
         ratio = apart.max(0) / size.max(0)
     outcome.stats["copy_distance"] = float(np.nanmax(apart)) if not np.isnan(apart).all() else float("nan")
-    lost = ratio > APART
+    lost = (ratio > APART) & (np.asarray(outcome.status) >= 0)  # what has failed says more
     if lost.any():
         which = "" if lost.ndim == 0 else f" of {np.count_nonzero(lost)} of {lost.size} trajectories"
         warnings.warn(
