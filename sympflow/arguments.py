@@ -153,6 +153,16 @@ def check_dt(dt: Any) -> None:
         raise ValueError(f"`dt` must be a positive and finite number, at most {LONGEST_STEP:g}; got {dt!r}.")
 
 
+def as_float(value: Any) -> float:
+    """Return a real number as a float; NaN for anything else, an integer beyond floats among it."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.floating | np.integer):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.nan
+
+
 def check_flag(name: str, value: Any) -> None:
     """Raise unless the option `name` is True or False."""
     if not isinstance(value, bool | np.bool_):

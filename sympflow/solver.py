@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import (
     MAX_ASKED_VALUES,
     MAX_SAVED_VALUES,
+    as_float,
     check_save_every,
     check_t_eval,
     check_t_span,
@@ -330,8 +331,7 @@ def check_events(events: Any, event_step: Any) -> EventSearch | None:
         return None if events is None else EventSearch(())
     if event_step is None:
         return EventSearch(parsed)
-    number = isinstance(event_step, int | float | np.floating | np.integer) and not isinstance(event_step, bool)
-    if not (number and event_step > 0):
+    if not as_float(event_step) > 0:
         raise ValueError(f"`event_step` must be a positive number, a time; got {event_step!r}.")
     return EventSearch(parsed, float(event_step))
 

@@ -51,7 +51,7 @@ def check_system(system: Any) -> None:
             "define one with HamiltonianSystem.from_sympy."
         )
     if system.functions_given:
-        system.check_functions(torch.empty(0, dtype=torch.float64))
+        system.check_functions(torch.empty(0, dtype=torch.float64) if system.takes_tensors else None)
 
 
 class FlowMap(nn.Module):

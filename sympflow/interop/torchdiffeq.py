@@ -169,6 +169,9 @@ def odeint_dense(
     _integrated(Path, func, y0, times[:1], rtol, atol, method, options, None)  # checks all arguments
     integrator, system = _build(func, method, options)
     path = DensePath(integrator, system, y0, _direction(times), times)
+    compared = _Compared(func, y0, times, integrator, system)
+    if compared.func is not None:
+        compared.run(path, times)
 
     def solution(t: Tensor) -> Tensor:
         if not (isinstance(t, Tensor) and t.ndim < 2 and t.is_floating_point()):
