@@ -22,6 +22,8 @@ _HOME = {
     "get": "integrators.registry",
     "available": "integrators.registry",
     "register": "integrators.registry",
+    "Scheme": "schemes",
+    "splitting_method": "integrators.splitting",
     "SympFlow": "flow.sympflow",
     "MLPFlow": "flow.mlp",
     "load": "flow.files",
@@ -61,6 +63,7 @@ if TYPE_CHECKING:
     from sympflow.integrators.registry import available as available
     from sympflow.integrators.registry import get as get
     from sympflow.integrators.registry import register as register
+    from sympflow.integrators.splitting import splitting_method as splitting_method
     from sympflow.metrics.accuracy import reference_error as reference_error
     from sympflow.metrics.accuracy import time_reversal_error as time_reversal_error
     from sympflow.metrics.energy import energy_drift as energy_drift
@@ -70,6 +73,7 @@ if TYPE_CHECKING:
     from sympflow.metrics.symplectic import loop_area_error as loop_area_error
     from sympflow.metrics.symplectic import symplecticity_defect as symplecticity_defect
     from sympflow.metrics.symplectic import volume_error as volume_error
+    from sympflow.schemes import Scheme as Scheme
     from sympflow.solution import Solution as Solution
     from sympflow.solver import solve as solve
     from sympflow.studies.comparison import compare as compare

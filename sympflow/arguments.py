@@ -112,10 +112,24 @@ def check_counts(**values: Any) -> None:
             raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
 
 
+def positive_numbers(name: str, values: Any) -> list[float]:
+    """Return a list of positive and finite numbers, sorted; raise if it is none, or is empty."""
+    try:
+        if isinstance(values, str) or any(isinstance(x, bool | np.bool_ | str) for x in values):
+            raise TypeError("no numbers")
+        numbers = sorted(float(x) for x in values)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise TypeError(f"`{name}` must be a list of positive numbers; got {values!r}.") from error
+    if not numbers:
+        raise ValueError(f"`{name}` is empty: give at least one number, or leave it out.")
+    if not all(0 < x < math.inf for x in numbers):
+        raise ValueError(f"`{name}` must be positive and finite; got {values!r}.")
+    return numbers
+
+
 def check_dt(dt: Any) -> None:
     """Raise unless `dt` is None or a step length."""
-    number = isinstance(dt, int | float | np.number) and not isinstance(dt, bool)
-    if dt is not None and not (number and 0 < dt <= LONGEST_STEP):
+    if dt is not None and not (real_number(dt) and 0 < dt <= LONGEST_STEP):
         raise ValueError(f"`dt` must be a positive and finite number, at most {LONGEST_STEP:g}; got {dt!r}.")
 
 
@@ -136,9 +150,14 @@ def floats(name: str, value: Any) -> np.ndarray:
     return array.astype(float)
 
 
+def real_number(value: Any) -> bool:
+    """Return True for a real number of Python's or NumPy's, however large; False for a bool."""
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
 def check_number(name: str, value: Any) -> None:
     """A TypeError unless `value` is a real number."""
-    if not isinstance(value, int | float | np.number) or isinstance(value, bool) or np.iscomplexobj(value):
+    if not real_number(value):
         raise TypeError(f"`{name}` must be a number; got {value!r}.")
 
 

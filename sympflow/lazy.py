@@ -1,12 +1,16 @@
-"""Imports: whole although interrupted, and by the paths that modules had before they moved."""
+"""Imports: whole although interrupted, by the paths that modules had before they moved, and of plug-ins when used."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Container, Iterable, Sequence
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from types import FrameType, ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 FORMER = {
     "callables": "hamiltonian.callables",
@@ -80,3 +84,64 @@ def whole_import(name: str) -> ModuleType:
         signal.signal(signal.SIGINT, handler)
         if pending:
             handler(*pending[0])
+
+
+# plug-ins ------------------------------------------------------------------------------------------
+
+
+def announced(group: str, what: str, taken: Container[str], others: Iterable[EntryPoint] = ()) -> dict[str, EntryPoint]:
+    """Return the entry points of a group by name, of all installed distributions; none is imported.
+
+    Parameters
+    ----------
+    group : str
+    what : str
+        Their kind in one word, for the warning that a name is taken: by `taken`, or by an entry point before.
+    taken : container of str
+    others : iterable of EntryPoint
+        Those of other groups, to stand beside them.
+    """
+    import warnings
+    from importlib.metadata import entry_points
+
+    found: dict[str, EntryPoint] = {}
+    for point in (*entry_points(group=group), *others):
+        if point.name in taken or point.name in found:
+            message = f"The {what} {point.name!r} of {distribution(point)} is ignored: the name is taken."
+            try:
+                warnings.warn(message, RuntimeWarning, stacklevel=5)
+            except RuntimeWarning:  # where warnings are errors, it must not take all others with it
+                import logging
+
+                logging.getLogger(__name__).warning(message)
+        else:
+            found[point.name] = point
+    return found
+
+
+def load_announced(point: EntryPoint, argument: str) -> Any:
+    """Import the object of an entry point.
+
+    Parameters
+    ----------
+    point : EntryPoint
+    argument : str
+        The argument that names it, for the message.
+
+    Raises
+    ------
+    ImportError
+        If it cannot be imported, with the name of its distribution.
+    """
+    try:
+        return point.load()
+    except (Exception, SystemExit) as error:
+        raise ImportError(
+            f"`{argument}` {point.name!r} of the plug-in {distribution(point)} cannot be loaded "
+            f"({type(error).__name__}: {error}): reinstall or remove that distribution."
+        ) from error
+
+
+def distribution(point: EntryPoint) -> str:
+    """Return the name of the distribution of an entry point, for messages."""
+    return point.dist.name if point.dist is not None else point.value

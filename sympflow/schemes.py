@@ -24,12 +24,34 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import pairwise
-from math import sqrt
-from typing import Any, NamedTuple
+from math import fsum, isfinite, sqrt
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-__all__ = ["CURVATURE", "FORCE_GRADIENT", "POLYNOMIAL", "SCHEMES", "Scheme", "Substep", "compose", "scheme_evaluations"]
+from sympflow.lazy import announced, distribution, load_announced
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+__all__ = [
+    "CURVATURE",
+    "FORCE_GRADIENT",
+    "GROUP",
+    "POLYNOMIAL",
+    "SCHEMES",
+    "Scheme",
+    "Substep",
+    "announced_schemes",
+    "checked_scheme",
+    "compose",
+    "register_scheme",
+    "scheme_evaluations",
+    "scheme_named",
+]
+
+GROUP = "sympflow.schemes"
+"""The entry-point group in which a distribution announces its schemes: `name = "package.module:SCHEME"`."""
 
 FORCE_GRADIENT, CURVATURE, POLYNOMIAL = 1, 2, 3  # levels of a scheme, or of a flow: what its kicks have beside V
 
@@ -67,7 +89,8 @@ class Scheme:
     order : int or None
         Classical order of convergence; None where nothing is claimed (a trained table).
     kicks, drifts, gradients : tuple of float
-        Coefficients b, a and g of the stages in their order of execution; zeros cost nothing.
+        Coefficients b, a and g of the stages in their order of execution; zeros cost nothing. No g means none but
+        zeros. Other sequences of numbers become tuples.
     curvatures : tuple of float
         Coefficients c, none for none.
     polynomials : tuple of tuple of float
@@ -84,20 +107,31 @@ class Scheme:
     ------
     ValueError
         If the tuples differ in length or are empty.
+
+    Examples
+    --------
+    >>> ruth3 = Scheme("ruth3", 3, kicks=(7 / 24, 3 / 4, -1 / 24), drifts=(2 / 3, -2 / 3, 1.0))
+    >>> ruth3.force_evaluations, ruth3.symmetric
+    (3, False)
     """
 
     name: str
     order: int | None
     kicks: tuple[float, ...]
     drifts: tuple[float, ...]
-    gradients: tuple[float, ...]
-    source: str
+    gradients: tuple[float, ...] = ()
+    source: str = ""
     nystrom: bool = False
     curvatures: tuple[float, ...] = ()
     polynomials: tuple[tuple[float, ...], ...] = ()
     monomials: tuple[tuple[int, ...], ...] = ()
 
     def __post_init__(self) -> None:
+        for column in ("kicks", "drifts", "gradients", "curvatures"):
+            if type(getattr(self, column)) is not tuple:
+                object.__setattr__(self, column, tuple(map(float, getattr(self, column))))
+        if not self.gradients:
+            object.__setattr__(self, "gradients", (0.0,) * len(self.kicks))
         if not len(self.kicks) == len(self.drifts) == len(self.gradients) > 0:
             raise ValueError(
                 f"`kicks`, `drifts` and `gradients` must have one coefficient per stage, got "
@@ -479,6 +513,81 @@ _TABLE = (
 )
 
 SCHEMES: dict[str, Scheme] = {scheme.name: scheme for scheme in _TABLE}
+
+_registered: dict[str, Scheme] = {}
+
+
+def scheme_named(name: str) -> Scheme:
+    """Return the scheme of that name: of `SCHEMES`, one that was registered, or that of an installed plug-in.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    ImportError
+        If the plug-in that announces it cannot be loaded, or announces something else.
+    """
+    if name in SCHEMES:
+        return SCHEMES[name]
+    if name in _registered:
+        return _registered[name]
+    point = announced_schemes().get(name)
+    if point is None:
+        known = sorted({*SCHEMES, *_registered, *announced_schemes()})
+        raise ValueError(f"`scheme` {name!r} is unknown: choose one of {', '.join(known)}.")
+    scheme = load_announced(point, "scheme")
+    try:
+        return checked_scheme(scheme)
+    except (TypeError, ValueError) as error:
+        raise ImportError(
+            f"`scheme` {name!r} of the plug-in {distribution(point)} is no usable scheme ({error}): report it there."
+        ) from error
+
+
+def register_scheme(name: str, scheme: Scheme) -> None:
+    """Make a scheme known by name in this process; `sympflow.register` does so, and makes it a method."""
+    _registered[name] = checked_scheme(scheme)
+
+
+@cache
+def announced_schemes() -> dict[str, EntryPoint]:
+    """Return the entry points of the schemes of installed plug-ins, by name."""
+    return announced(GROUP, "scheme", SCHEMES)
+
+
+def checked_scheme(scheme: Any) -> Scheme:
+    """Return the scheme, if it is one of finite numbers that is consistent where it declares an order.
+
+    Raises
+    ------
+    TypeError
+        If it is no Scheme, or not of numbers.
+    ValueError
+        If a number is not finite, the order is no positive integer, or kicks or drifts do not add up to 1.
+    """
+    if not isinstance(scheme, Scheme):
+        raise TypeError(
+            f"`scheme` must be a sympflow.Scheme or the name of one; got {type(scheme).__name__}: make one with "
+            "Scheme(name, order, kicks, drifts)."
+        )
+    numbers = (*scheme.kicks, *scheme.drifts, *scheme.gradients, *scheme.curvatures)
+    if not all(isinstance(x, int | float) for x in numbers):
+        raise TypeError(f"`scheme` {scheme.name!r} must have coefficients that are numbers; got {numbers}.")
+    if not all(map(isfinite, numbers)):
+        raise ValueError(f"`scheme` {scheme.name!r} must have finite coefficients; got {numbers}.")
+    order = scheme.order
+    if order is None:
+        return scheme
+    if not isinstance(order, int) or isinstance(order, bool) or order < 1:
+        raise ValueError(f"`scheme` {scheme.name!r} must have a positive integer or None as `order`; got {order!r}.")
+    for column in ("kicks", "drifts"):
+        total = fsum(getattr(scheme, column))
+        if abs(total - 1) > 1e-12:
+            raise ValueError(
+                f"`scheme` {scheme.name!r} has {column} that add up to {total!r}, and order {order} needs 1: mend the "
+                "table, or declare order=None."
+            )
+    return scheme
 
 
 def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:

@@ -13,7 +13,7 @@ from sympflow.commands.console import out
 PARAMETERS = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Options that are unknown to a command may be parameters of a system: --omega 100."""
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
+app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", pretty_exceptions_enable=False)
 app.command()(listings.systems)
 app.command()(listings.methods)
 app.command(context_settings=PARAMETERS)(listings.flows)
@@ -21,7 +21,9 @@ app.command(context_settings=PARAMETERS)(running.solve)
 app.command(context_settings=PARAMETERS)(studying.compare)
 app.command(context_settings=PARAMETERS)(studying.bench)
 app.command(context_settings=PARAMETERS)(studying.stability)
+app.command(context_settings=PARAMETERS)(studying.section)
 app.command(context_settings=PARAMETERS)(running.train)
+app.command(context_settings=PARAMETERS)(running.certificate)
 
 
 @app.callback(invoke_without_command=True)

@@ -1,51 +1,131 @@
-"""The console: errors as one line, progress, tables, and the files that commands write."""
+"""The console: errors as one line and in the words of the command line, progress, tables, and the files of `--out`."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 from rich.console import Console
 
-from sympflow.commands.words import Scene
+from sympflow.commands.words import Scene, Usage
 from sympflow.studies.reports import Column, text_table
 
 out = Console(soft_wrap=True, highlight=False)
 err = Console(stderr=True, soft_wrap=True, highlight=False)
 
 
+OPTIONS = {
+    "t_span": ("t_end",),
+    "t_eval": ("n_outputs",),
+    "method": ("method_name", "method_names"),
+    "methods": ("method_names",),
+    "flow": ("flow_name",),
+    "path": ("flow_name", "method_name", "method_names"),
+    "dtype": ("dtypes",),
+}
+"""Arguments of the library that commands have by other names: the first one counts that the command has."""
+PHRASES = {
+    "train one by flow = sympflow.train(system) and pass flow=flow": "train one by `sympflow train`, and name its file",
+    "train a flow and pass flow=flow": "train one by `sympflow train`, and name its file",
+    "pass the path of a flow saved with flow.save(path)": "name a file that `sympflow train` wrote",
+    "flows from other files are read by sympflow.load": "flows from other files are named by their path",
+    "pass the states to train on, as by domain=sympflow.Box(low, high), sympflow.Ball(center, radius) or "
+    "sympflow.EnergySublevel(energy, box)": "define the system with one, under [domain] of a .toml file for instance",
+    "Pass the states themselves": "Give --batch 0",
+    "sympflow.train(system)": "`sympflow train`",
+    "flow.certificate(system)": "`sympflow certificate`",
+    "poincare_section": "`sympflow section`",
+}
+"""Remedies in Python, and what they are on the command line."""
+
+
+def in_options(message: str, context: typer.Context) -> str:
+    """A message of the library in the options of the command that runs: `t_span` is `--t-end`, backend='array' too.
+
+    Arguments that the command has no option for stay as they are.
+    """
+    parameters = context.command.params
+    named = {
+        str(p.name): max(p.opts, key=lambda word: (word.startswith("--"), -p.opts.index(word))) for p in parameters
+    }
+    options = {name: option for name, option in named.items() if option.startswith("-")}
+    for name, others in OPTIONS.items():
+        option = next((options[other] for other in others if other in options), None)
+        if option is not None:
+            options.setdefault(name, option)
+    for phrase, here in PHRASES.items():
+        message = message.replace(phrase, here)
+    message = re.sub(r"`(\w+)`", lambda m: f"`{options.get(m[1], m[1])}`", message)
+    given = re.compile(r"`?(?<![\w:.-])(?P<name>\w+)=(?P<value>'[^']*'|[\d.eE+-]*\d|(?=\W|$))`?")
+
+    def as_option(found: re.Match[str]) -> str:
+        option, value = options.get(found["name"]), found["value"].strip("'")
+        return found[0] if option is None else f"`{option} {value}`" if value else f"`{option}`"
+
+    return given.sub(as_option, message)
+
+
 @contextlib.contextmanager
-def reporting() -> Iterator[None]:
-    """Errors as one line and an exit status: 2 for arguments, 1 for what failed, 130 for Ctrl-C."""
+def reporting(context: typer.Context) -> Iterator[None]:
+    """Errors as one line and an exit status: 2 for arguments, 1 for what failed, 130 for Ctrl-C; warnings as a line."""
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *where, **more: err.print(
+                f"Warning: {in_options(str(message), context)}", style="yellow", markup=False
+            )
+            yield
     except typer.Exit:
         raise
     except (ValueError, TypeError) as error:
-        err.print(f"Error: {error}", style="red", markup=False)
+        said = str(error) if isinstance(error, Usage) else in_options(str(error), context)
+        err.print(f"Error: {said}", style="red", markup=False)
         raise typer.Exit(2) from error
     except (RuntimeError, ImportError, OSError, ArithmeticError) as error:
-        err.print(f"Failed: {error}", style="red", markup=False)
+        err.print(f"Failed: {in_options(str(error), context)}", style="red", markup=False)
+        raise typer.Exit(1) from error
+    except MemoryError as error:
+        err.print(f"Failed: the memory is full ({error}): ask for less.", style="red", markup=False)
         raise typer.Exit(1) from error
     except KeyboardInterrupt as error:
         err.print("Interrupted.", style="red")
         raise typer.Exit(130) from error
 
 
+def _set_quiet(quiet: bool) -> bool:
+    out.quiet = quiet
+    return quiet
+
+
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "--quiet", "-q", callback=_set_quiet, is_eager=True, help="Print errors and warnings alone; files as ever."
+    ),
+]
+
+
 @contextlib.contextmanager
 def progress() -> Iterator[Callable[[str], None]]:
-    """A line on the terminal on the work in progress; nothing where there is no terminal."""
-    if not err.is_terminal:
+    """A line on the terminal on the work in progress; nothing where there is no terminal, or with --quiet."""
+    if not err.is_terminal or out.quiet:
         yield lambda text: None
         return
     with err.status("Starting") as status:
         yield status.update
+
+
+def show(text: str) -> None:
+    """Print a text as it is, unless --quiet is on."""
+    if not out.quiet:
+        print(text)
 
 
 def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -70,8 +150,8 @@ def ready_folder(folder: Path) -> None:
     _ready(folder, folder, "a folder")
 
 
-def ready_file(path: Path) -> None:
-    """Make the folder of the file of `--out`, and be sure that it can be written, before anything is computed.
+def ready_file(path: Path, option: str = "--out") -> None:
+    """Make the folder of the file of an option, and be sure that it can be written, before anything is computed.
 
     Raises
     ------
@@ -79,20 +159,20 @@ def ready_file(path: Path) -> None:
         If it cannot.
     """
     if path.is_dir():
-        raise ValueError(f"`--out` {str(path)!r} is a folder: name a file in it.")
-    _ready(path.parent, path, "a file")
+        raise ValueError(f"`{option}` {str(path)!r} is a folder: name a file in it.")
+    _ready(path.parent, path, "a file", option)
     if path.exists() and not os.access(path, os.W_OK):
-        raise ValueError(f"`--out` {str(path)!r} is write-protected: name another file.")
+        raise ValueError(f"`{option}` {str(path)!r} is write-protected: name another file.")
 
 
-def _ready(folder: Path, asked: Path, what: str) -> None:
+def _ready(folder: Path, asked: Path, what: str, option: str = "--out") -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         raise ValueError(
-            f"`--out` {str(asked)!r} cannot be written ({error.strerror}): name {what} that can be."
+            f"`{option}` {str(asked)!r} cannot be written ({error.strerror}): name {what} that can be."
         ) from error
 
 

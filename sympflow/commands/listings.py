@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import textwrap
-from typing import Annotated
 
 import typer
 
-from sympflow.commands.console import print_table, reporting
-from sympflow.commands.words import SCENES, one_scene, parameters, shown
+from sympflow.commands.console import Quiet, print_table, reporting
+from sympflow.commands.words import Own, Systems, made, one_scene, parameters, scene_names, shown
 
 
-def systems() -> None:
-    """List the built-in systems, their parameters and the flows that ship for them."""
-    with reporting():
+def systems(ctx: typer.Context, quiet: Quiet = False) -> None:
+    """List the systems, those of plug-ins too, their parameters and the flows that ship for them."""
+    with reporting(ctx):
         from sympflow.flow.shipped import shipped_flows
 
         rows = []
-        for name, factory in SCENES.items():
-            system = factory()
+        for name in scene_names():
+            try:
+                system = made(name)
+            except Exception as error:  # of a plug-in, which must not take all others with it
+                rows.append((name, str(error), "", "", "", ""))
+                continue
             flows = shipped_flows(system)
             primed = sum(f.stages is not None for f in flows)
             trained = [f"{f.kind} (Δt = {f.dt:g})" for f in flows if f.stages is None]
@@ -38,23 +41,25 @@ def systems() -> None:
 
 def flows(
     ctx: typer.Context,
-    system: Annotated[str | None, typer.Argument(help="Those of one system. Default: all.")] = None,
+    system: Systems = None,
+    own: Own = None,
+    quiet: Quiet = False,
 ) -> None:
-    """List the flows that ship, the cheapest of a system first, with what each achieves.
+    """List the flows that ship, all or those of one system, the cheapest of a system first, with what each achieves.
 
     The cost is that of a unit of time in force evaluations; the energy error is relative, the largest up to T, the 95 %
     quantile over held-out states: `solve(system, tol=1e-6)` takes the cheapest that meets it.
     """
-    with reporting():
+    with reporting(ctx):
         from sympflow.flow.shipped import HEADINGS, shipped_flows
 
-        scene = None if system is None else one_scene([system, *ctx.args]).system
+        scene = one_scene(system, own).system if system or own else None
         print_table(HEADINGS, list(shipped_flows(scene).rows()))
 
 
-def methods() -> None:
+def methods(ctx: typer.Context, quiet: Quiet = False) -> None:
     """List the methods, their orders, costs and options."""
-    with reporting():
+    with reporting(ctx):
         from sympflow.integrators.registry import available, get
 
         rows = []

@@ -1,4 +1,4 @@
-"""`sympflow solve` and `sympflow train`: one system, and a file of the result."""
+"""`sympflow solve`, `sympflow train` and `sympflow certificate`: one system, and a file of the result."""
 
 from __future__ import annotations
 
@@ -8,16 +8,30 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from sympflow.commands.console import out, print_table, ready_file, reporting, write_solution
-from sympflow.commands.words import Backend, State, Step, TEnd, interval, method, one_scene, state, widths
+from sympflow.arguments import MAX_ASKED_VALUES, check_counts
+from sympflow.commands import completion
+from sympflow.commands.console import Quiet, out, print_table, ready_file, reporting, show, write_solution
+from sympflow.commands.words import (
+    Backend,
+    Method,
+    Own,
+    State,
+    Step,
+    Systems,
+    TEnd,
+    configured,
+    interval,
+    one_scene,
+    state,
+    widths,
+)
 
 
 def solve(
     ctx: typer.Context,
-    system: Annotated[str, typer.Argument(help="See `sympflow systems`; its parameters as --omega 100.")],
-    method_name: Annotated[
-        str, typer.Option("--method", help="A name, name:option=number, or a .safetensors file.")
-    ] = "sympflow",
+    system: Systems = None,
+    own: Own = None,
+    method_name: Method = "sympflow",
     t_end: TEnd = None,
     y0: State = None,
     dt: Step = None,
@@ -27,8 +41,10 @@ def solve(
     n_outputs: Annotated[
         int | None, typer.Option(help="Number of equal intervals between outputs. Default: every step.")
     ] = None,
+    save_every: Annotated[int | None, typer.Option(help="Only every so many-th step is an output.")] = None,
     backend: Backend = "auto",
     to: Annotated[Path | None, typer.Option("--out", help="File for the solution: .csv or .npz.")] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Solve one system by one method.
 
@@ -43,21 +59,25 @@ def solve(
       sympflow solve kepler --tol 1e-6
 
       sympflow solve pendulum --method rk45:rtol=1e-8 --y0 1.5,0
+
+      sympflow solve own.py:spring --stiffness 4 --method kahan_li8
+
+      sympflow solve --system quartic.toml --method gauss_legendre6 --out orbit.csv
     """
-    with reporting():
+    with reporting(ctx):
         from sympflow.metrics.energy import max_energy_error
         from sympflow.solver import solve as solve_system
 
         if to is not None and to.suffix not in (".csv", ".npz"):
             raise ValueError(f"`--out` must end in .csv or .npz; got {str(to)!r}.")
-        scene = one_scene([system, *ctx.args])
-        chosen = method(method_name)
-        chosen = chosen[1] if isinstance(chosen, tuple) else chosen
+        scene = one_scene(system, own)
+        chosen = configured(method_name)
         span = interval(scene, t_end)
-        times = None if n_outputs is None else np.linspace(*span, n_outputs + 1)
+        times = None if n_outputs is None else _instants(*span, n_outputs)
         if to is not None:
             ready_file(to)
-        options: dict[str, Any] = {name: value for name, value in (("dt", dt), ("tol", tol)) if value is not None}
+        asked = {"dt": dt, "tol": tol, "save_every": save_every}
+        options: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
         sol = solve_system(scene.system, chosen, span, state(y0), t_eval=times, backend=backend, **options)
         if to is not None:
             write_solution(sol, to)
@@ -66,20 +86,32 @@ def solve(
         out.print(f"{len(sol.t)} outputs, largest energy error {worst:.2e}")
         out.print(", ".join(f"{k} = {v:.4g}" if isinstance(v, float) else f"{k} = {v}" for k, v in sol.stats.items()))
         if len(sol.t):
-            print(f"y({sol.t[-1]:g}) = [{', '.join(f'{x:.12g}' for x in sol.y[:, -1])}]")
+            show(f"y({sol.t[-1]:g}) = [{', '.join(f'{x:.12g}' for x in sol.y[:, -1])}]")
         if to is not None:
             out.print(f"Written: {to}")
         if not sol.success:
             raise typer.Exit(1)
 
 
+def _instants(start: float, end: float, n_outputs: int) -> np.ndarray:
+    """The ends of so many equal intervals."""
+    check_counts(n_outputs=n_outputs)
+    if n_outputs >= MAX_ASKED_VALUES:
+        raise ValueError(f"`n_outputs` must be less than {MAX_ASKED_VALUES:.0e}; got {n_outputs:.3g}: choose fewer.")
+    return np.linspace(start, end, n_outputs + 1)
+
+
 def train(
     ctx: typer.Context,
-    system: Annotated[str, typer.Argument(help="See `sympflow systems`; its parameters as --omega 100.")],
+    system: Systems = None,
+    own: Own = None,
     dt: Annotated[float | None, typer.Option(help="Δt, the longest time of the map. Default: what suits it.")] = None,
     kind: Annotated[
         str | None,
-        typer.Option(help="primed (with V and T), sympflow (a network), or mlp (the baseline). Default: the best."),
+        typer.Option(
+            help="primed (with V and T), sympflow (a network), or mlp (the baseline). Default: the best.",
+            autocompletion=completion.of(("primed", "sympflow", "mlp")),
+        ),
     ] = None,
     stages: Annotated[int | None, typer.Option(help="Kicks of a primed flow.")] = None,
     processor: Annotated[int | None, typer.Option(help="Kicks of a primed flow's processor; 0 for none.")] = None,
@@ -90,7 +122,10 @@ def train(
     activation: Annotated[str | None, typer.Option(help="Activation function of a network. Default: tanh.")] = None,
     optimizer: Annotated[
         str | None,
-        typer.Option(help="gauss-newton, adam, lbfgs or bfgs. Default: gauss-newton for primed flows, else adam."),
+        typer.Option(
+            help="gauss-newton, adam, lbfgs or bfgs. Default: gauss-newton for primed flows, else adam.",
+            autocompletion=completion.of(("gauss-newton", "adam", "lbfgs", "bfgs")),
+        ),
     ] = None,
     steps: Annotated[
         int | None, typer.Option("--steps", "--epochs", help="Training steps. Default: the optimizer's.")
@@ -113,6 +148,7 @@ def train(
         Path | None, typer.Option(help="File for the state of the run, written at intervals.")
     ] = None,
     resume: Annotated[Path | None, typer.Option(help="Go on from this checkpoint, given the same options.")] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Train a flow for a system and save it.
 
@@ -128,11 +164,13 @@ def train(
       sympflow train pendulum --dt 0.5 --pairs 5 --epochs 50000 --checkpoint run.pt
 
       sympflow train harmonic-oscillator --omega 100 --dt 0.01 --kind mlp
+
+      sympflow train quartic.toml --out quartic.safetensors
     """
-    with reporting():
+    with reporting(ctx):
         from sympflow.training.trainer import train as train_flow
 
-        scene = one_scene([system, *ctx.args])
+        scene = one_scene(system, own)
         chosen = {
             "kind": kind,
             "stages": stages,
@@ -155,10 +193,71 @@ def train(
         if to.suffix != ".safetensors":
             raise ValueError(f"`--out` must end in .safetensors; got {str(to)!r}.")
         ready_file(to)
+        if checkpoint is not None:
+            ready_file(checkpoint, "--checkpoint")
         flow = train_flow(scene.system, dt, seed=seed, checkpoint=checkpoint, resume=resume, **options)
         flow.save(to)
         figures = [
             (k.replace("_", " "), f"{v:.3g}" if isinstance(v, float) else str(v)) for k, v in flow.figures.items()
         ]
         print_table(("figure", "value"), figures)
-        out.print(f"Written: {to}. Use it with: sympflow compare {system} --methods {to},verlet")
+        out.print(f"Written: {to}. Use it with: sympflow compare {(system or own or [''])[0]} --methods {to},verlet")
+
+
+def certificate(
+    ctx: typer.Context,
+    system: Systems = None,
+    own: Own = None,
+    flow_name: Annotated[
+        str | None,
+        typer.Option(
+            "--flow",
+            help="A flow that ships, or a .safetensors file. Default: the one that solve takes.",
+            autocompletion=completion.flows,
+        ),
+    ] = None,
+    t_end: Annotated[float, typer.Option(help="How far the held-out orbits are followed.")] = 1000.0,
+    states: Annotated[int, typer.Option(help="States of the domain in the sample.")] = 2000,
+    times: Annotated[int, typer.Option(help="Times of a step in the sample.")] = 33,
+    held_out: Annotated[int, typer.Option(help="Orbits that are measured.")] = 100,
+    seed: Annotated[int, typer.Option(help="Of the sample and the orbits.")] = 0,
+    to: Annotated[
+        Path | None, typer.Option("--out", help="File: .json for the figures, .safetensors for the flow with them.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Compute the certificate of a flow: what its known Hamiltonian says of its energy error.
+
+    Examples:
+
+      sympflow certificate henon-heiles
+
+      sympflow certificate pendulum --flow pendulum-sympflow --out pendulum.json
+
+      sympflow certificate quartic.toml --flow quartic.safetensors --out certified.safetensors
+    """
+    with reporting(ctx):
+        from sympflow.flow.files import load
+        from sympflow.flow.shipped import choose, named
+        from sympflow.studies.reports import write_json
+
+        if to is not None and to.suffix not in (".json", ".safetensors"):
+            raise ValueError(f"`--out` must end in .json or .safetensors; got {str(to)!r}.")
+        scene = one_scene(system, own)
+        if flow_name is None:
+            flow = choose(scene.system).load(scene.system)
+        elif flow_name.endswith(".safetensors"):
+            flow = load(flow_name, system=scene.system)
+        else:
+            flow = named(flow_name).load(scene.system)
+        if to is not None:
+            ready_file(to)
+        end = t_end if scene.t_end is None else scene.t_end
+        found = flow.certificate(scene.system, states=states, times=times, held_out=held_out, t_end=end, seed=seed)
+        show(str(found))
+        if to is not None:
+            if to.suffix == ".json":
+                write_json(found.to_dict(), to)
+            else:
+                flow.save(to)
+            out.print(f"Written: {to}")

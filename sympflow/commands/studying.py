@@ -1,47 +1,73 @@
-"""`sympflow compare`, `sympflow bench` and `sympflow stability`: several methods, and a folder of figures."""
+"""`sympflow compare`, `bench`, `stability` and `section`: methods on systems, and a folder of figures."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 
-from sympflow.commands.console import out, progress, ready_folder, reporting, write_comparisons
+from sympflow.arguments import check_counts
+from sympflow.commands import completion
+from sympflow.commands.console import Quiet, out, progress, ready_folder, reporting, show, write_comparisons
 from sympflow.commands.words import (
-    SCENES,
     Backend,
+    Method,
+    Own,
+    Scene,
     State,
     Step,
     Systems,
     TEnd,
+    configured,
     interval,
     methods,
-    parameters,
+    one_scene,
     scenes,
     state,
+    varied,
 )
+
+Methods = Annotated[
+    str,
+    typer.Option(
+        "--methods",
+        help="Separated by commas; options as rk45:rtol=1e-8; also .safetensors files.",
+        autocompletion=completion.methods,
+    ),
+]
+Folder = Annotated[Path | None, typer.Option("--out", help="Folder for the figures, CSV and JSON.")]
+DIRECTIONS = {"up": 1, "down": -1, "both": 0}
 
 
 def compare(
-    systems: Systems,
-    method_names: Annotated[
-        str,
-        typer.Option("--methods", help="Separated by commas; options as rk45:rtol=1e-8; also .safetensors files."),
-    ] = "sympflow,mlp,verlet,leapfrog,rk45",
+    ctx: typer.Context,
+    systems: Systems = None,
+    own: Own = None,
+    method_names: Methods = "sympflow,mlp,verlet,leapfrog,rk45",
     t_end: TEnd = None,
     y0: State = None,
     dt: Step = None,
     metrics: Annotated[
-        str, typer.Option(help="Any of error,energy,drift,volume,symplecticity,reversal.")
+        str,
+        typer.Option(
+            help="Any of error,energy,drift,volume,symplecticity,reversal.",
+            autocompletion=completion.several(("error", "energy", "drift", "volume", "symplecticity", "reversal")),
+        ),
     ] = "error,energy,drift,volume,symplecticity",
     n_outputs: Annotated[int, typer.Option(help="Number of instants at which every method is measured.")] = 1000,
     repeats: Annotated[int, typer.Option(help="Timed runs of each method, interleaved.")] = 5,
     match: Annotated[
-        str | None, typer.Option(help="Tune the methods to the first in: time, evaluations or energy_error.")
+        str | None,
+        typer.Option(
+            help="Tune the methods to the first in: time, evaluations or energy_error.",
+            autocompletion=completion.of(("time", "evaluations", "energy_error")),
+        ),
     ] = None,
     backend: Backend = "auto",
-    to: Annotated[Path | None, typer.Option("--out", help="Folder for the figures, CSV and JSON.")] = None,
+    to: Folder = None,
+    quiet: Quiet = False,
 ) -> None:
     """Compare methods on one or more systems: a table, figures, CSV and JSON.
 
@@ -53,11 +79,11 @@ def compare(
 
       sympflow compare pendulum --methods verlet,kahan_li8:dt=0.5,rk45:rtol=1e-8 --match evaluations
     """
-    with reporting():
+    with reporting(ctx):
         from sympflow.studies.comparison import combined_table
         from sympflow.studies.comparison import compare as compare_methods
 
-        chosen, found = methods(method_names), scenes(systems)
+        chosen, found = methods(method_names), scenes(systems, own)
         start = state(y0)
         if to is not None:
             ready_folder(to)
@@ -78,7 +104,7 @@ def compare(
                 )
                 for scene in found
             ]
-        print(combined_table(comparisons, out.width if out.is_terminal else None))
+        show(combined_table(comparisons, out.width if out.is_terminal else None))
         if to is not None:
             with progress() as say:
                 written = write_comparisons(comparisons, found, to, say)
@@ -88,18 +114,24 @@ def compare(
 
 
 def bench(
-    systems: Systems,
-    method_names: Annotated[
-        str, typer.Option("--methods", help="As for compare; a bare name is swept over steps or tolerances.")
-    ] = "verlet,leapfrog,blanes_moan4,srkn11b,kahan_li8,rk45,dop853,sympflow,mlp",
+    ctx: typer.Context,
+    systems: Systems = None,
+    own: Own = None,
+    method_names: Methods = "verlet,leapfrog,blanes_moan4,srkn11b,kahan_li8,rk45,dop853,sympflow,mlp",
     t_end: TEnd = None,
     y0: State = None,
-    batch: Annotated[int, typer.Option(help="Also a batch of this many states of the domain; 0 for none.")] = 1000,
+    batch: Annotated[
+        int | None,
+        typer.Option(
+            help="Also a batch of this many states of the domain; 0 for none. Default: 1000 if there is a domain."
+        ),
+    ] = None,
     n_outputs: Annotated[int, typer.Option(help="Number of instants at which errors are measured.")] = 100,
     repeats: Annotated[int, typer.Option(help="Timed runs of each point, interleaved.")] = 5,
     budget: Annotated[float, typer.Option(help="Seconds that the repeats of one point may take.")] = 20.0,
     backend: Backend = "auto",
-    to: Annotated[Path | None, typer.Option("--out", help="Folder for the figures, CSV and JSON.")] = None,
+    to: Folder = None,
+    quiet: Quiet = False,
 ) -> None:
     """Work and precision: error against run time and evaluations, over a sweep of steps and tolerances.
 
@@ -109,11 +141,11 @@ def bench(
 
       sympflow bench pendulum --methods verlet,kahan_li8,dop853 --batch 0 --t-end 50
     """
-    with reporting():
+    with reporting(ctx):
         from sympflow.studies.figure_style import save
         from sympflow.studies.precision import work_precision
 
-        chosen, found, start = methods(method_names), scenes(systems), state(y0)
+        chosen, found, start = methods(method_names), scenes(systems, own), state(y0)
         if to is not None:
             ready_folder(to)
         for scene in found:
@@ -123,14 +155,14 @@ def bench(
                     chosen,
                     t_span=interval(scene, t_end),
                     y0=start,
-                    batch=batch or None,
+                    batch=(1000 if batch is None and scene.system.domain is not None else batch) or None,
                     n_outputs=n_outputs,
                     repeats=repeats,
                     budget=budget,
                     backend=backend,
                     progress=say,
                 )
-            print(report.table())
+            show(report.table())
             if to is not None:
                 name = f"{scene.key}-work-precision"
                 written = [report.to_csv(to / f"{name}.csv"), report.to_json(to / f"{name}.json")]
@@ -140,10 +172,10 @@ def bench(
 
 
 def stability(
-    systems: Systems,
-    method_names: Annotated[
-        str, typer.Option("--methods", help="As for compare.")
-    ] = "sympflow,verlet,leapfrog,kahan_li8,implicit_midpoint,rk4,rk45",
+    ctx: typer.Context,
+    systems: Systems = None,
+    own: Own = None,
+    method_names: Methods = "sympflow,verlet,leapfrog,kahan_li8,implicit_midpoint,rk4,rk45",
     vary: Annotated[
         str | None, typer.Option(help="A parameter and its values, for a stability map: omega=1,10,100.")
     ] = None,
@@ -154,11 +186,16 @@ def stability(
     y0: State = None,
     dtypes: Annotated[str, typer.Option(help="float64, float32 or both, separated by a comma.")] = "float64",
     metrics: Annotated[
-        str, typer.Option(help="Any of energy,drift,volume,symplecticity,domain.")
+        str,
+        typer.Option(
+            help="Any of energy,drift,volume,symplecticity,domain.",
+            autocompletion=completion.several(("energy", "drift", "volume", "symplecticity", "domain")),
+        ),
     ] = "energy,drift,volume,symplecticity,domain",
     bound: Annotated[float, typer.Option(help="Relative energy error above which a run counts as unstable.")] = 1e3,
     limits: Annotated[bool, typer.Option(help="Find the longest stable step by bisection.")] = True,
-    to: Annotated[Path | None, typer.Option("--out", help="Folder for the figures and CSV.")] = None,
+    to: Folder = None,
+    quiet: Quiet = False,
 ) -> None:
     """The longest stable step of each method, its errors at a range of steps, and how it fails beyond.
 
@@ -168,18 +205,18 @@ def stability(
 
       sympflow stability henon-heiles-escape --out out/
     """
-    with reporting():
+    with reporting(ctx):
         from sympflow.studies.step_stability import stability as find_stability
 
-        chosen, found = methods(method_names), scenes(systems)
+        chosen, found = methods(method_names), scenes(systems, own)
         lengths = None if steps is None else [_number("--steps", word) for word in steps.split(",")]
         if to is not None:
             ready_folder(to)
         for scene in found:
             family = [scene.system]
             if vary is not None:
-                name, values = _varied(scene.key, vary)
-                family = [SCENES[scene.key](**{name: value}) for value in values]
+                name, values = varied(scene, vary)
+                family = [scene.factory(**(scene.params | {name: value})) for value in values]
             span = None if scene.t_end is None and t_end is None else interval(scene, t_end)
             with progress() as say:
                 report = find_stability(
@@ -194,24 +231,103 @@ def stability(
                     limits=limits,
                     progress=say,
                 )
-            print(report.table())
+            show(report.table())
             if to is not None:
                 written = [report.to_csv(to / f"{scene.key}-stability.csv")]
                 report.plot(to / f"{scene.key}-stability.png")
                 out.print(f"\nWritten to {to}: {written[0].name}, {scene.key}-stability.png")
 
 
-def _varied(key: str, words: str) -> tuple[str, list[float]]:
-    """The parameter and its values in ``omega=1,10,100``."""
-    name, equals, values = words.partition("=")
-    if not (equals and values):
-        raise ValueError(f"`--vary` must be a parameter and its values, such as omega=1,10,100; got {words!r}.")
-    if key not in SCENES:
-        raise ValueError(f"`--vary` goes with a scene without parameters of its own; got {key}: leave those out.")
-    if name not in parameters(key):
-        takes = ", ".join(parameters(key)) or "none"
-        raise ValueError(f"`--vary` names {name!r}, which is not a parameter of {key}; it has {takes}.")
-    return name, [_number("--vary", word) for word in values.split(",")]
+def section(
+    ctx: typer.Context,
+    system: Systems = None,
+    own: Own = None,
+    method_name: Method = "sympflow",
+    t_end: TEnd = None,
+    y0: Annotated[
+        list[str] | None,
+        typer.Option("--y0", help="Initial state q,p; several times for several orbits. Default: the system's."),
+    ] = None,
+    orbits: Annotated[int | None, typer.Option(help="Instead: so many initial states drawn from the domain.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the states that are drawn.")] = 0,
+    dt: Step = None,
+    tol: Annotated[
+        float | None, typer.Option(help="Take the cheapest shipped flow with so small a relative energy error.")
+    ] = None,
+    coordinate: Annotated[
+        str | None, typer.Option(help="The coordinate that is constant on the plane: q1, p2. Default: the first.")
+    ] = None,
+    level: Annotated[float, typer.Option(help="Its value there.")] = 0.0,
+    direction: Annotated[
+        str, typer.Option(help="Crossings up, down or both.", autocompletion=completion.of(tuple(DIRECTIONS)))
+    ] = "up",
+    sample: Annotated[
+        float | None, typer.Option(help="Longest time between two looks at the plane. Default: the system's step.")
+    ] = None,
+    axes: Annotated[
+        str | None, typer.Option(help="Coordinates of the figure, as q2,p2. Default: the first other pair.")
+    ] = None,
+    limit: Annotated[int, typer.Option(help="Crossings in the table; the files have all.")] = 20,
+    to: Folder = None,
+    quiet: Quiet = False,
+) -> None:
+    """A Poincaré section: the states in which orbits cross a plane of phase space.
+
+    Examples:
+
+      sympflow section henon-heiles --method kahan_li8 --t-end 1000 --out out/
+
+      sympflow section henon-heiles --orbits 20 --coordinate q1 --direction up --t-end 2000 --out out/
+
+      sympflow section own.py:spring --y0 0.1,0,0,0.4 --y0 0.2,0,0,0.3 --axes q2,p2 --out out/
+    """
+    with reporting(ctx):
+        from sympflow.studies.figure_style import save
+        from sympflow.studies.poincare import names, poincare_section
+
+        scene, chosen = one_scene(system, own), configured(method_name)
+        span, start = interval(scene, t_end), _starts(scene, y0, orbits, seed)
+        if direction not in DIRECTIONS:
+            raise ValueError(f"`--direction` must be one of {', '.join(DIRECTIONS)}; got {direction!r}.")
+        pair = [word.strip() for word in axes.split(",")] if axes is not None else [None, None]
+        if len(pair) != 2 or not {*pair} <= {None, *names(scene.system.ndof)}:
+            known = ", ".join(names(scene.system.ndof))
+            raise ValueError(f"`--axes` must be two of {known}, separated by a comma; got {axes!r}.")
+        check_counts(limit=limit)
+        if to is not None:
+            ready_folder(to)
+        asked = {"dt": dt, "tol": tol, "coordinate": coordinate, "sample": sample}
+        options: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
+        with progress() as say:
+            say(f"{scene.key}: {method_name}")
+            found = poincare_section(
+                scene.system, chosen, span, start, level=level, direction=DIRECTIONS[direction], **options
+            )
+        show(found.table(limit))
+        if to is not None:
+            name = to / f"{scene.key}-section"
+            figure = found.figure(*pair)
+            written = [found.to_csv(f"{name}.csv"), found.to_json(f"{name}.json"), save(figure, Path(f"{name}.png"))]
+            out.print(f"\nWritten to {to}: {', '.join(p.name for p in written)}")
+        if not found.success:
+            raise typer.Exit(1)
+
+
+def _starts(scene: Scene, y0: list[str] | None, orbits: int | None, seed: int) -> np.ndarray | None:
+    """The initial states of several orbits: those given, or so many of the domain."""
+    if orbits is None:
+        states = [state(words) for words in y0 or ()]
+        if len({row.size for row in states}) > 1:
+            raise ValueError("`--y0` must have the same number of components each time it is given.")
+        return None if not states else states[0] if len(states) == 1 else np.array(states)
+    if y0:
+        raise ValueError("`--orbits` and `--y0` both choose the initial states: give one of them.")
+    check_counts(orbits=orbits)
+    if scene.system.domain is None:
+        raise ValueError(f"`--orbits` draws from the domain, which {scene.key} has not: give `--y0`, or a domain.")
+    if seed < 0:
+        raise ValueError(f"`--seed` must be a whole number from 0 on; got {seed}.")
+    return scene.system.domain.sample(orbits, seed=seed)
 
 
 def _number(option: str, word: str) -> float:

@@ -4,26 +4,74 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, overload
 
 import numpy as np
 import typer
 
+from sympflow.arguments import check_t_span
+from sympflow.commands import completion
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.systems import SYSTEMS, harmonic_oscillator
+from sympflow.systems import available as available_systems
+from sympflow.systems import get as system_named
+from sympflow.systems.user_files import factory as file_factory
+
+FILE = re.compile(r"(?P<path>.+?\.(?:py|toml))(?::(?P<rest>.*))?", re.DOTALL)
+"""A system in a file: file.toml, file.py:name, and parameters behind them."""
+
+
+class Usage(ValueError):
+    """An error in a word of the command line, whose message names what was written."""
+
+
+def _systems(incomplete: str) -> list[str]:
+    """Names of systems, and files that may hold one, for completion in the shell."""
+    return [*completion.of(scene_names())(incomplete), *completion.files(incomplete, (".toml", ".py"))]
+
 
 Systems = Annotated[
-    list[str],
-    typer.Argument(metavar="SYSTEM...", help="See `sympflow systems`; parameters as --omega 100 or name:omega=100."),
+    list[str] | None,
+    typer.Argument(
+        metavar="SYSTEM",
+        help="See `sympflow systems`; an own one: file.py:name, file.toml; parameters as --omega 100.",
+        show_default=False,
+        autocompletion=_systems,
+    ),
 ]
-TEnd = Annotated[float | None, typer.Option(help="End of the interval, which starts at 0. Default: the system's.")]
+Own = Annotated[
+    list[str] | None,
+    typer.Option("--system", metavar="SYSTEM", help="The same as an option.", autocompletion=_systems),
+]
+Method = Annotated[
+    str,
+    typer.Option(
+        "--method",
+        help="A name, name:option=value, or a .safetensors file.",
+        autocompletion=completion.one_method,
+    ),
+]
+TEnd = Annotated[float | None, typer.Option(help="End of the interval. Default: the system's.")]
 State = Annotated[str | None, typer.Option("--y0", help="Initial state q,p: 0.3,-0.3,0.3,0.15. Default: the system's.")]
 Step = Annotated[float | None, typer.Option(help="Step of fixed-step methods. Default: the system's, the flow's Δt.")]
-Backend = Annotated[str, typer.Option(help="auto, compiled or array.")]
+BACKENDS = ("auto", "compiled", "array")
+
+
+def _backend(word: str) -> str:
+    if word not in BACKENDS:
+        raise typer.BadParameter(f"{word!r} is none of {', '.join(BACKENDS)}.")
+    return word
+
+
+Backend = Annotated[
+    str, typer.Option(help="auto, compiled or array.", callback=_backend, autocompletion=completion.of(BACKENDS))
+]
 
 
 def _stiff_oscillator(omega: float = 100.0) -> HamiltonianSystem:
@@ -31,54 +79,116 @@ def _stiff_oscillator(omega: float = 100.0) -> HamiltonianSystem:
     return harmonic_oscillator(omega)
 
 
-SCENES: dict[str, Callable[..., HamiltonianSystem]] = {**SYSTEMS, "stiff-oscillator": _stiff_oscillator}
-"""The systems by the names of the command line."""
+_ALIASES: dict[str, Callable[..., HamiltonianSystem]] = {"stiff-oscillator": _stiff_oscillator}
+"""The scenes that only the command line has."""
+
+
+def scene_names() -> list[str]:
+    """The names of all scenes, those of installed plug-ins among them; none is imported."""
+    return list(dict.fromkeys([*SYSTEMS, *_ALIASES, *available_systems()]))
+
+
+def factory_of(scene: str) -> Callable[..., HamiltonianSystem]:
+    """The function that makes a scene."""
+    return _ALIASES[scene] if scene in _ALIASES else system_named(scene)
+
+
+def made(scene: str, **params: Any) -> HamiltonianSystem:
+    """The system of a scene; one of a plug-in may fail.
+
+    Raises
+    ------
+    ImportError
+        If a plug-in's cannot be loaded or makes something else.
+    """
+    system = factory_of(scene)(**params)
+    if not isinstance(system, HamiltonianSystem):
+        what = type(system).__name__
+        raise ImportError(f"`system` {scene!r} makes no HamiltonianSystem but a {what}: report it where it is from.")
+    return system
+
+
+def _making(scene: str) -> Callable[..., HamiltonianSystem]:
+    """`made` of one scene, with the parameters that it has."""
+
+    @wraps(factory_of(scene))
+    def make(**params: Any) -> HamiltonianSystem:
+        return made(scene, **params)
+
+    return make
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A system as asked for: its key (which names its files), and where it should end, if that was said."""
+    """A system as asked for.
+
+    Attributes
+    ----------
+    key : str
+        Names its files.
+    system : HamiltonianSystem
+    t_end : float or None
+        Where it should end, if that was said.
+    factory : callable
+        Makes the system of other parameters.
+    params : dict
+        The parameters that were said.
+    """
 
     key: str
     system: HamiltonianSystem
-    t_end: float | None = None
+    t_end: float | None
+    factory: Callable[..., HamiltonianSystem]
+    params: dict[str, Any]
 
 
 def parameters(scene: str) -> dict[str, Any]:
     """Parameters of a scene with their default values."""
-    return {name: p.default for name, p in inspect.signature(SCENES[scene]).parameters.items()}
+    return _defaults(factory_of(scene))
 
 
-def scenes(words: Sequence[str]) -> list[Scene]:
+def _defaults(factory: Callable[..., HamiltonianSystem]) -> dict[str, Any]:
+    return {name: p.default for name, p in inspect.signature(factory).parameters.items()}
+
+
+def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> list[Scene]:
     """Scenes from words such as ``henon-heiles``, ``harmonic-oscillator:omega=10:t_end=5`` and ``--omega 100``.
 
-    A parameter behind two dashes holds for every scene that has it.
+    A parameter behind two dashes holds for every scene that has it. A scene may be one of a file: ``file.toml``,
+    ``file.py:name``. `own` are more of them.
 
     Raises
     ------
     ValueError
         For a scene or a parameter that does not exist.
     """
-    names, shared = _split(words)
+    names, shared = _split(words or ())
+    names += own or ()
     if not names:
-        raise ValueError(f"`system` is missing: name one or more of {', '.join(SCENES)}.")
-    found = [_scene(name, shared) for name in names]
-    known = {p for name in names for p in parameters(_key(name))}
-    for name in shared:
-        if name not in known:
-            takes = f"its parameters are {', '.join(sorted(known))}" if known else "it has no parameters"
-            raise ValueError(f"`--{name}` is no option, nor a parameter of {', '.join(names)} ({takes}): see --help.")
-    return found
+        raise Usage(
+            f"`system` is missing: name one of {', '.join(scene_names())}, or an own one, file.py:name or file.toml."
+        )
+    try:
+        parted = [_parted(name) for name in names]
+        known = {p for _, factory, _ in parted for p in _defaults(factory)}
+        for name in shared:
+            if name not in known:
+                takes = f"its parameters are {', '.join(sorted(known))}" if known else "it has no parameters"
+                option = name.replace("_", "-")
+                raise Usage(f"`--{option}` is no option, nor a parameter of {', '.join(names)} ({takes}): see --help.")
+        return [_scene(name, factory, pairs, shared) for name, factory, pairs in parted]
+    except (ValueError, TypeError) as error:  # of what the system is made of, which is no option of the command
+        raise Usage(str(error)) from error
 
 
 def shown(value: Any) -> str:
     """A parameter's value as it is written on a command line."""
-    return value if isinstance(value, str) else f"{value:g}"
+    return f"{value:g}" if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
 
 
-def one_scene(words: Sequence[str]) -> Scene:
+def one_scene(words: Sequence[str] | None, own: Sequence[str] | None = None) -> Scene:
     """The scene of a command that takes one system."""
-    found = scenes(words)
+    found = scenes(words, own)
     if len(found) != 1:
         raise ValueError(f"`system` must be one; got {', '.join(s.key for s in found)}.")
     return found[0]
@@ -87,7 +197,7 @@ def one_scene(words: Sequence[str]) -> Scene:
 def interval(scene: Scene, t_end: float | None) -> tuple[float, float]:
     """From the scene's start to the end asked for: with the scene, by --t-end, or its own."""
     start, end = scene.system.t_span
-    return start, scene.t_end if scene.t_end is not None else t_end if t_end is not None else end
+    return check_t_span((start, scene.t_end if scene.t_end is not None else t_end if t_end is not None else end))
 
 
 def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
@@ -97,43 +207,78 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
     rest = list(words)
     while rest:
         word = rest.pop(0)
-        if not word.startswith("--"):
+        if not word.startswith("-") or _is_number(word):
             names.append(word)
             continue
-        name, equals, value = word[2:].partition("=")
+        name, equals, value = word.partition("=")
+        if not name.startswith("--"):
+            raise ValueError(f"`{name}` is no option: see --help.")
         if not equals:
             if not rest:
-                raise ValueError(f"`--{name}` is no option, or lacks its value: see --help.")
+                raise ValueError(f"`{name}` is no option, or lacks its value: see --help.")
             value = rest.pop(0)
-        shared[name] = value
+        shared[name[2:].replace("-", "_")] = value
     return names, shared
 
 
-def _key(word: str) -> str:
-    """The scene's name in a word such as ``henon-heiles:t_end=5``; `henon_heiles` is the same, as in Python."""
-    return word.partition(":")[0].replace("_", "-")
-
-
-def _scene(word: str, shared: dict[str, str]) -> Scene:
-    _, *pairs = word.split(":")
-    name = _key(word)
-    if name not in SCENES:
-        close = difflib.get_close_matches(name, SCENES, n=1)
+def _parted(word: str) -> tuple[str, Callable[..., HamiltonianSystem], list[str]]:
+    """The name of a scene, the function that makes it, and its parameters, of a word such as ``pendulum:t_end=5``."""
+    if match := FILE.fullmatch(word):
+        path, rest = Path(match["path"]), (match["rest"] or "").split(":")
+        name = rest.pop(0) if rest[0] and "=" not in rest[0] else None
+        return "-".join(filter(None, (path.stem, name))), file_factory(path, name), [pair for pair in rest if pair]
+    name, *pairs = word.split(":")
+    name = name.replace("_", "-")
+    if name not in scene_names():
+        close = difflib.get_close_matches(name, scene_names(), n=1)
         hint = f"Did you mean {close[0]!r}? " if close else ""
-        raise ValueError(f"`system` {name!r} is unknown. {hint}Choose from {', '.join(SCENES)}.")
+        raise ValueError(
+            f"`system` {name!r} is unknown. {hint}Choose from {', '.join(scene_names())}, or name an own one, "
+            "file.py:name or file.toml."
+        )
+    return name, _making(name), pairs
+
+
+def _scene(name: str, factory: Callable[..., HamiltonianSystem], pairs: list[str], shared: dict[str, str]) -> Scene:
     own = dict(_pairs(pairs))
     t_end = _float("t_end", own.pop("t_end")) if "t_end" in own else None
-    known = parameters(name)
+    known = inspect.signature(factory).parameters
     unknown = [key for key in own if key not in known]
     if unknown:
         raise ValueError(f"`{unknown[0]}` is not a parameter of {name}, which takes {', '.join((*known, 't_end'))}.")
     asked = {f"--{key}": value for key, value in shared.items() if key in known and key not in own} | own
-    params = {
-        key.lstrip("-"): value if isinstance(known[key.lstrip("-")], str) else _float(key, value)
-        for key, value in asked.items()
-    }
+    params = {key.lstrip("-"): _value(key, word, known[key.lstrip("-")]) for key, word in asked.items()}
     key = "-".join([name, *(f"{k}={shown(v)}" for k, v in params.items())])
-    return Scene(key, SCENES[name](**params), t_end)
+    return Scene(key, factory(**params), t_end, factory, params)
+
+
+def _value(name: str, word: str, parameter: inspect.Parameter) -> Any:
+    """A parameter's value: of the type that it is annotated with, or that its default has; a number else."""
+    kind = parameter.annotation
+    if kind in (str, "str") or isinstance(parameter.default, str):
+        return word
+    if kind in (bool, "bool") or isinstance(parameter.default, bool):
+        if word.lower() not in ("true", "false"):
+            raise ValueError(f"`{name}` must be true or false; got {word!r}.")
+        return word.lower() == "true"
+    number = _float(name, word)
+    if kind in (int, "int") or (kind is parameter.empty and isinstance(parameter.default, int)):
+        if number != int(number):
+            raise ValueError(f"`{name}` must be a whole number; got {word!r}.")
+        return int(number)
+    return number
+
+
+def varied(scene: Scene, words: str) -> tuple[str, list[Any]]:
+    """A parameter of a scene and its values, from ``omega=1,10,100``."""
+    name, equals, values = words.partition("=")
+    if not (equals and values):
+        raise ValueError(f"`--vary` must be a parameter and its values, such as omega=1,10,100; got {words!r}.")
+    known = inspect.signature(scene.factory).parameters
+    if name not in known:
+        takes = ", ".join(known) or "none"
+        raise ValueError(f"`--vary` names {name!r}, which is not a parameter of {scene.key}; it has {takes}.")
+    return name, [_value("--vary", word, known[name]) for word in values.split(",")]
 
 
 def methods(words: str) -> list[Any]:
@@ -157,8 +302,29 @@ def method(word: str) -> Any:
 
         return Path(word).stem, load(word)
     name, *pairs = word.split(":")
-    options = {key: value if key == "flow" else _float(key, value) for key, value in _pairs(pairs)}
-    return (word, build(name, options)) if options else name
+    options = {key: _option(value) for key, value in _pairs(pairs)}
+    if not options:
+        return name
+    try:
+        return word, build(name, options)
+    except (TypeError, ValueError) as error:
+        raise Usage(str(error)) from error
+
+
+def configured(word: str) -> Any:
+    """One method as `solve` takes it: without the label that `compare` shows."""
+    chosen = method(word)
+    return chosen[1] if isinstance(chosen, tuple) else chosen
+
+
+def _option(word: str) -> Any:
+    """A number, true or false, or a text: what the method takes, it says."""
+    if word.lower() in ("true", "false"):
+        return word.lower() == "true"
+    try:
+        return int(word)
+    except ValueError:
+        return float(word) if _is_number(word) else word
 
 
 def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
@@ -167,6 +333,14 @@ def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
         if not (key and equals and value):
             raise ValueError(f"`{key}` needs a value: write name:{key or 'option'}=number.")
     return [(key, value) for key, _, value in pairs]
+
+
+@overload
+def state(words: str) -> np.ndarray: ...
+
+
+@overload
+def state(words: None) -> None: ...
 
 
 def state(words: str | None) -> np.ndarray | None:
@@ -182,6 +356,14 @@ def widths(words: str) -> tuple[int, ...]:
         return tuple(int(word) for word in words.split(","))
     except ValueError as error:
         raise ValueError(f"`--hidden` must be whole numbers separated by commas; got {words!r}.") from error
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _float(name: str, word: str) -> float:

@@ -38,12 +38,13 @@ class Origin:
 
 
 def check_system(system: Any) -> None:
-    """Raise TypeError unless `system` is a HamiltonianSystem."""
+    """Raise TypeError unless `system` is a HamiltonianSystem; ValueError where functions of its user are wrong."""
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(
             f"`system` must be a HamiltonianSystem; got {type(system).__name__}: take a scene of sympflow.systems, or "
             "define one with HamiltonianSystem.from_sympy."
         )
+    system.check_functions(torch.empty(0, dtype=torch.float64))
 
 
 class FlowMap(nn.Module):
@@ -329,6 +330,11 @@ class FlowMap(nn.Module):
         self.recipe, self.figures, self.certified = description.recipe, description.figures, description.certificate
 
     # its system ---------------------------------------------------------------------------------------------
+
+    @property
+    def system(self) -> HamiltonianSystem | None:
+        """The system whose functions the flow evaluates; None for networks, and for a flow loaded without it."""
+        return None
 
     @property
     def origin(self) -> Origin | None:

@@ -45,7 +45,7 @@ from sympflow.hamiltonian.monomials import MOST_MONOMIALS, Monomials, monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE as CURVATURE_LEVEL
 from sympflow.schemes import POLYNOMIAL as POLYNOMIAL_LEVEL
-from sympflow.schemes import SCHEMES, Scheme, compose, scheme_evaluations
+from sympflow.schemes import SCHEMES, Scheme, compose, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
     from sympflow.kernels.flow_loops import PrimedFlowKernel
@@ -657,9 +657,7 @@ def _starting_scheme(system: HamiltonianSystem, scheme: Any, stages: Any, first:
         given = "stages" if stages is not None else "first"
         raise ValueError(f"`{given}` and `scheme` were both given: leave out `{given}`, the scheme has its own.")
     if isinstance(scheme, str):
-        if scheme not in SCHEMES:
-            raise ValueError(f"`scheme` {scheme!r} is unknown: choose one of {', '.join(SCHEMES)}.")
-        scheme = SCHEMES[scheme]
+        scheme = scheme_named(scheme)
     if not isinstance(scheme, Scheme):
         raise TypeError(
             f"`scheme` must be a Scheme or the name of one; got {scheme!r}: choose one of {', '.join(SCHEMES)}."

@@ -214,9 +214,9 @@ def choose(
         )
     own = ShippedFlows([f for f in shipped_flows(system, kind) if transformed or f.shift is None])
     if not own:
-        there = ", ".join(f.name for f in shipped_flows(kind=kind))
+        there = ", ".join(dict.fromkeys(f.system for f in shipped_flows(kind=kind)))
         raise ValueError(
-            f"`system` {system.name!r} has no shipped {kind} flow (there are: {there or 'none'}): train one by "
+            f"`system` {system.name!r} has no shipped {kind} flow (there are some of: {there or 'none'}): train one by "
             f"flow = sympflow.train(system{', kind=' + repr(kind) if kind != 'sympflow' else ''}) and pass flow=flow."
         )
     if tol is None:

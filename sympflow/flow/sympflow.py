@@ -166,7 +166,7 @@ class SympFlow(FlowMap):
         palindromic : bool
             True for a time-reversible flow, with half the parameters.
         scheme : Scheme or str, optional
-            A table, or its name in `sympflow.schemes.SCHEMES`, to start from in place of leapfrog.
+            A table, or its name as `sympflow.schemes.scheme_named` knows it, to start from in place of leapfrog.
         degree : int, optional
             Of the polynomials that multiply V and T; 7 by default, 5 with a processor, which has more of them.
         force_gradient : bool, optional

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.arguments import check_flag
 from sympflow.arrays import Array, is_tensor, stack, to_numpy
 from sympflow.hamiltonian.definition import Definition
+from sympflow.hamiltonian.function_checks import Tested, check_writes, test
 
 
 class CallableHamiltonian(Definition):
@@ -23,7 +25,9 @@ class CallableHamiltonian(Definition):
         hamiltonian: Callable[..., Array] | None,
         gradient: Callable[..., Any] | None,
         hessian_vector: Callable[..., Any] | None,
+        check: bool = True,
     ) -> None:
+        check_flag("check", check)
         if (potential is None) == (hamiltonian is None):
             raise TypeError("`potential` or `hamiltonian` must be given, and not both.")
         for name, function in (
@@ -35,7 +39,7 @@ class CallableHamiltonian(Definition):
                 raise TypeError(f"`{name}` must be callable; got {type(function).__name__}.")
         if potential is None and (gradient is not None or hessian_vector is not None):
             raise TypeError("`gradient` and `hessian_vector` only go with `potential`: leave them out.")
-        self.ndof = ndof
+        self.ndof, self.given = ndof, bool(check)
         self.separable = potential is not None
         if gradient is not None and hasattr(gradient, "py_func"):
             _check_numba(potential, gradient, hessian_vector)
@@ -46,6 +50,38 @@ class CallableHamiltonian(Definition):
         self._potential, self._hamiltonian = potential, hamiltonian
         self._gradient, self._hessian_vector = gradient, hessian_vector
         self.differentiates_itself = gradient is None and hessian_vector is None
+
+    def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
+        """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
+        if self.differentiates_itself and not is_tensor(like):
+            import torch
+
+            like = torch.from_numpy(np.empty(0, like.dtype))
+        if not self.separable:
+            names = "hamiltonian", "gradient", "[q, p]"
+            test(Tested(names, self.hamiltonian, self.gradient, None, True, self._result_types), states, like, n_given)
+            return
+        if self.numba_functions is not None:
+            _, gradient, hessian_vector = self.numba_functions
+            q = np.ascontiguousarray(states[0, : self.ndof])
+            check_writes("gradient", gradient, q)
+            if hessian_vector is not None:
+                check_writes("hessian_vector", hessian_vector, q, q[::-1].copy())
+            like = np.empty(0)
+        names = "potential", "gradient", "q"
+        product = None if self._hessian_vector is None else self.hessian_vector
+        automatic = self._gradient is None
+        functions = Tested(names, self.potential, self.potential_gradient, product, automatic, self._result_types)
+        test(functions, states[:, : self.ndof], like, n_given)
+
+    def _result_types(self, x: Array) -> list[tuple[str, Any]]:
+        """The types in which the functions themselves answer for a state x."""
+        if self.numba_functions is not None:
+            return []
+        if not self.separable:
+            return [("hamiltonian", self._H(x).dtype)]
+        functions = ("potential", self._potential), ("gradient", self._gradient)
+        return [(name, getattr(f(x), "dtype", None)) for name, f in functions if f is not None]
 
     def hamiltonian(self, y: Array) -> Array:
         return _with_torch(self._H, y, "hamiltonian", ())
@@ -269,7 +305,7 @@ def _each_row(f: Any, *arguments: np.ndarray) -> np.ndarray:
     """f(row, …, out) for every state."""
     shape = np.broadcast_shapes(*(a.shape for a in arguments))
     rows = [_rows(a, shape) for a in arguments]
-    out = np.empty_like(rows[0])
+    out = np.full_like(rows[0], np.nan)  # what a function does not write is not finite, and ends the run
     for each in zip(*rows, out, strict=True):
         f(*each)
     return out.reshape(shape).astype(arguments[0].dtype, copy=False)

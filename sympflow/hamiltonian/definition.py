@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from sympflow.arrays import Array
 
 
@@ -21,12 +23,18 @@ class Definition:
         (potential, gradient, hessian_vector), if they are Numba's.
     differentiates_itself : bool
         True if all derivatives are automatic ones of a function that is written with torch.
+    given : bool
+        True if the functions are a user's own, whose derivatives may be wrong: `check` tests them.
     """
 
     ndof: int
     separable: bool
     numba_functions: tuple[Any, Any, Any] | None = None
     differentiates_itself: bool = False
+    given: bool = False
+
+    def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
+        """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""
 
     def potential_hessian(self, q: Array) -> Array:
         """∇²V(q): (..., d) to (..., d, d)."""

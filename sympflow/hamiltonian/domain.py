@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -44,7 +45,7 @@ class Ball:
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", vector("center", self.center))
         check_number("radius", self.radius)
-        if not 0 < self.radius < np.inf:
+        if not 0 < self.radius <= sys.float_info.max:
             raise ValueError(f"`radius` must be positive and finite; got {self.radius!r}.")
 
     @property
@@ -97,8 +98,11 @@ class Box:
 
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """`low` and `high` as arrays."""
-        return np.asarray(self.low), np.asarray(self.high)
+        """`low` and `high` as arrays, to be read only."""
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        low.setflags(write=False)
+        high.setflags(write=False)
+        return low, high
 
     def contains(self, x: Array, slack: float = 0.0) -> np.ndarray:
         low, high = self.bounds
@@ -139,7 +143,7 @@ class EnergySublevel:
 
     def __post_init__(self) -> None:
         check_number("energy", self.energy)
-        if not np.isfinite(float(self.energy)):
+        if not abs(self.energy) <= sys.float_info.max:
             raise ValueError(f"`energy` must be finite; got {self.energy!r}.")
         if not isinstance(self.box, Box):
             raise TypeError(f"`box` must be a Box; got {type(self.box).__name__}.")

@@ -35,6 +35,8 @@ class Hamiltonian:
         The symbolic definition, if there is one.
     stiffness_matrix : ndarray of shape (d, d) or None
         A quadratic part ½ qᵀKq of V that was named, of a definition without symbols.
+    functions_given : bool
+        True if H is given by functions of a user, which are to be checked.
     """
 
     def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
@@ -44,8 +46,12 @@ class Hamiltonian:
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
         self.inverse_mass = inverse_mass
+        if inverse_mass is not None:
+            inverse_mass.setflags(write=False)  # a part of H, of which code is generated
         self.quadratic_kinetic = quadratic_kinetic
         self.stiffness_matrix: np.ndarray | None = None
+        self.functions_given: bool = definition.given
+        self._checked: frozenset[tuple[type, Any]] = frozenset()
 
     def hamiltonian(self, y: Array) -> Array:
         """H(y): (..., 2d) to (...)."""
@@ -191,7 +197,7 @@ class Hamiltonian:
         if not self.separable:
             raise ValueError(
                 f"`system` {self.name!r} is not separable: H does not split into T(p) + V(q), so splitting methods do "
-                "not apply. Use a Runge–Kutta method or train a SympFlow."
+                "not apply. Use an implicit method such as 'gauss_legendre6', or a Runge–Kutta method."
             )
         return self
 
@@ -210,7 +216,7 @@ def _like(constant: np.ndarray, x: Array) -> Array:
     if is_tensor(x):
         import torch
 
-        return torch.as_tensor(constant, dtype=x.dtype, device=x.device)
+        return torch.tensor(constant, dtype=x.dtype, device=x.device)
     return constant.astype(x.dtype, copy=False)
 
 

@@ -43,7 +43,7 @@ def _real(name: str, values: ArrayLike) -> np.ndarray:
         if array.dtype.kind not in "biufO":
             raise TypeError(f"of {array.dtype}")
         return array.astype(float)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise TypeError(f"`{name}` must be real numbers; got {values!r}: pass a number or an array of them.") from error
 
 

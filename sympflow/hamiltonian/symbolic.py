@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import numbers
 import re
+import reprlib
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, reduce
 from typing import Any
@@ -11,9 +14,12 @@ import numpy as np
 import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
+from sympflow.arguments import plain
 from sympflow.arrays import Array, assemble, concatenate, is_tensor
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.expression import Unreadable, read
+
+LARGEST = sys.float_info.max
 
 
 class SymbolicHamiltonian(Definition):
@@ -61,7 +67,7 @@ class SymbolicHamiltonian(Definition):
         """M⁻¹ if T = ½ pᵀM⁻¹p exactly, else None."""
         if self.T is None:
             return None
-        M = sp.hessian(self.T, self.p)
+        M = hessian(self.T, self.p)
         p = sp.Matrix(self.p)
         if M.free_symbols or sp.expand(self.T - (p.T * M * p)[0] / 2) != 0:
             return None
@@ -131,7 +137,7 @@ class SymbolicHamiltonian(Definition):
     def _vector(self, name: str) -> Callable[[Array], Array]:
         return self._function(
             name + "'",
-            lambda f, x: [sp.diff(f, s) for s in x],
+            gradient,
             lambda values, like, n: assemble(values, like),
         )
 
@@ -140,7 +146,7 @@ class SymbolicHamiltonian(Definition):
             flat = assemble(values, like)
             return flat.reshape(*flat.shape[:-1], n, n)
 
-        return self._function(name + "''", lambda f, x: list(sp.hessian(f, x)), reshape)
+        return self._function(name + "''", lambda f, x: list(hessian(f, x)), reshape)
 
     def _function(
         self,
@@ -182,13 +188,32 @@ class SymbolicHamiltonian(Definition):
         return {}
 
 
+def gradient(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[sp.Expr]:
+    """∂f/∂x of each x, of a sum by the terms that hold it: of many terms and variables few do."""
+    holding: dict[sp.Symbol, list[sp.Expr]] = {s: [] for s in x}
+    for term in sp.Add.make_args(f):
+        for s in term.free_symbols & holding.keys():
+            holding[s].append(term)
+    return [sp.Add(*[sp.diff(term, s) for term in holding[s]]) for s in x]
+
+
+def hessian(f: sp.Expr, x: Sequence[sp.Symbol]) -> sp.Matrix:
+    """∇²f, as `sympy.hessian`, by the terms that are not zero."""
+    rows = [[sp.S.Zero] * len(x) for _ in x]
+    for i, slope in enumerate(gradient(f, x)):
+        for j, entry in enumerate(gradient(slope, x[i:]), i):
+            rows[i][j] = rows[j][i] = entry
+    return sp.Matrix(rows)
+
+
 def parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
     """The expression in real symbols, its parameters replaced by their values."""
+    params = checked_params(params)
     names = {name: sp.Symbol(name, real=True) for name in params}
-    _check_params(params)
     if isinstance(expression, str):
         try:
-            H = read(expression, {*params, *(w for w in re.findall(r"[A-Za-z_]\w*", expression) if _is_coordinate(w))})
+            coordinates = (w for w in re.findall(r"[A-Za-z_]\w*", expression) if _is_coordinate(w))
+            H = read(expression, {*params, *_AMBIGUOUS, *coordinates})
         except Unreadable as error:
             shown = expression if len(expression) <= 200 else expression[:200] + "..."
             raise ValueError(
@@ -215,20 +240,42 @@ def parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
     if "t" in unknown:
         raise TypeError("`expression` depends on the time t: only autonomous Hamiltonians are supported.")
     if unknown:
-        raise ValueError(f"`expression` holds {', '.join(unknown)} without a value: give it in `params`.")
+        meant = "".join(f" {_AMBIGUOUS[name]}." for name in unknown if name in _AMBIGUOUS)
+        raise ValueError(f"`expression` holds {', '.join(unknown)} without a value: give it in `params`.{meant}")
     return H
 
 
-def _check_params(params: Mapping[str, float]) -> None:
-    for name, value in params.items():
+_AMBIGUOUS = {
+    "E": "Euler's number is written exp(1)",
+    "I": "The imaginary unit has no place in a Hamiltonian, which must be real",
+}
+"""Names that are constants for SymPy, but in the text of a Hamiltonian more likely an energy, a moment of inertia."""
+
+
+def checked_params(params: Mapping[str, float] | None) -> dict[str, float]:
+    """Return the parameters as numbers of Python.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If they are no mapping of names to finite real numbers, or a name is that of a coordinate.
+    """
+    if not isinstance(params, Mapping | None):
+        raise TypeError(f"`params` must be a mapping of names to numbers; got {type(params).__name__}: pass a dict.")
+    checked = {}
+    for name, given in (params or {}).items():
         if not isinstance(name, str) or _is_coordinate(name) or name == "t":
             raise ValueError(f"`params` gives a value to {name!r}, which is a coordinate: rename the parameter.")
-        try:
-            number = sp.sympify(value, strict=True)
-        except sp.SympifyError:
-            number = sp.nan
-        if not isinstance(number, sp.Expr) or not number.is_number or not number.is_finite:
-            raise ValueError(f"`params` has {name} = {value!r}: give a finite number.")
+        value = plain(given)
+        if isinstance(value, numbers.Rational | sp.Expr) and not isinstance(value, int):
+            try:
+                value = float(value)
+            except (TypeError, OverflowError):
+                value = None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+            raise ValueError(f"`params` has {name} = {reprlib.repr(given)}: give a finite real number.")
+        checked[name] = value
+    return checked
 
 
 def _is_coordinate(name: str) -> bool:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import copy
+import math
+import sys
 from collections.abc import Callable, Mapping
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arrays import Array
+from sympflow.arguments import floats, real_number
+from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import fingerprint
@@ -23,6 +27,22 @@ if TYPE_CHECKING:
 MOST_DEGREES = 1_000_000
 
 
+class Parameters(dict[str, float]):
+    """The parameters of a system: a dictionary that cannot be changed, for the code of H holds their values."""
+
+    def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
+        raise TypeError(
+            "`params` of a system are to be read only, for its forces would not change: make a system with other "
+            "parameters, by its scene's function or by HamiltonianSystem.from_sympy(..., params=...)."
+        )
+
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    update = setdefault = pop = popitem = clear = _refuse
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Parameters, (dict(self),)
+
+
 class HamiltonianSystem(Hamiltonian):
     """A Hamiltonian system x' = J∇H(x), x = [q, p], with H autonomous.
 
@@ -32,7 +52,7 @@ class HamiltonianSystem(Hamiltonian):
         V(q), q of shape (..., d), returning (...). Then H = ½ pᵀM⁻¹p + V(q) is separable. Without `gradient`
         it must be written with torch functions, and is differentiated automatically. With Numba functions
         (`potential`, `gradient` and `hessian_vector`) the system runs compiled. A function that writes into q is a
-        ValueError; of a Numba function that cannot be told, and it would corrupt the run: it may write into `out` only.
+        ValueError; so is a gradient that is none of V: see `check_functions`.
     hamiltonian : callable, optional
         H(q, p), written with torch functions, for a system that is not separable. Give this or `potential`.
     ndof : int
@@ -57,6 +77,8 @@ class HamiltonianSystem(Hamiltonian):
         Default step of the fixed-step classical methods.
     energy_scale : float, optional
         What energy errors are relative to; the default is |H(y0)|.
+    check : bool
+        False leaves out the test of the functions, see `check_functions`, that the first use of the system makes.
 
     Attributes
     ----------
@@ -92,6 +114,7 @@ class HamiltonianSystem(Hamiltonian):
         t_span: tuple[float, float] = (0.0, 100.0),
         dt: float = 0.05,
         energy_scale: float | None = None,
+        check: bool = True,
     ) -> None:
         from sympflow.hamiltonian.callables import CallableHamiltonian
 
@@ -100,7 +123,7 @@ class HamiltonianSystem(Hamiltonian):
             raise ValueError(
                 f"`ndof` must be a positive integer, at most {MOST_DEGREES:,}, the degrees of freedom; got {ndof!r}."
             )
-        definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector)
+        definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector, check)
         if definition.separable:
             super().__init__(name, definition, matrices.inverse_mass(mass, int(ndof)), True)
         elif mass is not None:
@@ -111,6 +134,7 @@ class HamiltonianSystem(Hamiltonian):
             if not definition.separable:
                 raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
             self.stiffness_matrix = matrices.stiffness_matrix(stiffness_matrix, definition.ndof)
+            self.stiffness_matrix.setflags(write=False)
         self._set_scene({}, domain, y0, t_span, dt, energy_scale)
 
     @classmethod
@@ -133,8 +157,11 @@ class HamiltonianSystem(Hamiltonian):
         Parameters
         ----------
         expression : str or sympy.Expr
+            In a text `pi` is a constant and every other name that is no function a symbol: so are `E` and `I`;
+            Euler's number is exp(1).
         params : mapping of str to float, optional
-            Values of the other symbols.
+            Values of the other symbols: finite real numbers. A name that is given here is a symbol whatever it means
+            otherwise. `system.params` holds them, to be read only.
         name, domain, y0, t_span, dt, energy_scale
             As for the class.
 
@@ -143,15 +170,16 @@ class HamiltonianSystem(Hamiltonian):
         ValueError, TypeError
             If the expression cannot be parsed, has symbols without a value, or depends on t.
         """
-        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, checked_params
 
+        params = checked_params(params)
         symbols = SymbolicHamiltonian(expression, params)
         self = cls.__new__(cls)
         M = symbols.inverse_mass
         inverse_mass = None if M is None else matrices.simplest(np.array(M.tolist(), dtype=float))
         Hamiltonian.__init__(self, name, symbols, inverse_mass, M is not None)
         self.symbols = symbols
-        self._set_scene(dict(params or {}), domain, y0, t_span, dt, energy_scale)
+        self._set_scene(params, domain, y0, t_span, dt, energy_scale)
         return self
 
     def _set_scene(
@@ -163,26 +191,75 @@ class HamiltonianSystem(Hamiltonian):
         dt: float,
         energy_scale: float | None,
     ) -> None:
-        self.params = params
-        if not (isinstance(dt, int | float | np.number) and 0 < dt < 1e100):
+        self._params = Parameters(params)
+        if not real_number(dt) or not 0 < dt < 1e100:
             raise ValueError(f"`dt` must be positive and finite; got {dt!r}.")
         try:
-            self.t_span = (float(t_span[0]), float(t_span[1]))
-        except (TypeError, ValueError, IndexError, KeyError) as error:
-            raise ValueError(f"`t_span` must be two numbers, start and end; got {t_span!r}.") from error
-        self.dt = float(dt)
-        scale = isinstance(energy_scale, int | float | np.number)
-        if energy_scale is not None and not (scale and 0 < energy_scale < np.inf):
+            t0, t1 = (float(t) for t in t_span)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"`t_span` must be two finite numbers, start and end; got {t_span!r}.") from error
+        if not math.isfinite(t1 - t0):
+            raise ValueError(f"`t_span` must be two finite numbers, start and end; got {t_span!r}.")
+        self.t_span, self.dt = (t0, t1), float(dt)
+        if energy_scale is not None and not (real_number(energy_scale) and 0 < energy_scale <= sys.float_info.max):
             raise ValueError(f"`energy_scale` must be positive and finite; got {energy_scale!r}.")
         self.energy_scale = energy_scale
-        self.y0 = None if y0 is None else np.array(y0, dtype=float)
-        if self.y0 is not None and self.y0.shape != (2 * self.ndof,):
-            raise ValueError(f"`y0` must have shape ({2 * self.ndof},), [q, p]; got {self.y0.shape}.")
+        self.y0 = None if y0 is None else self._checked_y0(y0)
         if domain is not None and not isinstance(domain, Domain):
             raise TypeError(f"`domain` must be a domain such as sympflow.Box(low, high); got {type(domain).__name__}.")
         self.domain = domain.attach(self.hamiltonian) if isinstance(domain, EnergySublevel) else domain
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
+
+    def _checked_y0(self, y0: ArrayLike) -> np.ndarray:
+        """The default initial state: a copy of floats."""
+        try:
+            state = floats("y0", y0)
+        except OverflowError:
+            raise ValueError("`y0` must be finite: it has an integer that no float is near.") from None
+        if state.shape != (2 * self.ndof,):
+            raise ValueError(f"`y0` must have shape ({2 * self.ndof},), [q, p]; got {state.shape}.")
+        return state
+
+    @property
+    def params(self) -> Mapping[str, float]:
+        """The values of the parameters, to be read only: they are part of H, from which all code is generated.
+
+        A system with others is made by `HamiltonianSystem.from_sympy`, or by the function of its scene.
+        """
+        return self._params
+
+    def check_functions(self, y0: Array | None = None) -> None:
+        """Test once that the functions of a user agree with each other: `solve`, `train` and their like call it.
+
+        At a few states, y0 (the system's if it is None), near these and of the domain, the gradient, given or
+        automatic, is compared with differences of H, and `hessian_vector` with those of the gradient; a batch with
+        single states; a value with the same once more. Nothing is said of states where H is not finite, and of those
+        next to a kink. It costs milliseconds; `check=False` of the system leaves it out.
+
+        Parameters
+        ----------
+        y0 : array or tensor of shape (..., 2d), optional
+            Its library and dtype are those in which the functions are called.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If a function is wrong: the message names it, the component, the state and both values.
+        """
+        if not self.functions_given:
+            return
+        like = np.empty(0) if y0 is None else y0
+        kind = type(like), like.dtype
+        if kind in self._checked:
+            return
+        from sympflow.hamiltonian.function_checks import FEW, probe_states
+
+        given = to_numpy(like) if math.prod(like.shape) else self.y0
+        probes = probe_states(given, self.domain, 2 * self.ndof)
+        n_given = min(FEW, math.prod(like.shape) // (2 * self.ndof))
+        self._definition.check(probes, like, n_given)
+        self._checked |= {kind}
 
     # structure --------------------------------------------------------------------------------------
 
@@ -210,3 +287,69 @@ class HamiltonianSystem(Hamiltonian):
         params = ", ".join(f"{k}={v:g}" for k, v in self.params.items())
         kind = "separable" if self.separable else "not separable"
         return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
+
+
+# a view that counts -------------------------------------------------------------------------------
+
+COUNTED = {
+    "force": "force_evaluations",
+    "gradient": "force_evaluations",
+    "vector_field": "force_evaluations",
+    "potential_hessian": "hessian_evaluations",
+    "hessian_vector": "hessian_evaluations",
+    "hessian": "hessian_evaluations",
+    "third_derivative": "curvature_evaluations",
+    "curvature_gradient": "curvature_evaluations",
+}
+"""The functions of a system that are counted, and as what."""
+
+
+def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]) -> HamiltonianSystem:
+    """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    count : callable
+        Called with what is evaluated, a value of `COUNTED`, and the states or positions (..., k).
+
+    Returns
+    -------
+    HamiltonianSystem
+        Equal to `system`, so that whatever is kept by system is found by the view too.
+    """
+    view = copy.copy(system)
+    view.__class__ = _counting_class(type(system))  # type: ignore[arg-type]
+    view._original, view._count, view._inside = system, count, False  # type: ignore[attr-defined]
+    return view
+
+
+@lru_cache(maxsize=64)
+def _counting_class(cls: type[HamiltonianSystem]) -> type[HamiltonianSystem]:
+    def counted(name: str) -> Callable[..., Array]:
+        def evaluate(self: Any, x: Array, *more: Array) -> Array:
+            function = getattr(super(view, self), name)
+            if self._inside:  # one of them may call another
+                return function(x, *more)
+            self._inside = True
+            try:
+                value = function(x, *more)
+            finally:
+                self._inside = False
+            self._count(COUNTED[name], x)
+            return value
+
+        return evaluate
+
+    view: Any = type(
+        cls.__name__,
+        (cls,),
+        {
+            **{name: counted(name) for name in COUNTED},
+            "__hash__": lambda self: hash(self._original),
+            "__eq__": lambda self, other: other is self or other is self._original,
+            "__reduce__": lambda self: (copy.copy, (self._original,)),
+            "__doc__": cls.__doc__,
+        },
+    )
+    return view

@@ -8,11 +8,13 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sympflow.arguments import real_number
 from sympflow.arrays import Array, concatenate, is_tensor
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.function_checks import as_like
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
-from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
 
 LARGEST_SHIFT = 1e30
 _ENERGIES: WeakKeyDictionary[HamiltonianSystem, tuple[bytes, float]] = WeakKeyDictionary()
@@ -74,14 +76,14 @@ def time_transformed(
     c = default_shift(system) if shift is None else checked_shift(shift)
     if system.symbols is not None:
         transformed = HamiltonianSystem.from_sympy(_expression(system, c), name=f"log_{system.name}", energy_scale=1.0)
+        transformed._params = Parameters({**system.params, "shift": c})
     else:
         transformed = HamiltonianSystem.__new__(HamiltonianSystem)
         Hamiltonian.__init__(transformed, f"log_{system.name}", _Logarithmic(system, c), None, False)
-        transformed._set_scene({}, None, None, (0.0, 100.0), 0.05, 1.0)
-    transformed.params = {**system.params, "shift": c}
+        transformed._set_scene({**system.params, "shift": c}, None, None, (0.0, 100.0), 0.05, 1.0)
     transformed.domain = domain
     if system.y0 is not None:
-        transformed.y0 = lifted(system, system.y0, c)
+        transformed.y0 = transformed._checked_y0(lifted(system, system.y0, c))
         scale = time_scale(system, c)
         transformed.dt = system.dt * scale
         transformed.t_span = (0.0, (system.t_span[1] - system.t_span[0]) * scale)
@@ -107,8 +109,7 @@ def checked_shift(shift: Any) -> float:
     """The shift as a float; beside one of 1e16 times the energies these would be lost already."""
     if type(shift) is float and abs(shift) <= LARGEST_SHIFT:
         return shift
-    real = isinstance(shift, int | float | np.number) and not isinstance(shift, bool) and not np.iscomplexobj(shift)
-    if not (real and math.isfinite(shift)) or abs(shift) > LARGEST_SHIFT:
+    if not real_number(shift) or not abs(shift) <= LARGEST_SHIFT:
         raise ValueError(
             f"`shift` must be a finite number, above the energy and at most {LARGEST_SHIFT:g}; got {shift!r}."
         )
@@ -162,6 +163,10 @@ class _Logarithmic(Definition):
 
     def __init__(self, system: HamiltonianSystem, c: float) -> None:
         self.ndof, self._system, self._c = system.ndof + 1, system, c
+        self.given = system.functions_given
+
+    def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
+        self._system.check_functions(projected(as_like(states[:n_given], like)) if n_given else None)
 
     def kinetic(self, P: Array) -> Array:
         return _log(self._system.kinetic(P[..., :-1]) + P[..., -1])

@@ -6,6 +6,7 @@ walks the grid, finds what is not finite, places the outputs and looks for event
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -16,7 +17,7 @@ import numpy as np
 from sympflow.arguments import check_dt
 from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
 from sympflow.events import EventSearch
-from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
 from sympflow.integrators.contract import ENDED, FINISHED, Failure, Integrator, Outcome, Problem, Steps
 from sympflow.integrators.grid import EPS, Grid
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FINISHED",
+    "CountingStepper",
     "FixedStep",
     "Integrator",
     "KernelStepper",
@@ -75,11 +77,28 @@ class FixedStep(Integrator):
 
     def stepper(self, problem: Problem) -> Stepper:
         """Return the stepper of one run, for states such as the problem's y0."""
-        return Stepper(self, problem)
+        self.check_library(problem.y0)
+        counted = _is_counted(type(self))  # type: ignore[arg-type]
+        return (CountingStepper if counted else Stepper)(self, problem)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Force and force-gradient evaluations of n_steps steps, n_saved saved states, n_extra shorter steps."""
+        """Force and force-gradient evaluations of n_steps steps, n_saved saved states, n_extra shorter steps.
+
+        A class that does not say, for the `step` that it defines, has them counted while it runs.
+        """
         return {"force_evaluations": 0, "hessian_evaluations": 0}
+
+    def checked_step(self, system: HamiltonianSystem, t: float, y: Array, h: Any) -> Array:
+        """`step`, whose failure on tensors is told from one on arrays."""
+        try:
+            return self.step(system, t, y, h)
+        except (TypeError, RuntimeError, AttributeError) as error:
+            if not is_tensor(y) or _definer(type(self), "step").__module__.startswith("sympflow."):
+                raise
+            raise TypeError(
+                f"`method` {self.name!r} cannot step the tensors that it is given ({type(error).__name__}: {error}): "
+                "pass NumPy arrays. A class whose step takes arrays only says so by `arrays_only`."
+            ) from error
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         """States after the steps `save` (sorted counts in 0 … n_steps): (len(save), ..., 2d).
@@ -87,13 +106,13 @@ class FixedStep(Integrator):
         Also the index of the last finite state of each trajectory, and the backend that ran.
         """
         states, finite = rollout(
-            lambda k, y: self.step(problem.system, problem.t0 + k * h, y, h), problem.y0, n_steps, save
+            lambda k, y: self.checked_step(problem.system, problem.t0 + k * h, y, h), problem.y0, n_steps, save
         )
         return states, finite, "torch" if is_tensor(problem.y0) else "numpy"
 
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
         """`step` on the backend of the run that it belongs to."""
-        return self.step(system, 0.0, y, h)
+        return self.checked_step(system, 0.0, y, h)
 
     def run(self, problem: Problem) -> Outcome:
         return GridRun(self, problem).outcome()
@@ -123,19 +142,24 @@ class OwnStepper(FixedStep):
         """Return the stepper of one run, for states such as the problem's y0."""
         raise NotImplementedError(f"{type(self).__name__} must define own_stepper().")
 
+    @classmethod
+    def overrides(cls, duty: str) -> bool:
+        """Tell whether a subclass of a built-in class defines a duty anew, such as "step"."""
+        return duty in _overridden(cls)  # type: ignore[arg-type]
+
     def stepper(self, problem: Problem) -> Stepper:
         asked = _overridden(type(self))  # type: ignore[arg-type]
-        return Stepper(self, problem) if asked else self.own_stepper(problem)
+        return super().stepper(problem) if asked else self.own_stepper(problem)
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
-        if "step" in _overridden(type(self)):  # type: ignore[arg-type]
+        if self.overrides("step"):
             return super().rollout(problem, h, n_steps, save)
         stepper = self.own_stepper(problem)
         states, finite = stepper.rollout(problem.y0, h, n_steps, save, problem.t0)
         return states, finite, stepper.backend
 
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
-        if "step" in _overridden(type(self)):  # type: ignore[arg-type]
+        if self.overrides("step"):
             return super().substep(system, y, h, backend)
         asked = "auto" if backend == "compiled" else "array"
         return self.own_stepper(Problem(system, 0.0, 0.0, y, backend=asked)).shorter(y, h)
@@ -145,8 +169,18 @@ class OwnStepper(FixedStep):
 def _overridden(cls: type[OwnStepper]) -> frozenset[str]:
     """Return the duties that a subclass of a built-in class defines anew: its stepper must ask them."""
     duties = ("step", "rollout", "substep", "evaluations")
-    definers = ((name, next(base for base in cls.__mro__ if name in vars(base))) for name in duties)
-    return frozenset(name for name, base in definers if not base.__module__.startswith("sympflow."))
+    return frozenset(name for name in duties if not _definer(cls, name).__module__.startswith("sympflow."))
+
+
+def _definer(cls: type, name: str) -> type:
+    """Return the class of which an attribute is inherited."""
+    return next(base for base in cls.__mro__ if name in vars(base))
+
+
+@cache
+def _is_counted(cls: type[FixedStep]) -> bool:
+    """True if the class does not say how many forces its step evaluates: if `evaluations` is of a class above it."""
+    return cls.__mro__.index(_definer(cls, "evaluations")) > cls.__mro__.index(_definer(cls, "step"))
 
 
 # one run of a method -------------------------------------------------------------------------------
@@ -182,13 +216,14 @@ class Stepper:
         Also the index of the last finite state of each trajectory, of shape y0.shape[:-1].
         """
         whole = y0 is self.problem.y0 and t0 == self.problem.t0
-        piece = self.problem if whole else Problem(self.system, t0, t0 + n_steps * h, y0, backend=self.problem.backend)
+        seen = self.problem
+        piece = seen if whole else Problem(seen.system, t0, t0 + n_steps * h, y0, backend=seen.backend)
         states, finite, self.backend = self.integrator.rollout(piece, h, n_steps, save)
         return states, finite
 
     def shorter(self, y: Array, h: Any) -> Array:
         """Return the states a step of length h, a number or one for each state, after y (..., 2d)."""
-        return self.integrator.substep(self.system, y, h, self.backend)
+        return self.integrator.substep(self.problem.system, y, h, self.backend)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         """Evaluations of the force and its derivatives so far, if it made so many steps, saves and shorter steps."""
@@ -197,6 +232,24 @@ class Stepper:
     def more_stats(self) -> dict[str, int]:
         """Further entries of the statistics."""
         return {}
+
+
+class CountingStepper(Stepper):
+    """A run whose forces are counted, on a view of the system; of a batch together as one, as everywhere."""
+
+    counts_itself = True
+
+    def __init__(self, integrator: FixedStep, problem: Problem) -> None:
+        super().__init__(integrator, problem)
+        self.counts = {"force_evaluations": 0, "hessian_evaluations": 0}
+        self.problem = replace(problem, system=counting_view(problem.system, self._count))
+
+    def _count(self, what: str, x: Array) -> None:
+        together = math.prod(self.problem.y0.shape[:-1])
+        self.counts[what] = self.counts.get(what, 0) + max(1, math.prod(x.shape[:-1]) // together)
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
+        return dict(self.counts)
 
 
 class KernelStepper(Stepper):
@@ -314,14 +367,25 @@ def rollout(
 
 def checked_state(y_next: Any, y: Array) -> Array:
     """Return the result of a step from y, checked to be of the same kind, shape and dtype: it may be a plug-in's."""
-    shape = getattr(y_next, "shape", None)
-    if shape == y.shape and y_next.dtype == y.dtype and is_tensor(y_next) == is_tensor(y):
+    shape, tensor = getattr(y_next, "shape", None), is_tensor(y)
+    if shape == y.shape and y_next.dtype == y.dtype and is_tensor(y_next) == tensor:
+        if tensor and y.requires_grad and not y_next.requires_grad and _gradients_are_on():
+            raise TypeError(
+                "`step` loses the gradient of the tensors that it is given: pass NumPy arrays, or y0.detach(). A class "
+                "whose step takes arrays only says so by `arrays_only`."
+            )
         return y_next
     what = "" if shape is None else f" of {y_next.dtype} and shape {tuple(shape)}"
     raise TypeError(
         f"`step` must return states as those that it is given, of {y.dtype} and shape {tuple(y.shape)}; got "
         f"{type(y_next).__name__}{what}. Mend the integrator: check_integrator tests it."
     )
+
+
+def _gradients_are_on() -> bool:
+    import torch
+
+    return torch.is_grad_enabled()
 
 
 def shorter_steps(stepper: Stepper, y: Array, extra: np.ndarray, h: np.ndarray) -> Array:

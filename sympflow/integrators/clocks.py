@@ -53,10 +53,20 @@ def scale_of(system: HamiltonianSystem, c: float) -> float:
     return known[c]
 
 
+ARRAYS_ONLY = (
+    "finds its outputs by root-finding on NumPy arrays: pass y0.numpy(), or solve time_transformed(system), which "
+    "takes tensors"
+)
+
+
 class OnClock(Protocol):
     """A method that is run on the logarithmic clock."""
 
     name: ClassVar[str]
+
+    def check_library(self, y0: Array) -> None:
+        """Refuse tensors: see `Integrator`."""
+        ...
 
     def reach_times(
         self,
@@ -157,11 +167,7 @@ class LogarithmicClock(NamedTuple):
 
     def run(self, problem: Problem) -> Outcome:
         """Solve the problem."""
-        if is_tensor(problem.y0):
-            raise TypeError(
-                f"`y0` is a tensor, but method {self.method.name!r} finds its outputs by root-finding on NumPy arrays: "
-                "pass y0.numpy(), or solve time_transformed(system), which takes tensors."
-            )
+        self.method.check_library(problem.y0)
         return timed_pass(self, problem) or PhysicalRun(self, problem).outcome()
 
     def steps(self, t_span: tuple[float, float], y0: Array) -> Steps:

@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
+from sympflow.hamiltonian.copies import both, coupling_strength, distance, mean, two_copies
 from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, like, linear_and_rest, map_evaluations
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -48,11 +49,27 @@ class Composition(ABC):
 
     compensates: ClassVar[bool] = False
     """True if there are compensated sums."""
+    extends: ClassVar[bool] = False
+    """True if the steps are made on an extended phase space, whose states a run keeps from step to step."""
+    counts_as_scheme: ClassVar[bool] = True
+    """True if a step evaluates as many forces as the scheme says, whatever the system."""
 
     def __init__(
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
     ) -> None:
         self.method, self.scheme = method, scheme
+
+    def lift(self, y: Array) -> Array:
+        """The states on which steps are made, of states y (..., 2d); y itself where the phase space is not extended."""
+        return y
+
+    def project(self, x: Array) -> Array:
+        """The states (..., 2d) of those on which steps are made."""
+        return x
+
+    def distance(self, x: Array) -> Array:
+        """How far those states are from ones that `lift` gives: (...)."""
+        return 0 * x[..., 0]
 
     @abstractmethod
     def step(self, y: Array, h: Any) -> Array:
@@ -90,8 +107,8 @@ class KineticPotential(Composition):
         self.method, self.scheme, self.system = method, scheme, system
         if not system.separable:
             raise ValueError(
-                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use a "
-                "Runge–Kutta method or train a SympFlow."
+                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use an "
+                "implicit method such as 'gauss_legendre6', or a Runge–Kutta method."
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(
@@ -329,6 +346,9 @@ class SolvableParts(ExactMaps):
     A Strang step of length h is φ₁(h/2) ∘ … ∘ φ_n(h) ∘ … ∘ φ₁(h/2).
     """
 
+    label: ClassVar[str] = "parts"
+    counts_as_scheme: ClassVar[bool] = False
+
     def __init__(
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
     ) -> None:
@@ -336,14 +356,18 @@ class SolvableParts(ExactMaps):
         weights = scheme.strang_weights
         if weights is None:
             raise ValueError(
-                f"`splitting` 'parts' composes Strang steps, which the scheme of method {method!r} is not made of: use "
-                "'kahan_li8', 'kahan_li6', 'suzuki4' or 'verlet'."
+                f"`splitting` {self.label!r} composes Strang steps, which the scheme of method {method!r} is not made "
+                "of: use 'kahan_li8', 'kahan_li6', 'suzuki4' or 'verlet'."
             )
         self.weights: tuple[float, ...] = weights
+        self.parts = self._parts(system, parts)
+
+    def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
+        """The parts of a system, found once."""
         known = _PARTS.setdefault(system, {})
         if parts not in known:
             known[parts] = exact_parts(system, parts)
-        self.parts = known[parts]
+        return known[parts]
 
     def maps(self, h: Any) -> list[Map]:
         parts, maps = self.parts, list[Map]()
@@ -360,11 +384,47 @@ class SolvableParts(ExactMaps):
         return Map(k, _each_class(h, self.parts) if k == LINEAR else h)
 
 
+class TwoCopies(SolvableParts):
+    """Strang steps over H(q, y), H(x, p) and the coupling of two copies of phase space, for any H: see `copies`."""
+
+    label = "copies"
+    extends = True
+
+    def __init__(
+        self,
+        method: str,
+        scheme: Scheme,
+        system: HamiltonianSystem,
+        parts: tuple[str, ...] | None = None,
+        omega: float | None = None,
+    ) -> None:
+        self.omega, self.ndof = omega, system.ndof
+        super().__init__(method, scheme, system, parts)
+
+    def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
+        known = _PARTS.setdefault(system, {})
+        key = "copies", self.omega
+        if key not in known:
+            known[key] = two_copies(system, coupling_strength(system) if self.omega is None else float(self.omega))
+        return known[key]
+
+    def lift(self, y: Array) -> Array:
+        return both(y, self.ndof)
+
+    def project(self, x: Array) -> Array:
+        return mean(x, self.ndof)
+
+    def distance(self, x: Array) -> Array:
+        """The largest difference of the copies: (..., 4d) to (...)."""
+        return distance(x, self.ndof)
+
+
 SPLITTINGS: dict[str, type[Composition]] = {
     "kinetic": KineticPotential,
     "linear": LinearRest,
     "mollified": MollifiedLinearRest,
     "midpoint": MidpointLinearRest,
     "parts": SolvableParts,
+    "copies": TwoCopies,
 }
 """The splittings by the name that the option `splitting` takes."""

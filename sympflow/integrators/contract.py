@@ -8,13 +8,17 @@ Its duties:
 3. `check(system)` raises a ValueError with the reason where the method does not apply.
 4. `run(problem)` produces the states that were asked for, and no others, as an `Outcome`.
 5. `steps(system, t_span, y0)` executes the same run again as a stream of the steps that it takes, and
-6. `tangent(system, t, y, h)` differentiates such a step, so that metrics judge the map that was really executed.
+6. `tangent(system, t, y, h)` differentiates such a step, so that metrics judge the map that was really executed; where
+   that acts on more than y, `jacobian` and `executed` differentiate it where it acts.
 7. `inverse(system, t, y, h)` undoes `step(system, t, y, h)` exactly, or raises a TypeError.
 8. `finds_events` is False, and `solve` seeks events on the dense output afterwards; or `run` hands every step to
    `problem.events`, if there are any, and ends where that says.
 
+9. `arrays_only` says so, where `step` and `run` take NumPy arrays only.
+
 `FixedStep`, in `sympflow.integrators.base`, does 4, 5, 6 and 8 for any integrator that has a step: a new one needs
-duties 1 to 3 only. Whatever a run changes, such as its kernel and its counts, belongs to a `Stepper`.
+duties 1 to 3 only, and its forces are counted. Whatever a run changes, such as its kernel and its counts, belongs to a
+`Stepper`.
 """
 
 from __future__ import annotations
@@ -27,7 +31,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arrays import Array, jvp, to_numpy
+from sympflow.arrays import Array, is_tensor, jvp, to_numpy
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -102,8 +106,13 @@ class Integrator:
     """True if the steps are those of the grid t0 + k·dt, as a peer that drives them presumes."""
     in_another_time: ClassVar[bool] = False
     """True if the steps are equal in a time that is not t."""
+    arrays_only: ClassVar[str] = ""
+    """Why the method takes NumPy arrays only, and what to do: "runs on NumPy arrays: pass y0.numpy()"; "" if it takes
+    tensors too."""
     tangent_holds: ClassVar[str] = ""
     """The quantity that `tangent` holds fixed though a step from a neighbouring state would change it."""
+    keeps: ClassVar[str] = ""
+    """What a run keeps from step to step beside the state y, and `step` from y alone does not know."""
 
     @classmethod
     def options(cls) -> tuple[str, ...]:
@@ -114,6 +123,11 @@ class Integrator:
     def label(self) -> str:
         """The name in rows and legends, which tells apart what the options make another method."""
         return self.name
+
+    @property
+    def kicks_and_drifts(self) -> Scheme | None:
+        """The table of a method whose steps are kicks by −∇V and drifts by ∇T in the physical time; else None."""
+        return None
 
     @classmethod
     def forces_a_step(cls) -> str:
@@ -127,6 +141,11 @@ class Integrator:
 
     def check(self, system: HamiltonianSystem) -> None:
         """Raise a ValueError with the reason if the method does not apply to the system."""
+
+    def check_library(self, y0: Array) -> None:
+        """Raise a TypeError with the reason if y0 is a tensor and the method takes NumPy arrays only."""
+        if is_tensor(y0) and self.arrays_only:
+            raise TypeError(f"`y0` is a tensor, but method {self.name!r} {self.arrays_only}.")
 
     def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> Integrator:
         """Return the integrator that runs from y0 over a time `length`, where the method leaves a choice."""
@@ -160,19 +179,23 @@ class Integrator:
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         """The step from y (..., 2d) and its Jacobian A (..., 2d, 2d), by forward-mode differentiation of `step`."""
-        import torch
+        if self.arrays_only:
+            raise TypeError(
+                f"`method` {self.name!r} {self.arrays_only}; so its step cannot be differentiated: write it with the "
+                "functions of sympflow.arrays, or define tangent()."
+            )
+        return forward_tangent(lambda x, lengths: self.step(system, t, x, lengths), y, h)
 
-        def step(x: torch.Tensor) -> torch.Tensor:
-            return self.step(system, t, x, torch.as_tensor(h, dtype=x.dtype))
+    def jacobian(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> np.ndarray:
+        """The Jacobian (..., n, n) of a step from y in the phase space where steps are made; n = 2d but if extended."""
+        return self.tangent(system, t, y, h)[1]
 
-        x = torch.as_tensor(to_numpy(y))
-        columns = []
-        for i in range(x.shape[-1]):
-            direction = torch.zeros_like(x)
-            direction[..., i] = 1
-            y_next, column = jvp(step, x, direction)
-            columns.append(column)
-        return to_numpy(y_next), to_numpy(torch.stack(columns, dim=-1))
+    def executed(
+        self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """The steps of the run, differentiated where they were made: times and lengths (n, ...), Jacobians as above."""
+        for times, states, lengths in self.steps(system, t_span, y0):
+            yield differentiated(lambda t, y, h: self.tangent(system, t, y, h)[1], times, states, lengths)
 
     def run(self, problem: Problem) -> Outcome:
         """Solve the problem."""
@@ -181,6 +204,39 @@ class Integrator:
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         """Execute the run again as a stream of its steps."""
         raise NotImplementedError(f"{type(self).__name__} must define steps().")
+
+
+def forward_tangent(step: Callable[[Any, Any], Any], y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
+    """step(y, h) and its Jacobian in y, (..., n) and (..., n, n), by forward-mode differentiation of tensors."""
+    import torch
+
+    x = torch.as_tensor(to_numpy(y))
+    lengths = torch.as_tensor(h, dtype=x.dtype)
+    columns = []
+    for i in range(x.shape[-1]):
+        direction = torch.zeros_like(x)
+        direction[..., i] = 1
+        y_next, column = jvp(lambda z: step(z, lengths), x, direction)
+        columns.append(column)
+    return to_numpy(y_next), to_numpy(torch.stack(columns, dim=-1))
+
+
+def differentiated(
+    jacobian: Callable[[float, np.ndarray, np.ndarray], np.ndarray],
+    times: np.ndarray,
+    states: Array,
+    lengths: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A chunk of `steps` as times and lengths (n, ...) and Jacobians (n, ..., k, k).
+
+    Each step is differentiated in the precision in which it was executed, so its Jacobian holds the rounding of that
+    precision; it is returned as float64, in which everything that follows is computed.
+    """
+    y = to_numpy(states)
+    batch = y.shape[:-1]
+    t, h = (np.broadcast_to(x.reshape(*x.shape, *[1] * (len(batch) - x.ndim)), batch) for x in (times, lengths))
+    with np.errstate(all="ignore"):
+        return t, h, jacobian(float(t.flat[0]), y, h.astype(y.dtype)).astype(float)
 
 
 @cache

@@ -20,6 +20,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep, GridRun, KernelStepper, OwnStepper, Stepper, compiled_loops, rollout
 from sympflow.integrators.clocks import (
+    ARRAYS_ONLY,
     LogarithmicClock,
     physical_length,
     scale_of,
@@ -382,6 +383,7 @@ class LogSympFlow(FixedStep):
     finds_events: ClassVar[bool] = False  # they are sought on the dense output
     on_grid: ClassVar[bool] = False
     in_another_time: ClassVar[bool] = True
+    arrays_only: ClassVar[str] = ARRAYS_ONLY
     tangent_holds: ClassVar[str] = "the realised step in s, and B,"
     breakdown: ClassVar[Failure] = Failure.CLOCK
 

@@ -31,10 +31,18 @@ _MOLLIFIED = (
     "B. García-Archilla, J. M. Sanz-Serna and R. D. Skeel, Long-time-step methods for oscillatory differential "
     "equations, SIAM J. Sci. Comput. 20 (1998) 930–963, φ = sinc"
 )
+_LINEAR = (
+    "R. I. McLachlan and G. R. W. Quispel, Splitting methods, Acta Numerica 11 (2002) 341–434, for Nyström schemes on "
+    "parts that are quadratic"
+)
 _MIDPOINT = (
     "A. Stern and E. Grinspun, Implicit-explicit variational integration of highly oscillatory problems, Multiscale "
     "Model. Simul. 7 (2009) 1779–1794; R. I. McLachlan and A. Stern, Modified trigonometric integrators, SIAM J. "
     "Numer. Anal. 52 (2014) 1378–1397"
+)
+_COPIES = (
+    "; on two coupled copies of phase space, for any H: M. Tao, Phys. Rev. E 94 (2016) 043303; P. Pihajoki, Celest. "
+    "Mech. Dyn. Astron. 121 (2015) 211–231"
 )
 _LOGARITHMIC = (
     "S. Mikkola and K. Tanikawa, Celest. Mech. Dyn. Astron. 74 (1999) 287–295; M. Preto and S. Tremaine, Astron. J. "
@@ -52,7 +60,7 @@ TRIPLES: dict[str, Triple] = {
     "mollified_impulse": Triple("verlet", "mollified", source=_MOLLIFIED),
     "implicit_explicit": Triple("verlet", "midpoint", source=_MIDPOINT),
     **{
-        f"linear_{name}": Triple(name, "linear", source=_of(name, ", with the exact linear flow"))
+        f"linear_{name}": Triple(name, "linear", source=_of(name, f", with the exact linear flow; {_LINEAR}"))
         for name in ("srkn6b", "srkn11b", "srkn14a", "omelyan4")
     },
     "strang_parts": Triple(
@@ -63,12 +71,16 @@ TRIPLES: dict[str, Triple] = {
         for name in ("suzuki4", "kahan_li6", "kahan_li8")
     },
     **{
+        f"tao{order}": Triple(name, "copies", source=_of(name, _COPIES))
+        for order, name in ((2, "verlet"), (4, "suzuki4"), (6, "kahan_li6"), (8, "kahan_li8"))
+    },
+    **{
         f"log_{name}": Triple(name, clock="logarithmic", source=f"{_of(name, '')}; {_LOGARITHMIC}")
         for name in ("leapfrog", "blanes_moan4", "kahan_li8")
     },
 }
-"""The splitting methods. `linear_*` have the exact linear flow, `*_parts` any number of parts, `log_*` steps that are
-equal on the logarithmic Hamiltonian."""
+"""The splitting methods. `linear_*` have the exact linear flow, `*_parts` any number of parts, `tao*` are for any H, on
+two copies of phase space, `log_*` have steps that are equal on the logarithmic Hamiltonian."""
 
 CLASSES: dict[str, str] = {
     "rk45": "scipy_methods:RK45",
@@ -77,6 +89,8 @@ CLASSES: dict[str, str] = {
     "mlp": "flows:MLPIntegrator",
     "implicit_midpoint": "implicit:ImplicitMidpoint",
     "gauss_legendre4": "implicit:GaussLegendre4",
+    "gauss_legendre6": "implicit:GaussLegendre6",
+    "gauss_legendre8": "implicit:GaussLegendre8",
 }
 """The other methods: module and class."""
 UNLISTED = {"log_sympflow": "flows:LogSympFlow"}

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import difflib
-import logging
 import sys
-import warnings
 from collections.abc import Callable
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
 from sympflow.integrators.methods import CLASSES, NAMES, TORCHDIFFEQ, TRIPLES, UNLISTED
-from sympflow.lazy import whole_import
+from sympflow.lazy import announced, distribution, load_announced, whole_import
+from sympflow.schemes import GROUP as SCHEME_GROUP
+from sympflow.schemes import Scheme, announced_schemes, register_scheme, scheme_named
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 T = TypeVar("T")
 
@@ -53,9 +56,9 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
     if not isinstance(method, str):
         raise TypeError(f"`method` must be a name or an Integrator class; got {type(method).__name__}.")
     if method in TRIPLES:
-        from sympflow.integrators.splitting import splitting_method
+        from sympflow.integrators.splitting import method_of_row
 
-        return splitting_method(method)
+        return method_of_row(method)
     if method in CLASSES or method in UNLISTED:
         return _built_in(method)
     if method in TORCHDIFFEQ:
@@ -77,15 +80,23 @@ def _built_in(method: str) -> type[Integrator]:
     return getattr(whole_import(f"sympflow.integrators.{module}"), attribute)
 
 
-def register(name: str, integrator: type[Integrator]) -> None:
-    """Make an integrator class available under a name, in this process.
+def register(name: str, integrator: type[Integrator] | Scheme) -> None:
+    """Make an integrator class, or a scheme, available under a name, in this process.
+
+    Parameters
+    ----------
+    name : str
+    integrator : subclass of Integrator, or Scheme
+        A scheme becomes a method on the splitting "kinetic" and the physical clock, with the other splittings and
+        clocks as its options: see `sympflow.splitting_method`.
 
     Raises
     ------
     ValueError
-        If the name is empty, or that of a built-in method or of an installed plug-in.
+        If the name is empty, or that of a built-in method or of an installed plug-in; or if the scheme is not
+        consistent.
     TypeError
-        If `name` is not a string, or `integrator` not a subclass of Integrator that has a `name`.
+        If `name` is not a string, or `integrator` neither a Scheme nor a subclass of Integrator that has a `name`.
     """
     if not isinstance(name, str):
         raise TypeError(f"`name` must be a string, such as 'my_method'; got {type(name).__name__}.")
@@ -93,15 +104,24 @@ def register(name: str, integrator: type[Integrator]) -> None:
         raise ValueError(f"`name` must not be empty; got {name!r}. Choose one, such as 'my_method'.")
     if name in NAMES or name in UNLISTED:
         raise ValueError(f"`name` {name!r} is a built-in method, which cannot be replaced: choose another name.")
+    scheme = integrator if isinstance(integrator, Scheme) else None
+    if scheme is not None:
+        from sympflow.integrators.splitting import splitting_method
+
+        integrator = splitting_method(scheme, name=name)
     if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
-        raise TypeError(f"`integrator` must be a subclass of sympflow.integrators.base.Integrator; got {integrator!r}.")
+        raise TypeError(
+            f"`integrator` must be a subclass of sympflow.integrators.base.Integrator or a Scheme; got {integrator!r}."
+        )
     if not named(integrator):
         raise TypeError(f"`integrator` {integrator.__name__} has no `name`: set that class attribute.")
     if name in _plugins():
         raise ValueError(
-            f"`name` {name!r} is that of the plug-in {_distribution(_plugins()[name])}, which would be replaced: "
+            f"`name` {name!r} is that of the plug-in {distribution(_plugins()[name])}, which would be replaced: "
             "choose another name."
         )
+    if scheme is not None:
+        register_scheme(name, scheme)
     _registered[name] = integrator
 
 
@@ -145,7 +165,7 @@ def _made(method: Any, make: Callable[[], T]) -> T:
     except (Exception, SystemExit) as error:
         if not isinstance(method, str) or method in NAMES or method in UNLISTED or method in _registered:
             raise
-        plugin = f"the plug-in {_distribution(_plugins()[method])}"
+        plugin = f"the plug-in {distribution(_plugins()[method])}"
         if isinstance(error, TypeError | ValueError):  # what its options were given, most likely
             kind = TypeError if isinstance(error, TypeError) else ValueError
             raise kind(f"{error} (Raised by {plugin}.)") from error
@@ -163,34 +183,23 @@ def _is_flow(method: Any) -> bool:
 
 @cache
 def _plugins() -> dict[str, EntryPoint]:
-    found: dict[str, EntryPoint] = {}
-    for point in entry_points(group=GROUP):
-        if point.name in NAMES or point.name in found:
-            message = f"The integrator {point.name!r} of {_distribution(point)} is ignored: the name is taken."
-            try:
-                warnings.warn(message, RuntimeWarning, stacklevel=4)
-            except RuntimeWarning:  # where warnings are errors, it must not take all other methods with it
-                logging.getLogger(__name__).warning(message)
-        else:
-            found[point.name] = point
-    return found
+    return announced(GROUP, "integrator", NAMES, announced_schemes().values())
 
 
 def _load(point: EntryPoint) -> type[Integrator]:
-    try:
-        integrator = point.load()
-    except (Exception, SystemExit) as error:
-        raise ImportError(
-            f"`method` {point.name!r} of the plug-in {_distribution(point)} cannot be loaded ({type(error).__name__}: "
-            f"{error}): reinstall or remove that distribution."
-        ) from error
+    if point.group == SCHEME_GROUP:
+        from sympflow.integrators.splitting import splitting_method
+
+        integrator: Any = splitting_method(scheme_named(point.name), name=point.name)
+    else:
+        integrator = load_announced(point, "method")
     if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
         raise ImportError(
-            f"`method` {point.name!r} of the plug-in {_distribution(point)} is no Integrator class: report it there."
+            f"`method` {point.name!r} of the plug-in {distribution(point)} is no Integrator class: report it there."
         )
     if not named(integrator):
         raise ImportError(
-            f"`method` {point.name!r} of the plug-in {_distribution(point)} is a class without `name`, which every "
+            f"`method` {point.name!r} of the plug-in {distribution(point)} is a class without `name`, which every "
             "integrator must have: report it there."
         )
     _loaded[integrator] = point
@@ -219,13 +228,17 @@ class naming_plugin:
         if point is None or not isinstance(error, Exception | SystemExit) or isinstance(error, self._passes):
             return
         raise RuntimeError(
-            f"`method` {point.name!r} of the plug-in {_distribution(point)} failed ({type(error).__name__}: {error}): "
+            f"`method` {point.name!r} of the plug-in {distribution(point)} failed ({type(error).__name__}: {error}): "
             "report it there, unless a function of your own, of the system or an event, raised it."
         ) from error
 
 
-def check_applies(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named."""
+def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array | None = None) -> None:
+    """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named.
+
+    The functions of a user's system are tested too, for states such as y0.
+    """
+    system.check_functions(y0)
     if type(integrator) not in _loaded:
         integrator.check(system)
         return
@@ -241,7 +254,3 @@ def name_of(integrator: Integrator) -> str:
     if integrator.name in NAMES and get(integrator.name) is cls:
         return integrator.name
     return next((name for name, registered in _registered.items() if registered is cls), integrator.name)
-
-
-def _distribution(point: EntryPoint) -> str:
-    return point.dist.name if point.dist is not None else point.value

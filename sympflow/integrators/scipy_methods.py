@@ -12,7 +12,7 @@ from scipy.integrate import DOP853 as ScipyDOP853
 from scipy.integrate import RK45 as ScipyRK45
 from scipy.integrate import OdeSolution
 
-from sympflow.arrays import Array, is_tensor
+from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Recorder
 from sympflow.integrators.contract import ENDED, FINISHED, Outcome, Problem, Steps
@@ -40,6 +40,7 @@ class _Scipy(RungeKutta):
     solver: ClassVar[Any]
     finds_events: ClassVar[bool] = True
     one_by_one: ClassVar[bool] = True
+    arrays_only: ClassVar[str] = "is SciPy's and runs on NumPy arrays: pass y0.numpy(), or use method='dopri5'"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -57,11 +58,7 @@ class _Scipy(RungeKutta):
         return solver if np.isfinite(solver.f).all() and 0 < solver.h_abs < math.inf else None
 
     def run(self, problem: Problem) -> Outcome:
-        if is_tensor(problem.y0):
-            raise TypeError(
-                f"`y0` is a tensor, but method {self.name!r} is SciPy's and runs on NumPy arrays: pass y0.numpy(), or "
-                "use method='dopri5'."
-            )
+        self.check_library(problem.y0)
         if problem.y0.ndim == 1:
             return self._run_one(problem, problem.y0, problem.t_eval)
         batch = problem.y0.shape[:-1]

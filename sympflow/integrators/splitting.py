@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copyreg
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_flag
+from sympflow.arguments import check_flag, check_number
 from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep, KernelStepper, OwnStepper, Stepper, compiled_loops
-from sympflow.integrators.clocks import LogarithmicClock, scale_of, transformed_system
+from sympflow.integrators.clocks import ARRAYS_ONLY, LogarithmicClock, scale_of, transformed_system
 from sympflow.integrators.compositions import SPLITTINGS, Composition
-from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
-from sympflow.integrators.methods import TRIPLES
-from sympflow.schemes import SCHEMES, Scheme, scheme_evaluations
+from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, differentiated, forward_tangent
+from sympflow.integrators.extended import extended_run
+from sympflow.integrators.methods import NAMES, TRIPLES
+from sympflow.schemes import SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
@@ -36,8 +38,8 @@ class Clock:
 
     on: Callable[[Splitting, HamiltonianSystem], LogarithmicClock] | None = None
     finds_events: bool = True
-    on_grid: bool = True
     in_another_time: bool = False
+    arrays_only: str = ""
     tangent_holds: str = ""
     breakdown: Failure = Failure.NON_FINITE
 
@@ -70,8 +72,8 @@ CLOCKS = {
     "logarithmic": Clock(
         _logarithmic,
         finds_events=False,  # they are sought on the dense output
-        on_grid=False,
         in_another_time=True,
+        arrays_only=ARRAYS_ONLY,
         tangent_holds="the realised step in s, and B,",
         breakdown=Failure.CLOCK,
     ),
@@ -87,6 +89,22 @@ class OfClock:
 
     def __get__(self, method: Splitting | None, cls: type[Splitting]) -> Any:
         return getattr(CLOCKS[cls.clock if method is None else method.clock], self.name)
+
+
+class OfGrid:
+    """Whether a peer can drive the steps: equal ones in t, of the state y alone."""
+
+    def __get__(self, method: Splitting | None, cls: type[Splitting]) -> bool:
+        triple = cls if method is None else method
+        return not (CLOCKS[triple.clock].in_another_time or SPLITTINGS[triple.splitting].extends)
+
+
+class Kept:
+    """What a run keeps beside y."""
+
+    def __get__(self, method: Splitting | None, cls: type[Splitting]) -> str:
+        extends = SPLITTINGS[(cls if method is None else method).splitting].extends
+        return "the second copy of phase space" if extends else ""
 
 
 @dataclass(frozen=True, repr=False)
@@ -105,8 +123,9 @@ class Splitting(OwnStepper):
         within SciPy's `solve_ivp`, and where the metrics execute it again.
     splitting : str
         The parts: "kinetic" | potential; "linear" | rest, the exact flow of the quadratic part of H in place of the
-        drifts, with the kicks filtered ("mollified") or the implicit midpoint rule's angles ("midpoint"); or any
-        solvable "parts" of H, for schemes that are compositions of Strang steps.
+        drifts, with the kicks filtered ("mollified") or the implicit midpoint rule's angles ("midpoint"); any solvable
+        "parts" of H; or, for any H, two coupled "copies" of phase space, H(q, y) + H(x, p) + ω(|q − x|² + |p − y|²)/2.
+        The last two are for schemes that are compositions of Strang steps.
     clock : str
         The time in which the steps are equal: "physical", or "logarithmic", that of the logarithmic Hamiltonian
         (`sympflow.time_transformed`), for close encounters. There a method is symplectic for the transformed system,
@@ -114,6 +133,10 @@ class Splitting(OwnStepper):
     parts : sequence of str, optional
         For the splitting "parts": expressions that add up to H, in their order, the last innermost. The default is
         found in the terms of H: as few as possible, potentials first and the linear part last.
+    omega : float, optional
+        For the splitting "copies": ω. The default is the largest |λ| of J∇²H at the system's y0. Weaker, the copies may
+        drift apart, of which a RuntimeWarning tells; stronger, the steps must be shorter. States are the means of the
+        copies; a run keeps both, and is symplectic in their phase space [3]_.
     shift : float, optional
         For the logarithmic clock: c, above the energy; default E + |E|, which is 0 for a bound system.
 
@@ -126,6 +149,7 @@ class Splitting(OwnStepper):
     ----------
     .. [1] S. Mikkola, K. Tanikawa, Celest. Mech. Dyn. Astron. 74 (1999) 287–295.
     .. [2] M. Preto, S. Tremaine, Astron. J. 118 (1999) 2532–2541.
+    .. [3] M. Tao, Phys. Rev. E 94 (2016) 043303; P. Pihajoki, Celest. Mech. Dyn. Astron. 121 (2015) 211–231.
     """
 
     compensated: bool = False
@@ -133,13 +157,16 @@ class Splitting(OwnStepper):
     clock: str = "physical"
     parts: tuple[str, ...] | None = None
     shift: float | None = None
+    omega: float | None = None
 
     scheme: ClassVar[Scheme]
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
     finds_events: ClassVar[Any] = OfClock()
-    on_grid: ClassVar[Any] = OfClock()
+    on_grid: ClassVar[Any] = OfGrid()
+    keeps: ClassVar[Any] = Kept()
     in_another_time: ClassVar[Any] = OfClock()
+    arrays_only: ClassVar[Any] = OfClock()
     tangent_holds: ClassVar[Any] = OfClock()
     breakdown: ClassVar[Any] = OfClock()
 
@@ -150,7 +177,7 @@ class Splitting(OwnStepper):
             self.compensated is False
             and self.splitting is cls.splitting
             and self.clock is cls.clock
-            and (self.parts is None and self.shift is None)
+            and (self.parts is None and self.shift is None and self.omega is None)
         ):
             return
         check_flag("compensated", self.compensated)
@@ -164,6 +191,12 @@ class Splitting(OwnStepper):
             checked_shift(self.shift)
             if self.clock == "physical":
                 raise ValueError("`shift` is for the clock 'logarithmic': leave it out.")
+        if self.omega is not None:
+            check_number("omega", self.omega)
+            if self.splitting != "copies":
+                raise ValueError("`omega` is for the splitting 'copies': leave it out.")
+            if not self.omega > 0:
+                raise ValueError(f"`omega` must be positive; got {self.omega!r}.")
         if self.parts is None:
             return
         sequence = isinstance(self.parts, list | tuple)
@@ -179,7 +212,8 @@ class Splitting(OwnStepper):
 
     def composed(self, system: HamiltonianSystem) -> Composition:
         """Return the scheme × the splitting on a system."""
-        return SPLITTINGS[self.splitting](self.name, self.scheme, system, self.parts)
+        more = {} if self.omega is None else {"omega": self.omega}
+        return SPLITTINGS[self.splitting](self.name, self.scheme, system, self.parts, **more)
 
     def on_clock(self, system: HamiltonianSystem) -> LogarithmicClock | None:
         """Return the method on its clock, where that is not the physical one."""
@@ -211,13 +245,18 @@ class Splitting(OwnStepper):
         """The scheme with the splitting and the clock that need none: on the logarithmic clock that is what runs."""
         return _on_the_physical_clock(type(self), bool(self.compensated))  # type: ignore[arg-type]
 
+    @property
+    def kicks_and_drifts(self) -> Scheme | None:
+        plain = self.splitting == "kinetic" and self.clock == "physical" and not self.overrides("step")
+        return self.scheme if plain else None
+
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count those of a scheme of kicks and drifts; a stepper counts those of other parts too."""
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
 
     @classmethod
     def forces_a_step(cls) -> str:
-        if cls.splitting == "parts" or cls.clock != "physical":
+        if not SPLITTINGS[cls.splitting].counts_as_scheme or cls.clock != "physical":
             return ""
         hessians = cls.scheme.hessian_evaluations
         return f"{cls.scheme.force_evaluations}{f' + {hessians} Hessian' if hessians else ''}"
@@ -235,14 +274,36 @@ class Splitting(OwnStepper):
             self.on_clock(system)
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        return (self.on_clock(system) or self.composed(system)).step(y, h)
+        clock = self.on_clock(system)
+        if clock is not None:
+            return clock.step(y, h)
+        composition = self.composed(system)
+        return composition.project(composition.step(composition.lift(y), h))
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        if self.keeps:
+            raise TypeError(f"`method` {self.name!r} keeps {self.keeps}, without which a step cannot be undone.")
         return (self.on_clock(system) or self.composed(system)).inverse(y, h)
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
-        known = (self.on_clock(system) or self.composed(system)).tangent(y, h)
+        known = None if self.keeps else (self.on_clock(system) or self.composed(system)).tangent(y, h)
         return super().tangent(system, t, y, h) if known is None else known
+
+    def jacobian(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> np.ndarray:
+        if not self.keeps:
+            return super().jacobian(system, t, y, h)
+        composition = self.composed(system)
+        return forward_tangent(composition.step, composition.lift(y), h)[1]
+
+    def executed(
+        self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        if not self.keeps:
+            yield from super().executed(system, t_span, y0)
+            return
+        composition = self.composed(system)
+        for times, states, lengths in super().steps(system, t_span, composition.lift(y0)):
+            yield differentiated(lambda t, x, h: forward_tangent(composition.step, x, h)[1], times, states, lengths)
 
     def own_stepper(self, problem: Problem) -> Stepper:
         composition = self.composed(problem.system)
@@ -255,11 +316,18 @@ class Splitting(OwnStepper):
 
     def run(self, problem: Problem) -> Outcome:
         clock = self.on_clock(problem.system)
-        return super().run(problem) if clock is None else clock.run(problem)
+        if clock is not None:
+            return clock.run(problem)
+        return extended_run(super().run, self.composed(problem.system), problem) if self.keeps else super().run(problem)
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         clock = self.on_clock(system)
-        return super().steps(system, t_span, y0) if clock is None else clock.steps(t_span, y0)
+        if clock is not None:
+            yield from clock.steps(t_span, y0)
+            return
+        composition = self.composed(system)
+        for times, states, lengths in super().steps(system, t_span, composition.lift(y0)):
+            yield times, composition.project(states), lengths
 
 
 class ArrayComposition(Stepper):
@@ -290,27 +358,114 @@ class CompiledComposition(KernelStepper):
         return self.composition.evaluations(n_steps, n_saved, n_extra, "compiled")
 
 
+# classes of triples -------------------------------------------------------------------------------
+
+
+def splitting_method(
+    scheme: Scheme | str, splitting: str = "kinetic", clock: str = "physical", *, name: str | None = None
+) -> type[Splitting]:
+    """Return the integrator class of a scheme × a splitting × a clock; it runs compiled as the built-in ones do.
+
+    Parameters
+    ----------
+    scheme : Scheme or str
+        A table of your own, or the name of a known one.
+    splitting, clock : str
+        The defaults of the options of these names: see `Splitting`.
+    name : str, optional
+        By which reports call the method. The default is that of the triple if it is a built-in one, else the scheme's,
+        with the splitting and the clock where they are not "kinetic" and "physical".
+
+    Returns
+    -------
+    type
+        The same class for the same arguments. Call it with options to get an integrator, or give it to
+        `sympflow.register`. It pickles by its table.
+
+    Raises
+    ------
+    TypeError
+        If `scheme` is no scheme, or `name` no string.
+    ValueError
+        If there is no such scheme, splitting or clock; if the scheme is not consistent; or if the name is that of
+        another, built-in method.
+
+    Examples
+    --------
+    >>> from sympflow.systems import pendulum
+    >>> Ruth3 = splitting_method(Scheme("ruth3", 3, kicks=(7 / 24, 3 / 4, -1 / 24), drifts=(2 / 3, -2 / 3, 1.0)))
+    >>> method = Ruth3(dt=0.05)
+    >>> method, method.order
+    (ruth3(dt=0.05), 3)
+    """
+    table = checked_scheme(scheme_named(scheme) if isinstance(scheme, str) else scheme)
+    for argument, value, known in (("splitting", splitting, SPLITTINGS), ("clock", clock, CLOCKS)):
+        if not isinstance(value, str) or value not in known:
+            raise ValueError(f"`{argument}` must be one of {', '.join(map(repr, known))}; got {value!r}.")
+    if name is None:
+        row = _row_of(table, splitting, clock)
+        if row is not None:
+            return method_of_row(row)
+        name = "_".join([table.name, *(part for part in (splitting, clock) if part not in ("kinetic", "physical"))])
+    elif not isinstance(name, str):
+        raise TypeError(f"`name` must be a string, such as 'my_method'; got {type(name).__name__}.")
+    if not name.strip() or name in NAMES:
+        taken = "is a built-in method of another table" if name in NAMES else "is empty"
+        raise ValueError(f"`name` {name!r} {taken}: choose another one, as by name='my_method'.")
+    return _method_of(name, table, splitting, clock)
+
+
+def _row_of(scheme: Scheme, splitting: str, clock: str) -> str | None:
+    """Return the name of a triple in `TRIPLES`, if it is there."""
+    if SCHEMES.get(scheme.name) != scheme:
+        return None
+    triple = (scheme.name, splitting, clock)
+    return next((name for name, row in TRIPLES.items() if (row.scheme, row.splitting, row.clock) == triple), None)
+
+
 @cache
-def splitting_method(name: str) -> type[Splitting]:
+def method_of_row(name: str) -> type[Splitting]:
     """Return the integrator class of a row of `TRIPLES`."""
     row = TRIPLES[name]
-    scheme = SCHEMES[row.scheme]
+    return _new_class(type, name, SCHEMES[row.scheme], row.splitting, row.clock, row.source)
+
+
+@cache
+def _method_of(name: str, scheme: Scheme, splitting: str, clock: str) -> type[Splitting]:
+    cls = _new_class(_ByTable, name, scheme, splitting, clock, scheme.source)
+    cls._made_of = (name, scheme, splitting, clock)  # type: ignore[attr-defined]
+    return cls
+
+
+class _ByTable(type):
+    """The type of classes that no module holds: they pickle as the table that they are made of."""
+
+
+def _reduced(cls: _ByTable) -> Any:
+    made_of = vars(cls).get("_made_of")
+    return cls.__qualname__ if made_of is None else (_method_of, made_of)  # a subclass is found by its name
+
+
+copyreg.pickle(_ByTable, _reduced)
+
+
+def _new_class(kind: type[type], name: str, scheme: Scheme, splitting: str, clock: str, source: str) -> type[Splitting]:
     namespace: dict[str, Any] = {
         "name": name,
         "order": scheme.order,
         "scheme": scheme,
-        "source": row.source,
-        "splitting": row.splitting,
-        "clock": row.clock,
+        "source": source,
+        "splitting": splitting,
+        "clock": clock,
         "__annotations__": {"splitting": str, "clock": str},
-        "__doc__": f"{name}: order {scheme.order}, {row.source}\n\n{Splitting.__doc__}",
+        "__doc__": f"{name}: order {scheme.order}, {source}\n\n{Splitting.__doc__}",
         "__module__": __name__,
     }
-    return dataclass(frozen=True, repr=False)(type(name, (Splitting,), namespace))
+    return dataclass(frozen=True, repr=False)(kind(name, (Splitting,), namespace))
 
 
 def __getattr__(name: str) -> type[Splitting]:
     """The integrator classes as attributes of the module, where pickle looks for them."""
     if name in TRIPLES:
-        return splitting_method(name)
+        return method_of_row(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

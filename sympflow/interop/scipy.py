@@ -15,12 +15,13 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem, Stepper
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import check_applies, naming_plugin
-from sympflow.interop.matching import fixed_step, warn_of_another_system
+from sympflow.interop.matching import Comparison, fixed_step
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
 
 LOOK_AHEAD = 64
+REMEDY = "Pass one system twice: solve_ivp(system, ..., method=as_scipy(name, system)), or as_scipy(name) alone."
 
 
 def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: Any) -> type[FlowSolver]:
@@ -42,7 +43,9 @@ def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: An
     Raises
     ------
     TypeError, ValueError
-        If the method does not apply to the system, is adaptive, or has no such option.
+        If the method does not apply to the system, is adaptive, or has no such option. Within `solve_ivp` a ValueError
+        says that `fun` is another system than the one that the method solves, or depends on the time, as far as several
+        states and times tell, before the run and along it.
 
     Examples
     --------
@@ -70,7 +73,8 @@ class FlowSolver(OdeSolver):
     Parameters
     ----------
     fun, t0, y0, t_bound, vectorized
-        As for every `OdeSolver`. `fun` is evaluated once, to warn if it is not the system of the method.
+        As for every `OdeSolver`. Where `fun` is not the system of the method itself, it is evaluated at a dozen states
+        and times before the run, and along it, about once in 60 steps.
     max_step : float
         Longest time between two reported states; they are samples of the flow within its steps.
 
@@ -122,10 +126,11 @@ class FlowSolver(OdeSolver):
         self._block = 1
 
     def _check(self, fun: Callable[..., Any]) -> None:
-        self._solved: Any = self.system
+        integrator = self.integrator
+        given = integrator.given_flow
+        self._solved: Any = self.system or (None if given is None else given.system)
         if self._solved is None and isinstance(fun, HamiltonianSystem):
             self._solved = fun
-        integrator = self.integrator
         if (self._solved is None and not integrator.trained) or (integrator.trained and self._flow() is None):
             raise TypeError(
                 f"`system` is needed for method {integrator.name!r}: as_scipy({integrator.name!r}, system), or pass a "
@@ -140,15 +145,35 @@ class FlowSolver(OdeSolver):
         if self._solved is not None and self._solved is not self.system:
             check_applies(integrator, self._solved)
         self.y = self.y.astype(float)
+        self._comparison = Comparison("fun", integrator, self._solved, REMEDY)
+        if isinstance(fun, HamiltonianSystem):
+            self._comparison.with_system(fun)
         with np.errstate(all="ignore"):
             slope = np.asarray(self.fun(self.t, self.y), dtype=float)
         if slope.shape != self.y.shape:
             raise ValueError(f"`fun` must return shape {self.y.shape}, as `y0`; got {slope.shape}.")
-        known = fun is self._solved and not integrator.trained
-        if np.isfinite(slope).all() and not known:
-            flow = self._flow()
-            self.nfev += 1 if flow is None else flow.evaluations(0, 0, 1, "array")["force_evaluations"]
-            warn_of_another_system(integrator, self._solved, self.y, slope, stacklevel=5)
+        self._comparison.with_flow(self.y)
+        self._fun: Any = None if fun is self._solved else fun  # None: there is nothing to compare
+        if self._fun is not None:
+            self._comparison.at_start(self._slope, self.y, (self.t, self.t_bound))
+        self._count_compared()
+
+    def _compare_again(self, last: bool) -> None:
+        """Compare at the state, if it is the last or the run is due."""
+        if self._fun is not None and (last or self._comparison.is_due(self._k)):
+            self._comparison.at(self.t, self.y, self._slope(self.t, self.y), self._slope, self._grid.t0)
+            self._count_compared()
+
+    def _slope(self, t: float, y: np.ndarray) -> np.ndarray:
+        """`fun` in the precision in which it answers."""
+        self._counts.others += 1
+        return np.asarray(self._fun(t, y.copy()))
+
+    def _count_compared(self) -> None:
+        """Count the evaluations of the method's own velocity."""
+        n, self._comparison.states_compared = self._comparison.states_compared, 0
+        flow = self._comparison.flow if self._solved is None else None
+        self._counts.others += n if flow is None else n * flow.evaluations(0, 0, 1, "array")["force_evaluations"]
 
     @property
     def nfev(self) -> int:
@@ -180,6 +205,7 @@ class FlowSolver(OdeSolver):
         if self._part == self._parts:
             self._k, self._part = self._k + 1, 0
             self.t, self.y = self._next_anchor
+            self._compare_again(last=self.t == self.t_bound)
         else:
             h = self._h * self._part / self._parts
             self.t, self.y = self._t_anchor + h, self._shorter(h)

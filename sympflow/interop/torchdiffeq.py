@@ -23,12 +23,14 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import available, check_applies
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED
-from sympflow.interop.matching import fixed_step, warn_of_another_system
+from sympflow.interop.matching import Comparison, fixed_step
 from sympflow.interop.path import Path
 
 State = Tensor | tuple[Tensor, ...]
 _THEIRS = {*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver"}
 _RTOL, _ATOL = 1e-7, 1e-9
+_CHECKPOINTS = 5  # outputs of a run at which another right-hand side is compared
+_REMEDY = "Pass one system: odeint(system, ...), without options['system'] and without another function."
 
 
 def odeint(
@@ -47,8 +49,8 @@ def odeint(
     Parameters
     ----------
     func : callable
-        func(t, y). With our classical methods it must be a HamiltonianSystem, or `options["system"]` one. A flow never
-        calls it but once, to warn if it is not the flow's system.
+        func(t, y). With our classical methods it must be a HamiltonianSystem, or `options["system"]` one. If it is not
+        that system, it is called at several states and times, to refuse it where it differs.
     y0 : tensor of shape (..., 2d), or tuple (q, p) of tensors of shape (..., d)
     t : tensor of shape (n,)
         Increasing or decreasing; t[0] is the time of y0, and the grid t[0] + k·dt is anchored there.
@@ -66,6 +68,12 @@ def odeint(
     y : tensor (n, ..., 2d), or tuple of tensors (n, ..., d)
         With `event_fn`: (event time, [y0, state at the event]). Gradients reach y0, t and the weights of the flow, the
         event time by the implicit function theorem; they are those of the map that was executed.
+
+    Raises
+    ------
+    ValueError
+        If `func` is another system than the one that our method solves, or depends on the time, as far as several
+        states and times tell, at the start and along the run.
     """
     if not _is_ours(method):
         with _names_of_both():
@@ -82,14 +90,15 @@ def odeint(
     integrator, system = _build(func, method, options)
     y, pack = _joined(y0)
     _check_state(y, system, integrator)
-    if func is not system:
-        _check_right_hand_side(func, y0, t, integrator, system)
+    compared = _Compared(func, y0, t, integrator, system)
     path = Path(integrator, system, y, -1 if len(t) > 1 and t[0] > t[1] else 1)
     if event_fn is None:
-        return pack(torch.cat([y[None], path(t[1:] - t[0])]) if len(t) > 1 else y[None])
+        return pack(compared.run(path, t))
     if len(t) != 2:
         raise ValueError(f"`t` must have 2 entries with `event_fn`, the start and a direction; got {len(t)}.")
-    return _until_event(path, t[0], event_fn, pack)
+    found, states = _until_event(path, t[0], event_fn, pack)
+    compared.along(found[None], states[1:])
+    return found, pack(states)
 
 
 def odeint_event(
@@ -193,6 +202,8 @@ def _build(func: Any, method: Any, options: dict[str, Any] | None) -> tuple[Fixe
     if "step_size" in options:
         options["dt"] = float(options.pop("step_size"))
     integrator = fixed_step(method, options, "torchdiffeq")
+    if system is None and integrator.given_flow is not None:
+        system = integrator.given_flow.system
     if system is None and not (integrator.trained and integrator.flow is not None):  # type: ignore[attr-defined]
         raise TypeError(
             f"`func` must be a HamiltonianSystem for method {integrator.name!r}; got {type(func).__name__}. Pass one, "
@@ -232,23 +243,64 @@ def _check_state(y: Tensor, system: HamiltonianSystem | None, integrator: Integr
         raise ValueError("`y0` must be finite; it holds NaN or infinity. Remove these states.")
 
 
-def _check_right_hand_side(
-    func: Any, y0: State, t: Tensor, integrator: FixedStep, system: HamiltonianSystem | None
-) -> None:
-    """Warn if `func` at (t[0], y0) is not the velocity of the method's own motion."""
-    with torch.no_grad():
-        slope = _of_pairs(func, y0)(t[0], y0)
-    slope = _joined(slope)[0]
-    y = _joined(y0)[0]
-    first = tuple(0 for _ in y.shape[:-1])
-    warn_of_another_system(integrator, system, _numpy(y[first]), _numpy(slope[first]), stacklevel=4)
+class _Compared:
+    """Compares `func`, where it is not the system itself, with what the method solves: see `matching.Comparison`."""
+
+    def __init__(
+        self, func: Any, y0: State, t: Tensor, integrator: FixedStep, system: HamiltonianSystem | None
+    ) -> None:
+        flow = integrator.given_flow
+        self.comparison = comparison = Comparison("func", integrator, system, _REMEDY)
+        y, self.pack = _joined(y0)
+        start = _numpy(y).reshape(-1, y.shape[-1])[0]
+        if flow is not None and not any(w.requires_grad for w in flow.parameters()):  # it may be in training
+            comparison.with_flow(start.astype(float))
+        self.func: Any = None if func is system else _of_pairs(func, y0)
+        if self.func is None:
+            return
+        if isinstance(func, HamiltonianSystem):
+            comparison.with_system(func)
+        self.like, self.t0 = y, t[0]
+        comparison.at_start(self._slope, _numpy(y), (float(t[0]), float(t[-1])))
+
+    def _slope(self, t: float, y: np.ndarray) -> np.ndarray:
+        """`func` at states like y0, in their precision and form."""
+        with torch.no_grad():
+            state = torch.tensor(y, dtype=self.like.dtype, device=self.like.device)
+            return _numpy(_joined(self.func(self.t0.new_tensor(t), self.pack(state)))[0])
+
+    def run(self, path: Path, t: Tensor) -> Tensor:
+        """The states (n, ..., 2d) at the times t (n,), compared at some of them, and between where these are few."""
+        elapsed = t[1:] - t[0]
+        if not len(elapsed):
+            return path.y0[None]
+        if self.func is None:
+            return torch.cat([path.y0[None], path(elapsed)])
+        n_steps = int(float(elapsed[-1]) / path.h)
+        n_more = min(_CHECKPOINTS - 1, n_steps) if len(elapsed) < _CHECKPOINTS else 0
+        count = np.unique(n_steps * (np.arange(n_more) + 0.38) / max(n_more, 1) // 1)
+        more = elapsed.new_tensor(count * path.h)
+        states = path(torch.cat([more, elapsed]))
+        self.along(t[0] + more, states[: len(more)])
+        outputs = states[len(more) :]
+        some = np.unique(np.linspace(0, len(elapsed) - 1, _CHECKPOINTS).astype(int)).tolist()
+        self.along(t[1:][some], outputs[some])
+        return torch.cat([path.y0[None], outputs])
+
+    def along(self, t: Tensor, states: Tensor) -> None:
+        """Compare at states (n, ..., 2d) of the run, at the times t (n,)."""
+        if self.func is None:
+            return
+        for s, y in zip(t.tolist(), _numpy(states), strict=True):
+            if np.isfinite(y).all():
+                self.comparison.at(s, y, self._slope(s, y), self._slope, float(self.t0))
 
 
 def _numpy(x: Tensor) -> np.ndarray:
     return x.detach().cpu().numpy()
 
 
-def _until_event(path: Path, t0: Tensor, event_fn: Any, pack: Callable[[Tensor], Any]) -> tuple[Tensor, Any]:
+def _until_event(path: Path, t0: Tensor, event_fn: Any, pack: Callable[[Tensor], Any]) -> tuple[Tensor, Tensor]:
     with torch.no_grad():
         signs = torch.sign(event_fn(t0, pack(path.y0)))
 
@@ -257,7 +309,7 @@ def _until_event(path: Path, t0: Tensor, event_fn: Any, pack: Callable[[Tensor],
 
     s = path.first_zero(g)
     y = path(s[None])[0]
-    return (t0 + s).to(t0.dtype), pack(torch.stack([path.y0, y]))
+    return (t0 + s).to(t0.dtype), torch.stack([path.y0, y])
 
 
 def _of_pairs(func: Any, y0: Any) -> Any:
@@ -303,7 +355,8 @@ class _Solver:
             shapes = getattr(func, "shapes", shapes)
             func = func.base_func
         integrator, system = _build(func, self.method, options)
-        self.y0, self.shapes = y0, shapes
+        self.y0, self.shapes, self.func = y0, shapes, func
+        self.integrator, self.system = integrator, system
         y, _ = _joined(self._given(y0))
         _check_state(y, system, integrator)
         self.path = Path(integrator, system, y, self.direction)
@@ -313,15 +366,19 @@ class _Solver:
         return set()
 
     def integrate(self, t: Tensor) -> Tensor:
-        return self._flat(torch.cat([self.path.y0[None], self.path(self.direction * (t[1:] - t[0]))]))
+        return self._flat(self._compared(t).run(self.path, self.direction * t))
 
     def integrate_until_event(self, t0: Tensor, event_fn: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
         def g(s: Tensor, y: Tensor) -> Tensor:
             return event_fn((t0 + self.direction * s).to(t0), self._flat(y[None])[0])
 
+        self._compared(torch.stack([t0, t0 + self.direction]))
         s = self.path.first_zero(g)
         y = torch.stack([self.path.y0, self.path(s[None])[0]])
         return t0 + self.direction * s, self._flat(y)
+
+    def _compared(self, t: Tensor) -> _Compared:
+        return _Compared(self.func, self._given(self.y0), self.direction * t, self.integrator, self.system)
 
     def _given(self, y: Tensor) -> Any:
         """The state as the user gave it: torchdiffeq flattens tuples."""

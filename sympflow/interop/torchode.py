@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+import torch
 from torch import Tensor
 
 try:
@@ -22,10 +24,13 @@ try:
 except ImportError as error:  # pragma: no cover
     raise ImportError("sympflow.interop.torchode needs torchode: pip install torchode.") from error
 
+from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.registry import check_applies, naming_plugin
-from sympflow.interop.matching import fixed_step
+from sympflow.interop.matching import Comparison, fixed_step
+
+_REMEDY = "Register the system of the term: register(name, system), and solve_ivp(system, ...)."
 
 
 def register(name: str, system: HamiltonianSystem, method: Any = None, **options: Any) -> None:
@@ -36,7 +41,8 @@ def register(name: str, system: HamiltonianSystem, method: Any = None, **options
     name : str
         What `torchode.solve_ivp(method=name)` will say; also the method, if that is not given.
     system : HamiltonianSystem
-        What is solved: torchode's term is not evaluated.
+        What is solved. torchode's term, where it is not this system, is evaluated at several states and times of a run:
+        a ValueError says that it is another one.
     method : str, trained flow or Integrator, optional
     **options
         Options of the method. The step length is torchode's `dt0`, so `dt` is not one of them.
@@ -70,6 +76,41 @@ class Beginning(NamedTuple):
     y0: Tensor
 
 
+class Run:
+    """One run: the end of each sample, and what its term is compared with."""
+
+    def __init__(self, term: Any, problem: Any, method: SymplecticStep, stats: dict[str, Any], args: Any) -> None:
+        self.ends: Tensor = problem.t_end.detach()
+        self._term, self._stats, self._args = term, stats, args
+        self._starts, self._y0 = problem.t_start.detach(), problem.y0.detach()
+        self._n_steps = 0
+        self._comparison = Comparison("term", method.integrator, method.system, _REMEDY)
+        self._known = term.f is method.system
+        if self._known:
+            return
+        if isinstance(term.f, HamiltonianSystem):
+            self._comparison.with_system(term.f)
+        span = float(self._starts[0]), float(self.ends[0])
+        self._comparison.at_start(self._at_fraction, to_numpy(self._y0), span)
+
+    def _at_fraction(self, t: float, y: np.ndarray) -> np.ndarray:
+        """The slopes of the term at t in the first sample, and as far on their way in the others."""
+        t0, t1 = self._starts[0], self.ends[0]
+        part = (t - t0) / (t1 - t0) if t1 != t0 else 0.0
+        return self._slopes(self._starts + part * (self.ends - self._starts), self._y0.new_tensor(y))
+
+    def _slopes(self, t: Tensor, y: Tensor) -> np.ndarray:
+        with torch.no_grad():
+            return to_numpy(self._term.vf(t, y, self._stats, self._args))
+
+    def compare(self, t: Tensor, y: Tensor, last: bool) -> None:
+        """Compare the term at the states y at t, if a comparison is due or the steps from there are the last."""
+        self._n_steps += 1
+        if not self._known and (self._comparison.is_due(self._n_steps) or last):
+            t, y = t.detach(), y.detach()
+            self._comparison.at(to_numpy(t), to_numpy(y), self._slopes(t, y), self._at_fraction, float(self._starts[0]))
+
+
 class SymplecticStep(SingleStepMethod):
     """A fixed-step method of sympflow as a torchode step; dense output by a shorter step, without interpolation."""
 
@@ -79,13 +120,13 @@ class SymplecticStep(SingleStepMethod):
         # the longest step that a flow was trained for; the state's own module, so that its weights are parameters
         self.flow = integrator.flow_for(system)
 
-    def init(self, term: Any, problem: Any, f0: Tensor | None, *, stats: dict[str, Any], args: Any) -> Tensor:
-        """The state of the method: the end of each sample."""
+    def init(self, term: Any, problem: Any, f0: Tensor | None, *, stats: dict[str, Any], args: Any) -> Run:
+        """The state of the method: its run."""
         if problem.n_features != 2 * self.system.ndof:
             raise ValueError(
                 f"`y0` must have shape (batch, {2 * self.system.ndof}), [q, p]; got {problem.n_features} features."
             )
-        return problem.t_end.detach()
+        return Run(term, problem, self, stats, args)
 
     def step(
         self,
@@ -94,14 +135,14 @@ class SymplecticStep(SingleStepMethod):
         y0: Tensor,
         t0: Tensor,
         dt: Tensor,
-        state: Tensor,
+        state: Run,
         *,
         stats: dict[str, Any],
         args: Any,
-    ) -> tuple[StepResult, Beginning, Tensor, None]:
-        left = state - t0.detach()
+    ) -> tuple[StepResult, Beginning, Run, None]:
+        left = state.ends - t0.detach()
         # torchode cuts a step away from the end to one of length 0, and would go on for ever
-        if ((dt.detach() * left <= 0) & (left.abs() > 1e-9 * (1 + state.abs()))).any():
+        if ((dt.detach() * left <= 0) & (left.abs() > 1e-9 * (1 + state.ends.abs()))).any():
             raise ValueError(
                 "`dt0` must have the sign of the direction in which its sample runs: make it negative "
                 "for samples that run backward."
@@ -111,13 +152,14 @@ class SymplecticStep(SingleStepMethod):
                 f"`dt0` must be at most the flow's Δt = {self.flow.dt:g}; got {float(dt.detach().abs().max()):g}. "
                 "Drive it with torchode.FixedStepController and a smaller dt0."
             )
+        state.compare(t0, y0, last=bool((left.abs() <= dt.detach().abs() * (1 + 1e-12)).all()))
         return StepResult(self._advance(y0, dt), None), Beginning(t0, y0), state, None
 
     def _advance(self, y: Tensor, h: Tensor) -> Tensor:
         with naming_plugin(self.integrator):
             return self.integrator.step(self.system, 0.0, y, h.to(y.dtype))
 
-    def merge_states(self, accept: Tensor, current: Tensor, previous: Tensor) -> Tensor:
+    def merge_states(self, accept: Tensor, current: Run, previous: Run) -> Run:
         return current
 
     def convergence_order(self) -> int:

@@ -12,13 +12,18 @@ from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels import families
 from sympflow.kernels.codegen import statements
+from sympflow.kernels.families import is_large
 from sympflow.kernels.modules import load_algebra, run_rows
 from sympflow.kernels.protocol import Kernel, Run, Steps
 
 __all__ = ["ImplicitKernel", "implicit_kernel"]
 
-Tableau = tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]
+Tableau = tuple[tuple[tuple[float, ...], ...], tuple[float, ...], tuple[float, ...]]
+"""A, B and scale of the increments K_i = h scale_i f(y + Σ_j A_ij K_j) and the step y + Σ_i B_i K_i.
+
+In Butcher's letters a_ij = A_ij scale_j and b_i = B_i scale_i."""
 
 
 def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> ImplicitKernel:
@@ -45,8 +50,8 @@ class ImplicitKernel(Kernel):
     ----------
     system : HamiltonianSystem
         Symbolic.
-    tableau : (A, b)
-        As tuples of numbers.
+    tableau : (A, B, scale)
+        As tuples of numbers: see `Tableau`.
     compensated : bool
         Sum with Kahan's compensation in runs.
     """
@@ -92,8 +97,8 @@ class ImplicitKernel(Kernel):
 
 @lru_cache(maxsize=256)
 def _load(algebra: str, tableau: Tableau, compensated: bool) -> ModuleType:
-    A, b = tableau
-    return load_algebra(algebra, ["newton"], COMPENSATED=compensated, STAGES=len(b), A=A, B=b)
+    A, B, scale = tableau
+    return load_algebra(algebra, ["newton"], COMPENSATED=compensated, STAGES=len(B), A=A, B=B, SCALE=scale)
 
 
 def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:
@@ -105,6 +110,10 @@ def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:
         If a function in H has no counterpart in compiled code.
     """
     variables = symbols.q + symbols.p
+    if is_large(symbols):
+        return f"NDOF = {symbols.ndof}\n\n\n" + families.gradient_and_hessian_source(
+            symbols.H, variables, "gradient_and_hessian"
+        )
     slopes = [sp.diff(symbols.H, s) for s in variables]
     triangle = [(i, j) for i in range(len(variables)) for j in range(i, len(variables))]
     entries = {ij: sp.diff(slopes[ij[0]], variables[ij[1]]) for ij in triangle}

@@ -57,7 +57,7 @@ class SplittingLoops:
     def __init__(self, system: HamiltonianSystem) -> None:
         self.ndof = system.ndof
         if not system.separable:
-            raise ValueError("`system` is not separable, so no splitting method applies: use a Runge–Kutta method.")
+            raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
         if system.symbols is not None:
             from sympflow.kernels.codegen import algebra_source  # SymPy, which Numba functions do without
             from sympflow.kernels.families import is_large

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.energy import failed
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
@@ -28,9 +29,11 @@ def reference_error(sol: Solution, reference: Reference | Solution | ArrayLike |
     TypeError
         If `sol` is not a Solution, or `reference` is nothing that holds states.
     ValueError
-        If the reference is not at the times of the solution.
+        If the reference is not at the times of the solution, or is a solution of another problem.
     """
     check_solution(sol)
+    if reference is not None:
+        check_problem(reference, sol.system, sol.t_span[0], to_numpy(sol.y0))
     y = to_numpy(sol.y).astype(float)
     if reference is None:
         reference = compute_reference(sol.system, sol.t_span, to_numpy(sol.y0), sol.t)
@@ -43,6 +46,52 @@ def reference_error(sol: Solution, reference: Reference | Solution | ArrayLike |
         raise ValueError(f"`reference` must have the shape {y.shape} of `sol.y`; got {y_ref.shape}.")
     with np.errstate(all="ignore"):
         return np.linalg.norm(y - y_ref, axis=-2)
+
+
+OTHER_ENERGY = 1e-2  # of the energy's scale: what no reference of a problem is off by
+SAMPLED = 32  # states at which vector fields are compared
+
+
+def check_problem(reference: object, system: HamiltonianSystem, t0: float, y0: np.ndarray) -> None:
+    """Raise a ValueError if a reference is none of this problem: another system, another y0, another energy.
+
+    A Solution tells its system, whose vector field is compared along it, and its y0. Of states alone the energy is all
+    that can be looked at.
+    """
+    if isinstance(reference, Solution):
+        if reference.system is not system and not _same_field(reference, system):
+            raise ValueError(
+                f"`reference` is a solution of another system, {reference.system.name!r}: pass one of {system.name!r}."
+            )
+        start = to_numpy(reference.y0)
+        eps = max(1e-12, *(4 * float(np.finfo(y.dtype).eps) for y in (start, y0)))
+        same = start.shape == y0.shape and np.allclose(start, y0, rtol=eps, atol=eps * np.abs(y0).max(initial=0.0))
+        if reference.t_span[0] == t0 and not same:
+            raise ValueError("`reference` is a solution from another `y0`: solve from the one that is compared.")
+        return
+    states = states_of(reference.y if isinstance(reference, Reference) else reference)
+    if states.shape[:-1] != y0.shape:
+        return  # the shape is refused where it is needed
+    with np.errstate(all="ignore"):
+        H0 = to_numpy(system.hamiltonian(y0))
+        H = to_numpy(system.hamiltonian(np.moveaxis(states, -1, 0)))
+        scale = np.maximum(np.abs(H0), np.abs(y0 * to_numpy(system.gradient(y0))).sum(-1))
+        off = np.abs(H - H0).max(0) > OTHER_ENERGY * scale
+    if np.all(off):
+        raise ValueError("`reference` has another energy than `y0`: it is no solution of this problem from there.")
+
+
+def _same_field(sol: Solution, system: HamiltonianSystem) -> bool:
+    """True if the vector fields agree along a solution."""
+    if sol.system.ndof != system.ndof:
+        return False
+    y = to_numpy(sol.y).astype(float)
+    states = np.moveaxis(y, -2, -1).reshape(-1, y.shape[-2])
+    states = states[:: max(1, len(states) // SAMPLED)]
+    with np.errstate(all="ignore"):
+        mine, other = (to_numpy(s.vector_field(states)) for s in (system, sol.system))
+    size = np.abs(other[np.isfinite(other)]).max(initial=0.0)
+    return np.allclose(mine, other, rtol=0, atol=1e-9 * size, equal_nan=True)
 
 
 def states_of(reference: object) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,16 +26,21 @@ class Reference:
     y : ndarray (..., 2d, n)
     method : str
         In words.
-    accuracy : float
-        Estimate of the largest error ‖y − y(t)‖; of a batch the median over its trajectories.
+    accuracy : float or None
+        Estimate of the largest error ‖y − y(t)‖; of a batch the median over its trajectories. None if it is unknown.
     """
 
     t: np.ndarray
     y: np.ndarray = field(repr=False)
     method: str
-    accuracy: float
+    accuracy: float | None
 
-    def summary(self) -> dict[str, str | float]:
+    def described(self) -> str:
+        """The method and its accuracy in words."""
+        known = "of unknown accuracy" if self.accuracy is None else f"good to {self.accuracy:.1e}"
+        return f"{self.method}, {known}"
+
+    def summary(self) -> dict[str, str | float | None]:
         """The method and its accuracy, as reports hold them."""
         return {"method": self.method, "accuracy": self.accuracy}
 
@@ -66,20 +72,21 @@ def _kahan_li(
     system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, t: np.ndarray, target: float
 ) -> Reference:
     dt = 4 * system.dt
-    previous, best = None, None
+    previous, best, accuracy = None, None, math.inf
     for _ in range(_HALVINGS):
         sol = solve(system, "kahan_li8", t_span, y0, t_eval=t, dt=dt)
         y = to_numpy(sol.y) if sol.y.shape[-1] == len(t) else None
         if y is not None and previous is not None:
-            accuracy = _distance(y, previous)
-            if best is not None and not accuracy < best.accuracy:
+            before, accuracy = accuracy, _distance(y, previous)
+            if best is not None and not accuracy < before:
+                accuracy = before
                 break
             best = Reference(t, y, f"Kahan–Li 8, dt = {dt:.3g}", accuracy)
             if accuracy <= max(target, _ROUNDING * _size(y)):
                 break
         previous = y
         dt /= 2
-    if best is None or not best.accuracy < _USELESS * _size(best.y):
+    if best is None or not accuracy < _USELESS * _size(best.y):
         raise ValueError(
             f"`t_span` reaches beyond where {system.name!r} can be solved from `y0` (a singularity or chaos), and "
             "no reference converges there. End it earlier, or pass your own `reference`."

@@ -20,19 +20,8 @@ from sympflow.solution import Solution, check_solution
 
 
 def step_tangents(sol: Solution) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """The steps of a run as a stream of chunks: t and h (n, ...), Jacobians A (n, ..., 2d, 2d).
-
-    Each step is differentiated in the precision in which it was executed, so A holds the rounding of that precision;
-    it is returned as float64, in which everything that follows is computed.
-    """
-    system, integrator = sol.system, sol.integrator
-    for times, states, lengths in integrator.steps(system, sol.t_span, sol.y0):
-        y = to_numpy(states)
-        batch = y.shape[:-1]
-        t, h = (np.broadcast_to(x.reshape(*x.shape, *[1] * (len(batch) - x.ndim)), batch) for x in (times, lengths))
-        with np.errstate(all="ignore"):
-            _, A = integrator.tangent(system, float(t.flat[0]), y, h.astype(y.dtype))
-        yield t, h, A.astype(float)
+    """The steps of a run as a stream of chunks: t and h (n, ...), Jacobians (n, ..., k, k); k = 2d but if extended."""
+    return sol.integrator.executed(sol.system, sol.t_span, sol.y0)
 
 
 def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.ndarray:
@@ -136,10 +125,11 @@ def symplecticity_defect(
     s = natural_scale(sol.system) if scale is None else _factors(scale, d)
     if not (np.isfinite(s) & (s > 0)).all():
         raise ValueError(f"`scale` must be positive and finite, one factor for each q; got {s.tolist()}.")
-    weights = np.concatenate([s, 1 / s])
-    J = np.block([[np.zeros((d, d)), np.eye(d)], [-np.eye(d), np.zeros((d, d))]])
     worst = np.zeros(sol.y.shape[:-2])
     for _, _, A in step_tangents(sol):
+        n = A.shape[-1] // 2
+        weights = np.concatenate([np.tile(s, n // d), np.tile(1 / s, n // d)])
+        J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
         with np.errstate(all="ignore"):
             scaled = weights[:, None] * A / weights
             finite = np.isfinite(scaled).all((-2, -1))

@@ -6,6 +6,7 @@ attempt that fills in its row, and a line in a study's table of metrics.
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,9 +23,17 @@ from sympflow.metrics.energy import energy_drift, energy_error, failed, max_ener
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.symplectic import symplecticity_defect, volume_error
 from sympflow.solution import Solution
+from sympflow.studies.reports import seconds
 
 REFUSALS = (ValueError, TypeError, ImportError, NotImplementedError)
 """Errors by which a method says that it does not apply; any other is a failure."""
+
+
+def check_progress(progress: object) -> None:
+    """Raise unless it is None or can be called with a line of text."""
+    if progress is not None and not callable(progress):
+        raise TypeError(f"`progress` must be a function of one line of text; got {progress!r}.")
+
 
 # methods ----------------------------------------------------------------------------------------------------------
 
@@ -137,6 +146,9 @@ class Row:
         The code that ran: "compiled", "numpy", "torch", "scipy" or "torchdiffeq".
     run_time, run_time_spread : float
         Median and interquartile range of the repeats, of all trajectories together, in seconds.
+    compile_time : float
+        Seconds by which the first run of the method, over a few steps, took longer than a second one: compiling its
+        loops, or loading them from the cache, and imports. They are no part of the run time.
     repeats : int
         Runs that were timed, where their number depends on the row.
     force_evaluations, hessian_evaluations : int or float
@@ -185,6 +197,7 @@ class Row:
     backend: str | None = None
     run_time: float | None = None
     run_time_spread: float | None = None
+    compile_time: float | None = None
     repeats: int = 0
     force_evaluations: float | None = None
     hessian_evaluations: float | None = None
@@ -280,6 +293,24 @@ class Attempt:
         )
         if sol.success and "domain_exit" in stats:
             self.note(f"The state left the flow's domain at t = {stats['domain_exit']:.4g}.")
+
+    def warm_up(
+        self, run: Callable[[Any, tuple[float, float], np.ndarray], object], t: np.ndarray, t0: float, dt: float
+    ) -> None:
+        """Compile what the candidate's runs need, and enter the time that it took; a run that fails is left to `run`.
+
+        `dt` is a step of the system, for methods that choose theirs.
+        """
+        integrator = self.candidate.integrator
+        if integrator is None:
+            return
+        step = (isinstance(integrator, FixedStep) and integrator.dt) or dt
+        try:
+            with warnings.catch_warnings(), np.errstate(all="ignore"):
+                warnings.simplefilter("ignore")
+                self.fill(compile_time=warm_up(lambda span, times: run(integrator, span, times), step, t, t0))
+        except Exception:  # the run itself says why
+            return
 
     def measure(self, metrics: Mapping[str, Metric], asked: Sequence[str]) -> None:
         """Fill in the metrics asked for; one that cannot be had leaves a note, and so does a RuntimeWarning."""
@@ -383,15 +414,58 @@ class RunTime:
 def interleaved(calls: Sequence[Callable[[], object]], repeats: int) -> list[RunTime]:
     """Time every call `repeats` times, going round over all of them, so that a slow spell of the machine hits each.
 
-    The calls should have run before: nothing is warmed up here.
+    The calls should have run before, or been warmed up: see `warm_up`.
     """
     if not calls:
         return []
-    seconds = np.empty((repeats, len(calls)))
+    passed = np.empty((repeats, len(calls)))
     for r in range(repeats):
         for i, call in enumerate(calls):
             start = time.perf_counter()
             call()
-            seconds[r, i] = time.perf_counter() - start
-    low, median, high = np.quantile(seconds, [0.25, 0.5, 0.75], axis=0)
+            passed[r, i] = time.perf_counter() - start
+    low, median, high = np.quantile(passed, [0.25, 0.5, 0.75], axis=0)
     return [RunTime(float(m), float(h - lo)) for lo, m, h in zip(low, median, high, strict=True)]
+
+
+NEGLIGIBLE = 0.1  # seconds of compilation that tables leave out
+
+
+def shown_compile_time(row: Row) -> str:
+    """The compile time as tables show it: empty where it is negligible."""
+    return seconds(row.compile_time) if (row.compile_time or 0.0) >= NEGLIGIBLE else ""
+
+
+WARM_STEPS = 3.5
+"""Steps of a run that compiles: whole ones, and the shorter ones of the outputs between them."""
+
+
+def warm_up(run: Callable[[tuple[float, float], np.ndarray], object], step: float, t: np.ndarray, t0: float) -> float:
+    """Make a run twice over a few steps, so that all that a long one needs is compiled; the seconds of doing so.
+
+    Parameters
+    ----------
+    run : callable
+        Solves over an interval with outputs at some instants.
+    step : float
+        Length of a step, about.
+    t : ndarray (n,)
+        The instants of the long run, up to its end: the short one has as many.
+    t0 : float
+        Its start.
+
+    Returns
+    -------
+    float
+        The time of the first run beyond that of the second.
+    """
+    length = float(t[-1]) - t0
+    short = math.copysign(min(abs(length), WARM_STEPS * step), length)
+    times = t0 + (t - t0) * (short / length)
+    times[-1] = t0 + short
+    passed = []
+    for _ in range(2):
+        start = time.perf_counter()
+        run((t0, t0 + short), times)
+        passed.append(time.perf_counter() - start)
+    return max(0.0, passed[0] - passed[1])

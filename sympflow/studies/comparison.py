@@ -15,14 +15,23 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import check_counts, check_t_span
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
-from sympflow.metrics.accuracy import states_of
+from sympflow.metrics.accuracy import check_problem, states_of
 from sympflow.metrics.energy import max_energy_error
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
 from sympflow.solver import check_y0, solve
 from sympflow.studies import attempts
-from sympflow.studies.attempts import Attempt, Candidate, Metric, Row, candidates, interleaved, tolerance_of
+from sympflow.studies.attempts import (
+    Attempt,
+    Candidate,
+    Metric,
+    Row,
+    candidates,
+    interleaved,
+    shown_compile_time,
+    tolerance_of,
+)
 from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table, title
 
 if TYPE_CHECKING:
@@ -74,7 +83,8 @@ def compare(
     n_outputs : int
         Number of instants, equally spaced and ending at the end of the interval.
     repeats : int
-        Runs that are timed, interleaved over the methods, after one that is not.
+        Runs that are timed, interleaved over the methods, after one that is not. What compiles them is told apart, as
+        `compile_time`.
     match : "time", "evaluations" or "energy_error", optional
         Tune the steps and tolerances of the methods after the first until they equal it in this.
         By default each method runs at its stated step or tolerance.
@@ -113,15 +123,17 @@ def compare(
         raise ValueError("`t_span` has length zero, so there is nothing to compare: choose a later end.")
     start = check_y0(system, system.y0 if y0 is None else y0, None)
     t = t0 + (t1 - t0) * np.arange(1, n_outputs + 1) / n_outputs
-    given = None if reference is None else _given(reference, start, t)
+    attempts.check_progress(progress)
+    given = None if reference is None else _given(reference, system, t0, start, t)
     say = progress or (lambda text: None)
 
-    def run(integrator: Any) -> Solution:
-        return solve(system, integrator, (t0, t1), start, t_eval=t, backend=backend)
+    def run(integrator: Any, t_span: tuple[float, float] = (t0, t1), times: np.ndarray = t) -> Solution:
+        return solve(system, integrator, t_span, start, t_eval=times, backend=backend)
 
     runs = [Attempt(c, Row(_identify(system), c.method, c.label)) for c in candidates(methods, dt)]
     for one in runs:
         say(f"{system.name}: running {one.candidate.label}")
+        one.warm_up(run, t, t0, system.dt)
         one.run(run)
     if match is not None:
         _match(runs, match, run, system, repeats, say)
@@ -156,16 +168,23 @@ def _note_backends(runs: Sequence[Attempt]) -> None:
             run.note("Runs in eager torch, while others run compiled: the run times are not like for like.")
 
 
-def _given(reference: Reference | Solution | ArrayLike, y0: np.ndarray, t: np.ndarray) -> Reference:
+def _given(
+    reference: Reference | Solution | ArrayLike,
+    system: HamiltonianSystem,
+    t0: float,
+    y0: np.ndarray,
+    t: np.ndarray,
+) -> Reference:
     """The reference that was given, if it is one and fits."""
     if isinstance(reference, Reference | Solution):
         if len(reference.t) != len(t) or not np.allclose(reference.t, t, rtol=1e-12, atol=0):
             raise ValueError(f"`reference` must be at the {len(t)} instants that are compared: see `.t` of the result.")
-        found = reference if isinstance(reference, Reference) else Reference(t, states_of(reference.y), "given", 0.0)
+        found = reference if isinstance(reference, Reference) else Reference(t, states_of(reference.y), "given", None)
     else:
-        found = Reference(t, states_of(reference), "given", 0.0)
+        found = Reference(t, states_of(reference), "given", None)
     if found.y.shape != (*y0.shape, len(t)):
         raise ValueError(f"`reference` must have the shape {(*y0.shape, len(t))} of the states; got {found.y.shape}.")
+    check_problem(reference, system, t0, y0)
     return found
 
 
@@ -200,10 +219,10 @@ def _errors(
             attempts.accuracy(one, truth)
         found = [one.row.error for one in runs if one.row.error is not None]
         target = min(found, default=math.inf) / 100
-        if given is not None or truth.accuracy <= target:
+        if truth.accuracy is None or given is not None or truth.accuracy <= target:
             break
     for one in runs:
-        if one.row.error is not None and one.row.error < 3 * truth.accuracy:
+        if truth.accuracy is not None and one.row.error is not None and one.row.error < 3 * truth.accuracy:
             one.note("The error is no larger than the uncertainty of the reference.")
     return truth
 
@@ -248,7 +267,8 @@ def _match(
         say(f"{system.name}: matching {one.candidate.label}")
         integrator, reached = matched(one.candidate.integrator, system, figure, target, what == "energy_error")
         one.candidate = replace(one.candidate, integrator=integrator)
-        one.row = Row(_identify(system), one.candidate.method, one.candidate.label)
+        row = Row(_identify(system), one.candidate.method, one.candidate.label)
+        one.row = replace(row, compile_time=one.row.compile_time)
         one.run(run)
         if not abs(math.log(reached / target)) < 0.1:
             one.note(f"Matched only to {reached:.2g} where {anchor.candidate.label} has {target:.2g}.")
@@ -344,7 +364,15 @@ class Comparison(Report):
 
     columns: ClassVar[tuple[str, ...]] = (
         *("system", "method", "label", "status", "reason", "dt", "tolerance", "backend", "run_time", "run_time_spread"),
-        *("force_evaluations", "hessian_evaluations", "error", "energy_error", "energy_drift", "energy_drift_error"),
+        *(
+            "compile_time",
+            "force_evaluations",
+            "hessian_evaluations",
+            "error",
+            "energy_error",
+            "energy_drift",
+            "energy_drift_error",
+        ),
         *("volume_error", "symplecticity_defect", "time_reversal_error", "training_time"),
     )
 
@@ -460,6 +488,7 @@ def _columns(rows: Sequence[Row]) -> list[Column]:
         Column("sympl. defect", [number(row.symplecticity_defect) for row in rows]),
         Column("reversal", [number(row.time_reversal_error) for row in rows]),
         Column("training", [seconds(row.training_time) for row in rows]),
+        Column("compiled in", [shown_compile_time(row) for row in rows]),
         Column("status", ["" if row.status == "ok" else row.status for row in rows], left=True),
     ]
 
@@ -470,7 +499,7 @@ def _settings(c: Comparison) -> str:
     if c.match:
         text += f", matched in {c.match.replace('_', ' ')}"
     if c.reference is not None:
-        text += f"; reference: {c.reference.method}, good to {number(c.reference.accuracy)}"
+        text += f"; reference: {c.reference.described()}"
     return text
 
 

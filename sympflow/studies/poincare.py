@@ -89,7 +89,7 @@ def poincare_section(
         raise TypeError("`y0` is a tensor, but crossings are located on NumPy arrays: pass y0.numpy().")
     start = check_y0(system, system.y0 if y0 is None else y0, None)
     integrator = integrator.resolved(system, start, abs(span[1] - span[0]))
-    check_applies(integrator, system)
+    check_applies(integrator, system, start)
     index = _check_coordinate(coordinate, system.ndof)
     if direction not in (-1, 0, 1):
         raise ValueError(f"`direction` must be 1 (upwards), -1 (downwards) or 0 (both); got {direction!r}.")

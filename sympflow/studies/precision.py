@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_counts, check_t_span
+from sympflow.arguments import check_counts, check_t_span, positive_numbers
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.metrics.energy import failed
@@ -22,7 +22,7 @@ from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
 from sympflow.solver import check_y0, solve
 from sympflow.studies import attempts
-from sympflow.studies.attempts import Attempt, Candidate, Row, candidates, interleaved, tolerance_of
+from sympflow.studies.attempts import Attempt, Candidate, Row, candidates, interleaved, shown_compile_time, tolerance_of
 from sympflow.studies.figure_style import saved
 from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table, title
 
@@ -75,7 +75,8 @@ def work_precision(
     repeats : int
         Timed runs of each point, interleaved over all points of one batch size.
     budget : float
-        Seconds that the repeats of one point may take; where one run takes longer, it is not repeated.
+        Seconds that the repeats of one point may take; where one run takes longer, it is not repeated. All that a
+        method runs is compiled before, which `compile_time` tells.
     backend, progress
         As for `compare`.
 
@@ -92,9 +93,12 @@ def work_precision(
     """
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
-    for name, values in (("steps", steps or [1.0]), ("tolerances", tolerances)):
-        if not all(0 < x < math.inf for x in values):
-            raise ValueError(f"`{name}` must be positive and finite; got {list(values)}.")
+    tolerances = positive_numbers("tolerances", tolerances)
+    if steps is not None:
+        steps = positive_numbers("steps", steps)
+    if isinstance(budget, bool) or not isinstance(budget, int | float | np.number) or not budget >= 0:
+        raise ValueError(f"`budget` must be a number of seconds; got {budget!r}: pass 0 to repeat nothing.")
+    attempts.check_progress(progress)
     check_counts(n_outputs=n_outputs, repeats=repeats)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     if t0 == t1:
@@ -166,11 +170,15 @@ class Conditions:
     def trajectories(self) -> int:
         return self.y0.size // self.y0.shape[-1]
 
-    def run(self, integrator: Any) -> Solution:
-        """The solution from all initial states, or of a method that takes them one by one from a few."""
+    def run(self, integrator: Any, t_span: tuple[float, float] | None = None, t: np.ndarray | None = None) -> Solution:
+        """The solution from all initial states, or of a method that takes them one by one from a few.
+
+        Over another interval if that is given.
+        """
         few = integrator.one_by_one and self.trajectories > SAMPLE
         y0 = self.y0[:SAMPLE] if few else self.y0
-        return solve(self.system, integrator, self.t_span, y0, t_eval=self.t, backend=self.backend)
+        times = self.t if t is None else t
+        return solve(self.system, integrator, t_span or self.t_span, y0, t_eval=times, backend=self.backend)
 
 
 def _measure(
@@ -184,8 +192,9 @@ def _measure(
     points: list[Attempt] = []
     for candidate, integrators in swept:
         say(candidate.label)
+        compile_time = _compiled(replace(candidate, integrator=integrators[-1]), conditions)
         for integrator in integrators:
-            point = _first(replace(candidate, integrator=integrator), conditions)
+            point = _first(replace(candidate, integrator=integrator), conditions, compile_time)
             points.append(point)
             row = point.row
             if row.status == "not applicable" or (row.energy_error or math.inf) < FLOOR:
@@ -203,10 +212,17 @@ def _measure(
     return [point.row for point in points], truth
 
 
-def _first(candidate: Candidate, conditions: Conditions) -> Attempt:
-    """The first run of a point, which also compiles."""
+def _compiled(candidate: Candidate, conditions: Conditions) -> float | None:
+    """Compile all that the points of a method run; the seconds that it took, None if it does not run."""
+    point = Attempt(candidate, Row(conditions.system.name, candidate.method, candidate.label))
+    point.warm_up(conditions.run, conditions.t, conditions.t_span[0], conditions.system.dt)
+    return point.row.compile_time
+
+
+def _first(candidate: Candidate, conditions: Conditions, compile_time: float | None) -> Attempt:
+    """The first run of a point."""
     row = Row(conditions.system.name, candidate.method, candidate.label, trajectories=conditions.trajectories)
-    point = Attempt(candidate, row)
+    point = Attempt(candidate, replace(row, compile_time=compile_time))
     point.run(conditions.run)
     if (sol := point.sol) is None:
         return point
@@ -241,7 +257,7 @@ def _errors(points: Sequence[Attempt], conditions: Conditions) -> Reference | No
     for point in points:
         if point.row.status == "ok":
             attempts.accuracy(point, truth)
-            resolved = (point.row.error or 0.0) >= MARGIN * truth.accuracy
+            resolved = (point.row.error or 0.0) >= MARGIN * (truth.accuracy or 0.0)
             point.fill(status="ok" if resolved else "uncertain")
     return truth
 
@@ -301,8 +317,8 @@ class WorkPrecision(Report):
 
     columns: ClassVar[tuple[str, ...]] = (
         *("system", "method", "label", "trajectories", "dt", "tolerance", "status", "reason", "backend", "run_time"),
-        *("run_time_spread", "repeats", "force_evaluations", "hessian_evaluations", "error", "energy_error"),
-        *("training_time", "break_even"),
+        *("run_time_spread", "compile_time", "repeats", "force_evaluations", "hessian_evaluations", "error"),
+        *("energy_error", "training_time", "break_even"),
     )
 
     system: HamiltonianSystem
@@ -326,7 +342,7 @@ class WorkPrecision(Report):
         """Evaluations and run time of each method for each level of the energy error; then every point."""
         heading = [f"{self.title}: t = {self.t_span[0]:g} … {self.t_span[1]:g}, {self.n_outputs} instants"]
         for size, reference in zip(self.sizes, self.references, strict=True):
-            known = "none" if reference is None else f"{reference.method}, good to {number(reference.accuracy)}"
+            known = "none" if reference is None else reference.described()
             heading.append(f"reference for {_size(size)}: {known}")
         blocks = [
             f"For an energy error of …, {_size(size)} (run time of all, evaluations of one)\n\n{self._at(size, levels)}"
@@ -345,10 +361,13 @@ class WorkPrecision(Report):
                 found = [cost_at([r for r in rows if r.label == label], level, cost) for label in labels]
                 head = f"{level:.0e}" if cost == "run_time" else "forces"
                 columns.append(Column(head, [show(x) if math.isfinite(x) else "–" for x in found]))
+        first = {row.label: row for row in reversed(rows)}
+        first = {label: first[label] for label in labels}
         trained = {row.label: row for row in rows if row.training_time is not None}
         columns.append(Column("training", [seconds(trained[n].training_time) if n in trained else "" for n in labels]))
         paid = [_paid(trained[n].break_even) if n in trained else "" for n in labels]
         columns.append(Column("paid after t =", paid))
+        columns.append(Column("compiled in", [shown_compile_time(r) for r in first.values()]))
         return text_table(columns)
 
     def _points(self) -> str:

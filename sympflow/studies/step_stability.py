@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import MAX_SAVED_VALUES, check_counts, check_t_span
+from sympflow.arguments import MAX_SAVED_VALUES, check_counts, check_t_span, positive_numbers
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.energy import max_energy_error
+from sympflow.metrics.linear_stability import LinearStability, SmallOscillations, of_method, small_oscillations
 from sympflow.metrics.symplectic import symplecticity_defect, volume_error
 from sympflow.solution import Solution
 from sympflow.solver import check_y0, solve
@@ -37,6 +38,11 @@ STEPS = tuple(2.0**k for k in range(-1, 7))
 FRACTIONS = (0.25, 0.5, 1.0)
 PHASES = (0.0, 3.0, 10.0, 31.0)
 """Places of the initial states along the orbit, in the system's steps: several, for one may hide an instability."""
+ORBIT, MOST_OF_ORBIT = 64, 1000  # states along an orbit at which frequencies are looked at, within so many steps
+FINE, COARSE = 2 ** (1 / 8), 2 ** (1 / 4)  # ratio of the steps that are tried, compiled and not
+OCTAVES = 3  # below the first unstable one of steps that are doubled, in which all of these are tried
+HALVINGS = 24
+SHOWN_INTERVALS = 3
 PRECISION = 1.002  # the shortest unstable step found, in units of the longest stable one
 STABLE = ("stable", "bounded")
 MOST_OUTPUTS, TANGENT_STEPS, FEWEST_FOR_DRIFT = 20_000, 256, 40
@@ -63,6 +69,13 @@ def stability(
 ) -> StabilityReport:
     """Run every method with a range of steps, find the longest stable one, and say how the longer ones fail.
 
+    The longest stable step is the first loss of stability. If H is quadratic and the method composed of kicks and
+    drifts, it is known for certain, from the trace of a step: see `sympflow.metrics.linear_stability`. Else steps are
+    doubled from an eighth of that limit for small oscillations, or of the system's `dt`, until one is unstable; in
+    the three octaves below it steps at ratios of 2^(1/8) are tried, of 2^(1/4) for methods that are not compiled, and
+    in every window of linear instability the middle; the first loss is found by bisection, to 0.2 %. The answer does
+    not depend on `steps`, unless one of them is unstable below it: then that one counts.
+
     Parameters
     ----------
     system : HamiltonianSystem or sequence of them
@@ -86,8 +99,7 @@ def stability(
         Steps of a run; where both cannot be, `max_steps` holds. Methods that run with array operations, and float32,
         take at most `max_steps`/200.
     limits : bool
-        True to find the longest stable step, by bisection between the longest stable and the shortest unstable one,
-        to 0.2 %. If all are stable, longer ones are tried, and shorter ones if none is.
+        True to find the longest stable step.
     progress : callable, optional
         Called with a line of text when something begins: a method, each of its steps, each trial for the longest one.
 
@@ -117,9 +129,8 @@ def stability(
     real = isinstance(bound, int | float | np.number) and not isinstance(bound, bool)
     if not real or np.iscomplexobj(bound) or not 0 < bound < math.inf:
         raise ValueError(f"`bound` must be positive and finite, a relative energy error; got {bound!r}.")
-    if progress is not None and not callable(progress):
-        raise TypeError(f"`progress` must be a function of one line of text; got {progress!r}.")
-    lengths = None if steps is None else _checked_steps(steps)
+    attempts.check_progress(progress)
+    lengths = None if steps is None else positive_numbers("steps", steps)
     unknown = [d for d in dtypes if d not in ("float32", "float64")]
     if isinstance(dtypes, str) or unknown or not len(dtypes):
         raise ValueError(f"`dtypes` must be a list of 'float32' and 'float64'; got {dtypes!r}.")
@@ -130,10 +141,13 @@ def stability(
         if span[0] == span[1]:
             raise ValueError("`t_span` has length zero, so there is nothing to run: choose a later end.")
         starts = initial_states(one, y0)
+        small = small_oscillations(one, starts[0], partial(_orbit, one, starts[0], span)) if limits else None
         for candidate in candidates(methods):
             for dtype in dtypes:
                 say = partial(_say, progress, f"{title(one)}: {candidate.label}, {dtype}")
-                study = Study(one, candidate, dtype, span, starts, tuple(metrics), bound, min_steps, max_steps, say)
+                study = Study(
+                    one, candidate, dtype, span, starts, tuple(metrics), bound, min_steps, max_steps, say, small
+                )
                 say("")
                 own = [study.row(h) for h in study.lengths(lengths)]
                 rows += own
@@ -161,16 +175,13 @@ def initial_states(system: HamiltonianSystem, y0: ArrayLike | None) -> np.ndarra
     return sol.states if sol.success and np.isfinite(sol.y).all() else given[None]
 
 
-def _checked_steps(steps: Sequence[float]) -> list[float]:
-    try:
-        if any(isinstance(h, bool | np.bool_ | str) for h in steps):
-            raise TypeError("no step lengths")
-        lengths = sorted(float(h) for h in steps)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"`steps` must be a list of step lengths; got {steps!r}.") from error
-    if not lengths or not all(0 < h < math.inf for h in lengths):
-        raise ValueError(f"`steps` must be positive and finite; got {steps!r}.")
-    return lengths
+def _orbit(system: HamiltonianSystem, y0: np.ndarray, t_span: tuple[float, float]) -> np.ndarray:
+    """States (n, 2d) along the orbit of y0, as far as it is found."""
+    length = min(abs(t_span[1] - t_span[0]), MOST_OF_ORBIT * system.dt)
+    times = np.linspace(0.0, length, ORBIT)
+    with _quiet():
+        states = solve(system, "dop853", (0.0, length), y0, t_eval=times, rtol=1e-6, atol=1e-8).states
+    return states if len(states) else y0[None]
 
 
 # one method with a range of steps -------------------------------------------------------------------------------------
@@ -190,6 +201,7 @@ class Study:
     min_steps: int
     max_steps: int
     say: Callable[[str], None] = lambda text: None  # for a line of progress
+    small: SmallOscillations | None = None
 
     @cached_property
     def integrator(self) -> Any:
@@ -201,6 +213,28 @@ class Study:
             return asked.resolved(self.system, self.starts[0], abs(self.t_span[1] - self.t_span[0]))
         except Exception:  # the rows say why
             return asked
+
+    @cached_property
+    def linear(self) -> LinearStability | None:
+        """The steps at which small oscillations are stable, or those of the largest frequency along the orbit."""
+        if self.small is None or not self.has_steps:
+            return None
+        longest = abs(self.t_span[1] - self.t_span[0])
+        if self.integrator.trained:
+            longest = self.integrator.step_length(self.system)
+        return of_method(self.integrator, self.system, self.small, longest)
+
+    @property
+    def anchor(self) -> float:
+        """The step that the steps to be tried are multiples of, whatever steps were asked for."""
+        limit = 0.0 if self.linear is None else self.linear.limit
+        return limit if 0 < limit < math.inf else float(self.system.dt)
+
+    @property
+    def known(self) -> bool:
+        """True if the linear stability is that of all orbits, known without a run."""
+        exact = self.small is not None and self.small.everywhere and self.integrator.kicks_and_drifts is not None
+        return exact and self.linear is not None and 0 < self.linear.limit < math.inf
 
     @property
     def has_steps(self) -> bool:
@@ -308,6 +342,9 @@ class Study:
         if one.sol is not None:
             _note_blow_up(one)
             one.measure(MEASURES, self.metrics)
+            window = None if h is None or self.linear is None else self.linear.window_of(h)
+            if window is not None and one.row.status in STABLE and self.small and self.small.equilibrium is not None:
+                one.note(f"Small oscillations are unstable here: they grow {_by(window.growth)} a step.")
         return one.row
 
 
@@ -455,29 +492,23 @@ def _ran(row: Row) -> bool:
 
 
 def step_limit(study: Study, rows: Sequence[Row]) -> StepLimit:
-    """Find the longest stable step, from the rows and by bisection below the first unstable one."""
+    """Find the longest stable step: the first loss of stability."""
     tried = [row for row in rows if row.dt is not None and row.status != "not applicable"]
-    ran = [(row.dt, row.status in STABLE) for row in tried if row.dt is not None]
-    first_bad = next((i for i, (_, good) in enumerate(ran) if not good), len(ran))
-    low = ran[first_bad - 1][0] if first_bad else None
-    high = ran[first_bad][0] if first_bad < len(ran) else None
+    stable = [row.dt for row in tried if row.status in STABLE]
+    low: float | None = None
+    high: float | None = None
     reached = ""
-    if high is None and low is not None:
-        low, high, reached = _longer(study, low)
-    elif low is None and any(row.singular for row in tried):
+    if not stable and any(row.singular for row in tried):
         reached = "none: the solution is singular"  # no step helps
-    elif low is None and tried and all(row.status == "outside" for row in tried):
+    elif not stable and tried and all(row.status == "outside" for row in tried):
         reached = "none: the solution leaves the flow's domain"
-    elif low is None and high is not None:
-        low, high = _shorter(study, high)
+    else:
+        search = Search(study, [row.dt for row in tried if row.dt is not None and row.status not in STABLE])
+        low, high, reached = search.known_limit() if study.known else search.limit()
     error = None
-    while low is not None and high is not None and high / low > PRECISION:
-        middle = math.sqrt(low * high)
-        good, error_there = study.stable(middle)
-        low, high, error = (middle, high, error_there) if good else (low, middle, error)
-    if low is not None and error is None:
-        error = study.stable(low)[1]
-    c, params = study.candidate, study.system.params
+    if low is not None:
+        error = study.stable(low / PRECISION if study.known else low)[1]
+    c, params, linear = study.candidate, study.system.params, study.linear
     return StepLimit(
         title(study.system),
         next(iter(params), None),
@@ -489,31 +520,100 @@ def step_limit(study: Study, rows: Sequence[Row]) -> StepLimit:
         high,
         error,
         reached,
+        None if study.small is None else study.small.fastest,
+        None if linear is None or not linear.windows else linear.limit,
+        () if linear is None or study.small is None or study.small.equilibrium is None else linear.intervals,
     )
 
 
-def _longer(study: Study, low: float) -> tuple[float, float | None, str]:
-    """Double a stable step until it is unstable, refused, or as long as the interval."""
-    longest = abs(study.t_span[1] - study.t_span[0])
-    if study.integrator.trained:
-        top = study.integrator.step_length(study.system)
-        if low >= top * (1 - 1e-12):
-            return low, None, "all up to the flow's Δt"
-        good, _ = study.stable(top)
-        return (top, None, "all up to the flow's Δt") if good else (low, top, "")
-    while low < longest:
-        if not study.stable(2 * low)[0]:
-            return low, 2 * low, ""
-        low = 2 * low
-    return low, None, "all up to the length of the interval"
+@dataclass
+class Search:
+    """The search for the first step that is unstable.
+
+    Attributes
+    ----------
+    study : Study
+    bad : list of float
+        Steps that are known to be unstable.
+    found : dict
+        What was found, stable or not, for each step that was tried.
+    """
+
+    study: Study
+    bad: list[float]
+    found: dict[float, bool] = field(default_factory=dict)
+
+    def stable(self, h: float) -> bool:
+        if h not in self.found:
+            self.found[h] = h not in self.bad and self.study.stable(h)[0]
+        return self.found[h]
+
+    def known_limit(self) -> tuple[float, float, str]:
+        """The first exit of the trace, and a step just beyond."""
+        linear = self.study.linear
+        assert linear is not None
+        first = linear.windows[0]
+        return first.start, min(first.start * PRECISION, (first.start + first.stop) / 2), ""
+
+    def limit(self) -> tuple[float | None, float | None, str]:
+        """The longest stable step and the shortest unstable one, a remark; the steps are None where there is none."""
+        study = self.study
+        if study.integrator.trained:
+            longest = study.integrator.step_length(study.system)
+            top, remark, steps = longest, "all up to the flow's Δt", [longest * f for f in FRACTIONS]
+        else:
+            longest, remark = abs(study.t_span[1] - study.t_span[0]), "all up to the length of the interval"
+            start = self._start()
+            if start is None:
+                return None, min(self.found), ""
+            top = self._first_unstable_double(start, longest)
+            ratio = FINE if study.compiled else COARSE
+            below = math.floor(math.log(2**OCTAVES) / math.log(ratio))
+            steps = [top / ratio**k for k in range(below, -1, -1)] if not self.stable(top) else [top]
+            steps = [start, *(h for h in steps if h > start)]
+        inside = [h for h in [*self.bad, *self._in_windows()] if h < top]
+        low: float | None = None
+        for h in sorted({*steps, *inside}):
+            if not self.stable(h):
+                return *self._bisected(low, h), ""
+            low = h
+        return low, None, remark
+
+    def _start(self) -> float | None:
+        """A stable step well below the limit for small oscillations."""
+        h = self.study.anchor / 8
+        for _ in range(HALVINGS):
+            if self.stable(h):
+                return h
+            h /= 2
+        return None
+
+    def _first_unstable_double(self, h: float, longest: float) -> float:
+        while h < longest and self.stable(h):
+            h *= 2
+        return h
+
+    def _in_windows(self) -> list[float]:
+        """Steps where small oscillations are unstable, in each window one."""
+        linear = self.study.linear
+        if linear is None:
+            return []
+        return [(w.start + (w.stop if w.stop < math.inf else PRECISION * w.start)) / 2 for w in linear.windows]
+
+    def _bisected(self, low: float | None, high: float) -> tuple[float | None, float]:
+        for _ in range(HALVINGS if low is None else 0):
+            if self.stable(high / 2):
+                low = high / 2
+                break
+            high /= 2
+        while low is not None and high / low > PRECISION:
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if self.stable(middle) else (low, middle)
+        return low, high
 
 
-def _shorter(study: Study, high: float) -> tuple[float | None, float]:
-    for _ in range(12):
-        if study.stable(high / 2)[0]:
-            return high / 2, high
-        high = high / 2
-    return None, high
+def _by(growth: float) -> str:
+    return "without bound" if growth == math.inf else f"by up to a factor {growth:.5g}"
 
 
 # the report -----------------------------------------------------------------------------------------------------------
@@ -521,7 +621,7 @@ def _shorter(study: Study, high: float) -> tuple[float | None, float]:
 
 @dataclass(frozen=True)
 class StepLimit:
-    """The longest stable step of one method on one system.
+    """The longest stable step of one method on one system: the first loss of stability.
 
     Attributes
     ----------
@@ -529,14 +629,22 @@ class StepLimit:
         As in `Row`.
     stable : float or None
         The longest step that was found stable or bounded, all shorter ones that were tried being so; None if there is
-        none.
+        none. If H is quadratic and the method one of kicks and drifts, the step at which stability is first lost in
+        a run of any length.
     unstable : float or None
-        The next longer one that was tried, which is not; None if all were stable.
+        The next longer one that was tried, or is known, to be unstable; None if all were stable.
     energy_error : float
-        The largest energy error with `stable`.
+        The largest energy error with `stable`, or just below.
     reached : str
         A remark: that all steps are stable, up to the flow's Δt or the length of the interval; or that
         the solution itself is singular, or leaves the flow's domain, so that none is.
+    frequency : float or None
+        ω of the fastest small oscillation about the equilibrium, or, where none is found, the largest along the orbit.
+    linear : float or None
+        The step at which oscillations of these frequencies are first lost; None if they never are, or it is not known.
+        The orbits of the study may bear longer steps, or only shorter ones.
+    intervals : tuple of (float, float)
+        All intervals (from, to) of steps at which small oscillations about the equilibrium are stable.
     """
 
     system: str
@@ -549,6 +657,9 @@ class StepLimit:
     unstable: float | None
     energy_error: float | None = None
     reached: str = ""
+    frequency: float | None = None
+    linear: float | None = None
+    intervals: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -653,6 +764,8 @@ class StabilityReport(Report):
             *self._names(self.limits),
             Column("longest stable step", ["none" if x.stable is None else f"{x.stable:.5g}" for x in self.limits]),
             Column("energy error there", [number(x.energy_error) for x in self.limits]),
+            Column("linear limit", ["" if x.linear is None else f"{x.linear:.5g}" for x in self.limits]),
+            Column("small oscillations are stable in", [_intervals(x.intervals) for x in self.limits], left=True),
             Column("stable", [x.reached for x in self.limits], left=True),
         ]
 
@@ -684,6 +797,14 @@ class StabilityReport(Report):
             Column("method", [r.label for r in rows], left=True),
             Column("dtype", [r.dtype if len(precisions) > 1 else "" for r in rows], left=True),
         ]
+
+
+def _intervals(intervals: Sequence[tuple[float, float]]) -> str:
+    """The first intervals of stability, where there is more than one."""
+    if len(intervals) < 2:
+        return ""
+    shown = [f"{a:.5g} to {b:.5g}" for a, b in intervals[:SHOWN_INTERVALS]]
+    return ", ".join(shown) + (", …" if len(intervals) > SHOWN_INTERVALS else "")
 
 
 def _listed(systems: list[str]) -> str:

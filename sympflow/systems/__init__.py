@@ -1,8 +1,13 @@
-"""The built-in scenes."""
+"""The scenes by name: the built-in ones, those registered at run time, and those of installed plug-ins."""
 
+import difflib
+import inspect
 from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.lazy import announced, distribution, load_announced
 from sympflow.systems.celestial import kepler, kepler_ellipse, outer_solar_system, three_body
 from sympflow.systems.chains import fput, lax_eigenvalues, lennard_jones, oscillatory_energies, toda_lattice
 from sympflow.systems.textbook import (
@@ -16,6 +21,13 @@ from sympflow.systems.textbook import (
     quartic,
     spring_pendulum,
 )
+from sympflow.systems.user_files import from_toml
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+GROUP = "sympflow.systems"
+"""The entry-point group in which a distribution announces its systems: `name = "package.module:factory"`."""
 
 SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {
     "harmonic-oscillator": harmonic_oscillator,
@@ -34,7 +46,112 @@ SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {
     "lennard-jones": lennard_jones,
     "nonseparable": nonseparable,
 }
-"""The scenes by the name that the command line uses."""
+"""The built-in scenes by the name that the command line uses."""
 
-__all__ = ["SYSTEMS", "kepler_ellipse", "lax_eigenvalues", "oscillatory_energies"]
+_registered: dict[str, Callable[..., HamiltonianSystem]] = {}
+
+
+def available() -> list[str]:
+    """The names of all scenes: built in, registered, and from plug-ins. Nothing is imported to list them."""
+    return [*SYSTEMS, *_registered, *sorted(_plugins())]
+
+
+def get(name: str) -> Callable[..., HamiltonianSystem]:
+    """The function that makes the system of a name; call it with its parameters: ``get("fput")(omega=100)``.
+
+    Parameters
+    ----------
+    name : str
+        With hyphens or underscores.
+
+    Raises
+    ------
+    ValueError
+        If there is no such scene.
+    ImportError
+        If the plug-in that provides it cannot be loaded.
+    """
+    if not isinstance(name, str):
+        raise TypeError(f"`name` must be that of a scene, such as 'henon-heiles'; got {type(name).__name__}.")
+    key = _key(name)
+    if key in SYSTEMS:
+        return SYSTEMS[key]
+    if key in _registered:
+        return _registered[key]
+    if key in _plugins():
+        return _load(key, _plugins()[key])
+    close = difflib.get_close_matches(key, available(), n=1)
+    hint = f" Did you mean {close[0]!r}?" if close else ""
+    raise ValueError(f"`name` {name!r} is no known scene.{hint} Choose one of {', '.join(available())}.")
+
+
+def register(name: str, factory: Callable[..., HamiltonianSystem]) -> None:
+    """Make a scene available under a name, on the command line's lists too, in this process.
+
+    Parameters
+    ----------
+    name : str
+        With hyphens or underscores.
+    factory : callable
+        Makes the system; all its parameters have defaults.
+
+    Raises
+    ------
+    ValueError
+        If the name is empty, or that of a built-in scene or of an installed plug-in.
+    TypeError
+        If `name` is not a string, or `factory` cannot be called without arguments.
+    """
+    if not isinstance(name, str):
+        raise TypeError(f"`name` must be a string, such as 'my-scene'; got {type(name).__name__}.")
+    key = _key(name)
+    if not key.strip() or set(key) & set(":=, "):
+        raise ValueError(f"`name` must be a word without spaces or any of : = ,; got {name!r}. Choose another one.")
+    if key in SYSTEMS:
+        raise ValueError(f"`name` {name!r} is a built-in scene, which cannot be replaced: choose another name.")
+    if key in _plugins():
+        raise ValueError(
+            f"`name` {name!r} is that of the plug-in {distribution(_plugins()[key])}, which would be replaced: choose "
+            "another name."
+        )
+    if isinstance(factory, HamiltonianSystem) or not _makes_a_default(factory):
+        raise TypeError(
+            f"`factory` must be a function that makes the system, with a default for every parameter; got {factory!r}."
+        )
+    _registered[key] = factory
+
+
+@cache
+def _plugins() -> dict[str, "EntryPoint"]:
+    taken = {*SYSTEMS, *(name.replace("-", "_") for name in SYSTEMS)}
+    return {_key(name): point for name, point in announced(GROUP, "system", taken).items()}
+
+
+@cache
+def _load(key: str, point: "EntryPoint") -> Callable[..., HamiltonianSystem]:
+    factory = load_announced(point, "system")
+    if isinstance(factory, HamiltonianSystem) or not _makes_a_default(factory):
+        raise ImportError(
+            f"`system` {key!r} of the plug-in {distribution(point)} is no function with a default for every parameter: "
+            "report it there."
+        )
+    return factory
+
+
+def _makes_a_default(factory: Any) -> bool:
+    """True for a callable that needs no arguments."""
+    try:
+        parameters = inspect.signature(factory).parameters.values()
+    except (TypeError, ValueError):
+        return False
+    needs = (p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
+    return not any(needs)
+
+
+def _key(name: str) -> str:
+    return name.replace("_", "-")
+
+
+__all__ = ["SYSTEMS", "available", "from_toml", "get", "register"]
+__all__ += ["kepler_ellipse", "lax_eigenvalues", "oscillatory_energies"]
 __all__ += [factory.__name__ for factory in SYSTEMS.values()]

@@ -177,6 +177,7 @@ def outer_solar_system() -> HamiltonianSystem:
         y0=y0,
         t_span=(0.0, 200_000.0),
         dt=50.0,
+        check=False,
     )
 
 

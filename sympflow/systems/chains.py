@@ -189,6 +189,7 @@ def lennard_jones() -> HamiltonianSystem:
         y0=y0,
         t_span=(0.0, 0.2),
         dt=4e-5,
+        check=False,
     )
 
 

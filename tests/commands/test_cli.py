@@ -8,9 +8,12 @@ import sys
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
+from sympflow import get
 from sympflow.commands import app
+from sympflow.commands.console import in_options
 from sympflow.commands.words import method, scenes
 
 FAST = ["--t-end", "5", "--n-outputs", "40", "--repeats", "1"]
@@ -143,14 +146,39 @@ def test_a_blow_up_prints_no_warnings_of_numpy(tmp_path):
         (["compare", "harmonic-oscillator:mass=2"], "`mass` is not a parameter of harmonic-oscillator"),
         (["compare", "pendulum", "--methods", "vertel"], "Did you mean 'verlet'"),
         (["compare", "pendulum", "--methods", "verlet:rtol=1"], "`rtol` is not an option of method 'verlet'"),
-        (["compare", "pendulum", "--metrics", "beauty"], "`metrics` has no 'beauty'"),
+        (["compare", "pendulum", "--metrics", "beauty"], "`--metrics` has no 'beauty'"),
         (["compare", "pendulum", "--methods", "none.safetensors"], "none.safetensors"),
         (["solve", "pendulum", "--method", "verlet", "--y0", "1,a"], "`--y0` must be a number"),
         (["solve", "pendulum", "--method", "verlet", "--out", "y.txt"], "`--out` must end in .csv or .npz"),
         (["solve", "pendulum", "henon-heiles", "--method", "verlet"], "`system` must be one"),
-        (["solve", "pendulum", "--method", "verlet", "--dt", "-1"], "`dt` must be a positive"),
+        (["solve", "pendulum", "--method", "verlet", "--dt", "-1"], "`--dt` must be a positive"),
         (["train", "pendulum", "--hidden", "ten"], "`--hidden` must be whole numbers"),
         (["train", "pendulum", "--out", "flow.pt"], "`--out` must end in .safetensors"),
+        (["train", "pendulum", "--checkpoint", "."], "`--checkpoint` '.' is a folder"),
+        (["train", "pendulum", "--resume", "none.pt"], "is not a file: pass the path that was given as `--checkpoint`"),
+        (["solve"], "`system` is missing"),
+        (["solve", "pendulum", "-x"], "`-x` is no option"),
+        (["solve", "pendulum", "--method", "verlet", "--n-outputs", "0"], "`--n-outputs` must be a positive integer"),
+        (["solve", "pendulum", "--method", "verlet", "--n-outputs", "-3"], "`--n-outputs` must be a positive integer"),
+        (["solve", "pendulum", "--method", "verlet", "--n-outputs", 10**12], "`--n-outputs` must be less than 1e+09"),
+        (["solve", "pendulum", "--method", "verlet", "--save-every", "0"], "`--save-every` must be a positive integer"),
+        (["solve", "pendulum", "--method", "verlet", "--t-end", "inf"], "`--t-end` must be finite"),
+        (["solve", "pendulum", "--method", "verlet", "--y0", "1"], "`--y0` must have shape"),
+        (["solve", "pendulum", "--method", "none.safetensors"], "`--method` 'none.safetensors' is not a file: name a"),
+        (["solve", "pendulum", "--method", "rk45:dt=0.1"], "`dt` is not an option of method 'rk45'"),  # as written
+        (["solve", "nonseparable", "--method", "verlet"], "use an implicit method such as 'gauss_legendre6'"),
+        (["compare", "pendulum", "--backend", "fast"], "'fast' is none of auto, compiled, array"),
+        (["bench", "own.toml"], "`system` 'own.toml': there is no such file"),
+        (["section", "pendulum", "--direction", "left"], "`--direction` must be one of up, down, both"),
+        (["section", "pendulum", "--axes", "q"], "`--axes` must be two of q, p"),
+        (["section", "pendulum", "--coordinate", "z"], "`--coordinate` must be one of q, p"),
+        (["section", "pendulum", "--orbits", "2", "--y0", "1,0"], "`--orbits` and `--y0` both choose"),
+        (["section", "pendulum", "--y0", "1,0", "--y0", "1"], "`--y0` must have the same number of components"),
+        (["certificate", "pendulum", "--flow", "none"], "`--flow` 'none' is the name of no flow that ships"),
+        (["certificate", "pendulum", "--flow", "pendulum-mlp"], "`--flow` is an unconstrained network"),
+        (["certificate", "pendulum", "--held-out", "0"], "`--held-out` must be an integer and at least 1"),
+        (["certificate", "pendulum", "--out", "c.txt"], "`--out` must end in .json or .safetensors"),
+        (["certificate", "quartic:t_end=0.01"], "`--t-end` must be finite and at least Δt"),
     ],
 )
 def test_wrong_usage_ends_with_a_remedy_and_not_with_a_traceback(words, message):
@@ -169,7 +197,7 @@ def test_train_makes_a_primed_flow_unless_told_otherwise(tmp_path):
     assert run("solve", "pendulum", "--method", path, "--t-end", 1).exit_code == 0
     refused = run("train", "pendulum", *small, "--pairs", 2, "--out", path)
     assert refused.exit_code == 2
-    assert "`pairs` is not an option of flows of kind 'primed'" in refused.stderr
+    assert "`--pairs` is not an option of flows of kind 'primed'" in refused.stderr
 
 
 def test_flows_are_listed():
@@ -203,8 +231,95 @@ def test_parameters_reach_the_system():
     assert method("verlet:dt=0.1")[1].dt == 0.1
 
 
+def test_a_run_that_is_too_long_names_options_that_there_are():
+    result = run("solve", "pendulum", "--method", "verlet", "--t-end", 1e9)
+    assert result.exit_code == 2
+    named = set(re.findall(r"--[\w-]+", result.stderr))
+    assert named == {"--n-outputs", "--save-every"}
+    assert named <= set(re.findall(r"--[\w-]+", run("solve", "--help").output))
+    thinned = run("solve", "pendulum", "--method", "verlet", "--save-every", 100)
+    assert "21 outputs" in thinned.stdout
+
+
+def test_a_backticked_argument_is_the_option_of_the_command_that_runs():
+    said = "`t_eval` and `hidden`: use backend='array' or `dt=0.1`, or flow.save(path=3); `rtol` stays."
+    here = "`--n-outputs` and `hidden`: use `--backend array` or `--dt 0.1`, or flow.save(path=3); `rtol` stays."
+    contexts = []
+
+    def command(ctx: typer.Context, n_outputs: int = 1, backend: str = "", dt: float = 1.0) -> None:
+        contexts.append(ctx)
+
+    app = typer.Typer()
+    app.command()(command)
+    assert CliRunner().invoke(app, []).exit_code == 0
+    assert in_options(said, contexts[0]) == here
+
+
+def test_quiet_prints_errors_alone(tmp_path):
+    words = ("solve", "pendulum", "--method", "verlet", "--t-end", 1, "--out", tmp_path / "y.csv")
+    quiet = run(*words, "--quiet")
+    assert (quiet.exit_code, quiet.output) == (0, "")
+    assert (tmp_path / "y.csv").exists()
+    assert "outputs" in run(*words).stdout  # it is not kept for the next command
+    for command in (("compare", "--metrics", "energy", *FAST), ("section", "--t-end", 5), ("flows",), ("systems",)):
+        names = () if command[0] == "systems" else ("pendulum",)
+        methods = {"compare": ("--methods", "verlet"), "section": ("--method", "verlet")}.get(command[0], ())
+        assert run(command[0], *names, *methods, *command[1:], "-q").output == ""
+    refused = run("solve", "pendulum", "--method", "vertel", "-q")
+    assert refused.stdout == ""
+    assert "Did you mean 'verlet'" in refused.stderr
+
+
+def test_a_section_is_printed_and_written(tmp_path):
+    words = ("henon-heiles", "--method", "kahan_li8", "--t-end", 60, "--dt", 0.1)
+    result = run("section", *words, "--orbits", 2, "--seed", 1, "--out", tmp_path, "--limit", 3)
+    assert result.exit_code == 0, result.output
+    with (tmp_path / "henon-heiles-section.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["trajectory"] for row in rows} == {"0", "1"}
+    assert all(abs(float(row["q1"])) < 1e-12 for row in rows)
+    assert all(float(row["p1"]) > 0 for row in rows)  # upwards
+    assert (tmp_path / "henon-heiles-section.png").stat().st_size > 1000
+    assert json.loads((tmp_path / "henon-heiles-section.json").read_text())["coordinate"] == "q1"
+    assert f"… {len(rows) - 3} more" in result.stdout
+    failed = run("section", "henon-heiles", "--method", "verlet", "--y0", "0,0,0,0.7", "--t-end", 20)
+    assert failed.exit_code == 1
+    assert "became non-finite" in failed.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("solve hen", {"henon-heiles", "henon-heiles-escape"}),
+        ("compare pendulum --methods verlet,gauss", {f"verlet,gauss_legendre{order}" for order in (4, 6, 8)}),
+        ("section pendulum --method strang", {"strang_parts"}),
+        ("section pendulum --direction b", {"both"}),
+        ("solve --system qua", {"quartic", "quartic.toml"}),
+        ("certificate pendulum --flow pendulum-m", {"pendulum-mlp"}),
+        ("compare pendulum --metrics energy,vol", {"energy,volume"}),
+    ],
+)
+def test_the_shell_completes_systems_methods_and_flows(words, expected, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "quartic.toml").write_text("")
+    asked = {"_SYMPFLOW_COMPLETE": "complete_bash", "COMP_WORDS": f"sympflow {words}"}
+    asked["COMP_CWORD"] = str(len(words.split()))
+    result = CliRunner().invoke(app, [], prog_name="sympflow", env=asked)
+    assert set(result.stdout.split()) == expected
+
+
+def test_each_source_is_that_of_the_method():
+    sources = {name: get(name).summary() for name in ("verlet", "impulse", "mollified_impulse", "linear_srkn11b")}
+    assert [name for name, source in sources.items() if "1967" in source] == ["verlet"]
+    assert "Tuckerman" in sources["impulse"]
+    assert "Grubmüller" in sources["impulse"]
+    assert "Mikkola" in get("log_kahan_li8").summary()
+    assert "exact linear flow" in sources["linear_srkn11b"]
+    assert all("Sanz-Serna" in get(f"gauss_legendre{order}").summary() for order in (4, 6, 8))
+
+
 def test_help_has_examples():
-    for command in ("solve", "compare", "train"):
+    for command in ("solve", "compare", "bench", "stability", "section", "train", "certificate"):
         result = run(command, "--help")
         assert result.exit_code == 0
         assert f"sympflow {command} " in result.output
@@ -231,4 +346,4 @@ def test_solve_takes_a_tolerance():
     assert float(re.search(r"largest energy error (\S+)", result.output)[1]) <= 1e-5
     refused = run("solve", "kepler", "--method", "verlet", "--tol", 1e-5)
     assert refused.exit_code != 0
-    assert "`tol` is not an option of" in refused.output
+    assert "`--tol` is not an option of" in refused.output

@@ -1,10 +1,14 @@
 """HamiltonianSystem: symbolic and callable definitions agree with each other and with automatic differentiation."""
 
+import copy
+import json
 import math
 import pickle
+from fractions import Fraction
 
 import numpy as np
 import pytest
+import sympy
 import torch
 from numba import njit
 
@@ -205,7 +209,7 @@ class TestNumbaFunctions:
         ),
         (lambda: HamiltonianSystem.from_sympy("p**2 + k*q", params={"k": np.inf}), ValueError, "k = inf"),
         (lambda: HamiltonianSystem.from_sympy("p**2 + k*q", params={"k": "a"}), ValueError, "^`params` has k = 'a'"),
-        (lambda: HamiltonianSystem.from_sympy("p**2 + I*q"), ValueError, "^`expression` is complex"),
+        (lambda: HamiltonianSystem.from_sympy(sympy.I * sympy.Symbol("q")), ValueError, "^`expression` is complex"),
         (lambda: HamiltonianSystem.from_sympy("p**2 + q", y0=[1, 2, 3]), ValueError, r"^`y0` must have shape \(2,\)"),
         (lambda: HamiltonianSystem.from_sympy("p**2 + q", dt=0), ValueError, "^`dt` must be positive"),
         (lambda: HamiltonianSystem.from_sympy("p**2 + q", domain=Ball([0.0] * 4, 1)), ValueError, "^`domain` must be"),
@@ -322,3 +326,88 @@ def test_a_function_that_writes_into_the_state_is_refused(method):
 def test_states_of_another_width_are_refused(name, width):
     with pytest.raises(ValueError, match=r"^`y` must have shape \(\.\.\., 4\).* got \(2, " + str(width)):
         getattr(systems.henon_heiles(), name)(np.zeros((2, width)))
+
+
+class TestParameters:
+    """They are part of H, so that a change of theirs would be one of its name alone."""
+
+    system = HamiltonianSystem.from_sympy("p**2/2 + a*q**4", params={"a": 1.0})
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            lambda p: p.__setitem__("a", 5.0),
+            lambda p: p.__delitem__("a"),
+            lambda p: p.update(a=5.0),
+            lambda p: p.__ior__({"a": 5.0}),
+            lambda p: p.setdefault("b", 1.0),
+            lambda p: p.pop("a"),
+            lambda p: p.popitem(),
+            lambda p: p.clear(),
+        ],
+    )
+    def test_are_to_be_read_only(self, change):
+        with pytest.raises(TypeError, match=r"^`params` of a system .* make a system with other parameters, by its"):
+            change(self.system.params)
+        assert self.system.params == {"a": 1.0}
+
+    def test_are_not_to_be_replaced(self):
+        with pytest.raises(AttributeError):
+            self.system.params = {"a": 5.0}
+
+    def test_survive_pickles_copies_and_json(self):
+        for again in (pickle.loads(pickle.dumps(self.system)), copy.deepcopy(self.system), copy.copy(self.system)):
+            assert again.params == {"a": 1.0}
+            with pytest.raises(TypeError, match=r"^`params`"):
+                again.params["a"] = 5.0
+        assert json.dumps(self.system.params) == '{"a": 1.0}'
+
+    def test_so_are_the_matrices_of_which_code_is_generated(self):
+        plain = HamiltonianSystem(lambda q: q.sum(-1), ndof=2, mass=[1.0, 2.0], stiffness_matrix=np.eye(2))
+        for matrix in (plain.inverse_mass, plain.stiffness_matrix, SYSTEMS["masses"].inverse_mass):
+            with pytest.raises(ValueError, match="read-only"):
+                matrix[0] = 5.0
+
+    @pytest.mark.parametrize("value", [1 + 2j, np.complex128(2), 10**400, math.nan, math.inf, True, "2", [1.0], None])
+    def test_that_are_no_finite_real_numbers_are_refused(self, value):
+        with pytest.raises(ValueError, match=r"^`params` has a = .*: give a finite real number\.$"):
+            HamiltonianSystem.from_sympy("p**2/2 + a*q**2", params={"a": value})
+
+    @pytest.mark.parametrize("value", [2, np.float32(2), np.array(2.0), Fraction(2), sympy.Integer(2)])
+    def test_of_every_kind_of_number_are_numbers_of_python(self, value):
+        system = HamiltonianSystem.from_sympy("p**2/2 + a*q**2/2", params={"a": value})
+        assert type(system.params["a"]) in (int, float)
+        assert system.params["a"] == 2 == -system.force(np.array([1.0]))[0]
+
+    @pytest.mark.parametrize(
+        ("name", "hint"),
+        [("E", "Euler's number is written exp(1)"), ("I", "imaginary unit"), *((n, "") for n in ("N", "O", "Q", "S"))],
+    )
+    def test_may_be_named_as_sympy_names_its_own_things(self, name, hint):
+        text = f"p**2/2 + {name}*q**2/2"
+        with pytest.raises(ValueError, match=rf"^`expression` holds {name} without a value: give it in `params`") as e:
+            HamiltonianSystem.from_sympy(text)
+        assert hint in str(e.value)
+        assert HamiltonianSystem.from_sympy(text, params={name: 4.0}).force(np.array([1.0])) == -4.0
+
+    def test_pi_is_a_constant_unless_it_is_given(self):
+        assert HamiltonianSystem.from_sympy("p**2/2 + pi*q").force(np.array([1.0])) == -np.pi
+        assert HamiltonianSystem.from_sympy("p**2/2 + pi*q", params={"pi": 2}).force(np.array([1.0])) == -2.0
+
+    @pytest.mark.parametrize(
+        ("scene", "error"),
+        [
+            ({"y0": [10**400, 0]}, TypeError),
+            ({"y0": [1j, 0]}, TypeError),
+            ({"t_span": (0, 10**400)}, ValueError),
+            ({"t_span": (0, math.nan)}, ValueError),
+            ({"dt": np.complex128(1)}, ValueError),
+            ({"dt": True}, ValueError),
+            ({"energy_scale": 10**400}, ValueError),
+            ({"energy_scale": np.complex128(1)}, ValueError),
+            ({"params": [("a", 1.0)]}, TypeError),
+        ],
+    )
+    def test_of_the_scene_are_checked_too(self, scene, error):
+        with pytest.raises(error, match=f"^`{next(iter(scene))}` must be"):
+            HamiltonianSystem.from_sympy("p**2/2 + q**2/2", **scene)

@@ -1,7 +1,6 @@
 """Our methods inside `solve_ivp`: the same numbers as `solve`, and all that SciPy's driver asks of a solver."""
 
 import math
-import warnings
 
 import numpy as np
 import pytest
@@ -9,12 +8,12 @@ import torch
 from conftest import KINDS
 from scipy.integrate import solve_ivp
 
-from sympflow import HamiltonianSystem, MLPFlow, SympFlow, available, get, solve, systems
+from sympflow import HamiltonianSystem, SympFlow, available, get, shipped_flows, solve, systems
 from sympflow.arrays import stack
 from sympflow.integrators.base import FixedStep
 from sympflow.interop.scipy import as_scipy
 
-HH, OSCILLATOR = systems.henon_heiles(), systems.harmonic_oscillator()
+HH, OSCILLATOR, PENDULUM = systems.henon_heiles(), systems.harmonic_oscillator(), systems.pendulum()
 EPS = np.finfo(float).eps
 METHODS = [name for name in available() if issubclass(get(name), FixedStep) and get(name).on_grid]
 OF_EACH_KIND = [name for name in METHODS if name in KINDS]
@@ -103,7 +102,7 @@ def counting():
         evaluated.append(math.prod(q.shape) // 2)
         return stack([q[..., 0] + 2 * q[..., 0] * q[..., 1], q[..., 1] + q[..., 0] ** 2 - q[..., 1] ** 2])
 
-    system = HamiltonianSystem(lambda q: 0 * q[..., 0], ndof=2, gradient=gradient, y0=HH.y0)
+    system = HamiltonianSystem(lambda q: 0 * q[..., 0], ndof=2, gradient=gradient, y0=HH.y0, check=False)
     return system, lambda: sum(evaluated)
 
 
@@ -129,9 +128,15 @@ def test_every_evaluation_of_a_force_is_counted(method, arguments, counting):
     system, evaluated = counting
     sol = solve_ivp(system, (0, 9.99), HH.y0, method=as_scipy(method, system, dt=0.1), **arguments)
     assert sol.nfev == evaluated()
-    before = evaluated()
-    other = solve_ivp(HH, (0, 9.99), HH.y0, method=as_scipy(method, system, dt=0.1), **arguments)
-    assert other.nfev == evaluated() - before + 1  # `fun` is HH now, evaluated once
+    before, of_fun = evaluated(), []
+
+    def fun(t, y):
+        of_fun.append(t)
+        return HH(t, y)
+
+    other = solve_ivp(fun, (0, 9.99), HH.y0, method=as_scipy(method, system, dt=0.1), **arguments)
+    assert other.nfev == evaluated() - before + len(of_fun)
+    assert len(of_fun) < 20
 
 
 def test_a_flow_of_networks_evaluates_no_force():
@@ -167,14 +172,71 @@ def test_a_blow_up_ends_with_status_minus_one():
     assert np.isfinite(sol.y).all()
 
 
-def test_a_warning_where_fun_is_another_system(rotation):
-    other = systems.harmonic_oscillator(3.0)
-    for method in (as_scipy(rotation), as_scipy("verlet", OSCILLATOR)):
-        with pytest.warns(UserWarning, match="solves its own system, not this one"):
-            solve_ivp(other, (0, 1), [1.0, 0.5], method=method)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            solve_ivp(lambda t, y: [y[1], -y[0]], (0, 1), [1.0, 0.5], method=method)
+def pendulum(t, y):
+    return [y[1], -np.sin(y[0])]
+
+
+class TestAnotherSystem:
+    """A right-hand side that is not what the method solves is refused, wherever it differs: here 1e-6 and more."""
+
+    @pytest.mark.parametrize("y0", [[0.0, 1.9], [1.0, 0.5], [0.0, 0.0], [1e-3, 0.0]])
+    @pytest.mark.parametrize("fun", [PENDULUM, pendulum])
+    def test_that_agrees_at_the_start(self, fun, y0):
+        """The oscillator has the velocity of the pendulum where q = 0."""
+        with pytest.raises(ValueError, match=r"^`fun` is not the system that method 'kahan_li8' solves.*as_scipy"):
+            solve_ivp(fun, (0, 5), y0, method=as_scipy("kahan_li8", OSCILLATOR))
+
+    def test_that_is_right(self):
+        for fun in (PENDULUM, systems.pendulum(), pendulum, lambda t, y: np.array(pendulum(t, y), dtype=np.float32)):
+            sol = solve_ivp(fun, (0, 5), [0.0, 1.9], method=as_scipy("kahan_li8", PENDULUM))
+            assert sol.y[:, -1] == pytest.approx([0.340, -1.870], abs=1e-3)
+
+    @pytest.mark.parametrize("strength", [lambda t: 0.01 * t, np.sin, lambda t: 31 < t < 36, lambda t: t > 99.6])
+    def test_that_depends_on_the_time(self, strength):
+        """It agrees at t0: what changes later, for a while or at the end, is seen."""
+
+        def fun(t, y):
+            return [y[1], -np.sin(y[0]) * (1 + strength(t))]
+
+        with pytest.raises(ValueError, match=r"^`fun` depends on the time: .* method 'verlet' solves an autonomous"):
+            solve_ivp(fun, (0, 100), [0.0, 1.9], method=as_scipy("verlet", PENDULUM))
+
+    @pytest.mark.parametrize("turn", [1.2, 2.2, 2.45])
+    def test_that_differs_only_where_the_run_comes_to(self, turn):
+        """The states around the start and those of the domain do not tell; the run itself does."""
+
+        def fun(t, y):
+            return [y[1], -np.sin(y[0]) - (y[0] - turn if y[0] > turn else 0.0)]
+
+        with pytest.raises(ValueError, match=r"^`fun` is not the system that method 'verlet' solves: at t = \d"):
+            solve_ivp(fun, (0, 60), [0.0, 1.9], method=as_scipy("verlet", PENDULUM))
+
+    def test_that_has_another_number_of_variables_to_compare(self):
+        with pytest.raises(ValueError, match=r"^`fun` is not the system that method 'verlet' solves: their Hamilt"):
+            solve_ivp(HH, (0, 1), HH.y0[:2], method=as_scipy("verlet", PENDULUM))
+
+    def test_of_functions_that_fail_elsewhere(self):
+        """Only where the run is must a function have a value."""
+
+        def fun(t, y):
+            if abs(y[0] - 1.0) > 1e-3:
+                raise ArithmeticError
+            return pendulum(t, y)
+
+        assert solve_ivp(fun, (0, 0.01), [1.0, 0.0], method=as_scipy("verlet", PENDULUM)).success
+
+    def test_of_a_flow(self, rotation):
+        """Of a bare flow, of a network that knows its own error, and of a primed flow, which knows its system."""
+        with pytest.raises(ValueError, match=r"^`fun` is not the system that method 'sympflow' solves"):
+            solve_ivp(systems.harmonic_oscillator(3.0), (0, 1), [1.0, 0.5], method=as_scipy(rotation))
+        solve_ivp(lambda t, y: [y[1], -y[0]], (0, 1), [1.0, 0.5], method=as_scipy(rotation))
+        for name in ("pendulum-sympflow", "pendulum-primed-3-1"):
+            (shipped,) = (f for f in shipped_flows(PENDULUM) if f.name == name)
+            flow = as_scipy(shipped.load(PENDULUM))
+            assert solve_ivp(pendulum, (0, 20), [0.0, 0.9], method=flow).success
+            for other in (lambda t, y: [y[1], -y[0]], lambda t, y: [y[1], -np.sin(y[0]) * (1 + 0.01 * t)]):
+                with pytest.raises(ValueError, match=r"^`fun` (is not the system|depends on the time)"):
+                    solve_ivp(other, (0, 20), [0.0, 0.9], method=flow)
 
 
 def test_a_flow_and_a_name_without_system():
@@ -241,10 +303,8 @@ class TestBadInput:
             solve_ivp(lambda t, y: y, (0, 1), HH.y0, method=as_scipy("verlet"))
 
     def test_of_a_flow_without_an_inverse_and_of_single_precision(self):
-        mlp = MLPFlow(2, hidden=(4,)).requires_grad_(False)
-        with pytest.raises((TypeError, ValueError), match=r"inverse|negative"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            solve_ivp(HH, (1, 0), HH.y0, method=as_scipy(mlp))
-        with pytest.raises(TypeError, match=r"^`y0` is torch.float64, but .*float32"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            solve_ivp(HH, (0, 1), HH.y0, method=as_scipy(SympFlow(2, dtype=torch.float32)))
+        with pytest.raises((TypeError, ValueError), match=r"inverse|negative"):
+            solve_ivp(HH, (1, 0), HH.y0, method=as_scipy("mlp", HH))
+        flow = SympFlow.primed(PENDULUM).to(torch.float32)
+        with pytest.raises(TypeError, match=r"^`y0` is torch.float64, but .*float32"):
+            solve_ivp(PENDULUM, (0, 1), [1.0, 0.0], method=as_scipy(flow))

@@ -304,16 +304,60 @@ class TestRegistration:
         assert method not in import_module("torchdiffeq._impl.odeint").SOLVERS
 
 
-def test_a_warning_where_func_is_another_system(rotation):
-    with pytest.warns(UserWarning, match="solves its own system, not this one"):
-        odeint(lambda t, y: 9.0 * y, times(1.0, 0.5), times(0.0, 1.0), method=rotation)
-    odeint(lambda t, y: torch.stack([y[1], -y[0]]), times(1.0, 0.5), times(0.0, 1.0), method=rotation)
-    with pytest.warns(UserWarning, match="solves its own system, not this one"):  # two systems in one call
-        odeint(PENDULUM, times(1.0, 0.5), times(0.0, 1.0), method="verlet", options={"system": OSCILLATOR})
-    with pytest.warns(UserWarning, match="solves its own system, not this one"):
-        odeint(PENDULUM, (times(1.0), times(0.5)), times(0.0, 1.0), method="verlet", options={"system": OSCILLATOR})
-    same = systems.pendulum()
-    odeint(PENDULUM, times(1.0, 0.5), times(0.0, 1.0), method="verlet", options={"system": same})
+def right_hand_side(t, y):
+    return torch.stack([y[1], -torch.sin(y[0])])
+
+
+class TestAnotherSystem:
+    """A right-hand side that is not what the method solves is refused, wherever it differs."""
+
+    def test_of_a_bare_flow(self, rotation):
+        with pytest.raises(ValueError, match=r"^`func` is not the system that method 'sympflow' solves"):
+            odeint(lambda t, y: 9.0 * y, times(1.0, 0.5), times(0.0, 1.0), method=rotation)
+        odeint(lambda t, y: torch.stack([y[1], -y[0]]), times(1.0, 0.5), times(0.0, 1.0), method=rotation)
+        with pytest.raises(ValueError, match=r"^`func` is not the system that method 'sympflow' solves"):
+            odeint(PENDULUM, times(1.9, 0.5), times(0.0, 1.0), method=rotation)
+        primed = SympFlow.primed(PENDULUM, curvature=True).requires_grad_(False)  # it knows its system
+        odeint(right_hand_side, times(1.0, 0.5), times(0.0, 1.0), method=primed)
+        with pytest.raises(ValueError, match=r"^`func` is not the system that method 'sympflow' solves"):
+            odeint(OSCILLATOR, times(0.0, 0.5), times(0.0, 1.0), method=primed, options={"system": PENDULUM})
+
+    @pytest.mark.parametrize(
+        ("func", "y0"),
+        [
+            (PENDULUM, times(0.0, 1.9)),
+            (PENDULUM, (times(0.0), times(1.9))),
+            (right_hand_side, times(0.0, 1.9)),
+            (right_hand_side, torch.tensor([0.0, 1.9])),
+            (lambda t, y: (y[1], -torch.sin(y[0])), (times(0.0), times(1.9))),
+            (lambda t, y: torch.stack([y[..., 1], -torch.sin(y[..., 0])], -1), times(0.0, 1.9).repeat(3, 2, 1)),
+        ],
+    )
+    def test_that_agrees_at_the_start(self, func, y0):
+        """The oscillator has the velocity of the pendulum where q = 0."""
+        t = torch.linspace(0, 5, 3, dtype=torch.float64).to((y0[0] if isinstance(y0, tuple) else y0).dtype)
+        with pytest.raises(ValueError, match=r"^`func` is not the system that method 'verlet' solves"):
+            odeint(func, y0, t, method="verlet", options={"system": OSCILLATOR})
+        odeint(func, y0, t.flip(0), method="verlet", options={"system": systems.pendulum()})
+
+    def test_that_depends_on_the_time(self):
+        arguments = {"method": "verlet", "options": {"system": PENDULUM}}
+        for late in (torch.sin, lambda t: t > 0.9, lambda t: 0.01 * t):
+
+            def func(t, y, late=late):
+                return right_hand_side(t, y) * (1 + late(t))
+
+            with pytest.raises(ValueError, match=r"^`func` depends on the time"):
+                odeint(func, times(0.0, 1.9), times(0.0, 1.0), **arguments)
+            with pytest.raises(ValueError, match=r"^`func` depends on the time"):
+                odeint_event(func, times(0.0, 1.9), times(0.0)[0], event_fn=lambda t, y: y[0] - 1.0, **arguments)
+
+    def test_that_differs_only_where_the_run_comes_to(self):
+        def func(t, y):
+            return right_hand_side(t, y) * (1 + (y[0].abs() > 2.2))
+
+        with pytest.raises(ValueError, match=r"^`func` is not the system that method 'verlet' solves"):
+            odeint(func, times(0.0, 1.9), times(0.0, 50.0), method="verlet", options={"system": PENDULUM})
 
 
 @pytest.mark.parametrize(
@@ -362,10 +406,6 @@ def test_bad_arguments_are_named(arguments, error, message):
 def test_tolerances_have_no_effect_and_say_so():
     with pytest.warns(UserWarning, match="`rtol` and `atol` have no effect"):
         odeint(PENDULUM, times(1.0, 0.0), times(0.0, 1.0), method="verlet", rtol=1e-3)
-
-
-def right_hand_side(t, y):
-    return torch.stack([y[1], -torch.sin(y[0])])
 
 
 def test_single_precision_and_a_system_in_the_options():

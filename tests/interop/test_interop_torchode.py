@@ -78,6 +78,35 @@ def test_gradients_to_y0_t_and_weights():
         assert torch.autograd.gradcheck(states, (y0, t, *weights))
 
 
+def pendulum(t, y):
+    return torch.stack([y[:, 1], -torch.sin(y[:, 0])], -1)
+
+
+@pytest.mark.parametrize(
+    ("term", "message"),
+    [
+        (systems.harmonic_oscillator(), "is not the system that method 'verlet' solves: their Hamiltonians differ"),
+        (lambda t, y: torch.stack([y[:, 1], -y[:, 0]], -1), "is not the system that method 'verlet' solves: at t = "),
+        (lambda t, y: pendulum(t, y) * (1 + 0.01 * torch.sin(t))[:, None], "depends on the time"),
+        (lambda t, y: pendulum(t, y) * (1 + (t > 19.7))[:, None], "depends on the time"),
+        (lambda t, y: pendulum(t, y) * (1 + (y[:, :1] > 2.4)), "is not the system that method 'verlet' solves: at t"),
+    ],
+)
+def test_a_term_that_is_another_system_is_refused(term, message):
+    """It agrees at the start: there q = 0 and t = 0."""
+    y0 = torch.tensor([[0.0, 1.9], [0.0, 1.8]], dtype=torch.float64)
+    t_eval = torch.tensor([[0.0, 20.0], [0.0, 13.0]], dtype=torch.float64)
+    arguments = {
+        "method": step_method("verlet", PENDULUM),
+        "controller": torchode.FixedStepController(),
+        "dt0": torch.full((2,), 0.1, dtype=torch.float64),
+    }
+    with pytest.raises(ValueError, match=rf"^`term` {message}"):
+        torchode.solve_ivp(term, y0, t_eval, **arguments)
+    for same in (pendulum, systems.pendulum(), PENDULUM):
+        assert (torchode.solve_ivp(same, y0, t_eval[:, [0]] + t_eval / 10, **arguments).status == 0).all()
+
+
 def test_bad_arguments_are_named():
     with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem"):
         register("verlet", lambda t, y: y)

@@ -64,6 +64,18 @@ def test_reference_may_be_given_and_must_fit():
         reference_error(sol, better.y[:, :5])
 
 
+def test_a_solution_of_another_problem_is_no_reference():
+    t = np.linspace(0, 10, 11)
+    sol = solve(systems.henon_heiles(), "verlet", (0, 10), t_eval=t)
+    with pytest.raises(ValueError, match=r"^`reference` is a solution of another system, 'kepler'"):
+        reference_error(sol, solve(systems.kepler(0.6), "verlet", (0, 10), t_eval=t))
+    with pytest.raises(ValueError, match=r"^`reference` is a solution from another `y0`"):
+        reference_error(sol, solve(systems.henon_heiles(), "verlet", (0, 10), sol.y0 + 1e-9, t_eval=t))
+    single = solve(systems.henon_heiles(), "verlet", (0, 10), t_eval=t, dtype="float32")
+    assert reference_error(single, sol).max() < 1e-4  # the same start, in another precision
+    assert reference_error(sol, single).max() < 1e-4
+
+
 def test_reference_of_a_solution_that_ends_in_finite_time_is_refused():
     with pytest.raises(ValueError, match="no reference converges"):
         reference(systems.henon_heiles(), (0, 6), np.array([0.0, 0.0, 0.0, 0.7]), np.array([6.0]))

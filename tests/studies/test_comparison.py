@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sympflow import HamiltonianSystem, SympFlow, compare, get, reference_error, solve, stability, systems
+from sympflow.metrics.reference import Reference
 from sympflow.studies.attempts import Row, interleaved
 from sympflow.studies.comparison import combined_table, matched
 
@@ -99,6 +100,26 @@ def test_a_flow_in_eager_torch_beside_compiled_methods_says_so():
     assert verlet.reason == ""
     alone = compare(systems.pendulum(), ["mlp", "rk45"], **arguments).rows[0]
     assert "eager" not in alone.reason
+
+
+def test_a_reference_of_another_problem_is_refused():
+    system = systems.pendulum()
+    few = {"metrics": ["error"], "t_span": (0, 10), **QUICK}
+    t = np.linspace(0.2, 10, 50)
+    other = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 - 1", y0=system.y0)
+    with pytest.raises(ValueError, match=r"^`reference` is a solution of another system, 'custom': pass one of 'pen"):
+        compare(system, ["verlet"], reference=solve(other, "dop853", (0, 10), t_eval=t), **few)
+    elsewhere = solve(system, "dop853", (0, 10), [0.3, 0.1], t_eval=t)
+    with pytest.raises(ValueError, match=r"^`reference` is a solution from another `y0`"):
+        compare(system, ["verlet"], reference=elsewhere, **few)
+    for states in (elsewhere.y, Reference(t, elsewhere.y, "mine", 1e-9)):
+        with pytest.raises(ValueError, match=r"^`reference` has another energy than `y0`"):
+            compare(system, ["verlet"], reference=states, **few)
+    same = HamiltonianSystem.from_sympy("p**2/2 - cos(q)", name="mine", y0=system.y0)  # the same vector field
+    report = compare(system, ["verlet"], reference=solve(same, "dop853", (0, 10), t_eval=t, rtol=1e-12), **few)
+    assert report.reference.accuracy is None
+    assert "reference: given, of unknown accuracy" in report.table()
+    assert report.to_dict()["reference"] == {"method": "given", "accuracy": None}
 
 
 def test_a_solution_may_be_the_reference():

@@ -2,12 +2,16 @@
 
 import csv
 import math
+import time
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from sympflow import HamiltonianSystem, SympFlow, compare, get, systems, work_precision
-from sympflow.studies.attempts import Row
+from sympflow.integrators.base import FixedStep
+from sympflow.studies.attempts import Row, warm_up
 from sympflow.studies.precision import break_even, cost_at
 
 QUICK = {"t_span": (0, 10), "n_outputs": 10, "repeats": 1}
@@ -113,6 +117,18 @@ def test_methods_that_do_not_apply_and_unstable_steps_are_rows():
         ({"y0": [[1.0, 0.0]]}, "`y0` must be one state"),
         ({"repeats": 0}, "`repeats` must be a positive integer"),
         ({"t_span": (1, 1)}, "`t_span` has length zero"),
+        ({"tolerances": []}, "`tolerances` is empty"),
+        ({"tolerances": 1e-3}, "`tolerances` must be a list of positive numbers; got 0.001"),
+        ({"tolerances": [None]}, "`tolerances` must be a list of positive numbers"),
+        ({"tolerances": "1e-3"}, "`tolerances` must be a list of positive numbers"),
+        ({"steps": []}, "`steps` is empty"),
+        ({"steps": np.array([])}, "`steps` is empty"),
+        ({"steps": [10**400]}, "`steps` must be a list of positive numbers"),
+        ({"steps": [0.1, np.nan]}, "`steps` must be positive and finite"),
+        ({"budget": np.nan}, "`budget` must be a number of seconds"),
+        ({"budget": "1"}, "`budget` must be a number of seconds"),
+        ({"progress": 3}, "`progress` must be a function"),
+        ({"n_outputs": 0}, "`n_outputs` must be a positive integer"),
     ],
 )
 def test_bad_arguments_are_refused_at_once(arguments, message):
@@ -128,3 +144,53 @@ def test_a_flow_in_another_time_is_a_point_as_it_is_a_row_of_compare():
     assert (point.label, point.status, point.dt) == ("sympflow", "uncertain", row.dt)  # better than the reference
     assert point.training_time == row.training_time > 0
     assert point.energy_error == row.energy_error < 1e-6 * verlet.energy_error
+
+
+COMPILING = 0.3  # seconds
+
+
+@dataclass(frozen=True)
+class Cold(FixedStep):
+    """Explicit Euler, "compiled" at its first step of one state, of states in a batch, and of shorter steps."""
+
+    name: ClassVar[str] = "cold"
+    order: ClassVar[int | None] = 1
+    symplectic: ClassVar[bool] = False
+    ready: ClassVar[set[tuple[int, int]]] = set()
+
+    def step(self, system, t, y, h):
+        kind = (y.ndim, np.ndim(h))
+        if kind not in self.ready:
+            time.sleep(COMPILING)
+            self.ready.add(kind)
+        return y + np.asarray(h)[..., None] * system.vector_field(y)
+
+
+@pytest.mark.parametrize("budget", [20.0, 0.0])
+def test_compiling_is_no_run_time(budget):
+    """Without repeats the first run of a point counts; the outputs at 1/3, 2/3, 1 need shorter steps as well."""
+    Cold.ready.clear()
+    few = {"t_span": (0, 1), "n_outputs": 3, "repeats": 1, "budget": budget}
+    report = work_precision(systems.pendulum(), [("cold", Cold(dt=0.5))], batch=5, **few)
+    assert all(row.run_time < COMPILING / 3 for row in report.rows)
+    assert all(row.compile_time > 0.9 * COMPILING for row in report.rows)
+    assert "compiled in" in report.table()
+    again = work_precision(systems.pendulum(), [("cold", Cold(dt=0.5))], **few)
+    assert all(row.compile_time < COMPILING / 3 for row in again.rows)
+    assert "compiled in" not in again.table()
+    Cold.ready.clear()
+    (row,) = compare(systems.pendulum(), [Cold(dt=0.5)], ["energy"], t_span=(0, 1), n_outputs=3, repeats=1).rows
+    assert row.run_time < COMPILING / 3 < 0.9 * COMPILING < row.compile_time
+
+
+def test_a_warm_up_is_a_run_of_a_few_steps_with_as_many_outputs():
+    runs = []
+    warm_up(lambda span, t: runs.append((span, t)), 0.1, np.linspace(0.1, 100.0, 1000), 0.0)
+    warm_up(lambda span, t: runs.append((span, t)), 0.1, np.linspace(-0.01, -0.1, 10), 0.0)
+    for (t0, t1), t in runs:
+        assert t0 == 0
+        assert t[-1] == t1
+        assert np.all(np.diff(t) * t1 > 0)
+    assert [len(t) for _, t in runs] == [1000, 1000, 10, 10]
+    assert runs[0][0][1] == pytest.approx(0.35)
+    assert runs[2][0][1] == -0.1

@@ -16,7 +16,8 @@ import sympflow
 from sympflow import HamiltonianSystem, max_energy_error, solve, stability, systems
 from sympflow.commands import app
 from sympflow.integrators.base import FixedStep
-from sympflow.studies.step_stability import blow_up, initial_states
+from sympflow.studies.attempts import candidates
+from sympflow.studies.step_stability import Search, Study, blow_up, initial_states
 
 SINGULARITY = 5.450984210235402  # of Hénon–Heiles from q = 0, p = (0, 0.7)
 
@@ -27,6 +28,48 @@ def test_the_limit_of_an_oscillator_is_two_at_every_frequency(method, omega):
     (limit,) = report.limits
     assert abs(limit.stable * omega - 2) < 0.02
     assert abs(limit.unstable * omega - 2) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("method", "first"), [("omelyan4", 3.1393), ("mclachlan4", 3.0355), ("srkn14a", 3.1409), ("yoshida6", 2.2691)]
+)
+def test_the_first_loss_of_stability_is_found_whatever_the_steps(method, first):
+    """At ω = 3 the energy is lost from 1.047 on with omelyan4; a sweep that doubles its steps calls 1.788 stable."""
+    system = systems.harmonic_oscillator(3.0)
+    few = {"metrics": ("energy",), "max_steps": 5000}
+    found = [stability(system, [method], steps=steps, **few).limits[0] for steps in ([0.1], [0.3, 1.6], [4.0, 5.0])]
+    assert found[0] == found[1] == found[2]
+    assert 3 * found[0].stable == pytest.approx(first, abs=6e-5)
+    assert found[0].stable < found[0].unstable < found[0].intervals[1][0]
+    assert found[0].frequency == pytest.approx(3)
+
+
+@pytest.mark.parametrize("method", ["kahan_li8", "gauss_legendre4"])
+def test_the_limit_of_a_nonlinear_system_does_not_depend_on_the_steps(method):
+    few = {"metrics": ("energy",), "max_steps": 5000, "min_steps": 200, "t_span": (0.0, 20.0)}
+    limits = {
+        stability(systems.henon_heiles(), [method], steps=steps, **few).limits[0].stable
+        for steps in ([0.05], [0.31, 0.32], [0.06, 7.0])
+    }
+    assert len(limits) == 1
+
+
+def test_an_unstable_step_that_was_asked_for_lowers_the_limit():
+    study = Study(
+        *(systems.pendulum(), candidates(["verlet"])[0], "float64", (0.0, 20.0)),
+        *(systems.pendulum().y0[None], (), 1e3, 200, 5000),
+    )
+    low, high, _ = Search(study, []).limit()
+    lower, bad, _ = Search(study, [0.3]).limit()
+    assert low > 1
+    assert 0.29 < lower < bad <= 0.3 < low < high
+
+
+def test_a_row_inside_a_window_says_so():
+    oscillator = systems.harmonic_oscillator()
+    (row,) = stability(oscillator, ["srkn14a"], steps=[3.1415], metrics=("energy",), max_steps=1000).rows
+    assert row.status == "bounded"  # a factor 1.0006 a step, in 1000 of them
+    assert row.reason.endswith("Small oscillations are unstable here: they grow by up to a factor 1.0006 a step.")
 
 
 def test_two_is_unstable_though_one_state_does_not_show_it():

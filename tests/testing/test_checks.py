@@ -20,7 +20,7 @@ NO_STEP = {check.__name__ for check in laws.OF_STEPS} - {"the_order_is_the_slope
 def not_applicable(integrator):
     """The checks that have nothing to check, from what a method is."""
     name, skipped = integrator.name, set()
-    if not integrator.symplectic:
+    if not integrator.symplectic or integrator.keeps:
         skipped.add("the_inverse_undoes_the_step")
     if integrator.trained:
         skipped.add("the_order_is_the_slope")
@@ -71,15 +71,18 @@ def test_a_new_integrator_passes_without_further_work():
     assert set(report) | set(report.skipped) == {check.name for check in CHECKS}
 
 
+ARRAYS = "steps by NumPy: pass y0.numpy()"
+
+
 def with_numpy_only(self, system, t, y, h):
-    """A step that neither takes tensors nor says so."""
+    """A step that makes arrays of tensors."""
     d, h = system.ndof, per_state(np.asarray(h), y)
     q, p = np.asarray(y)[..., :d], np.asarray(y)[..., d:]
     p = p + h * system.force(q)
     return np.concatenate([q + h * system.velocity(p), p], axis=-1).astype(q.dtype)
 
 
-def numpy_only_and_says_so(self, system, t, y, h):
+def refuses_tensors(self, system, t, y, h):
     if not isinstance(y, np.ndarray):
         raise TypeError("`y0` must be an array.")
     return with_numpy_only(self, system, t, y, h)
@@ -93,17 +96,22 @@ def heun(self, system, t, y, h):
 
 def test_what_runs_on_arrays_alone_is_judged_all_the_same():
     """By finite differences of the step, since it cannot be differentiated."""
-    check_integrator(lying(step=with_numpy_only))
-    report = check_integrator(lying(step=numpy_only_and_says_so))
+    report = check_integrator(lying(step=with_numpy_only, arrays_only=ARRAYS))
     assert "symplecticity_as_declared" in report.passed
-    assert "it takes no tensors" in report.skipped["dtype_device_and_gradient_of_tensors"]
+    assert "it takes NumPy arrays only, as it says" in report.skipped["dtype_device_and_gradient_of_tensors"]
     assert "volume and symplecticity cannot be measured" in report.skipped["the_tangent_is_the_derivative_of_the_step"]
+    for undeclared in (with_numpy_only, refuses_tensors):
+        with pytest.raises(AssertionError, match=r"^dtype_device_and_gradient_of_tensors .* or declare `arrays_only`"):
+            check_integrator(lying(step=undeclared))
+    overcautious = {"arrays_only": ARRAYS, "check_library": lambda *_: None}
+    with pytest.raises(AssertionError, match=r"`arrays_only` is declared, but tensors are taken: leave it out"):
+        laws.dtype_device_and_gradient_of_tensors(lying(**overcautious)(), laws.default_system())
 
     def unaware_heun(self, system, t, y, h):
-        return heun(self, system, t, numpy_only_and_says_so(self, system, t, y, 0 * h) * 0 + y, h)
+        return heun(self, system, t, refuses_tensors(self, system, t, y, 0 * h) * 0 + y, h)
 
     with pytest.raises(AssertionError, match=r"^symplecticity_as_declared of .*declared symplectic, but AᵀJA − J is"):
-        check_integrator(lying(step=unaware_heun, order=2))
+        check_integrator(lying(step=unaware_heun, order=2, arrays_only=ARRAYS))
 
 
 def forgets_the_short_step(self, problem):
@@ -144,6 +152,25 @@ def leaves_the_graph(self, system, t, y, h):
     return torch.from_numpy(SymplecticEuler.step(self, system, t, y.numpy(), np.asarray(h)))
 
 
+def loses_gradients(self, system, t, y, h):
+    return SymplecticEuler.step(self, system, t, y if isinstance(y, np.ndarray) else y.detach(), h)
+
+
+def says_nothing(self, n_steps, n_saved, n_extra, backend):
+    return {"force_evaluations": 0, "hessian_evaluations": 0}
+
+
+def says_two(self, n_steps, n_saved, n_extra, backend):
+    return {"force_evaluations": 2 * (n_steps + n_extra), "hessian_evaluations": 0}
+
+
+def by_its_own_force(self, system, t, y, h):
+    """Hénon–Heiles by heart: no function of the system is called."""
+    q1, q2, h = y[..., :1], y[..., 1:2], per_state(h, y)
+    p = y[..., 2:] - h * concatenate([q1 + 2 * q1 * q2, q2 + q1**2 - q2**2])
+    return concatenate([y[..., :2] + h * p, p])
+
+
 def wrong_tangent(self, system, t, y, h):
     return self.step(system, t, y, h), np.broadcast_to(np.eye(y.shape[-1]), (*y.shape, y.shape[-1])).copy()
 
@@ -176,7 +203,14 @@ def hides_failure(self, problem):
         ({"step": goes_forward_only}, r"^both_directions of .*it raised ValueError: `h` must be positive"),
         ({"tangent": wrong_tangent}, r"^the_tangent_is_the_derivative_of_the_step of .*finite differences"),
         ({"step": crashes}, r"^dtype_and_shape_of_arrays of .*it raised RuntimeError: some library failed"),
-        ({"step": leaves_the_graph}, r"^dtype_device_and_gradient_of_tensors of .*it raised RuntimeError: Can't call"),
+        (
+            {"step": leaves_the_graph},
+            r"^dtype_device_and_gradient_of_tensors of .*Can't call.*or declare `arrays_only`",
+        ),
+        ({"step": loses_gradients}, r"^dtype_device_and_gradient_of_tensors of .*loses the gradient of the tensors"),
+        ({"evaluations": says_nothing}, r"^statistics of .*stats count no force: let them be counted, or mend"),
+        ({"evaluations": says_two}, r"^statistics of .*`evaluations` tells 2 forces a step, but step\(\) evaluates 1"),
+        ({"step": by_its_own_force}, r"^statistics of .*stats count no force"),
     ],
 )
 def test_lies_are_caught(lie, message):

@@ -65,12 +65,20 @@ def workspace():
     return np.empty(NDOF), np.empty(NDOF), np.empty(NDOF), np.empty(NDOF)
 
 
+@njit(**OPTIONS)
+def forget(x):
+    """NaN: what a user's function does not write then ends the run."""
+    for i in range(NDOF):
+        x[i] = np.nan
+
+
 COUPLED = True
 
 
 @njit(**OPTIONS)
 def kick(q, numbers, work):
     slope = work[0]
+    forget(slope)
     gradient(q, slope)
     for i in range(NDOF):
         slope[i] *= -numbers[0]
@@ -81,8 +89,10 @@ def kick(q, numbers, work):
 def gradient_kick(q, numbers, work):
     b, g = numbers
     slope, velocity, product, _ = work
+    forget(slope)
     gradient(q, slope)
     apply_inverse_mass(slope, velocity)
+    forget(product)
     hessian_vector(q, velocity, product)
     for i in range(NDOF):
         slope[i] *= -b

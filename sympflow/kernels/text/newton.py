@@ -1,10 +1,10 @@
 """The loops of an implicit Gauss method: Newton's iteration, a step, a run. Source text for `implicit`.
 
-What comes before defines `NDOF`, `COMPENSATED`, the tableau `A` and `B` of `STAGES` stages as tuples, and the system's
-``gradient_and_hessian(y, g, S)``, which leaves the entries of S that are always zero as they are.
+What comes before defines `NDOF`, `COMPENSATED`, the tableau `A`, `B` and `SCALE` of `STAGES` stages as tuples, and the
+system's ``gradient_and_hessian(y, g, S)``, which leaves the entries of S that are always zero as they are.
 
-The unknowns are K_i = h f(y + Σ_j a_ij K_j), in which the coefficients of both methods that are used are exact where it
-matters for the long run, and y + Σ b_i K_i needs no further evaluation of f.
+The unknowns are K_i = h SCALE_i f(y + Σ_j A_ij K_j), in which the coefficients are exact where it matters for the long
+run, and y + Σ B_i K_i needs no further evaluation of f.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -90,9 +90,9 @@ def stages(y, h, work):
             for m in range(SIZE):
                 sign = 1.0 if m < NDOF else -1.0  # J∇H = (∂H/∂p, −∂H/∂q)
                 other = m + NDOF if m < NDOF else m - NDOF
-                change[row + m] = K[row + m] - h * sign * g[other]
+                change[row + m] = K[row + m] - h * sign * SCALE[i] * g[other]
                 for j in range(STAGES):
-                    factor = h * sign * A[i][j]
+                    factor = h * sign * SCALE[i] * A[i][j]
                     for n in range(SIZE):
                         M[row + m, j * SIZE + n] = -factor * S[other, n]
                 M[row + m, row + m] += 1.0

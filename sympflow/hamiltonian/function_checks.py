@@ -1,0 +1,335 @@
+"""Checks of the functions that define H: derivatives against differences, batches against single states, repetition.
+
+They run once for a system, at a few states, and cost milliseconds. A function passes unless it is certainly wrong:
+next to a kink or a singularity, or where rounding hides the answer, nothing is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.hamiltonian.domain import Domain
+
+SPREAD = 0.05
+"""The distance of the probes about a given state from it, relative to its size."""
+FEW = 4
+EVERY_COMPONENT = 64
+"""Most components that are tested one by one; of more, as many random directions as DIRECTIONS."""
+DIRECTIONS = 8
+STEPS = {np.dtype(np.float64): (1e-5, 1e-4), np.dtype(np.float32): (3e-3, 1e-2)}
+"""Steps of the differences, relative to the size of the state: a derivative is wrong if both say so."""
+REMEDY = "where all is as it should be, pass check=False to HamiltonianSystem."
+
+
+def probe_states(given: np.ndarray | None, domain: Domain | None, width: int) -> np.ndarray:
+    """States (n, width) at which functions are tested: the given ones, near these, and some of the domain.
+
+    Without any they are random numbers of size 1.
+    """
+    rng = np.random.Generator(np.random.PCG64(20260102))
+    found = []
+    if given is not None:
+        rows = np.asarray(given, dtype=float).reshape(-1, width)
+        rows = rows[np.isfinite(rows).all(1)][:FEW]
+        halves = rows.reshape(len(rows), 2, -1)
+        size = np.abs(halves).max(-1, keepdims=True, initial=0.0)
+        noise = rng.standard_normal((2, *halves.shape)) * SPREAD * np.where(size > 0, size, 1.0)
+        found += [rows, *(halves + noise).reshape(2, *rows.shape)]
+    if domain is not None:
+        found.append(np.asarray(domain.sample(FEW, seed=20260102)))
+    if not found:
+        found.append(rng.standard_normal((FEW, width)))
+    return np.concatenate(found)
+
+
+@dataclass(frozen=True)
+class Tested:
+    """A function of states x (..., n), its gradient, and its Hessian times a vector where that was given.
+
+    Parameters
+    ----------
+    names : (str, str, str)
+        Those of the functions, and of the state, in messages.
+    automatic : bool
+        True if the gradient is an automatic one.
+    result_types : callable, optional
+        The types in which the user's own functions answer.
+    """
+
+    names: tuple[str, str, str]
+    value: Callable[[Array], Array]
+    gradient: Callable[[Array], Array]
+    hessian_vector: Callable[[Array, Array], Array] | None = None
+    automatic: bool = False
+    result_types: Callable[[Array], list[tuple[str, Any]]] | None = None
+
+
+def test(functions: Tested, states: np.ndarray, like: Array, n_given: int) -> None:
+    """Test the functions at states (N, n), in the library, dtype and on the device of `like`.
+
+    Parameters
+    ----------
+    n_given : int
+        How many of the first states must be in the domain of the functions; where they fail at others, these are
+        left out.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If a function is wrong: the message names it, the component, the state and both values.
+    """
+    with np.errstate(all="ignore"):
+        kept = _evaluated(functions, as_like(states, like), n_given)
+        if kept is None:
+            return
+        x, V, g = kept
+        _check_types(functions, x)
+        _check_repetition(functions, x, V, g)
+        _check_batches(functions, x, V, g)
+        _check_gradient(functions, x, V, g)
+        if functions.hessian_vector is not None:
+            _check_hessian_vector(functions, x, g)
+
+
+def as_like(states: np.ndarray, like: Array) -> Array:
+    """Return states in the library, dtype and on the device of `like`."""
+    if not is_tensor(like):
+        return states.astype(like.dtype)
+    import torch
+
+    return torch.as_tensor(states, dtype=like.dtype, device=like.device)
+
+
+def _precision(x: Array) -> np.dtype:
+    return np.dtype(str(x.dtype).removeprefix("torch."))
+
+
+def _numbers(value: Array) -> np.ndarray:
+    return to_numpy(value).astype(float)
+
+
+def _evaluated(functions: Tested, x: Array, n_given: int) -> tuple[Array, np.ndarray, np.ndarray] | None:
+    """The states at which both functions are finite, and their values there, one state at a time."""
+    rows, values, slopes = [], [], []
+    for i in range(len(x)):
+        try:
+            V, g = functions.value(x[i]), functions.gradient(x[i])
+        except Exception:
+            if i < n_given:
+                raise
+            continue
+        if np.isfinite(_numbers(V)) and np.isfinite(_numbers(g)).all():
+            rows.append(i)
+            values.append(_numbers(V))
+            slopes.append(_numbers(g))
+    return (x[rows], np.stack(values), np.stack(slopes)) if rows else None
+
+
+def _check_types(functions: Tested, x: Array) -> None:
+    """Refuse answers of less precision than the states have, which would be taken for exact."""
+    if functions.result_types is None:
+        return
+    mine = _precision(x)
+    for name, dtype in functions.result_types(x[0]):
+        kind = str(dtype).removeprefix("torch.")
+        if kind in ("float16", "bfloat16", "float32") and (kind != "float32" or mine == np.float64):
+            raise TypeError(
+                f"`{name}` returns {kind} for a state in {mine}, whose digits it loses: compute in the type of the "
+                f"argument, or solve in {kind}; {REMEDY}"
+            )
+
+
+def _check_repetition(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -> None:
+    for name, function, before in (
+        (functions.names[0], functions.value, V[0]),
+        (functions.names[1], functions.gradient, g[0]),
+    ):
+        again = _numbers(function(x[0]))
+        if not np.allclose(again, before, rtol=1e-6, atol=1e-12 * np.abs(before).max(), equal_nan=True):
+            raise ValueError(
+                f"`{name}` gives another value each time: at {_shown(functions, x[0])} {_short(before)}, then "
+                f"{_short(again)}. A Hamiltonian is a function of the state alone; {REMEDY}"
+            )
+
+
+def _check_batches(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -> None:
+    """In a square batch, d states of d components, a transposed result has the right shape."""
+    n = x.shape[-1]
+    rows = np.arange(n if 2 <= n <= EVERY_COMPONENT else 3) % len(x)
+    tolerance = 1e-7 if _precision(x) == np.float64 else 1e-3
+    for name, function, single in (
+        (functions.names[0], functions.value, V),
+        (functions.names[1], functions.gradient, g),
+    ):
+        batch, expected = _numbers(function(x[rows])), single[rows]
+        if batch.shape != expected.shape:
+            raise ValueError(
+                f"`{name}` must return shape {expected.shape} for a batch of shape {tuple(x[rows].shape)}; got "
+                f"{batch.shape}. Write it for states on the last axis, q[..., 0] in place of q[0]; {REMEDY}"
+            )
+        size = np.abs(expected).max(axis=tuple(range(1, expected.ndim)), keepdims=True)
+        wrong = ~(np.abs(batch - expected) <= tolerance * size + 1e-300)
+        if wrong.any():
+            i = tuple(np.argwhere(wrong)[0].tolist())
+            part = f"component {i[1]} of its result" if len(i) == 2 else "its result"
+            raise ValueError(
+                f"`{name}` gives a batch other values than single states: {part} at {_shown(functions, x[rows][i[0]])}"
+                f" is {expected[i]:g} alone, {batch[i]:g} in a batch of shape {tuple(x[rows].shape)}. Write it for "
+                f"states on the last axis, q[..., 0] in place of q[0]; {REMEDY}"
+            )
+
+
+def _directions(x: np.ndarray, chosen: Sequence[int] | None) -> np.ndarray:
+    """Directions (N, m, n) at states (N, n), of the size of these: those of chosen components, or random ones."""
+    largest = np.abs(x).max(-1, keepdims=True)
+    size = np.maximum(np.abs(x), 0.1 * np.where(largest > 0, largest, 1.0))
+    if chosen is not None:
+        return size[:, None, :] * np.eye(x.shape[-1])[list(chosen)]
+    rng = np.random.Generator(np.random.PCG64(20260103))
+    return size[:, None, :] * rng.uniform(-1, 1, (DIRECTIONS, x.shape[-1]))
+
+
+def _differences(
+    function: Callable[[Array], Array], x: Array, w: np.ndarray, h: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Central differences of a function along w (N, m, n) at x (N, n): (N, m, …), and how far they may be off.
+
+    The one is as uncertain as the slopes on both sides differ, and as rounding makes it: that is seen in the values at
+    states a few units in the last place away.
+    """
+    eps = np.finfo(_precision(x)).eps
+    at = _numbers(x)[:, None, :]
+    lengths = np.array([h, -h, 2 * eps, -2 * eps, 4 * eps, 0.0]).reshape(-1, 1, 1, 1)
+    states = at + lengths * w
+    flat = as_like(states.reshape(-1, x.shape[-1]), x)
+    values = _numbers(function(flat))
+    values = values.reshape(*states.shape[:-1], *values.shape[1:])
+    up, down, *near, here = values
+    rounding = np.max([np.abs(v - here) for v in near], axis=0) + 4 * eps * np.abs(here)
+    ahead, behind = (up - here) / h, (here - down) / h
+    return (ahead + behind) / 2, 2 * np.abs(ahead - behind) + 16 * rounding / h
+
+
+def _certainly_wrong(
+    function: Callable[[Array], Array], x: Array, w: np.ndarray, claimed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the claimed derivatives along w (N, m, …) are none of the function, and the differences."""
+    small, large = STEPS[_precision(x)]
+    floor = 10 * small if _precision(x) == np.float64 else 3 * small
+    wrong = np.ones(claimed.shape, dtype=bool)
+    for h in (large, small):
+        found, uncertain = _differences(function, x, w, h)
+        beside = floor * np.maximum(np.abs(found), np.abs(claimed))
+        wrong &= np.abs(found - claimed) > beside + uncertain  # False where one of them is not finite
+    return wrong, found
+
+
+def _check_gradient(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -> None:
+    n = x.shape[-1]
+    at = _numbers(x)
+    if n > EVERY_COMPONENT:
+        w = _directions(at, None)
+        wrong, _ = _certainly_wrong(functions.value, x, w, (w * g[:, None]).sum(-1))
+        if not wrong.any():
+            return
+        worst = int(np.argwhere(wrong)[0][0])
+        x, at, g = x[worst : worst + 1], at[worst : worst + 1], g[worst : worst + 1]
+    for start in range(0, n, EVERY_COMPONENT):
+        chosen = range(start, min(start + EVERY_COMPONENT, n))
+        w = _directions(at, chosen)
+        size = w.sum(-1)
+        wrong, found = _certainly_wrong(functions.value, x, w, size * g[:, list(chosen)])
+        if wrong.any():
+            i, k = np.argwhere(wrong)[0].tolist()
+            _refuse(functions, x[i], chosen[k], g[i, chosen[k]], found[i, k] / size[i, k], g)
+
+
+def _refuse(functions: Tested, state: Array, k: int, given: float, found: float, g: np.ndarray) -> None:
+    value, gradient, _ = functions.names
+    if not functions.automatic:
+        raise ValueError(
+            f"`{gradient}` is not that of `{value}`: at {_shown(functions, state)} its component {k} is {given:g}, "
+            f"but `{value}` grows by {found:g} a unit, by differences. Correct one of them; {REMEDY}"
+        )
+    cut = "is" if not g[:, k].any() else "is in part"
+    raise ValueError(
+        f"`{value}` {cut} cut off from automatic differentiation: at {_shown(functions, state)} component {k} of its "
+        f"gradient is {given:g}, but it grows by {found:g} a unit, by differences. Write it with torch functions "
+        f"throughout, without detach(), item() or NumPy, or pass `gradient` as well; {REMEDY}"
+    )
+
+
+def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
+    assert functions.hessian_vector is not None
+    w = _directions(_numbers(x), None)[:, :1]
+    v = as_like(w[:, 0], x)
+    claimed = np.stack([_numbers(functions.hessian_vector(x[i], v[i])) for i in range(len(x))])
+    batch = _numbers(functions.hessian_vector(x, v))
+    name = "hessian_vector"
+    if claimed.shape != g.shape or batch.shape != g.shape:
+        got = claimed.shape[1:] if claimed.shape != g.shape else batch.shape
+        expected = g.shape[1:] if claimed.shape != g.shape else g.shape
+        raise ValueError(
+            f"`{name}` must return shape {expected}, that of its arguments; got {got}. Write it for states on the last "
+            f"axis; {REMEDY}"
+        )
+    wrong, found = _certainly_wrong(functions.gradient, x, w, claimed[:, None])
+    if wrong.any():
+        i, _, k = np.argwhere(wrong)[0].tolist()
+        raise ValueError(
+            f"`{name}` is not the derivative of `{functions.names[1]}`: at {_shown(functions, x[i])}, along v = "
+            f"{_short(w[i, 0])}, its component {k} is {claimed[i, k]:g}, but the gradient grows by "
+            f"{found[i, 0, k]:g}, by differences. Correct one of them; {REMEDY}"
+        )
+    size = np.abs(claimed).max(-1, keepdims=True)
+    apart = ~(np.abs(batch - claimed) <= (1e-7 if _precision(x) == np.float64 else 1e-3) * size + 1e-300)
+    apart &= np.isfinite(claimed)
+    if apart.any():
+        i, k = np.argwhere(apart)[0].tolist()
+        raise ValueError(
+            f"`{name}` gives a batch other values than single states: component {k} of its result at "
+            f"{_shown(functions, x[i])} is {claimed[i, k]:g} alone, {batch[i, k]:g} in a batch of shape "
+            f"{tuple(x.shape)}. Write it for states on the last axis, q[..., 0] in place of q[0]; {REMEDY}"
+        )
+
+
+def check_writes(name: str, function: Callable[..., Any], *states: np.ndarray) -> None:
+    """Test that a Numba function (x, …, out) sets every number of `out`, which holds anything before, and no other.
+
+    Raises
+    ------
+    ValueError
+        If one is left as it was, or added to; or if x is written into.
+    """
+    found = []
+    for fill in (7.0, -3.0):
+        out = np.full(states[0].shape, fill)
+        copies = [x.copy() for x in states]
+        function(*copies, out)
+        if not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(copies, states, strict=True)):
+            raise ValueError(
+                f"`{name}` writes into its argument, the state of the run: it may write into `out` only; {REMEDY}"
+            )
+        found.append(out)
+    apart = np.flatnonzero((found[0] != found[1]) & ~(np.isnan(found[0]) & np.isnan(found[1])))
+    if apart.size:
+        raise ValueError(
+            f"`{name}` does not set out[{apart[0]}] at {_short(states[0])}: it leaves what was there, or adds to it. "
+            f"Assign every component, 0.0 where it vanishes; {REMEDY}"
+        )
+
+
+def _shown(functions: Tested, state: Array) -> str:
+    return f"{functions.names[2]} = {_short(_numbers(state))}"
+
+
+def _short(v: np.ndarray) -> str:
+    if v.ndim == 0:
+        return f"{float(v):g}"
+    shown = ", ".join(f"{x:.6g}" for x in v.ravel()[:8])
+    return f"({shown}{', …' if v.size > 8 else ''})"

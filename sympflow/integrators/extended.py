@@ -1,0 +1,98 @@
+"""Runs on an extended phase space: the states that were asked for are projections of those of the run."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from sympflow.arrays import Array, to_numpy
+from sympflow.events import EventSearch
+from sympflow.integrators.contract import Outcome, Problem
+
+APART = 0.1
+"""Of the largest coordinate or momentum of the run: the distance of two copies beyond which its states mean little."""
+
+
+class Extension(Protocol):
+    """A phase space that extends the one of the system, and the way back."""
+
+    method: str
+
+    def lift(self, y: Array) -> Array:
+        """The states of the extended space for states y (..., 2d)."""
+        ...
+
+    def project(self, x: Array) -> Array:
+        """The states (..., 2d) of those of the extended space."""
+        ...
+
+    def distance(self, x: Array) -> Array:
+        """How far states of the extended space are from those that `lift` gives: (...)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Projected:
+    """The dense output of a run on an extended phase space."""
+
+    sol: Callable[[Any], Array]
+    extension: Extension
+
+    def __call__(self, t: Any) -> Array:
+        x = self.sol(t)
+        if np.ndim(t) == 0:
+            return self.extension.project(x)
+        from_last = np.moveaxis if isinstance(x, np.ndarray) else type(x).movedim
+        return from_last(self.extension.project(from_last(x, -2, -1)), -1, -2)
+
+
+def extended_run(run: Callable[[Problem], Outcome], extension: Extension, problem: Problem) -> Outcome:
+    """The outcome of a problem that is run on an extended phase space.
+
+    Warns
+    -----
+    RuntimeWarning
+        If the states of the run depart from those that stand for a state of the system.
+    """
+    search = problem.events
+    lifted = None if search is None else EventSearch(_of_projections(search, extension), search.max_interval)
+    outcome = run(replace(problem, y0=extension.lift(problem.y0), events=lifted))
+    x = outcome.y
+    if search is not None and lifted is not None:
+        search.found = [[(t, extension.project(y)) for t, y in zeros] for zeros in lifted.found]
+        search.end = None if lifted.end is None else (lifted.end[0], extension.project(lifted.end[1]))
+        search.n_dense = lifted.n_dense
+    outcome.y = extension.project(x)
+    if outcome.sol is not None:
+        outcome.sol = Projected(outcome.sol, extension)
+    if len(x):
+        _warn_of_distance(extension, to_numpy(x), outcome)
+    return outcome
+
+
+def _of_projections(search: EventSearch, extension: Extension) -> Any:
+    return tuple(
+        replace(event, g=lambda t, x, g=event.g: g(t, extension.project(x)))  # type: ignore[misc]
+        for event in search.events
+    )
+
+
+def _warn_of_distance(extension: Extension, x: np.ndarray, outcome: Outcome) -> None:
+    with np.errstate(all="ignore"):
+        apart, size = np.asarray(extension.distance(x)), np.abs(x).max(-1)
+        ratio = apart.max(0) / size.max(0)
+    outcome.stats["copy_distance"] = float(np.nanmax(apart)) if not np.isnan(apart).all() else float("nan")
+    lost = ratio > APART
+    if lost.any():
+        which = "" if lost.ndim == 0 else f" of {np.count_nonzero(lost)} of {lost.size} trajectories"
+        warnings.warn(
+            f"The two copies{which} that method {extension.method!r} keeps differ by up to "
+            f"{float(np.nanmax(apart)):.3g}: its states say little about the system. Reduce `dt`, or change `omega`, "
+            "the strength by which the copies are bound.",
+            RuntimeWarning,
+            stacklevel=4,
+        )

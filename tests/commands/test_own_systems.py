@@ -1,0 +1,184 @@
+"""Systems in files of the user, TOML with a formula and Python with a name; what is wrong with them is said."""
+
+import numpy as np
+import pytest
+from test_cli import run
+
+from sympflow import EnergySublevel, systems
+from sympflow.commands.words import one_scene, scenes
+from sympflow.systems.user_files import factory
+
+QUARTIC = """
+hamiltonian = "p**2/2 + q**2/2 + lam*q**4/4"
+y0 = [1.0, 0.0]
+t_span = [0, 2]
+dt = 0.1
+
+[params]
+lam = 0.5
+
+[domain]
+kind = "EnergySublevel"
+energy = 1.0
+box = { low = [-1.3, -1.5], high = [1.3, 1.5] }
+"""
+PYTHON = """
+from sympflow import HamiltonianSystem
+
+spring = HamiltonianSystem.from_sympy("p**2/2 + q**2/2", y0=[1.0, 0.0], t_span=(0, 2), dt=0.1)
+
+
+def chain(stiffness: float = 1.0, power: int = 2, label: str = "a") -> HamiltonianSystem:
+    H = f"p**2/2 + k*q**{power}/2"
+    return HamiltonianSystem.from_sympy(H, params={"k": stiffness}, name=label, y0=[1.0, 0.0], t_span=(1, 2))
+
+
+def needs(k):
+    return spring
+
+
+def number():
+    return 3
+
+
+def fails():
+    return 1 / 0
+
+
+seven = 7
+"""
+ARRAY = ("--method", "leapfrog", "--backend", "array")
+
+
+@pytest.fixture(autouse=True)
+def files(tmp_path, monkeypatch):
+    """A folder with files of systems, which is the current one."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "quartic.toml").write_text(QUARTIC, encoding="utf-8")
+    (tmp_path / "own.py").write_text(PYTHON, encoding="utf-8")
+    return tmp_path
+
+
+def test_a_formula_in_a_file_is_the_system_of_the_same_formula():
+    scene = one_scene(["quartic.toml"])
+    y = np.array([[0.3, -0.7], [1.1, 0.2]])
+    expected = y[:, 1] ** 2 / 2 + y[:, 0] ** 2 / 2 + 0.5 * y[:, 0] ** 4 / 4
+    np.testing.assert_allclose(scene.system.hamiltonian(y), expected, rtol=1e-15)
+    assert (scene.key, scene.system.name, scene.system.t_span, scene.system.dt) == ("quartic", "quartic", (0, 2), 0.1)
+    assert scene.system.y0.tolist() == [1, 0]
+    assert isinstance(scene.system.domain, EnergySublevel)
+    assert scene.system.domain.contains([0.1, 0.1])
+    assert systems.from_toml("quartic.toml", lam=3.0).params == {"lam": 3.0}
+    assert one_scene(["quartic.toml:lam=2:t_end=1"]).system.params == {"lam": 2.0}
+    assert one_scene(["quartic.toml", "--lam", "2"]).key == "quartic-lam=2"
+
+
+def test_a_name_in_a_python_file_is_a_system_or_a_function_of_parameters():
+    assert one_scene(["own.py:spring"]).system is factory("own.py", "spring")()
+    made = one_scene(["own.py:chain:power=4:label=b", "--stiffness", "2"])
+    assert (made.system.params, made.system.name) == ({"k": 2.0}, "b")
+    assert made.system.hamiltonian(np.array([2.0, 0.0])) == 16
+    assert made.key == "own-chain-stiffness=2-power=4-label=b"
+    one, other = scenes(["own.py:spring", "pendulum"], ["quartic.toml"])[1:]
+    assert (one.key, other.key) == ("pendulum", "quartic")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["own.py:spring"],
+        ["--system", "own.py:spring"],
+        ["--system", "quartic.toml", "--lam", "2"],
+        ["own.py:chain:power=4", "--stiffness", "2"],
+        ["own.py:needs:k=1"],
+        ["own.py"],
+    ],
+)
+def test_solve_takes_it(words):
+    result = run("solve", *words, *ARRAY)
+    assert result.exit_code == 0, result.output
+    assert "y(2) = [" in result.stdout
+
+
+def test_every_command_that_takes_a_system_takes_it():
+    fast = ("--methods", "leapfrog", "--backend", "array", "--n-outputs", 3, "--repeats", 1)
+    for words in (
+        ("compare", "quartic.toml", "own.py:spring", *fast, "--metrics", "energy"),
+        ("bench", "own.py:spring", *fast, "--t-end", 0.5),
+        ("section", "own.py:spring", "--method", "leapfrog", "--t-end", 7),
+        ("flows", "own.py:spring"),
+        ("stability", "own.py:chain", "--vary", "power=2", "--methods", "rk45", "--steps", 0.1, "--no-limits"),
+    ):
+        result = run(*words)
+        assert result.exit_code == 0, (words, result.output)
+    assert "harmonic_oscillator-sympflow" in run("flows", "own.py:spring").stdout  # known by its H
+
+
+def test_a_flow_is_trained_on_it_certified_and_used(files):
+    small = ("--stages", 1, "--processor", 0, "--dt", 0.4, "--restarts", 1, "--steps", 2, "--points", 20)
+    trained = run("train", "quartic.toml", *small, "--out", "q.safetensors")
+    assert trained.exit_code == 0, trained.output
+    sample = ("--states", 20, "--times", 3, "--held-out", 3, "--t-end", 4)
+    for to in ("c.json", "certified.safetensors"):
+        found = run("certificate", "quartic.toml", "--flow", "q.safetensors", *sample, "--out", to)
+        assert found.exit_code == 0, found.output
+        assert "Certificate of a flow of quartic" in found.stdout
+    assert '"held_out": 3' in (files / "c.json").read_text(encoding="utf-8")
+    result = run("solve", "quartic.toml", "--method", "certified.safetensors", "--backend", "array")
+    assert result.exit_code == 0, result.output
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("gone.toml", "`system` 'gone.toml': there is no such file"),
+        ("gone.py:x", "`system` 'gone.py': there is no such file"),
+        ("folder.toml", "`system` 'folder.toml' cannot be read"),
+        ("own.py:sprong", "`system` 'sprong' is not in 'own.py'. Did you mean 'spring'?"),
+        ("own.py:seven", "must be a HamiltonianSystem, or a function that returns one; it is int"),
+        ("own.py:number", "must return a HamiltonianSystem; it returns int"),
+        (
+            "own.py:fails",
+            "`system` 'fails' in 'own.py' failed (ZeroDivisionError: division by zero, line 21): mend it.",
+        ),
+        ("own.py:needs", "needs a value of `k`: write own.py:needs:k=number."),
+        ("own.py:chain:power=2.5", "`power` must be a whole number; got '2.5'."),
+        ("own.py:spring:k=1", "`k` is not a parameter of own-spring"),
+        ("quartic.toml:x", "is one system, which has no 'x'"),
+        ("quartic.toml:mu=1", "`mu` is not a parameter of quartic, which takes lam, t_end."),
+    ],
+)
+def test_a_wrong_word_is_named(word, message, files):
+    (files / "folder.toml").mkdir()
+    result = run("solve", word)
+    assert result.exit_code == 2
+    assert message in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("f.toml", 'hamiltonain = "p**2/2"', "`hamiltonain` is no key of a system (in 'f.toml'). Did you mean"),
+        ("f.toml", "dt = 1", "`hamiltonian` is missing in 'f.toml'"),
+        ("f.toml", "hamiltonian = p**2", "`system` 'f.toml' is no TOML"),
+        ("f.toml", 'hamiltonian = "p**2/2 + q**"', "`hamiltonian` cannot be parsed"),
+        ("f.toml", 'hamiltonian = "p**2/2 + w*q**2"', "`hamiltonian` holds w without a value: give it in `params`"),
+        ("f.toml", 'hamiltonian = "p**2 + w*q**2"\nparams = {w = "a"}', "`params` must be a table of numbers"),
+        ("f.toml", 'hamiltonian = "p**2 + q**2"\ny0 = ["a", 1]', "`y0` must be a list of numbers"),
+        ("f.toml", 'hamiltonian = "p**2 + q**2"\ny0 = [1]', "`y0` must have shape (2,)"),
+        ("f.toml", 'hamiltonian = "p**2 + q**2"\ndt = true', "`dt` must be a number; got True"),
+        ("f.toml", 'hamiltonian = "p**2 + q**2"\nt_span = [1, 2, 3]', "`t_span` must be two"),
+        ("f.toml", 'hamiltonian = "p**2 + q**2"\n[domain]\nkind = "Bax"', "`domain` needs a kind, one of Ball, Box"),
+        ("f.toml", 'hamiltonian = "p**2 + q**2"\n[domain]\nkind = "Box"\nlow = [1, 2]', "`domain` is no Box"),
+        ("f.toml", 'hamiltonian = "p**2"\n[domain]\nkind = "Box"\nr = 1', "`domain` has a key 'r', but a Box has low"),
+        ("f.py:x", "import a_module_that_is_not_there", "`system` 'f.py' cannot be run (ModuleNotFoundError"),
+        ("f.py:x", "def f(:", "`system` 'f.py' cannot be run (SyntaxError: invalid syntax, line 1): mend it."),
+        ("f.py", "x = 1", "`system` 'f.py' lacks the name of a system in it (it has none)"),
+    ],
+)
+def test_a_wrong_file_is_named_with_what_is_wrong(name, text, message, files):
+    (files / name.partition(":")[0]).write_text(text, encoding="utf-8")
+    result = run("solve", name)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert "Traceback" not in result.output

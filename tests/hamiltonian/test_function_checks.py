@@ -1,0 +1,271 @@
+"""Functions of a user that contradict each other are refused when they are first used; right ones never are."""
+
+import copy
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from numba import njit
+
+from sympflow import Ball, HamiltonianSystem, poincare_section, solve, systems, time_transformed, train
+from sympflow.interop.scipy import as_scipy
+
+Y1, Y2 = np.array([1.0, 0.3]), np.array([0.3, 0.6, 0.1, 0.2])
+SQUARE = {"potential": lambda q: (q**2).sum(-1) / 2, "ndof": 1}
+QUARTIC = {"potential": lambda q: (q**4).sum(-1) / 4, "ndof": 2}
+PLANE = {"potential": lambda q: q[..., 0] ** 2 / 2 + 2 * q[..., 1] ** 2, "ndof": 2}
+
+
+def counting():
+    """A potential that differs at each call."""
+    calls = []
+
+    def potential(q):
+        calls.append(q)
+        return (q**2).sum(-1) * (1 + 1e-3 * len(calls))
+
+    return potential
+
+
+def refused(message, y0, **functions):
+    with pytest.raises((ValueError, TypeError), match=message) as error:
+        HamiltonianSystem(**functions).check_functions(y0)
+    assert "check=False" in str(error.value)
+    HamiltonianSystem(**functions, check=False).check_functions(y0)
+
+
+@pytest.mark.parametrize(
+    ("functions", "y0", "message"),
+    [
+        (
+            {"potential": lambda q: (q.detach() ** 2).sum(-1), "ndof": 1},
+            Y1,
+            r"^`potential` is cut off .* at q = \(1\) component 0 of its gradient is 0, but it grows by 2 a unit",
+        ),
+        (
+            {"potential": lambda q: (q**2).sum(-1) + (q.detach() ** 4).sum(-1), "ndof": 1},
+            Y1,
+            r"^`potential` is in part cut off .* component 0 of its gradient is 2, but it grows by 6 a unit",
+        ),
+        (
+            {"hamiltonian": lambda q, p: (q.detach() ** 2 + p**2).sum(-1), "ndof": 1},
+            Y1,
+            r"^`hamiltonian` is cut off .* at \[q, p\] = \(1, 0\.3\) component 0 .* grows by 2",
+        ),
+        (
+            SQUARE | {"gradient": lambda q: -q},
+            Y1,
+            r"^`gradient` is not that of `potential`: at q = \(1\) its component 0 is -1, but `potential` grows by 1",
+        ),
+        (SQUARE | {"gradient": lambda q: 1.001 * q}, Y1, r"component 0 is 1\.001, but `potential` grows by 1 a unit"),
+        (
+            QUARTIC | {"gradient": lambda q: q**3 * np.array([1, -1])},
+            Y2,
+            r"at q = \(0\.3, 0\.6\) its component 1 is -0\.216, but `potential` grows by 0\.216 a unit",
+        ),
+        (
+            PLANE | {"gradient": lambda q: np.array([q[0], 4 * q[1]])},
+            Y2,
+            r"^`gradient` gives a batch other values .* is 2\.4 alone, 0\.6 in a batch of shape \(2, 2\)",
+        ),
+        (
+            {"potential": lambda q: q[0] ** 2 + (q**2).sum(-1), "ndof": 2},
+            Y2,
+            r"^`potential` must return shape \(\) for a state part of shape \(2,\)|^`potential` gives a batch other",
+        ),
+        (
+            {"potential": lambda q: (q * q).sum() if q.ndim == 1 else (q * q).sum(-1) / 2, "ndof": 2},
+            Y2,
+            r"^`potential` gives a batch other values than single states: its result at q = \(0\.3, 0\.6\)",
+        ),
+        (
+            QUARTIC | {"gradient": lambda q: q**3, "hessian_vector": lambda q, v: 3 * q * v},
+            Y2,
+            r"^`hessian_vector` is not the derivative of `gradient`: at q = \(0\.3, 0\.6\), along v = ",
+        ),
+        (
+            QUARTIC | {"gradient": lambda q: q**3, "hessian_vector": lambda q, v: (3 * q**2 * v).sum(-1)},
+            Y2,
+            r"^`hessian_vector` must return shape \(2,\)",
+        ),
+        (QUARTIC | {"potential": lambda q: (q.float() ** 4).sum(-1)}, Y2, "^`potential` returns float32 for a state"),
+        ({"potential": counting(), "ndof": 1}, Y1, r"^`potential` gives another value each time: at q = \(1\)"),
+    ],
+)
+def test_contradictions_are_named_with_the_component_the_state_and_both_values(functions, y0, message):
+    refused(message, y0, **functions)
+
+
+@pytest.mark.parametrize(
+    ("functions", "y0"),
+    [
+        ({"potential": lambda q: 0 * q.sum(-1), "ndof": 1}, Y1),
+        ({"potential": lambda q: abs(q).sum(-1), "ndof": 1}, np.array([0.0, 1.0])),
+        ({"potential": lambda q: torch.relu(q - 1).sum(-1), "ndof": 1}, np.array([1.0, 1.0])),
+        ({"potential": lambda q: abs(q).sum(-1), "gradient": np.sign, "ndof": 1}, np.array([0.0, 1.0])),
+        (
+            {"potential": lambda q: np.maximum(q, 0).sum(-1), "gradient": lambda q: (q >= 0) * 1.0, "ndof": 1},
+            np.zeros(2),
+        ),
+        (
+            {
+                "potential": lambda q: 1e12 * q[..., 0] ** 2 / 2 + q[..., 1] ** 2,
+                "gradient": lambda q: q * np.array([1e12, 2]),
+                "ndof": 2,
+            },
+            Y2,
+        ),
+        (SQUARE | {"potential": lambda q: 1e12 + (q**2).sum(-1) / 2, "gradient": lambda q: q}, Y1),
+        (
+            SQUARE
+            | {"potential": lambda q: (1e9 * np.cos(q) - 1e9 * np.cos(q) + q**2 / 2).sum(-1), "gradient": lambda q: q},
+            Y1,
+        ),
+        ({"potential": lambda q: -1 / (q**2).sum(-1) ** 0.5, "ndof": 2}, np.array([1e-8, 0, 0, 1.0])),
+        ({"potential": lambda q: -1e20 / (q**2).sum(-1) ** 0.5, "ndof": 2}, np.array([1.5e11, 0, 0, 1e4])),
+        (
+            {"potential": lambda q: -np.sqrt(q).sum(-1), "gradient": lambda q: -0.5 / np.sqrt(q), "ndof": 1},
+            np.array([1e-9, 0.0]),
+        ),
+        (QUARTIC | {"ndof": 300, "gradient": lambda q: q**3}, np.linspace(-1, 1, 600)),
+        ({"potential": lambda q: (1 / torch.clamp(q, min=0.0)).sum(-1), "ndof": 1}, np.array([-1.0, 0.0])),
+    ],
+    ids=[
+        *("free", "kink", "relu at its kink", "sign at its kink", "a slope of a kink", "stiff", "far from 0", "noisy"),
+        *("singular", "other units", "next to the end of its domain", "many", "infinite"),
+    ],
+)
+def test_right_functions_pass(functions, y0):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        HamiltonianSystem(**functions).check_functions(y0)
+
+
+def test_one_wrong_component_of_many_is_found():
+    def gradient(q):
+        return q**3 * (1 + (np.arange(300) == 177))
+
+    refused(r"its component 177 is ", np.linspace(-1, 1, 600), **QUARTIC | {"ndof": 300, "gradient": gradient})
+
+
+def test_a_contradiction_elsewhere_in_the_domain_is_found():
+    wrong = SQUARE | {"gradient": lambda q: np.where(q > 2, 2 * q, q), "domain": Ball([3.0, 0.0], 1.0)}
+    refused("^`gradient` is not that of `potential`", Y1, **wrong)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_tensors_are_tested_in_their_precision(dtype):
+    y0 = torch.tensor(Y2, dtype=dtype)
+    HamiltonianSystem(**QUARTIC, gradient=lambda q: q**3, hessian_vector=lambda q, v: 3 * q**2 * v).check_functions(y0)
+    refused("^`gradient` is not that of", y0, **QUARTIC, gradient=lambda q: 1.2 * q**3)
+
+
+def test_every_door_tests():
+    wrong = SQUARE | {"gradient": lambda q: -q, "y0": Y1, "domain": Ball([0.0, 0.0], 1.0)}
+    doors = [
+        lambda s: solve(s, "verlet", (0, 1)),
+        lambda s: solve(s, "rk45", (0, 1), torch.tensor(Y1)),
+        lambda s: solve(time_transformed(s), "leapfrog", (0, 1)),
+        train,
+        lambda s: as_scipy("verlet", s),
+        lambda s: poincare_section(s, "verlet", (0, 1)),
+    ]
+    for door in doors:
+        with pytest.raises(ValueError, match=r"^`gradient` is not that of `potential`"):
+            door(HamiltonianSystem(**wrong))
+
+
+def test_once_and_again_in_another_copy():
+    calls = []
+
+    def gradient(q):
+        calls.append(q.shape)
+        return q
+
+    system = HamiltonianSystem(**SQUARE, gradient=gradient)
+    system.check_functions(Y1)
+    n = len(calls)
+    system.check_functions(2 * Y1)
+    assert len(calls) == n < 100
+    plain = HamiltonianSystem(potential=systems.pendulum().potential, ndof=1)
+    for again in (copy.copy(plain), copy.deepcopy(plain), pickle.loads(pickle.dumps(plain))):
+        again.check_functions(Y1)
+
+
+@njit
+def potential(q):
+    return q[0] ** 2 / 2 + 2 * q[1] ** 2
+
+
+@njit
+def partly(q, out):
+    out[0] = q[0]
+
+
+@njit
+def adding(q, out):
+    out[0] += q[0]
+    out[1] += 4 * q[1]
+
+
+@njit
+def doubled(q, out):
+    out[0] = q[0]
+    out[1] = 8 * q[1]
+
+
+@njit
+def overwriting(q, out):
+    out[0], out[1] = q[0], 4 * q[1]
+    q[0] = 0.0
+
+
+@njit
+def gradient(q, out):
+    out[0], out[1] = q[0], 4 * q[1]
+
+
+@njit
+def wrong_product(q, v, out):
+    out[0], out[1] = v[0], v[1]
+
+
+class TestNumbaFunctions:
+    @pytest.mark.parametrize(
+        ("functions", "message"),
+        [
+            ({"gradient": partly}, r"^`gradient` does not set out\[1\] at \(0\.3, 0\.6\)"),
+            ({"gradient": adding}, r"^`gradient` does not set out\[0\]"),
+            ({"gradient": doubled}, r"its component 1 is 4\.8, but `potential` grows by 2\.4 a unit"),
+            ({"gradient": overwriting}, r"^`gradient` writes into its argument"),
+            ({"gradient": gradient, "hessian_vector": wrong_product}, r"^`hessian_vector` is not the derivative"),
+        ],
+    )
+    def test_that_are_wrong_are_named(self, functions, message):
+        refused(message, Y2, potential=potential, ndof=2, **functions)
+
+    def test_that_are_right_pass(self):
+        HamiltonianSystem(potential, gradient=gradient, ndof=2).check_functions(Y2)
+
+    def test_what_is_not_written_is_not_finite(self):
+        """Untested, it ends the run rather than take what memory holds."""
+        unchecked = HamiltonianSystem(potential, gradient=partly, ndof=2, check=False)
+        assert np.isnan(unchecked.force(Y2[:2])).tolist() == [False, True]
+        assert solve(unchecked, "verlet", (0, 1), Y2, dt=0.1).status == -1
+
+
+@pytest.mark.parametrize("scene", [systems.outer_solar_system, systems.lennard_jones])
+def test_the_scenes_that_ship_are_right(scene):
+    system = scene()
+    assert not system.functions_given
+    names = ("potential", "gradient", "hessian_vector")
+    given = dict(zip(names, system.numba_functions, strict=True))
+    again = HamiltonianSystem(**given, ndof=system.ndof, domain=system.domain, y0=system.y0)
+    again.check_functions()
+
+
+def test_symbolic_systems_are_not_tested():
+    assert not systems.pendulum().functions_given
+    assert not time_transformed(systems.kepler()).functions_given
