@@ -7,6 +7,7 @@ however many there are.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -23,10 +24,13 @@ __all__ = [
     "gradient_source",
     "is_large",
     "product_source",
+    "warn_if_long",
+    "written_out",
 ]
 
 MOST_WRITTEN_OUT = 200  # operations of a gradient: longer ones take Numba more than a few seconds
 MOST_IN_REGISTERS = 16  # degrees of freedom of states that are tuples of numbers
+MOST_COMPILED = 5000  # operations of all formulas, before a warning
 MOST_OPERATIONS = 300  # in one function of terms that stand alone
 
 
@@ -39,6 +43,18 @@ def written_out(f: sp.Expr, variables: Sequence[sp.Symbol]) -> int:
     """Operations of ∇f, roughly: those of each term as often as it has variables."""
     known = set(variables)
     return sum(sp.count_ops(term) * len(term.free_symbols & known) for term in sp.Add.make_args(f))
+
+
+def warn_if_long(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> None:
+    """Warn of a function whose formulas, one for each kind of term, take Numba more than half a minute."""
+    n = sum(written_out(family.f, family.x) for family in families(f, variables))
+    if n > MOST_COMPILED:
+        warnings.warn(
+            f"`system` {name!r} has so many terms of different kinds, about {n:,} operations, that compiling takes "
+            "minutes. Give it by Numba functions that loop over its terms: HamiltonianSystem(V, ndof=…, gradient=…, "
+            "hessian_vector=…).",
+            stacklevel=2,
+        )
 
 
 class Family(NamedTuple):
@@ -234,7 +250,7 @@ def _source(
     values: Callable[[Family], dict[str, sp.Expr]],
     after: str = "",
 ) -> str:
-    """A function that adds the values of each term to what they are values of; a function of its own for each family."""
+    """A function that adds up the values of all terms, and one that it calls for each family."""
     parts, calls = [], []
     for k, family in enumerate(families(f, variables)):
         wanted = {target: value for target, value in values(family).items() if value != 0}

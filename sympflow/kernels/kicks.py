@@ -229,7 +229,8 @@ def shapes(symbols: SymbolicHamiltonian, terms: int, monomials: Monomials = ()) 
         if any(f.has(*UNTOUCHED) or sp.count_ops(f) > MOST_OPERATIONS for f in W):
             return
         W = [sp.powsimp(f) for f in W]
-        if any(len(_denominators(f)) > 1 or _length(f) > MOST_MULTIPLIED for f in W):  # products of several take SymPy minutes to factor
+        several = [len(_denominators(f)) > 1 and d > 1 for f in W]  # whose products SymPy would factor for minutes
+        if any(several) or any(_length(f) > MOST_MULTIPLIED for f in W):
             return
         W = [sp.factor(f) for f in W]
         changes = [

@@ -236,10 +236,11 @@ def symbolic_module(
 def _family_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
     """The loops of a symbolic system of many terms, around loops over these: see `sympflow.kernels.families`."""
     from sympflow.kernels.codegen import polynomial_slope_source
-    from sympflow.kernels.families import bend_source, gradient_source, product_source
+    from sympflow.kernels.families import bend_source, gradient_source, product_source, warn_if_long
 
     symbols = system.symbols
     assert symbols is not None
+    warn_if_long(symbols.V, symbols.q, system.name)
     sources = [f"import numpy as np\n\nNDOF = {symbols.ndof}", gradient_source(symbols.V, symbols.q, "gradient")]
     if level in (FORCE_GRADIENT, CURVATURE):
         sources.append(product_source(symbols.V, symbols.q, "hessian_vector"))
