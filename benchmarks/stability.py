@@ -26,6 +26,8 @@ from measuring.fragments import add_out, number, table, write
 import sympflow
 from sympflow import HamiltonianSystem, energy_growth, get, max_energy_error, solve, stability, systems
 from sympflow.integrators.flows import LogSympFlow
+from sympflow.metrics.linear_stability import linear_stability
+from sympflow.schemes import SCHEMES
 from sympflow.studies.attempts import Row
 from sympflow.studies.step_stability import StabilityReport
 from sympflow.systems import oscillatory_energies
@@ -139,7 +141,21 @@ def linear_limit(figures: Path) -> Fragments:
             assert limit.stable is not None
             rows.append([method, f"{omega:g}", *cells, f"{limit.stable * omega:.4f}"])
     titles = ["method", "ω", "z = 0.1: error / bound", "z = 1", "z = 1.9", "z = 1.99", "longest stable z found"]
-    return {"linear-limit": table(titles, rows)}
+    return {"linear-limit": table(titles, rows), "linear-windows": _linear_windows()}
+
+
+def _linear_windows() -> str:
+    """Where each scheme is unstable on the oscillator, in z = dt·ω."""
+    rows = []
+    for name, scheme in SCHEMES.items():
+        found = linear_stability(scheme)
+        windows = [
+            f"{w.start:.5g} to {w.stop:.5g} (×{w.growth:.5g})" if math.isfinite(w.stop) else f"from {w.start:.5g}"
+            for w in found.windows
+        ]
+        forces = scheme.force_evaluations + scheme.hessian_evaluations
+        rows.append([name, str(scheme.order), f"{found.limit:.5g}", f"{found.limit / forces:.3g}", ", ".join(windows)])
+    return table(["scheme", "order", "first exit", "per force or Hessian", "unstable z (largest growth a step)"], rows)
 
 
 def maps(figures: Path) -> Fragments:
@@ -326,6 +342,7 @@ def three_body(figures: Path) -> Fragments:
     ]
     times = np.linspace(0.0, 70.0, 20_001)
     for method, options in cases:
+        solve(system, method, (0.0, 0.1), **options)  # compiles
         sol = solve(system, method, t_eval=times, **options)
         told = ", ".join(
             f"{key} = {value if isinstance(value, bool) else f'{value:g}'}" for key, value in options.items()

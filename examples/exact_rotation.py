@@ -9,7 +9,7 @@ kick(tan t/2), each with a potential w(t)·x²/2, is the rotation by t, for |t| 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,13 @@ from torch import Tensor, nn
 
 from sympflow import SympFlow, solve, systems
 from sympflow.flow.layers import Drift, Kick
-from sympflow.flow.potentials import Potential, Time
+from sympflow.flow.potentials import Potential, Time, register_potential
+
+FUNCTIONS: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]] = {
+    "sin t": (torch.sin, torch.cos),
+    "tan t/2": (lambda t: torch.tan(t / 2), lambda t: 0.5 / torch.cos(t / 2) ** 2),
+}
+"""w and its derivative, of tensors."""
 
 
 class Shear(Potential):
@@ -26,14 +32,15 @@ class Shear(Potential):
 
     Parameters
     ----------
-    w, dw : callable
-        w and its derivative, of tensors.
+    function : str
+        The name of w in `FUNCTIONS`.
     ndof : int
     """
 
-    def __init__(self, w: Callable[[Tensor], Tensor], dw: Callable[[Tensor], Tensor], ndof: int = 1) -> None:
+    def __init__(self, function: str, ndof: int = 1) -> None:
         super().__init__()
-        self.w, self.dw, self.ndof = w, dw, ndof
+        self.function, self.ndof = function, ndof
+        self.w, self.dw = FUNCTIONS[function]
         self.c = nn.Parameter(torch.ones((), dtype=torch.float64))
 
     def impulse(self, t: Time, x: Tensor) -> Tensor:
@@ -48,13 +55,19 @@ class Shear(Potential):
         return self.impulse(t, x), self.c * (self.dw(time) * x + self.w(time) * dx)
 
     def to_dict(self) -> dict[str, Any]:
-        return {"kind": "shear"}
+        return {"type": "shear", "function": self.function}
+
+    @classmethod
+    def from_dict(cls, ndof: int, plan: Mapping[str, Any], dtype: torch.dtype) -> Shear:
+        return cls(plan["function"], ndof).to(dtype)
+
+
+register_potential("shear", Shear)  # files of flows with it can be read where this module is imported
 
 
 def rotation(dt: float = 1.0) -> SympFlow:
     """The exact flow of (p² + q²)/2 for t ∈ [0, dt]."""
-    kick = (lambda t: torch.tan(t / 2), lambda t: 0.5 / torch.cos(t / 2) ** 2)
-    flow = SympFlow.from_layers([Kick(Shear(*kick)), Drift(Shear(torch.sin, torch.cos)), Kick(Shear(*kick))], dt=dt)
+    flow = SympFlow.from_layers([Kick(Shear("tan t/2")), Drift(Shear("sin t")), Kick(Shear("tan t/2"))], dt=dt)
     return flow.requires_grad_(False)
 
 

@@ -25,7 +25,11 @@ FEWEST_TIMES = 8  # floating-point numbers that an interval must span
 _MOST_SAMPLES = 100_000_000
 
 
-def check_t_span(t_span: Any) -> tuple[float, float]:
+def check_t_span(t_span: Any, ends_by_event: bool | None = None) -> tuple[float, float]:
+    """Return the start and end, two finite numbers; the end may be infinite if the run `ends_by_event`.
+
+    None where there are no events that could end it.
+    """
     try:
         if type(t_span) is tuple and len(t_span) == 2 and {type(t_span[0]), type(t_span[1])} <= _PLAIN:
             t0, t1 = float(t_span[0]), float(t_span[1])
@@ -40,7 +44,11 @@ def check_t_span(t_span: Any) -> tuple[float, float]:
     except OverflowError:
         t0, t1 = -math.inf, math.inf
     if not math.isfinite(t1 - t0):
-        raise ValueError(f"`t_span` must be finite; got ({t0:g}, {t1:g}). Choose an end that can be reached.")
+        endless = math.isfinite(t0) and math.isinf(t1)
+        if endless and ends_by_event:
+            return t0, t1
+        remedy = ", or pass a terminal event" if endless and ends_by_event is not None else ""
+        raise ValueError(f"`t_span` must be finite; got ({t0:g}, {t1:g}). Choose an end that can be reached{remedy}.")
     spacing = math.ulp(max(abs(t0), abs(t1)))
     if 0 < abs(t1 - t0) < FEWEST_TIMES * spacing:
         raise ValueError(

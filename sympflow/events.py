@@ -120,6 +120,15 @@ class EventSearch:
         self.end: tuple[float, Array] | None = None
         self.n_dense = 0
 
+    @property
+    def may_end_run(self) -> bool:
+        """True if one of the events is terminal."""
+        return any(math.isfinite(event.limit) for event in self.events)
+
+    def afresh(self) -> EventSearch:
+        """Return a search for the same events that has found none."""
+        return EventSearch(self.events, self.max_interval)
+
     def parts(self, h: float, default: float = math.inf) -> int:
         """The number of equal parts at whose ends a step of length h is sampled; `default` is the interval if unset."""
         return max(1, math.ceil(abs(h) / (self.max_interval or default) * (1 - 4 * _EPS)))

@@ -94,7 +94,10 @@ class Solution:
             return self.system.hamiltonian(self.states)
 
     def energy_error(self) -> np.ndarray:
-        """Relative energy error over time, (..., n); inf where H is beyond floats; see `sympflow.energy_error`."""
+        """Relative energy error over time, (..., n), with its sign; inf where H is beyond floats.
+
+        See `sympflow.energy_error`; the largest magnitude is `sympflow.max_energy_error(sol)`.
+        """
         return energy_change(self, stacklevel=3)
 
     def energy_scale(self) -> np.ndarray:

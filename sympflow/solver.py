@@ -4,23 +4,32 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import MAX_ASKED_VALUES, MAX_SAVED_VALUES, check_save_every, check_t_eval, check_t_span
+from sympflow.arguments import (
+    MAX_ASKED_VALUES,
+    MAX_SAVED_VALUES,
+    check_save_every,
+    check_t_eval,
+    check_t_span,
+)
 from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
 from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import run_and_search
 from sympflow.integrators.contract import Integrator, Outcome, Problem
-from sympflow.integrators.domain_exit import check_domain
+from sympflow.integrators.domain_exit import check_domain, check_system_along
+from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
 from sympflow.integrators.registry import build, check_applies, naming_plugin
 from sympflow.solution import Solution
 
 BACKENDS = ("auto", "compiled", "array")
 MAX_EVENT_SAMPLES = 100_000_000
+FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite end
 _FLOAT64 = np.dtype(np.float64)
 
 
@@ -48,7 +57,8 @@ def solve(
     method : str, Integrator, or trained flow
         A name from `sympflow.available()`; or a configured integrator such as ``get("verlet")(dt=0.05)``; or a flow.
     t_span : (float, float), optional
-        Start and end; the end may lie before the start. The default is the system's.
+        Start and end; the end may lie before the start. The default is the system's. With a terminal event the end may
+        be infinite: without the event the run ends after a million steps, with status −1.
     y0 : array_like or tensor of shape (..., 2d), optional
         Initial state [q, p], or a batch of them. The default is the system's. A NumPy array gives float64 (integers are
         promoted); a tensor gives a tensor of its dtype and device, and gradients flow to it.
@@ -103,7 +113,8 @@ def solve(
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     integrator = build(method, options)
-    t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
+    search = check_events(events, event_step)
+    t0, t1 = check_t_span(system.t_span if t_span is None else t_span, search is not None and search.may_end_run)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
     integrator = integrator.resolved(system, y_start, abs(t1 - t0))
     check_applies(integrator, system, y_start)
@@ -119,23 +130,26 @@ def solve(
     action = ("warn" if integrator.trained else "ignore") if on_domain_exit is None else on_domain_exit
     if not isinstance(action, str) or action not in ("warn", "stop", "ignore"):
         raise ValueError(f"`on_domain_exit` must be 'warn', 'stop' or 'ignore'; got {on_domain_exit!r}.")
-    search = check_events(y_start, events, event_step, abs(t1 - t0))
+    if search is not None:
+        check_event_search(search, y_start, abs(t1 - t0))
     problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend, search)
-    check_memory(integrator, problem)
+    run = _run
+    if t1 in (math.inf, -math.inf):
+        run = _run_endless
+    else:
+        check_memory(integrator, problem)
 
     start = time.perf_counter()
     with naming_plugin(integrator):
-        outcome = (
-            integrator.run(problem)
-            if search is None or integrator.finds_events
-            else run_and_search(integrator, problem, search)
-        )
+        outcome, problem = run(integrator, problem)
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
     if outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0):
         from sympflow.integrators.diagnosis import note_singularities
 
         note_singularities(outcome, integrator, problem)
+    if integrator.trained:
+        check_system_along(outcome, integrator, system, y_start)
     if action != "ignore":
         check_domain(outcome, integrator, system, action)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
@@ -147,12 +161,54 @@ def solve(
         stats=outcome.stats,
         system=system,
         integrator=integrator,
-        t_span=(t0, t1),
+        t_span=(t0, problem.t1),
         y0=y_start,
         sol=outcome.sol,
-        t_events=None if search is None else search.times(),
-        y_events=None if search is None else search.states(y_start),
+        t_events=None if problem.events is None else problem.events.times(),
+        y_events=None if problem.events is None else problem.events.states(y_start),
     )
+
+
+def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
+    """The outcome of a run, and the problem that was solved."""
+    search = problem.events
+    if search is None or integrator.finds_events:
+        return integrator.run(problem), problem
+    return run_and_search(integrator, problem, search), problem
+
+
+def _run_endless(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
+    """The outcome of a run to an infinite end, and the problem with the end that was reached.
+
+    Where the method looks for events as it goes, and its grid costs nothing, it is one run, of `MOST_OPEN_STEPS` at
+    most; else there are ever longer ones.
+    """
+    search, size = problem.events, math.prod(problem.y0.shape)
+    assert search is not None
+    length = integrator.step_length(problem.system) or problem.system.dt
+    stored = problem.t_eval is None or problem.dense_output
+    most = min(MOST_OPEN_STEPS, MAX_SAVED_VALUES // size - 1) if stored else MOST_OPEN_STEPS
+    if integrator.takes_infinite_end:
+        outcome = integrator.run(problem)
+    else:
+        streams = integrator.finds_events and integrator.on_grid
+        n_steps = most if streams else min(FIRST_WINDOW, most)
+        while True:
+            end = problem.t0 + math.copysign(n_steps * length, problem.t1)
+            piece = replace(problem, t1=end, events=search.afresh())
+            if problem.t_eval is not None:
+                piece = replace(piece, t_eval=problem.t_eval[np.abs(problem.t_eval - problem.t0) <= n_steps * length])
+            outcome, piece = _run(integrator, piece)
+            if n_steps == most or np.any(np.asarray(outcome.status) != 0):
+                break
+            n_steps = min(4 * n_steps, most)
+        problem = piece
+    assert problem.events is not None
+    if outcome.status == 0:
+        outcome.status = -1
+        outcome.message = no_event(outcome.stats.get("n_steps", most), problem.t1)
+    reached = problem.events.end or (outcome.stats.get("failed_at", problem.t1),)
+    return outcome, replace(problem, t1=float(reached[0]))
 
 
 def _time_last(y: np.ndarray) -> np.ndarray:
@@ -257,27 +313,32 @@ def _check_dtype(dtype: Any) -> np.dtype:
     return chosen
 
 
-def check_events(y0: Array, events: Any, event_step: Any, duration: float) -> EventSearch | None:
+def check_events(events: Any, event_step: Any) -> EventSearch | None:
     parsed = parse(events)
     if not parsed:
         if event_step is not None:
             raise ValueError("`event_step` samples events, but there are none: pass `events`, or leave it out.")
         return None if events is None else EventSearch(())
-    if y0.ndim != 1:
+    if event_step is None:
+        return EventSearch(parsed)
+    number = isinstance(event_step, int | float | np.floating | np.integer) and not isinstance(event_step, bool)
+    if not (number and event_step > 0):
+        raise ValueError(f"`event_step` must be a positive number, a time; got {event_step!r}.")
+    return EventSearch(parsed, float(event_step))
+
+
+def check_event_search(search: EventSearch, y0: Array, duration: float) -> None:
+    """Refuse events along a batch, and samples of them that would never end."""
+    if search.events and y0.ndim != 1:
         raise ValueError(
             f"`events` are found along one trajectory, but `y0` is a batch of shape {tuple(y0.shape)}: solve one state "
             "at a time, or use poincare_section, which takes batches."
         )
-    if event_step is None:
-        return EventSearch(parsed)
-    if not (isinstance(event_step, int | float | np.number) and event_step > 0):
-        raise ValueError(f"`event_step` must be a positive number, a time; got {event_step!r}.")
-    if duration > MAX_EVENT_SAMPLES * event_step:
+    if search.max_interval is not None and MAX_EVENT_SAMPLES * search.max_interval < duration < math.inf:
         raise ValueError(
-            f"`event_step` {event_step:g} would take more than {MAX_EVENT_SAMPLES:.0e} samples over a time of "
+            f"`event_step` {search.max_interval:g} would take more than {MAX_EVENT_SAMPLES:.0e} samples over a time of "
             f"{duration:g}: increase it."
         )
-    return EventSearch(parsed, float(event_step))
 
 
 def check_memory(integrator: Integrator, problem: Problem) -> None:
@@ -290,7 +351,7 @@ def check_memory(integrator: Integrator, problem: Problem) -> None:
         )
     if problem.t_eval is not None and not problem.dense_output:
         return
-    length = integrator.step_length(problem.system)
+    length = integrator.step_length(problem.system) if problem.dense_output else integrator.output_step(problem)
     if length is None:
         return
     n_steps = abs(problem.t1 - problem.t0) / length

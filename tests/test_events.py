@@ -1,5 +1,6 @@
 """Events: zeros of functions of t and y along the solution, for every method, with SciPy's attributes."""
 
+import re
 import tracemalloc
 
 import numpy as np
@@ -326,3 +327,53 @@ def test_an_event_function_that_writes_into_its_state_changes_no_result(method):
     oscillator = systems.harmonic_oscillator()
     sol = solve(oscillator, method, (0.0, 1.0), events=spoils)
     np.testing.assert_array_equal(sol.y, solve(oscillator, method, (0.0, 1.0), events=lambda t, y: 1.0).y)
+
+
+class TestAnInfiniteEnd:
+    """A terminal event ends a run whose interval has no end; a limit on steps, where it never comes."""
+
+    @pytest.mark.parametrize("sign", [1, -1])
+    @pytest.mark.parametrize("method", ["verlet", "sympflow", "rk45", "dopri5", "explicit_adams"])
+    def test_the_event_ends_it(self, method, sign):
+        def third(t, y):
+            return y[0]
+
+        third.terminal = 3
+        endless = solve(OSCILLATOR, method, (0, sign * np.inf), [1.0, 0.0], events=third, dense_output=True)
+        finite = solve(OSCILLATOR, method, (0, sign * 20), [1.0, 0.0], events=third, dense_output=True)
+        assert (endless.status, endless.message) == (1, "A termination event occurred.")
+        np.testing.assert_array_equal(endless.t_events[0], finite.t_events[0])
+        np.testing.assert_array_equal(endless.y, finite.y)
+        np.testing.assert_array_equal(endless.sol(sign * 1.234), finite.sol(sign * 1.234))
+        assert endless.t_span == (0.0, endless.t_events[0][-1])  # finite, for what executes the run again
+
+    def test_of_a_method_that_is_searched_afterwards(self):
+        def third(t, y):
+            return y[0]
+
+        third.terminal = 3
+        sol = solve(systems.kepler(), "log_leapfrog", (0, np.inf), events=third, t_eval=[1.0, 2.0, 1e6])
+        assert (sol.status, sol.t.tolist(), len(sol.t_events[0])) == (1, [1.0, 2.0], 3)
+        assert 6 < sol.t_events[0][-1] < 3 * np.pi
+
+    def test_an_event_that_never_comes(self, monkeypatch):
+        def never(t, y):
+            return y[0] - 5
+
+        never.terminal = True
+        monkeypatch.setattr("sympflow.solver.MOST_OPEN_STEPS", 1000)
+        monkeypatch.setattr("sympflow.integrators.scipy_methods.MOST_OPEN_STEPS", 1000)
+        for method, n in (("verlet", 1000), ("rk45", 1000)):
+            sol = solve(OSCILLATOR, method, (0, np.inf), [1.0, 0.0], events=never)
+            assert (sol.status, sol.success, sol.stats["n_steps"]) == (-1, False, n)
+            assert re.match(
+                r"No terminal event ended the run within 1,000 steps, up to t = [\d.]+\. Check", sol.message
+            )
+            assert sol.t_span[1] == sol.t[-1]
+        blow_up = solve(systems.henon_heiles(), "verlet", (0, np.inf), [0.0, 0.0, 0.0, 0.9], events=never)
+        assert "non-finite after t = 4.7" in blow_up.message
+
+    @pytest.mark.parametrize("events", [None, lambda t, y: y[0]])
+    def test_without_a_terminal_event_it_is_refused(self, events):
+        with pytest.raises(ValueError, match=r"^`t_span` must be finite; .*or pass a terminal event"):
+            solve(OSCILLATOR, "rk45", (0, np.inf), [1.0, 0.0], events=events)

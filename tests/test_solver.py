@@ -1,6 +1,7 @@
 """The solver's contract, for every classical method: outputs, dense output, directions, batches, order, failure."""
 
 import pickle
+import re
 import tracemalloc
 from functools import cache
 
@@ -306,6 +307,63 @@ def test_a_run_that_would_never_end_says_so(method, arguments):
     sol = solve(PENDULUM, method, **arguments)
     assert sol.status == -1
     assert "at this pace the end needs about" in sol.message
+
+
+@pytest.mark.parametrize("method", ["rk45", "dop853"])
+def test_a_limit_on_steps_keeps_what_was_computed(method):
+    """An oscillator of 10⁶ rad/s over 1000 s: seen to be hopeless; a limit of one's own: kept exactly up to there."""
+    fast = HamiltonianSystem(lambda q: 5e11 * (q**2).sum(-1), ndof=1, gradient=lambda q: 1e12 * q)
+    sol = solve(fast, method, (0, 1000), [1.0, 0.0])
+    assert (sol.status, sol.stats["n_steps"], len(sol.t)) == (-1, 10_000, 10_001)
+    assert re.match(r"After 10,000 steps t = 0\.0\d+ is reached.* `max_steps` is 10,000,000\. Raise it", sol.message)
+    few = solve(HH, method, (0, 100), max_steps=7, dense_output=True)
+    whole = solve(HH, method, (0, 100))
+    assert (few.status, few.stats["n_steps"], few.stats["failed_at"]) == (-1, 7, few.t[-1])
+    np.testing.assert_array_equal(few.y, whole.y[:, :8])
+    np.testing.assert_allclose(few.sol(few.t[-1]), few.y[:, -1], rtol=1e-14)
+    assert sum(len(t) for t, _, _ in few.integrator.steps(HH, few.t_span, few.y0)) == 7  # as metrics execute it
+    enough = solve(HH, method, (0, 100), max_steps=len(whole.t) - 1)
+    assert (enough.status, enough.message) == (0, whole.message)
+    batch = solve(HH, method, (0, 100), [HH.y0, HH.y0], max_steps=7)
+    assert batch.status.tolist() == [-1, -1]
+    for wrong in (0, -1, 1.5, True, np.inf):
+        with pytest.raises(ValueError, match=r"^`max_steps` must be a positive integer"):
+            solve(HH, method, max_steps=wrong)
+
+
+def test_a_first_step_beyond_the_interval():
+    for t_span in ((0, 5), (5, 0)):
+        with pytest.raises(ValueError, match=r"^`first_step` 5.5 exceeds the interval, of length 5"):
+            solve(HH, "rk45", t_span, first_step=5.5)
+        assert solve(HH, "rk45", t_span, first_step=5.0).success
+    assert solve(HH, "rk45", (2, 2), first_step=5.0).success
+
+
+@pytest.mark.parametrize("method", ["verlet", "sympflow", "implicit_midpoint", "rk4", "dopri5", "log_leapfrog"])
+def test_a_run_that_ends_with_its_last_output_says_so(method):
+    """The end of `t_span` is not reached, which for this orbit of the escape could not be."""
+    system = systems.kepler() if method == "log_leapfrog" else systems.henon_heiles_escape()
+    if method == "sympflow":
+        system = HH
+    for y0 in (system.y0, np.array([system.y0, system.y0])):
+        early = solve(system, method, (0, 100), y0, t_eval=[0.5, 1.0])
+        assert early.success
+        assert "ended at t = 1, the last time of `t_eval`, before the end of `t_span`, t = 100:" in early.message
+        assert solve(system, method, (0, 1), y0, t_eval=[0.5, 1.0]).message.startswith("The solver successfully")
+    none = solve(system, method, (0, 100), t_eval=[])
+    assert (none.status, none.stats["n_steps"]) == (0, 0)
+    assert none.message.startswith("`t_eval` is empty, so no step was made")
+    dense = solve(system, method, (0, 2), t_eval=[1.0], dense_output=True)
+    assert dense.message.startswith("The solver successfully")
+    assert np.isfinite(dense.sol(2.0)).all()
+
+
+@pytest.mark.parametrize(("method", "y0"), [("dopri8", None), ("dopri5", None), ("rk45", np.zeros((2, 4)))])
+def test_outputs_that_fill_the_memory_are_refused_for_adaptive_methods_too(method, y0):
+    """They are reported every `system.dt`, which may be short."""
+    short = HamiltonianSystem.from_sympy("p1**2/2+p2**2/2+q1**2/2+q2**2/2", y0=[1, 0, 0, 0], dt=1e-8)
+    with pytest.raises(ValueError, match=r"^`t_eval` is not given, so [48]e\+11 values"):
+        solve(short, method, (0, 1000), y0)
 
 
 # the Solution -------------------------------------------------------------------------------------

@@ -47,8 +47,11 @@ def flows(
 ) -> None:
     """List the flows that ship, all or those of one system, the cheapest of a system first, with what each achieves.
 
-    The cost is that of a unit of time in force evaluations; the energy error is relative, the largest up to T, the 95 %
-    quantile over held-out states: `solve(system, tol=1e-6)` takes the cheapest that meets it.
+    The cost is that of a unit of time in force evaluations.
+
+    The energy error is relative, the largest up to T: the 95 % quantile over held-out states.
+
+    `sympflow solve SYSTEM --tol 1e-6` takes the cheapest that meets it.
     """
     with reporting(ctx):
         from sympflow.flow.shipped import HEADINGS, shipped_flows

@@ -152,8 +152,9 @@ def train(
 ) -> None:
     """Train a flow for a system and save it.
 
-    With nothing else said, a system with separable H gets a flow primed with its own V and T, in at most
-    about a minute (--time-budget); any other, or where an option is one of networks, a SympFlow with neural potentials.
+    With nothing else said, a system with separable H gets a flow primed with its own V and T, in about a minute.
+
+    Any other, or where an option is one of networks, gets a SympFlow with neural potentials.
 
     Examples:
 

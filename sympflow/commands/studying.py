@@ -45,17 +45,17 @@ def compare(
     ctx: typer.Context,
     systems: Systems = None,
     own: Own = None,
-    method_names: Methods = "sympflow,mlp,verlet,leapfrog,rk45",
+    method_names: Methods = "sympflow, mlp, verlet, leapfrog, rk45",
     t_end: TEnd = None,
     y0: State = None,
     dt: Step = None,
     metrics: Annotated[
         str,
         typer.Option(
-            help="Any of error,energy,drift,volume,symplecticity,reversal.",
+            help="Any of error, energy, drift, volume, symplecticity, reversal.",
             autocompletion=completion.several(("error", "energy", "drift", "volume", "symplecticity", "reversal")),
         ),
-    ] = "error,energy,drift,volume,symplecticity",
+    ] = "error, energy, drift, volume, symplecticity",
     n_outputs: Annotated[int, typer.Option(help="Number of instants at which every method is measured.")] = 1000,
     repeats: Annotated[int, typer.Option(help="Timed runs of each method, interleaved.")] = 5,
     match: Annotated[
@@ -117,7 +117,7 @@ def bench(
     ctx: typer.Context,
     systems: Systems = None,
     own: Own = None,
-    method_names: Methods = "verlet,leapfrog,blanes_moan4,srkn11b,kahan_li8,rk45,dop853,sympflow,mlp",
+    method_names: Methods = "verlet, leapfrog, blanes_moan4, srkn11b, kahan_li8, rk45, dop853, sympflow, mlp",
     t_end: TEnd = None,
     y0: State = None,
     batch: Annotated[
@@ -175,7 +175,7 @@ def stability(
     ctx: typer.Context,
     systems: Systems = None,
     own: Own = None,
-    method_names: Methods = "sympflow,verlet,leapfrog,kahan_li8,implicit_midpoint,rk4,rk45",
+    method_names: Methods = "sympflow, verlet, leapfrog, kahan_li8, implicit_midpoint, rk4, rk45",
     vary: Annotated[
         str | None, typer.Option(help="A parameter and its values, for a stability map: omega=1,10,100.")
     ] = None,
@@ -188,10 +188,10 @@ def stability(
     metrics: Annotated[
         str,
         typer.Option(
-            help="Any of energy,drift,volume,symplecticity,domain.",
+            help="Any of energy, drift, volume, symplecticity, domain.",
             autocompletion=completion.several(("energy", "drift", "volume", "symplecticity", "domain")),
         ),
-    ] = "energy,drift,volume,symplecticity,domain",
+    ] = "energy, drift, volume, symplecticity, domain",
     bound: Annotated[float, typer.Option(help="Relative energy error above which a run counts as unstable.")] = 1e3,
     limits: Annotated[bool, typer.Option(help="Find the longest stable step by bisection.")] = True,
     to: Folder = None,

@@ -47,7 +47,12 @@ Systems = Annotated[
 ]
 Own = Annotated[
     list[str] | None,
-    typer.Option("--system", metavar="SYSTEM", help="The same as an option.", autocompletion=_systems),
+    typer.Option(
+        "--system",
+        metavar="SYSTEM",
+        help="A system, as the argument is; several times for several.",
+        autocompletion=_systems,
+    ),
 ]
 Method = Annotated[
     str,

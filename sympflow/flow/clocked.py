@@ -158,7 +158,7 @@ class ClockedFlow(SympFlow):
         self.layers = (*maps, Drift(self.clock))  # type: ignore[assignment]
         if system is not None:
             self._check(system)
-            self.fingerprint, self.system_name = system.fingerprint, system.name
+            self.identify(system)
 
     @staticmethod
     def _check(system: HamiltonianSystem) -> None:

@@ -1,7 +1,8 @@
 """Files of flows: safetensors with a JSON record, never pickle. A file is taken for hostile until all of it is checked.
 
 The metadata entry "sympflow" is a JSON object: format, version (of the package), kind, architecture, dt, domain,
-system, fingerprint, recipe, figures, checksum (of the tensors), and certificate, if one was computed.
+system, fingerprint, recipe, figures, checksum (of the tensors), and, where there are any, certificate and identity
+(the H of the system, at states of the domain and as an expression).
 """
 
 from __future__ import annotations
@@ -27,9 +28,11 @@ from sympflow._version import __version__
 from sympflow.arguments import naming_path, writable
 from sympflow.flow.certificate import Certificate
 from sympflow.flow.families import KINDS, family_of
+from sympflow.flow.potentials import Unregistered
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.weights import checked_device, checksum
 from sympflow.hamiltonian.domain import Domain, domain_from_dict
+from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 FORMAT = 1
@@ -56,7 +59,17 @@ STAGE: dict[str, Any] = {
 
 
 class Refused(Exception):
-    """The reason for which a file is refused."""
+    """The reason for which a file is refused, and what to do.
+
+    Parameters
+    ----------
+    reason : str
+    remedy : str
+    """
+
+    def __init__(self, reason: str, remedy: str = "Save it again with flow.save(path)") -> None:
+        super().__init__(reason)
+        self.remedy = remedy
 
 
 @dataclass(frozen=True)
@@ -67,6 +80,8 @@ class Description:
     ----------
     domain, system, fingerprint, recipe, figures, certificate
         `FlowMap`'s domain, system_name, fingerprint, recipe, figures, certified.
+    identity
+        `FlowMap`'s own.
     """
 
     domain: Domain | None = None
@@ -75,6 +90,7 @@ class Description:
     recipe: dict[str, Any] = field(default_factory=dict)
     figures: dict[str, Any] = field(default_factory=dict)
     certificate: Certificate | None = None
+    identity: Identity | None = None
 
     @classmethod
     def of_record(cls, record: dict[str, Any], ndof: int) -> Self:
@@ -97,11 +113,11 @@ class Description:
         for name, value in record["figures"].items():
             if value is not None and not _is_number(value):
                 raise Refused(f"its figures have a {name} that is neither a number nor None: {value!r}")
-        certificate = _certificate(record)
+        certificate, identity = _certificate(record), _identity(record, ndof)
         domain = None if record["domain"] is None else _domain(record["domain"], ndof)
         if fingerprint is not None:
             fingerprint = tuple(math.nan if v is None else float(v) for v in fingerprint)
-        return cls(domain, system, fingerprint, record["recipe"], record["figures"], certificate)
+        return cls(domain, system, fingerprint, record["recipe"], record["figures"], certificate, identity)
 
 
 # writing ---------------------------------------------------------------------------------------------------
@@ -134,6 +150,8 @@ def write(
         "figures": description.figures,
         "checksum": checksum(tensors),
     }
+    if description.identity is not None:
+        record["identity"] = description.identity.to_dict()
     if description.certificate is not None:
         if description.certificate.weights == record["checksum"]:
             record["certificate"] = description.certificate.to_dict()
@@ -216,9 +234,9 @@ def load(
         _fill(flow, content, header, record)
         flow.describe(Description.of_record(record, flow.ndof))
     except Refused as reason:
-        raise _refusal(file, str(reason)) from None
+        raise _refusal(file, str(reason), reason.remedy) from None
     except OverflowError:
-        raise _refusal(file, "a number in its record is too large") from None
+        raise _refusal(file, "a number in its record is too large", Refused("").remedy) from None
     if system is not None:
         flow.check_system(system)
         flow.bound(system)
@@ -231,8 +249,8 @@ def _path(path: Any) -> Path:
     return Path(path)
 
 
-def _refusal(path: Path, reason: str) -> ValueError:
-    return ValueError(f"`path` {str(path)!r} is not a usable flow: {reason}. Save it again with flow.save(path).")
+def _refusal(path: Path, reason: str, remedy: str) -> ValueError:
+    return ValueError(f"`path` {str(path)!r} is not a usable flow: {reason}. {remedy}.")
 
 
 def _read(path: Path) -> tuple[bytes, dict[str, Any], dict[str, Any]]:
@@ -316,6 +334,9 @@ def _build(record: dict[str, Any], dtype: torch.dtype) -> Any:
     ndof = checked_integer(plan.get("ndof"), "ndof", MAX_WIDTH)
     try:
         return family_of(record["kind"], plan).from_architecture(ndof, plan, dt, dtype)
+    except Unregistered as error:
+        remedy = f"Import the package that it is from, or {error.remedy}, before you load the file"
+        raise Refused(f"it needs the {error.what}, which is not known here", remedy) from None
     except ValueError as error:
         raise Refused(f"its architecture is not admissible ({error})") from None
 
@@ -382,6 +403,16 @@ def _certificate(record: dict[str, Any]) -> Certificate | None:
     if certificate.weights != record.get("checksum"):
         raise Refused("its certificate is one of other weights")
     return certificate
+
+
+def _identity(record: dict[str, Any], ndof: int) -> Identity | None:
+    """Return the identity of the system in the record, if there is one; a text in it is not read yet."""
+    if record.get("identity") is None:
+        return None
+    try:
+        return Identity.from_dict(record["identity"], ndof)
+    except ValueError as error:
+        raise Refused(f"its identity of the system is not admissible: {error}") from None
 
 
 def _check_system(name: Any, fingerprint: Any) -> None:

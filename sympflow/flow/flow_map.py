@@ -17,7 +17,7 @@ from sympflow.flow.certificate import Certificate, certify
 from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
-from sympflow.hamiltonian.fingerprint import same_system
+from sympflow.hamiltonian.fingerprint import Identity, same_system
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 
@@ -31,10 +31,13 @@ class Origin:
     system: str
     fingerprint: tuple[float, ...]
     shift: float
+    identity: Identity | None = None
 
     def is_of(self, system: HamiltonianSystem) -> bool:
         """Return True for that system, which is recognised by its H."""
-        return same_system(self.fingerprint, system.fingerprint)
+        if not same_system(self.fingerprint, system.fingerprint):
+            return False
+        return self.identity is None or self.identity.agrees(system)
 
 
 def check_system(system: Any) -> None:
@@ -69,6 +72,8 @@ class FlowMap(nn.Module):
         Ω, where it was trained.
     fingerprint, system_name : tuple of float or None, str or None
         The system it was trained for.
+    identity : Identity or None
+        H of that system, all over Ω; None for a flow without a system, or from a file that was written before.
     recipe, figures : dict
         How it was trained, and what it achieved.
     history : list of dict
@@ -97,6 +102,8 @@ class FlowMap(nn.Module):
         self.domain: Domain | None = None
         self.fingerprint: tuple[float, ...] | None = None
         self.system_name: str | None = None
+        self.identity: Identity | None = None
+        self._origin: tuple[dict[str, Any], Origin] | None = None
         self.recipe: dict[str, Any] = {}
         self.figures: dict[str, Any] = {}
         self.history: list[dict[str, float]] = []
@@ -319,7 +326,13 @@ class FlowMap(nn.Module):
     def description(self) -> Description:
         """All that a file tells of it beside architecture and weights."""
         return Description(
-            self.domain, self.system_name, self.fingerprint, self.recipe, self.figures, certificate=self.certified
+            self.domain,
+            self.system_name,
+            self.fingerprint,
+            self.recipe,
+            self.figures,
+            certificate=self.certified,
+            identity=self.identity,
         )
 
     def describe(self, description: Description) -> None:
@@ -328,6 +341,7 @@ class FlowMap(nn.Module):
             description.domain, description.system, description.fingerprint,
         )  # fmt: skip
         self.recipe, self.figures, self.certified = description.recipe, description.figures, description.certificate
+        self.identity = description.identity
 
     # its system ---------------------------------------------------------------------------------------------
 
@@ -340,12 +354,27 @@ class FlowMap(nn.Module):
     def origin(self) -> Origin | None:
         """The system in the physical time, for a flow in another time; None for a flow in its system's own time."""
         made = (self.recipe or {}).get("transforms")
-        return None if made is None else Origin(made["system"], tuple(made["fingerprint"]), made["shift"])
+        if made is None:
+            return None
+        if self._origin is None or self._origin[0] is not made:
+            kept = made.get("identity")
+            identity = None if kept is None else Identity.from_dict(kept, self.ndof - 1)
+            self._origin = made, Origin(made["system"], tuple(made["fingerprint"]), made["shift"], identity)
+        return self._origin[1]
+
+    def identify(self, system: HamiltonianSystem, domain: Domain | None = None) -> None:
+        """Make this the flow of a system, which it will know again: by its fingerprint, and by its H over a domain."""
+        self.fingerprint, self.system_name = system.fingerprint, system.name
+        self.identity = Identity.of(system, domain)
 
     def matches(self, system: HamiltonianSystem) -> bool:
         """Return True if the flow is of this system, and in its time; a bare flow fits any of its size."""
         mine = self.fingerprint
-        return system.ndof == self.ndof and (mine is None or same_system(mine, system.fingerprint))
+        if system.ndof != self.ndof:
+            return False
+        if mine is None:
+            return True
+        return same_system(mine, system.fingerprint) and (self.identity is None or self.identity.agrees(system))
 
     def check_system(self, system: HamiltonianSystem) -> None:
         """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""

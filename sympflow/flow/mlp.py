@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from sympflow.flow.files import checked_widths
 from sympflow.flow.flow_map import FlowMap
-from sympflow.flow.potentials import activation_named, hidden_widths, outer
+from sympflow.flow.potentials import activation_named, count_weights, hidden_widths, outer
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
-from sympflow.flow.weights import checked_device, checked_dtype
+from sympflow.flow.weights import check_memory, checked_device, checked_dtype
 
 MAX_DIFFERENCE = 6  # between the widths of two layers that are about the same
 
@@ -55,6 +55,8 @@ class MLPFlow(FlowMap):
             hidden = _default_widths(ndof)
         self.hidden, self.activation = hidden_widths(hidden), activation
         self._sigma = activation_named(activation)
+        weights = count_weights(2 * ndof, self.hidden) + 2 * ndof * self.hidden[-1]
+        check_memory(f"`hidden` {self.hidden!r}", weights, "take narrower layers")
         scale = Scaling.unit(ndof, dt) if scale is None else scale
         generator = torch.Generator().manual_seed(seed)
 

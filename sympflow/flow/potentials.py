@@ -10,27 +10,54 @@ sweeps through a network need of it, which shares more than separate derivatives
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from sympflow.arguments import plain
-from sympflow.flow.weights import checked_device, checked_dtype
+from sympflow.arrays import jvp
+from sympflow.flow.weights import check_memory, checked_device, checked_dtype
+from sympflow.lazy import announced, distribution, load_announced
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from importlib.metadata import EntryPoint
+
     from sympflow.kernels.network_loops import NetworkLayer
 
 Time = float | Tensor
 
+ACTIVATION_GROUP, POTENTIAL_GROUP = "sympflow.activations", "sympflow.potentials"
+"""The entry-point groups in which a distribution announces its activations and potentials: files name them."""
+
 NO_NETWORK = "`flow` has layers other than kicks and drifts with MLP potentials: use backend='array'."
+
+
+class Unregistered(ValueError):
+    """A name of an activation or a potential that nothing is registered under.
+
+    Attributes
+    ----------
+    what, remedy : str
+        For the message of a file that needs it.
+    """
+
+    def __init__(self, kind: str, name: Any, known: Iterable[str]) -> None:
+        self.what = f"{kind} {_short(name)}"
+        self.remedy = f"register it by sympflow.flow.potentials.register_{kind}"
+        super().__init__(f"`{kind}` {_short(name)} is unknown: choose one of {', '.join(known)}, or {self.remedy}.")
 
 
 class Activation:
     """σ, and its derivatives as the sweeps need them."""
+
+    compiled: Any = None
+    """For compiled loops, if they do not know σ by name: a function of a number a, of Python or Numba, that returns
+    σ(a) and σ'(a)."""
 
     def value(self, a: Tensor) -> Tensor:
         """σ(a)."""
@@ -108,26 +135,169 @@ class LogCosh(Activation):
         return h, slope, slope * da, (1 - slope * slope) * da
 
 
+class Swish(Activation):
+    """a / (1 + exp(−a)), which is also called SiLU."""
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        s = torch.sigmoid(a)
+        h = a * s
+        return h, s + h * (1 - s)
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        s = torch.sigmoid(a)
+        h, rest = a * s, 1 - s
+        slope = s + h * rest
+        return h, slope, slope * da, s * rest * (2 + a * (1 - 2 * s)) * da
+
+
+class FunctionActivation(Activation):
+    """A function of tensors, whose derivatives are found by forward-mode differentiation.
+
+    Parameters
+    ----------
+    name : str
+        By which it is registered, and pickled.
+    function : callable
+        σ, elementwise.
+    compiled : callable, optional
+        See `Activation`.
+    """
+
+    def __init__(self, name: str, function: Callable[[Tensor], Tensor], compiled: Any = None) -> None:
+        self.name, self.function, self.compiled = name, function, compiled
+
+    def value(self, a: Tensor) -> Tensor:
+        return self.function(a)
+
+    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        return jvp(self.function, a, torch.ones_like(a))
+
+    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        (h, slope), (dh, dslope) = jvp(self.slope, a, da)
+        return h, slope, dh, dslope
+
+    def __reduce__(self) -> Any:
+        return activation_named, (self.name,)
+
+
 ACTIVATIONS: dict[str, Activation] = {
     "tanh": Tanh(),
     "sin": Sin(),
     "sigmoid": Sigmoid(),
     "softplus": Softplus(),
     "logcosh": LogCosh(),
+    "swish": Swish(),
 }
+"""The built-in activations."""
+
+_activations: dict[str, Activation] = {}
 
 
 def activation_named(name: str) -> Activation:
-    """Return the activation of that name.
+    """Return the activation of that name: a built-in one, one that was registered, or that of a plug-in.
 
     Raises
     ------
     ValueError
         If there is none.
+    ImportError
+        If the plug-in that announces it cannot be loaded.
     """
-    if not isinstance(name, str) or name not in ACTIVATIONS:
-        raise ValueError(f"`activation` {name!r} is unknown: choose one of {', '.join(ACTIVATIONS)}.")
-    return ACTIVATIONS[name]
+    known = ACTIVATIONS | _activations
+    if isinstance(name, str) and name in known:
+        return known[name]
+    if not isinstance(name, str) or name not in _announced(ACTIVATION_GROUP):
+        raise Unregistered("activation", name, [*known, *_announced(ACTIVATION_GROUP)])
+    point = _announced(ACTIVATION_GROUP)[name]
+    try:
+        _activations[name] = _checked_activation(name, load_announced(point, "activation"), None)
+    except (TypeError, ValueError) as error:
+        raise ImportError(
+            f"`activation` {name!r} of the plug-in {distribution(point)} is none ({error}): report it there."
+        ) from error
+    return _activations[name]
+
+
+def register_activation(
+    name: str, activation: Activation | Callable[[Tensor], Tensor], compiled: Callable[[float], Any] | None = None
+) -> None:
+    """Make an activation known by name in this process: to new networks, and to files of flows that have it.
+
+    Parameters
+    ----------
+    name : str
+    activation : Activation or callable
+        An elementwise function σ of tensors, C² (a torch.nn.Module for instance), whose derivatives are found by
+        forward-mode differentiation; or an `Activation`, which has them in closed form.
+    compiled : callable, optional
+        A function of a number a that returns σ(a) and σ'(a), one of Numba or one that Numba compiles. With it flows
+        run compiled, else by array operations.
+
+    Raises
+    ------
+    ValueError
+        If the name is empty or that of a built-in activation, or if a derivative is wrong.
+    TypeError
+        If `name` is not a string, or `activation` or `compiled` not callable.
+
+    Examples
+    --------
+    >>> def and_slope(a):
+    ...     return a**3, 3 * a**2
+    >>> register_activation("cube", lambda a: a**3, and_slope)
+    """
+    if not isinstance(name, str):
+        raise TypeError(f"`name` must be a string, such as 'my_activation'; got {type(name).__name__}.")
+    if not name.strip() or name in ACTIVATIONS:
+        taken = "is a built-in activation, which cannot be replaced" if name in ACTIVATIONS else "is empty"
+        raise ValueError(f"`name` {name!r} {taken}: choose another one, such as 'my_activation'.")
+    _activations[name] = _checked_activation(name, activation, compiled)
+
+
+def _checked_activation(name: str, activation: Any, compiled: Any) -> Activation:
+    """Return an activation whose values and derivatives agree at samples."""
+    if not isinstance(activation, Activation):
+        if not callable(activation):
+            raise TypeError(f"`activation` must be a function of tensors or an Activation; got {activation!r}.")
+        activation = FunctionActivation(name, activation, compiled)
+    elif compiled is not None:
+        activation.compiled = compiled
+    a = torch.linspace(-3.1, 3.1, 62, dtype=torch.float64).reshape(2, 31)  # not at 0, where one may have a special case
+    da = torch.cos(3 * a)
+    x = a.clone().requires_grad_()
+    value = activation.value(x)
+    if not isinstance(value, Tensor) or value.shape != a.shape or value.dtype != a.dtype or not value.requires_grad:
+        raise TypeError(f"`activation` {name!r} must be an elementwise function of tensors that torch differentiates.")
+    (slope,) = torch.autograd.grad(value.sum(), x, create_graph=True)
+    bend = torch.autograd.grad(slope.sum(), x)[0] if slope.requires_grad else torch.zeros_like(a)
+    slope = slope.detach()
+    expected = {"value": value.detach(), "slope": slope, "dvalue": slope * da, "dslope": bend * da}
+    for what, found in zip(expected, activation.tangent(a, da), strict=True):
+        if not torch.allclose(found, expected[what], rtol=1e-9, atol=1e-9):
+            raise ValueError(f"`activation` {name!r} has a tangent() whose {what} is not that of value(): mend it.")
+    for found, of in zip(activation.slope(a), ("value", "slope"), strict=True):
+        if not torch.allclose(found, expected[of], rtol=1e-9, atol=1e-9):
+            raise ValueError(f"`activation` {name!r} has a slope() that is not the derivative of value(): mend it.")
+    if activation.compiled is not None:
+        if not callable(activation.compiled):
+            raise TypeError(f"`compiled` must be a function of a number; got {activation.compiled!r}.")
+        function = getattr(activation.compiled, "py_func", activation.compiled)  # Numba's, not compiled for this
+        pairs = torch.tensor([tuple(function(number)) for number in a.reshape(-1).tolist()], dtype=torch.float64)
+        if not torch.allclose(pairs, torch.stack([expected["value"], slope], -1).reshape(-1, 2), rtol=1e-9, atol=1e-9):
+            raise ValueError(f"`compiled` does not return the value and the slope of activation {name!r}: mend it.")
+    return activation
+
+
+@cache
+def _announced(group: str) -> dict[str, EntryPoint]:
+    what, taken = ("activation", ACTIVATIONS) if group == ACTIVATION_GROUP else ("potential", {"mlp": None})
+    return announced(group, what, taken)
+
+
+def _short(name: Any) -> str:
+    """A name as it is shown in a message, which may be from a file."""
+    text = repr(name)
+    return text if len(text) < 60 else f"{text[:50]} …"
 
 
 class Potential(nn.Module):
@@ -138,7 +308,10 @@ class Potential(nn.Module):
     1. `impulse(t, x)`: ∇V(t, x) − ∇V(0, x), shape (d, N).
     2. `impulse_and_rate(t, x)`: the impulse, and ∂_tV(t, x) of shape (N,).
     3. `impulse_and_tangent(t, x, dx)`: the impulse, and its derivative along a curve x(t) with velocity dx.
-    4. `to_dict()`: its architecture, JSON-able, from which its family builds it again.
+    4. `to_dict()`: its architecture, JSON-able. For files it has a "type", the name by which the class is registered
+       with `register_potential`, and
+    5. `from_dict(ndof, plan, dtype)`, a class method, builds it again from that, untrained. The file is not to be
+       trusted: it checks the plan before it allocates anything.
     """
 
     ndof: int
@@ -154,6 +327,11 @@ class Potential(nn.Module):
 
     def to_dict(self) -> dict[str, Any]:
         raise NotImplementedError
+
+    @classmethod
+    def from_dict(cls, ndof: int, plan: Mapping[str, Any], dtype: torch.dtype) -> Self:
+        """Return the untrained potential of an architecture that a file describes."""
+        raise NotImplementedError(f"{cls.__name__} must define from_dict(), by which files are read.")
 
     def network(self, is_kick: bool) -> NetworkLayer:
         """Return the weights of a kick or drift of it for compiled loops; ValueError if there are none."""
@@ -218,6 +396,7 @@ class MLPPotential(Potential):
     ) -> None:
         super().__init__()
         hidden, dtype, device = hidden_widths(hidden), checked_dtype(dtype), checked_device(device)
+        check_memory(f"`hidden` {hidden!r}", count_weights(ndof, hidden), "take narrower layers")
         self.ndof, self.hidden, self.activation = int(ndof), hidden, activation
         self._sigma = activation_named(activation)
 
@@ -246,6 +425,88 @@ class MLPPotential(Potential):
     def to_dict(self) -> dict[str, Any]:
         return {"type": "mlp", "hidden": list(self.hidden), "activation": self.activation}
 
+    @classmethod
+    def from_dict(cls, ndof: int, plan: Mapping[str, Any], dtype: torch.dtype) -> Self:
+        return cls(ndof, plan["hidden"], plan.get("activation"), dtype=dtype)  # type: ignore[arg-type]
+
+    @classmethod
+    def from_weights(
+        cls,
+        weights: Sequence[Any],
+        biases: Sequence[Any],
+        activation: str = "tanh",
+        *,
+        time: str = "last",
+        dtype: torch.dtype | None = None,
+    ) -> Self:
+        """Return the potential V(t, x) = w · σ(W_n σ(… σ(W_1 [x, t] + b_1) …) + b_n) of given numbers.
+
+        Parameters
+        ----------
+        weights : sequence of array_like
+            W_1 of shape (h_1, d + 1), W_l of shape (h_l, h_{l−1}), and w of shape (h_n,) or (1, h_n): those of
+            `torch.nn.Linear`.
+        biases : sequence of array_like
+            b_l of shape (h_l,). One of the output, of shape () or (1,), may follow: it moves nothing and is left out.
+        activation : str
+        time : {"last", "first"}
+            The place of t in the input of W_1.
+        dtype : torch.dtype, optional
+            The default is that of the numbers.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, a number is not finite, or there is no such activation.
+        TypeError
+            If the numbers are not of one of the dtypes float32 and float64.
+        """
+        W, b = _tensors("weights", weights, dtype), _tensors("biases", biases, dtype)
+        if len({x.dtype for x in (*W, *b)}) != 1:
+            raise TypeError(
+                "`weights` and `biases` must be of one dtype, float32 or float64: pass dtype=torch.float64."
+            )
+        if time not in ("last", "first"):
+            raise ValueError(f"`time` must be 'last' or 'first', the place of t in the input; got {time!r}.")
+        n = len(W) - 1
+        if n < 1 or len(b) not in (n, n + 1):
+            raise ValueError(
+                f"`weights` must be those of one or more hidden layers and of the output, and `biases` one for each "
+                f"hidden layer, with or without the output's; got {len(W)} and {len(b)}."
+            )
+        out = W[-1].reshape(-1) if W[-1].ndim == 2 and len(W[-1]) == 1 else W[-1]
+        widths = [len(x) if x.ndim else 0 for x in b[:n]]
+        ndof = W[0].shape[-1] - 1 if W[0].ndim == 2 else 0
+        fits = ndof > 0 and min(widths) > 0 and tuple(out.shape) == (widths[-1],)
+        fits = fits and all(tuple(x.shape) == (h,) for x, h in zip(b[:n], widths, strict=True))
+        shapes = zip(W[:-1], widths, (ndof + 1, *widths[:-1]), strict=True)
+        if not fits or any(tuple(x.shape) != (h, k) for x, h, k in shapes) or any(x.numel() != 1 for x in b[n:]):
+            shown = [tuple(x.shape) for x in W], [tuple(x.shape) for x in b]
+            raise ValueError(
+                "`weights` must have shapes (h_1, d + 1), (h_2, h_1), …, (1, h_n), and `biases` (h_1,), …, (h_n,); got "
+                f"{shown[0]} and {shown[1]}: check their order, or transpose them."
+            )
+        self = cls(ndof, widths, activation, dtype=W[0].dtype, generator=torch.Generator())
+        first = W[0].roll(-1, 1) if time == "first" else W[0]
+        with torch.no_grad():
+            self.weight_x.copy_(first[:, :ndof])
+            self.weight_t.copy_(first[:, ndof])
+            self.weight_out.copy_(out)
+            for mine, given in zip((*self.weights, *self.biases), (*W[1:-1], *b[:n]), strict=True):
+                mine.copy_(given)
+        return self
+
+    def to_weights(self) -> dict[str, Any]:
+        """Return the arguments of `from_weights` for this potential, as arrays: its units are multiplied in."""
+        K, k, b, W, w = self.folded()
+        matrices = [torch.cat([K, k[:, None]], 1), *W, w[None]]
+        return {
+            "weights": [x.detach().cpu().numpy().copy() for x in matrices],
+            "biases": [x.detach().cpu().numpy().copy() for x in b],
+            "activation": self.activation,
+            "time": "last",
+        }
+
     def folded(self) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor], Tensor]:
         """The weights (K/s, k/τ, [b_l], [W_l], c·w): V(t, x) = c·w · σ(… σ((K/s) x + (k/τ) t + b_1) …)."""
         K, k, w = self.weight_x / self.scale, self.weight_t / self.tau, self.gain * self.weight_out
@@ -259,7 +520,9 @@ class MLPPotential(Potential):
         def array(weight: Tensor) -> np.ndarray:
             return weight.detach().cpu().numpy()
 
-        return NetworkLayer(is_kick, self.activation, array(K), array(k), [*map(array, b)], [*map(array, W)], array(w))
+        biases, weights = [*map(array, b)], [*map(array, W)]
+        first = is_kick, self.activation, array(K), array(k)
+        return NetworkLayer(*first, biases, weights, array(w), self._sigma.compiled)
 
     # V and its derivatives at one time ---------------------------------------------------------------
 
@@ -365,9 +628,143 @@ def outer(k: Tensor, t: Time) -> Tensor:
     return k[:, None] * t
 
 
+def count_weights(inputs: int, hidden: Sequence[int]) -> int:
+    """The number of weights of a network of these widths with one output, with those of the time."""
+    fans = (inputs + 1, *hidden[:-1])
+    return sum(h * fan + h for h, fan in zip(hidden, fans, strict=True)) + hidden[-1]
+
+
 def hidden_widths(hidden: Sequence[int]) -> tuple[int, ...]:
     """Return `hidden`, checked."""
     widths = tuple(map(plain, hidden)) if isinstance(hidden, Sequence) else ()
     if not widths or any(isinstance(h, bool) or not isinstance(h, int) or h < 1 for h in widths):
         raise ValueError(f"`hidden` must be the widths of one or more hidden layers, such as (10, 10); got {hidden!r}.")
     return widths
+
+
+# numbers and modules of others ------------------------------------------------------------------------
+
+
+def module_weights(module: nn.Module) -> dict[str, Any]:
+    """Return the arguments of `MLPPotential.from_weights` for a `torch.nn.Sequential` of the input [x, t].
+
+    Its activations are recognised by their values, whatever their classes.
+
+    Raises
+    ------
+    TypeError
+        If it is no Sequential of Linear layers and activations in turn, the output linear.
+    ValueError
+        If an activation is none of those that are known, or they differ.
+    """
+    layers = list(module) if isinstance(module, nn.Sequential) else []
+    linear, between = layers[::2], layers[1::2]
+    if len(linear) != len(between) + 1 or len(linear) < 2 or not all(isinstance(each, nn.Linear) for each in linear):
+        raise TypeError(
+            "`potentials` must be torch.nn.Sequential of Linear, activation, …, Linear; got "
+            f"{_short(module)}: give weights and biases instead."
+        )
+    names = {_activation_of(each) for each in between}
+    if len(names) != 1:
+        raise ValueError(f"`potentials` must have one activation in a network; got {', '.join(sorted(names))}.")
+    return {
+        "weights": [each.weight for each in linear],
+        "biases": [each.bias if each.bias is not None else each.weight.new_zeros(len(each.weight)) for each in linear],
+        "activation": names.pop(),
+    }
+
+
+def _activation_of(module: nn.Module) -> str:
+    """Return the name of the known activation that has the values of a module."""
+    a = torch.linspace(-4.0, 4.0, 41, dtype=torch.float64)
+    known = ACTIVATIONS | _activations
+    with torch.no_grad():
+        for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
+            try:
+                values = module(a.to(dtype))
+            except (RuntimeError, TypeError, ValueError):  # not of this dtype, or not elementwise
+                continue
+            for name, sigma in known.items():
+                if values.shape == a.shape and bool((values.to(a) - sigma.value(a)).abs().max() < 5 * tolerance):
+                    return name
+    raise ValueError(
+        f"`potentials` have an activation {_short(module)} that is none of {', '.join(known)}: register it by "
+        "sympflow.flow.potentials.register_activation(name, activation)."
+    )
+
+
+def _tensors(name: str, arrays: Any, dtype: torch.dtype | None) -> list[Tensor]:
+    if isinstance(arrays, str) or not isinstance(arrays, Sequence):
+        raise TypeError(f"`{name}` must be a list of arrays, one for each layer; got {type(arrays).__name__}.")
+    found = []
+    for array in arrays:
+        try:
+            x = torch.as_tensor(array.detach() if isinstance(array, Tensor) else np.asarray(array), device="cpu")
+        except (TypeError, ValueError) as error:
+            raise TypeError(f"`{name}` must be arrays of numbers; got one that is not ({error}).") from None
+        x = x.to(torch.float64) if not x.is_floating_point() and not x.is_complex() else x
+        if x.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"`{name}` must be of float32 or float64; got {x.dtype}: convert them first.")
+        if not torch.isfinite(x).all():
+            raise ValueError(f"`{name}` must be finite; they hold NaN or infinity. Check where they are from.")
+        found.append(x if dtype is None else x.to(checked_dtype(dtype)))
+    return found
+
+
+# potentials by name -------------------------------------------------------------------------------------
+
+_potentials: dict[str, type[Potential]] = {"mlp": MLPPotential}
+
+
+def potential_named(name: str) -> type[Potential]:
+    """Return the class of potentials that files call by that name.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    ImportError
+        If the plug-in that announces it cannot be loaded.
+    """
+    if isinstance(name, str) and name in _potentials:
+        return _potentials[name]
+    if not isinstance(name, str) or name not in _announced(POTENTIAL_GROUP):
+        raise Unregistered("potential", name, [*_potentials, *_announced(POTENTIAL_GROUP)])
+    point = _announced(POTENTIAL_GROUP)[name]
+    cls = load_announced(point, "potential")
+    if not (isinstance(cls, type) and issubclass(cls, Potential)):
+        raise ImportError(
+            f"`potential` {name!r} of the plug-in {distribution(point)} is no Potential class: report it there."
+        )
+    _potentials[name] = cls
+    return cls
+
+
+def register_potential(name: str, potential: type[Potential]) -> None:
+    """Make a class of potentials known by name in this process, so that files of flows with them can be read.
+
+    Parameters
+    ----------
+    name : str
+        The "type" in its `to_dict()`.
+    potential : subclass of Potential
+        With `from_dict`.
+
+    Raises
+    ------
+    ValueError
+        If the name is empty or "mlp".
+    TypeError
+        If `name` is not a string, or `potential` no class of potentials with `from_dict`.
+    """
+    if not isinstance(name, str):
+        raise TypeError(f"`name` must be a string, such as 'my_potential'; got {type(name).__name__}.")
+    if not name.strip() or name == "mlp":
+        raise ValueError(
+            f"`name` {name!r} is {'built in' if name else 'empty'}: choose another, such as 'my_potential'."
+        )
+    if not (isinstance(potential, type) and issubclass(potential, Potential)):
+        raise TypeError(f"`potential` must be a subclass of Potential; got {potential!r}.")
+    if potential.from_dict.__func__ is Potential.from_dict.__func__:  # type: ignore[attr-defined]
+        raise TypeError(f"`potential` {potential.__name__} has no from_dict(), by which files are read: define it.")
+    _potentials[name] = potential

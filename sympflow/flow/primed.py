@@ -430,7 +430,7 @@ class PrimedFlow(SympFlow):
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(self._layer(substep) for substep in self.substeps)  # type: ignore[assignment]
         if system is not None:
-            self.fingerprint, self.system_name = system.fingerprint, system.name
+            self.identify(system)
 
     @classmethod
     def untrained(
@@ -464,6 +464,7 @@ class PrimedFlow(SympFlow):
             raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
         exponents = _monomials_of(system, polynomial, force_gradient, curvature)
         force_gradient = _force_gradient_of(system, False if exponents else force_gradient, curvature)
+        _check_counts(stages, processor)
         scheme = _starting_scheme(system, scheme, stages, first)
         if palindromic and not scheme.symmetric:
             raise ValueError(f"`scheme` {scheme.name!r} is not symmetric: take another, or palindromic=False.")
@@ -646,6 +647,14 @@ class PrimedFlow(SympFlow):
         return super().initial_velocity(x) if self.system is None else self.system.vector_field(x)
 
 
+def _check_counts(stages: Any, processor: Any) -> None:
+    """Raise ValueError where there are more maps than a file may hold."""
+    for name, value in (("stages", stages), ("processor", processor)):
+        if isinstance(value, int) and 2 * value + 1 > MAX_LAYERS:
+            most = (MAX_LAYERS - 1) // 2
+            raise ValueError(f"`{name}` must be at most {most}, as many as a file may hold; got {value!r}.")
+
+
 def _starting_scheme(system: HamiltonianSystem, scheme: Any, stages: Any, first: str) -> Scheme:
     """Return the scheme that an untrained flow is: the given one, or so many equal steps."""
     if scheme is None:
@@ -670,8 +679,7 @@ def _starting_scheme(system: HamiltonianSystem, scheme: Any, stages: Any, first:
 def _force_gradient_of(system: HamiltonianSystem, asked: bool | None, curvature: bool) -> bool:
     """Return True if the kicks have force gradients: if asked for, or by default where T is quadratic."""
     if asked is None:
-        functions = system.numba_functions
-        asked = system.quadratic_kinetic and (functions is None or functions[2] is not None)
+        asked = system.quadratic_kinetic and system.has_hessian_vector
     elif asked and not system.quadratic_kinetic:
         raise ValueError("`force_gradient` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
     if curvature and not (asked and system.symbols is not None):

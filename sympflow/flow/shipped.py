@@ -17,7 +17,7 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sympflow.hamiltonian.fingerprint import same_system
+from sympflow.hamiltonian.fingerprint import Identity, same_system
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
@@ -76,22 +76,25 @@ class ShippedFlow:
     shift: float | None
     path: Path = field(repr=False)
     fingerprint: tuple[float, ...] = field(repr=False)
+    identity: Identity | None = field(repr=False, default=None)
 
     @classmethod
     def of(cls, path: Path) -> ShippedFlow:
         """Return the description in the header of a file."""
         record = _record(path)
-        figures, plan = record["figures"], record["architecture"].get("primed")
+        figures, plan = record["figures"], record["architecture"]
+        primed = plan.get("primed")
         origin = record["recipe"].get("transforms")  # of a flow in another time, the system that it is for
-        of = record if origin is None else origin
+        of, ndof = (record, plan["ndof"]) if origin is None else (origin, plan["ndof"] - 1)
+        kept = of.get("identity")
         return cls(
             name=path.stem,
             kind=record["kind"],
             system=of["system"],
             dt=record["dt"] if origin is None else figures["step"],
-            stages=None if plan is None else plan["maps"] // 2,
-            processor=0 if plan is None else plan.get("processor", 0),
-            polynomial=0 if plan is None else max(map(sum, plan.get("monomials", ())), default=0),
+            stages=None if primed is None else primed["maps"] // 2,
+            processor=0 if primed is None else primed.get("processor", 0),
+            polynomial=0 if primed is None else max(map(sum, primed.get("monomials", ())), default=0),
             cost=figures.get("cost"),
             energy_error=figures.get("energy_error_95"),
             t_end=figures.get("t_end"),
@@ -101,7 +104,14 @@ class ShippedFlow:
             shift=None if origin is None else origin["shift"],
             path=path,
             fingerprint=tuple(math.nan if v is None else v for v in of["fingerprint"]),
+            identity=None if kept is None else Identity.from_dict(kept, ndof),
         )
+
+    def is_of(self, system: HamiltonianSystem) -> bool:
+        """Return True for a flow of that system, in whatever time, which is recognised by its H."""
+        if not same_system(self.fingerprint, system.fingerprint):
+            return False
+        return self.identity is None or self.identity.agrees(system)
 
     def load(self, system: HamiltonianSystem | None = None) -> Any:
         """The flow itself; see `sympflow.load`."""
@@ -191,7 +201,7 @@ def shipped_flows(system: HamiltonianSystem | None = None, kind: str | None = No
         raise ValueError(f"`kind` {kind!r} is unknown: choose 'sympflow' or 'mlp', or leave it out.")
     found = [f for f in _catalogue() if kind in (None, f.kind)]
     if system is not None:
-        found = [f for f in found if same_system(f.fingerprint, system.fingerprint)]
+        found = [f for f in found if f.is_of(system)]
     return ShippedFlows(sorted(found, key=lambda f: (f.system, math.inf if f.cost is None else f.cost)))
 
 

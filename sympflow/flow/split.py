@@ -248,7 +248,7 @@ class SplitFlow(SympFlow):
         self.layers = tuple(SplitLayer(self, i) for i in range(len(self.sequence)))  # type: ignore[assignment]
         if system is not None:
             self._check_parts(self._binding.parts)
-            self.fingerprint, self.system_name = system.fingerprint, system.name
+            self.identify(system)
 
     @classmethod
     def untrained(

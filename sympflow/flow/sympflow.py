@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
@@ -19,9 +20,17 @@ from sympflow.flow.files import (
 )
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.layers import LAYERS, Drift, Kick, Layer
-from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.potentials import (
+    MLPPotential,
+    Potential,
+    Unregistered,
+    count_weights,
+    hidden_widths,
+    module_weights,
+    potential_named,
+)
 from sympflow.flow.scaling import Scaling
-from sympflow.flow.weights import Kept, check_compilable
+from sympflow.flow.weights import Kept, check_compilable, check_memory
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 from sympflow.schemes import Scheme
@@ -95,6 +104,10 @@ class SympFlow(FlowMap):
         if len(scale.q) != ndof:
             raise ValueError(f"`scale` is for {len(scale.q)} degrees of freedom, not {ndof}: give one entry for each.")
         generator = torch.Generator().manual_seed(seed)
+        if 2 * pairs > MAX_LAYERS:
+            raise ValueError(f"`pairs` must be at most {MAX_LAYERS // 2}, as many as a file may hold; got {pairs!r}.")
+        weights = 2 * pairs * count_weights(ndof, widths := hidden_widths(hidden))
+        check_memory(f"`hidden` {widths!r} with `pairs` {pairs}", weights, "take narrower layers, or fewer pairs")
 
         def potential(unit: tuple[float, ...], center: tuple[float, ...] | None) -> MLPPotential:
             return MLPPotential(
@@ -132,6 +145,77 @@ class SympFlow(FlowMap):
         FlowMap.__init__(self, layers[0].ndof, dt)
         self.layers = nn.ModuleList(layers)
         return self
+
+    @classmethod
+    def from_potentials(cls, potentials: Iterable[Any], dt: float, *, dtype: torch.dtype | None = None) -> Self:
+        """Return the SympFlow of networks that were trained elsewhere; `to_potentials` is the reverse.
+
+        Each potential V(t, x) = w · σ(W_n σ(… σ(W_1 [x, t] + b_1) …) + b_n) is one of a kick,
+        p −= ∇V(t, q) − ∇V(0, q), or of a drift, q += ∇V(t, p) − ∇V(0, p), in the order in which they are applied: in
+        the architecture of [1]_ kick, drift, kick, drift, ….
+
+        Parameters
+        ----------
+        potentials : iterable of mapping, or of (str, torch.nn.Sequential)
+            A mapping has the entry "kind", "kick" (V of q) or "drift" (V of p), and the arguments of
+            `MLPPotential.from_weights`: "weights", those of `torch.nn.Linear`, (h_1, d + 1), …, (1, h_n); "biases",
+            (h_1,), …, (h_n,), that of the output being optional, as it moves nothing; "activation", a name, "tanh" if
+            there is none; and "time", the place of t in the input, "last" if there is none. A pair has the kind and a
+            module of Linear layers and activations in turn, whose last input is t.
+        dt : float
+            Δt, the longest time that they were trained for.
+        dtype : torch.dtype, optional
+            The default is that of the numbers.
+
+        Returns
+        -------
+        SympFlow
+            With parameters that do not require gradients, on the CPU, in the units of the numbers.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If there are none, their sizes differ or do not fit, or a number or an activation is not admissible: the
+            message begins with the number of the potential.
+
+        Examples
+        --------
+        >>> net = torch.nn.Sequential(torch.nn.Linear(2, 5), torch.nn.SiLU(), torch.nn.Linear(5, 1))
+        >>> flow = SympFlow.from_potentials([("kick", net), ("drift", net)], dt=1.0)
+        >>> flow.ndof, flow.dtype, flow.layers[0].potential.activation
+        (1, torch.float32, 'swish')
+        """
+        layers = []
+        for i, entry in enumerate(_listed(potentials)):
+            try:
+                layers.append(_layer_of(entry, dtype))
+            except (ValueError, TypeError) as error:
+                kind = TypeError if isinstance(error, TypeError) else ValueError
+                raise kind(f"`potentials[{i}]` cannot be taken: {error}") from error
+        if not layers or len({(layer.ndof, layer.potential.weight_x.dtype) for layer in layers}) != 1:
+            raise ValueError(
+                "`potentials` must be one or more of the same degrees of freedom and dtype; got "
+                f"{[layer.ndof for layer in layers]}: check the list, or pass dtype=torch.float64."
+            )
+        return cls.from_layers(layers, dt).requires_grad_(False)
+
+    def to_potentials(self) -> list[dict[str, Any]]:
+        """Return its networks in the layout of `from_potentials`, as NumPy arrays, its units multiplied in.
+
+        Raises
+        ------
+        TypeError
+            If a layer is no kick or drift with an MLP potential.
+        """
+        found = []
+        for layer in self.layers:
+            if type(layer) not in LAYERS.values() or not isinstance(layer.potential, MLPPotential):
+                raise TypeError(
+                    "`flow` has layers other than kicks and drifts with MLP potentials, whose numbers have no such "
+                    "layout: save it by flow.save(path)."
+                )
+            found.append({"kind": layer.kind, **layer.potential.to_weights()})
+        return found
 
     @staticmethod
     def primed(
@@ -277,16 +361,18 @@ class SympFlow(FlowMap):
             raise Refused("its list of layers is missing or absurdly long")
         # All sizes first: nothing is allocated for a file that asks for too much.
         potentials = [_potential_of(layer) for layer in layers]
-        widths = [checked_widths(potential.get("hidden"), ndof) for potential in potentials]
+        widths = [checked_widths(plan.get("hidden"), ndof) for plan in potentials if plan["type"] == "mlp"]
         if sum(count_parameters(w, ndof) for w in widths) > MAX_PARAMETERS:
             raise Refused("its architecture is absurdly large")
-        return cls.from_layers(
-            (
-                LAYERS[layer["kind"]](MLPPotential(ndof, hidden, str(potential.get("activation")), dtype=dtype))
-                for layer, potential, hidden in zip(layers, potentials, widths, strict=True)
-            ),
-            dt,
-        )
+        built = [_built(potential, ndof, dtype) for potential in potentials]
+        made = (LAYERS[layer["kind"]](potential) for layer, potential in zip(layers, built, strict=True))
+        return cls.from_layers(made, dt)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        if "layers" in self.architecture():  # the plans of special families describe no layers one by one
+            for layer in self.layers:
+                _check_storable(layer)
+        super().save(path)
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         if compensated:
@@ -345,6 +431,64 @@ def _potential_of(layer: Any) -> dict[str, Any]:
     if not isinstance(layer, dict) or str(layer.get("kind")) not in LAYERS:
         raise Refused("it has a layer of unknown kind")
     potential = layer.get("potential")
-    if not isinstance(potential, dict) or potential.get("type") != "mlp":
+    if not isinstance(potential, dict) or not isinstance(potential.get("type"), str):
         raise Refused("it has a potential of unknown type")
     return potential
+
+
+def _built(plan: dict[str, Any], ndof: int, dtype: torch.dtype) -> Potential:
+    """Return the untrained potential of a description; its class may be a user's."""
+    cls = potential_named(plan["type"])
+    if cls is MLPPotential:
+        return cls.from_dict(ndof, plan, dtype)
+    try:
+        potential = cls.from_dict(ndof, plan, dtype)
+    except Exception as error:
+        raise Refused(f"its potential {plan['type']!r} cannot be built ({type(error).__name__}: {error})") from error
+    if not isinstance(potential, Potential) or potential.ndof != ndof:
+        raise Refused(f"its potential {plan['type']!r} is not one of {ndof} degrees of freedom")
+    return potential
+
+
+def _check_storable(layer: Any) -> None:
+    """Raise a ValueError if a file of the layer could not be read again."""
+    if type(layer) not in LAYERS.values():
+        raise ValueError(
+            f"`flow` has a layer {type(layer).__name__}, and files hold kicks and drifts only: write it as these."
+        )
+    plan = layer.potential.to_dict()
+    name = plan.get("type")
+    try:
+        known = potential_named(name)
+    except Unregistered:
+        known = None
+    if known is not type(layer.potential):
+        raise ValueError(
+            f"`flow` has a potential {type(layer.potential).__name__} that no file can name: register the class by "
+            "sympflow.flow.potentials.register_potential(name, cls), with that name as the 'type' in its to_dict()."
+        )
+
+
+def _listed(potentials: Any) -> list[Any]:
+    if isinstance(potentials, str | Mapping | nn.Sequential) or not isinstance(potentials, Iterable):
+        raise TypeError(f"`potentials` must be a list, in the order of the layers; got {type(potentials).__name__}.")
+    return list(potentials)
+
+
+def _layer_of(entry: Any, dtype: torch.dtype | None) -> Any:
+    """Return the kick or drift of an entry of `from_potentials`."""
+    if isinstance(entry, Mapping):
+        given = dict(entry)
+        kind = given.pop("kind", None)
+        unknown = given.keys() - {"weights", "biases", "activation", "time"}
+        if unknown or not given.keys() >= {"weights", "biases"}:
+            raise ValueError(
+                f"it must have kind, weights and biases, and may have activation and time; got {sorted(entry)}."
+            )
+    elif isinstance(entry, Sequence) and len(entry) == 2 and isinstance(entry[1], nn.Module):
+        kind, given = entry[0], module_weights(entry[1])
+    else:
+        raise TypeError(f"it must be a mapping, or a pair of a kind and a torch.nn.Sequential; got {entry!r:.60}.")
+    if not isinstance(kind, str) or kind not in LAYERS:
+        raise ValueError(f"its kind must be 'kick', V of q, or 'drift', V of p; got {kind!r}.")
+    return LAYERS[kind](MLPPotential.from_weights(**given, dtype=dtype))

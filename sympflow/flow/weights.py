@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Generic, TypeVar
 
@@ -56,6 +57,32 @@ def checked_device(device: Any) -> torch.device | None:
         reason = str(error).splitlines()[0].rstrip(". ") if str(error) else type(error).__name__
         raise ValueError(f"`device` {str(device)!r} is not to be had here ({reason}): use device='cpu'.") from None
     return there
+
+
+def check_memory(what: str, numbers: float, remedy: str) -> None:
+    """Raise ValueError where so many float64 numbers are more than the memory of the machine.
+
+    Parameters
+    ----------
+    what : str
+        The arguments that ask for them, in backticks, with their values.
+    numbers : float
+    remedy : str
+    """
+    needed, there = 8.0 * numbers, _machine_memory()
+    if needed > there:
+        raise ValueError(
+            f"{what} would take {needed / 2**30:.3g} GiB of memory, and this machine has {there / 2**30:.3g} GiB: "
+            f"{remedy}."
+        )
+
+
+def _machine_memory() -> float:
+    """Bytes; where the system does not say, 64 GiB."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return 64.0 * 2**30
 
 
 def check_compilable(dtype: torch.dtype, device: torch.device) -> None:

@@ -41,6 +41,7 @@ class CallableHamiltonian(Definition):
             raise TypeError("`gradient` and `hessian_vector` only go with `potential`: leave them out.")
         self.ndof, self.given = ndof, bool(check)
         self.separable = potential is not None
+        self.has_hessian_vector = gradient is None or hessian_vector is not None
         if gradient is not None and hasattr(gradient, "py_func"):
             _check_numba(potential, gradient, hessian_vector)
             self.numba_functions = (potential, gradient, hessian_vector)

@@ -23,6 +23,8 @@ class Definition:
         (potential, gradient, hessian_vector), if they are Numba's.
     differentiates_itself : bool
         True if all derivatives are automatic ones of a function that is written with torch.
+    has_hessian_vector : bool
+        False if ∇²V·v of arrays is not to be had: a gradient was given without it.
     given : bool
         True if the functions are a user's own, whose derivatives may be wrong: `check` tests them.
     """
@@ -31,6 +33,7 @@ class Definition:
     separable: bool
     numba_functions: tuple[Any, Any, Any] | None = None
     differentiates_itself: bool = False
+    has_hessian_vector: bool = True
     given: bool = False
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 
-def reference_step(system: HamiltonianSystem, x: np.ndarray, t: float, rtol: float = 1e-12) -> np.ndarray:
-    """φ_H,t(x) by DOP853, for states x (n, 2d): (n, 2d), with NaN where the solution does not exist."""
+def reference_step(
+    system: HamiltonianSystem,
+    x: np.ndarray,
+    t: float,
+    rtol: float = 1e-12,
+    check: Callable[[], None] = lambda: None,
+) -> np.ndarray:
+    """φ_H,t(x) by DOP853, for states x (n, 2d): (n, 2d), with NaN where the solution does not exist.
+
+    `check` is called at every evaluation of the vector field, and may raise to end it.
+    """
     scale = np.abs(x).max(0)
     scale = np.where(scale > 0, scale, 1.0)
 
     def integrate(x: np.ndarray) -> np.ndarray | None:
         def velocity(_: float, y: np.ndarray) -> np.ndarray:
+            check()
             v = system.vector_field(y.reshape(x.shape)).ravel()
             if not np.isfinite(v).all():
                 raise FloatingPointError  # SciPy would go on for ever

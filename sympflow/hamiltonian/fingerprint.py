@@ -1,25 +1,41 @@
-"""Fingerprints of systems, by which a trained flow knows its own."""
+"""Fingerprints and identities of systems, by which a trained flow knows its own."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from sympflow.arrays import to_numpy
+from sympflow.hamiltonian.domain import Domain, EnergySublevel
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
 
+DRAWN = 512
+"""States of a domain from which those of an identity are chosen."""
+MOST_STATES, FEWEST_STATES, MOST_NUMBERS = 64, 8, 4096
+LONGEST_EXPRESSION = 20_000
+"""Characters of an H that is kept as a text; a longer one is known by its values alone."""
+LONGEST_COMPARED = 2_000
+"""Characters of two formulas that are compared as such, where their texts differ."""
+TOLERANCE = 1e-9
+"""Of the largest difference of energies among the states."""
+
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
     """H at 8 fixed states less H at a ninth."""
-    probes = np.random.Generator(np.random.PCG64(20260101)).random((9, 2 * system.ndof)) * 0.9 - 0.35
     with np.errstate(all="ignore"):
-        H = to_numpy(system.hamiltonian(probes))
+        H = to_numpy(system.hamiltonian(_fixed_states(system.ndof)))
     return tuple((H[1:] - H[0]).tolist())
+
+
+def _fixed_states(ndof: int) -> np.ndarray:
+    return np.random.Generator(np.random.PCG64(20260101)).random((9, 2 * ndof)) * 0.9 - 0.35
 
 
 def same_system(a: Sequence[float], b: Sequence[float]) -> bool:
@@ -33,4 +49,181 @@ def _agree(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
     if u.shape != v.shape:
         return False
     finite = u[np.isfinite(u)]
-    return np.allclose(u, v, rtol=0, atol=1e-9 * np.abs(finite).max(initial=0.0), equal_nan=True)
+    return np.allclose(u, v, rtol=0, atol=TOLERANCE * np.abs(finite).max(initial=0.0), equal_nan=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Identity:
+    """The H of a system as a flow keeps it, to know it again all over its domain, and along a run.
+
+    A fingerprint probes H near the origin alone, and two systems may agree there and differ where the flow is used.
+
+    Attributes
+    ----------
+    states : ndarray of shape (n, 2d)
+        States of Ω, its extreme ones among them; n may be 0.
+    energies : ndarray of shape (n,)
+        H there.
+    expression : str or None
+        H itself, of a symbolic system, if it is not longer than 20,000 characters.
+    """
+
+    states: np.ndarray
+    energies: np.ndarray
+    expression: str | None
+
+    @classmethod
+    def of(cls, system: Hamiltonian, domain: Domain | None, seed: int = 20260103) -> Self:
+        """Return the identity of a system, by seeded states of a domain."""
+        states = np.empty((0, 2 * system.ndof)) if domain is None else _spread_states(system, domain, seed)
+        energies = _energies(system, states) if len(states) else np.empty(0)
+        expression = system.expression
+        if expression is not None and len(expression) > LONGEST_EXPRESSION:
+            expression = None
+        return cls(states, energies, expression)
+
+    def agrees(self, system: Hamiltonian) -> bool:
+        """Return True if H of a system has these energies at these states, up to a constant; found out once."""
+        known = _AGREED.setdefault(system, WeakKeyDictionary())
+        found = known.get(self)
+        if found is None:
+            found = known[self] = self.is_proved(system) or self.first_difference(system) is None
+        return found
+
+    def first_difference(self, system: Hamiltonian, states: np.ndarray | None = None) -> int | None:
+        """Return the index of the first of the states (n, 2d), by default its own, where H is another than a system's.
+
+        None if there is none, or where it cannot be told, as without an expression for other states than its own.
+        """
+        if states is None:
+            if not len(self.states):
+                return None
+            states, mine = self.states, self.energies
+        else:
+            read = _read(self.expression, system.ndof)
+            if read is None:
+                return None
+            mine = _energies(read, states)
+        # H is known up to a constant: both are compared with what they are at one state that both can evaluate
+        theirs = _energies(system, states)
+        origin, base = self._origin(system)
+        if not np.isfinite(origin - base):
+            return None
+        mine, theirs = mine - base, theirs - origin
+        usual = np.abs(self.energies - base) if len(self.states) else np.abs(mine)
+        usual = usual[np.isfinite(usual)].max(initial=0.0)
+        size = TOLERANCE * np.maximum(np.abs(mine), usual) + 64 * np.finfo(float).eps * max(abs(base), abs(origin))
+        same = (np.abs(mine - theirs) <= size) | (np.isnan(mine) & np.isnan(theirs)) | (mine == theirs)
+        return None if same.all() else int(np.argmin(same))
+
+    def _origin(self, system: Hamiltonian) -> tuple[float, float]:
+        """H of the system and of this identity at a state that belongs to neither run."""
+        if len(self.states):
+            finite = np.flatnonzero(np.isfinite(self.energies))
+            i = int(finite[0]) if finite.size else 0
+            return float(_energies(system, self.states[i : i + 1])[0]), float(self.energies[i])
+        read, state = _read(self.expression, system.ndof), _fixed_states(system.ndof)[:1]
+        assert read is not None
+        return float(_energies(system, state)[0]), float(_energies(read, state)[0])
+
+    def is_proved(self, system: Hamiltonian) -> bool:
+        """Return True if the formula of a system is this one, up to a constant; found out once."""
+        known = _PROVED.setdefault(system, WeakKeyDictionary())
+        found = known.get(self)
+        if found is None:
+            found = known[self] = self._prove(system)
+        return found
+
+    def _prove(self, system: Hamiltonian) -> bool:
+        mine, theirs = self.expression, system.expression
+        if mine is None or theirs is None:
+            return False
+        if mine == theirs:
+            return True
+        if len(mine) + len(theirs) > LONGEST_COMPARED:
+            return False
+        import sympy
+
+        read, given = _read(mine, system.ndof), system.symbols
+        if read is None or read.symbols is None or given is None:
+            return False
+        return bool(sympy.expand(read.symbols.H - given.H).is_number)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {"states": self.states.tolist(), "energies": self.energies.tolist(), "expression": self.expression}
+
+    @classmethod
+    def from_dict(cls, description: Any, ndof: int) -> Self:
+        """Return the identity that `to_dict` described; None stands for what was not finite.
+
+        Raises
+        ------
+        ValueError
+            If the description is not one of an identity of d degrees of freedom.
+        """
+        names = {"states", "energies", "expression"}
+        if not isinstance(description, Mapping) or set(description) != names:
+            raise ValueError("it is not a table of states, energies and an expression")
+        expression = description["expression"]
+        if not isinstance(expression, str | None) or len(expression or "") > LONGEST_EXPRESSION:
+            raise ValueError("its expression is not a text, or too long")
+        states, energies = _floats(description["states"], 2), _floats(description["energies"], 1)
+        states = states.reshape(-1, 2 * ndof) if states.size == 0 else states
+        if states.shape != (len(energies), 2 * ndof) or not np.isfinite(states).all():
+            raise ValueError("its states and energies do not fit each other")
+        return cls(states, energies, expression)
+
+
+_AGREED: WeakKeyDictionary[Hamiltonian, WeakKeyDictionary[Identity, bool]] = WeakKeyDictionary()
+_PROVED: WeakKeyDictionary[Hamiltonian, WeakKeyDictionary[Identity, bool]] = WeakKeyDictionary()
+
+
+def _floats(values: Any, ndim: int) -> np.ndarray:
+    """A list of numbers or None, or for ndim = 2 a list of such lists, as an array."""
+    rows = values if ndim == 2 else [values]
+    if not isinstance(values, list) or not all(isinstance(row, list) for row in rows):
+        raise ValueError("its numbers are not in lists")
+    for v in (v for row in rows for v in row):
+        if v is not None and (isinstance(v, bool) or not isinstance(v, int | float)):
+            raise ValueError(f"it has {v!r}, which is no number")
+    try:
+        return np.array([np.nan if v is None else v for v in values] if ndim == 1 else values, dtype=float)
+    except (ValueError, OverflowError, TypeError):
+        raise ValueError("its numbers are no array of floats") from None
+
+
+def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
+    with np.errstate(all="ignore"):
+        return to_numpy(system.hamiltonian(states)).astype(float)
+
+
+@lru_cache(maxsize=16)
+def _read(expression: str | None, ndof: int) -> Hamiltonian | None:
+    """The H of a text in a file, read by a grammar and never executed; None if it is none of d degrees of freedom."""
+    from sympflow.hamiltonian.hamiltonian import Hamiltonian
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+
+    if expression is None:
+        return None
+    try:
+        symbols = SymbolicHamiltonian(expression)
+    except (ValueError, TypeError):
+        return None
+    system = Hamiltonian("", symbols, None, False)
+    system.symbols = symbols
+    return system if system.ndof == ndof else None
+
+
+def _spread_states(system: Hamiltonian, domain: Domain, seed: int) -> np.ndarray:
+    """States of the domain, the ends of each coordinate among them, to six digits."""
+    width = 2 * system.ndof
+    n = min(MOST_STATES, max(FEWEST_STATES, MOST_NUMBERS // width))
+    if FEWEST_STATES * width > 8 * MOST_NUMBERS:
+        return np.empty((0, width))
+    if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
+        domain = domain.attach(system.hamiltonian)
+    drawn = domain.sample(DRAWN, seed)
+    ends = np.stack([drawn.argmin(0), drawn.argmax(0)], axis=-1).ravel()[: n // 2]
+    chosen = list(dict.fromkeys([*ends.tolist(), *range(len(drawn))]))[:n]
+    return np.vectorize(lambda x: float(f"{x:.6g}"))(drawn[chosen])

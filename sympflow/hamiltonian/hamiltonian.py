@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -200,6 +201,16 @@ class Hamiltonian:
                 "not apply. Use an implicit method such as 'gauss_legendre6', or a Runge–Kutta method."
             )
         return self
+
+    @cached_property
+    def expression(self) -> str | None:
+        """H as a text, in q1 … qd, p1 … pd and numbers, of a symbolic system; else None."""
+        return None if self.symbols is None else str(self.symbols.H)
+
+    @property
+    def has_hessian_vector(self) -> bool:
+        """False if ∇²V·v of arrays is not to be had, as for a gradient that was given without it."""
+        return self._definition.has_hessian_vector
 
     @property
     def numba_functions(self) -> tuple[Any, Any, Any] | None:

@@ -74,17 +74,22 @@ class SymbolicHamiltonian(Definition):
         return M
 
     @cached_property
+    def slope(self) -> tuple[sp.Expr, ...]:
+        """∇V."""
+        return tuple(sp.diff(self.V, s) for s in self.q)
+
+    @cached_property
     def force_gradient(self) -> sp.Expr:
         """−½|∇V|²_{M⁻¹}."""
         assert self.inverse_mass is not None
-        slope = sp.Matrix([sp.diff(self.V, s) for s in self.q])
+        slope = sp.Matrix(self.slope)
         return -(slope.T * self.inverse_mass * slope)[0] / 2
 
     @cached_property
     def W(self) -> sp.Expr:
         """½ v·∇²V v with v = M⁻¹∇V."""
         assert self.inverse_mass is not None
-        slope = sp.Matrix([sp.diff(self.V, s) for s in self.q])
+        slope = sp.Matrix(self.slope)
         v = self.inverse_mass * slope
         return (v.T * sp.hessian(self.V, self.q) * v)[0] / 2
 

@@ -18,7 +18,7 @@ from sympflow.arguments import check_dt
 from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
-from sympflow.integrators.contract import ENDED, FINISHED, Failure, Integrator, Outcome, Problem, Steps
+from sympflow.integrators.contract import ENDED, FINISHED, Failure, Integrator, Outcome, Problem, Steps, finished
 from sympflow.integrators.grid import EPS, Grid
 
 if TYPE_CHECKING:
@@ -436,7 +436,7 @@ class GridRun:
         end = len(save) if n_steps == last else int(save.searchsorted(n_steps, "right"))
         n_saved = end - int(save.searchsorted(0, "right") if end and save[0] <= 0 else 0)
         at_end = int(bool(extra.size) and extra[-1] == len(t) - 1 and t[-1] == grid.t1)
-        outcome = Outcome(t, y, 0, FINISHED, self._stats(n_steps + at_end, n_steps, n_saved, int(extra.size)))
+        outcome = Outcome(t, y, 0, finished(problem), self._stats(n_steps + at_end, n_steps, n_saved, int(extra.size)))
         if problem.dense_output:
             outcome.sol = GridSolution(stepper, grid, saved)
         outcome.finite = stepper.compiled and stepper.saves_finite and not extra.size

@@ -19,7 +19,7 @@ from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
 from sympflow.integrators.base import FixedStep, Stepper
-from sympflow.integrators.contract import FINISHED, Failure, Outcome, Problem, Steps
+from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, finished
 from sympflow.integrators.grid import Grid
 
 LARGEST_CHUNK = 2**20  # numbers in one chunk of states
@@ -394,7 +394,8 @@ class PhysicalRun:
         if times is not None and not problem.dense_output:  # what few outputs do not need is not kept
             steps = self.length / self.clock.dt / (len(wanted) + 1)
             self.stride = int(min(max(1.0, steps**0.5), LONGEST_STRIDE))
-        for states, last in self.chunks():
+        more = problem.dense_output or times is None or bool((delivered < len(wanted)).any())
+        for states, last in self.chunks() if more else ():
             if problem.dense_output or times is None:
                 kept.append((states, last))
                 self._check_memory(kept)
@@ -417,7 +418,8 @@ class PhysicalRun:
             **self.stepper.evaluations(n_steps, n_steps, self.n_extra),
             "backend": self.backend or "numpy",
         }
-        outcome = Outcome(times, y, 0 if single else np.where(failed, -1, 0).reshape(y.shape[1:-1]), FINISHED, stats)
+        status: Any = 0 if single else np.where(failed, -1, 0).reshape(y.shape[1:-1])
+        outcome = Outcome(times, y, status, finished(problem), stats)
         if failed.any():
             if single:
                 outcome.status = -1
@@ -579,4 +581,4 @@ def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:
         **clock.method.evaluations(n_steps, n_steps, n_extra, "compiled"),
         "backend": "compiled",
     }
-    return Outcome(times, Y.reshape(len(times), *y0.shape), status, FINISHED, stats, finite=True)
+    return Outcome(times, Y.reshape(len(times), *y0.shape), status, finished(problem), stats, finite=True)

@@ -23,6 +23,7 @@ duties 1 to 3 only, and its forces are counted. Whatever a run changes, such as 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
@@ -37,6 +38,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
+    from sympflow.hamiltonian.fingerprint import Identity
     from sympflow.schemes import Scheme
 
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
@@ -44,6 +46,22 @@ Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
 
 FINISHED = "The solver successfully reached the end of the integration interval."
 ENDED = "A termination event occurred."
+
+
+def finished(problem: Problem) -> str:
+    """Return the message of a run that went as far as the last time that was asked for, which may be before the end."""
+    times = problem.t_eval
+    if times is None or problem.dense_output or problem.events is not None:
+        return FINISHED
+    if not len(times):
+        return "`t_eval` is empty, so no step was made: give the times to report, or leave it out."
+    last = float(times[-1])
+    if abs(last - problem.t1) <= 8 * math.ulp(problem.t1):
+        return FINISHED
+    return (
+        f"The run ended at t = {last:.17g}, the last time of `t_eval`, before the end of `t_span`, t = "
+        f"{problem.t1:.17g}: nothing later was asked for. To go on, add the end to `t_eval`."
+    )
 
 
 class Failure(Enum):
@@ -100,6 +118,8 @@ class Integrator:
     """The citation, or a line on the method, as lists of methods print it."""
     compiles: ClassVar[bool] = False
     finds_events: ClassVar[bool] = False
+    takes_infinite_end: ClassVar[bool] = False
+    """True if `run` takes an infinite t1, where a terminal event is to end it, and bounds its steps itself."""
     one_by_one: ClassVar[bool] = False
     """True if the trajectories of a batch are run one after another, at the cost of as many single runs."""
     on_grid: ClassVar[bool] = False
@@ -160,6 +180,11 @@ class Integrator:
         """Return the trained flow that is used for a system, one in the system's own time; None if there is none."""
         return None
 
+    def identity_for(self, system: HamiltonianSystem) -> Identity | None:
+        """Return the H that the trained flow for a system was made for; None without a flow, or where it is unknown."""
+        flow = self.flow_for(system)
+        return None if flow is None else flow.identity
+
     def figures(self, system: HamiltonianSystem) -> Mapping[str, Any]:
         """Return the figures of the trained flow that runs, such as `training_seconds`; {} without a flow."""
         flow = self.flow_for(system)
@@ -168,6 +193,10 @@ class Integrator:
     def step_length(self, system: HamiltonianSystem) -> float | None:
         """Return the step that is used for a system; None where the method chooses its steps."""
         return None
+
+    def output_step(self, problem: Problem) -> float | None:
+        """Return the time between two outputs where no `t_eval` is given; None where that is each step's own."""
+        return self.step_length(problem.system)
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         """One step of signed length h from the states y (..., 2d)."""

@@ -1,4 +1,4 @@
-"""Exits of a solution from the domain Ω of a flow or of its system, and what is said of them."""
+"""What is looked at after a run of a trained flow: is the system its own, and where did the solution leave Ω?"""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from sympflow.integrators.contract import Integrator, Outcome
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
+
+STATES_COMPARED, MOST_COMPARED = 16, 64
+"""Outputs of a run, and states of a batch, at which H is compared with that of the flow."""
 
 
 def _surely_within(flow: FlowMap | None, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:
@@ -35,6 +38,36 @@ def _compiled() -> Callable[..., bool]:
 
 def _domain(flow: FlowMap | None, system: HamiltonianSystem) -> Domain | None:
     return system.domain if flow is None else flow.domain_for(system)
+
+
+def check_system_along(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, y0: Array) -> None:
+    """A trained flow must have run on its own system: H is compared at the start and at a few states of the run.
+
+    A formula that is that of the flow needs no comparison.
+
+    Raises
+    ------
+    ValueError
+        If H of the system is another one at one of these states.
+    """
+    identity = integrator.identity_for(system)
+    if identity is None or identity.is_proved(system):
+        return
+    width = 2 * system.ndof
+    y = to_numpy(outcome.y)
+    chosen = y[np.linspace(0, len(y) - 1, min(len(y), STATES_COMPARED)).astype(int)].reshape(-1, width)
+    starts = to_numpy(y0).reshape(-1, width)
+    rows = [states[:: max(1, len(states) // MOST_COMPARED)] for states in (starts, chosen)]
+    states = np.concatenate(rows).astype(float)
+    states = states[np.isfinite(states).all(-1)]
+    first = identity.first_difference(system, states)
+    if first is None:
+        return
+    shown = ", ".join(f"{x:.6g}" for x in states[first][:8]) + (", …" if width > 8 else "")
+    raise ValueError(
+        f"`system` {system.name!r} is not the one that the flow was trained for: at the state ({shown}) of this run "
+        "its H is another. Pass the flow of this system, or train one with sympflow.train(system)."
+    )
 
 
 def check_start(flow: FlowMap, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import Any, ClassVar, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from sympflow.arguments import check_flag
 from sympflow.arrays import Array, is_tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.shipped import choose, forces_saved, named, shipped, shipped_flows
+from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep, GridRun, KernelStepper, OwnStepper, Stepper, compiled_loops, rollout
@@ -42,6 +44,19 @@ def known(key: tuple[Any, ...], make: Callable[[], T]) -> T:
     if key not in _KNOWN:
         _KNOWN[key] = make()
     return _KNOWN[key]
+
+
+_KINDS_OF_SYSTEM: dict[tuple[Any, ...], int] = {}
+_KIND_OF: WeakKeyDictionary[HamiltonianSystem, int] = WeakKeyDictionary()
+
+
+def kind_of(system: HamiltonianSystem) -> int:
+    """A number that systems with the same formula and the same flows share, by which flows that ship are kept."""
+    kind = _KIND_OF.get(system)
+    if kind is None:
+        found = system.fingerprint, system.expression, tuple(f.name for f in shipped_flows(system))
+        kind = _KIND_OF[system] = _KINDS_OF_SYSTEM.setdefault(found, len(_KINDS_OF_SYSTEM))
+    return kind
 
 
 def flow_named(name: str) -> FlowMap:
@@ -100,7 +115,7 @@ class FlowIntegrator(OwnStepper):
         if self.flow is not None:
             return self.flow.bound(system)
         name, tolerance = self.name, self.tolerance
-        return known((name, system.fingerprint, tolerance), lambda: shipped(system, name, tolerance))
+        return known((name, kind_of(system), tolerance), lambda: shipped(system, name, tolerance))
 
     def check(self, system: HamiltonianSystem) -> None:
         if self.flow is not None:
@@ -126,7 +141,7 @@ class FlowIntegrator(OwnStepper):
             return flow
         if self.flow is None:
             dtype, device = tensor.dtype, tensor.device
-            key = (self.name, system.fingerprint, self.tolerance, dtype, device)
+            key = (self.name, kind_of(system), self.tolerance, dtype, device)
             return known(key, lambda: copy.deepcopy(flow).to(dtype=dtype, device=device))
         if tensor.dtype != flow.dtype:
             raise TypeError(
@@ -279,7 +294,7 @@ class SympFlowIntegrator(FlowIntegrator):
         if self.tol is None or self.compensated or is_tensor(y0) or y0.dtype != np.float64:
             return self
         name, tol = self.name, self.tol
-        other = known(("in another time", name, system.fingerprint, tol), lambda: _in_another_time(system, name, tol))
+        other = known(("in another time", name, kind_of(system), tol), lambda: _in_another_time(system, name, tol))
         if other is None:
             return self
         flow, shift, saved = other
@@ -464,6 +479,10 @@ class LogSympFlow(FixedStep):
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count evaluations on the transformed system: see `clocks.OnClock`."""
         return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
+
+    def identity_for(self, system: HamiltonianSystem) -> Identity | None:
+        origin = None if self.flow is None else self.flow.origin
+        return None if origin is None else origin.identity
 
     def figures(self, system: HamiltonianSystem) -> Mapping[str, Any]:
         return {} if self.flow is None else self.flow.figures

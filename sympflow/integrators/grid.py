@@ -9,6 +9,21 @@ import numpy as np
 EPS = float(np.finfo(float).eps)
 MOST_STEPS = 10**11
 """A run of more is refused: at the 10 ns of the cheapest compiled step it takes a quarter of an hour."""
+MOST_OPEN_STEPS = 1_000_000
+"""A run whose interval has no end is ended after so many: an event that never comes would be waited for, for ever."""
+
+
+def open_end(t0: float, t1: float, dt: float, most: int = MOST_OPEN_STEPS) -> float:
+    """Return t1, or for an infinite one the end of `most` steps of length dt."""
+    return t1 if math.isfinite(t1) else t0 + math.copysign(most * dt, t1)
+
+
+def no_event(n_steps: int, t: float) -> str:
+    """Return the message of a run to an infinite end that no event ended."""
+    return (
+        f"No terminal event ended the run within {n_steps:,} steps, up to t = {t:.17g}. Check the event, or give "
+        "`t_span` a finite end, however late."
+    )
 
 
 class Grid:

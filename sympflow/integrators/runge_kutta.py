@@ -11,6 +11,7 @@ import numpy as np
 from sympflow.arrays import Array, per_state, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
+from sympflow.integrators.grid import no_event
 
 
 class ExplicitStep(Integrator):
@@ -71,15 +72,22 @@ def weighted(weights: Any, K: list[Array]) -> Array:
     return sum((float(w) * k for w, k in zip(weights, K, strict=False) if w), 0.0 * K[0])
 
 
-def hopeless(n_steps: int, t0: float, t: float, t1: float) -> str | None:
-    """Why a run that has taken `n_steps` to t will not reach t1 within a lifetime of patience, or None.
+def hopeless(n_steps: int, t0: float, t: float, t1: float, most: int) -> str | None:
+    """Why a run that has taken `n_steps` of `most` to t goes no further, or None.
 
-    Looked at every ten thousand steps: an interval of 1e300, or steps too short to move t, would never end otherwise.
+    It has taken as many as it may; or, looked at every ten thousand steps, needs ten times as many at its pace: on an
+    interval of 1e300, say, or with steps too short to move t.
     """
-    if n_steps % 10_000 or n_steps * abs(t1 - t) <= 1e10 * abs(t - t0):
+    left = abs(t1 - t)
+    spent = n_steps >= most and left > 0
+    if math.isinf(left):
+        return no_event(n_steps, t) if spent else None
+    lost = n_steps % 10_000 == 0 and n_steps * left > 10.0 * most * abs(t - t0)
+    if not (spent or lost):
         return None
-    pace = n_steps * abs(t1 - t) / abs(t - t0) if t != t0 else math.inf
+    pace = n_steps * left / abs(t - t0) if t != t0 else math.inf
     return (
-        f"After {n_steps} steps t = {t:.17g} is reached, and at this pace the end needs about {pace:.1g} more. End "
-        "`t_span` earlier, or raise `max_step` or the tolerances."
+        f"After {n_steps:,} steps t = {t:.17g} is reached, and at this pace the end needs about {pace:.1g} more; "
+        f"`max_steps` is {most:,}. Raise it, or `max_step` or the tolerances, or end `t_span` earlier; a fixed-step "
+        "method may do with fewer steps."
     )

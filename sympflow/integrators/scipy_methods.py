@@ -5,19 +5,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from scipy.integrate import DOP853 as ScipyDOP853
 from scipy.integrate import RK45 as ScipyRK45
 from scipy.integrate import OdeSolution
 
+from sympflow.arguments import MAX_SAVED_VALUES, check_counts
 from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Recorder
 from sympflow.integrators.contract import ENDED, FINISHED, Outcome, Problem, Steps
-from sympflow.integrators.grid import Grid
+from sympflow.integrators.grid import MOST_OPEN_STEPS, Grid
 from sympflow.integrators.runge_kutta import RungeKutta, hopeless
+
+MOST_STEPS = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -31,14 +34,20 @@ class _Scipy(RungeKutta):
     max_step : float
         Longest step.
     first_step : float, optional
-        Length of the first step; the solver chooses it by default.
+        Length of the first step, at most that of the interval; the solver chooses it by default.
+    max_steps : int, optional
+        Most steps of a trajectory; then it ends with status −1, and keeps what it has. So it does as soon as it is seen
+        that it needs ten times as many. The default is 10 million, a quarter of an hour, and one million to an
+        infinite end.
     """
 
     max_step: float = math.inf
     first_step: float | None = None
+    max_steps: int | None = None
 
     solver: ClassVar[Any]
     finds_events: ClassVar[bool] = True
+    takes_infinite_end: ClassVar[bool] = True
     one_by_one: ClassVar[bool] = True
     arrays_only: ClassVar[str] = "is SciPy's and runs on NumPy arrays: pass y0.numpy(), or use method='dopri5'"
 
@@ -49,6 +58,25 @@ class _Scipy(RungeKutta):
         number = isinstance(self.first_step, int | float | np.number)
         if self.first_step is not None and not (number and 0 < self.first_step < math.inf):
             raise ValueError(f"`first_step` must be positive and finite; got {self.first_step!r}.")
+        if self.max_steps is not None:
+            check_counts(max_steps=self.max_steps)
+
+    def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> Self:
+        if self.first_step is not None and self.first_step > length > 0:
+            raise ValueError(
+                f"`first_step` {self.first_step:g} exceeds the interval, of length {length:g}: reduce it, or leave it "
+                "out."
+            )
+        return self
+
+    def output_step(self, problem: Problem) -> float | None:
+        return problem.system.dt if problem.y0.ndim > 1 else None
+
+    def most_steps(self, t1: float, size: int) -> int:
+        """Return the most steps to t1, of a trajectory of `size` numbers."""
+        if self.max_steps is not None:
+            return int(self.max_steps)
+        return MOST_STEPS if math.isfinite(t1) else min(MOST_OPEN_STEPS, max(MAX_SAVED_VALUES // size, 1))
 
     def _start(self, system: HamiltonianSystem, t0: float, t1: float, y0: np.ndarray) -> Any:
         """The SciPy solver at t0, or None if the vector field or the first step is not finite there."""
@@ -103,7 +131,7 @@ class _Scipy(RungeKutta):
         record = Recorder(replace(problem, y0=y0), np.empty(0) if t_eval is None else t_eval)
         if t1 == t0:
             record.empty(t0, y0)
-        y_old, reached = y0, t0
+        y_old, reached, most = y0, t0, self.most_steps(t1, y0.size)
         with np.errstate(all="ignore"):
             while solver is not None and solver.status == "running":
                 failure = solver.step()
@@ -114,9 +142,6 @@ class _Scipy(RungeKutta):
                     failure = f"The solution became non-finite after t = {solver.t_old:.17g}. End `t_span` earlier."
                     break
                 stats["n_steps"] += 1
-                failure = hopeless(stats["n_steps"], t0, solver.t, t1)
-                if failure:
-                    break
                 interpolant = _Lazily(solver.dense_output)
                 t_new, y_new = record.take(solver.t_old, y_old, solver.t, solver.y, interpolant)
                 if problem.dense_output:
@@ -127,6 +152,9 @@ class _Scipy(RungeKutta):
                 if record.end is not None:
                     break
                 y_old, reached = y_new, t_new
+                failure = hopeless(stats["n_steps"], t0, solver.t, t1, most)
+                if failure:
+                    break
         stats["force_evaluations"] = 0 if solver is None else int(solver.nfev)
         if t_eval is None:
             keep = sorted({*range(0, len(times), problem.save_every), len(times) - 1})
@@ -148,7 +176,7 @@ class _Scipy(RungeKutta):
         starts = np.asarray(y0, dtype=float).reshape(-1, y0.shape[-1])
         solvers = [self._start(system, *t_span, y) if t_span[0] != t_span[1] else None for y in starts]
         t = np.full(len(starts), t_span[0], dtype=float)
-        y, n_steps = starts.copy(), 0
+        y, n_steps, most = starts.copy(), 0, self.most_steps(t_span[1], y0.shape[-1])
         while any(solver is not None and solver.status == "running" for solver in solvers):
             h, y_next = np.zeros(len(starts)), y.copy()
             for i, solver in enumerate(solvers):
@@ -156,11 +184,12 @@ class _Scipy(RungeKutta):
                     continue
                 with np.errstate(all="ignore"):
                     solver.step()
-                stuck = hopeless(n_steps + 1, t_span[0], solver.t, t_span[1])
-                if solver.status == "failed" or not np.isfinite(solver.y).all() or stuck:
+                if solver.status == "failed" or not np.isfinite(solver.y).all():
                     solvers[i] = None
-                else:
-                    h[i], y_next[i] = solver.t - t[i], solver.y
+                    continue
+                h[i], y_next[i] = solver.t - t[i], solver.y
+                if hopeless(n_steps + 1, t_span[0], solver.t, t_span[1], most):
+                    solvers[i] = None
             yield t.reshape(1, *batch).copy(), y.reshape(1, *y0.shape), h.reshape(1, *batch)
             t, y, n_steps = t + h, y_next, n_steps + 1
 
@@ -208,6 +237,8 @@ class RK45(_Scipy):
     ----------
     rtol, atol, max_step, first_step
         As in `scipy.integrate.solve_ivp`.
+    max_steps : int, optional
+        Most steps of a trajectory; 10 million by default, and one million to an infinite end.
     """
 
     name: ClassVar[str] = "rk45"
@@ -226,6 +257,8 @@ class DOP853(_Scipy):
     ----------
     rtol, atol, max_step, first_step
         As in `scipy.integrate.solve_ivp`.
+    max_steps : int, optional
+        Most steps of a trajectory; 10 million by default, and one million to an infinite end.
     """
 
     name: ClassVar[str] = "dop853"

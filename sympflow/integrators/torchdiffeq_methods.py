@@ -19,7 +19,7 @@ from sympflow.arguments import check_dt
 from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Recorder
-from sympflow.integrators.contract import ENDED, FINISHED, Integrator, Outcome, Problem, Steps
+from sympflow.integrators.contract import ENDED, Integrator, Outcome, Problem, Steps, finished
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
@@ -64,7 +64,7 @@ class Trace:
     def announce(self, step: Interpolant) -> None:
         self.n_steps += 1
         self.reached, self.last = step.t1, step.y0
-        if stuck := hopeless(self.n_steps, self.t_span[0], self.reached, self.t_span[1]):
+        if stuck := hopeless(self.n_steps, self.t_span[0], self.reached, self.t_span[1], 2**31):
             raise AssertionError(stuck)
         if self.visit(step):
             raise _EndedError
@@ -176,7 +176,7 @@ class Watched(Integrator):
             times,
             stack(states, axis=0) if states else y0[None][:0],
             np.full(y0.shape[:-1], status) if y0.ndim > 1 else status,
-            (ENDED if status == 1 else failure or FINISHED) + trace.note,
+            (ENDED if status == 1 else failure or finished(problem)) + trace.note,
             stats,
         )
         if problem.dense_output:
@@ -231,7 +231,7 @@ def run_in_parts(method: Watched, problem: Problem, joint: Outcome, trace: Trace
         times,
         stack([run.y[:, j] for run, j in source], axis=1).reshape(len(times), *problem.y0.shape),
         np.where(done, 0, -1).reshape(batch),
-        _message(method, batch, source, done, unfinished, reached),
+        _message(method, batch, source, done, unfinished, reached) or finished(problem),
         stats,
     )
     if problem.dense_output:
@@ -276,7 +276,7 @@ def _message(
             f"are kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.17g}. Raise "
             "`max_num_steps`, or solve those that fail in another call, or end `t_span` before they do."
         )
-    return " ".join(said) or FINISHED
+    return " ".join(said)
 
 
 def _index(i: Any, batch: tuple[int, ...]) -> str:
@@ -327,6 +327,9 @@ class Adaptive(Watched, RungeKutta):
             return problem.t_eval, {}
         dt = problem.system.dt
         return Grid(problem.t0, problem.t1, dt).outputs(None, problem.save_every)[0], {"output_step": dt}
+
+    def output_step(self, problem: Problem) -> float:
+        return problem.system.dt
 
     @property
     def most_steps(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import math
 import warnings
 from collections import Counter, deque
@@ -13,7 +14,7 @@ from scipy.integrate import DenseOutput, OdeSolver
 
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem, Stepper
-from sympflow.integrators.grid import Grid
+from sympflow.integrators.grid import Grid, no_event, open_end
 from sympflow.integrators.registry import check_applies, naming_plugin
 from sympflow.interop.matching import Comparison, fixed_step
 
@@ -63,11 +64,29 @@ def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: An
     integrator = fixed_step(method, options, "SciPy")
     if system is not None:
         check_applies(integrator, system)
+    return _solver_class(integrator, system)
+
+
+def _solver_class(integrator: FixedStep, system: HamiltonianSystem | None) -> type[FlowSolver]:
     name = f"{integrator.name.title().replace('_', '')}Solver"
-    return type(name, (FlowSolver,), {"integrator": integrator, "system": system, "__doc__": FlowSolver.__doc__})
+    namespace = {"integrator": integrator, "system": system, "__doc__": FlowSolver.__doc__}
+    return _SolverType(name, (FlowSolver,), namespace)  # type: ignore[return-value]
 
 
-class FlowSolver(OdeSolver):
+class _SolverType(type):
+    """The type of the classes that `as_scipy` makes: they are pickled as what they were made of."""
+
+
+def _made_of(cls: type[FlowSolver]) -> Any:
+    """What pickle makes the class of again: its name, if it is the base class or a user's."""
+    made = {"integrator", "system"} <= set(vars(cls))
+    return (_solver_class, (cls.integrator, cls.system)) if made else cls.__qualname__
+
+
+copyreg.pickle(_SolverType, _made_of)  # type: ignore[arg-type]
+
+
+class FlowSolver(OdeSolver, metaclass=_SolverType):
     """A fixed-step method of sympflow as a SciPy solver, on the grid t0 + k·dt. Made by `as_scipy`.
 
     Parameters
@@ -100,6 +119,9 @@ class FlowSolver(OdeSolver):
         max_step: float = math.inf,
         **extraneous: Any,
     ) -> None:
+        if math.isnan(t0) or math.isnan(t_bound) or math.isinf(t0):
+            raise ValueError(f"`t_span` must start at a finite time and end at one or ±inf; got ({t0}, {t_bound}).")
+        _check_first_step(extraneous.get("first_step"), abs(t_bound - t0))
         if extraneous:
             own = sorted(set(extraneous) & set(self.integrator.options()))
             remedy = f"leave them out; {', '.join(own)} is an option of as_scipy" if own else "leave them out"
@@ -108,16 +130,15 @@ class FlowSolver(OdeSolver):
                 UserWarning,
                 stacklevel=3,
             )
-        if not (isinstance(max_step, int | float | np.number) and max_step > 0):
+        if not (isinstance(max_step, int | float | np.floating | np.integer) and max_step > 0):
             raise ValueError(f"`max_step` must be positive; got {max_step!r}.")
-        if not (math.isfinite(t0) and math.isfinite(t_bound)):
-            raise ValueError(f"`t_span` must be finite; got ({t0}, {t_bound}). Choose an end that can be reached.")
         self._counts = _Counts()
         super().__init__(fun, t0, y0, t_bound, vectorized)
         self._check(fun)
         system = self._solved
-        self._stepper = self._counts.stepper = self.integrator.stepper(Problem(system, t0, t_bound, self.y))
-        self._grid = Grid(t0, t_bound, self.integrator.step_length(system))
+        dt = self.integrator.step_length(system)
+        self._grid = Grid(t0, open_end(t0, t_bound, dt), dt)
+        self._stepper = self._counts.stepper = self.integrator.stepper(Problem(system, t0, self._grid.t1, self.y))
         self._parts = max(1, math.ceil(abs(self._grid.h) / max_step * (1 - 1e-12)))
         self._k, self._part = 0, 0  # the grid point before the state, and the sample after it
         self._t_anchor, self._anchor = float(t0), self.y
@@ -190,6 +211,8 @@ class FlowSolver(OdeSolver):
     def _step_impl(self) -> tuple[bool, str | None]:
         grid = self._grid
         if self._part == 0:
+            if self._k == grid.n_steps and not grid.remainder:
+                return False, no_event(self._k, self.t)
             self._t_anchor, self._anchor = self._next_anchor
             whole = self._k < grid.n_steps
             self._h = grid.h if whole else grid.remainder
@@ -201,6 +224,8 @@ class FlowSolver(OdeSolver):
                     "`t_span` earlier."
                 )
             self._next_anchor = (self._end, y_end)
+        if self._parts > 1 and abs(self._h) < 10 * self._parts * math.ulp(self.t):
+            return False, f"{self.TOO_SMALL_STEP} Raise `max_step`, or start nearer to t = 0."
         self._part += 1
         if self._part == self._parts:
             self._k, self._part = self._k + 1, 0
@@ -230,6 +255,16 @@ class FlowSolver(OdeSolver):
 
     def _dense_output_impl(self) -> DenseOutput:
         return FlowOutput(self, self._t_anchor, self._anchor)
+
+
+def _check_first_step(first_step: Any, length: float) -> None:
+    """Refuse what SciPy's own solvers refuse, though the steps of the method are its own."""
+    if first_step is None:
+        return
+    if not (isinstance(first_step, int | float | np.floating | np.integer) and first_step > 0):
+        raise ValueError(f"`first_step` must be positive; got {first_step!r}. Leave it out.")
+    if first_step > length:
+        raise ValueError(f"`first_step` {first_step:g} exceeds the interval, of length {length:g}. Leave it out.")
 
 
 class _Counts:

@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
+from numba import njit
+from numba.core.registry import CPUDispatcher
 from numpy.typing import ArrayLike
 
 from sympflow.kernels.modules import OPTIONS, load_module, run_rows, template
@@ -14,7 +17,7 @@ from sympflow.kernels.protocol import Kernel, Run, Steps
 
 __all__ = ["MLPFlowKernel", "NetworkLayer"]
 
-_ACTIVATIONS = ("tanh", "sin", "sigmoid", "softplus", "logcosh")
+_ACTIVATIONS = ("tanh", "sin", "sigmoid", "softplus", "logcosh", "swish")
 _LANES = 32  # states side by side in a batch
 _UNROLLED = 16  # the widest product that is unrolled whole
 
@@ -32,6 +35,8 @@ class NetworkLayer:
     biases : sequence of ndarrays of shape (h_l,)
     weights : sequence of ndarrays of shape (h_{l+1}, h_l)
     w : ndarray of shape (h_n,)
+    slopes : callable, optional
+        Where the loops do not know σ by its name: a function of a number a that returns σ(a) and σ'(a).
     """
 
     is_kick: bool
@@ -41,6 +46,7 @@ class NetworkLayer:
     biases: Sequence[np.ndarray]
     weights: Sequence[np.ndarray]
     w: np.ndarray
+    slopes: Callable[[float], Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -49,17 +55,25 @@ class _Architecture:
     depth: int
     width: int
     activation: str
+    slopes: Callable[[float], Any] | None = None
 
     @cache  # noqa: B019  (a few architectures in a process)
     def rollout(self, states: int) -> Callable[..., None]:
         """The compiled loops with `states` states side by side."""
         chunk = self.width if self.width <= _UNROLLED else 8
+        own = self.activation not in _ACTIVATIONS
         constants = (
-            f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': True}}\n"
+            f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': not own}}\n"
             f"NDOF = {self.ndof}\nDEPTH = {self.depth}\nWIDTH = {self.width}\nCHUNK = {chunk}\nSTATES = {states}"
         )
+        after = map(template, ("aligned", "network"))
+        if own:  # a function of the user's: compiled for this process only
+            slopes = self.slopes if isinstance(self.slopes, CPUDispatcher) else njit(**OPTIONS)(self.slopes)
+            functions: dict[str, Any] = {"activation": slopes}
+            exec("\n\n".join([constants, *after]), functions)
+            return functions["rollout"]
         activation = f"activation = {self.activation}\n"
-        before, after = map(template, ("elementary", "activation_slopes")), map(template, ("aligned", "network"))
+        before = map(template, ("elementary", "activation_slopes"))
         source = "\n\n".join([constants, *before, activation, *after])
         return load_module(source).rollout
 
@@ -84,15 +98,17 @@ class MLPFlowKernel(Kernel):
 
     def __init__(self, ndof: int, layers: Sequence[NetworkLayer]) -> None:
         depths, activations = {len(layer.biases) for layer in layers}, {layer.activation for layer in layers}
-        if len(depths) > 1 or len(activations) > 1 or not activations <= set(_ACTIVATIONS):
+        slopes = layers[0].slopes
+        if len(depths) > 1 or len(activations) > 1 or not (activations <= set(_ACTIVATIONS) or slopes is not None):
             raise ValueError(
                 "`flow` must have potentials of one depth with one activation out of "
-                f"{', '.join(_ACTIVATIONS)} to be compiled: use backend='array'."
+                f"{', '.join(_ACTIVATIONS)}, or one that was registered with `compiled`, to be compiled: use "
+                "backend='array'."
             )
         width = max(len(b) for layer in layers for b in layer.biases)
         if width > _UNROLLED:
             width = -(-width // 8) * 8
-        self._architecture = _Architecture(ndof, depths.pop(), width, activations.pop())
+        self._architecture = _Architecture(ndof, depths.pop(), width, activations.pop(), slopes)
         padded = [_padded(layer, self._architecture) for layer in layers]
         K, k, b, W, w = (np.stack(arrays) for arrays in zip(*padded, strict=True))
         is_kick = np.array([layer.is_kick for layer in layers])

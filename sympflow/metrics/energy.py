@@ -16,6 +16,8 @@ WINDOWS_PER_DECADE = 3
 def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
     """H(y(t)) − H(y0), relative to `energy_scale(sol)`, at the times `sol.t`: (..., n), in float64, signed.
 
+    The largest magnitude over the run is `max_energy_error(sol)`.
+
     Where the state is finite and H of it is beyond floats, so that inf − inf would be NaN, the error is inf. NaN is
     left where the state is: after the end of a trajectory in a batch.
 

@@ -15,6 +15,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from sympflow.flow.clocked import ClockedFlow
+from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
 from sympflow.integrators.flows import LogSympFlow
@@ -74,7 +75,12 @@ def train_clock(
     flow.recipe = {
         "stages": [stage],
         "torch": torch.__version__,
-        "transforms": {"system": system.name, "shift": shift, "fingerprint": list(system.fingerprint)},
+        "transforms": {
+            "system": system.name,
+            "shift": shift,
+            "fingerprint": list(system.fingerprint),
+            "identity": Identity.of(system, system.domain).to_dict(),
+        },
     }
     flow.figures = {"step": dt, **clock_errors(flow, system, seed)}
     flow.figures["training_seconds"] = round(time.perf_counter() - started, 3)

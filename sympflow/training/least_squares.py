@@ -27,6 +27,7 @@ from torch import Tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.training.losses import Objective
 from sympflow.training.options import LossOptions
+from sympflow.training.session import OutOfTime
 
 PROBE = 0.1  # share of a step over which the residuals' curvature is measured
 CURVED = 0.75  # largest ratio of the second-order correction to the step
@@ -174,30 +175,34 @@ def levenberg_marquardt(
     damping : float
         The first λ.
     stop : callable
-        Asked before each step whether to end here.
+        Asked before each step whether to end here. An OutOfTime that r or J raises ends it as well.
     """
 
     def cost_at(x: np.ndarray) -> float:
         r = residuals(x)
         return float(r @ r)
 
-    cost = cost_at(x)
-    if not math.isfinite(cost):
-        return Minimum(x, math.inf, 0, "the residuals are not finite at the start")
-    costs, scale, level = [cost], np.zeros(len(x)), Damping(damping, LEAST_DAMPING)
-    for iteration in range(iterations):
-        if stop():
-            return Minimum(x, cost, iteration, STOPPED)
-        model = _Factored(x, *linearized(x), scale)
-        scale = model.scale
-        found = damped_step(model, residuals, cost_at, cost, level, MAX_REJECTED)
-        if found is None:
-            return Minimum(x, cost, iteration, "no step lowers the cost")
-        x, cost = found
-        costs.append(cost)
-        if len(costs) > patience and cost > (1 - gain) * costs[-1 - patience]:
-            return Minimum(x, cost, iteration + 1, "it has converged")
-    return Minimum(x, cost, iterations, "the iterations were used up")
+    costs: list[float] = []
+    scale, level = np.zeros(len(x)), Damping(damping, LEAST_DAMPING)
+    try:
+        costs.append(cost_at(x))
+        if not math.isfinite(costs[0]):
+            return Minimum(x, math.inf, 0, "the residuals are not finite at the start")
+        for iteration in range(iterations):
+            if stop():
+                return Minimum(x, costs[-1], iteration, STOPPED)
+            model = _Factored(x, *linearized(x), scale)
+            scale = model.scale
+            found = damped_step(model, residuals, cost_at, costs[-1], level, MAX_REJECTED)
+            if found is None:
+                return Minimum(x, costs[-1], iteration, "no step lowers the cost")
+            x, cost = found
+            costs.append(cost)
+            if len(costs) > patience and cost > (1 - gain) * costs[-1 - patience]:
+                return Minimum(x, cost, iteration + 1, "it has converged")
+    except OutOfTime:
+        return Minimum(x, costs[-1] if costs else math.inf, max(len(costs) - 1, 0), STOPPED)
+    return Minimum(x, costs[-1], iterations, "the iterations were used up")
 
 
 class _Factored(Linearized):
@@ -314,8 +319,15 @@ class GaussNewton:
         self.costs, self.draw, self.finished = list(state["costs"]), state["draw"], state["finished"]
 
     def step(self, index: int, objective: Objective) -> float:
-        """Take a step; the loss before it."""
+        """Take a step; the loss before it. An OutOfTime of the objective leaves the weights as they were."""
         x = weight_vector(self.parameters)
+        try:
+            return self._step(x, objective)
+        except OutOfTime:
+            put_weights(self.parameters, x)
+            raise
+
+    def _step(self, x: Tensor, objective: Objective) -> float:
         r, J = objective.linearized()
         loss = float(r @ r)
         r, J = torch.cat([r, PULL**0.5 * x]), torch.cat([J, PULL**0.5 * torch.eye(len(x)).to(J)])

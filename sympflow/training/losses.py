@@ -95,26 +95,31 @@ class Objective:
     points : Points
     draw : int
         Which points of the run these are.
+    check : callable
+        Called before each evaluation, and may raise to end it.
     """
 
     loss: Loss
     flow: FlowMap
     points: Points
     draw: int = 0
+    check: Callable[[], None] = lambda: None
 
     def __call__(self) -> Tensor:
+        self.check()
         return self.loss(self.flow, self.points)
 
     @torch.no_grad()
     def residuals(self) -> Tensor:
         """The residuals (m,)."""
+        self.check()
         return torch.cat([self._reduced(b, b.function(self.flow, *b.points)) for b in self._blocks()])
 
     def linearized(self) -> tuple[Tensor, Tensor]:
         """The residuals (m,) and their Jacobian (m, n) by the parameters, in the order of `flow.parameters()`."""
         rows = []
         for block in self._blocks():
-            r, J = jacobian(self.flow, block.function, block.points)
+            r, J = jacobian(self.flow, block.function, block.points, self.check)
             rows.append((self._reduced(block, r), self._reduced(block, J.movedim(-1, 0), 1).T))
         return torch.cat([r for r, _ in rows]), torch.cat([J for _, J in rows])
 
@@ -164,11 +169,19 @@ class _Evaluation(nn.Module):
         return self.function(self.flow, *arguments)
 
 
-def jacobian(flow: FlowMap, function: Callable[..., Tensor], arguments: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+AT_ONCE = 2**24  # numbers of a Jacobian that are made at once: 128 MiB
+
+
+def jacobian(
+    flow: FlowMap,
+    function: Callable[..., Tensor],
+    arguments: tuple[Tensor, ...],
+    check: Callable[[], None] = lambda: None,
+) -> tuple[Tensor, Tensor]:
     """function(flow, *arguments) of N points, (N, ...), and its derivatives by the n parameters, (N, ..., n).
 
     By reverse mode for each point, a sweep for each of its values; where these are more than the parameters, by
-    forward mode.
+    forward mode. `check` is called before each block of points, and may raise to end it.
     """
     evaluation = _Evaluation(flow, function)
     parameters = {name: w.detach() for name, w in evaluation.named_parameters()}
@@ -180,8 +193,13 @@ def jacobian(flow: FlowMap, function: Callable[..., Tensor], arguments: tuple[Te
     each = (None, *(0 for _ in arguments))
     outputs = torch.func.vmap(value, each)(parameters, *arguments)[0][0].numel()
     derivative = torch.func.jacrev if outputs <= flow.n_parameters else torch.func.jacfwd
-    J, values = torch.func.vmap(derivative(value, has_aux=True), each)(parameters, *arguments)
-    return values, torch.cat([J[name].flatten(values.ndim) for name in parameters], -1)
+    differentiated = torch.func.vmap(derivative(value, has_aux=True), each)
+    blocks = []
+    for points in zip(*(a.split(max(1, AT_ONCE // (outputs * flow.n_parameters))) for a in arguments), strict=True):
+        check()
+        J, values = differentiated(parameters, *points)
+        blocks.append((values, torch.cat([J[name].flatten(values.ndim) for name in parameters], -1)))
+    return blocks[0] if len(blocks) == 1 else tuple(torch.cat(parts) for parts in zip(*blocks, strict=True))  # type: ignore[return-value]
 
 
 def _less_mean(values: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -12,15 +13,30 @@ from torch import Tensor
 
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.scaling import Scaling
+from sympflow.flow.weights import check_memory
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.losses import Loss, Objective
-from sympflow.training.optimizers import Optimizer, optimizer
+from sympflow.training.optimizers import MEMORY, Optimizer, optimizer
 from sympflow.training.options import LossOptions
-from sympflow.training.points import BLOCK, Labelled, Labels, Points, PointSource, Stream, parted, states
-from sympflow.training.runs import INTERRUPTED, OUT_OF_TIME, Advance, Run
-from sympflow.training.session import Session
+from sympflow.training.points import (
+    BLOCK,
+    Labelled,
+    Labels,
+    Points,
+    PointSource,
+    Stream,
+    parted,
+    shares_missed,
+    states,
+)
+from sympflow.training.runs import INTERRUPTED, LABEL_SHARE, OUT_OF_TIME, Advance, Run
+from sympflow.training.session import Deadline, OutOfTime, Session
+
+PROBE = 32  # held-out points whose time tells how many there is time for
+VALIDATION_SHARE = 0.1  # of the time left, that a validation may take
+BACKWARD = 3.0  # times what a point takes in a validation, that it takes in a step
 
 
 @dataclass
@@ -35,6 +51,8 @@ class LossRun(Run):
         Steps taken.
     best : dict
         The weights with the least held-out loss so far.
+    step_seconds : float
+        What the longest step took; before there was one, what it takes at least.
     """
 
     scaling: Scaling
@@ -48,6 +66,7 @@ class LossRun(Run):
     best: dict[str, Tensor] = field(default_factory=dict)
     ended: bool = field(default=False, init=False)
     reason: str | None = field(default=None, init=False)
+    step_seconds: float = field(default=0.0, init=False)
 
     UNIT: ClassVar[str] = "steps"
 
@@ -60,12 +79,25 @@ class LossRun(Run):
         scaling: Scaling,
         options: LossOptions,
         data: Labelled | None = None,
+        deadline: Deadline | None = None,
     ) -> LossRun:
-        """A run of a flow with fresh points; labels are made where they have a weight and none are handed in."""
+        """A run of a flow with fresh points; labels are made where they have a weight and none are handed in.
+
+        Raises
+        ------
+        OutOfTime
+            If the labels take longer than their share of the time.
+        """
+        method = optimizer(flow, options)
+        _check_memory(flow, options)
+        deadline = Session().deadline if deadline is None else deadline
         loss = Loss(system, scaling, options.residual_weight, options.matching_weight, options.label_weight)
         labels = unseen = None
         if options.label_weight:
-            labels, unseen = _labels(system, domain, flow.dt, options) if data is None else parted(data, options.seed)
+            if data is None:
+                labels, unseen = _labels(system, domain, flow.dt, options, deadline.part(LABEL_SHARE))
+            else:
+                labels, unseen = parted(data, options.seed)
         common = (options.matching_times, options.seed, flow.dtype, flow.device)
         block = 1 if options.refresh is None else BLOCK
         source = PointSource(domain, flow.dt, options.points, *common, block=block, labels=labels)
@@ -74,10 +106,10 @@ class LossRun(Run):
             domain, flow.dt, options.validation_points, *common, streams=streams, block=1, labels=unseen
         )(0)
         start = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
-        end = reference_step(system, start, flow.dt)
+        end = _end_of_step(system, start, flow.dt, deadline.part(LABEL_SHARE))
         exists = np.isfinite(end).all(-1)
         x, y = (torch.as_tensor(a[exists], dtype=flow.dtype, device=flow.device) for a in (start, end))
-        return cls(flow, system, domain, scaling, options, loss, source, held_out, (x, y), optimizer(flow, options))
+        return cls(flow, system, domain, scaling, options, loss, source, held_out, (x, y), method)
 
     @property
     def done(self) -> int:
@@ -88,9 +120,16 @@ class LossRun(Run):
         return self.options.steps
 
     def begin(self, session: Session) -> None:
+        self.held_out = self._affordable(session.deadline)
+        self.work_end = session.deadline
         if self.history:
             return
+        began = session.passed
         self._validate()
+        self.closing = session.passed - began
+        self.work_end = session.deadline.before(self.closing)
+        points = len(self.held_out.t)
+        self.step_seconds = BACKWARD * self.closing * self.options.points / points if points > PROBE else 0.0
         if not math.isfinite(self.history[0]["loss"]):
             raise FloatingPointError(
                 "The loss is not finite at the first validation: the system's H or its gradient is not finite "
@@ -98,18 +137,32 @@ class LossRun(Run):
             )
 
     def over(self, session: Session) -> bool:
+        if self.step == 0 and not self._fits():
+            self.ended, self.reason = True, OUT_OF_TIME
         return self.ended
+
+    def _fits(self) -> bool:
+        """Return whether there is time for another step."""
+        return not self.work_end.over() and self.step_seconds <= self.work_end.left
 
     def advance(self, session: Session) -> Advance:
         options = self.options
         index = 0 if options.refresh is None else self.step // options.refresh
-        value = self.optimizer.step(self.step, Objective(self.loss, self.flow, self.source(index), index))
+        began = session.passed
+        objective = Objective(self.loss, self.flow, self.source(index), index, self.work_end.check)
+        try:
+            value = self.optimizer.step(self.step, objective)
+        except OutOfTime:
+            self.ended, self.reason = True, OUT_OF_TIME
+            at_end = self._validate()
+            return Advance(at_end["loss"], at_end, False)  # half a step is not gone on with
+        self.step_seconds = max(self.step_seconds if self.step else 0.0, session.passed - began)
         self.step += 1
         if not math.isfinite(value):
             self.ended, self.reason = True, f"the loss was not finite at step {self.step}: lower `learning_rate`"
             return Advance(value, None, False)
         last = self.step == options.steps or (options.refresh is None and self.optimizer.finished is not None)
-        self.ended = last or session.spent()
+        self.ended = last or not self._fits()
         if self.ended and not last:
             self.reason = OUT_OF_TIME
         figures = self._validate() if self.ended or self.step % options.validate_every == 0 else None
@@ -122,6 +175,31 @@ class LossRun(Run):
         """The figures of the best state, which the flow takes over."""
         self.flow.load_state_dict(self.best)
         return self._best_figures()
+
+    def missed(self) -> tuple[float, float] | None:
+        x, _ = self.reference
+        return self._share(self.flow.psi(self.flow.dt, x).detach()) if len(x) else None
+
+    def missed_by_verlet(self) -> tuple[float, float] | None:
+        x, _ = self.reference
+        if not (len(x) and self.system.separable):
+            return None
+        (q, p), dt = x.chunk(2, -1), self.flow.dt
+        q = q + dt / 2 * self.system.velocity(p)
+        p = p + dt * self.system.force(q)
+        return self._share(torch.cat([q + dt / 2 * self.system.velocity(p), p], -1).detach())
+
+    def _share(self, end: Tensor) -> tuple[float, float]:
+        x, y = (states.cpu().double().numpy() for states in self.reference)
+        labels = Labels(np.array([self.flow.dt]), x, y[None])
+        return shares_missed(end.cpu().double().numpy() - y, labels, np.array(self.scaling.x))
+
+    @property
+    def remedy(self) -> str:
+        more = "Train longer, with optimizer='gauss-newton', a shorter `dt`, or a smaller `domain`."
+        if self.system.separable and self.system.quadratic_kinetic:
+            return f"kind='primed' is far better where H = ½ pᵀM⁻¹p + V(q). {more}"
+        return more
 
     def remarks(self, reason: str | None) -> dict[str, Any]:
         return {
@@ -161,6 +239,21 @@ class LossRun(Run):
             figures |= {"one_step_error": float(error.mean()), "one_step_error_max": float(error.max())}
         return figures
 
+    def _affordable(self, deadline: Deadline) -> Points:
+        """The held-out points, or fewer where a validation of all takes more than its share of the time."""
+        points, n = self.held_out, len(self.held_out.t)
+        if deadline.end == math.inf or n <= PROBE:
+            return points
+        m, session = PROBE, deadline.session
+        while 2 * m < n:
+            began = session.passed
+            with torch.no_grad():
+                self.loss.terms(self.flow, _first(points, m))
+            if 2 * (session.passed - began) > VALIDATION_SHARE * deadline.left:
+                return _first(points, m)
+            m *= 2
+        return points
+
     def _losses(self) -> list[float]:
         return [figures["loss"] for figures in self.history if math.isfinite(figures["loss"])]
 
@@ -168,13 +261,54 @@ class LossRun(Run):
         return min((f for f in self.history if math.isfinite(f["loss"])), key=lambda f: f["loss"])
 
 
-def _labels(system: HamiltonianSystem, domain: Domain, dt: float, options: LossOptions) -> tuple[Labelled, Labelled]:
+def _check_memory(flow: FlowMap, options: LossOptions) -> None:
+    """Raise ValueError where the points, or what the optimizer keeps, are more than the memory of the machine."""
+    n, width = flow.n_parameters, 2 * flow.ndof
+    points = max(options.points, options.validation_points, options.reference_states)
+    of_points = points * width * (1 if options.refresh is None else BLOCK)
+    if options.label_weight and options.data is None:
+        of_points += (options.points + options.validation_points) * options.label_times * width
+    check_memory(f"`points` {options.points} and `validation_points`", of_points, "take fewer")
+    kept = {
+        "adam": 4 * n,
+        "lbfgs": 2 * MEMORY * n,
+        "bfgs": 3 * n**2,
+        "gauss-newton": 3 * n * (options.points * width + n),
+    }
+    smaller = "take fewer `points`, a smaller network, or optimizer='adam'"
+    check_memory(f"`optimizer` {options.optimizer!r} of {n} parameters", kept[options.optimizer], smaller)
+
+
+def _first(points: Points, n: int) -> Points:
+    """The first n points, and of the other losses as large a share."""
+    m = max(2, points.matching_x.shape[1] * n // len(points.t))
+    labels = None if points.labels is None else tuple(a[:n] for a in points.labels)
+    return Points(points.t[:n], points.x[:n], points.matching_t, points.matching_x[:, :m], labels)  # type: ignore[arg-type]
+
+
+def _end_of_step(system: HamiltonianSystem, x: np.ndarray, dt: float, deadline: Deadline) -> np.ndarray:
+    """φ_H,Δt(x), NaN if there is no time for it: then the error of a step is not known."""
+    try:
+        return reference_step(system, x, dt, check=deadline.check)
+    except OutOfTime:
+        warnings.warn(
+            f"There was no time to follow {len(x)} held-out states to dt = {dt:g}: the one-step error of the flow is "
+            "not known. Give a longer `time_budget`, a shorter `dt`, or fewer `reference_states`.",
+            RuntimeWarning,
+            stacklevel=6,
+        )
+        return np.full_like(x, np.nan)
+
+
+def _labels(
+    system: HamiltonianSystem, domain: Domain, dt: float, options: LossOptions, deadline: Deadline
+) -> tuple[Labelled, Labelled]:
     """Labels to train on, and held-out ones, at equidistant times."""
     t = dt * np.arange(1, options.label_times + 1) / options.label_times
     unseen = max(1, options.validation_points // options.label_times)
     sets = []
     for n, stream in ((options.points, Stream.LABELS), (unseen, Stream.VALIDATION)):
-        labels = Labels.needed(system, states(domain, n, options.seed, stream), t)
+        labels = Labels.needed(system, states(domain, n, options.seed, stream), t, deadline)
         x = np.broadcast_to(labels.x, labels.y.shape).reshape(-1, labels.x.shape[1])
         sets.append((np.repeat(t, len(labels.x)), x, labels.y.reshape(x.shape)))
     return sets[0], sets[1]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,6 +19,7 @@ from sympflow.flow.flow_map import FlowMap
 from sympflow.training.least_squares import MAX_PARAMETERS, GaussNewton, put_weights, weight_vector
 from sympflow.training.losses import Objective
 from sympflow.training.options import LossOptions
+from sympflow.training.session import OutOfTime
 
 ITERATIONS = 20  # of quasi-Newton methods, in a step
 MEMORY = 30
@@ -77,8 +78,9 @@ class LBFGS:
     finished: str | None = None
 
     def __init__(self, flow: FlowMap, options: LossOptions) -> None:
+        self.parameters = list(flow.parameters())
         self.method = torch.optim.LBFGS(
-            list(flow.parameters()),
+            self.parameters,
             max_iter=ITERATIONS,
             history_size=MEMORY,
             tolerance_grad=0.0,
@@ -87,15 +89,23 @@ class LBFGS:
         )
 
     def step(self, index: int, loss: Callable[[], Tensor]) -> float:
-        """Iterate; the loss before the first iteration."""
+        """Iterate; the loss before the first iteration. An OutOfTime of the loss leaves the best weights there were."""
+        best, x = math.inf, weight_vector(self.parameters)
 
         def closure() -> Tensor:
+            nonlocal best, x
             self.method.zero_grad()
             value = loss()
+            if float(value.detach()) < best:
+                best, x = float(value.detach()), weight_vector(self.parameters)
             value.backward()
             return value.detach()
 
-        return float(self.method.step(closure))
+        try:
+            return float(self.method.step(closure))
+        except OutOfTime:
+            put_weights(self.parameters, x)
+            raise
 
     def state_dict(self) -> dict[str, Any]:
         return self.method.state_dict()
@@ -140,9 +150,18 @@ class BFGS:
         self.B = None if B is None else B.to(self.parameters[0])
 
     def step(self, index: int, loss: Callable[[], Tensor]) -> float:
-        """Iterate; the loss before the first iteration."""
+        """Iterate; the loss before the first iteration. An OutOfTime of the loss leaves the weights that it got to."""
         x = weight_vector(self.parameters)
-        value, g = self._evaluate(loss, x)
+        try:
+            value, g = self._evaluate(loss, x)
+            for reached in self._iterates(loss, x, value, g):
+                x = reached
+        finally:
+            put_weights(self.parameters, x)
+        return value
+
+    def _iterates(self, loss: Callable[[], Tensor], x: Tensor, value: float, g: Tensor) -> Iterator[Tensor]:
+        """The weights after each iteration."""
         first = value
         for _ in range(ITERATIONS if math.isfinite(first) else 0):
             p = -g / max(1.0, float(g.abs().sum())) if self.B is None else -(self.B @ g)
@@ -157,8 +176,7 @@ class BFGS:
             if float(y @ s) > 0:
                 self._update(s, y, -length * float(s @ g))
             x, g = x + s, after
-        put_weights(self.parameters, x)
-        return first
+            yield x
 
     def _along(
         self, loss: Callable[[], Tensor], x: Tensor, p: Tensor, value: float, slope: float

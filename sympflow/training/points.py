@@ -19,10 +19,12 @@ from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.training.session import Deadline, OutOfTime
 
 BLOCK = 32  # steps drawn at once: a rejection-sampled domain then costs little
 LABEL_TOLERANCE = 1e-13
 HELD_OUT_SHARE = 0.1  # of the labels that are handed in
+USELESS = 0.1  # of what a step moves a state: leapfrog at ω Δt = 1 misses a hundredth, the identity all of it
 
 Labelled = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Times (n,), states (n, 2d), and where the flow takes them (n, 2d)."""
@@ -143,28 +145,43 @@ class Labels:
     y: np.ndarray
 
     @classmethod
-    def of(cls, system: HamiltonianSystem, x: np.ndarray, t: np.ndarray) -> Labels:
+    def of(cls, system: HamiltonianSystem, x: np.ndarray, t: np.ndarray, deadline: Deadline | None = None) -> Labels:
         """Make labels by DOP853 at rtol = 1e-13, all states in one integration from each time to the next.
 
         States whose solution ends before the last time are left out.
+
+        Raises
+        ------
+        OutOfTime
+            At the deadline; it says how far the labels got.
         """
         y, reached = [x], 0.0
         for time in t:
-            after = reference_step(system, y[-1], float(time - reached), LABEL_TOLERANCE)
+            check = (lambda: None) if deadline is None else deadline.check
+            try:
+                after = reference_step(system, y[-1], float(time - reached), LABEL_TOLERANCE, check)
+            except OutOfTime:
+                raise OutOfTime(
+                    f"the exact solution was followed from {len(y[-1])} states to t = {reached:.3g} of {t[-1]:.3g} only"
+                ) from None
             exists = np.isfinite(after).all(-1)
             y, reached = [states[exists] for states in (*y, after)], time
         return cls(np.asarray(t), y[0], np.stack(y[1:]))
 
     @classmethod
-    def needed(cls, system: HamiltonianSystem, x: np.ndarray, t: np.ndarray) -> Labels:
+    def needed(
+        cls, system: HamiltonianSystem, x: np.ndarray, t: np.ndarray, deadline: Deadline | None = None
+    ) -> Labels:
         """`of`, for a fit, which cannot do without.
 
         Raises
         ------
         ValueError
             If there are none.
+        OutOfTime
+            As `of` does.
         """
-        labels = cls.of(system, x, t)
+        labels = cls.of(system, x, t, deadline)
         if not len(labels.x):
             raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
         return labels
@@ -188,6 +205,30 @@ def step_errors(difference: np.ndarray) -> dict[str, float]:
         "one_step_error_max": float(error[-1].max()),
         "fractional_error": float(error[:-1].mean()),
     }
+
+
+@np.errstate(all="ignore")
+def shares_missed(difference: np.ndarray, labels: Labels, unit: np.ndarray) -> tuple[float, float]:
+    """The share that is missed of what a step of Δt moves a state: mean of all states over mean, median over median.
+
+    They are 1 for the identity, and the same in all units of q, p and t; infinite if anything is not a number.
+
+    Parameters
+    ----------
+    difference : (N, 2d)
+        ψ̄_Δt(x) − φ_H,Δt(x).
+    labels : Labels
+        The last time is Δt.
+    unit : (2d,)
+        In which coordinates and momenta are measured: their spread over Ω.
+    """
+    error, moved = (np.linalg.norm(v / unit, axis=-1) for v in (difference, labels.y[-1] - labels.x))
+    return _share(error.mean(), moved.mean()), _share(np.median(error), np.median(moved))
+
+
+def _share(error: Any, of: Any) -> float:
+    share = float(error / of) if error != 0 else 0.0
+    return share if math.isfinite(share) else math.inf
 
 
 def handed_in(data: Any, system: HamiltonianSystem, dt: float) -> Labelled:

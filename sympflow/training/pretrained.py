@@ -6,6 +6,7 @@ python -m sympflow.training.pretrained kepler --rung primed-3-0.08      one rung
 python -m sympflow.training.pretrained fput_50                          one of a stiff system
 python -m sympflow.training.pretrained --measure                        their figures, without training
 python -m sympflow.training.pretrained --measure --keep                 and put them into the files
+python -m sympflow.training.pretrained --identify                       put the H that flows know into the files
 """
 
 from __future__ import annotations
@@ -43,6 +44,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, help="folder to write to (default: the package)")
     parser.add_argument("--measure", action="store_true", help="only measure the files that are there")
     parser.add_argument("--keep", action="store_true", help="with --measure: put the figures into the files")
+    parser.add_argument(
+        "--identify", action="store_true", help="only put the H by which flows know their system into the files"
+    )
     options = parser.parse_args(arguments)
     unknown = sorted(set(options.scenes) - set(known))
     if unknown:
@@ -66,6 +70,13 @@ def main(arguments: list[str] | None = None) -> None:
 def _figures(recipes: list[Recipe], options: argparse.Namespace) -> Iterator[tuple[Path, dict[str, Any]]]:
     """The files of the recipes, as they are written or only measured, and their figures."""
     folder = package_folder() if options.out is None else options.out
+    if options.identify:
+        for recipe in recipes:
+            flow = load(file_of(recipe, folder))
+            recipe.identify(flow)
+            flow.save(file_of(recipe, folder))
+            yield file_of(recipe, folder), {}
+        return
     if options.measure:
         for recipe in recipes:
             flow = load(file_of(recipe, folder))

@@ -15,12 +15,14 @@ from sympflow.flow.scaling import Scaling
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
-from sympflow.training.least_squares import STOPPED, Minimum, Stop
+from sympflow.training.least_squares import STOPPED, Minimum
 from sympflow.training.options import LossOptions, SearchOptions
-from sympflow.training.session import Path, Session
+from sympflow.training.points import USELESS
+from sympflow.training.session import Deadline, Path, Session
 
 OUT_OF_TIME = "the time budget was used up"
 INTERRUPTED = "it was interrupted"
+LABEL_SHARE = 0.3  # of the time left, that each set of labels may take
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,8 @@ class Run(ABC):
         The figures of each validation.
     seconds : float
         Wall time of the run, and of those that it goes on with.
+    closing : float
+        Seconds that its end takes, which are kept free.
     """
 
     flow: FlowMap
@@ -51,6 +55,7 @@ class Run(ABC):
     options: LossOptions | SearchOptions
     history: list[dict[str, float]] = field(default_factory=list, kw_only=True)
     seconds: float = field(default=0.0, kw_only=True)
+    closing: float = field(default=0.0, kw_only=True)
 
     UNIT: ClassVar[str]
 
@@ -83,6 +88,19 @@ class Run(ABC):
     @abstractmethod
     def achieved(self) -> dict[str, float]:
         """The figures of that flow."""
+
+    @abstractmethod
+    def missed(self) -> tuple[float, float] | None:
+        """The share of what a step of Δt moves a state that the flow misses, see `shares_missed`; None if unknown."""
+
+    def missed_by_verlet(self) -> tuple[float, float] | None:
+        """The same of one Verlet step of Δt; None if there is none to compare with."""
+        return None
+
+    @property
+    def remedy(self) -> str:
+        """What to do about a flow that is far from the exact one."""
+        return "Take a shorter `dt`, a smaller `domain`, or another `flow`, with more kicks."
 
     @abstractmethod
     def remarks(self, reason: str | None) -> dict[str, Any]:
@@ -118,22 +136,22 @@ class Run(ABC):
         self.seconds = before + session.passed
         return reason
 
+    def ended_early(self, reason: str) -> str:
+        """The warning of a run that did not come to its end."""
+        when = f"after {self.done} of {self.planned} {self.UNIT}"
+        if self.done >= self.planned:
+            when = f"in its last fits, after all {self.planned} {self.UNIT},"
+        return f"Training ended {when} because {reason}. The best state so far is returned."
+
     def finish(self, reason: str | None, expected: bool = False) -> Any:
         """The flow with the record of its training, its parameters without gradient; an expected end does not warn."""
         if reason is not None and not (expected and reason == OUT_OF_TIME):
-            done, planned = self.done, self.planned
-            when = f"after {done} of {planned} {self.UNIT}"
-            if done >= planned:
-                when = f"in its last fits, after all {planned} {self.UNIT},"
-            warnings.warn(
-                f"Training ended {when} because {reason}. The best state so far is returned.",
-                RuntimeWarning,
-                stacklevel=4,
-            )
+            warnings.warn(self.ended_early(reason), RuntimeWarning, stacklevel=4)
         flow, figures = self.flow, self.achieved()
         flow.requires_grad_(False)
         flow.zero_grad(set_to_none=True)
-        flow.domain, flow.fingerprint, flow.system_name = self.domain, self.system.fingerprint, self.system.name
+        flow.domain = self.domain
+        flow.identify(self.system, self.domain)
         earlier = float(flow.figures.get("training_seconds", 0.0))
         stage = {**self.options.to_dict(), **self.remarks(reason)}
         flow.recipe = {
@@ -143,8 +161,31 @@ class Run(ABC):
         }
         flow.figures = {name: value for name, value in figures.items() if name not in ("step", "loss", "iterations")}
         flow.figures["training_seconds"] = round(earlier + self.seconds, 3)
+        flow.figures |= self._compared()
         flow.history = self.history
         return flow
+
+    def _compared(self) -> dict[str, float]:
+        """Figures of what the flow is worth, with a warning where that is nothing.
+
+        That is where it misses, in the mean over held-out states, a tenth or more of what a step moves them, or as much
+        as one Verlet step.
+        """
+        missed, verlet = self.missed(), self.missed_by_verlet()
+        if missed is None:
+            return {}
+        mean, median = missed
+        no_better = verlet is not None and mean >= verlet[0] > 0
+        if mean >= USELESS or no_better:
+            beside = f", no better than one Verlet step with {verlet[0]:.1e}" if verlet and no_better else ""
+            warnings.warn(
+                f"The flow is far from the exact one: at held-out states its error in one step of dt = "
+                f"{self.flow.dt:g} is {mean:.1e} times what a step moves them (in the median {median:.1e} times)"
+                f"{beside}. {self.remedy}",
+                UserWarning,
+                stacklevel=5,
+            )
+        return {"missed_share": mean} | ({} if verlet is None else {"verlet_missed_share": verlet[0]})
 
     # checkpoints ------------------------------------------------------------------------------------------
 
@@ -171,6 +212,62 @@ class Run(ABC):
 
 
 @dataclass
+class Unstarted(Run):
+    """A run for which there was no time: what it was to start from took longer. The flow stays as it is.
+
+    Parameters
+    ----------
+    reached : str
+        How far that got.
+    """
+
+    reached: str
+
+    UNIT: ClassVar[str] = "steps"
+
+    @property
+    def done(self) -> int:
+        return 0
+
+    @property
+    def planned(self) -> int:
+        return 0
+
+    def begin(self, session: Session) -> None:
+        self.history = list(self.flow.history)
+
+    def over(self, session: Session) -> bool:
+        return True
+
+    def advance(self, session: Session) -> Advance:
+        raise AssertionError
+
+    def end(self, session: Session) -> str | None:
+        return INTERRUPTED if session.interruption.asked else OUT_OF_TIME
+
+    def ended_early(self, reason: str) -> str:
+        return (
+            f"Training did not start because {reason}: {self.reached}. What it was to start from is returned. Give a "
+            "longer `time_budget`, a shorter `dt`, or fewer `points`, `label_times` and `reference_states`."
+        )
+
+    def achieved(self) -> dict[str, float]:
+        return dict(self.flow.figures)
+
+    def missed(self) -> tuple[float, float] | None:
+        return None
+
+    def remarks(self, reason: str | None) -> dict[str, Any]:
+        return {"ended_early": f"{reason}: {self.reached}"}
+
+    def kept(self) -> dict[str, Any]:
+        raise AssertionError  # it has nothing to keep
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.flow.load_state_dict(state["best"])
+
+
+@dataclass
 class SearchRun(Run):
     """Many starts, each followed to a minimum, and a flow that is made of the best of them."""
 
@@ -178,10 +275,10 @@ class SearchRun(Run):
     minima: list[Minimum] = field(default_factory=list, kw_only=True)
 
     UNIT: ClassVar[str] = "starts"
-    SEARCH_SHARE: ClassVar[float] = 1.0  # of a time budget
+    SEARCH_SHARE: ClassVar[float] = 0.5  # of a time budget
 
     @abstractmethod
-    def next_minimum(self, stop: Stop) -> Minimum:
+    def next_minimum(self, deadline: Deadline) -> Minimum:
         """Follow the next start, of number len(minima)."""
 
     @abstractmethod
@@ -204,12 +301,14 @@ class SearchRun(Run):
         if session.checkpoint is not None and not self.minima:  # a first search may be long
             self.save(session.checkpoint)
         session.interruption.armed = True
+        self.whole_end = session.deadline.before(self.closing)
+        self.search_end = self.whole_end.part(self.SEARCH_SHARE)
 
     def over(self, session: Session) -> bool:
-        return session.spent(self.SEARCH_SHARE)
+        return self.search_end.over()
 
     def advance(self, session: Session) -> Advance:
-        minimum = self.next_minimum(lambda: session.spent(self.SEARCH_SHARE))
+        minimum = self.next_minimum(self.search_end)
         self.minima.append(minimum)
         # a start that was stopped is followed to its end another time
         return Advance(minimum.cost, self.found(minimum), minimum.reason != STOPPED)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
@@ -18,7 +19,11 @@ from sympflow.training.options import is_number
 Path = str | os.PathLike[str]
 Callback = Callable[[int, dict[str, float]], None]
 
-LEAST_BUDGET = 1.0  # seconds that are left to a run, however long trials and labels took
+LEAST_PART = 1.0  # seconds that a part of a budget has at least: what is compiled and imported takes as long
+
+
+class OutOfTime(Exception):
+    """Raised within a piece of work whose time is up, or which Ctrl-C asked to end."""
 
 
 class Interruption:
@@ -76,7 +81,7 @@ class Session:
     Attributes
     ----------
     cut : bool
-        Whether the time was up when it was looked at.
+        Whether the time was up when a `Deadline` was asked.
 
     Raises
     ------
@@ -95,7 +100,7 @@ class Session:
     def __post_init__(self) -> None:
         self._began = time.perf_counter()
         budget, callback = self.time_budget, self.callback
-        if budget is not None and not (is_number(budget) and 0 < budget < float("inf")):
+        if budget is not None and not (is_number(budget) and 0 < budget < math.inf):
             raise ValueError(f"`time_budget` must be a positive number of seconds; got {budget!r}: leave it out.")
         if callback is not None and not callable(callback):
             raise TypeError(
@@ -109,22 +114,13 @@ class Session:
 
     @property
     def passed(self) -> float:
-        """Seconds since the session, or its run, began."""
+        """Seconds since the session began."""
         return time.perf_counter() - self._began
 
-    def begin_run(self) -> float:
-        """Start the clock of the run; the seconds that went by before, which count as part of the budget."""
-        before = self.passed
-        if self.time_budget is not None:
-            self.time_budget = max(self.time_budget - before, min(self.time_budget, LEAST_BUDGET))
-        self._began = time.perf_counter()
-        return before
-
-    def spent(self, share: float = 1.0) -> bool:
-        """Return whether this share of the time is used up, or the run is to end at once."""
-        over = self.interruption.asked or (self.time_budget is not None and self.passed > share * self.time_budget)
-        self.cut = self.cut or over
-        return over
+    @property
+    def deadline(self) -> Deadline:
+        """The moment by which all that the session does has to end."""
+        return Deadline(self, math.inf if self.time_budget is None else self._began + self.time_budget)
 
     def bar(self, total: int, label: str, start: int = 0) -> Silent:
         """The display of so many steps, as a context."""
@@ -134,6 +130,48 @@ class Session:
             return Bar(total, label, start)
         except ImportError:
             return Lines(total, label)
+
+
+@dataclass(frozen=True)
+class Deadline:
+    """The moment by which a piece of work has to end; it is handed down to all that takes long.
+
+    Parameters
+    ----------
+    session : Session
+        Its `interruption` ends every piece, and it notes that the time was up.
+    end : float
+        By the clock `time.perf_counter`; infinite for none.
+    """
+
+    session: Session
+    end: float = math.inf
+
+    @property
+    def left(self) -> float:
+        """Seconds."""
+        return self.end - time.perf_counter() if self.end < math.inf else math.inf
+
+    def over(self) -> bool:
+        """Return whether to end: asked between steps."""
+        over = self.session.interruption.asked or self.left <= 0
+        self.session.cut = self.session.cut or over
+        return over
+
+    def check(self) -> None:
+        """Raise OutOfTime if it is over: asked within a step."""
+        if self.over():
+            raise OutOfTime
+
+    def part(self, share: float) -> Deadline:
+        """The end of this share of the time left, or of a second if that is more."""
+        if self.end == math.inf:
+            return self
+        return Deadline(self.session, time.perf_counter() + max(share * self.left, LEAST_PART))
+
+    def before(self, seconds: float) -> Deadline:
+        """So many seconds earlier, for what comes after."""
+        return Deadline(self.session, self.end - seconds)
 
 
 # progress -------------------------------------------------------------------------------------------------------

@@ -24,9 +24,9 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.parts_loops import parts_loops
 from sympflow.training.least_squares import Minimum, Stop, levenberg_marquardt, put_weights
 from sympflow.training.options import SplitOptions
-from sympflow.training.points import Labels, Stream, states, stream_seed
-from sympflow.training.runs import SearchRun
-from sympflow.training.session import Session
+from sympflow.training.points import Labels, Stream, shares_missed, states, stream_seed
+from sympflow.training.runs import LABEL_SHARE, SearchRun
+from sympflow.training.session import Deadline, Session
 
 DIFFERENCE = 1e-5  # of a coefficient, relative to its unit
 SPREAD = 0.3  # of random weights about those of equal steps
@@ -45,21 +45,31 @@ class SplitRun(SearchRun):
     fit: SplitFit
 
     @classmethod
-    def start(cls, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, options: SplitOptions) -> SplitRun:
+    def start(
+        cls,
+        flow: SplitFlow,
+        system: HamiltonianSystem,
+        domain: Domain,
+        options: SplitOptions,
+        deadline: Deadline | None = None,
+    ) -> SplitRun:
         """A run of a flow that is bound to its system.
 
         Raises
         ------
         ValueError
             If the system cannot be compiled, or no solution from the domain exists up to Δt.
+        OutOfTime
+            If the labels take longer than their share of the time.
         """
-        return cls(flow, system, domain, None, options, SplitFit(flow, system, domain, options))
+        deadline = Session().deadline if deadline is None else deadline
+        return cls(flow, system, domain, None, options, SplitFit(flow, system, domain, options, deadline))
 
-    def next_minimum(self, stop: Stop) -> Minimum:
+    def next_minimum(self, deadline: Deadline) -> Minimum:
         """At Δt, its x the numbers u: from the flow as it is, then from random ones."""
         fit, restart, last = self.fit, len(self.minima), len(self.fit.t) - 1
         u = fit.random(restart) if restart else fit.current(fit.t[last])
-        return fit.minimize(u, last, self.options.steps, stop)
+        return fit.minimize(u, last, self.options.steps, deadline.over)
 
     def found(self, minimum: Minimum) -> dict[str, float]:
         self.history.append({"step": len(self.minima), "loss": minimum.cost, "iterations": minimum.iterations})
@@ -72,9 +82,12 @@ class SplitRun(SearchRun):
             if not math.isfinite(best.cost):
                 raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
             u = best.x
-        whole = self.fit.whole(u, session.spent)
+        whole = self.fit.whole(u, self.whole_end.over)
         last = {"step": len(self.minima), "loss": whole.cost, "iterations": whole.iterations}
         self.history.append(last | self.fit.errors())
+
+    def missed(self) -> tuple[float, float]:
+        return self.fit.missed()
 
 
 def _phases(share: np.ndarray) -> np.ndarray:
@@ -85,7 +98,9 @@ def _phases(share: np.ndarray) -> np.ndarray:
 class SplitFit:
     """Labels in modes, and the flow's coefficients as numbers: those of the first half of the palindrome."""
 
-    def __init__(self, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, options: SplitOptions) -> None:
+    def __init__(
+        self, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, options: SplitOptions, deadline: Deadline
+    ) -> None:
         self.flow, self.options, self.parts = flow, options, flow.parts
         self.kernel = parts_loops(self.parts)
         self.columns = flow.columns()
@@ -94,12 +109,12 @@ class SplitFit:
         self.n = int(ends[-1]) if len(ends) else 0
         t = flow.dt * _phases(np.arange(1, options.label_times + 1) / options.label_times)
         x = states(domain, options.points, options.seed, Stream.RESIDUAL)
-        labels = Labels.needed(system, x, t)
+        labels = Labels.needed(system, x, t, deadline.part(LABEL_SHARE))
         self.t, self.z, self.labels = t, self._modes(labels.x), [self._modes(y) for y in labels.y]
         self.unit = self._unit(float(np.std(system.hamiltonian(labels.x))))
         x = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
         between = _phases((np.arange(2 * options.label_times) + 1) / (2 * options.label_times))
-        self.held_out = Labels.of(system, x, flow.dt * between)
+        self.held_out = Labels.of(system, x, flow.dt * between, deadline.part(LABEL_SHARE))
 
     def _modes(self, y: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(np.concatenate(self.parts.to_modes(y), axis=-1))
@@ -275,6 +290,13 @@ class SplitFit:
     def assign(self, theta: np.ndarray) -> None:
         """Put the parameters into the flow."""
         put_weights([c.free for c in self.columns], torch.as_tensor(theta))
+
+    def missed(self) -> tuple[float, float]:
+        """See `shares_missed`: at the last of the held-out times, which is next to Δt."""
+        t, z = self.held_out.t, self._modes(self.held_out.x)
+        modes = Labels(t[-1:], z, self._modes(self.held_out.y[-1])[None])
+        end = self.kernel.step_modes(self.flow.numpy_maps(np.array(t[-1])), z)
+        return shares_missed(end - modes.y[-1], modes, self.unit)
 
     def errors(self) -> dict[str, float]:
         """‖ψ̄_t(x) − φ_H,t(x)‖ of held-out states, in the units of the modes."""

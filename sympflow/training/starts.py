@@ -20,6 +20,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.options import NewFlow
 from sympflow.training.points import Stream, states
 from sympflow.training.table_fit import take_over
+from sympflow.training.table_step import DENSE, forces_of
 
 SCALING_SAMPLES = 4096
 SAMPLES, SEED = 1000, 0
@@ -27,6 +28,8 @@ QUANTILE = 0.99
 PHASE = 1.0  # ω Δt of the default flow: energy errors of 1e-8 to 1e-5, where its gain in time is the largest
 KICK_PHASE = 0.25  # ω Δt for each kick of the kernel
 MOST_STAGES = 24
+MOST_PERIODS = 30  # of most states, that Δt may hold
+ITERATIONS, FEWER_SAMPLES = 40, 100  # of the power method, for many degrees of freedom
 
 
 class Start(Protocol):
@@ -122,16 +125,70 @@ def frequency(system: HamiltonianSystem, domain: Domain | None) -> float:
     """The fastest frequency of the linearized motion that 99 % of the states of the domain stay below."""
     if domain is None:
         raise ValueError(f"`domain` is not known for the system {system.name!r}: pass one.")
-    y = domain.sample(SAMPLES, SEED)
-    q, p = y[:, : system.ndof], y[:, system.ndof :]
-    product = system.kinetic_hessian(p) @ system.potential_hessian(q)
-    squares = np.linalg.eigvals(product).real.max(-1)
+    d, large = system.ndof, system.ndof > DENSE and system.quadratic_kinetic
+    y = domain.sample(FEWER_SAMPLES if large else SAMPLES, SEED)
+    q, p = y[:, :d], y[:, d:]
+    if large:
+        squares = _largest_eigenvalues(system, q)
+    else:
+        squares = np.linalg.eigvals(system.kinetic_hessian(p) @ potential_hessian(system, q)).real.max(-1)
     squares = squares[np.isfinite(squares)]
     omega = math.sqrt(max(float(np.quantile(squares, QUANTILE)), 0.0)) if len(squares) else 0.0
     if omega == 0.0:  # nowhere bound: what a state needs to cross the domain
         speed = np.linalg.norm(system.velocity(p), axis=-1)
         omega = float(np.quantile(speed, QUANTILE) / max(float(q.std(0).max()), np.finfo(float).tiny)) or 1.0
     return omega
+
+
+def potential_hessian(system: HamiltonianSystem, q: np.ndarray) -> np.ndarray:
+    """∇²V (n, d, d), from differences of ∇V where it is not known."""
+    if system.has_hessian_vector:
+        return system.potential_hessian(q)
+    return np.moveaxis(-forces_of(system, 0).all(q.T)[1][0], -1, 0)
+
+
+def _largest_eigenvalues(system: HamiltonianSystem, q: np.ndarray) -> np.ndarray:
+    """Of M⁻¹∇²V the one of largest size, by the power method: (n, d) to (n,)."""
+    forces = forces_of(system, 0)
+    v = np.random.default_rng(SEED).standard_normal(q.shape)
+    size = np.ones(len(q))
+    with np.errstate(all="ignore"):
+        for _ in range(ITERATIONS):
+            v = v / size[:, None]
+            v = system.velocity(-forces.along(q.T, v.T[None])[1][0][0].T)
+            size = np.linalg.norm(v, axis=-1)
+    return size
+
+
+def check_step(system: HamiltonianSystem, domain: Domain, dt: float) -> None:
+    """Raise ValueError where Δt is far beyond the periods of the system, or what changes it, at half of the states."""
+    y = domain.sample(FEWER_SAMPLES, SEED)
+    d = system.ndof
+    with np.errstate(all="ignore"):
+        if system.separable and system.quadratic_kinetic and d > DENSE:
+            rates = np.sqrt(_largest_eigenvalues(system, y[:, :d]))
+        elif system.separable:
+            squares = system.kinetic_hessian(y[:, d:]) @ potential_hessian(system, y[:, :d])
+            rates = np.sqrt(_sizes(squares))
+        else:
+            second = system.hessian(y)
+            rates = _sizes(np.concatenate([second[:, d:], -second[:, :d]], axis=1))
+    rates = rates[np.isfinite(rates)]
+    rate = float(np.median(rates)) if len(rates) else 0.0
+    periods = rate * dt / (2 * math.pi)
+    if periods > MOST_PERIODS:
+        raise ValueError(
+            f"`dt` = {dt:g} is far beyond the periods of the system {system.name!r}, {periods:.2g} of them at half of "
+            f"the states of `domain`: no flow takes that in one step. Leave `dt` out, or take "
+            f"dt={_rounded(PHASE / rate)}."
+        )
+
+
+def _sizes(matrices: np.ndarray) -> np.ndarray:
+    """The largest size of an eigenvalue of each of n matrices, NaN where it is not finite."""
+    finite = np.isfinite(matrices).all((-1, -2))
+    sizes = np.abs(np.linalg.eigvals(np.where(finite[:, None, None], matrices, 0.0))).max(-1)
+    return np.where(finite, sizes, np.nan)
 
 
 def _rounded(dt: float) -> float:
@@ -162,8 +219,17 @@ class Split:
 
 
 def scaling_of(domain: Domain, dt: float, seed: int) -> Scaling:
-    """The units of x and t, from samples of the domain."""
-    return Scaling.of_samples(states(domain, SCALING_SAMPLES, seed, Stream.SCALING), dt)
+    """The units of x and t, from samples of the domain.
+
+    Raises
+    ------
+    ValueError
+        If the squares of its states overflow.
+    """
+    x = states(domain, SCALING_SAMPLES, seed, Stream.SCALING)
+    if not np.abs(x).max() < math.sqrt(np.finfo(float).max) / SCALING_SAMPLES:
+        raise ValueError(f"`domain` has states as large as {np.abs(x).max():.1e}, whose squares overflow: shrink it.")
+    return Scaling.of_samples(x, dt)
 
 
 def new_network(system: HamiltonianSystem, new: NewFlow, dt: float, scaling: Scaling, seed: int) -> FlowMap:

@@ -8,8 +8,7 @@ to labels at several times in (0, Δt].
 Other losses (the residual of the flow, Hamiltonian matching) join in the last stage. Without labels there is that stage
 alone, from each start.
 
-A flow that misses a tenth of what a step moves a state, or more, in the mean over held-out states and in units of the
-spread of each coordinate over Ω, comes with a warning.
+Every piece of it has a deadline, which is asked within each evaluation.
 """
 
 from __future__ import annotations
@@ -25,30 +24,41 @@ import torch
 from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
+from sympflow.flow.weights import check_memory
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.monomials import in_monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.training.least_squares import Minimum, Stop, levenberg_marquardt, put_weights
+from sympflow.training.least_squares import Minimum, levenberg_marquardt, put_weights
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.options import TableOptions
-from sympflow.training.points import Labelled, Labels, PointSource, Stream, states, step_errors, stream_seed
-from sympflow.training.runs import SearchRun
-from sympflow.training.session import Session
-from sympflow.training.table_step import TableStep
+from sympflow.training.points import (
+    Labelled,
+    Labels,
+    PointSource,
+    Stream,
+    shares_missed,
+    states,
+    step_errors,
+    stream_seed,
+)
+from sympflow.training.runs import LABEL_SHARE, SearchRun
+from sympflow.training.session import Deadline, Session
+from sympflow.training.table_step import Check, TableStep
 
 SPREAD = 0.25  # of random coefficients about those of equal steps
 WIDE_SPREAD = 2.0  # without force gradients, where an order above 2 needs negative ones
 PROCESSOR_SPREAD = 0.1
 STIFFNESS = 1e-3  # how reluctantly a table is made to vary with t where that is not called for
-USELESS = 0.1  # of what a step moves a state: leapfrog at ω Δt = 1 misses a hundredth, the identity all of it
 FINALISTS = 4  # tables of the search that are followed to the end
 FITTED = 2  # tables from which the polynomials are fitted
 HOPELESS = 100.0  # times the cost of the best table at Δt: polynomials are not fitted from there
 SEARCH_STEPS = 60  # iterations from each start
 FROZEN_SHARE = 0.7  # of a time budget, that all work on frozen tables may use
-FRACTIONAL_TIMES = 50
+FRACTIONAL_TIMES = 50  # of the held-out labels; as many as of the fit where these would take longer than
+HELD_OUT_SHARE = 0.1  # of the time left
+LAST_EVALUATIONS = 3  # times what the held-out figures take, for what is left to do when the time is up
 CLOSE = 1.1  # held-out errors that differ by less are the same for a warning
-FEWEST_POINTS, MOST_POINTS, COORDINATES = 40, 250, 1000
+FEWEST_POINTS, MOST_POINTS, COORDINATES = 16, 250, 1000
 FITTED_POINTS = 120  # that are enough for the polynomials in t: at each of several times
 RESIDUALS = 10  # at least, at Δt, for each number of the table; half as many for the polynomials in t
 
@@ -66,6 +76,8 @@ class TableRun(SearchRun):
         A flow like this one from a trial, which the result of an interrupted run is to be no worse than.
     kept_start : bool
         Whether the flow is returned as it was given.
+    at_start, at_end : ndarray
+        Differences from the exact flow at the held-out labels: of the flow as it was given, and as it is.
     """
 
     flow: PrimedFlow
@@ -78,13 +90,14 @@ class TableRun(SearchRun):
     held_out: Labels
     tried: PrimedFlow | None = None
     kept_start: bool = field(default=False, init=False)
+    at_start: np.ndarray = field(init=False)
+    at_end: np.ndarray = field(init=False)
 
     SEARCH_SHARE: ClassVar[float] = 0.4
 
     def __post_init__(self) -> None:
         self.table = Table(self.flow)
         self.given = self.table.parameters()
-        self.at_start = self._differences()
 
     @classmethod
     def start(
@@ -96,6 +109,7 @@ class TableRun(SearchRun):
         options: TableOptions,
         data: Labelled | None = None,
         tried: PrimedFlow | None = None,
+        deadline: Deadline | None = None,
     ) -> TableRun:
         """A run for labels made on the spot, or for `data`: times (n,), states and where they go, (n, 2d).
 
@@ -103,7 +117,11 @@ class TableRun(SearchRun):
         ------
         ValueError
             If T is not ½ pᵀM⁻¹p, no solution from the domain exists up to Δt, or the data have no labels at Δt.
+        OutOfTime
+            If the labels take longer than their share of the time.
         """
+        deadline = Session().deadline if deadline is None else deadline
+        fractions = FRACTIONAL_TIMES
         step, table = TableStep(system, flow.sequence, flow.tables.level, flow.monomials), Table(flow)
         unit = np.array(scaling.x)
         parts: list[tuple[float, Fit]] = []
@@ -112,9 +130,13 @@ class TableRun(SearchRun):
             numbers = table.frozen(flow.dt)[1].shape[-1]
             enough = math.ceil(RESIDUALS * numbers / (2 * system.ndof))
             points = options.points or max(enough, min(MOST_POINTS, max(FEWEST_POINTS, COORDINATES // system.ndof)))
+            _check_memory(points, options, step.n_coefficients, system.ndof)
             x = states(domain, points, options.seed, Stream.RESIDUAL)
             t = flow.dt * np.arange(1, options.label_times + 1) / options.label_times
-            labels = Labels.needed(system, x, t)
+            began = deadline.session.passed
+            labels = Labels.needed(system, x, t, deadline.part(LABEL_SHARE))
+            if (deadline.session.passed - began) / len(t) * fractions > HELD_OUT_SHARE * deadline.left:
+                fractions = min(fractions, len(t))
             slope = energy_slope(system, labels, options.energy_weight)
             frozen, weighted = _with_and_without(step, labels.at(-1), table.frozen(flow.dt), unit, slope)
             weight = np.where(t < t[-1], 1.0, options.frozen_weight)
@@ -140,14 +162,22 @@ class TableRun(SearchRun):
             points_at = replace(PointSource(domain, *shape, block=1)(0), labels=_tensors(data) if rest else None)
             parts.append((1.0, LossFit(table, Objective(loss, flow, points_at))))
         x = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
-        t = flow.dt * (np.arange(FRACTIONAL_TIMES) + 0.5) / FRACTIONAL_TIMES
-        held_out = Labels.of(system, x, np.append(t, flow.dt))
+        t = flow.dt * (np.arange(fractions) + 0.5) / fractions
+        held_out = Labels.of(system, x, np.append(t, flow.dt), deadline.part(LABEL_SHARE))
         whole = parts[0][1] if len(parts) == 1 else StackedFit(*parts)  # one weight changes nothing
-        return cls(flow, system, domain, scaling, options, step, frozen, weighted, whole, held_out, tried)
+        run = cls(flow, system, domain, scaling, options, step, frozen, weighted, whole, held_out, tried)
+        began = deadline.session.passed
+        run.at_start = run.differences()
+        run.closing = LAST_EVALUATIONS * (deadline.session.passed - began)
+        return run
 
-    def next_minimum(self, stop: Stop) -> Minimum:
+    def begin(self, session: Session) -> None:
+        super().begin(session)
+        self._frozen_end = self.whole_end.part(FROZEN_SHARE)
+
+    def next_minimum(self, deadline: Deadline) -> Minimum:
         steps = min(SEARCH_STEPS, self.options.steps)
-        return (self.frozen or self.whole).minimize(self._start(), steps, stop)
+        return (self.frozen or self.whole).minimize(self._start(), steps, deadline)
 
     def found(self, minimum: Minimum) -> dict[str, float]:
         self.table.assign(self._continued(min(self.minima, key=lambda m: m.cost)))
@@ -157,21 +187,26 @@ class TableRun(SearchRun):
         finalists, frozen, steps = _distinct(self.minima)[:FINALISTS], self.frozen, self.options.steps
         if frozen is not None:
             for fit in filter(None, (frozen, self.weighted)):
-                finalists = [
-                    fit.minimize(m.x, steps, lambda: session.spent(FROZEN_SHARE), thorough=True) for m in finalists
-                ]
+                finalists = [fit.minimize(m.x, steps, self._frozen_end, thorough=True) for m in finalists]
         starts = [self._continued(m) for m in _distinct(finalists)[:FITTED]]
         if not finalists or frozen is None or self._frozen_cost(self.given) < HOPELESS * min(m.cost for m in finalists):
             starts.insert(0, self.given)
-        fitted = [self.whole.minimize(theta, steps, session.spent, thorough=True) for theta in starts]
+        fitted = [self.whole.minimize(theta, steps, self.whole_end, thorough=True) for theta in starts]
         best = min(fitted, key=lambda m: m.cost)
         if not math.isfinite(best.cost):
             raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
         self.table.assign(best.x)
-        self._keep_better(session.interruption.asked)
-        self._record(best)
-        shares = shares_missed(self._differences()[-1], self.held_out, np.array(self.scaling.x))
-        warn_of_useless_flow(shares, self.flow.dt, stacklevel=6)
+        self._record(best, self._keep_better(session))
+
+    @property
+    def remedy(self) -> str:
+        return (
+            "Take a smaller `domain`, without states where H is singular or nearly so, a shorter `dt`, or another "
+            "`flow`, with more kicks."
+        )
+
+    def missed(self) -> tuple[float, float]:
+        return shares_missed(self.at_end[-1], self.held_out, np.array(self.scaling.x))
 
     def _frozen_cost(self, theta: np.ndarray) -> float:
         """The cost of parameters at Δt; infinite if they lead to no finite states."""
@@ -185,19 +220,23 @@ class TableRun(SearchRun):
     def remarks(self, reason: str | None) -> dict[str, Any]:
         return super().remarks(reason) | ({"kept_start": True} if self.kept_start else {})
 
-    def _keep_better(self, interrupted: bool) -> None:
-        """Go back to where the run began, or to `tried`, if that is nearer to the exact flow at the held-out states."""
-        if interrupted and self.tried is not None:
+    def _keep_better(self, session: Session) -> np.ndarray:
+        """Go back to where the run began, or to `tried`, if that is nearer to the exact flow at the held-out states.
+
+        The differences from it, of the one or the other.
+        """
+        if session.cut and self.tried is not None:
             self.given = Table(self.tried).parameters()
             self.at_start = differences(self.tried, self.step, self.held_out)
         unit = np.array(self.scaling.x)
-        before, after = (distance(e, unit) for e in (self.at_start, self._differences()))
+        at_end = self.differences()
+        before, after = (distance(e, unit) for e in (self.at_start, at_end))
         if after <= before or not math.isfinite(before):
-            return
+            return at_end
         self.table.assign(self.given)
         self.kept_start = True
-        if interrupted or after < CLOSE * before:  # as when a fit is fitted again
-            return
+        if session.interruption.asked or after < CLOSE * before:  # as when a fit is fitted again
+            return self.at_start
         warnings.warn(
             f"The fit has a larger held-out error ({after:.1e}, in units of the spread of `domain`) than the flow that "
             f"it started from ({before:.1e}), which is returned: its data are too few, too far from Δt, or not of this "
@@ -205,6 +244,7 @@ class TableRun(SearchRun):
             RuntimeWarning,
             stacklevel=7,
         )
+        return self.at_start
 
     def _start(self) -> np.ndarray:
         """The start of the next search: the flow as it was given, then random tables."""
@@ -223,19 +263,30 @@ class TableRun(SearchRun):
         """The parameters that a minimum of the search gives."""
         return minimum.x if self.frozen is None else self.table.continued(self.frozen.design[0] @ minimum.x)
 
-    def _differences(self) -> np.ndarray:
+    def differences(self) -> np.ndarray:
         """The differences from the exact flow, at the held-out states and times."""
         return differences(self.flow, self.step, self.held_out)
 
-    def _record(self, minimum: Minimum) -> dict[str, float]:
+    def _record(self, minimum: Minimum, differences: np.ndarray | None = None) -> dict[str, float]:
+        self.at_end = self.differences() if differences is None else differences
         figures = {
             "step": len(self.minima),
             "loss": minimum.cost,
             "iterations": minimum.iterations,
-            **step_errors(self._differences()),
+            **step_errors(self.at_end),
         }
         self.history.append(figures)
         return figures
+
+
+def _check_memory(points: int, options: TableOptions, numbers: int, ndof: int) -> None:
+    """Raise ValueError where the labels and the Jacobian of a fit are more than the memory of the machine."""
+    labels = max(points, min(points, FITTED_POINTS) * options.label_times, options.reference_states * FRACTIONAL_TIMES)
+    check_memory(
+        f"`points` {points}, `label_times` {options.label_times} and `reference_states` {options.reference_states}",
+        2 * ndof * labels * 3 * numbers,
+        "take fewer",
+    )
 
 
 def energy_slope(system: HamiltonianSystem, labels: Labels, weight: float) -> np.ndarray | None:
@@ -273,19 +324,29 @@ def _tensors(data: tuple[np.ndarray, ...] | None) -> Any:
 class Fit:
     """Residuals of parameters θ whose sum of squares is to be small."""
 
-    def residuals(self, theta: np.ndarray) -> np.ndarray:
-        """(m,)."""
+    def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
+        """(m,); `check` is called within, and may raise."""
         raise NotImplementedError
 
-    def linearized(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
         """The residuals and their Jacobian, (m, f)."""
         raise NotImplementedError
 
-    def minimize(self, theta: np.ndarray, iterations: int, stop: Stop, thorough: bool = False) -> Minimum:
-        """Least squares from θ; a thorough one goes on where little is gained, as along a narrow curved valley."""
-        patience, gain = (20, 1e-3) if thorough else (10, 1e-2)
-        limits: dict[str, Any] = {"iterations": iterations, "patience": patience, "gain": gain, "stop": stop}
-        return levenberg_marquardt(self.residuals, self.linearized, theta, **limits)
+    def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
+        """Least squares from θ; a thorough one goes on where little is gained, as along a narrow curved valley.
+
+        The residuals at θ are evaluated even past the deadline, so that starts can be compared.
+        """
+        at_start = self.residuals(theta)
+        return levenberg_marquardt(
+            lambda x: at_start if x is theta else self.residuals(x, deadline.check),
+            lambda x: self.linearized(x, deadline.check),
+            theta,
+            iterations=iterations,
+            patience=20 if thorough else 10,
+            gain=1e-3 if thorough else 1e-2,
+            stop=deadline.over,
+        )
 
 
 class StackedFit(Fit):
@@ -294,11 +355,11 @@ class StackedFit(Fit):
     def __init__(self, *parts: tuple[float, Fit]) -> None:
         self.parts = parts
 
-    def residuals(self, theta: np.ndarray) -> np.ndarray:
-        return np.concatenate([math.sqrt(weight) * fit.residuals(theta) for weight, fit in self.parts])
+    def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
+        return np.concatenate([math.sqrt(weight) * fit.residuals(theta, check) for weight, fit in self.parts])
 
-    def linearized(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        pieces = [(math.sqrt(weight), *fit.linearized(theta)) for weight, fit in self.parts]
+    def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
+        pieces = [(math.sqrt(weight), *fit.linearized(theta, check)) for weight, fit in self.parts]
         return np.concatenate([w * r for w, r, _ in pieces]), np.concatenate([w * J for w, _, J in pieces])
 
 
@@ -308,13 +369,13 @@ class LossFit(Fit):
     def __init__(self, table: Table, objective: Objective) -> None:
         self.table, self.objective = table, objective
 
-    def residuals(self, theta: np.ndarray) -> np.ndarray:
+    def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
         self.table.assign(theta)
-        return self.objective.residuals().numpy()
+        return replace(self.objective, check=check).residuals().numpy()
 
-    def linearized(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
         self.table.assign(theta)
-        r, J = self.objective.linearized()
+        r, J = replace(self.objective, check=check).linearized()
         return r.detach().numpy(), J.detach().numpy()
 
 
@@ -357,14 +418,14 @@ class TableFit(Fit):
         """(n, P), P = J N."""
         return np.repeat((self.offset + self.design @ theta).T, self.count, axis=1)
 
-    def residuals(self, theta: np.ndarray) -> np.ndarray:
+    def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
         with np.errstate(all="ignore"):
-            y = self.step(self.coefficients(theta), self._x)
+            y = self.step(self.coefficients(theta), self._x, check)
             return self._rows(self._errors(y - self._y)).ravel()
 
     @np.errstate(all="ignore")  # as in the residuals: what is not finite is rejected
-    def linearized(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        y, J = self.step.with_jacobian(self.coefficients(theta), self._x)
+    def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
+        y, J = self.step.with_jacobian(self.coefficients(theta), self._x, check)
         by_table = self._rows(self._errors(J))  # (J, (2d + 1) N, n)
         J = (by_table @ self.design).reshape(-1, self.design.shape[-1])
         return self._rows(self._errors(y - self._y)).ravel(), J
@@ -547,41 +608,3 @@ def distance(difference: np.ndarray, unit: np.ndarray) -> float:
     figures = step_errors(difference / unit)
     both = figures["one_step_error"] + figures["fractional_error"]
     return both if math.isfinite(both) else math.inf
-
-
-@np.errstate(all="ignore")
-def shares_missed(difference: np.ndarray, labels: Labels, unit: np.ndarray) -> tuple[float, float]:
-    """The share that is missed of what a step of Δt moves a state: mean of all states over mean, median over median.
-
-    They are 1 for the identity, and the same in all units of q, p and t; infinite if anything is not a number.
-
-    Parameters
-    ----------
-    difference : (N, 2d)
-        ψ̄_Δt(x) − φ_H,Δt(x).
-    labels : Labels
-        The last time is Δt.
-    unit : (2d,)
-        In which coordinates and momenta are measured: their spread over Ω.
-    """
-    error, moved = (np.linalg.norm(v / unit, axis=-1) for v in (difference, labels.y[-1] - labels.x))
-    return _share(error.mean(), moved.mean()), _share(np.median(error), np.median(moved))
-
-
-def _share(error: Any, of: Any) -> float:
-    share = float(error / of) if error != 0 else 0.0
-    return share if math.isfinite(share) else math.inf
-
-
-def warn_of_useless_flow(shares: tuple[float, float], dt: float, stacklevel: int) -> None:
-    """Warn if in the mean over the states a tenth or more of what a step moves them is missed."""
-    mean, median = shares
-    if mean < USELESS:
-        return
-    warnings.warn(
-        f"The flow is far from the exact one: at held-out states its error in one step of dt = {dt:g} is {mean:.1e} "
-        f"times what a step moves them (in the median {median:.1e} times). Take a smaller `domain`, without states "
-        "where H is singular or nearly so, a shorter `dt`, or another `flow`, with more kicks.",
-        UserWarning,
-        stacklevel=stacklevel + 1,
-    )

@@ -7,15 +7,23 @@ after F the −∇q^m of each monomial. Arrays are feature-major: q and F, G, C 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, Protocol
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sympflow.hamiltonian.hamiltonian import derivative
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 ALONG = 1e-4  # length of the difference, relative to q, that gives the third derivative of V along M⁻¹∇V
+DENSE = 16  # degrees of freedom up to which third derivatives of a symbolic V are generated
+PRODUCT = 1e-3  # length of the difference, relative to q, that gives ∇²V·v where it is not known
+
+Check = Callable[[], None]
+Product = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class TableStep:
@@ -45,6 +53,7 @@ class TableStep:
             )
         self.ndof, self.sequence = system.ndof, tuple(sequence)
         self._inverse_mass = system.kinetic_hessian(np.zeros(system.ndof))
+        self._times_inverse_mass = system.velocity
         self._forces = forces_of(system, level, monomials)
         n, terms = len(sequence), len(monomials) or level
         kicks = [i for i in range(n) if sequence[i] == "kick"]
@@ -54,22 +63,57 @@ class TableStep:
             kick: [kick, *(n + term * len(kicks) + j for term in range(terms))] for j, kick in enumerate(kicks)
         }
 
-    def __call__(self, c: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """The step: coefficients c in the order of the sequence, then of each further term those of the kicks."""
+    def __call__(self, c: np.ndarray, y: np.ndarray, check: Check = lambda: None) -> np.ndarray:
+        """The step: coefficients c in the order of the sequence, then of each further term those of the kicks.
+
+        `check` is called at each kick, and may raise to end the step.
+        """
         q, p = y[: self.ndof], y[self.ndof :]
         for i, kind in enumerate(self.sequence):
             if kind == "drift":
                 q = q + c[i] * (self._inverse_mass @ p)
             else:
+                check()
                 for place, F in zip(self._places[i], self._forces.values(q), strict=True):
                     p = p + c[place] * F
         return np.concatenate([q, p])
 
-    def with_jacobian(self, c: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The step, and its derivatives by each coefficient: (n, 2d, P).
+    def with_jacobian(self, c: np.ndarray, y: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
+        """The step, and its derivatives by each coefficient: (n, 2d, P); `check` as in the step."""
+        return (self._backward if 2 * self.ndof <= self.n_coefficients else self._forward)(c, y, check)
 
-        The states are stored on the way, and the derivative of the map after each is built on the way back: with few
-        degrees of freedom that is cheaper than a tangent for each coefficient.
+    def _forward(self, c: np.ndarray, y: np.ndarray, check: Check) -> tuple[np.ndarray, np.ndarray]:
+        """A tangent for each coefficient is carried along: the cheaper way for many degrees of freedom."""
+        d = self.ndof
+        q, p = y[:d], y[d:]
+        J = np.zeros((self.n_coefficients, *y.shape))
+        by_q, by_p = J[:, :d], J[:, d:]
+        moved: list[int] = []  # the coefficients that were met
+        for i, kind in enumerate(self.sequence):
+            check()
+            if kind == "drift":
+                by_q[moved] += c[i] * self._velocity(by_p[moved])
+                velocity = self._velocity(p)
+                by_q[i] += velocity
+                q = q + c[i] * velocity
+                moved.append(i)
+            else:
+                forces, changes = self._forces.along(q, by_q[moved])
+                for place, F, change in zip(self._places[i], forces, changes, strict=True):
+                    by_p[moved] += c[place] * change
+                    by_p[place] += F
+                    p = p + c[place] * F
+                moved += self._places[i]
+        return np.concatenate([q, p]), J
+
+    def _velocity(self, p: np.ndarray) -> np.ndarray:
+        """M⁻¹p: (..., d, P)."""
+        return self._times_inverse_mass(p.swapaxes(-1, -2)).swapaxes(-1, -2)
+
+    def _backward(self, c: np.ndarray, y: np.ndarray, check: Check) -> tuple[np.ndarray, np.ndarray]:
+        """The states are stored on the way, and the derivative of the map after each is built on the way back.
+
+        With few degrees of freedom that is cheaper than a tangent for each coefficient.
         """
         d = self.ndof
         q, p = y[:d], y[d:]
@@ -80,6 +124,7 @@ class TableStep:
                 passed.append((velocity,))
                 q = q + c[i] * velocity
             else:
+                check()
                 forces, jacobians = self._forces.all(q)
                 weights = [c[place] for place in self._places[i]]
                 passed.append((sum(w * D for w, D in zip(weights, jacobians, strict=True)), *forces))
@@ -122,34 +167,50 @@ class Forces(Protocol):
     def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         """These, and their Jacobians."""
 
+    def along(self, q: np.ndarray, v: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        """These, and their derivatives along directions v (k, d, P), of the same shape."""
+
 
 def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = ()) -> Forces:
     """The forces of a separable system with T = ½ pᵀM⁻¹p: from its symbols, its Numba functions, or its own arrays."""
-    if system.symbols is not None:
+    if system.symbols is not None and (system.ndof <= DENSE or level == CURVATURE or monomials):
         return SymbolicForces(system.symbols, level, monomials)
-    if system.numba_functions is not None and system.numba_functions[2] is not None:
-        return NumbaForces(system, level)
-    return CallableForces(system, level)
+    return ArrayForces(system, level)
 
 
 class SymbolicForces:
-    """All derivatives in closed form, generated from the symbols."""
+    """All derivatives in closed form, generated from the symbols when first asked for."""
 
     def __init__(self, symbols: Any, level: int, monomials: Monomials) -> None:
         import sympy as sp
 
-        slope = sp.Matrix([sp.diff(symbols.V, s) for s in symbols.q])
+        slope = sp.Matrix(symbols.slope)
         terms = [-slope]
         if level in (FORCE_GRADIENT, CURVATURE):
-            terms.append(sp.hessian(symbols.V, symbols.q) * symbols.inverse_mass * slope)
+            v = symbols.inverse_mass * slope
+            terms.append(sp.Matrix([_derivative(f, symbols.q, v) for f in slope]))
         if level == CURVATURE:
             terms.append(sp.Matrix([-sp.diff(symbols.W, s) for s in symbols.q]))
         products = [sp.Mul(*map(sp.Pow, symbols.q, m)) for m in monomials]
         terms += [sp.Matrix([-sp.diff(product, s) for s in symbols.q]) for product in products]
-        values = [f for term in terms for f in term]
-        self._d, self._n = symbols.ndof, len(terms)
-        self._values = _generated(symbols.q, values)
-        self._all = _generated(symbols.q, [*values, *(f for term in terms for f in term.jacobian(symbols.q))])
+        self._d, self._n, self._q, self._terms = symbols.ndof, len(terms), symbols.q, terms
+
+    @cached_property
+    def _values(self) -> Callable[[np.ndarray], np.ndarray]:
+        return _generated(self._q, [f for term in self._terms for f in term])
+
+    @cached_property
+    def _all(self) -> Callable[[np.ndarray], np.ndarray]:
+        values = [f for term in self._terms for f in term]
+        return _generated(self._q, [*values, *(f for term in self._terms for f in term.jacobian(self._q))])
+
+    @cached_property
+    def _along(self) -> Callable[[np.ndarray], np.ndarray]:
+        import sympy as sp
+
+        directions = sp.symbols(f"v1:{self._d + 1}", real=True)
+        changes = [_derivative(f, self._q, directions) for term in self._terms for f in term]
+        return _generated((*self._q, *directions), changes)
 
     def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
         return self._values(q).reshape(self._n, self._d, q.shape[1])  # type: ignore[return-value]
@@ -159,9 +220,23 @@ class SymbolicForces:
         rows = self._all(q)
         return rows[: n * d].reshape(n, d, -1), rows[n * d :].reshape(n, d, d, -1)  # type: ignore[return-value]
 
+    def along(self, q: np.ndarray, v: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        k, d, P = v.shape
+        both = np.concatenate([np.broadcast_to(q, v.shape), v], axis=1)  # (k, 2d, P)
+        changes = self._along(np.ascontiguousarray(both.swapaxes(0, 1)).reshape(2 * d, k * P))
+        return self.values(q), np.moveaxis(changes.reshape(self._n, d, k, P), 2, 1)  # type: ignore[return-value]
 
-class CallableForces:
-    """From the system's gradients and Hessians of arrays.
+
+def _derivative(f: Any, variables: Sequence[Any], direction: Sequence[Any]) -> Any:
+    """The derivative of an expression along a direction: of a sparse one in few operations."""
+    import sympy as sp
+
+    there = f.free_symbols
+    return sp.Add(*(sp.diff(f, s) * v for s, v in zip(variables, direction, strict=True) if s in there))
+
+
+class ArrayForces:
+    """From the system's gradients and products ∇²V·v of arrays; where these are not known, from differences of ∇V.
 
     The Jacobian of G(q) = ∇²V(q) v(q), v = M⁻¹∇V, is ∇²V M⁻¹ ∇²V and the derivative of ∇²V along v, a central
     difference of two Hessians: third derivatives of V are never asked for, so there is no C.
@@ -170,106 +245,142 @@ class CallableForces:
     def __init__(self, system: HamiltonianSystem, level: int) -> None:
         assert level < CURVATURE
         self.system, self.force_gradient = system, level >= FORCE_GRADIENT
+        self._gradient, self._product = _row_functions(system)
 
     def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
-        F = self.system.force(q.T)
+        rows = np.ascontiguousarray(q.T)
+        slope = self._gradient(rows)
         if not self.force_gradient:
-            return (F.T,)
-        return F.T, self.system.hessian_vector(q.T, -self.system.velocity(F)).T
+            return (-slope.T,)
+        return -slope.T, self._product(rows, self.system.velocity(slope)).T
 
     def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
-        F = self.system.force(q.T)
-        hessian = self.system.potential_hessian(q.T)  # (P, d, d)
-        DF = np.moveaxis(-hessian, 0, -1)
+        rows = np.ascontiguousarray(q.T)
+        slope, hessian = self._gradient(rows), self._hessian(rows)
+        F, DF = -slope.T, np.moveaxis(-hessian, 0, -1)
         if not self.force_gradient:
-            return (F.T,), (DF,)
-        v = -self.system.velocity(F)
-        G = (hessian @ v[..., None])[..., 0]
-        largest = np.abs(v).max(-1, keepdims=True)
-        step = ALONG * np.maximum(np.abs(q.T).max(-1, keepdims=True), 1e-300) / np.where(largest > 0, largest, 1.0)
-        ends = [self.system.potential_hessian(q.T + sign * step * v) for sign in (1, -1)]
-        along = (ends[0] - ends[1]) / (2 * step[..., None])
+            return (F,), (DF,)
+        v = self.system.velocity(slope)
+        ends, length = _ends(rows, v)
         inverse_mass = self.system.kinetic_hessian(np.zeros(self.system.ndof))
+        along = (self._hessian(ends[0]) - self._hessian(ends[1])) / (2 * length[..., None])
         DG = along + hessian @ inverse_mass @ hessian
-        return (F.T, G.T), (DF, np.moveaxis(DG, 0, -1))
+        return (F, (hessian @ v[..., None])[..., 0].T), (DF, np.moveaxis(DG, 0, -1))
+
+    def along(self, q: np.ndarray, v: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        rows, directions = np.ascontiguousarray(q.T), np.ascontiguousarray(v.swapaxes(-1, -2))  # (k, P, d)
+        slope = self._gradient(rows)
+        change = self._product(rows, directions)
+        F, DF = -slope.T, -change.swapaxes(-1, -2)
+        if not self.force_gradient:
+            return (F,), (DF,)
+        acceleration = self.system.velocity(slope)
+        ends, length = _ends(rows, acceleration)
+        DG = (self._product(ends[0], directions) - self._product(ends[1], directions)) / (2 * length)
+        DG = DG + self._product(rows, self.system.velocity(change))
+        return (F, self._product(rows, acceleration).T), (DF, DG.swapaxes(-1, -2))
+
+    def _hessian(self, rows: np.ndarray) -> np.ndarray:
+        """∇²V: (P, d) to (P, d, d)."""
+        given = self.system.symbols is not None or self.system.numba_functions is not None
+        if not given and self.system.has_hessian_vector:
+            return self.system.potential_hessian(rows)
+        basis = np.broadcast_to(np.eye(rows.shape[1])[:, None], (rows.shape[1], *rows.shape))
+        return np.moveaxis(self._product(rows, basis), 0, -1)
 
 
-class NumbaForces(CallableForces):
-    """`CallableForces` in one compiled loop over the states, around the user's functions of one state."""
-
-    def __init__(self, system: HamiltonianSystem, level: int) -> None:
-        super().__init__(system, level)
-        assert system.numba_functions is not None
-        _, gradient, hessian_vector = system.numba_functions
-        self._loops = _compiled(gradient, hessian_vector)
-        self._inverse_mass = system.kinetic_hessian(np.zeros(system.ndof))
-
-    def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
-        rows = np.ascontiguousarray(q.T)
-        F, G = np.empty_like(rows), np.empty_like(rows)
-        self._loops[0](rows, self._inverse_mass, self.force_gradient, F, G)
-        return (F.T, G.T) if self.force_gradient else (F.T,)
-
-    def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
-        d, n = q.shape
-        F, G, DF, DG = np.empty((n, d)), np.empty((n, d)), np.empty((n, d, d)), np.empty((n, d, d))
-        rows = np.ascontiguousarray(q.T)
-        self._loops[1](rows, self._inverse_mass, ALONG if self.force_gradient else 0.0, F, G, DF, DG)
-        if self.force_gradient:
-            DG += DF @ self._inverse_mass @ DF
-        forces, jacobians = ([np.moveaxis(a, 0, -1) for a in pair] for pair in ((F, G), (DF, DG)))
-        n_terms = 2 if self.force_gradient else 1
-        return forces[:n_terms], jacobians[:n_terms]
+def _ends(rows: np.ndarray, v: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """The states on both sides of each row along v (P, d), and their distance from it over that of v (P, 1)."""
+    largest = np.abs(v).max(-1, keepdims=True)
+    length = ALONG * np.maximum(np.abs(rows).max(-1, keepdims=True), 1e-300) / np.where(largest > 0, largest, 1.0)
+    return (rows + length * v, rows - length * v), length
 
 
-def _compiled(gradient: Any, hessian_vector: Any) -> tuple[Callable[..., None], Callable[..., None]]:
-    """The loops over the states (n, d) for `values` and `all`."""
+def _row_functions(system: HamiltonianSystem) -> tuple[Callable[[np.ndarray], np.ndarray], Product]:
+    """∇V of rows (..., P, d), and ∇²V·v of rows and v: of Numba functions in one compiled loop each.
+
+    Where a gradient was given without products, these are differences of it along v.
+    """
+
+    def slopes(rows: np.ndarray) -> np.ndarray:
+        return -system.force(rows)
+
+    if system.symbols is not None:
+        return slopes, _symbolic_product(system.symbols)
+    if system.numba_functions is None:
+        return slopes, system.hessian_vector if system.has_hessian_vector else _differences_of(slopes)
+    _, gradient, hessian_vector = system.numba_functions
+    slope_loop, product_loop = _compiled(gradient, hessian_vector)
+
+    def compiled_slopes(q: np.ndarray) -> np.ndarray:
+        rows = np.array(q).reshape(-1, q.shape[-1])
+        out = np.empty_like(rows)
+        slope_loop(rows, out)
+        return out.reshape(q.shape)
+
+    if product_loop is None:
+        return compiled_slopes, _differences_of(compiled_slopes)
+
+    def compiled_products(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        shape = np.broadcast_shapes(q.shape, v.shape)
+        q, v = (np.array(np.broadcast_to(a, shape)).reshape(-1, shape[-1]) for a in (q, v))
+        out = np.empty_like(v)
+        product_loop(q, v, out)
+        return out.reshape(shape)
+
+    return compiled_slopes, compiled_products
+
+
+_PRODUCTS: WeakKeyDictionary[Any, Product] = WeakKeyDictionary()
+
+
+def _symbolic_product(symbols: Any) -> Product:
+    """∇²V·v, generated once from the derivatives that do not vanish."""
+    import sympy as sp
+
+    if symbols in _PRODUCTS:
+        return _PRODUCTS[symbols]
+    directions = sp.symbols(f"v1:{symbols.ndof + 1}", real=True)
+    changes = [_derivative(f, symbols.q, directions) for f in symbols.slope]
+    d, function = symbols.ndof, _generated((*symbols.q, *directions), changes)
+
+    def product(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        both = np.concatenate(np.broadcast_arrays(q, v), axis=-1)
+        rows = np.ascontiguousarray(both.reshape(-1, both.shape[-1]).T)
+        return function(rows).T.reshape(*both.shape[:-1], d)
+
+    _PRODUCTS[symbols] = product
+    return product
+
+
+def _differences_of(slopes: Callable[[np.ndarray], np.ndarray]) -> Product:
+    def product(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        q, v = np.broadcast_arrays(q, v)
+        largest = np.abs(v).max(-1, keepdims=True)
+        length = PRODUCT * np.maximum(np.abs(q).max(-1, keepdims=True), 1e-300)
+        return largest * derivative(slopes, q, v / np.where(largest > 0, largest, 1.0), length)
+
+    return product
+
+
+def _compiled(gradient: Any, hessian_vector: Any) -> tuple[Callable[..., None], Callable[..., None] | None]:
+    """The loops of both over the states (n, d)."""
     from numba import njit
 
     @njit(error_model="numpy")
-    def values(Q: Any, inverse_mass: Any, force_gradient: Any, F: Any, G: Any) -> None:
-        slope = np.empty(Q.shape[1])
+    def slopes(Q: Any, out: Any) -> None:
         for s in range(Q.shape[0]):
-            gradient(Q[s], slope)
-            F[s] = -slope
-            if force_gradient:
-                hessian_vector(Q[s], inverse_mass @ slope, G[s])
+            gradient(Q[s], out[s])
+
+    if hessian_vector is None:
+        return slopes, None
 
     @njit(error_model="numpy")
-    def derivatives(Q: Any, inverse_mass: Any, along: float, F: Any, G: Any, DF: Any, DG: Any) -> None:
-        n, d = Q.shape
-        slope, e, upper, lower = np.empty(d), np.zeros(d), np.empty(d), np.empty(d)
-        for s in range(n):
-            q = Q[s].copy()
-            gradient(q, slope)
-            for i in range(d):
-                F[s, i] = -slope[i]
-            for j in range(d):
-                e[j] = 1.0
-                hessian_vector(q, e, upper)
-                e[j] = 0.0
-                for i in range(d):
-                    DF[s, i, j] = -upper[i]
-            if along == 0.0:
-                continue
-            v = inverse_mass @ slope
-            size, largest = 1e-300, 0.0
-            for i in range(d):
-                size, largest = max(size, abs(q[i])), max(largest, abs(v[i]))
-            hessian_vector(q, v, upper)
-            for i in range(d):
-                G[s, i] = upper[i]
-            h = along * size / (largest if largest > 0.0 else 1.0)
-            q_upper, q_lower = q + h * v, q - h * v
-            for j in range(d):
-                e[j] = 1.0
-                hessian_vector(q_upper, e, upper)
-                hessian_vector(q_lower, e, lower)
-                e[j] = 0.0
-                for i in range(d):
-                    DG[s, i, j] = (upper[i] - lower[i]) / (2 * h)
+    def products(Q: Any, V: Any, out: Any) -> None:
+        for s in range(Q.shape[0]):
+            hessian_vector(Q[s], V[s], out[s])
 
-    return values, derivatives
+    return slopes, products
 
 
 def _generated(variables: Sequence[Any], expressions: list[Any]) -> Callable[[np.ndarray], np.ndarray]:

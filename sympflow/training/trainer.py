@@ -9,10 +9,12 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import plain
+from sympflow.arrays import is_tensor
 from sympflow.flow.flow_map import FlowMap, check_system
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
@@ -35,17 +37,17 @@ from sympflow.training.options import (
     plain_numbers,
 )
 from sympflow.training.points import digest, handed_in
-from sympflow.training.runs import Run, SearchRun
-from sympflow.training.session import Path, Session
+from sympflow.training.runs import Run, Unstarted
+from sympflow.training.session import Deadline, OutOfTime, Path, Session
 from sympflow.training.split_fit import SplitRun
-from sympflow.training.starts import default_primed, new_network, scaling_of
+from sympflow.training.starts import check_step, default_primed, new_network, scaling_of
 from sympflow.training.table_fit import TableRun
 
 BUDGET = 60.0  # seconds of a fit of which nothing else is said
 
 
 def train(
-    system: HamiltonianSystem,
+    system: HamiltonianSystem | None = None,
     dt: float | None = None,
     *,
     kind: str | None = None,
@@ -99,6 +101,7 @@ def train(
     Parameters
     ----------
     system : HamiltonianSystem
+        H, which a flow is fitted to, with `data` as well.
     dt : float, optional
         Δt, the longest time of the map; the default is that of `flow`, for a new primed flow what suits the system's
         frequencies on Ω (see `sympflow.training.starts`) and gains most in trials, else 1.
@@ -177,7 +180,7 @@ def train(
         On Ctrl-C before there is anything to return, or twice.
     """
     _refuse_unknown(unknown)
-    check_system(system)
+    system = _known_system(system, data)
     dt = plain(dt)
     if dt is not None and not (is_number(dt) and 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
@@ -222,23 +225,27 @@ def fit_flow(
     """`train`, its arguments sorted: a new flow or a given one, its fit, and the surroundings of the run."""
     domain = _domain_for(system, domain)
     untold = flow is None and asked.restarts is None and asked.steps is None
-    hurried = untold and session.time_budget is None and session.resume is None
     kind = _kind_of(system, flow, new, asked)
+    hurried = untold and session.time_budget is None and session.resume is None and kind == "primed" and asked.searches
+    if hurried:
+        session.time_budget = BUDGET
     with session.interruption:
         tried = None
+        if dt is not None and flow is None:
+            check_step(system, domain, dt)
         if flow is not None:
             _check_flow(flow, system, dt)
+            if kind in ("primed", "sympflow", "mlp"):  # the others have exact parts, however fast
+                check_step(system, domain, flow.dt)
         elif kind == "primed":
             if asked.searches:
                 TableOptions.of(asked)  # raises before trials
             flow, tried = _new_primed(system, domain, dt, new, asked, session)
-        run = _run_of(system, domain, kind, flow, tried, dt, new, asked)
+            session.cut = session.interruption.asked  # what trials were left out does not end the run
+        system.vector_field(domain.sample(1, 0))  # what is compiled for it counts, but not as labels
+        run = _run_of(system, domain, kind, flow, tried, dt, new, asked, session.deadline)
         if session.resume is not None:
             run.load(session.resume)
-        hurried = hurried and isinstance(run, SearchRun)
-        if hurried:
-            session.time_budget = BUDGET
-        run.seconds += session.begin_run()
         reason = run.go(session)
     return run.finish(reason, expected=hurried)
 
@@ -257,6 +264,23 @@ def _refuse_unknown(options: dict[str, Any]) -> None:
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"is `{close[0]}` meant?" if close else f"choose from {', '.join(known[1:])}."
         raise TypeError(f"`{name}` is no option of train(): {hint}")
+
+
+def _known_system(system: Any, data: Any) -> HamiltonianSystem:
+    """Return H, of which data alone tell nothing."""
+    if not isinstance(system, HamiltonianSystem) and (data is not None or system is None or _is_data(system)):
+        raise TypeError(
+            f"`system` must be a HamiltonianSystem, the H of the flow; got {type(system).__name__}: train() fits a "
+            "flow to an H that is known, and `data` adds labels to that; it finds no H in data. Define H by "
+            "HamiltonianSystem.from_sympy, or where you have its vector field by "
+            "sympflow.interop.systems.from_module, and pass data=(t, x, y) beside it."
+        )
+    check_system(system)
+    return system
+
+
+def _is_data(value: Any) -> bool:
+    return isinstance(value, list | tuple | dict | np.ndarray) or is_tensor(value)
 
 
 def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
@@ -323,7 +347,7 @@ def _meant(system: HamiltonianSystem, new: NewFlow, asked: NewFit) -> str:
     if asked.loss is None:
         of_networks += asked.given((*OF_LOSSES, "data"))
     wants_network = not asked.searches or of_networks or new.given(NewFlow.OF_NETWORKS)
-    return "primed" if fits and system.symbols is not None and not wants_network else "sympflow"
+    return "primed" if fits and not wants_network else "sympflow"
 
 
 def _check_primable(system: HamiltonianSystem, new: NewFlow, asked: NewFit) -> None:
@@ -397,6 +421,7 @@ def _run_of(
     dt: float | None,
     new: NewFlow,
     asked: NewFit,
+    deadline: Deadline,
 ) -> Run:
     """The run of a copy of a flow, or of a new network if there is none."""
     searched = kind in ("primed", "split") and asked.searches
@@ -408,15 +433,26 @@ def _run_of(
         flow.certified = None  # of the numbers as they were
         dt = flow.dt
     if searched and isinstance(flow, SplitFlow):
-        return SplitRun.start(flow, system, domain, SplitOptions.of(asked))
+        split = SplitOptions.of(asked)
+        try:
+            return SplitRun.start(flow, system, domain, split, deadline)
+        except OutOfTime as cut:
+            return Unstarted(flow, system, domain, None, split, str(cut))
     dt = 1.0 if dt is None else float(dt)
     labels = None if asked.data is None else handed_in(asked.data, system, dt)
     checksum = None if labels is None else digest(labels)
     if searched and isinstance(flow, PrimedFlow):
         table = TableOptions.of(asked, checksum)
-        return TableRun.start(flow, system, domain, scaling_of(domain, dt, table.seed), table, labels, tried)
+        scaling = scaling_of(domain, dt, table.seed)
+        try:
+            return TableRun.start(flow, system, domain, scaling, table, labels, tried, deadline)
+        except OutOfTime as cut:
+            return Unstarted(flow if tried is None else tried, system, domain, scaling, table, str(cut))
     options = LossOptions.of(asked, kind, checksum)
     scaling = scaling_of(domain, dt, options.seed)
     if flow is None:
         flow = new_network(system, new, dt, scaling, options.seed)
-    return LossRun.start(flow.requires_grad_(True), system, domain, scaling, options, labels)
+    try:
+        return LossRun.start(flow.requires_grad_(True), system, domain, scaling, options, labels, deadline)
+    except OutOfTime as cut:
+        return Unstarted(flow, system, domain, scaling, options, str(cut))

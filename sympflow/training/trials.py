@@ -13,16 +13,17 @@ from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 from sympflow.training.options import TableOptions
-from sympflow.training.points import Stream, states
-from sympflow.training.session import Session
+from sympflow.training.points import USELESS, Stream, shares_missed, states, step_errors
+from sympflow.training.session import Deadline, OutOfTime, Session
 from sympflow.training.starts import PHASE, SEED, Primed, default_primed
-from sympflow.training.table_fit import USELESS, TableRun, shares_missed
+from sympflow.training.table_fit import TableRun
 
 PHASES = (PHASE, 1.25, 1.5)  # ω Δt of the flows that are tried
 STARTS, STEPS, FINAL_STEPS, POINTS = 6, 40, 160, 80  # of a trial's search, and what follows the best start
 ORBITS, LENGTH = 20, 256  # held-out orbits of a trial, and their steps
 ORDER = 8  # with which the errors of classical schemes fall where these flows are used
 MOST_NDOF = 3  # beyond which trials take too long
+SHARE = 0.5  # of a time budget
 DEAREST = 2.0  # times the cycles of a kick without them, beyond which curvature terms are not tried
 GOAL = 1e-5  # the energy error of a trial that a default flow shall not exceed, if one of those tried does not
 ALIKE = 2.0  # energy errors above that which differ by no more are the same
@@ -49,7 +50,8 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     e, the work of a classical scheme of order p is in proportion to e^(−1/p); so the flow gains most whose kicks take
     the fewest cycles in a unit of time, times e^(1/p), p = 8. Curvature terms are tried with the best Δt, unless they
     make kicks twice as dear. Where all errors are above 1e-5 it is the flow with the smallest, or of those with up to
-    twice that the one that gains most. The choice depends on the system and Ω alone, not on the machine.
+    twice that the one that gains most. The choice depends on the system and Ω alone, not on the machine, unless half
+    the time of the session is not enough for the trials.
 
     Parameters
     ----------
@@ -68,7 +70,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     except ValueError:  # H has no compiled form
         return Trial(starts[0], math.inf)
     session, found = Session() if session is None else session, dict[Primed, Trial]()
-    interruption = session.interruption
+    interruption, deadline = session.interruption, session.deadline.part(SHARE)
 
     def best(tried: list[Primed]) -> Primed:
         least = min(found[start].error for start in tried)
@@ -85,17 +87,19 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
 
         def tried(start: Primed) -> bool:
             bar.tries(len(found), f"Δt = {start.dt:g}{', with curvature terms' * start.curvature}")
-            made = trial(start, system, domain, session)
-            if not interruption.asked:  # else it says nothing
+            made = trial(start, system, domain, deadline)
+            if not deadline.over():  # else it says nothing
                 found[start] = made
                 # from the first flow on Ctrl-C ends the trials
                 interruption.armed = interruption.armed or made.flow is not None
             return start in found
 
-        plain = best([start for start in starts if not interruption.asked and tried(start)])
-        bent = replace(plain, curvature=True)
-        more = bends and not interruption.asked and tried(bent)
-        return found[best([plain, bent]) if more else plain]
+        plain = [start for start in starts if not deadline.over() and tried(start)]
+        if not plain:
+            return Trial(starts[0], math.inf)
+        bent = replace(best(plain), curvature=True)
+        more = bends and not deadline.over() and tried(bent)
+        return found[best([best(plain), bent]) if more else best(plain)]
 
 
 def tried_starts(system: HamiltonianSystem, domain: Domain, curvature: bool = True) -> list[Primed]:
@@ -104,32 +108,28 @@ def tried_starts(system: HamiltonianSystem, domain: Domain, curvature: bool = Tr
     return plain + [replace(start, curvature=True) for start in plain if curvature]
 
 
-def trial(start: Primed, system: HamiltonianSystem, domain: Domain, session: Session | None = None) -> Trial:
+def trial(start: Primed, system: HamiltonianSystem, domain: Domain, deadline: Deadline | None = None) -> Trial:
     """A short fit of the flow at its Δt, with its relative energy error, the median over held-out orbits.
 
     Infinite if there are no orbits, or the fit leads nowhere: where in the median it misses a tenth of what a step
     moves a state. The energy alone would be kept best by the identity.
     """
-    interruption = (Session() if session is None else session).interruption
-
-    def stopped() -> bool:
-        return interruption.asked
-
+    deadline = Session().deadline if deadline is None else deadline
     options = TableOptions(
         points=POINTS, label_times=1, restarts=STARTS, steps=STEPS, reference_states=ORBITS, seed=SEED
     )
     scaling = Scaling.of_samples(states(domain, 1000, SEED, Stream.SCALING), start.dt)
     try:
-        run = TableRun.start(start.flow(system), system, domain, scaling, options)
-    except ValueError:  # of no state of Ω the solution exists up to Δt
+        run = TableRun.start(start.flow(system), system, domain, scaling, options, deadline=deadline)
+    except (ValueError, OutOfTime):  # of no state of Ω the solution exists up to Δt, or it takes too long
         return Trial(start, math.inf)
     fit = run.frozen
     assert fit is not None
     for _ in range(STARTS):
-        run.minima.append(run.next_minimum(stopped))
+        run.minima.append(run.next_minimum(deadline))
     best = min(run.minima, key=lambda m: m.cost)
     for final in filter(None, (fit, run.weighted)):
-        best = final.minimize(best.x, FINAL_STEPS, stopped, thorough=True)
+        best = final.minimize(best.x, FINAL_STEPS, deadline, thorough=True)
     table = fit.coefficients(best.x)[:, :1]
     y = states(domain, ORBITS, SEED, Stream.REFERENCE)
     H, worst, y = system.hamiltonian(y), np.zeros(len(y)), y.T
@@ -143,7 +143,8 @@ def trial(start: Primed, system: HamiltonianSystem, domain: Domain, session: Ses
             worst = np.maximum(worst, np.abs(system.hamiltonian(y.T) - H))
         worst /= np.abs(H) if system.energy_scale is None else system.energy_scale
     error = float(np.median(np.where(np.isnan(worst), np.inf, worst)))
-    if not math.isfinite(error) or interruption.asked:
+    if not math.isfinite(error) or deadline.over():
         return Trial(start, error)
     run.table.assign(run.table.continued(table[:, 0]))
+    run.flow.figures = step_errors(run.differences())
     return Trial(start, error, run.flow)

@@ -8,8 +8,8 @@ import pytest
 from sympflow import Box, HamiltonianSystem, SympFlow, systems, train
 from sympflow.flow.scaling import Scaling
 from sympflow.training.options import TableOptions
-from sympflow.training.points import Labels
-from sympflow.training.table_fit import USELESS, TableRun, differences, distance, shares_missed
+from sympflow.training.points import USELESS, Labels, shares_missed
+from sympflow.training.table_fit import TableRun, differences, distance
 
 PENDULUM = systems.pendulum()
 FEW = {"restarts": 1, "steps": 8, "points": 40, "reference_states": 20, "progress": False}

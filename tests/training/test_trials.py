@@ -87,7 +87,7 @@ def test_the_error_of_a_trial_is_that_of_its_orbits(monkeypatch):
 
 
 def test_a_domain_without_solutions_has_no_trial(monkeypatch):
-    def start(*_):
+    def start(*_, **__):
         raise ValueError("`domain` holds no states whose solution exists up to `dt`")
 
     monkeypatch.setattr(TableRun, "start", start)

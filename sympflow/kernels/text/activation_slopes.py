@@ -32,3 +32,10 @@ def softplus(a):
 @njit(**OPTIONS)
 def logcosh(a):
     return abs(a) + math.log1p(math.exp(-2.0 * abs(a))) - math.log(2.0), fast_tanh(a)
+
+
+@njit(**OPTIONS)
+def swish(a):
+    sigmoid_a = 0.5 + 0.5 * fast_tanh(0.5 * a)
+    value = a * sigmoid_a
+    return value, sigmoid_a + value * (1.0 - sigmoid_a)

@@ -10,7 +10,9 @@ from typing import Any, Protocol
 
 from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.time_transformation import time_transformed
 from sympflow.training.options import NewFit, NewFlow
 from sympflow.training.session import Session
 from sympflow.training.starts import Start
@@ -79,6 +81,16 @@ class Recipe:
             flow = fit_flow(system, None, flow, NewFlow(), fit, domain, Session(progress=progress))
         flow.figures["training_cpu_seconds"] = round(time.process_time() - before, 3)
         return flow
+
+    def identify(self, flow: FlowMap) -> None:
+        """Put into the flow by what it knows its system: H all over the domain."""
+        system = self.system()
+        if flow.origin is None:
+            flow.identify(system, flow.domain)
+            return
+        flow.identify(time_transformed(system, flow.origin.shift))
+        made = {**flow.recipe["transforms"], "identity": Identity.of(system, self.domain_of(system)).to_dict()}
+        flow.recipe = {**flow.recipe, "transforms": made}
 
     def measure(self, flow: FlowMap) -> dict[str, Any]:
         """The figures by which flows are chosen, measured again."""
