@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arrays import is_tensor, to_numpy
+from sympflow.arrays import differentiable, is_tensor, to_numpy
 
 MAX_SAVED_VALUES = 10_000_000
 MAX_ASKED_VALUES = 1_000_000_000
@@ -30,6 +30,7 @@ def check_t_span(t_span: Any, ends_by_event: bool | None = None) -> tuple[float,
 
     None where there are no events that could end it.
     """
+    check_not_followed("t_span", t_span)
     try:
         if type(t_span) is tuple and len(t_span) == 2 and {type(t_span[0]), type(t_span[1])} <= _PLAIN:
             t0, t1 = float(t_span[0]), float(t_span[1])
@@ -58,6 +59,16 @@ def check_t_span(t_span: Any, ends_by_event: bool | None = None) -> tuple[float,
     return t0, t1
 
 
+def check_not_followed(name: str, times: Any) -> None:
+    """Raise a TypeError if times carry derivatives: where times are numbers they would be dropped in silence."""
+    parts = times if type(times) in (tuple, list) else (times,)
+    if any(is_tensor(t) and differentiable(t) for t in parts):
+        raise TypeError(
+            f"`{name}` is a tensor that torch differentiates or transforms, but the times of a solution are numbers: "
+            "use sympflow.interop.torchdiffeq.odeint, whose times are differentiated, or pass `.detach()`."
+        )
+
+
 def _real(x: Any) -> float:
     if type(x) is float or type(x) is int:
         return float(x)
@@ -70,6 +81,7 @@ def check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
     plain = type(t_eval) is np.ndarray and t_eval.dtype == _FLOAT64 and t_eval.ndim == 1
     if plain and 0 < t_eval.size <= MAX_SAVED_VALUES and _proper(t_eval, t0, t1):
         return t_eval.copy()
+    check_not_followed("t_eval", t_eval)
     try:
         times = to_numpy(t_eval)
         if times.dtype.kind not in "fiu":

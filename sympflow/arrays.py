@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from functools import cache
 from typing import Any
 
@@ -20,6 +21,15 @@ def is_tensor(x: object) -> bool:
     """Return True for a torch tensor, decided without importing torch."""
     kind = type(x)
     return kind is not np.ndarray and kind.__module__.partition(".")[0] == "torch" and hasattr(x, "requires_grad")
+
+
+def library(x: Array) -> Any:
+    """Return the module of the functions for `x`: NumPy or torch."""
+    if is_tensor(x):
+        import torch
+
+        return torch
+    return np
 
 
 def concatenate(parts: Sequence[Array]) -> Array:
@@ -63,12 +73,146 @@ def per_state(h: Any, y: Array) -> Any:
 
 
 def to_numpy(x: Array) -> np.ndarray:
-    """A NumPy view or copy of `x`, detached from any graph."""
-    return x.detach().cpu().numpy() if is_tensor(x) else np.asarray(x)
+    """A NumPy view or copy of `x`, detached from any graph.
+
+    Raises
+    ------
+    TypeError
+        If `x` has no such values: inside `torch.func.vmap` it stands for many arrays, and in a graph that
+        `torch.compile` traces for none.
+    """
+    if not is_tensor(x):
+        return np.asarray(x)
+    found = values(x)
+    if found is None or found.ndim != x.ndim:
+        where = "in a graph that torch.compile traces" if found is None else "inside torch.func.vmap"
+        raise TypeError(
+            f"The values of a tensor of shape {tuple(x.shape)} are needed as numbers, which it has not {where}: make "
+            "this call outside, on the results."
+        )
+    return found
+
+
+def differentiable(*arrays: Any) -> bool:
+    """Return True if torch follows one of these tensors, so that NumPy would silently drop what it follows.
+
+    That is a graph (reverse mode), a tangent (forward mode), a transform of `torch.func`, or a graph that
+    `torch.compile` traces.
+    """
+    return any(is_tensor(x) and _is_followed(x) for x in arrays)
+
+
+def values(x: Any) -> np.ndarray | None:
+    """Return the values of a tensor, (*lanes, *x.shape), the axes first over which `torch.func.vmap` maps.
+
+    None where there are none to be read, in a graph that `torch.compile` traces.
+    """
+    plain, order = _behind(x)
+    if plain is None:
+        return None
+    import torch
+
+    with torch._C._DisableFuncTorch():
+        return plain.cpu().numpy().transpose(order)
+
+
+def has_values(x: Array) -> bool:
+    """Return True unless `x` is a tensor without values, in a graph that `torch.compile` traces."""
+    return not is_tensor(x) or _behind(x)[0] is not None
+
+
+def one_lane(x: Array) -> np.ndarray:
+    """Return the values of `x`, under `torch.func.vmap` those of the first lane.
+
+    Raises
+    ------
+    TypeError
+        If there are none, in a graph that `torch.compile` traces.
+    """
+    found = values(x) if is_tensor(x) else np.asarray(x)
+    return to_numpy(x) if found is None else found[(0,) * (found.ndim - x.ndim)]
+
+
+def lanes(x: Array) -> int:
+    """Return the number of axes, hidden in the shape of `x`, over which `torch.func.vmap` maps it."""
+    return len(_behind(x)[1]) - x.ndim if is_tensor(x) else 0
+
+
+def readable(x: Array) -> bool:
+    """Return True if the values of `x` are there, one for each entry: not under vmap, nor where a graph is traced."""
+    if not is_tensor(x):
+        return True
+    plain, order = _behind(x)
+    return plain is not None and len(order) == x.ndim
+
+
+def untransformed() -> AbstractContextManager[Any]:
+    """Return a context in which tensors are made outside of the transforms of `torch.func` that may be under way."""
+    from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
+
+    return temporarily_clear_interpreter_stack()
+
+
+def _behind(x: Any) -> tuple[Any, list[int]]:
+    """The tensor with the values of x, in no graph, and the order of its axes: lanes first; None without values."""
+    import torch
+
+    if torch.compiler.is_dynamo_compiling():
+        return None, []
+    functorch, axes = torch._C._functorch, list(range(x.ndim))
+    with torch._C._DisableFuncTorch():
+        while functorch.is_functorch_wrapped_tensor(x):
+            if functorch.is_batchedtensor(x):
+                axes.insert(functorch.maybe_get_bdim(x), min([0, *axes]) - 1)
+            x = functorch.get_unwrapped(x)
+        order = sorted(range(len(axes)), key=axes.__getitem__)
+        return (None if _is_symbolic(x) else x.detach()), order
+
+
+def transformed(*arrays: Any) -> bool:
+    """Return True if torch follows one of these tensors by other means than a graph for reverse mode."""
+    return any(is_tensor(x) and _is_transformed(x) for x in arrays)
+
+
+def _is_followed(x: Any) -> bool:
+    import torch
+
+    return bool(x.requires_grad and torch.is_grad_enabled()) or _is_transformed(x)
+
+
+def _is_transformed(x: Any) -> bool:
+    import torch
+    from torch.autograd import forward_ad
+
+    if torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x) or _is_symbolic(x):
+        return True
+    return forward_ad.unpack_dual(x).tangent is not None
+
+
+def _is_symbolic(x: Any) -> bool:
+    """True for the tensors without values with which `torch.compile` traces."""
+    from torch._subclasses import FakeTensor
+    from torch._subclasses.functional_tensor import FunctionalTensor
+
+    return isinstance(x, FakeTensor | FunctionalTensor)
+
+
+def finite_states(y: Array, *, in_any_lane: bool = False) -> np.ndarray:
+    """Return True for each of the states y (..., k) that is finite: (...) booleans.
+
+    Of tensors under `torch.func.vmap` those that are finite in all lanes, or in any; where there are no values, all.
+    """
+    if not is_tensor(y):
+        return np.isfinite(y).all(-1)
+    finite = values(all_finite(y))
+    if finite is None:
+        return np.ones(y.shape[:-1], dtype=bool)
+    hidden = tuple(range(finite.ndim - y.ndim + 1))
+    return np.asarray(finite.any(hidden) if in_any_lane else finite.all(hidden))
 
 
 def all_finite(y: Array) -> Array:
-    """Return True for each of the states y (..., k) that is finite: (...) booleans."""
+    """Return True for each of the states y (..., k) that is finite: (...) booleans of the library of y."""
     if is_tensor(y):
         import torch
 
@@ -86,11 +230,20 @@ def full_of_nan(y: Array) -> Array:
 
 
 def jvp(f: Callable[[Array], Array], x: Array, v: Array) -> tuple[Array, Array]:
-    """Return f(x) and its derivative at the tensor x along v, by torch, without the warnings that its set-up gives."""
+    """Return f(x) and its derivative at the tensor x along v, by torch, without the warnings that its set-up gives.
+
+    By forward mode; inside `torch.autograd.forward_ad`, which cannot be nested, by reverse mode twice.
+    """
     import torch
 
     _set_up()
-    y, dy = torch.func.jvp(f, (x,), (v,))[:2]
+    try:
+        y, dy = torch.func.jvp(f, (x,), (v,))[:2]
+    except RuntimeError as error:
+        if "Nested forward mode" not in str(error):
+            raise
+        y, pull = torch.func.vjp(f, x)[:2]
+        dy = torch.func.vjp(lambda u: pull(u)[0], torch.zeros_like(y))[1](v)[0]
     return y, dy
 
 

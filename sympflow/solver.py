@@ -17,11 +17,11 @@ from sympflow.arguments import (
     check_t_eval,
     check_t_span,
 )
-from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
+from sympflow.arrays import Array, finite_states, is_tensor, lanes, readable
 from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import run_and_search
-from sympflow.integrators.contract import Integrator, Outcome, Problem
+from sympflow.integrators.base import report_lanes, run_and_search
+from sympflow.integrators.contract import Failure, Integrator, Outcome, Problem
 from sympflow.integrators.domain_exit import check_domain, check_system_along
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
 from sympflow.integrators.registry import build, check_applies, naming_plugin
@@ -130,6 +130,11 @@ def solve(
     action = ("warn" if integrator.trained else "ignore") if on_domain_exit is None else on_domain_exit
     if not isinstance(action, str) or action not in ("warn", "stop", "ignore"):
         raise ValueError(f"`on_domain_exit` must be 'warn', 'stop' or 'ignore'; got {on_domain_exit!r}.")
+    if action == "stop" and not readable(y_start):
+        raise ValueError(
+            "`on_domain_exit` 'stop' needs the values of the states, which torch.func.vmap and torch.compile hide: use "
+            "'warn' or 'ignore' there."
+        )
     if search is not None:
         check_event_search(search, y_start, abs(t1 - t0))
     problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend, search)
@@ -144,13 +149,14 @@ def solve(
         outcome, problem = run(integrator, problem)
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
-    if outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0):
+    failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
+    if failed and readable(y_start):
         from sympflow.integrators.diagnosis import note_singularities
 
         note_singularities(outcome, integrator, problem)
     if integrator.trained:
         check_system_along(outcome, integrator, system, y_start)
-    if action != "ignore":
+    if action != "ignore" and readable(outcome.y):
         check_domain(outcome, integrator, system, action)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
     return Solution(
@@ -238,9 +244,12 @@ def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
         )
     if outcome.finite or (not is_tensor(outcome.y) and np.isfinite(outcome.y).all()):
         return
-    finite = to_numpy(all_finite(outcome.y))
+    finite = finite_states(outcome.y)
     bad = ~finite.all(0) & (np.asarray(outcome.status) >= 0)
     if not bad.any():
+        return
+    if is_tensor(outcome.y) and lanes(outcome.y):
+        report_lanes(outcome, finite, Failure.NON_FINITE)
         return
     first = int(np.argmin(finite[(slice(None), *np.argwhere(bad)[0])] if bad.ndim else finite))
     index = f" (trajectory {', '.join(map(str, np.argwhere(bad)[0].tolist()))})" if bad.ndim else ""
@@ -277,7 +286,7 @@ def check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
         )
     if math.prod(y0.shape) == 0:
         raise ValueError(f"`y0` is an empty batch, of shape {tuple(y0.shape)}: pass at least one state.")
-    if np.count_nonzero(np.isfinite(to_numpy(y0))) < math.prod(y0.shape):
+    if not finite_states(y0).all():
         raise ValueError("`y0` must be finite; it holds NaN or infinity. Remove these states.")
     return y0
 
@@ -329,6 +338,11 @@ def check_events(events: Any, event_step: Any) -> EventSearch | None:
 
 def check_event_search(search: EventSearch, y0: Array, duration: float) -> None:
     """Refuse events along a batch, and samples of them that would never end."""
+    if search.events and not readable(y0):
+        raise ValueError(
+            "`events` are found by the values of the states, which torch.func.vmap and torch.compile hide: call solve "
+            "outside of them, one state at a time."
+        )
     if search.events and y0.ndim != 1:
         raise ValueError(
             f"`events` are found along one trajectory, but `y0` is a batch of shape {tuple(y0.shape)}: solve one state "

@@ -29,6 +29,7 @@ OPTIONS = {
     "methods": ("method_names",),
     "flow": ("flow_name",),
     "path": ("flow_name", "method_name", "method_names"),
+    "n": ("batch", "orbits"),
     "dtype": ("dtypes",),
 }
 """Arguments of the library that commands have by other names: the first one counts that the command has."""
@@ -61,9 +62,7 @@ def in_options(message: str, context: typer.Context) -> str:
         option = next((options[other] for other in others if other in options), None)
         if option is not None:
             options.setdefault(name, option)
-    for phrase, here in PHRASES.items():
-        message = message.replace(phrase, here)
-    message = re.sub(r"`(\w+)`", lambda m: f"`{options.get(m[1], m[1])}`", message)
+    message = re.sub(r"`(\w+)`", lambda m: f"`{options.get(m[1], m[1])}`", in_words(message))
     given = re.compile(r"`?(?<![\w:.-])(?P<name>\w+)=(?P<value>'[^']*'|[\d.eE+-]*\d|(?=\W|$))`?")
 
     def as_option(found: re.Match[str]) -> str:
@@ -71,6 +70,13 @@ def in_options(message: str, context: typer.Context) -> str:
         return found[0] if option is None else f"`{option} {value}`" if value else f"`{option}`"
 
     return given.sub(as_option, message)
+
+
+def in_words(message: str) -> str:
+    """A message with its remedies in Python as those on the command line."""
+    for phrase, here in PHRASES.items():
+        message = message.replace(phrase, here)
+    return message
 
 
 @contextlib.contextmanager
@@ -85,7 +91,7 @@ def reporting(context: typer.Context) -> Iterator[None]:
     except typer.Exit:
         raise
     except (ValueError, TypeError) as error:
-        said = str(error) if isinstance(error, Usage) else in_options(str(error), context)
+        said = in_words(str(error)) if isinstance(error, Usage) else in_options(str(error), context)
         err.print(f"Error: {said}", style="red", markup=False)
         raise typer.Exit(2) from error
     except (RuntimeError, ImportError, OSError, ArithmeticError) as error:

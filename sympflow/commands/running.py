@@ -10,7 +10,7 @@ import typer
 
 from sympflow.arguments import MAX_ASKED_VALUES, check_counts
 from sympflow.commands import completion
-from sympflow.commands.console import Quiet, out, print_table, ready_file, reporting, show, write_solution
+from sympflow.commands.console import Quiet, in_options, out, print_table, ready_file, reporting, show, write_solution
 from sympflow.commands.words import (
     Backend,
     Method,
@@ -82,7 +82,7 @@ def solve(
         if to is not None:
             write_solution(sol, to)
         worst = max_energy_error(sol) if len(sol.t) else np.nan
-        out.print(sol.message)
+        out.print(in_options(sol.message, ctx), markup=False)
         out.print(f"{len(sol.t)} outputs, largest energy error {worst:.2e}")
         out.print(", ".join(f"{k} = {v:.4g}" if isinstance(v, float) else f"{k} = {v}" for k, v in sol.stats.items()))
         if len(sol.t):

@@ -6,7 +6,7 @@ import difflib
 import inspect
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, overload
@@ -181,9 +181,18 @@ def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> lis
                 takes = f"its parameters are {', '.join(sorted(known))}" if known else "it has no parameters"
                 option = name.replace("_", "-")
                 raise Usage(f"`--{option}` is no option, nor a parameter of {', '.join(names)} ({takes}): see --help.")
-        return [_scene(name, factory, pairs, shared) for name, factory, pairs in parted]
+        return _told_apart([_scene(name, factory, pairs, shared) for name, factory, pairs in parted])
     except (ValueError, TypeError) as error:  # of what the system is made of, which is no option of the command
         raise Usage(str(error)) from error
+
+
+def _told_apart(found: list[Scene]) -> list[Scene]:
+    """The scenes with keys that differ, so that none overwrites the files of another."""
+    keys = [scene.key for scene in found]
+    numbers = [keys[:i].count(key) + 1 for i, key in enumerate(keys)]
+    return [
+        scene if n == 1 else replace(scene, key=f"{scene.key}-{n}") for scene, n in zip(found, numbers, strict=True)
+    ]
 
 
 def shown(value: Any) -> str:
@@ -222,7 +231,10 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
             if not rest:
                 raise ValueError(f"`{name}` is no option, or lacks its value: see --help.")
             value = rest.pop(0)
-        shared[name[2:].replace("-", "_")] = value
+        key = name[2:].replace("-", "_")
+        if key in shared:
+            raise Usage(f"`{name}` is given twice: give it once.")
+        shared[key] = value
     return names, shared
 
 
@@ -241,7 +253,7 @@ def _parted(word: str) -> tuple[str, Callable[..., HamiltonianSystem], list[str]
             f"`system` {name!r} is unknown. {hint}Choose from {', '.join(scene_names())}, or name an own one, "
             "file.py:name or file.toml."
         )
-    return name, _making(name), pairs
+    return name, _making(name), [pair for pair in pairs if pair]
 
 
 def _scene(name: str, factory: Callable[..., HamiltonianSystem], pairs: list[str], shared: dict[str, str]) -> Scene:
@@ -333,11 +345,15 @@ def _option(word: str) -> Any:
 
 
 def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
-    pairs = [word.partition("=") for word in words]
-    for key, equals, value in pairs:
+    found: dict[str, str] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
         if not (key and equals and value):
-            raise ValueError(f"`{key}` needs a value: write name:{key or 'option'}=number.")
-    return [(key, value) for key, _, value in pairs]
+            raise Usage(f"`{word}` behind a colon is no option with a value: write name:{key or 'option'}=value.")
+        if key in found:
+            raise Usage(f"`{key}` is given twice: give it once.")
+        found[key] = value
+    return list(found.items())
 
 
 @overload

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor, nn
 
+from sympflow.arrays import to_numpy
 from sympflow.flow.files import MAX_DEGREE, Refused, checked_integer
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.layers import Drift, Kick, Layer
@@ -183,7 +184,7 @@ class ClockedFlow(SympFlow):
 
     def clock_numbers(self) -> tuple[float, ...]:
         """Return the c_k that the clock has now, the last one first."""
-        return self._numbers.current(lambda: tuple(self.clock.numbers.detach().cpu().double().numpy()[::-1].tolist()))
+        return self._numbers.current(lambda: tuple(to_numpy(self.clock.numbers).astype(float)[::-1].tolist()))
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> ClockedFlowKernel:
         if compensated:

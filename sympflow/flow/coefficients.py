@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from sympflow.arrays import to_numpy
 from sympflow.flow.potentials import Time
 
 
@@ -117,7 +118,7 @@ class Coefficients(FreeTable):
     def at(self, tau: float | np.ndarray) -> np.ndarray:
         """c_i(τ): (n,), or (n, N) for N values of τ."""
         exponents = np.array(self.exponents, dtype=float).reshape(-1, *[1] * np.ndim(tau))
-        return self.table.detach().cpu().double().numpy() @ np.asarray(tau) ** exponents
+        return to_numpy(self.table).astype(float) @ np.asarray(tau) ** exponents
 
     def value(self, i: int, t: Time) -> Time:
         """t^m c_i(t/Δt)."""
@@ -191,7 +192,7 @@ class Column(FreeTable):
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """`values` of an array of times: (…, n)."""
-        c = self.table.detach().cpu().double().numpy()
+        c = to_numpy(self.table).astype(float)
         return np.asarray(t)[..., None] ** self.power * (self.functions(t) @ c.T)
 
     def functions(self, t: np.ndarray) -> np.ndarray:

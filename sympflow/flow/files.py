@@ -2,7 +2,7 @@
 
 The metadata entry "sympflow" is a JSON object: format, version (of the package), kind, architecture, dt, domain,
 system, fingerprint, recipe, figures, checksum (of the tensors), and, where there are any, certificate and identity
-(the H of the system, at states of the domain and as an expression).
+(the H of the system, at states of the domain and as an expression) and unfitted (intervals of t without labels).
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Description:
     ----------
     domain, system, fingerprint, recipe, figures, certificate
         `FlowMap`'s domain, system_name, fingerprint, recipe, figures, certified.
-    identity
+    identity, unfitted
         `FlowMap`'s own.
     """
 
@@ -91,6 +91,7 @@ class Description:
     figures: dict[str, Any] = field(default_factory=dict)
     certificate: Certificate | None = None
     identity: Identity | None = None
+    unfitted: tuple[tuple[float, float], ...] = ()
 
     @classmethod
     def of_record(cls, record: dict[str, Any], ndof: int) -> Self:
@@ -117,7 +118,8 @@ class Description:
         domain = None if record["domain"] is None else _domain(record["domain"], ndof)
         if fingerprint is not None:
             fingerprint = tuple(math.nan if v is None else float(v) for v in fingerprint)
-        return cls(domain, system, fingerprint, record["recipe"], record["figures"], certificate, identity)
+        unfitted = _intervals(record.get("unfitted", []))
+        return cls(domain, system, fingerprint, record["recipe"], record["figures"], certificate, identity, unfitted)
 
 
 # writing ---------------------------------------------------------------------------------------------------
@@ -150,6 +152,8 @@ def write(
         "figures": description.figures,
         "checksum": checksum(tensors),
     }
+    if description.unfitted:
+        record["unfitted"] = description.unfitted
     if description.identity is not None:
         record["identity"] = description.identity.to_dict()
     if description.certificate is not None:
@@ -413,6 +417,15 @@ def _identity(record: dict[str, Any], ndof: int) -> Identity | None:
         return Identity.from_dict(record["identity"], ndof)
     except ValueError as error:
         raise Refused(f"its identity of the system is not admissible: {error}") from None
+
+
+def _intervals(pairs: Any) -> tuple[tuple[float, float], ...]:
+    """Return the intervals of times in a record; else they are refused."""
+    if not isinstance(pairs, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in pairs):
+        raise Refused("its unfitted times are not a list of pairs")
+    if not all(_is_number(v) for pair in pairs for v in pair):
+        raise Refused("its unfitted times are not numbers")
+    return tuple((float(low), float(high)) for low, high in pairs)
 
 
 def _check_system(name: Any, fingerprint: Any) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any, ClassVar, Self
@@ -13,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.arguments import plain
+from sympflow.arrays import differentiable, finite_states, is_tensor, readable, values
 from sympflow.flow.certificate import Certificate, certify
 from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
@@ -74,6 +77,9 @@ class FlowMap(nn.Module):
         The system it was trained for.
     identity : Identity or None
         H of that system, all over Ω; None for a flow without a system, or from a file that was written before.
+    unfitted : tuple of (float, float)
+        Open intervals of t in which it was never compared with anything: those between the times of labels, if these
+        were few and it was fitted to nothing else. Results there come with a warning.
     recipe, figures : dict
         How it was trained, and what it achieved.
     history : list of dict
@@ -103,6 +109,7 @@ class FlowMap(nn.Module):
         self.fingerprint: tuple[float, ...] | None = None
         self.system_name: str | None = None
         self.identity: Identity | None = None
+        self.unfitted: tuple[tuple[float, float], ...] = ()
         self._origin: tuple[dict[str, Any], Origin] | None = None
         self.recipe: dict[str, Any] = {}
         self.figures: dict[str, Any] = {}
@@ -196,6 +203,7 @@ class FlowMap(nn.Module):
             If an argument has the wrong type, shape, dtype or device, or t is not finite.
         """
         t = self._checked_time(t, x)
+        self.warn_of_times(t)
         if isinstance(t, float):
             return self._whole(whole_steps(abs(t), self.dt), t < 0, x)
         k, r, back, x = self._split(t, x)
@@ -206,12 +214,40 @@ class FlowMap(nn.Module):
     def inverse(self, t: float | Tensor, x: Tensor) -> Tensor:
         """The exact inverse of ψ_t, for every t: arguments as for the call."""
         t = self._checked_time(t, x)
+        self.warn_of_times(t)
         if isinstance(t, float):
             return self._whole(whole_steps(abs(t), self.dt), t >= 0, x, remainder_first=True)
         k, r, back, x = self._split(t, x)
         x = self._remainder(r, ~back, x)
         x = self._repeat(k * ~back, True, x)
         return self._repeat(k * back, False, x)
+
+    def warn_of_times(self, t: Any) -> None:
+        """Warn where a time, or one of several, is k·Δt + r with an r at which the flow was fitted to nothing.
+
+        Warns
+        -----
+        UserWarning
+        """
+        if not self.unfitted:
+            return
+        seen = values(t) if is_tensor(t) else np.asarray(t)
+        if seen is None:  # in a graph that torch.compile traces
+            return
+        times = np.abs(seen.astype(float)).reshape(-1)
+        slack = 1e-9 * self.dt
+        for low, high in self.unfitted:
+            r = times % self.dt  # a multiple of Δt, up to rounding, is at one end or the other
+            inside = (r > low + slack) & (r < high - slack) & (r > slack) & (r < self.dt - slack)
+            if inside.any():
+                warnings.warn(
+                    f"The flow was fitted to labels, of which none is at a time between {low:g} and {high:g}: what it "
+                    f"gives at t = {times[inside][0]:g} was compared with nothing. Ask for results at multiples of its "
+                    f"Δt = {self.dt:g}, or train it with labels at more times, or by loss='labels+residual'.",
+                    UserWarning,
+                    stacklevel=3,
+                )
+                return
 
     def _whole(self, count: tuple[int, float], back: bool, x: Tensor, remainder_first: bool = False) -> Tensor:
         """k steps and the remainder of one time for all states."""
@@ -236,17 +272,14 @@ class FlowMap(nn.Module):
     def _repeat(self, k: Tensor, back: bool, x: Tensor) -> Tensor:
         """ψ̄_Δt, or its inverse, k times, with a count k for each state."""
         step = self.psi_inverse if back else self.psi
-        for j in range(int(k.max()) if k.numel() else 0):
-            active = k > j
-            x = x.index_put((active,), step(self.dt, x[active]))
+        for j in range(int(to_values(k).max(initial=0))):
+            x = _where(k > j, lambda t, y: step(self.dt, y), k, x)
         return x
 
     def _remainder(self, r: Tensor, back: Tensor, x: Tensor) -> Tensor:
-        moving = (r > 0) | r.requires_grad  # at r = 0 the state stays, but has a derivative
-        for step, active in ((self.psi, moving & ~back), (self.psi_inverse, moving & back)):
-            if active.any():
-                x = x.index_put((active,), step(r[active], x[active]))
-        return x
+        moving = (r > 0) | differentiable(r)  # at r = 0 the state stays, but has a derivative
+        x = _where(moving & ~back, self.psi, r, x)
+        return _where(moving & back, self.psi_inverse, r, x)
 
     # a run of many steps --------------------------------------------------------------------------------------
 
@@ -333,6 +366,7 @@ class FlowMap(nn.Module):
             self.figures,
             certificate=self.certified,
             identity=self.identity,
+            unfitted=self.unfitted,
         )
 
     def describe(self, description: Description) -> None:
@@ -341,7 +375,7 @@ class FlowMap(nn.Module):
             description.domain, description.system, description.fingerprint,
         )  # fmt: skip
         self.recipe, self.figures, self.certified = description.recipe, description.figures, description.certificate
-        self.identity = description.identity
+        self.identity, self.unfitted = description.identity, description.unfitted
 
     # its system ---------------------------------------------------------------------------------------------
 
@@ -514,12 +548,12 @@ class FlowMap(nn.Module):
                 f"`x` must have shape (..., {2 * self.ndof}), states [q, p]; got {tuple(x.shape)}: "
                 "put them on the last axis."
             )
-        if isinstance(t, Tensor) and (t.ndim or t.requires_grad):
+        if isinstance(t, Tensor) and (t.ndim or differentiable(t)):
             if t.dtype == torch.bool or t.is_complex():
                 raise TypeError(f"`t` must be real times; got {t.dtype}: use a floating-point tensor.")
             if t.device != x.device:
                 raise ValueError(f"`t` is on {t.device} but `x` on {x.device}: move one of them.")
-            if not torch.isfinite(t).all():
+            if not finite_states(t[..., None]).all():
                 raise ValueError("`t` must be finite: remove its NaN and infinite entries.")
             try:
                 torch.broadcast_shapes(t.shape, x.shape[:-1])
@@ -545,8 +579,8 @@ class FlowMap(nn.Module):
         low, high, slack = 0.0, 0.0, 1e-14
         if isinstance(t, float):
             low = high = t
-        elif t.numel():
-            low, high = float(t.detach().min()), float(t.detach().max())
+        elif t.numel() and (times := values(t)) is not None:
+            low, high = float(times.min()), float(times.max())
             slack = 1e-6 if t.dtype == torch.float32 else slack
         if low < 0 or high > self.dt * (1 + slack):
             raise ValueError(f"`t` must lie in [0, dt] = [0, {self.dt:g}]; got {low} to {high}: reduce it modulo dt.")
@@ -555,6 +589,32 @@ class FlowMap(nn.Module):
     def __repr__(self) -> str:
         system = f" of {self.system_name}" if self.system_name else ""
         return f"<{type(self).__name__}{system}: ndof={self.ndof}, dt={self.dt:g}, {self.n_parameters} parameters>"
+
+
+def to_values(t: Tensor) -> np.ndarray:
+    """Return the values of times, with those of all lanes of `torch.func.vmap`.
+
+    Raises
+    ------
+    TypeError
+        If there are none, in a graph that `torch.compile` traces.
+    """
+    found = values(t)
+    if found is None:
+        raise TypeError(
+            "`t` is a tensor without values where torch.compile traces, but it says how many steps of Δt are made: "
+            "pass a number, or call psi(t, x), for t in [0, Δt]."
+        )
+    return found
+
+
+def _where(active: Tensor, step: Callable[[Tensor, Tensor], Tensor], t: Tensor, x: Tensor) -> Tensor:
+    """step(t, x) where `active`, which is of the batch shape of x, and x elsewhere."""
+    if not to_values(active).any():
+        return x
+    if active.ndim and readable(active) and readable(x):
+        return x.index_put((active,), step(t[active], x[active]))
+    return torch.where(active[..., None], step(t, x), x)  # under vmap each lane chooses its own
 
 
 def whole_steps(t: float, dt: float) -> tuple[int, float]:
@@ -588,8 +648,8 @@ def whole_steps_of_each(t: Tensor, dt: float) -> tuple[Tensor, Tensor]:
     near = ratio.round()
     exact = (ratio - near).abs() <= 2 * eps * near
     k = torch.where(exact, near, ratio.floor())
-    if k.numel() and k.max() > MAX_STEPS:
-        raise _too_many_steps(float(t.detach().max()), dt)
+    if to_values(k).max(initial=0) > MAX_STEPS:
+        raise _too_many_steps(float(to_values(t).max()), dt)
     r = t - k * dt
     return k.to(torch.int64), torch.where(exact, r - r.detach(), r).clamp(0.0, dt)
 

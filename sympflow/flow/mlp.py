@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.flow.files import checked_widths
-from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.flow_map import FlowMap, to_values
 from sympflow.flow.potentials import activation_named, count_weights, hidden_widths, outer
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
@@ -101,7 +101,7 @@ class MLPFlow(FlowMap):
     def forward(self, t: float | Tensor, x: Tensor) -> Tensor:
         """ψ_t(x) for t ≥ 0, extended beyond Δt as SympFlow is; for t < 0 a ValueError, for want of an inverse."""
         checked = self._checked_time(t, x)
-        negative = checked < 0 if isinstance(checked, float) else bool((checked < 0).any())
+        negative = checked < 0 if isinstance(checked, float) else bool((to_values(checked) < 0).any())
         if negative:
             raise ValueError("`t` must not be negative: an MLPFlow has no exact inverse; use a SympFlow to go back.")
         return super().forward(t, x)

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.arguments import check_flag, plain
+from sympflow.arrays import to_numpy
 from sympflow.flow.coefficients import Coefficients, Entry
 from sympflow.flow.files import MAX_DEGREE, MAX_LAYERS, Refused, checked_integer
 from sympflow.flow.flow_map import FlowMap, check_system
@@ -255,7 +256,7 @@ class Tables:
         numbers = [c.table for c in columns_of(substeps)]
         self.placements = {(c.dtype, c.device) for c in numbers}
         exponents = columns_of(substeps)[0].exponents
-        self._coefficients = {id(c): c.table.detach().cpu().double().numpy() for c in columns_of(substeps)}
+        self._coefficients = {id(c): to_numpy(c.table).astype(float) for c in columns_of(substeps)}
         self._exponents = np.array(exponents, dtype=float)
         self._even = exponents[1:2] != (1,)
         self._kept: dict[Any, Any] = {}

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from sympflow.arguments import check_flag, plain
-from sympflow.arrays import jvp
+from sympflow.arrays import jvp, to_numpy
 from sympflow.flow.coefficients import Column
 from sympflow.flow.files import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
 from sympflow.flow.flow_map import FlowMap, check_system
@@ -343,7 +343,7 @@ class SplitFlow(SympFlow):
     def _coefficient_maps(self) -> list[Map]:
         """The maps with the coefficients of the columns, (K, …), in place of their values."""
         return self._assemble(
-            lambda column: column.table.detach().cpu().double().numpy(),
+            lambda column: to_numpy(column.table).astype(float),
             lambda entries: np.stack(entries, axis=-1),
             np.eye(1, self.terms)[0],
         )

@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sympflow.arrays import to_numpy
+
 T = TypeVar("T")
 
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -124,10 +126,14 @@ class Contents:
 
     def snapshot(self) -> bytes:
         """Return the bytes of all numbers."""
-        addresses = [w.data_ptr() for d in self._tensors for w in d.values() if w is not None]
+        tensors = [w for d in self._tensors for w in d.values() if w is not None]
+        try:
+            addresses = [w.data_ptr() for w in tensors]
+        except RuntimeError:  # handed in by functional_call inside torch.func: they have no memory of their own
+            self._shared = False
+            return b"".join(np.ascontiguousarray(to_numpy(w)) for w in tensors)  # type: ignore[misc]
         if addresses != self._addresses or not self._shared:
-            tensors = [w for d in self._tensors for w in d.values() if w is not None]
-            self._views = [np.ascontiguousarray(w.detach().cpu().numpy()) for w in tensors]
+            self._views = [np.ascontiguousarray(to_numpy(w)) for w in tensors]
             self._addresses, self._shared = addresses, all(w.device.type == "cpu" for w in tensors)
         return b"".join(self._views)  # type: ignore[arg-type]
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, is_tensor, stack, to_numpy
+from sympflow.arrays import Array, differentiable, is_tensor, stack, to_numpy
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.function_checks import Tested, check_writes, test
 
@@ -51,6 +51,15 @@ class CallableHamiltonian(Definition):
         self._potential, self._hamiltonian = potential, hamiltonian
         self._gradient, self._hessian_vector = gradient, hessian_vector
         self.differentiates_itself = gradient is None and hessian_vector is None
+
+    def learns(self, y: Array) -> bool:
+        if self.numba_functions is not None:
+            return False
+        try:
+            slope = self.potential_gradient(y[..., : self.ndof]) if self.separable else self.gradient(y)
+        except (TypeError, ValueError, RuntimeError):  # written for NumPy arrays: torch can follow nothing in it
+            return False
+        return differentiable(slope) and not differentiable(y)
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
@@ -216,7 +225,7 @@ def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[in
     if tensor._version != version:
         raise ValueError(f"`{name}` writes into its argument, the state of the run: let it work on a copy, q.clone().")
     value = _checked(value, tensor, name, tail)
-    return value if is_tensor(x) else value.detach().numpy()
+    return value if is_tensor(x) else to_numpy(value)
 
 
 def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:

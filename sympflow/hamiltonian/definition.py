@@ -39,6 +39,10 @@ class Definition:
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""
 
+    def learns(self, y: Array) -> bool:
+        """Return True if torch follows numbers within the functions at the states y (..., 2d), such as weights."""
+        return False
+
     def potential_hessian(self, q: Array) -> Array:
         """∇²V(q): (..., d) to (..., d, d)."""
         raise NotImplementedError(f"{type(self).__name__} must define potential_hessian().")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.arrays import Array, is_tensor, one_lane
 from sympflow.hamiltonian.domain import Domain
 
 SPREAD = 0.05
@@ -110,7 +110,7 @@ def _precision(x: Array) -> np.dtype:
 
 
 def _numbers(value: Array) -> np.ndarray:
-    return to_numpy(value).astype(float)
+    return one_lane(value).astype(float)
 
 
 def _evaluated(functions: Tested, x: Array, n_given: int) -> tuple[Array, np.ndarray, np.ndarray] | None:

@@ -88,6 +88,10 @@ class Hamiltonian:
         g = self._definition.gradient(y)
         return concatenate([g[..., d:], -g[..., :d]])
 
+    def learns(self, y: Array) -> bool:
+        """Return True if torch follows numbers of H other than y (..., 2d), a tensor: such as a network's weights."""
+        return self._definition.learns(y)
+
     def __call__(self, t: float, y: Array) -> Array:
         """The right-hand side fun(t, y) of `scipy.integrate.solve_ivp` and `torchdiffeq.odeint`."""
         return self.vector_field(y)

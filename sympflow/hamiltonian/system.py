@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import floats, real_number
-from sympflow.arrays import Array, to_numpy
+from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import fingerprint
@@ -255,7 +255,7 @@ class HamiltonianSystem(Hamiltonian):
             return
         from sympflow.hamiltonian.function_checks import FEW, probe_states
 
-        given = to_numpy(like) if math.prod(like.shape) else self.y0
+        given = one_lane(like) if math.prod(like.shape) else self.y0
         probes = probe_states(given, self.domain, 2 * self.ndof)
         n_given = min(FEW, math.prod(like.shape) // (2 * self.ndof))
         self._definition.check(probes, like, n_given)

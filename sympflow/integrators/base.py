@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_dt
-from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
+from sympflow.arguments import check_dt, check_not_followed
+from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, stack
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
 from sympflow.integrators.contract import ENDED, FINISHED, Failure, Integrator, Outcome, Problem, Steps, finished
@@ -335,7 +335,7 @@ def rollout(
     out: Any = [] if tensor else np.full((len(save), *y.shape), np.nan, dtype=y.dtype)
     wanted = save.tolist()
     position = 0
-    finite = np.where(to_numpy(all_finite(y)), n_steps, -1)
+    finite = np.where(finite_states(y, in_any_lane=True), n_steps, -1)
     if wanted and wanted[0] == 0:
         out.append(y) if tensor else out.__setitem__(0, y)
         position = 1
@@ -352,12 +352,12 @@ def rollout(
                         out[position] = y
                     position += 1
             k += 1
-            failed = (finite == n_steps) & ~to_numpy(all_finite(y))
+            failed = (finite == n_steps) & ~finite_states(y, in_any_lane=True)
             if failed.any():
                 z = y_start
                 for j in range(start, k):
                     z = step(j, z)
-                    first = failed & (finite == n_steps) & ~to_numpy(all_finite(z))
+                    first = failed & (finite == n_steps) & ~finite_states(z, in_any_lane=True)
                     finite = np.where(first, j, finite)
     if tensor:
         out += [full_of_nan(y)] * (len(wanted) - len(out))
@@ -508,7 +508,7 @@ class GridRun:
             y, k, chunk = states[n], k + n, 2 * chunk
 
         t, y_out = times[:delivered], _join(outputs)
-        finite_outputs = to_numpy(all_finite(y_out))  # a shorter step may overflow too
+        finite_outputs = finite_states(y_out)  # a shorter step may overflow too
         failed = failed or not finite_outputs.all()
         t_end = search.end[0] if search.end else grid.time(k) if failed else grid.t1
         keep = finite_outputs & ((t - t_end) * np.sign(grid.h) <= 0)
@@ -569,7 +569,7 @@ class GridRun:
 
         y_end = dense(grid.t1)
         search.n_dense += 1
-        if not to_numpy(all_finite(y_end)):
+        if not finite_states(y_end):
             return False
         inner = self._samples(search, y[None], grid.remainder)
         return bool(search.step(t, y, grid.t1, y_end, dense, inner[0]))
@@ -593,8 +593,11 @@ class GridRun:
             if finite.ndim:
                 outcome.status = np.zeros(finite.shape, dtype=int)
             return
-        ok = to_numpy(all_finite(outcome.y))  # (n, ...): shorter steps may overflow too
-        if finite.ndim:
+        ok = finite_states(outcome.y)  # (n, ...): shorter steps may overflow too
+        if is_tensor(outcome.y) and lanes(outcome.y):
+            if not ok.all():
+                report_lanes(outcome, ok, self.integrator.breakdown)
+        elif finite.ndim:
             outcome.status = np.where((finite < n_run) | ~ok.all(0), -1, 0)
             failed = np.argwhere(outcome.status)
             if failed.size:
@@ -606,14 +609,28 @@ class GridRun:
                     f"{len(failed)} of {finite.size} trajectories failed, the first of them (index "
                     f"{', '.join(map(str, i))}) after t = {grid.time(int(finite[i])):.17g}. {what}. {remedy}."
                 )
-            return
-        if finite < n_run or not ok.all():
+        elif finite < n_run or not ok.all():
             last = int(finite) if finite < n_run else int(grid.locate(outcome.t[~ok][:1])[0][0])
             outcome.status = -1
             outcome.stats["failed_at"] = grid.time(last)
             outcome.message = self._failure(grid.time(last), last)
             keep = int(np.argmin(ok)) if not ok.all() else len(ok)
             outcome.t, outcome.y = outcome.t[:keep], outcome.y[:keep]
+
+
+def report_lanes(outcome: Outcome, ok: np.ndarray, breakdown: Failure) -> None:
+    """Flag a run under `torch.func.vmap` of which some lane failed: `ok` (n, ...) is False where one is not finite.
+
+    The states of all lanes stay, for they are one tensor: no time of one may depend on another.
+    """
+    what, remedy = breakdown.value
+    bad = ~ok.all(0)
+    outcome.status = np.where(bad, -1, 0) if bad.ndim else -1
+    outcome.stats["failed_at"] = float(outcome.t[int(np.argmin(ok.reshape(len(ok), -1).all(1)))])
+    outcome.message = (
+        f"{what} in some lane of torch.func.vmap before t = {outcome.stats['failed_at']:.17g}. {remedy}, or pass the "
+        "states as a batch, whose trajectories are told apart."
+    )
 
 
 class GridSolution:
@@ -644,6 +661,7 @@ class GridSolution:
         GridSolution.__init__(self, integrator.stepper(problem), grid, states)
 
     def __call__(self, t: float | np.ndarray) -> Array:
+        check_not_followed("t", t)
         times = np.atleast_1d(np.asarray(t, dtype=float))
         count, remainder = self.grid.locate(times)
         y = self.states[count]

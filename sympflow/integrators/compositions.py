@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
+from sympflow.arrays import Array, concatenate, is_tensor, library, per_state, to_numpy
 from sympflow.hamiltonian.copies import both, coupling_strength, distance, mean, two_copies
 from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, like, linear_and_rest, map_evaluations
@@ -305,7 +305,7 @@ class MollifiedLinearRest(LinearRest):
         assert self.parts.linear is not None
         representatives = self.parts.linear.representatives
         times = _each_class(h, self.parts)
-        return _module(times).sinc(like(self.parts.linear.frequencies[representatives], times) * times / np.pi)
+        return library(times).sinc(like(self.parts.linear.frequencies[representatives], times) * times / np.pi)
 
 
 class MidpointLinearRest(LinearRest):
@@ -320,7 +320,7 @@ class MidpointLinearRest(LinearRest):
         kinds = [parts.linear.kinds[j] for j in parts.linear.representatives]
         rates = like(parts.linear.rates[parts.linear.representatives], times)
         oscillates = like(np.array([kind == "oscillator" for kind in kinds]), times) != 0
-        module = _module(times)
+        module = library(times)
         angle = 2 * module.arctan(rates * times / 2)
         return module.where(oscillates, angle / module.where(oscillates, rates, 1 + 0 * rates), times)
 
@@ -330,14 +330,6 @@ def _each_class(s: Any, parts: ExactParts) -> Any:
     if is_tensor(s):
         return s[..., None] * s.new_ones(parts.n_classes)
     return np.asarray(s)[..., None] * np.ones(parts.n_classes, dtype=getattr(s, "dtype", float))
-
-
-def _module(x: Any) -> Any:
-    if is_tensor(x):
-        import torch
-
-        return torch
-    return np
 
 
 class SolvableParts(ExactMaps):
@@ -370,7 +362,8 @@ class SolvableParts(ExactMaps):
         return known[parts]
 
     def maps(self, h: Any) -> list[Map]:
-        parts, maps = self.parts, list[Map]()
+        parts = self.parts
+        maps: list[Map] = []
         for weight in self.weights:
             outer = [self._map(k, weight * h / 2) for k in parts.sequence[:-1]]
             inner = self._map(parts.sequence[-1], weight * h)

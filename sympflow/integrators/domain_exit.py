@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sympflow.arrays import Array, all_finite, is_tensor, to_numpy
+from sympflow.arrays import Array, finite_states, has_values, is_tensor, one_lane, readable
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Outcome
@@ -53,10 +53,12 @@ def check_system_along(outcome: Outcome, integrator: Integrator, system: Hamilto
     identity = integrator.identity_for(system)
     if identity is None or identity.is_proved(system):
         return
+    if not has_values(outcome.y):
+        return
     width = 2 * system.ndof
-    y = to_numpy(outcome.y)
+    y = one_lane(outcome.y)
     chosen = y[np.linspace(0, len(y) - 1, min(len(y), STATES_COMPARED)).astype(int)].reshape(-1, width)
-    starts = to_numpy(y0).reshape(-1, width)
+    starts = one_lane(y0).reshape(-1, width)
     rows = [states[:: max(1, len(states) // MOST_COMPARED)] for states in (starts, chosen)]
     states = np.concatenate(rows).astype(float)
     states = states[np.isfinite(states).all(-1)]
@@ -83,6 +85,11 @@ def check_start(flow: FlowMap, system: HamiltonianSystem, y0: Array, compiled: b
     domain = _domain(flow, system)
     if domain is None:
         return
+    if not readable(y0):
+        raise ValueError(
+            "`tol` needs the values of y0, to see that it is in the domain of the flow, and torch.func.vmap and "
+            "torch.compile hide them: pass the flow itself, as `flow`."
+        )
     inside = np.asarray(domain.contains(y0))
     if not inside.all():
         which = f" (trajectory {', '.join(map(str, np.argwhere(~inside)[0].tolist()))})" if inside.ndim else ""
@@ -115,7 +122,7 @@ def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSy
     if inside.all():
         return
     with np.errstate(invalid="ignore"):
-        inside = inside | ~to_numpy(all_finite(outcome.y))  # what has become non-finite is reported as that
+        inside = inside | ~finite_states(outcome.y)  # what has become non-finite is reported as that
     if inside.all():
         return
     first = int(np.argmin(inside.reshape(len(inside), -1).all(1)))

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, is_tensor
+from sympflow.arrays import Array, is_tensor, to_numpy, untransformed
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.shipped import choose, forces_saved, named, shipped, shipped_flows
 from sympflow.hamiltonian.fingerprint import Identity
@@ -42,7 +42,8 @@ _KNOWN: dict[tuple[Any, ...], Any] = {}
 def known(key: tuple[Any, ...], make: Callable[[], T]) -> T:
     """Return the result of `make`, made once in a process for each key: files that ship are read once."""
     if key not in _KNOWN:
-        _KNOWN[key] = make()
+        with untransformed():  # what is kept must not be a tensor of a transform that ends
+            _KNOWN[key] = make()
     return _KNOWN[key]
 
 
@@ -120,7 +121,10 @@ class FlowIntegrator(OwnStepper):
     def check(self, system: HamiltonianSystem) -> None:
         if self.flow is not None:
             self.flow.check_system(system)
-        self._check_dt(self.flow_for(system))
+        flow = self.flow_for(system)
+        self._check_dt(flow)
+        if self.dt is not None:
+            flow.warn_of_times(self.dt)
 
     def step_length(self, system: HamiltonianSystem) -> float:
         return float(self.dt if self.dt is not None else self.flow_for(system).dt)
@@ -194,7 +198,7 @@ class FlowStepper(Stepper):
         if not is_tensor(y0):
             with torch.no_grad():
                 states, finite = self.rollout(torch.from_numpy(np.ascontiguousarray(y0)), h, n_steps, save)
-            return states.numpy(), finite
+            return to_numpy(states), finite
         flow, t = self.flow, abs(h)
         if not flow.symplectic:  # without an inverse: the call says so where h < 0
             return rollout(lambda k, y: flow(h, y), y0, n_steps, save)
@@ -217,6 +221,10 @@ class CompiledFlowStepper(KernelStepper):
         super().__init__(integrator, problem, kernel)
         self.flow = flow
 
+    def shorter(self, y: Array, h: Any) -> Array:
+        self.flow.warn_of_times(h)
+        return super().shorter(y, h)
+
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         counted = self.kernel.evaluations(n_steps, n_saved, n_extra)
         return self.flow.evaluations(n_steps, n_saved, n_extra, "compiled") if counted is None else counted
@@ -228,7 +236,7 @@ def _apply(function: Any, y: Array, h: float | Array) -> Array:
         return function(h, y)
     with torch.no_grad():
         length = torch.from_numpy(np.array(h)) if np.ndim(h) else float(h)
-        return function(length, torch.from_numpy(np.ascontiguousarray(y))).numpy()
+        return to_numpy(function(length, torch.from_numpy(np.ascontiguousarray(y))))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, concatenate, is_tensor, per_state, to_numpy
+from sympflow.arrays import Array, concatenate, is_tensor, library, per_state, to_numpy, values
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import KernelStepper, OwnStepper, Problem, Stepper, compiled_loops, rollout
 from sympflow.integrators.contract import Failure
@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from sympflow.kernels.implicit_loops import ImplicitKernel, Tableau
 
 MOST_ITERATIONS = 50
+DIFFERENTIATED = 3
+"""Iterations in the graph, and so the orders of derivatives that are right."""
+TRACED_ITERATIONS = 8
+"""Newton's iterations in a graph that `torch.compile` traces; from K = 0 some five converge where dt is sensible."""
 _BUTCHER = "J. C. Butcher, Implicit Runge–Kutta processes, Math. Comp. 18 (1964) 50–64"
 _SYMPLECTIC = (
     "symplectic by J. M. Sanz-Serna, Runge–Kutta schemes for Hamiltonian systems, BIT 28 (1988) 877–883; any H"
@@ -125,23 +129,48 @@ class Gauss(OwnStepper):
         return K, iteration * done.size
 
     def _tensor_stages(self, system: HamiltonianSystem, y: Array, h: Any) -> tuple[Array, int]:
-        """`_stages` of tensors: solved without a graph, then two more iterations in it, which give it derivatives.
+        """`_stages` of tensors: solved without a graph, then three more iterations in it, which give it derivatives.
 
-        At the solution each differentiable iteration of Newton's method doubles the order of the derivatives that are
-        right, so first and second ones are.
+        They are Newton's with the matrix of the solution held fixed: each makes derivatives of one more order right.
         """
         import torch
 
-        constant = h.detach() if is_tensor(h) else h
-        with torch.no_grad():
-            flat = to_numpy(y.detach())
-            K0, iterations = self._stages(system, flat, to_numpy(constant) if is_tensor(h) else h)
-        K = torch.as_tensor(K0, dtype=y.dtype, device=y.device)
         A, _, scale = (torch.as_tensor(c, dtype=y.dtype, device=y.device) for c in self.tableau)
-        for _ in range(2):
-            M, residual = _equations(system, y, K, h, A, scale)
-            K = K - torch.linalg.solve_ex(M, residual[..., None])[0][..., 0].reshape(K.shape)
+        with torch.no_grad():
+            start, length = y.detach(), h.detach() if is_tensor(h) else h
+            K, iterations = _solved_tensors(system, start, length, A, scale)
+            M, _ = _newton_matrix(system, start[..., None, :] + A @ K, length, A, scale)
+            inverse = torch.linalg.inv_ex(M)[0]
+        for _ in range(DIFFERENTIATED):
+            K = K - (inverse @ _residual(system, y, K, h, A, scale)[..., None])[..., 0].reshape(K.shape)
         return K, iterations
+
+
+def _solved_tensors(system: HamiltonianSystem, y: Any, h: Any, A: Any, scale: Any) -> tuple[Any, int]:
+    """The K of `Gauss._stages` for tensors, by the same iteration, and its count over all states.
+
+    Under `torch.func.vmap` it runs until the last lane has converged; where a graph is traced, which cannot depend on
+    values, `TRACED_ITERATIONS` times.
+    """
+    import torch
+
+    eps = torch.finfo(y.dtype).eps
+    K = y[..., None, :] * torch.zeros_like(A[:, :1])
+    before = y[..., 0] * 0 + torch.inf
+    done = before < 0
+    for iteration in range(1, MOST_ITERATIONS + 1):
+        M, residual = _equations(system, y, K, h, A, scale)
+        change = torch.linalg.solve_ex(M, residual[..., None])[0][..., 0].reshape(K.shape)
+        K = torch.where(done[..., None, None], K, K - change)
+        size = _relative_size(change, y, K, system.ndof)
+        small = (size <= eps**0.7) | ((size <= eps**0.57) & (size >= before / 2))
+        lost = ~(size < torch.inf) & ~done
+        K = torch.where(lost[..., None, None], torch.nan, K)
+        done, before = done | small | lost, size
+        found = values(done)
+        if iteration == TRACED_ITERATIONS if found is None else found.all():
+            break
+    return torch.where(done[..., None, None], K, torch.nan), iteration * done.numel()
 
 
 class _Counts:
@@ -184,12 +213,16 @@ class ArrayGauss(_Counts, Stepper):
 
 
 def _equations(system: HamiltonianSystem, y: Array, K: Array, h: Any, A: Array, scale: Array) -> tuple[Array, Array]:
-    """Newton's matrix (..., s·2d, s·2d) and the residuals K_i − h scale_i f(Y_i), (..., s·2d)."""
-    Y = y[..., None, :] + A @ K
-    M, _ = _newton_matrix(system, Y, h, A, scale)
+    """Newton's matrix (..., s·2d, s·2d) and the residuals of `_residual`."""
+    M, _ = _newton_matrix(system, y[..., None, :] + A @ K, h, A, scale)
+    return M, _residual(system, y, K, h, A, scale)
+
+
+def _residual(system: HamiltonianSystem, y: Array, K: Array, h: Any, A: Array, scale: Array) -> Array:
+    """K_i − h scale_i f(Y_i), (..., s·2d)."""
     outer = h[..., None] if getattr(h, "ndim", 0) else h
-    residual = K - outer * scale[:, None] * system.vector_field(Y)
-    return M, residual.reshape(*residual.shape[:-2], -1)
+    residual = K - outer * scale[:, None] * system.vector_field(y[..., None, :] + A @ K)
+    return residual.reshape(*residual.shape[:-2], -1)
 
 
 def _newton_matrix(system: HamiltonianSystem, Y: Array, h: Any, A: Array, scale: Array) -> tuple[Array, Array]:
@@ -219,14 +252,15 @@ def _solved(M: np.ndarray, x: np.ndarray) -> np.ndarray:
         return out
 
 
-def _relative_size(change: np.ndarray, y: np.ndarray, K: np.ndarray, d: int) -> np.ndarray:
+def _relative_size(change: Array, y: Array, K: Array, d: int) -> Array:
     """The larger of ‖ΔK_q‖/(‖q‖ + ‖K_q‖) and ‖ΔK_p‖/(‖p‖ + ‖K_p‖), (...)."""
+    xp = library(y)
     ratios = []
     for part in (slice(0, d), slice(d, None)):
-        top = np.abs(change[..., part]).max((-2, -1))
-        scale = (np.abs(y[..., part]) + np.abs(K[..., part]).max(-2)).max(-1)
-        ratios.append(np.where(top == 0, 0.0, top / np.where(scale == 0, 1, scale)))
-    return np.maximum(*ratios)
+        top = xp.amax(abs(change[..., part]), (-2, -1))
+        scale = xp.amax(abs(y[..., part]) + xp.amax(abs(K[..., part]), -2), -1)
+        ratios.append(xp.where(top == 0, 0 * top, top / xp.where(scale == 0, 1 + 0 * scale, scale)))
+    return xp.maximum(*ratios)
 
 
 def gauss_legendre(stages: int) -> Tableau:

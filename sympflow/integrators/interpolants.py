@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sympflow.arguments import check_not_followed
 from sympflow.arrays import Array, is_tensor, stack
 
 if TYPE_CHECKING:
@@ -88,6 +89,7 @@ class Piecewise:
         return np.array(begin), np.array(length), coefficients
 
     def __call__(self, t: float | np.ndarray) -> Array:
+        check_not_followed("t", t)
         times = np.atleast_1d(np.asarray(t, dtype=float))
         if times.size and not (times.min() >= self.t_min and times.max() <= self.t_max):
             raise ValueError(f"`t` must lie in [{self.t_min:g}, {self.t_max:g}], the interval that was solved.")
@@ -123,6 +125,7 @@ class Batch:
         self.places = [(run.sol, j) for run, j in sources]
 
     def __call__(self, t: float | np.ndarray) -> Array:
+        check_not_followed("t", t)
         times = np.atleast_1d(np.asarray(t, dtype=float))
         if times.size and not (times.min() >= self.t_min and times.max() <= self.t_max):
             raise ValueError(f"`t` must lie in [{self.t_min:g}, {self.t_max:g}], the interval that was solved.")

@@ -16,7 +16,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt
-from sympflow.arrays import Array, all_finite, full_of_nan, is_tensor, stack, to_numpy
+from sympflow.arrays import (
+    Array,
+    differentiable,
+    finite_states,
+    full_of_nan,
+    is_tensor,
+    readable,
+    stack,
+    to_numpy,
+    transformed,
+)
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Recorder
 from sympflow.integrators.contract import ENDED, Integrator, Outcome, Problem, Steps, finished
@@ -116,6 +126,13 @@ class Watched(Integrator):
                 failure = f"torchdiffeq stopped after t = {trace.reached:.17g} ({error}). End `t_span` earlier."
             except TooManyStepsError as error:
                 failure, trace.spent = str(error), True
+            except RuntimeError as error:  # their own autograd.Function has derivatives in reverse mode only
+                if not transformed(y):
+                    raise
+                raise TypeError(
+                    f"`method` {self.name!r} of torchdiffeq cannot be run in forward mode or inside torch.func: use "
+                    "torch.autograd.grad, or a method of fixed steps, such as 'rk4'."
+                ) from error
         return trace, failure
 
     @property
@@ -127,6 +144,11 @@ class Watched(Integrator):
         raise NotImplementedError
 
     def run(self, problem: Problem) -> Outcome:
+        if not readable(problem.y0):
+            raise TypeError(
+                f"`method` {self.name!r} chooses its steps by the values of the states, which torch.func.vmap and "
+                "torch.compile hide: pass the states as a batch y0, or use a method of fixed steps, such as 'rk4'."
+            )
         times, stats = self.outputs(problem)
         outcome, trace = self.run_jointly(problem, times)
         if trace.failed and problem.y0.ndim > 1 and not trace.spent:
@@ -390,7 +412,7 @@ class _Stages(Trace):
 
     def callback_accept_step(self, s: Any, y: Any, dt: Any) -> None:
         K, y = [self.array(f) for f in (self.first, *self.slopes)], self.array(y)
-        if not (s.requires_grad or dt.requires_grad):
+        if not differentiable(s, dt):
             s, dt = float(s), float(dt)
         t0, t1 = (self.t_span[0] + self.direction * x for x in (s, s + dt))
         h = self.direction * dt
@@ -537,7 +559,12 @@ class FixedGrid(ExplicitStep, FixedStep):
     tableau: ClassVar[Tableau]
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
-        """Calls of `odeint` for 64 steps each, in the time s = (t − t0)/h, where h is exact."""
+        """Calls of `odeint` for 64 steps each, in the time s = (t − t0)/h, where h is exact.
+
+        Under `torch.func.vmap` or `torch.compile`, which torchdiffeq's loop does not allow, the same steps by `step`.
+        """
+        if not readable(problem.y0):
+            return super().rollout(problem, h, n_steps, save)
         import torch
         from torchdiffeq import odeint
 
@@ -555,7 +582,7 @@ class FixedGrid(ExplicitStep, FixedStep):
                 wanted = save[(save > k) & (save <= k + n)] - k
                 if (finite == n_steps).any():
                     block = odeint(scaled, y, torch.arange(n + 1, dtype=y.dtype, device=y.device), method=self.name)
-                    ok = to_numpy(all_finite(block))
+                    ok = finite_states(block)
                     finite = np.where((finite == n_steps) & ~ok[-1], k + np.argmin(ok, axis=0) - 1, finite)
                     y = block[-1]
                     states += [block[i] for i in wanted.tolist()]

@@ -1,15 +1,18 @@
-"""ψ_s(y0) as a differentiable function of the elapsed time s, of y0 and of a flow's weights; and its first zero."""
+"""ψ_s(y0) as a differentiable function of the elapsed time s, of y0 and of all weights; and its first zero."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.optimize import brentq
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from sympflow.arrays import differentiable, readable, to_numpy, values
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid
@@ -17,6 +20,8 @@ from sympflow.integrators.registry import naming_plugin
 
 MAX_EVENT_STEPS = 1_000_000
 _EPS = 4 * float(np.finfo(float).eps)
+BeforeStep = Callable[[float, Tensor, float], None]
+"""Called before a step with the elapsed time, the state and the signed length."""
 
 
 class Path:
@@ -29,86 +34,150 @@ class Path:
         None for a flow that needs none.
     y0 : tensor of shape (..., 2d)
     direction : 1 or -1
+    before_step : callable, optional
+        Called before each step, which are then made one by one.
     """
 
-    def __init__(self, integrator: FixedStep, system: HamiltonianSystem | None, y0: Tensor, direction: int) -> None:
-        self.integrator, self.y0, self.eager = integrator, y0, False
+    def __init__(
+        self,
+        integrator: FixedStep,
+        system: HamiltonianSystem | None,
+        y0: Tensor,
+        direction: int,
+        before_step: BeforeStep | None = None,
+    ) -> None:
+        self.integrator, self.y0, self.before_step = integrator, y0, before_step
         self.system: HamiltonianSystem = system  # type: ignore[assignment]
         self.h = math.copysign(integrator.step_length(self.system), direction)
+        self.eager = self._learns()
 
     def __call__(self, s: Tensor) -> Tensor:
         """ψ_s(y0), (n, ..., 2d), for elapsed times s (n,), each 0 or with the sign of the direction.
 
         Differentiable in s (where an s is a whole number of steps: in the step that begins or ends there).
         """
-        times = s.detach().cpu().to(torch.float64).numpy()
-        reach = float(times[np.argmax(np.abs(times))]) if len(times) else 0.0
-        count, remainder = Grid(0.0, reach or self.h, abs(self.h)).locate(times)
-        states = self._rollout(count)
-        grid_times = torch.as_tensor(count * self.h, dtype=torch.float64, device=s.device)
-        r = (s.to(torch.float64) - grid_times).to(self.y0.dtype)
-        r = torch.where(torch.as_tensor(remainder == 0, device=r.device), r - r.detach(), r)
-        if not (s.requires_grad or np.any(remainder)):
+        count, r = self.located(s)
+        saved = np.unique(numbers(count))
+        states = self.rollout(saved)[_places(saved, count)]
+        if not (differentiable(r) or numbers(r).any()):
             return states
-        h = r.reshape(-1, *[1] * (states.ndim - 2)).expand(states.shape[:-1])
-        return self._step(states, h)
+        if self.before_step is not None and numbers(r)[-1]:
+            self.before_step(float(numbers(count)[-1]) * self.h, states[-1], float(numbers(r)[-1]))
+        return self.step(states, _each(r.to(states.dtype), states))
 
-    def _rollout(self, count: np.ndarray) -> Tensor:
-        """The states after the steps `count`: compiled where nothing is to be differentiated."""
-        save, n_steps = np.unique(count), int(count.max(initial=0))
-        y0: Tensor | np.ndarray = self.y0
-        plain = self._plain()
-        if plain:
-            y0 = self.y0.detach().numpy()
-        with naming_plugin(self.integrator):
-            stepper = self.integrator.stepper(Problem(self.system, 0.0, n_steps * self.h, y0))
-            states, _ = stepper.rollout(y0, self.h, n_steps, save)
-        if plain:
-            states = torch.from_numpy(np.ascontiguousarray(states))
-        return states[torch.as_tensor(np.searchsorted(save, count), device=self.y0.device)]
+    def located(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Counts k of whole steps and remainders r (n,), in float64, with s = k·h + r; gradients flow from s to r.
 
-    def _step(self, y: Tensor, h: float | Tensor) -> Tensor:
-        """A step of length h, by NumPy (a flow's: compiled) where nothing is to be differentiated."""
-        moving = y.requires_grad or (isinstance(h, Tensor) and h.requires_grad)
+        As `Grid.locate`: a quotient within a few ulp of an integer is that integer. Under `torch.func.vmap` each lane
+        has its own.
+        """
+        far = float(np.abs(numbers(s)).max(initial=0.0))
+        Grid(0.0, math.copysign(far, self.h) or self.h, abs(self.h))  # refuses too many steps
+        s = s.to(torch.float64)
+        x = s.detach() / self.h
+        nearest = x.round()
+        on_grid = (x - nearest).abs() <= _EPS * (nearest.abs() + x.abs())
+        count = torch.where(on_grid, nearest, x.floor())
+        r = s - count * self.h
+        return count.to(torch.int64), torch.where(on_grid, r - r.detach(), r)
+
+    def rollout(self, save: np.ndarray, start: Tensor | None = None) -> Tensor:
+        """The states after the steps `save` (sorted counts) from y0, or `start`: compiled if torch follows nothing."""
+        y: Any = self.y0 if start is None else start
+        if self.before_step is not None:
+            return self._one_by_one(save)
+        n_steps = int(save.max(initial=0))
+        plain = self._plain(y)
+        if plain:
+            y = to_numpy(y)
         with naming_plugin(self.integrator):
-            if moving or not self._plain():
-                return self.integrator.step(self.system, 0.0, y, h)
-            length = h.numpy() if isinstance(h, Tensor) else h
-            stepped = self.integrator.step(self.system, 0.0, y.numpy(), length)
+            stepper = self.integrator.stepper(Problem(self.system, 0.0, n_steps * self.h, y))
+            states, _ = stepper.rollout(y, self.h, n_steps, save)
+        return torch.from_numpy(np.ascontiguousarray(states)) if plain else states
+
+    def _one_by_one(self, save: np.ndarray) -> Tensor:
+        """`rollout` with a call of `before_step` for each step."""
+        assert self.before_step is not None
+        y, states = self.y0, []
+        for k in range(int(save.max(initial=0)) + 1):
+            if k in save:
+                states.append(y)
+            if k < save.max(initial=0):
+                self.before_step(k * self.h, y, self.h)
+                y = self.step(y, self.h)
+        return torch.stack(states)
+
+    def step(self, y: Tensor, h: float | Tensor) -> Tensor:
+        """A step of length h, a number or one for each state: by NumPy where nothing is to be differentiated."""
+        return self._stepped(self.integrator.step, y, h)
+
+    def inverse(self, y: Tensor) -> Tensor:
+        """The state from which a whole step leads to y."""
+        return self._stepped(self.integrator.inverse, y, self.h)
+
+    def _stepped(self, function: Callable[..., Any], y: Tensor, h: float | Tensor) -> Tensor:
+        with naming_plugin(self.integrator):
+            if differentiable(h) or not self._plain(y):
+                return function(self.system, 0.0, y, h)
+            stepped = function(self.system, 0.0, to_numpy(y), to_numpy(h) if isinstance(h, Tensor) else h)
         return torch.from_numpy(np.ascontiguousarray(stepped))
 
-    def _plain(self) -> bool:
-        return not (self.eager or self._differentiable()) and self.y0.device.type == "cpu"
-
-    def _differentiable(self) -> bool:
-        return torch.is_grad_enabled() and (self.y0.requires_grad or self._learns())
+    def _plain(self, y: Tensor) -> bool:
+        """True if NumPy may step y: on the CPU, and with nothing that torch follows, of the state or of weights."""
+        return not (self.eager or differentiable(y)) and y.device.type == "cpu"
 
     def _learns(self) -> bool:
-        """True if the flow has weights that require gradients."""
-        flow = self.integrator.flow_for(self.system)
-        return flow is not None and any(w.requires_grad for w in flow.parameters())
+        """True if torch follows numbers of the map: the weights of the flow, or those of H."""
+        if differentiable(*self.weights()):
+            return True
+        return self.system is not None and self.system.learns(self.y0.detach())
 
-    def first_zero(self, g: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """The elapsed time s at which g(s, ψ_s(y0)), a number, first vanishes.
+    def weights(self) -> list[Tensor]:
+        """The weights of the flow, if there is one."""
+        flow = self.integrator.flow_for(self.system)
+        return [] if flow is None else list(flow.parameters())
+
+    # events ------------------------------------------------------------------------------------------
+
+    def first_zero(self, g: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+        """The elapsed time s at which g(s, ψ_s(y0)), a number, first vanishes, and the state there.
 
         g is tested at every step, and every `system.dt` within longer ones, such as those of a flow.
 
-        Its derivatives are those of the implicit function: ds = −dg / (dg/ds).
+        Their derivatives are those of the implicit function g(s, ψ_s) = 0, in both modes, the first and the second.
 
         Raises
         ------
         RuntimeError
             If there is none within a million steps, or the state became non-finite before.
+        TypeError
+            If the values of the states are hidden, by `torch.func.vmap` or `torch.compile`.
         """
+        if not readable(self.y0):
+            raise TypeError(
+                "`event_fn` is followed by the values of the states, which torch.func.vmap and torch.compile hide: "
+                "call it outside of them, for one event at a time."
+            )
         with torch.no_grad():
             value = self._bracket(g)
-        s = torch.tensor(value, dtype=torch.float64, device=self.y0.device)
-        c = g(s, self(s[None])[0])
-        if not c.requires_grad:
-            return s
-        moving = s.clone().requires_grad_(True)
-        (slope,) = torch.autograd.grad(g(moving, self(moving[None])[0]), moving)
-        return s - (c - c.detach()) / slope
+        s = zero = torch.tensor(value, dtype=torch.float64, device=self.y0.device)
+        count, r = self.located(zero[None])
+        start, inside = self(count.to(torch.float64) * self.h)[0], float(r[0])
+
+        def state(time: Tensor) -> Tensor:
+            remainder = (time - zero + inside).to(start.dtype)
+            moves = inside or differentiable(remainder)
+            return self.step(start, remainder.expand(start.shape[:-1])) if moves else start
+
+        if not differentiable(c := g(s, state(s))):
+            return s, state(s)
+        slope = torch.func.grad(lambda time: g(time, state(time)))(zero).detach()
+        # Newton's method with a fixed slope: each iteration makes the derivatives of one more order right
+        for _ in range(2):
+            s_next = s - (c - c.detach()) / slope
+            c = g(s_next, state(s_next))
+            s = s_next
+        return s, state(s)
 
     def _bracket(self, g: Callable[[Tensor, Tensor], Tensor]) -> float:
         def value(s: float, y: Tensor) -> float:
@@ -118,11 +187,10 @@ class Path:
         if before == 0:
             return 0.0
         k, chunk, y = 0, 8, self.y0.detach()
-        eager = self._learns()  # the map whose derivatives follow, not a compiled copy of its weights
         while k < MAX_EVENT_STEPS:
             ahead = Path(self.integrator, self.system, y, 1 if self.h > 0 else -1)
-            ahead.eager = eager
-            states = ahead._rollout(np.arange(chunk + 1))
+            ahead.eager = self.eager  # the map whose derivatives follow, not a compiled copy of its weights
+            states = ahead.rollout(np.arange(chunk + 1))
             inner = self._samples(states[:-1])
             parts = inner.shape[1] + 1
             for j in range(chunk):
@@ -148,7 +216,7 @@ class Path:
         repeated = states[:, None].expand(-1, parts - 1, *states.shape[1:])
         fractions = torch.arange(1, parts, dtype=states.dtype, device=states.device) / parts
         h = (self.h * fractions).reshape(-1, *[1] * (states.ndim - 2)).expand(repeated.shape[:-1])
-        return repeated if parts == 1 else self._step(repeated, h)
+        return repeated if parts == 1 else self.step(repeated, h)
 
     def _locate(
         self,
@@ -167,6 +235,193 @@ class Path:
         def f(s: float) -> float:
             if s in known:
                 return known[s] * unit
-            return value(s, self._step(y, s - start)) * unit
+            return value(s, self.step(y, s - start)) * unit
 
         return b if g_b == 0 else float(brentq(f, a, b, xtol=_EPS, rtol=_EPS))
+
+
+class DensePath(Path):
+    """A path to a known end whose states on the grid are computed once.
+
+    Parameters
+    ----------
+    integrator, system, y0, direction
+        As for `Path`.
+    times : tensor of shape (2,)
+        Its beginning and end.
+    """
+
+    def __init__(
+        self, integrator: FixedStep, system: HamiltonianSystem | None, y0: Tensor, direction: int, times: Tensor
+    ) -> None:
+        super().__init__(integrator, system, y0, direction)
+        count, _ = self.located(times[1:] - times[0])
+        self.times = numbers(times)
+        self.states = super().rollout(np.arange(int(numbers(count).max()) + 1))
+
+    def __call__(self, s: Tensor) -> Tensor:
+        found, length, slack = numbers(s), self.times[1] - self.times[0], _EPS * np.abs(self.times).max()
+        if found.size and not (found.min() >= min(0.0, length) - slack and found.max() <= max(0.0, length) + slack):
+            raise ValueError(
+                f"`t` must lie between {self.times[0]:g} and {self.times[1]:g}, the interval that was solved."
+            )
+        return super().__call__(s)
+
+    def rollout(self, save: np.ndarray, start: Tensor | None = None) -> Tensor:
+        return self.states[torch.as_tensor(save, device=self.states.device)]
+
+
+class AdjointPath(Path):
+    """A path whose derivatives are pulled back step by step, along the states that the inverse of the map steps to.
+
+    Memory does not grow with the number of steps: only the states at the outputs are kept. They are those of
+    backpropagation to the rounding of the inverse, which an unstable orbit magnifies from output to output. A map
+    without an inverse is run again from its outputs, with √n states kept of n steps between two of them.
+
+    Reverse mode only, and once.
+
+    Parameters
+    ----------
+    integrator, system, y0, direction, before_step
+        As for `Path`.
+    parameters : sequence of tensors
+        Numbers of H that get gradients, beside the weights of a flow.
+    """
+
+    def __init__(self, *arguments: Any, parameters: Sequence[Tensor] = (), **more: Any) -> None:
+        super().__init__(*arguments, **more)
+        self.eager = False  # nothing is differentiated in the forward run
+        known = {id(w): w for w in (*self.weights(), *parameters) if w.requires_grad}
+        self.parameters = tuple(known.values())
+
+    def __call__(self, s: Tensor) -> Tensor:
+        return _PulledBack.apply(self, s, self.y0, *self.parameters)
+
+    def backwards(self, grid: Tensor, saved: np.ndarray) -> Iterator[tuple[int, Tensor]]:
+        """The states after k steps, k from the last of `saved` to 0, where those after the steps `saved` are known."""
+        for i in range(len(saved) - 1, 0, -1):
+            first, last = int(saved[i - 1]), int(saved[i])
+            yield last, grid[i]
+            try:
+                y = grid[i]
+                for k in range(last - 1, first, -1):
+                    y = self.inverse(y)
+                    yield k, y
+            except TypeError:  # there is none
+                yield from self._run_again(grid[i - 1], first, last)
+        yield 0, grid[0]
+
+    def _run_again(self, y: Tensor, first: int, last: int) -> Iterator[tuple[int, Tensor]]:
+        """The same for the steps between two counts, of a map without an inverse."""
+        path = Path(self.integrator, self.system, y, 1 if self.h > 0 else -1)
+        stride = math.isqrt(last - first) + 1
+        marks = np.arange(0, last - first, stride)
+        for mark, start in zip(marks[::-1].tolist(), path.rollout(marks).flip(0), strict=True):
+            n = min(stride, last - first - mark)
+            for j, state in zip(range(n - 1, -1, -1), path.rollout(np.arange(n), start).flip(0), strict=True):
+                if mark + j:
+                    yield first + mark + j, state
+
+    def pulled(self, y: Tensor, h: float | Tensor, a: Tensor) -> tuple[Tensor, Tensor | None, list[Tensor | None]]:
+        """The cotangents of y, of h and of the parameters in a step from y, where that of its end is a."""
+        with torch.enable_grad(), naming_plugin(self.integrator):
+            y = y.detach().requires_grad_(True)
+            inputs = [y, h, *self.parameters] if isinstance(h, Tensor) and h.requires_grad else [y, *self.parameters]
+            end = self.integrator.step(self.system, 0.0, y, h)
+            # what is retained is freed with `end`; the part of a graph that lies outside of the step has to stay
+            found: list[Tensor | None] = list(torch.autograd.grad(end, inputs, a, allow_unused=True, retain_graph=True))
+        of_y = torch.zeros_like(y) if found[0] is None else found[0]
+        n = len(self.parameters)
+        return of_y, (found[1] if len(inputs) > 1 + n else None), found[len(found) - n :]
+
+
+class _PulledBack(torch.autograd.Function):
+    """The states of an `AdjointPath` at the elapsed times s."""
+
+    @staticmethod
+    def forward(ctx: Any, path: AdjointPath, s: Tensor, y0: Tensor, *parameters: Tensor) -> Tensor:
+        count, r = path.located(s)
+        saved = np.union1d(0, numbers(count))
+        grid = path.rollout(saved)
+        ctx.path, ctx.saved, ctx.dtype = path, saved, s.dtype
+        ctx.save_for_backward(s, grid, *parameters)
+        states = grid[_places(saved, count)]
+        return path.step(states, _each(r.to(states.dtype), states)) if r.any() else states
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangents: Tensor) -> tuple[Any, ...]:
+        path, saved = ctx.path, ctx.saved
+        s, grid, *_ = ctx.saved_tensors
+        count, r = path.located(s.detach())
+        counts, remainders = numbers(count), numbers(r)
+        of_s, of_parameters = torch.zeros_like(r), [torch.zeros_like(w) for w in path.parameters]
+        a, top = torch.zeros_like(grid[0]), int(saved[-1])
+
+        def add(found: list[Tensor | None]) -> None:
+            for i, part in enumerate(found):
+                if part is not None:
+                    of_parameters[i] += part
+
+        for k, y in path.backwards(grid, saved):
+            if k < top:
+                a, _, found = path.pulled(y, path.h, a)
+                add(found)
+            for i in np.flatnonzero(counts == k).tolist():
+                if not (ctx.needs_input_grad[1] or remainders[i]):
+                    a = a + cotangents[i]
+                    continue
+                h = r[i].to(y.dtype).requires_grad_(ctx.needs_input_grad[1])
+                with torch.enable_grad():
+                    lengths = h.expand(y.shape[:-1])
+                of_y, of_h, found = path.pulled(y, lengths, cotangents[i])
+                a = a + of_y
+                add(found)
+                if of_h is not None:
+                    of_s[i] = of_h.sum()
+        return None, of_s.to(ctx.dtype) if ctx.needs_input_grad[1] else None, a, *of_parameters
+
+
+def numbers(t: Tensor) -> np.ndarray:
+    """The values of times, of all lanes of `torch.func.vmap`, (..., n).
+
+    Raises
+    ------
+    TypeError
+        If there are none, in a graph that `torch.compile` traces.
+    """
+    found = values(t)
+    if found is None:
+        raise TypeError(
+            "`t` is a tensor without values where torch.compile traces, but it says how many steps are made: use "
+            "sympflow.solve, whose times are numbers."
+        )
+    return found
+
+
+def leaves(system: HamiltonianSystem, y: Tensor) -> list[Tensor]:
+    """The leaves of the graph on which the vector field at y depends, other than y: such as a network's weights."""
+    y = y.detach()
+    if not system.learns(y):
+        return []
+    found: list[Tensor] = []
+    waiting, seen = [system.vector_field(y).grad_fn], set()
+    while waiting:
+        node = waiting.pop()
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        if isinstance(leaf := getattr(node, "variable", None), Tensor):
+            found.append(leaf)
+        waiting += [parent for parent, _ in node.next_functions]
+    return found
+
+
+def _places(saved: np.ndarray, count: Tensor) -> Tensor:
+    """The index of each count among those that were saved."""
+    return torch.searchsorted(torch.as_tensor(saved, device=count.device), count)
+
+
+def _each(h: Tensor, states: Tensor) -> Tensor:
+    """Lengths (n,) for states (n, ..., 2d): (n, ...)."""
+    return h.reshape(-1, *[1] * (states.ndim - 2)).expand(states.shape[:-1])

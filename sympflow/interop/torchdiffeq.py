@@ -1,4 +1,4 @@
-"""torchdiffeq's `odeint` and `odeint_event` with our methods: identical signatures, change the import or nothing.
+"""torchdiffeq's `odeint` and its siblings with our methods: identical signatures, change the import or nothing.
 
 `method="sympflow"` and all our fixed-step methods are run here; everything else is handed on to torchdiffeq. Their
 options go into `options`: `flow`, `dt` (or `step_size`), and `system` where `func` is not a HamiltonianSystem.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
@@ -19,16 +19,25 @@ import torch
 import torchdiffeq
 from torch import Tensor
 
+from sympflow.arrays import differentiable, finite_states, one_lane, readable, transformed
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import available, check_applies
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED
 from sympflow.interop.matching import Comparison, fixed_step
-from sympflow.interop.path import Path
+from sympflow.interop.path import AdjointPath, BeforeStep, DensePath, Path, leaves, numbers
 
 State = Tensor | tuple[Tensor, ...]
 _THEIRS = {*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver"}
 _RTOL, _ATOL = 1e-7, 1e-9
+_CALLBACKS = (
+    "callback_accept_step",
+    "callback_reject_step",
+    "callback_step_adjoint",
+    "callback_accept_step_adjoint",
+    "callback_reject_step_adjoint",
+)
+"""Callbacks of torchdiffeq for adaptive steps and its adjoint equation, which our methods have not."""
 _CHECKPOINTS = 5  # outputs of a run at which another right-hand side is compared
 _REMEDY = "Pass one system: odeint(system, ...), without options['system'] and without another function."
 
@@ -75,30 +84,99 @@ def odeint(
         If `func` is another system than the one that our method solves, or depends on the time, as far as several
         states and times tell, at the start and along the run.
     """
-    if not _is_ours(method):
+    if not _is_ours(method, func, options):
         with _names_of_both():
             return torchdiffeq.odeint(
                 _of_pairs(func, y0), y0, t, rtol=rtol, atol=atol, method=method, options=options, event_fn=event_fn
             )
+    return _integrated(Path, func, y0, t, rtol, atol, method, options, event_fn)
+
+
+def _integrated(
+    make_path: Callable[..., Path],
+    func: Any,
+    y0: State,
+    t: Tensor,
+    rtol: Any,
+    atol: Any,
+    method: Any,
+    options: dict[str, Any] | None,
+    event_fn: Any,
+) -> Any:
+    """`odeint` by one of our methods, along a path."""
     if (rtol, atol) != (_RTOL, _ATOL):
         warnings.warn(
             f"`rtol` and `atol` have no effect on the fixed-step method {_name(method)!r}: leave them out.",
             UserWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
-    _check_times(t)
+    direction = _direction(t)
     integrator, system = _build(func, method, options)
     y, pack = _joined(y0)
     _check_state(y, system, integrator)
     compared = _Compared(func, y0, t, integrator, system)
-    path = Path(integrator, system, y, -1 if len(t) > 1 and t[0] > t[1] else 1)
     if event_fn is None:
+        path = make_path(integrator, system, y, direction, before_step=_announced(func, y, t, pack, integrator))
         return pack(compared.run(path, t))
     if len(t) != 2:
         raise ValueError(f"`t` must have 2 entries with `event_fn`, the start and a direction; got {len(t)}.")
-    found, states = _until_event(path, t[0], event_fn, pack)
+    found, states = _until_event(make_path(integrator, system, y, direction), t[0], event_fn, pack)
     compared.along(found[None], states[1:])
     return found, pack(states)
+
+
+def odeint_dense(
+    func: Callable[[Tensor, Any], Any],
+    y0: Tensor,
+    t0: Any,
+    t1: Any,
+    *,
+    rtol: float = _RTOL,
+    atol: float = _ATOL,
+    method: Any = None,
+    options: dict[str, Any] | None = None,
+) -> Callable[[Tensor], Tensor]:
+    """`torchdiffeq.odeint_dense` with our methods as well: the solution as a function of t.
+
+    Parameters
+    ----------
+    func, y0, rtol, atol, method, options
+        As for `odeint`; torchdiffeq itself has "dopri5" only.
+    t0, t1 : float tensor () or number
+        Start and end.
+
+    Returns
+    -------
+    callable
+        Of a time () or times (n,) between t0 and t1 to states (..., 2d) or (n, ..., 2d): a shorter step from the last
+        grid point before t. The states on the grid are computed once. Gradients reach y0, t and weights.
+
+    Raises
+    ------
+    ValueError
+        From the result, for a t that is not between t0 and t1.
+    """
+    if not _is_ours(method, func, options):
+        with _names_of_both():
+            if method not in (None, "dopri5"):
+                raise ValueError(f"`method` {method!r} has no dense output in torchdiffeq: use 'dopri5', or ours.")
+            return torchdiffeq.odeint_dense(func, y0, t0, t1, rtol=rtol, atol=atol, method=method, options=options)
+    if not isinstance(y0, Tensor):
+        raise TypeError(f"`y0` must be a tensor [q, p], as in torchdiffeq's odeint_dense; got {type(y0).__name__}.")
+    times = torch.stack(
+        [t if isinstance(t, Tensor) else torch.tensor(t, dtype=y0.dtype, device=y0.device) for t in (t0, t1)]
+    )
+    _integrated(Path, func, y0, times[:1], rtol, atol, method, options, None)  # checks all arguments
+    integrator, system = _build(func, method, options)
+    path = DensePath(integrator, system, y0, _direction(times), times)
+
+    def solution(t: Tensor) -> Tensor:
+        if not (isinstance(t, Tensor) and t.ndim < 2 and t.is_floating_point()):
+            raise TypeError("`t` must be a floating-point tensor, a time or a list of times: use torch.tensor(1.0).")
+        states = path(t.reshape(-1) - times[0])
+        return states if t.ndim else states[0]
+
+    return solution
 
 
 def odeint_event(
@@ -113,41 +191,104 @@ def odeint_event(
 ) -> Any:
     """`torchdiffeq.odeint_event` with our methods as well: the event time, and [y0, state at the event].
 
-    Arguments as there; with our methods `odeint_interface` is torchdiffeq's `odeint` or ours, which are the same then.
-    Gradients reach y0, t0 and the weights.
+    Arguments as there; with our methods `odeint_interface` is `odeint` or `odeint_adjoint`, theirs or ours, which are
+    the same then. Gradients reach y0, t0 and all weights, those of the time by the implicit function theorem.
     """
-    if not _is_ours(kwargs.get("method")):
+    if not _is_ours(kwargs.get("method"), func, kwargs.get("options")):
         theirs = torchdiffeq.odeint if odeint_interface is odeint else odeint_interface
         arguments = {"event_fn": event_fn, "reverse_time": reverse_time, "odeint_interface": theirs, **kwargs}
         with _names_of_both():
             return torchdiffeq.odeint_event(_of_pairs(func, y0), y0, t0, **arguments)
-    if odeint_interface not in (odeint, torchdiffeq.odeint):
-        raise _no_adjoint(kwargs["method"])
+    adjoint = odeint_interface in (odeint_adjoint, torchdiffeq.odeint_adjoint)
+    if not (adjoint or odeint_interface in (odeint, torchdiffeq.odeint)):
+        raise ValueError("`odeint_interface` must be odeint or odeint_adjoint, of torchdiffeq or of this module.")
     if not (isinstance(t0, Tensor) and t0.numel() == 1 and t0.is_floating_point()):
         raise TypeError("`t0` must be a floating-point tensor with one time: use torch.tensor(0.0).")
     start = t0.reshape(-1)
     t = torch.cat([start, start.detach() + (-1.0 if reverse_time else 1.0)])
-    return odeint(func, y0, t, event_fn=event_fn, **kwargs)
+    return (odeint_adjoint if adjoint else odeint)(func, y0, t, event_fn=event_fn, **kwargs)
 
 
-def odeint_adjoint(func: Any, y0: State, t: Tensor, *, method: Any = None, **kwargs: Any) -> Any:
-    """`torchdiffeq.odeint_adjoint`, which is refused for our methods.
+def odeint_adjoint(
+    func: Callable[[Tensor, Any], Any],
+    y0: State,
+    t: Tensor,
+    *,
+    rtol: float = _RTOL,
+    atol: float = _ATOL,
+    method: Any = None,
+    options: dict[str, Any] | None = None,
+    event_fn: Callable[[Tensor, Any], Tensor] | None = None,
+    adjoint_rtol: Any = None,
+    adjoint_atol: Any = None,
+    adjoint_method: Any = None,
+    adjoint_options: dict[str, Any] | None = None,
+    adjoint_params: Iterable[Tensor] | None = None,
+) -> Any:
+    """`torchdiffeq.odeint_adjoint` with our methods as well: gradients in memory that does not grow with the steps.
+
+    With our methods these are the gradients of the map that was executed, those of `odeint`: the run is stepped back
+    by the map's own inverse, and the cotangent is pulled back a step at a time. Only the states at `t` are kept.
+    Rounding of the inverse is magnified by an unstable orbit, from one output to the one before. A map without an
+    inverse, such as "mlp", is run again from the outputs, with √n states kept of n steps between two of them.
+
+    Parameters
+    ----------
+    func, y0, t, rtol, atol, method, options, event_fn
+        As for `odeint`.
+    adjoint_params : iterable of tensors, optional
+        Tensors within H that get gradients; the weights of a flow always do. The default with our methods is the
+        parameters of `func`, if it is a module, and all leaves on which the vector field at y0 depends.
+    adjoint_rtol, adjoint_atol, adjoint_method, adjoint_options
+        For torchdiffeq's methods. With ours no second equation is solved; `adjoint_method` must be `method`.
 
     Raises
     ------
-    ValueError
-        For our methods: the adjoint method integrates the derivative of `func`, not that of the map that was run.
+    TypeError
+        With our methods, where torch follows y0, t or a parameter in forward mode or in a transform of `torch.func`:
+        this is for reverse mode, `backward` and `torch.autograd.grad`.
     """
-    if _is_ours(method):
-        raise _no_adjoint(method)
-    with _names_of_both():
-        return torchdiffeq.odeint_adjoint(func, y0, t, method=method, **kwargs)
+    if not _is_ours(method, func, options):
+        arguments: dict[str, Any] = {"rtol": rtol, "atol": atol, "method": method, "options": options}
+        arguments |= {"event_fn": event_fn, "adjoint_rtol": adjoint_rtol, "adjoint_atol": adjoint_atol}
+        arguments |= {"adjoint_method": adjoint_method, "adjoint_options": adjoint_options}
+        with _names_of_both():
+            return torchdiffeq.odeint_adjoint(func, y0, t, adjoint_params=adjoint_params, **arguments)
+    if adjoint_method is not None and _name(adjoint_method) != _name(method):
+        raise ValueError(
+            f"`adjoint_method` is {_name(adjoint_method)!r}, but the gradients of {_name(method)!r} are those of its "
+            "own steps: leave it out."
+        )
+    if not (adjoint_rtol is None and adjoint_atol is None and adjoint_options is None):
+        warnings.warn(
+            f"`adjoint_rtol`, `adjoint_atol` and `adjoint_options` have no effect on the fixed-step method "
+            f"{_name(method)!r}, whose gradients are exact: leave them out.",
+            UserWarning,
+            stacklevel=2,
+        )
+    given = None if adjoint_params is None else tuple(adjoint_params)
+    if given is None and isinstance(func, torch.nn.Module):
+        given = tuple(func.parameters())
+
+    def make_path(integrator: FixedStep, system: HamiltonianSystem | None, y: Tensor, *more: Any, **named: Any) -> Path:
+        own = [] if adjoint_params is not None or system is None else leaves(system, y)
+        parameters = (*(given or ()), *own)
+        flow = integrator.flow_for(system)  # type: ignore[arg-type]
+        if transformed(y, t, *parameters, *(() if flow is None else flow.parameters())):
+            raise TypeError(
+                "`odeint_adjoint` is for reverse mode, backward() and torch.autograd.grad: in forward mode, and inside "
+                "torch.func, use odeint."
+            )
+        return AdjointPath(integrator, system, y, *more, parameters=parameters, **named)
+
+    return _integrated(make_path, func, y0, t, rtol, atol, method, options, event_fn)
 
 
 def register(method: str) -> None:
     """Add one of our methods to torchdiffeq's own table, for code whose calls of `odeint` cannot be changed.
 
-    That table is private to torchdiffeq, so this is never done unasked, and may break with a release of it.
+    That table is private to torchdiffeq, so this is never done unasked, and may break with a release of it. A name that
+    it has already, such as its own "implicit_midpoint" of some release, is left alone, with a warning.
 
     Raises
     ------
@@ -159,7 +300,15 @@ def register(method: str) -> None:
     if method in _THEIRS:
         raise ValueError(f"`method` {method!r} is torchdiffeq's own already: register one of ours, such as 'verlet'.")
     fixed_step(method, {}, "torchdiffeq")
-    table = import_module("torchdiffeq._impl.odeint").SOLVERS
+    table = _their_table()
+    if method in table and not issubclass(table[method], _Solver):
+        warnings.warn(
+            f"`method` {method!r} is torchdiffeq's own in this release, and stays so in its table: for ours call "
+            "sympflow.interop.torchdiffeq.odeint.",
+            UserWarning,
+            stacklevel=2,
+        )
+        return
     table[method] = type(f"{method.title()}Solver", (_Solver,), {"method": method})
 
 
@@ -178,10 +327,20 @@ def _names_of_both() -> Iterator[None]:
         raise ValueError(f"`method` {name!r} is unknown.{hint} Choose one of {', '.join(known)}.") from None
 
 
-def _is_ours(method: Any) -> bool:
-    if isinstance(method, str):
-        return method not in _THEIRS and method in available()
-    return method is not None
+def _their_table() -> dict[str, Any]:
+    """torchdiffeq's solvers by name, which is private to it."""
+    return import_module("torchdiffeq._impl.odeint").SOLVERS
+
+
+def _is_ours(method: Any, func: Any, options: Any) -> bool:
+    """True if `method` is one of ours; a name that both have is theirs for a `func` of which we know no system."""
+    if not isinstance(method, str):
+        return method is not None
+    if method in _THEIRS or method not in available():
+        return False
+    ours = isinstance(func, HamiltonianSystem) or (isinstance(options, dict) and {"system", "flow"} & set(options))
+    found = _their_table().get(method)
+    return bool(ours) or found is None or issubclass(found, _Solver)
 
 
 def _name(method: Any) -> str:
@@ -214,12 +373,39 @@ def _build(func: Any, method: Any, options: dict[str, Any] | None) -> tuple[Fixe
     return integrator, system
 
 
-def _check_times(t: Any) -> None:
+def _direction(t: Any) -> int:
+    """The direction of the times, 1 or −1, which are checked; under `torch.func.vmap` all lanes must have the same."""
     if not (isinstance(t, Tensor) and t.ndim == 1 and len(t) and t.is_floating_point()):
         raise TypeError("`t` must be a one-dimensional floating-point tensor of times: use torch.tensor([...]).")
-    steps = torch.diff(t.detach())
-    if not torch.isfinite(t).all() or not ((steps > 0).all() or (steps < 0).all()):
+    found = numbers(t)
+    steps = np.diff(found)
+    if not np.isfinite(found).all() or not ((steps > 0).all() or (steps < 0).all()):
         raise ValueError("`t` must be finite and strictly increasing or decreasing: sort it and drop repeats.")
+    return -1 if steps.size and steps.flat[0] < 0 else 1
+
+
+def _announced(
+    func: Any, y0: Tensor, t: Tensor, pack: Callable[[Tensor], Any], integrator: FixedStep
+) -> BeforeStep | None:
+    """torchdiffeq's `callback_step`, if `func` has it: called before each step with its time, state and length."""
+    others = {name for name in _CALLBACKS if getattr(func, name, None) is not None}
+    if others:
+        warnings.warn(
+            f"Method {integrator.name!r} does not support the callbacks {sorted(others)}: only callback_step.",
+            UserWarning,
+            stacklevel=4,
+        )
+    callback = getattr(func, "callback_step", None)
+    if callback is None:
+        return None
+    if not (readable(y0) and readable(t)):
+        raise TypeError("`callback_step` is handed one state and time, which torch.func.vmap has not: remove it.")
+    start = t[0].detach()
+
+    def before_step(s: float, y: Tensor, h: float) -> None:
+        callback(start + s, pack(y), torch.tensor(abs(h), dtype=start.dtype, device=start.device))
+
+    return before_step
 
 
 def _joined(y0: Any) -> tuple[Tensor, Callable[[Tensor], Any]]:
@@ -239,7 +425,7 @@ def _check_state(y: Tensor, system: HamiltonianSystem | None, integrator: Integr
         raise TypeError(f"`y0` must be real floating-point; got {y.dtype}. Use y0.double().")
     if y.ndim == 0 or y.shape[-1] != size:
         raise ValueError(f"`y0` must have shape (..., {size}), [q, p]; got {tuple(y.shape)}.")
-    if not torch.isfinite(y).all():
+    if not finite_states(y).all():
         raise ValueError("`y0` must be finite; it holds NaN or infinity. Remove these states.")
 
 
@@ -252,22 +438,23 @@ class _Compared:
         flow = integrator.given_flow
         self.comparison = comparison = Comparison("func", integrator, system, _REMEDY)
         y, self.pack = _joined(y0)
-        start = _numpy(y).reshape(-1, y.shape[-1])[0]
-        if flow is not None and not any(w.requires_grad for w in flow.parameters()):  # it may be in training
+        start = one_lane(y).reshape(-1, y.shape[-1])[0]
+        training = flow is not None and any(w.requires_grad or differentiable(w) for w in flow.parameters())
+        if flow is not None and not training:
             comparison.with_flow(start.astype(float))
         self.func: Any = None if func is system else _of_pairs(func, y0)
         if self.func is None:
             return
         if isinstance(func, HamiltonianSystem):
             comparison.with_system(func)
-        self.like, self.t0 = y, t[0]
-        comparison.at_start(self._slope, _numpy(y), (float(t[0]), float(t[-1])))
+        self.like, self.times, self.t0 = y, t, float(one_lane(t)[0])
+        comparison.at_start(self._slope, one_lane(y), (float(one_lane(t)[0]), float(one_lane(t)[-1])))
 
     def _slope(self, t: float, y: np.ndarray) -> np.ndarray:
         """`func` at states like y0, in their precision and form."""
         with torch.no_grad():
             state = torch.tensor(y, dtype=self.like.dtype, device=self.like.device)
-            return _numpy(_joined(self.func(self.t0.new_tensor(t), self.pack(state)))[0])
+            return one_lane(_joined(self.func(self.times.new_tensor(t), self.pack(state)))[0])
 
     def run(self, path: Path, t: Tensor) -> Tensor:
         """The states (n, ..., 2d) at the times t (n,), compared at some of them, and between where these are few."""
@@ -276,7 +463,7 @@ class _Compared:
             return path.y0[None]
         if self.func is None:
             return torch.cat([path.y0[None], path(elapsed)])
-        n_steps = int(float(elapsed[-1]) / path.h)
+        n_steps = int(float(one_lane(elapsed)[-1]) / path.h) if readable(t) else 0
         n_more = min(_CHECKPOINTS - 1, n_steps) if len(elapsed) < _CHECKPOINTS else 0
         count = np.unique(n_steps * (np.arange(n_more) + 0.38) / max(n_more, 1) // 1)
         more = elapsed.new_tensor(count * path.h)
@@ -291,13 +478,9 @@ class _Compared:
         """Compare at states (n, ..., 2d) of the run, at the times t (n,)."""
         if self.func is None:
             return
-        for s, y in zip(t.tolist(), _numpy(states), strict=True):
+        for s, y in zip(one_lane(t).tolist(), one_lane(states), strict=True):
             if np.isfinite(y).all():
-                self.comparison.at(s, y, self._slope(s, y), self._slope, float(self.t0))
-
-
-def _numpy(x: Tensor) -> np.ndarray:
-    return x.detach().cpu().numpy()
+                self.comparison.at(s, y, self._slope(s, y), self._slope, self.t0)
 
 
 def _until_event(path: Path, t0: Tensor, event_fn: Any, pack: Callable[[Tensor], Any]) -> tuple[Tensor, Tensor]:
@@ -307,8 +490,7 @@ def _until_event(path: Path, t0: Tensor, event_fn: Any, pack: Callable[[Tensor],
     def g(s: Tensor, y: Tensor) -> Tensor:
         return torch.min(event_fn((t0 + s).to(t0.dtype), pack(y)) * signs)
 
-    s = path.first_zero(g)
-    y = path(s[None])[0]
+    s, y = path.first_zero(g)
     return (t0 + s).to(t0.dtype), torch.stack([path.y0, y])
 
 
@@ -317,14 +499,21 @@ def _of_pairs(func: Any, y0: Any) -> Any:
     if not (isinstance(func, HamiltonianSystem) and isinstance(y0, tuple)):
         return func
     _joined(y0)
-    return lambda t, y: tuple(func(t, torch.cat(y, dim=-1)).chunk(2, dim=-1))
+
+    def of_pair(t: Any, y: Any) -> Any:
+        return tuple(func(t, torch.cat(y, dim=-1)).chunk(2, dim=-1))
+
+    for name in ("callback_step", *_CALLBACKS):
+        if getattr(func, name, None) is not None:
+            setattr(of_pair, name, getattr(func, name))
+    return of_pair
 
 
 def _no_adjoint(method: Any) -> ValueError:
     return ValueError(
-        f"`method` {_name(method)!r} cannot be used with odeint_adjoint: the adjoint integrates the derivative of "
-        "`func` backward, which is not the derivative of the map that was run, and never sees a flow's weights; the "
-        "gradients would be wrong without notice. Use odeint, which differentiates the map itself."
+        f"`method` {_name(method)!r} cannot be used with torchdiffeq's own odeint_adjoint, which integrates the "
+        "derivative of `func` backward: that is not the derivative of the map that was run, and never sees a flow's "
+        "weights. Use odeint_adjoint of sympflow.interop.torchdiffeq, whose gradients are those of the map."
     )
 
 
@@ -349,7 +538,7 @@ class _Solver:
     def __init__(self, func: Any, y0: Tensor, rtol: Any, atol: Any, **options: Any) -> None:
         if _within_adjoint():
             raise _no_adjoint(self.method)
-        self.direction, shapes = 1, None
+        self.direction, shapes, announced = 1, None, func
         while type(func).__module__.startswith("torchdiffeq"):
             self.direction = -1 if type(func).__name__ == "_ReverseFunc" else self.direction
             shapes = getattr(func, "shapes", shapes)
@@ -360,12 +549,20 @@ class _Solver:
         y, _ = _joined(self._given(y0))
         _check_state(y, system, integrator)
         self.path = Path(integrator, system, y, self.direction)
+        self.announced = None if getattr(func, "callback_step", None) is None else announced
 
     @classmethod
     def valid_callbacks(cls) -> set[str]:
-        return set()
+        return {"callback_step"}
 
     def integrate(self, t: Tensor) -> Tensor:
+        if self.announced is not None:
+            start, callback = t[0].detach(), self.announced.callback_step
+
+            def before_step(s: float, y: Tensor, h: float) -> None:
+                callback(start + abs(s), self._flat(y[None])[0], torch.tensor(abs(h)).to(start))
+
+            self.path.before_step = before_step
         return self._flat(self._compared(t).run(self.path, self.direction * t))
 
     def integrate_until_event(self, t0: Tensor, event_fn: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
@@ -373,9 +570,8 @@ class _Solver:
             return event_fn((t0 + self.direction * s).to(t0), self._flat(y[None])[0])
 
         self._compared(torch.stack([t0, t0 + self.direction]))
-        s = self.path.first_zero(g)
-        y = torch.stack([self.path.y0, self.path(s[None])[0]])
-        return t0 + self.direction * s, self._flat(y)
+        s, y = self.path.first_zero(g)
+        return t0 + self.direction * s, self._flat(torch.stack([self.path.y0, y]))
 
     def _compared(self, t: Tensor) -> _Compared:
         return _Compared(self.func, self._given(self.y0), self.direction * t, self.integrator, self.system)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import warnings
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -24,6 +25,8 @@ from sympflow.training.session import Deadline, OutOfTime
 BLOCK = 32  # steps drawn at once: a rejection-sampled domain then costs little
 LABEL_TOLERANCE = 1e-13
 HELD_OUT_SHARE = 0.1  # of the labels that are handed in
+LABELS_APART = 8  # intervals without labels that are as long as a fraction of Δt are remembered
+LABELS_COMPARED, COMPARED_TO = 8, 1e-8  # of the labels that are handed in, and the tolerance of their exact flow
 USELESS = 0.1  # of what a step moves a state: leapfrog at ω Δt = 1 misses a hundredth, the identity all of it
 
 Labelled = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -251,6 +254,40 @@ def handed_in(data: Any, system: HamiltonianSystem, dt: float) -> Labelled:
             f"`data` has times from {t.min():g} to {t.max():g}, beyond [0, dt] = [0, {dt:g}]: change `dt`."
         )
     return t, x, y
+
+
+def unlabelled(t: np.ndarray, dt: float) -> tuple[tuple[float, float], ...]:
+    """The intervals of [0, Δt], longer than Δt/8, in which no label is."""
+    ends = np.unique(np.concatenate([[0.0], t, [dt]]))
+    long = np.flatnonzero(np.diff(ends) > dt / LABELS_APART * (1 + 1e-9))
+    return tuple((float(ends[i]), float(ends[i + 1])) for i in long)
+
+
+def warn_of_another_system(data: Labelled, system: HamiltonianSystem) -> None:
+    """Warn if the exact flow of the system takes a few of the labelled states elsewhere than the labels say.
+
+    Warns
+    -----
+    UserWarning
+        If the distance is, in the median, a tenth or more of what the labels move.
+    """
+    t, x, y = data
+    rows = np.linspace(0, len(t) - 1, min(len(t), LABELS_COMPARED)).astype(int)
+    with np.errstate(all="ignore"):
+        exact = np.concatenate([reference_step(system, x[[i]], float(t[i]), COMPARED_TO) for i in rows])
+        unit = np.ptp(np.concatenate([x, y]), axis=0)
+        unit = np.where(unit > 0, unit, 1.0)
+        away = np.linalg.norm((exact - y[rows]) / unit, axis=-1)
+        moved = np.linalg.norm((y[rows] - x[rows]) / unit, axis=-1)
+    away = away[np.isfinite(away)]
+    if len(away) and np.median(away) >= 0.1 * np.median(moved) and np.median(away) > COMPARED_TO:
+        warnings.warn(
+            f"`data` are no labels of the system {system.name!r}: its exact flow takes the labelled states elsewhere, "
+            f"in the median {np.median(away) / max(np.median(moved), 1e-300):.1e} times as far as they move. Figures "
+            "such as one_step_error compare with H of the system, and say nothing of your data: give its own system.",
+            UserWarning,
+            stacklevel=5,
+        )
 
 
 def digest(labels: Labelled) -> str:

@@ -46,6 +46,8 @@ class Run(ABC):
         Wall time of the run, and of those that it goes on with.
     closing : float
         Seconds that its end takes, which are kept free.
+    unfitted : tuple of (float, float)
+        Intervals of t at which the fit compares the flow with nothing.
     """
 
     flow: FlowMap
@@ -56,6 +58,7 @@ class Run(ABC):
     history: list[dict[str, float]] = field(default_factory=list, kw_only=True)
     seconds: float = field(default=0.0, kw_only=True)
     closing: float = field(default=0.0, kw_only=True)
+    unfitted: tuple[tuple[float, float], ...] = field(default=(), kw_only=True)
 
     UNIT: ClassVar[str]
 
@@ -154,6 +157,8 @@ class Run(ABC):
         flow.identify(self.system, self.domain)
         earlier = float(flow.figures.get("training_seconds", 0.0))
         stage = {**self.options.to_dict(), **self.remarks(reason)}
+        if self.done and not stage.get("kept_start"):
+            flow.unfitted = self.unfitted
         flow.recipe = {
             "stages": [*flow.recipe.get("stages", []), stage],
             **({} if self.scaling is None else {"scaling": self.scaling.to_dict()}),

@@ -36,7 +36,7 @@ from sympflow.training.options import (
     is_number,
     plain_numbers,
 )
-from sympflow.training.points import digest, handed_in
+from sympflow.training.points import digest, handed_in, unlabelled, warn_of_another_system
 from sympflow.training.runs import Run, Unstarted
 from sympflow.training.session import Deadline, OutOfTime, Path, Session
 from sympflow.training.split_fit import SplitRun
@@ -441,18 +441,27 @@ def _run_of(
     dt = 1.0 if dt is None else float(dt)
     labels = None if asked.data is None else handed_in(asked.data, system, dt)
     checksum = None if labels is None else digest(labels)
+    if labels is not None:
+        warn_of_another_system(labels, system)
     if searched and isinstance(flow, PrimedFlow):
         table = TableOptions.of(asked, checksum)
         scaling = scaling_of(domain, dt, table.seed)
         try:
-            return TableRun.start(flow, system, domain, scaling, table, labels, tried, deadline)
+            run: Run = TableRun.start(flow, system, domain, scaling, table, labels, tried, deadline)
         except OutOfTime as cut:
             return Unstarted(flow if tried is None else tried, system, domain, scaling, table, str(cut))
+        if labels is not None and table.loss == "labels":
+            run.unfitted = unlabelled(labels[0], dt)
+        return run
     options = LossOptions.of(asked, kind, checksum)
     scaling = scaling_of(domain, dt, options.seed)
     if flow is None:
         flow = new_network(system, new, dt, scaling, options.seed)
     try:
-        return LossRun.start(flow.requires_grad_(True), system, domain, scaling, options, labels, deadline)
+        run = LossRun.start(flow.requires_grad_(True), system, domain, scaling, options, labels, deadline)
     except OutOfTime as cut:
         return Unstarted(flow, system, domain, scaling, options, str(cut))
+    if not (options.residual_weight or options.matching_weight):
+        made = dt * np.arange(1, options.label_times + 1) / options.label_times
+        run.unfitted = unlabelled(made if labels is None else labels[0], dt)
+    return run

@@ -157,6 +157,11 @@ def test_a_blow_up_prints_no_warnings_of_numpy(tmp_path):
         (["train", "pendulum", "--checkpoint", "."], "`--checkpoint` '.' is a folder"),
         (["train", "pendulum", "--resume", "none.pt"], "is not a file: pass the path that was given as `--checkpoint`"),
         (["solve"], "`system` is missing"),
+        (["solve", "harmonic-oscillator:omega=1:omega=2"], "`omega` is given twice"),
+        (["solve", "harmonic-oscillator", "--omega", "1", "--omega", "2"], "`--omega` is given twice"),
+        (["solve", "pendulum", "--method", "verlet:"], "behind a colon is no option with a value"),
+        (["solve", "pendulum", "--method", "sympflow:flow=nope"], "flows from other files are named by their path"),
+        (["bench", "pendulum", "--methods", "verlet", "--t-end", 1, "--batch", 10**12], "`--batch` must be at most"),
         (["solve", "pendulum", "-x"], "`-x` is no option"),
         (["solve", "pendulum", "--method", "verlet", "--n-outputs", "0"], "`--n-outputs` must be a positive integer"),
         (["solve", "pendulum", "--method", "verlet", "--n-outputs", "-3"], "`--n-outputs` must be a positive integer"),
@@ -239,6 +244,17 @@ def test_a_run_that_is_too_long_names_options_that_there_are():
     assert named <= set(re.findall(r"--[\w-]+", run("solve", "--help").output))
     thinned = run("solve", "pendulum", "--method", "verlet", "--save-every", 100)
     assert "21 outputs" in thinned.stdout
+
+
+def test_a_run_that_stops_says_what_to_raise_in_options():
+    result = run("solve", "pendulum", "--method", "dopri5:max_num_steps=3")
+    assert result.exit_code == 1
+    assert "or end `--t-end` earlier" in result.stdout
+
+
+def test_systems_of_one_name_do_not_overwrite_their_files():
+    keys = [scene.key for scene in scenes(["pendulum:t_end=1", "henon-heiles", "pendulum", "pendulum"])]
+    assert keys == ["pendulum", "henon-heiles", "pendulum-2", "pendulum-3"]
 
 
 def test_a_backticked_argument_is_the_option_of_the_command_that_runs():

@@ -7,10 +7,10 @@ import pytest
 import torch
 import torchdiffeq
 
-from sympflow import MLPFlow, SympFlow, available, get, solve, systems
+from sympflow import HamiltonianSystem, MLPFlow, SympFlow, available, get, solve, systems
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.tableaux import FIXED
-from sympflow.interop.torchdiffeq import odeint, odeint_adjoint, odeint_event, register
+from sympflow.interop.torchdiffeq import odeint, odeint_adjoint, odeint_dense, odeint_event, register
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 EPS = np.finfo(float).eps
@@ -231,19 +231,213 @@ def test_a_name_that_neither_has_is_answered_with_both():
         odeint(HH, y0, times(0.0, 1.0, 2.0), method="dopri5", event_fn=lambda t, y: y[0])  # their own errors pass
 
 
-def test_the_adjoint_is_refused():
-    for method in ("sympflow", "verlet", flow()):
-        with pytest.raises(ValueError, match=r"cannot be used with odeint_adjoint.*Use odeint"):
-            odeint_adjoint(PENDULUM, times(1.0, 0.0), times(0.0, 1.0), method=method, adjoint_params=())
-    with pytest.raises(ValueError, match="cannot be used with odeint_adjoint"):
-        odeint_event(
-            PENDULUM,
-            times(1.0, 0.0),
-            times(0.0)[0],
-            event_fn=lambda t, y: y[0],
-            odeint_interface=torchdiffeq.odeint_adjoint,
-            method="verlet",
+class TestAdjoint:
+    """Gradients by stepping back: those of backpropagation, in memory that does not grow with the steps."""
+
+    @pytest.mark.parametrize("t", [(0.0, 0.25, 0.31, 1.7), (0.2, 0.1, -1.4)])
+    @pytest.mark.parametrize("method", [*KINDS, "sympflow"])
+    def test_backpropagation_to_rounding(self, method, t):
+        y0 = torch.tensor(HH.domain.sample(2, 1), requires_grad=True)
+        t = times(*t).requires_grad_(True)
+        found = []
+        for run in (odeint, odeint_adjoint):
+            y = run(HH, y0, t, method=method, options=options(method))
+            found.append((y, *torch.autograd.grad(y.sin().sum(), (y0, t))))
+        for ours, expected in zip(found[1], found[0], strict=True):
+            torch.testing.assert_close(ours, expected, rtol=0, atol=1e-10)
+
+    @pytest.mark.parametrize("kind", ["layers", "primed", "mlp"])
+    def test_the_weights_of_a_flow(self, kind):
+        """A map without an inverse is run again from its outputs."""
+        psi = {"layers": flow, "primed": lambda: SympFlow.primed(PENDULUM), "mlp": lambda: MLPFlow(1, hidden=(4,))}[
+            kind
+        ]()
+        psi.requires_grad_(True)
+        y0 = times(1.0, 0.2).requires_grad_(True)
+        found = [
+            torch.autograd.grad(
+                run(PENDULUM, y0, times(0.0, 0.3, 9.3, 15.0), method=psi).sin().sum(), (y0, *psi.parameters())
+            )
+            for run in (odeint, odeint_adjoint)
+        ]
+        for ours, expected in zip(*found, strict=True):
+            torch.testing.assert_close(ours, expected, rtol=1e-10, atol=1e-10)
+
+    @pytest.mark.parametrize("given", [True, False])
+    def test_numbers_of_H(self, given):
+        """`adjoint_params`, or else all leaves on which the vector field depends, here through another tensor."""
+        net = torch.nn.Sequential(torch.nn.Linear(1, 4), torch.nn.Tanh(), torch.nn.Linear(4, 1)).double()
+        raw = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+        k = torch.nn.functional.softplus(raw)
+        system = HamiltonianSystem(lambda q: k * net(q)[..., 0] + (q**2).sum(-1) / 2, ndof=1)
+        numbers = [raw, *list(net.parameters())[:-1]]  # a constant of V has no effect
+        y0, t = times(0.4, 0.2), times(0.0, 0.25, 1.0)
+        arguments = {"method": "kahan_li8", "options": {"dt": 0.1}}
+        more = {"adjoint_params": tuple(numbers)} if given else {}
+        runs = (odeint(system, y0, t, **arguments), odeint_adjoint(system, y0, t, **arguments, **more))
+        found = [torch.autograd.grad(y.sin().sum(), numbers, retain_graph=True) for y in runs]
+        for ours, expected in zip(found[1], found[0], strict=True):
+            torch.testing.assert_close(ours, expected, rtol=0, atol=1e-10)
+            assert expected.abs().max() > 0
+
+    def test_memory_does_not_grow_with_the_steps(self):
+        """The most that autograd keeps at a time, forward and backward."""
+
+        def most_kept(run, n):
+            live, most = 0, 0
+
+            class Kept:
+                def __init__(self, x):
+                    nonlocal live, most
+                    self.x = x
+                    live += x.numel()
+                    most = max(most, live)
+
+                def __del__(self):
+                    nonlocal live
+                    live -= self.x.numel()
+
+            y0 = torch.tensor(HH.y0, requires_grad=True)
+            with torch.autograd.graph.saved_tensors_hooks(Kept, lambda kept: kept.x):
+                odeint_end = run(HH, y0, times(0.0, 0.05 * n), method="verlet", options={"dt": 0.05})[-1]
+                odeint_end.sum().backward()
+            return most
+
+        assert most_kept(odeint_adjoint, 400) == most_kept(odeint_adjoint, 40)
+        assert most_kept(odeint, 400) > 9 * most_kept(odeint, 40)
+
+    def test_events(self):
+        y0, t0 = times(1.0, 0.2).requires_grad_(True), times(0.1)[0].requires_grad_(True)
+        psi = flow(seed=3).requires_grad_(True)
+        found = []
+        for interface in (odeint, odeint_adjoint, torchdiffeq.odeint_adjoint):
+            t, y = odeint_event(
+                PENDULUM, y0, t0, event_fn=lambda t, y: t + y[0] - 1.9, method=psi, odeint_interface=interface
+            )
+            found.append(torch.autograd.grad(t + y[1].sum(), (y0, t0, *psi.parameters())))
+        for others in found[1:]:
+            for ours, expected in zip(others, found[0], strict=True):
+                torch.testing.assert_close(ours, expected, rtol=0, atol=1e-10)
+
+    def test_tuples_and_single_precision(self):
+        q, p = torch.tensor([1.0], requires_grad=True), torch.tensor([0.2], requires_grad=True)
+        t = torch.tensor([0.0, 0.33, 1.0])
+        found = []
+        for run in (odeint, odeint_adjoint):
+            states = run(PENDULUM, (q, p), t, method="verlet", options={"dt": 0.1})
+            assert states[0].dtype == torch.float32
+            found.append(torch.autograd.grad(states[0].sum() + states[1].sin().sum(), (q, p)))
+        for ours, expected in zip(*found, strict=True):
+            torch.testing.assert_close(ours, expected)
+
+    def test_what_has_no_meaning_is_said(self):
+        y0, t = times(1.0, 0.0).requires_grad_(True), times(0.0, 1.0)
+        with pytest.raises(TypeError, match=r"^`odeint_adjoint` is for reverse mode.*use odeint"):
+            torch.func.jacrev(lambda y: odeint_adjoint(PENDULUM, y, t, method="verlet"))(y0.detach())
+        with (
+            torch.autograd.forward_ad.dual_level(),
+            pytest.raises(TypeError, match=r"^`odeint_adjoint` is for reverse"),
+        ):
+            dual = torch.autograd.forward_ad.make_dual(y0.detach(), y0.detach())
+            odeint_adjoint(PENDULUM, dual, t, method="verlet")
+        with pytest.raises(ValueError, match=r"^`adjoint_method` is 'rk4', but the gradients of 'verlet'"):
+            odeint_adjoint(PENDULUM, y0, t, method="verlet", adjoint_method="rk4")
+        with pytest.warns(UserWarning, match=r"`adjoint_rtol`.* have no effect on the fixed-step method 'verlet'"):
+            odeint_adjoint(PENDULUM, y0, t, method="verlet", adjoint_rtol=1e-3)
+        (slope,) = torch.autograd.grad(
+            odeint_adjoint(PENDULUM, y0, t, method="verlet")[-1].square().sum(), y0, create_graph=True
         )
+        with pytest.raises(RuntimeError, match="once_differentiable"):
+            slope.sum().backward()
+
+
+class TestDense:
+    """torchdiffeq's `odeint_dense` as a function of t, with derivatives."""
+
+    @pytest.mark.parametrize("method", [*KINDS, "sympflow"])
+    @pytest.mark.parametrize("end", [1.2, -1.25])
+    def test_equal_odeint(self, method, end):
+        t = end * times(0.0, 0.1, 0.35, 1.0)
+        y = odeint_dense(HH, torch.tensor(HH.y0), t[0], t[-1], method=method, options=options(method))
+        expected = odeint(HH, torch.tensor(HH.y0), t, method=method, options=options(method))
+        torch.testing.assert_close(y(t), expected, rtol=0, atol=200 * EPS)
+        torch.testing.assert_close(y(t[2]), expected[2], rtol=0, atol=200 * EPS)
+
+    def test_gradients(self):
+        psi = flow().requires_grad_(True)
+        y0 = times(1.0, 0.2).requires_grad_(True)
+
+        def states(y, t, *weights):
+            return odeint_dense(PENDULUM, y, 0.0, 2.0, method=psi)(t)
+
+        assert torch.autograd.gradcheck(states, (y0, times(0.1, 1.3).requires_grad_(True), *psi.parameters()))
+
+    def test_theirs_and_what_is_refused(self):
+        y0 = torch.tensor(HH.y0)
+        theirs = torchdiffeq.odeint_dense(HH, y0, times(0.0)[0], times(1.0)[0], method="dopri5")
+        ours = odeint_dense(HH, y0, times(0.0)[0], times(1.0)[0], method="dopri5")
+        assert torch.equal(theirs(times(0.7)[0]), ours(times(0.7)[0]))
+        y = odeint_dense(HH, y0, 0.0, 1.0, method="verlet")
+        for t in (times(1.1), times(-0.01)):
+            with pytest.raises(ValueError, match=r"^`t` must lie between 0 and 1"):
+                y(t)
+        with pytest.raises(TypeError, match=r"^`t` must be a floating-point tensor"):
+            y(0.5)
+        with pytest.raises(ValueError, match=r"^`method` 'rk4' has no dense output in torchdiffeq"):
+            odeint_dense(HH, y0, 0.0, 1.0, method="rk4")
+        with pytest.raises(TypeError, match=r"^`y0` must be a tensor"):
+            odeint_dense(HH, (y0[:2], y0[2:]), 0.0, 1.0, method="verlet")
+
+
+class TestCallbacks:
+    """torchdiffeq's `callback_step`, called before each step as its own fixed-step methods call it."""
+
+    @pytest.mark.parametrize("t", [(0.0, 0.2, 0.5), (0.0, -0.35)])
+    @pytest.mark.parametrize("as_tuple", [False, True])
+    def test_as_rk4_calls_it(self, t, as_tuple):
+        called = {}
+        y0 = (times(1.0), times(0.2)) if as_tuple else times(1.0, 0.2)
+        for method in ("rk4", "verlet"):
+            system, seen = systems.pendulum(), []
+
+            def note(t0, y, dt, seen=seen):
+                seen.append((float(t0), float(dt), len(y)))
+
+            system.callback_step = note
+            run = odeint(system, y0, times(*t), method=method, options={"step_size": 0.1})
+            called[method] = np.array(seen)
+            assert len(run) == (2 if as_tuple else len(t))
+        np.testing.assert_allclose(called["verlet"], called["rk4"], atol=1e-12)
+
+    def test_states_and_gradients_are_those_of_the_run(self):
+        system, seen = systems.pendulum(), []
+        system.callback_step = lambda t0, y, dt: seen.append(y)
+        y0 = times(1.0, 0.2).requires_grad_(True)
+        y = odeint(system, y0, times(0.0, 0.1, 0.2, 0.3), method="verlet", options={"dt": 0.1})
+        torch.testing.assert_close(torch.stack(seen), y[:-1], rtol=0, atol=0)
+        plain = odeint(PENDULUM, y0, times(0.0, 0.1, 0.2, 0.3), method="verlet", options={"dt": 0.1})
+        torch.testing.assert_close(y, plain, rtol=0, atol=0)
+
+    def test_those_of_adaptive_steps_are_not_supported(self):
+        system = systems.pendulum()
+        system.callback_accept_step = lambda t0, y, dt: None
+        with pytest.warns(UserWarning, match=r"'verlet' does not support the callbacks \['callback_accept_step'\]"):
+            odeint(system, times(1.0, 0.2), times(0.0, 0.3), method="verlet")
+
+
+def test_names_that_torchdiffeq_has_in_another_release(monkeypatch):
+    """Its own "implicit_midpoint" is left alone, and runs where `func` is no system."""
+    table = import_module("torchdiffeq._impl.odeint").SOLVERS
+    theirs = table["rk4"]
+    monkeypatch.setitem(table, "implicit_midpoint", theirs)
+    with pytest.warns(UserWarning, match=r"'implicit_midpoint' is torchdiffeq's own in this release"):
+        register("implicit_midpoint")
+    assert table["implicit_midpoint"] is theirs
+    y0, t = times(1.0, 0.5), times(0.0, 0.1)
+    by_function = odeint(right_hand_side, y0, t, method="implicit_midpoint")
+    assert torch.equal(by_function, torchdiffeq.odeint(right_hand_side, y0, t, method="rk4"))
+    sol = solve(PENDULUM, "implicit_midpoint", (0.0, 0.1), y0.numpy())
+    torch.testing.assert_close(odeint(PENDULUM, y0, t, method="implicit_midpoint")[-1], torch.tensor(sol.y[:, -1]))
 
 
 class TestRegistration:
@@ -280,10 +474,11 @@ class TestRegistration:
 
     def test_gradients_and_the_adjoint(self):
         y0 = times(1.0, 0.2).requires_grad_(True)
+        register("verlet")  # again: it is ours already
         assert torch.autograd.gradcheck(
             lambda y: torchdiffeq.odeint(PENDULUM, y, times(0.0, 0.33), method="verlet"), (y0,)
         )
-        with pytest.raises(ValueError, match=r"^`method` 'verlet' cannot be used with odeint_adjoint"):
+        with pytest.raises(ValueError, match=r"^`method` 'verlet' cannot be used with torchdiffeq's own odeint_adj"):
             torchdiffeq.odeint_adjoint(PENDULUM, y0, times(0.0, 0.33), method="verlet", adjoint_params=())
 
     def test_their_names_cannot_be_taken(self):

@@ -532,7 +532,10 @@ def test_a_fit_returns_nothing_worse_than_its_start():
     """Labels at Δt of another system: the flow as it was given is nearer to the exact one at the held-out states."""
     start = SympFlow.primed(PENDULUM, 2, dt=0.5, processor=2)
     t, x, y = _labels_at(0.5)
-    with pytest.warns(RuntimeWarning, match=r"^The fit has a larger held-out error .* started from"):
+    with (
+        pytest.warns(UserWarning, match=r"^`data` are no labels of the system 'pendulum'"),
+        pytest.warns(RuntimeWarning, match=r"^The fit has a larger held-out error .* started from"),
+    ):
         flow = train(PENDULUM, flow=start, data=(t, x, 2 * y), restarts=2, steps=8, progress=False)
     for name, value in start.state_dict().items():
         torch.testing.assert_close(flow.state_dict()[name], value, rtol=0, atol=1e-15)

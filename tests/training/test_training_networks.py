@@ -7,13 +7,13 @@ import pytest
 import torch
 
 import sympflow
-from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, systems, train
+from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, load, solve, systems, train
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.training.least_squares import PULL, GaussNewton
 from sympflow.training.losses import Loss, Objective, jacobian
 from sympflow.training.options import LossOptions
-from sympflow.training.points import Labels, Points, PointSource
+from sympflow.training.points import Labels, Points, PointSource, unlabelled
 
 HH, OSCILLATOR, PENDULUM = systems.henon_heiles(), systems.harmonic_oscillator(), systems.pendulum()
 QUICK = {
@@ -191,15 +191,73 @@ def test_data_is_used_and_a_tenth_of_it_held_out():
     arguments |= {"pairs": 2, "points": 300}
     flow = train(OSCILLATOR, data=(t, x, y), **arguments)
     assert flow.figures["one_step_error"] < flow.history[0]["one_step_error"] / 5
-    other = train(OSCILLATOR, data=(t, torch.tensor(x), -y), **{**arguments, "steps": 2})
+    with pytest.warns(UserWarning, match=r"^`data` are no labels of the system 'harmonic_oscillator'"):
+        other = train(OSCILLATOR, data=(t, torch.tensor(x), -y), **{**arguments, "steps": 2})
+    assert flow.unfitted == other.unfitted == ()  # labels at random times leave no gap
     assert other.recipe["stages"][0]["data"] != flow.recipe["stages"][0]["data"]
+
+
+@pytest.fixture(scope="module")
+def labelled_at_dt():
+    """A flow fitted to labels at Δt = 1 and no other time."""
+    x = OSCILLATOR.domain.sample(60, 3)
+    c, s = np.cos(1.0), np.sin(1.0)
+    y = np.stack([c * x[:, 0] + s * x[:, 1], c * x[:, 1] - s * x[:, 0]], -1)
+    arguments = {**QUICK, "residual_weight": 0.0, "matching_weight": 0.0, "optimizer": "gauss-newton", "steps": 15}
+    return train(OSCILLATOR, data=(np.full(60, 1.0), x, y), **arguments | {"pairs": 2, "points": 60})
+
+
+class TestLabelsAtFewTimes:
+    """What was compared with nothing is given with a warning, wherever it is asked for."""
+
+    def test_the_flow_knows_its_times_and_so_does_its_file(self, labelled_at_dt, tmp_path):
+        assert labelled_at_dt.unfitted == ((0.0, 1.0),)
+        labelled_at_dt.save(tmp_path / "flow.safetensors")
+        assert load(tmp_path / "flow.safetensors").unfitted == ((0.0, 1.0),)
+        assert train(OSCILLATOR, flow=labelled_at_dt, steps=1, optimizer="gauss-newton", points=20).unfitted == ()
+
+    @pytest.mark.parametrize(
+        "ask",
+        [
+            lambda f, x: solve(OSCILLATOR, f, (0, 3), t_eval=[0.5, 1.0]),
+            lambda f, x: solve(OSCILLATOR, f, (0, 3), t_eval=[0.5, 1.0], backend="array"),
+            lambda f, x: solve(OSCILLATOR, f, (0, 2.5)),
+            lambda f, x: solve(OSCILLATOR, f, (0, 3), dt=0.5),
+            lambda f, x: solve(OSCILLATOR, f, (0, 3), dense_output=True).sol(1.5),
+            lambda f, x: f(1.25, x),
+            lambda f, x: f(torch.tensor([1.0, 1.25], dtype=x.dtype), x),
+            lambda f, x: f.inverse(0.25, x),
+        ],
+    )
+    def test_results_between_them_warn(self, labelled_at_dt, ask):
+        message = r"none is at a time between 0 and 1: what it gives at t = \S+ was compared with nothing"
+        with pytest.warns(UserWarning, match=message):
+            ask(labelled_at_dt, torch.tensor(OSCILLATOR.domain.sample(2)))
+
+    def test_results_at_them_do_not(self, labelled_at_dt):
+        solve(OSCILLATOR, labelled_at_dt, (0, 3), t_eval=[1.0, 3.0])
+        solve(OSCILLATOR, labelled_at_dt, (3, 0), dense_output=True).sol([2.0, 1.0])
+        labelled_at_dt(3.0, torch.tensor(OSCILLATOR.domain.sample(2)))
+
+    @pytest.mark.parametrize(
+        ("t", "gaps"),
+        [
+            ([1.0], ((0.0, 1.0),)),
+            ([0.5, 1.0, 0.5], ((0.0, 0.5), (0.5, 1.0))),
+            ([0.5], ((0.0, 0.5), (0.5, 1.0))),
+            (np.arange(1, 9) / 8, ()),
+            (np.linspace(0.5, 1, 50), ((0.0, 0.5),)),
+        ],
+    )
+    def test_gaps_are_longer_than_an_eighth(self, t, gaps):
+        assert unlabelled(np.asarray(t), 1.0) == gaps
 
 
 def test_a_resumed_run_with_other_data_is_refused(tmp_path):
     t, x, y = labels(20)
     train(HH, data=(t, x, y), steps=2, checkpoint=tmp_path / "run.ckpt", optimizer="gauss-newton", **QUICK)
     with pytest.raises(ValueError, match="`resume` is a run with another data"):
-        train(HH, data=(t, x, y + 1), steps=2, resume=tmp_path / "run.ckpt", optimizer="gauss-newton", **QUICK)
+        train(HH, data=(t, x, y * (1 + 1e-6)), steps=2, resume=tmp_path / "run.ckpt", optimizer="gauss-newton", **QUICK)
 
 
 @pytest.mark.parametrize(
