@@ -65,7 +65,7 @@ class SymbolicHamiltonian(Definition):
     @cached_property
     def inverse_mass(self) -> sp.Matrix | None:
         """M⁻¹ if T = ½ pᵀM⁻¹p exactly, else None."""
-        if self.T is None:
+        if self.T is None or not self.T.is_polynomial(*self.p):
             return None
         M = hessian(self.T, self.p)
         p = sp.Matrix(self.p)

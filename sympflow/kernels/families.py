@@ -31,6 +31,7 @@ __all__ = [
 MOST_WRITTEN_OUT = 200  # operations of a gradient: longer ones take Numba more than a few seconds
 MOST_IN_REGISTERS = 16  # degrees of freedom of states that are tuples of numbers
 MOST_COMPILED = 5000  # operations of all formulas, before a warning
+MOST_SEPARATE = 8  # slopes of a formula that have nothing in common
 MOST_OPERATIONS = 300  # in one function of terms that stand alone
 
 
@@ -47,7 +48,7 @@ def written_out(f: sp.Expr, variables: Sequence[sp.Symbol]) -> int:
 
 def warn_if_long(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> None:
     """Warn of a function whose formulas, one for each kind of term, take Numba more than half a minute."""
-    n = sum(written_out(family.f, family.x) for family in families(f, variables))
+    n = sum(sp.count_ops(family.f) * min(len(family.x), MOST_SEPARATE) for family in families(f, variables))
     if n > MOST_COMPILED:
         warnings.warn(
             f"`system` {name!r} has so many terms of different kinds, about {n:,} operations, that compiling takes "

@@ -136,6 +136,12 @@ def test_a_warning_names_the_door_for_systems_of_very_many_kinds_of_terms(monkey
         families.warn_if_long(SYSTEM.symbols.V, SYSTEM.symbols.q, SYSTEM.name)
 
 
+def test_the_logarithmic_clock_of_many_degrees_of_freedom():
+    solution = solve(SYSTEM, "log_leapfrog", (0, 0.1), dt=0.05)
+    arrays = solve(SYSTEM, "log_leapfrog", (0, 0.1), dt=0.05, backend="array")
+    np.testing.assert_allclose(solution.y, arrays.y, atol=1e-12)
+
+
 def test_momenta_that_are_not_quadratic():
     relativistic = chain("sqrt(1 + p{0}**2)")
     compiled = splitting_loops(relativistic)
