@@ -43,6 +43,7 @@ bench: .venv/installed  ## The benchmarks that the docs quote, into docs/measure
 	$(BIN)/python benchmarks/training_step.py
 	$(BIN)/python benchmarks/kernels.py
 	$(BIN)/python benchmarks/interop.py --out docs/measured
+	$(BIN)/python benchmarks/plugins.py --out docs/measured
 	$(BIN)/python benchmarks/primed.py --out docs/measured
 	$(BIN)/python benchmarks/through_solve.py --out docs/measured
 	$(BIN)/python benchmarks/stability.py --out docs/measured

@@ -69,6 +69,17 @@ def check_not_followed(name: str, times: Any) -> None:
         )
 
 
+def check_not_traced(function: str) -> None:
+    """Raise a TypeError in a graph that `torch.compile` traces, into which a whole run does not go."""
+    import torch
+
+    if torch.compiler.is_dynamo_compiling():
+        raise TypeError(
+            f"`{function}` looks at values, which torch.compile hides: compile the steps, "
+            'sympflow.get("verlet")().step(system, t, y, h), or a flow, flow(t, y) with a number t.'
+        )
+
+
 def _real(x: Any) -> float:
     if type(x) is float or type(x) is int:
         return float(x)
@@ -151,6 +162,16 @@ def check_dt(dt: Any) -> None:
     """Raise unless `dt` is None or a step length."""
     if dt is not None and not (real_number(dt) and 0 < dt <= LONGEST_STEP):
         raise ValueError(f"`dt` must be a positive and finite number, at most {LONGEST_STEP:g}; got {dt!r}.")
+
+
+def as_float(value: Any) -> float:
+    """Return a real number as a float; NaN for anything else, an integer beyond floats among it."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.floating | np.integer):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.nan
 
 
 def check_flag(name: str, value: Any) -> None:

@@ -5,6 +5,7 @@ Dispatch is on the type of the argument, so that NumPy calls never import torch.
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -19,8 +20,10 @@ Array = Any
 
 def is_tensor(x: object) -> bool:
     """Return True for a torch tensor, decided without importing torch."""
-    kind = type(x)
-    return kind is not np.ndarray and kind.__module__.partition(".")[0] == "torch" and hasattr(x, "requires_grad")
+    if type(x) is np.ndarray:
+        return False
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(x, torch.Tensor)
 
 
 def library(x: Array) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
-from sympflow.arrays import Array, is_tensor, stack, to_numpy
+from sympflow.arrays import Array, differentiable, is_tensor, stack, to_numpy
 
 EventFunction = Callable[[float, Array], Any]
 Dense = Callable[[float], Array]
@@ -169,9 +170,17 @@ class EventSearch:
                 zeros.append((self._locate(event, a, b, before[i], after[i], inside), i))
         for t, i in sorted(zeros, key=lambda zero: zero[0] if b >= a else -zero[0]):
             y = inside(t)
+            followed = differentiable(y)
             y = y.detach() if is_tensor(y) else y  # the time depends on y0 as well: a gradient through y alone is wrong
             self.found[i].append((t, y))
             if len(self.found[i]) >= self.events[i].limit:
+                if followed:
+                    warnings.warn(
+                        "The state at the event that ends the run carries no derivative, nor does its time: use "
+                        "sympflow.interop.torchdiffeq.odeint_event, which gives both.",
+                        UserWarning,
+                        stacklevel=2,
+                    )
                 self.end = (t, y)
                 return True
         return False

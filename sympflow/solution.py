@@ -39,8 +39,8 @@ class Solution:
     nfev : int
         Force (right-hand side) evaluations.
     status : int, or ndarray of the batch's shape
-        0: the end was reached. −1: the solution became non-finite, an implicit step could not be solved, or the step
-        size underflowed. 1: an event ended it.
+        0: the end was reached, or the last time of `t_eval`. −1: the solution became non-finite, an implicit step could
+        not be solved, the step size underflowed, or the steps were too many. 1: an event ended it.
     message : str
         In words, with the time and the remedy.
     stats : dict

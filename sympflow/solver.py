@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import (
     MAX_ASKED_VALUES,
     MAX_SAVED_VALUES,
+    as_float,
+    check_not_traced,
     check_save_every,
     check_t_eval,
     check_t_span,
@@ -110,6 +112,8 @@ def solve(
     >>> sol.y.shape
     (4, 101)
     """
+    if is_tensor(y0):
+        check_not_traced("solve")
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     integrator = build(method, options)
@@ -330,8 +334,7 @@ def check_events(events: Any, event_step: Any) -> EventSearch | None:
         return None if events is None else EventSearch(())
     if event_step is None:
         return EventSearch(parsed)
-    number = isinstance(event_step, int | float | np.floating | np.integer) and not isinstance(event_step, bool)
-    if not (number and event_step > 0):
+    if not as_float(event_step) > 0:
         raise ValueError(f"`event_step` must be a positive number, a time; got {event_step!r}.")
     return EventSearch(parsed, float(event_step))
 

@@ -22,6 +22,7 @@ sys.path.insert(0, str(BENCHMARKS))
 import drift
 import own_systems
 import peers
+import plugins
 import primed
 import primed_ideas
 import solar_system
@@ -398,3 +399,13 @@ def test_a_network_on_top_of_a_primed_flow_starts_as_nothing_and_trains():
     assert table.count("|") == 6 * 4
     errors = [float(row.split("|")[3].split("/")[0]) for row in table.splitlines()[2:]]
     assert errors[1] <= errors[0]
+
+
+# a third party's method both ways ----------------------------------------------------------------------
+
+
+def test_a_scheme_and_a_step_are_one_method_and_each_is_timed():
+    found = plugins.rows(scale=100, repeats=1)
+    assert [name for name, *_ in found] == ["1 trajectory, 20 steps", "10 trajectories, 2 steps"]
+    assert all(0 < time < math.inf for _, *times in found for time in times)
+    assert plugins.table(found).count("\n") == 3

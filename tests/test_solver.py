@@ -331,6 +331,34 @@ def test_a_limit_on_steps_keeps_what_was_computed(method):
             solve(HH, method, max_steps=wrong)
 
 
+@pytest.mark.parametrize("method", ["rk45", "dop853"])
+def test_the_cause_is_named_where_there_is_no_first_step(method):
+    """A relative error of a component that is 0, an infinite field: two causes, two remedies."""
+    none = solve(PENDULUM, method, (0, 1), [1.0, 0.0], rtol=1e-6, atol=0)
+    assert (none.status, none.t.tolist()) == (-1, [0.0])
+    assert re.match(
+        r"There is no first step from t = 0: `atol` is 0, and `y0` has components .* Give an `atol`", none.message
+    )
+    infinite = solve(systems.kepler(), method, (0, 1), np.zeros(4))
+    assert infinite.message.startswith("The vector field is not finite at t = 0. Check `y0` and its scale.")
+    assert solve(PENDULUM, method, (0, 1), [1.0, 0.1], rtol=1e-6, atol=0).success
+
+
+@pytest.mark.parametrize(
+    "value", [1j, np.complex128(1), 10**400, np.nan, "1", [0.1], True, None], ids=lambda v: repr(v)[:9]
+)
+@pytest.mark.parametrize("option", ["rtol", "atol", "max_step", "first_step", "event_step"])
+def test_options_that_are_no_real_numbers(option, value):
+    """Complex numbers, and integers that no float holds, are refused by name like anything else."""
+    if value is None and option in ("first_step", "event_step"):
+        return  # the default
+    arguments = {option: value, "events": lambda t, y: y[0]}
+    methods = ["rk45", "dop853"] + ["dopri5"] * (option in ("rtol", "atol", "event_step"))
+    for method in methods:
+        with pytest.raises((ValueError, TypeError), match=f"^`{option}` must be"):
+            solve(PENDULUM, method, (0, 1), [1.0, 0.0], **arguments)
+
+
 def test_a_first_step_beyond_the_interval():
     for t_span in ((0, 5), (5, 0)):
         with pytest.raises(ValueError, match=r"^`first_step` 5.5 exceeds the interval, of length 5"):

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.arguments import plain
-from sympflow.arrays import differentiable, finite_states, is_tensor, readable, values
+from sympflow.arrays import differentiable, finite_states, has_values, is_tensor, readable, values
 from sympflow.flow.certificate import Certificate, certify
 from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
@@ -50,7 +50,8 @@ def check_system(system: Any) -> None:
             f"`system` must be a HamiltonianSystem; got {type(system).__name__}: take a scene of sympflow.systems, or "
             "define one with HamiltonianSystem.from_sympy."
         )
-    system.check_functions(torch.empty(0, dtype=torch.float64))
+    if system.functions_given:
+        system.check_functions(torch.empty(0, dtype=torch.float64) if system.takes_tensors else None)
 
 
 class FlowMap(nn.Module):
@@ -553,7 +554,7 @@ class FlowMap(nn.Module):
                 raise TypeError(f"`t` must be real times; got {t.dtype}: use a floating-point tensor.")
             if t.device != x.device:
                 raise ValueError(f"`t` is on {t.device} but `x` on {x.device}: move one of them.")
-            if not finite_states(t[..., None]).all():
+            if has_values(t) and not finite_states(t[..., None]).all():
                 raise ValueError("`t` must be finite: remove its NaN and infinite entries.")
             try:
                 torch.broadcast_shapes(t.shape, x.shape[:-1])
@@ -569,7 +570,7 @@ class FlowMap(nn.Module):
             raise TypeError(
                 f"`t` must be a number or a tensor of times; got {type(t).__name__}: pass seconds."
             ) from None
-        if not math.isfinite(value):
+        if not -math.inf < value < math.inf:
             raise ValueError(f"`t` must be finite; got {value}: pass a finite time.")
         return value
 

@@ -55,7 +55,7 @@ class MLPFlow(FlowMap):
             hidden = _default_widths(ndof)
         self.hidden, self.activation = hidden_widths(hidden), activation
         self._sigma = activation_named(activation)
-        weights = count_weights(2 * ndof, self.hidden) + 2 * ndof * self.hidden[-1]
+        weights = count_weights(2 * ndof, self.hidden) - self.hidden[-1] + 2 * ndof * (self.hidden[-1] + 1)
         check_memory(f"`hidden` {self.hidden!r}", weights, "take narrower layers")
         scale = Scaling.unit(ndof, dt) if scale is None else scale
         generator = torch.Generator().manual_seed(seed)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 from torch import Tensor
 
-from sympflow.arrays import jvp
+from sympflow.arrays import Array, jvp
 from sympflow.flow.potentials import Potential, Time
 from sympflow.hamiltonian.hamiltonian import derivative, direction, length_of_change, step
 from sympflow.hamiltonian.monomials import Monomials, gradient, value
@@ -66,13 +66,25 @@ class Term:
     gradient: Callable[[HamiltonianSystem, Tensor], Tensor]
 
 
+def _called(f: Callable[[Array], Array], system: HamiltonianSystem, q: Tensor) -> Tensor:
+    """f(q), by way of NumPy where the functions of the system take nothing else."""
+    if system.takes_tensors:
+        return f(q)
+    if q.requires_grad:
+        raise TypeError(
+            f"`system` {system.name!r} has functions of NumPy arrays, through which no gradient flows: write them for "
+            "tensors too, or use HamiltonianSystem.from_sympy."
+        )
+    return torch.as_tensor(f(q.cpu().numpy()), dtype=q.dtype, device=q.device)
+
+
 def _force_gradient_value(system: HamiltonianSystem, q: Tensor) -> Tensor:
-    F = system.force(q)
+    F = _called(system.force, system, q)
     return -(F * system.velocity(F)).sum(-1) / 2
 
 
 def _force_gradient(system: HamiltonianSystem, q: Tensor) -> Tensor:
-    return system.hessian_vector(q, system.velocity(system.force(q)))
+    return _called(lambda x: system.hessian_vector(x, system.velocity(system.force(x))), system, q)
 
 
 def _curvature(system: HamiltonianSystem, q: Tensor) -> Tensor:
@@ -84,11 +96,11 @@ def _curvature_gradient(system: HamiltonianSystem, q: Tensor) -> Tensor:
 
 
 def _potential(system: HamiltonianSystem, q: Tensor) -> Tensor:
-    return system.potential(q)
+    return _called(system.potential, system, q)
 
 
 def _potential_gradient(system: HamiltonianSystem, q: Tensor) -> Tensor:
-    return -system.force(q)
+    return -_called(system.force, system, q)
 
 
 def _kinetic(system: HamiltonianSystem, p: Tensor) -> Tensor:

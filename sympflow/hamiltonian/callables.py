@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any
@@ -92,6 +93,20 @@ class CallableHamiltonian(Definition):
             return [("hamiltonian", self._H(x).dtype)]
         functions = ("potential", self._potential), ("gradient", self._gradient)
         return [(name, getattr(f(x), "dtype", None)) for name, f in functions if f is not None]
+
+    @cached_property
+    def takes_tensors(self) -> bool:  # type: ignore[override]
+        """False if the gradient fails on a tensor, or answers with something else or NumPy's warnings."""
+        if self._gradient is None or self.numba_functions is not None:
+            return True
+        import torch
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                return is_tensor(self._gradient(torch.full((2, self.ndof), 0.5, dtype=torch.float64)))
+            except Exception:  # whatever a user's function raises
+                return False
 
     def hamiltonian(self, y: Array) -> Array:
         return _with_torch(self._H, y, "hamiltonian", ())

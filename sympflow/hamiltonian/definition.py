@@ -25,6 +25,8 @@ class Definition:
         True if all derivatives are automatic ones of a function that is written with torch.
     has_hessian_vector : bool
         False if ∇²V·v of arrays is not to be had: a gradient was given without it.
+    takes_tensors : bool
+        False if the functions take NumPy arrays alone.
     given : bool
         True if the functions are a user's own, whose derivatives may be wrong: `check` tests them.
     """
@@ -34,6 +36,7 @@ class Definition:
     numba_functions: tuple[Any, Any, Any] | None = None
     differentiates_itself: bool = False
     has_hessian_vector: bool = True
+    takes_tensors: bool = True
     given: bool = False
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:

@@ -217,6 +217,11 @@ class Hamiltonian:
         return self._definition.has_hessian_vector
 
     @property
+    def takes_tensors(self) -> bool:
+        """False if the functions are a user's that take NumPy arrays alone."""
+        return self._definition.takes_tensors
+
+    @property
     def numba_functions(self) -> tuple[Any, Any, Any] | None:
         """(potential, gradient, hessian_vector) if the system was given by Numba functions, else None."""
         return self._definition.numba_functions

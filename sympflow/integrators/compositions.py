@@ -144,6 +144,8 @@ class KineticPotential(Composition):
         system, d = self.system, self.system.ndof
         y = to_numpy(y)
         q, p, h = y[..., :d], y[..., d:], np.asarray(h, dtype=y.dtype)[..., None]
+        if not system.has_hessian_vector:
+            system.potential_hessian(q)  # which says so, before anything large is made
         A = np.broadcast_to(np.eye(2 * d, dtype=y.dtype), (*y.shape, 2 * d)).copy()
         for kind, c, *_ in self.scheme.substeps:
             if kind == "drift":

@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from sympflow.arguments import MAX_ASKED_VALUES
 from sympflow.arrays import Array, is_tensor, jvp, to_numpy
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -43,6 +44,9 @@ if TYPE_CHECKING:
 
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
 """Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
+
+MOST_ENTRIES = 20_000_000
+"""Entries of the Jacobians that are held at a time."""
 
 FINISHED = "The solver successfully reached the end of the integration interval."
 ENDED = "A termination event occurred."
@@ -223,7 +227,7 @@ class Integrator:
         self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """The steps of the run, differentiated where they were made: times and lengths (n, ...), Jacobians as above."""
-        for times, states, lengths in self.steps(system, t_span, y0):
+        for times, states, lengths in in_blocks(self.steps(system, t_span, y0)):
             yield differentiated(lambda t, y, h: self.tangent(system, t, y, h)[1], times, states, lengths)
 
     def run(self, problem: Problem) -> Outcome:
@@ -233,6 +237,20 @@ class Integrator:
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         """Execute the run again as a stream of its steps."""
         raise NotImplementedError(f"{type(self).__name__} must define steps().")
+
+
+def in_blocks(steps: Steps) -> Steps:
+    """The chunks of a stream of steps, divided so that the Jacobians of each fit into the memory."""
+    for times, states, lengths in steps:
+        rows, k = math.prod(states.shape[1:-1]), states.shape[-1]
+        if rows * k**2 > MAX_ASKED_VALUES:
+            raise ValueError(
+                f"`sol` has {rows} trajectories of {k} variables, so that the Jacobians of one step have "
+                f"{rows * k**2:.3g} entries, more than {MAX_ASKED_VALUES:.0e}: solve fewer, or smaller ones."
+            )
+        n = max(1, MOST_ENTRIES // (rows * k**2))
+        for i in range(0, len(times), n):
+            yield times[i : i + n], states[i : i + n], lengths[i : i + n]
 
 
 def forward_tangent(step: Callable[[Any, Any], Any], y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:

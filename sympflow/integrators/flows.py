@@ -6,14 +6,13 @@ import copy
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from numbers import Real
 from typing import Any, ClassVar, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 
-from sympflow.arguments import check_flag
+from sympflow.arguments import as_float, check_flag
 from sympflow.arrays import Array, is_tensor, to_numpy, untransformed
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.shipped import choose, forces_saved, named, shipped, shipped_flows
@@ -275,7 +274,7 @@ class SympFlowIntegrator(FlowIntegrator):
         check_flag("compensated", self.compensated)
         if self.tol is None:
             return
-        if not isinstance(self.tol, Real) or isinstance(self.tol, bool) or not 0 < self.tol < math.inf:
+        if not 0 < as_float(self.tol) < math.inf:
             raise ValueError(
                 f"`tol` must be a positive number, a relative energy error; got {self.tol!r}: take 1e-6, for instance."
             )

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from sympflow.arguments import as_float
 from sympflow.arrays import Array, per_state, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
@@ -33,6 +34,8 @@ class ExplicitStep(Integrator):
         """The step and its Jacobian, the step length held fixed: each stage differentiated as it is executed."""
         y = to_numpy(y)
         h = np.asarray(h, dtype=y.dtype)[..., None]
+        if not system.has_hessian_vector:
+            system.hessian(y)  # which says so, before anything large is made
         d, identity = system.ndof, np.eye(y.shape[-1], dtype=y.dtype)
         K: list[np.ndarray] = []
         dK: list[np.ndarray] = []
@@ -61,7 +64,7 @@ class RungeKutta(ExplicitStep):
     def __post_init__(self) -> None:
         for name in ("rtol", "atol"):
             value = getattr(self, name)
-            if not (isinstance(value, int | float) and 0 <= value < math.inf):
+            if not 0 <= as_float(value) < math.inf:
                 raise ValueError(f"`{name}` must be a finite number, not negative; got {value!r}.")
         if self.rtol == 0 and self.atol == 0:
             raise ValueError("`rtol` and `atol` are both 0, which no step can meet: make one of them positive.")

@@ -12,7 +12,7 @@ from scipy.integrate import DOP853 as ScipyDOP853
 from scipy.integrate import RK45 as ScipyRK45
 from scipy.integrate import OdeSolution
 
-from sympflow.arguments import MAX_SAVED_VALUES, check_counts
+from sympflow.arguments import MAX_SAVED_VALUES, as_float, check_counts
 from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Recorder
@@ -53,10 +53,9 @@ class _Scipy(RungeKutta):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (isinstance(self.max_step, int | float | np.number) and self.max_step > 0):
+        if not as_float(self.max_step) > 0:
             raise ValueError(f"`max_step` must be positive; got {self.max_step!r}.")
-        number = isinstance(self.first_step, int | float | np.number)
-        if self.first_step is not None and not (number and 0 < self.first_step < math.inf):
+        if self.first_step is not None and not 0 < as_float(self.first_step) < math.inf:
             raise ValueError(f"`first_step` must be positive and finite; got {self.first_step!r}.")
         if self.max_steps is not None:
             check_counts(max_steps=self.max_steps)
@@ -84,6 +83,18 @@ class _Scipy(RungeKutta):
         with np.errstate(all="ignore"):
             solver = self.solver(system, t0, y0, t1, self.max_step, self.rtol, self.atol, first_step=first)
         return solver if np.isfinite(solver.f).all() and 0 < solver.h_abs < math.inf else None
+
+    def _no_start(self, system: HamiltonianSystem, t0: float, y0: np.ndarray) -> str:
+        """The message of a trajectory that has no first step."""
+        with np.errstate(all="ignore"):
+            finite = bool(np.isfinite(system.vector_field(y0.astype(float))).all())
+        if finite and self.atol == 0 and (y0 == 0).any():
+            return (
+                f"There is no first step from t = {t0:.17g}: `atol` is 0, and `y0` has components that are 0, of which "
+                "a relative error has no meaning. Give an `atol`, such as `rtol` times the size of the state."
+            )
+        what = "first step" if finite else "vector field"
+        return f"The {what} is not finite at t = {t0:.17g}. Check `y0` and its scale{', or raise `atol`' * finite}."
 
     def run(self, problem: Problem) -> Outcome:
         self.check_library(problem.y0)
@@ -124,10 +135,7 @@ class _Scipy(RungeKutta):
         solver = self._start(problem.system, t0, t1, y0.astype(float)) if t1 != t0 else None
         failure = None
         if t1 != t0 and solver is None:
-            failure = (
-                f"The vector field or the first step is not finite at t = {t0:.17g}. Check `y0` and its scale, or "
-                "raise `atol`."
-            )
+            failure = self._no_start(problem.system, t0, y0)
         record = Recorder(replace(problem, y0=y0), np.empty(0) if t_eval is None else t_eval)
         if t1 == t0:
             record.empty(t0, y0)

@@ -17,7 +17,7 @@ from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep, KernelStepper, OwnStepper, Stepper, compiled_loops
 from sympflow.integrators.clocks import ARRAYS_ONLY, LogarithmicClock, scale_of, transformed_system
 from sympflow.integrators.compositions import SPLITTINGS, Composition
-from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, differentiated, forward_tangent
+from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, differentiated, forward_tangent, in_blocks
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
 from sympflow.schemes import SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
@@ -302,7 +302,7 @@ class Splitting(OwnStepper):
             yield from super().executed(system, t_span, y0)
             return
         composition = self.composed(system)
-        for times, states, lengths in super().steps(system, t_span, composition.lift(y0)):
+        for times, states, lengths in in_blocks(super().steps(system, t_span, composition.lift(y0))):
             yield differentiated(lambda t, x, h: forward_tangent(composition.step, x, h)[1], times, states, lengths)
 
     def own_stepper(self, problem: Problem) -> Stepper:
@@ -326,7 +326,7 @@ class Splitting(OwnStepper):
             yield from clock.steps(t_span, y0)
             return
         composition = self.composed(system)
-        for times, states, lengths in super().steps(system, t_span, composition.lift(y0)):
+        for times, states, lengths in in_blocks(super().steps(system, t_span, composition.lift(y0))):
             yield times, composition.project(states), lengths
 
 

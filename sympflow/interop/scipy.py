@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from scipy.integrate import DenseOutput, OdeSolver
 
+from sympflow.arguments import as_float
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem, Stepper
 from sympflow.integrators.grid import Grid, no_event, open_end
@@ -130,7 +131,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
                 UserWarning,
                 stacklevel=3,
             )
-        if not (isinstance(max_step, int | float | np.floating | np.integer) and max_step > 0):
+        if not as_float(max_step) > 0:
             raise ValueError(f"`max_step` must be positive; got {max_step!r}.")
         self._counts = _Counts()
         super().__init__(fun, t0, y0, t_bound, vectorized)
@@ -261,7 +262,7 @@ def _check_first_step(first_step: Any, length: float) -> None:
     """Refuse what SciPy's own solvers refuse, though the steps of the method are its own."""
     if first_step is None:
         return
-    if not (isinstance(first_step, int | float | np.floating | np.integer) and first_step > 0):
+    if not as_float(first_step) > 0:
         raise ValueError(f"`first_step` must be positive; got {first_step!r}. Leave it out.")
     if first_step > length:
         raise ValueError(f"`first_step` {first_step:g} exceeds the interval, of length {length:g}. Leave it out.")

@@ -19,6 +19,7 @@ import torch
 import torchdiffeq
 from torch import Tensor
 
+from sympflow.arguments import check_not_traced
 from sympflow.arrays import differentiable, finite_states, one_lane, readable, transformed
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
@@ -169,6 +170,9 @@ def odeint_dense(
     _integrated(Path, func, y0, times[:1], rtol, atol, method, options, None)  # checks all arguments
     integrator, system = _build(func, method, options)
     path = DensePath(integrator, system, y0, _direction(times), times)
+    compared = _Compared(func, y0, times, integrator, system)
+    if compared.func is not None:
+        compared.run(path, times)
 
     def solution(t: Tensor) -> Tensor:
         if not (isinstance(t, Tensor) and t.ndim < 2 and t.is_floating_point()):
@@ -334,6 +338,8 @@ def _their_table() -> dict[str, Any]:
 
 def _is_ours(method: Any, func: Any, options: Any) -> bool:
     """True if `method` is one of ours; a name that both have is theirs for a `func` of which we know no system."""
+    if method is not None and method not in _THEIRS:
+        check_not_traced("odeint")
     if not isinstance(method, str):
         return method is not None
     if method in _THEIRS or method not in available():

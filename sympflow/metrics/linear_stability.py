@@ -38,6 +38,7 @@ ROUNDING = 2.0**-52  # of a coefficient of a table
 STEPS_TRIED = 2048  # at which a method that is no table is differentiated
 WIDEST = 20.0  # z up to which it is
 GROWS = 1e-5  # beyond 1, of a spectral radius that is not rounding: that of a double eigenvalue is √ε
+TURNS = 1e-5  # imaginary part of an eigenvalue that is simple, whose rounding is ε
 NEWTON_STEPS = 50
 SCALES = (0.1, 1.0, 10.0, 100.0)  # of the states at which Hessians are compared, in units of y0
 
@@ -401,7 +402,17 @@ def of_method(
         growth = _growth(integrator, system, y, steps)
     except Exception:  # a method that cannot be differentiated there, or a plug-in's step
         return None
-    return LinearStability(tuple(_found(growth, steps, lambda h: _growth(integrator, system, y, h))))
+    windows = _found(growth, steps, lambda h: _growth(integrator, system, y, h))
+    if windows and not integrator.symplectic and _grows_slowly(integrator, system, y, windows[0].start / 2):
+        windows[0] = windows[0]._replace(start=0.0)
+    return LinearStability(tuple(windows))
+
+
+def _grows_slowly(integrator: Integrator, system: HamiltonianSystem, y: np.ndarray, h: float) -> bool:
+    """True if some oscillation grows at a step h at all, as by explicit Runge–Kutta methods such as Euler's."""
+    _, A = integrator.tangent(system, 0.0, y[None], np.array([h]))
+    values = np.linalg.eigvals(A[0])
+    return bool((np.abs(values[np.abs(values.imag) > TURNS]) > 1 + GROWS**2).any())
 
 
 def _growth(integrator: Integrator, system: HamiltonianSystem, y: np.ndarray, steps: np.ndarray) -> np.ndarray:

@@ -34,6 +34,7 @@ TOLERANCES = tuple(10.0**-k for k in range(3, 13))
 LARGEST_STEP, N_STEPS = 32, 14  # the default sweep: from 32·system.dt, halving
 LEVELS = (1e-3, 1e-6, 1e-9)  # energy errors for which the table gives the costs
 FLOOR = 1e-12  # energy error from which smaller steps only cost more
+NEAR_FLOOR = 1e-6  # and of the point before it: an error that is small by chance is no end
 SAMPLE = 4  # trajectories of a batch that are run by a method that takes them one by one
 MARGIN = 100.0  # by which a reference must be better than an error
 
@@ -192,12 +193,14 @@ def _measure(
     points: list[Attempt] = []
     for candidate, integrators in swept:
         say(candidate.label)
+        error = math.inf
         compile_time = _compiled(replace(candidate, integrator=integrators[-1]), conditions)
         for integrator in integrators:
             point = _first(replace(candidate, integrator=integrator), conditions, compile_time)
             points.append(point)
-            row = point.row
-            if row.status == "not applicable" or (row.energy_error or math.inf) < FLOOR:
+            row, before = point.row, error
+            error = math.inf if row.energy_error is None else row.energy_error
+            if row.status == "not applicable" or (error < FLOOR and before < NEAR_FLOOR):
                 break
     say("timing")
     again = [p for p in points if p.row.status == "ok" and (p.row.run_time or 0.0) * repeats <= budget]

@@ -36,7 +36,7 @@ from sympflow.training.session import Deadline, OutOfTime, Session
 
 PROBE = 32  # held-out points whose time tells how many there is time for
 VALIDATION_SHARE = 0.1  # of the time left, that a validation may take
-BACKWARD = 3.0  # times what a point takes in a validation, that it takes in a step
+BACKWARD = 2.0  # times what a point takes in a validation, that it takes in a step at least
 
 
 @dataclass
@@ -128,8 +128,12 @@ class LossRun(Run):
         self._validate()
         self.closing = session.passed - began
         self.work_end = session.deadline.before(self.closing)
-        points = len(self.held_out.t)
-        self.step_seconds = BACKWARD * self.closing * self.options.points / points if points > PROBE else 0.0
+        if self.work_end.end < math.inf:
+            began = session.passed
+            with torch.no_grad():
+                self.loss.terms(self.flow, self.held_out)
+            each = (session.passed - began) / len(self.held_out.t)
+            self.step_seconds = BACKWARD * each * max(self.options.points - PROBE, 0)
         if not math.isfinite(self.history[0]["loss"]):
             raise FloatingPointError(
                 "The loss is not finite at the first validation: the system's H or its gradient is not finite "
@@ -139,11 +143,14 @@ class LossRun(Run):
     def over(self, session: Session) -> bool:
         if self.step == 0 and not self._fits():
             self.ended, self.reason = True, OUT_OF_TIME
+            if not session.cut:
+                self.reason = f"a step takes about {self.step_seconds:.2g} s, for which the time budget is too short"
         return self.ended
 
     def _fits(self) -> bool:
-        """Return whether there is time for another step."""
-        return not self.work_end.over() and self.step_seconds <= self.work_end.left
+        """Return whether there is time for another step; those of Adam are one piece, others can be cut."""
+        in_time = self.options.optimizer != "adam" or self.step_seconds <= self.work_end.left
+        return not self.work_end.over() and in_time
 
     def advance(self, session: Session) -> Advance:
         options = self.options

@@ -91,9 +91,10 @@ def train(
 ) -> Any:
     """Train a flow map of `system` on [0, dt]: with nothing else given, the best that is known for it.
 
-    For a separable symbolic system with T = ½ pᵀM⁻¹p that is a primed flow (`SympFlow.primed`), whose few numbers are
-    fitted to the exact flow in seconds. In up to three degrees of freedom short trials choose its Δt, and whether its
-    kicks have curvature terms (`sympflow.training.trials`), unless an option says something of the flow or its fit. For
+    For a separable system with T = ½ pᵀM⁻¹p, however V was given, that is a primed flow (`SympFlow.primed`), whose few
+    numbers are fitted to the exact flow in seconds. In up to three degrees of freedom of a symbolic system short trials
+    choose its Δt, and whether its kicks have curvature terms (`sympflow.training.trials`), unless an option says
+    something of the flow or its fit. For
     any other system it is a SympFlow with MLP potentials, symplectic for every H, trained by Adam on its residual and
     by Hamiltonian matching, without data. A flow of any kind, one made by `SympFlow.primed` or `SympFlow.split` among
     them, is trained further as `flow`.
@@ -104,7 +105,8 @@ def train(
         H, which a flow is fitted to, with `data` as well.
     dt : float, optional
         Δt, the longest time of the map; the default is that of `flow`, for a new primed flow what suits the system's
-        frequencies on Ω (see `sympflow.training.starts`) and gains most in trials, else 1.
+        frequencies on Ω (see `sympflow.training.starts`) and gains most in trials, else 1. At most thirty periods of
+        half of the states of Ω: no flow takes more in one step.
     kind : {"primed", "sympflow", "mlp"}, optional
         The architecture: a SympFlow primed with the system's V and T; one with MLP potentials; or the unconstrained
         baseline with as many parameters as the SympFlow that `pairs` and `hidden` describe. The default is "primed"
@@ -146,7 +148,10 @@ def train(
         Go on from this checkpoint, given the same arguments otherwise; the weights end bit-identical to those of a
         run that was not interrupted.
     time_budget : float, optional
-        Stop after so many seconds, trials and labels among them. The default for a new primed flow is 60, unless
+        Stop after so many seconds, to 20 %, and a few seconds for what is imported and compiled; a single evaluation of
+        a network's loss at 32 points is the smallest piece. All counts: trials (at most half of it), labels (at most
+        0.3 of what is left, each set), starts, fits, held-out figures. Where labels take longer the flow
+        is returned as it was, and a warning says how far they came. The default for a new primed flow is 60, unless
         `restarts`, `steps` or `resume` is given: the search then takes fewer starts than it might, which the recipe
         records; else there is none.
     progress : bool, optional
@@ -165,13 +170,16 @@ def train(
     Warns
     -----
     UserWarning
-        If a primed flow is far from the exact one: where its error in one step of Δt is, in the mean over held-out
-        states, a tenth or more of what the step moves a state, coordinates in units of their spread over Ω.
+        If the flow is far from the exact one: where its error in one step of Δt is, in the mean over held-out states, a
+        tenth or more of what the step moves a state, coordinates in units of their spread over Ω; or, for a network on
+        a separable system, no less than that of one Verlet step. `figures` has both as "missed_share" and
+        "verlet_missed_share".
 
     Raises
     ------
     ValueError
-        If the system has no domain and none is given, or an argument is not admissible.
+        If the system has no domain and none is given, an argument is not admissible, Δt is far beyond the periods of
+        the system, or the weights and points would take more memory than the machine has.
     TypeError
         If an option is not one of the optimizer's, or of no training at all.
     FloatingPointError

@@ -1,5 +1,7 @@
 """Derivatives and transforms of torch through `odeint`, `solve` and flows: right, or refused, never silently zero."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from torch.autograd import forward_ad
 from torch.autograd.functional import jacobian
 from torch.func import functional_call, grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
-from sympflow import HamiltonianSystem, MLPFlow, SympFlow, solve, systems
+from sympflow import HamiltonianSystem, MLPFlow, SympFlow, get, solve, systems
 from sympflow.interop.torchdiffeq import odeint, odeint_event
 
 PENDULUM, OSCILLATOR = systems.pendulum(), systems.harmonic_oscillator()
@@ -52,6 +54,31 @@ def problem(method):
         return solve(system, method, (0.0, 0.7), y, t_eval=[0.25, 0.7], on_domain_exit="ignore", **chosen).y[..., -1]
 
     return by_odeint, by_solve
+
+
+DOCUMENTED = {
+    "`backward`, `torch.autograd.grad`": ["backward"],
+    "dual tensors, `torch.autograd.forward_ad`": ["dual tensors"],
+    "`torch.autograd.functional.jacobian`, both strategies": ["jacobian, forward mode", "jacobian, vectorized"],
+    "`torch.func.grad`, `vjp`, `jacrev`": ["grad", "vjp", "jacrev"],
+    "`torch.func.jvp`, `jacfwd`": ["jvp", "jacfwd"],
+    "`torch.func.hessian`": ["TestEveryTransform.test_derivatives_in_y0"],
+    "`torch.func.vmap`, of these too": ["TestEveryTransform.test_vmap"],
+    "`torch.func.functional_call`": ["TestFlows.test_functional_weights"],
+    "`torch.compile(fullgraph=True)`": ["TestCompiled.test_steps", "TestCompiled.test_whole_runs_are_refused"],
+}
+"""The rows of the table in docs/plugins-and-interop.md, and what executes them: derivatives above, and tests below."""
+
+
+def test_every_row_of_the_documented_table_is_executed():
+    page = (Path(__file__).parents[2] / "docs" / "plugins-and-interop.md").read_text(encoding="utf-8")
+    table = page.partition("| transform |")[2].partition("\n\n")[0]
+    rows = [line.split("|")[1].strip() for line in table.splitlines()[2:]]
+    assert rows == list(DOCUMENTED)
+    for names in DOCUMENTED.values():
+        for name in names:
+            cls, _, test = name.partition(".")
+            assert name in DERIVATIVES or callable(getattr(globals()[cls], test))
 
 
 @pytest.mark.parametrize("method", KINDS)
@@ -211,6 +238,56 @@ class TestEvents:
     def test_hidden_values_are_refused(self):
         with pytest.raises(TypeError, match=r"^`event_fn` is followed by the values.*torch\.func\.vmap"):
             vmap(lambda y: self.event(y)[0])(Y)
+
+
+def test_the_state_at_a_terminal_event_of_solve_says_that_it_has_no_derivative():
+    def crossing(t, y):
+        return y[0] - 0.9
+
+    crossing.terminal = True
+    with pytest.warns(UserWarning, match="carries no derivative.*odeint_event"):
+        jacfwd(lambda y: solve(PENDULUM, "verlet", (0.0, 5.0), y, events=crossing).y)(Y[0])
+    with pytest.warns(UserWarning, match="carries no derivative.*odeint_event"):
+        solve(PENDULUM, "verlet", (0.0, 5.0), Y[0].clone().requires_grad_(True), events=crossing)
+    assert solve(PENDULUM, "verlet", (0.0, 5.0), Y[0], events=crossing).status == 1
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Dynamo's own, of code that it traces
+class TestCompiled:
+    """`torch.compile(fullgraph=True)`: steps and flows are one graph; whole runs say that they are none."""
+
+    @pytest.mark.parametrize("method", ["verlet", "strang_parts", "implicit_midpoint"])
+    def test_steps(self, method):
+        torch.compiler.reset()
+        integrator = get(method)(dt=0.1)
+        expected = integrator.step(PENDULUM, 0.0, Y, 0.1)  # the parts of H are found in the first call
+        compiled = torch.compile(lambda y: integrator.step(PENDULUM, 0.0, y, 0.1), backend="eager", fullgraph=True)
+        torch.testing.assert_close(compiled(Y), expected, **CLOSE)
+
+    def test_flows(self):
+        torch.compiler.reset()
+        psi = SympFlow(1, hidden=(5,), dt=0.5)
+        expected = psi(1.2, Y)
+        compiled = torch.compile(lambda y: psi(1.2, y), backend="eager", fullgraph=True)
+        torch.testing.assert_close(compiled(Y), expected, **CLOSE)
+        compiled = torch.compile(psi.psi, backend="eager", fullgraph=True)
+        torch.testing.assert_close(compiled(T[1], Y), psi(0.25, Y), **CLOSE)
+
+    def test_gradients_of_a_step(self):
+        torch.compiler.reset()
+        integrator = get("verlet")(dt=0.1)
+        compiled = torch.compile(
+            lambda y: integrator.step(PENDULUM, 0.0, y, 0.1).sum(0), backend="aot_eager", fullgraph=True
+        )
+        J = jacobian(lambda y: integrator.step(PENDULUM, 0.0, y, 0.1).sum(0), Y)
+        torch.testing.assert_close(jacobian(compiled, Y), J, **CLOSE)
+
+    @pytest.mark.parametrize("which", [0, 1], ids=["odeint", "solve"])
+    def test_whole_runs_are_refused(self, which):
+        torch.compiler.reset()
+        f = problem("verlet")[which]
+        with pytest.raises(Exception, match=r"looks at values, which torch\.compile hides: compile the steps"):
+            torch.compile(f, backend="eager", fullgraph=True)(Y[0])
 
 
 class TestRefusals:

@@ -547,6 +547,20 @@ class TestAnotherSystem:
             with pytest.raises(ValueError, match=r"^`func` depends on the time"):
                 odeint_event(func, times(0.0, 1.9), times(0.0)[0], event_fn=lambda t, y: y[0] - 1.0, **arguments)
 
+    @pytest.mark.parametrize("change", [lambda t: 0.01 * t, lambda t: t > 9.9])
+    def test_in_the_adjoint_and_the_dense_output(self, change):
+        def func(t, y):
+            return right_hand_side(t, y) * (1 + change(t))
+
+        arguments = {"method": "verlet", "options": {"system": PENDULUM}}
+        for run in (
+            lambda f: odeint_adjoint(f, times(0.0, 1.9), times(0.0, 10.0), **arguments),
+            lambda f: odeint_dense(f, times(0.0, 1.9), 0.0, 10.0, **arguments),
+        ):
+            run(right_hand_side)
+            with pytest.raises(ValueError, match=r"^`func` depends on the time"):
+                run(func)
+
     def test_that_differs_only_where_the_run_comes_to(self):
         def func(t, y):
             return right_hand_side(t, y) * (1 + (y[0].abs() > 2.2))

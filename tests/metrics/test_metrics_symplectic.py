@@ -1,5 +1,6 @@
 """Volume, symplecticity and transported area of the map as executed."""
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -223,3 +224,27 @@ def test_loops_are_checked():
         loop_area_error(solve(systems.pendulum(), "verlet", (0, 1)))
     with pytest.raises(ValueError, match="without area"):
         loop_area_error(solve(systems.pendulum(), "verlet", (0, 1), np.ones((16, 2))))
+
+
+@pytest.mark.parametrize("method", ["verlet", "rk4"])
+def test_what_is_missing_is_said_before_jacobians_are_made(method, monkeypatch):
+    """A gradient alone has no Hessian: no array of (2d)² numbers is asked for to find that out."""
+    d = 50_000
+    system = HamiltonianSystem(lambda q: (q**2).sum(-1) / 2, ndof=d, gradient=lambda q: q, y0=np.ones(2 * d))
+    sol = solve(system, method, (0, 0.1), dt=0.1)
+    with pytest.raises(ValueError, match=r"^`sol` has 1 trajectories of 100000 variables, so that the Jacobians"):
+        volume_error(sol)
+    monkeypatch.setattr("sympflow.integrators.contract.MAX_ASKED_VALUES", math.inf)
+    for metric in (volume_error, symplecticity_defect):
+        with pytest.raises(ValueError, match=r"^`hessian_vector` is needed here"):
+            metric(sol)
+
+
+def test_metrics_hold_few_jacobians_at_a_time(monkeypatch):
+    """Divided into blocks of steps they are the same."""
+    sol = solve(systems.henon_heiles(), "rk4", (0, 5), dt=0.1)
+    before = volume_error(sol), symplecticity_defect(sol), volume_error(sol, over_time=True)
+    monkeypatch.setattr("sympflow.integrators.contract.MOST_ENTRIES", 64)
+    after = volume_error(sol), symplecticity_defect(sol), volume_error(sol, over_time=True)
+    for a, b in zip(before, after, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-14)

@@ -194,3 +194,11 @@ def test_a_warm_up_is_a_run_of_a_few_steps_with_as_many_outputs():
     assert [len(t) for _, t in runs] == [1000, 1000, 10, 10]
     assert runs[0][0][1] == pytest.approx(0.35)
     assert runs[2][0][1] == -0.1
+
+
+def test_an_error_that_is_small_by_chance_does_not_end_a_sweep():
+    """At dt·ω = 2 Verlet turns an oscillator at rest by half a turn: all outputs have its energy, but for rounding."""
+    few = {"t_span": (0, 20 / 1.3), "y0": [1.0, 0.0], "n_outputs": 10, "repeats": 1}
+    rows = work_precision(systems.harmonic_oscillator(1.3), ["verlet"], steps=[2 / 1.3, 0.4, 0.1], **few).rows
+    assert [row.dt for row in rows] == [2 / 1.3, 0.4, 0.1]
+    assert 0 < rows[0].energy_error < 1e-12 < rows[2].energy_error < rows[1].energy_error

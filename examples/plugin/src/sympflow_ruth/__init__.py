@@ -1,1 +1,1 @@
-"""Ruth's third-order symplectic method as a plug-in of sympflow."""
+"""Ruth's third-order symplectic method, and the Morse oscillator, as a plug-in of sympflow."""

@@ -1,4 +1,4 @@
-"""Ruth's symplectic integrator of order three."""
+"""The same method written as a step: the way for what is no scheme of kicks and drifts. It is far slower."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -6,13 +6,11 @@ from typing import Any, ClassVar
 from sympflow.arrays import Array, concatenate, per_state
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
-
-KICKS = (7 / 24, 3 / 4, -1 / 24)
-DRIFTS = (2 / 3, -2 / 3, 1.0)
+from sympflow_ruth.schemes import RUTH3
 
 
 @dataclass(frozen=True)
-class Ruth3(FixedStep):
+class Ruth3BySteps(FixedStep):
     """Three pairs of a kick p += b h F(q) and a drift q += a h ∇T(p).
 
     Parameters
@@ -25,27 +23,26 @@ class Ruth3(FixedStep):
     .. [1] R. D. Ruth, "A canonical integration technique", IEEE Trans. Nucl. Sci. 30 (1983) 2669–2671.
     """
 
-    name: ClassVar[str] = "ruth3"
+    name: ClassVar[str] = "ruth3_by_steps"
     order: ClassVar[int | None] = 3
     symplectic: ClassVar[bool] = True
 
     def check(self, system: HamiltonianSystem) -> None:
         if not system.separable:
-            raise ValueError(f"`method` 'ruth3' needs a separable system; {system.name!r} is not: use 'dop853'.")
+            raise ValueError(
+                f"`method` 'ruth3_by_steps' needs a separable system; {system.name!r} is not: use 'dop853'."
+            )
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: Any) -> Array:
         q, p, h = y[..., : system.ndof], y[..., system.ndof :], per_state(h, y)
-        for b, a in zip(KICKS, DRIFTS, strict=True):
+        for b, a in zip(RUTH3.kicks, RUTH3.drifts, strict=True):
             p = p + b * h * system.force(q)
             q = q + a * h * system.velocity(p)
         return concatenate([q, p])
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: Any) -> Array:
         q, p, h = y[..., : system.ndof], y[..., system.ndof :], per_state(h, y)
-        for b, a in zip(reversed(KICKS), reversed(DRIFTS), strict=True):
+        for b, a in zip(reversed(RUTH3.kicks), reversed(RUTH3.drifts), strict=True):
             q = q - a * h * system.velocity(p)
             p = p - b * h * system.force(q)
         return concatenate([q, p])
-
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        return {"force_evaluations": len(KICKS) * (n_steps + n_extra), "hessian_evaluations": 0}
