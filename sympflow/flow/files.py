@@ -453,6 +453,9 @@ def _check_recipe(recipe: Any, ndof: int) -> None:
             kind = STAGE.get(name, (int, float, str, bool, type(None)))
             if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
                 raise Refused(f"its recipe has a stage with {name} {value!r}, which is of the wrong type")
+    made = recipe.get("transforms")
+    if isinstance(made, dict) and made.get("identity") is not None:
+        _identity(made, ndof - 1)
     if not isinstance(recipe.get("torch", ""), str):
         raise Refused("its recipe has a version of torch that is not a string")
     if "scaling" in recipe:

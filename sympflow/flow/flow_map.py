@@ -50,7 +50,8 @@ def check_system(system: Any) -> None:
             f"`system` must be a HamiltonianSystem; got {type(system).__name__}: take a scene of sympflow.systems, or "
             "define one with HamiltonianSystem.from_sympy."
         )
-    system.check_functions(torch.empty(0, dtype=torch.float64) if system.takes_tensors else None)
+    if system.functions_given:
+        system.check_functions(torch.empty(0, dtype=torch.float64) if system.takes_tensors else None)
 
 
 class FlowMap(nn.Module):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import math
+import re
 from collections.abc import Callable, Collection
 from typing import Any
 
@@ -21,6 +22,7 @@ MAX_BITS = 4096  # of an exact fraction; a longer one is rounded
 MAX_TERMS = 50_000  # that the expression may have when it is multiplied out
 MAX_ARGUMENT = 1e4  # of a special function of numbers
 MAX_ARGUMENTS = 64
+TERMS_IN_A_ROW = 200
 
 # fmt: off
 ELEMENTARY = (
@@ -69,10 +71,13 @@ def read(text: str, names: Collection[str] = ()) -> sp.Expr:
         If the text is not an expression of the kind described, or a larger one than anything can be done with.
     """
     if len(text) > MAX_TEXT:
-        raise Unreadable(f"it has {len(text):,} characters, more than {MAX_TEXT:,}")
+        raise Unreadable(
+            f"it has {len(text):,} characters, more than {MAX_TEXT:,}: a system that large is better given by Numba "
+            "functions, HamiltonianSystem(V, ndof=…, gradient=…)"
+        )
     _check_brackets(text)
     try:
-        tree = ast.parse(" ".join(text.replace("^", "**").split()), mode="eval").body
+        tree = ast.parse(_grouped(" ".join(text.replace("^", "**").split())), mode="eval").body
     except (SyntaxError, ValueError) as error:
         raise Unreadable(getattr(error, "msg", None) or str(error)) from None
     except (RecursionError, MemoryError):
@@ -88,6 +93,38 @@ def _check_brackets(text: str) -> None:
         depth += (character in "([{") - (character in ")]}")
         if depth > MAX_NESTING:
             raise Unreadable(f"it is nested more than {MAX_NESTING} deep")
+
+
+_TOKEN = re.compile(r"\s*((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[^\W\d]\w*|\*\*|.)")
+
+
+def _grouped(text: str) -> str:
+    """The text, its long sums in brackets of `TERMS_IN_A_ROW` each, for a sum is nested as deep as it has terms."""
+    if text.count("+") + text.count("-") <= TERMS_IN_A_ROW:
+        return text
+    written: list[str] = []
+    counts, opened, last = [0], [False], "("
+    for token in _TOKEN.findall(text):
+        ends_sum = token in ")]},<>="
+        if ends_sum and opened[-1]:
+            written.append(")")
+            opened[-1] = False
+        if ends_sum:
+            counts[-1] = 0
+        if token in "([{":
+            counts.append(0)
+            opened.append(False)
+        elif token in ")]}" and len(counts) > 1:
+            counts.pop()
+            opened.pop()
+        elif token in "+-" and (last in ")]}" or last[-1].isalnum() or last[-1] in "_."):
+            counts[-1] += 1
+            if counts[-1] % TERMS_IN_A_ROW == 0:
+                written.append(")+(" if opened[-1] else "+(")
+                opened[-1] = True
+        written.append(token)
+        last = token
+    return " ".join(written) + ")" * opened[0]
 
 
 class _Reader:

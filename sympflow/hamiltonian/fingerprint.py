@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Self
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
@@ -52,7 +52,10 @@ def _agree(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
     return np.allclose(u, v, rtol=0, atol=TOLERANCE * np.abs(finite).max(initial=0.0), equal_nan=True)
 
 
-@dataclass(frozen=True, eq=False)
+Known = WeakKeyDictionary["Hamiltonian", bool]
+
+
+@dataclass(eq=False)
 class Identity:
     """The H of a system as a flow keeps it, to know it again all over its domain, and along a run.
 
@@ -71,6 +74,13 @@ class Identity:
     states: np.ndarray
     energies: np.ndarray
     expression: str | None
+    _agreed: Known = field(default_factory=WeakKeyDictionary, init=False, repr=False)
+    _proved: Known = field(default_factory=WeakKeyDictionary, init=False, repr=False)
+    _last: ref[Hamiltonian] | None = field(default=None, init=False, repr=False)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Everything but what was found out about systems."""
+        return Identity, (self.states, self.energies, self.expression)
 
     @classmethod
     def of(cls, system: Hamiltonian, domain: Domain | None, seed: int = 20260103) -> Self:
@@ -84,10 +94,11 @@ class Identity:
 
     def agrees(self, system: Hamiltonian) -> bool:
         """Return True if H of a system has these energies at these states, up to a constant; found out once."""
-        known = _AGREED.setdefault(system, WeakKeyDictionary())
-        found = known.get(self)
+        if self._last is not None and self._last() is system:  # in nearly all calls
+            return True
+        found = self._agreed.get(system)
         if found is None:
-            found = known[self] = self.is_proved(system) or self.first_difference(system) is None
+            found = self._agreed[system] = self.is_proved(system) or self.first_difference(system) is None
         return found
 
     def first_difference(self, system: Hamiltonian, states: np.ndarray | None = None) -> int | None:
@@ -128,10 +139,13 @@ class Identity:
 
     def is_proved(self, system: Hamiltonian) -> bool:
         """Return True if the formula of a system is this one, up to a constant; found out once."""
-        known = _PROVED.setdefault(system, WeakKeyDictionary())
-        found = known.get(self)
+        if self._last is not None and self._last() is system:
+            return True
+        found = self._proved.get(system)
         if found is None:
-            found = known[self] = self._prove(system)
+            found = self._proved[system] = self._prove(system)
+        if found:
+            self._last = ref(system)
         return found
 
     def _prove(self, system: Hamiltonian) -> bool:
@@ -173,10 +187,6 @@ class Identity:
         if states.shape != (len(energies), 2 * ndof) or not np.isfinite(states).all():
             raise ValueError("its states and energies do not fit each other")
         return cls(states, energies, expression)
-
-
-_AGREED: WeakKeyDictionary[Hamiltonian, WeakKeyDictionary[Identity, bool]] = WeakKeyDictionary()
-_PROVED: WeakKeyDictionary[Hamiltonian, WeakKeyDictionary[Identity, bool]] = WeakKeyDictionary()
 
 
 def _floats(values: Any, ndim: int) -> np.ndarray:

@@ -65,9 +65,9 @@ class SymbolicHamiltonian(Definition):
     @cached_property
     def inverse_mass(self) -> sp.Matrix | None:
         """M⁻¹ if T = ½ pᵀM⁻¹p exactly, else None."""
-        if self.T is None:
+        if self.T is None or not self.T.is_polynomial(*self.p):
             return None
-        M = sp.hessian(self.T, self.p)
+        M = hessian(self.T, self.p)
         p = sp.Matrix(self.p)
         if M.free_symbols or sp.expand(self.T - (p.T * M * p)[0] / 2) != 0:
             return None
@@ -142,7 +142,7 @@ class SymbolicHamiltonian(Definition):
     def _vector(self, name: str) -> Callable[[Array], Array]:
         return self._function(
             name + "'",
-            lambda f, x: [sp.diff(f, s) for s in x],
+            gradient,
             lambda values, like, n: assemble(values, like),
         )
 
@@ -151,7 +151,7 @@ class SymbolicHamiltonian(Definition):
             flat = assemble(values, like)
             return flat.reshape(*flat.shape[:-1], n, n)
 
-        return self._function(name + "''", lambda f, x: list(sp.hessian(f, x)), reshape)
+        return self._function(name + "''", lambda f, x: list(hessian(f, x)), reshape)
 
     def _function(
         self,
@@ -191,6 +191,24 @@ class SymbolicHamiltonian(Definition):
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:
         return {}
+
+
+def gradient(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[sp.Expr]:
+    """∂f/∂x of each x, of a sum by the terms that hold it: of many terms and variables few do."""
+    holding: dict[sp.Symbol, list[sp.Expr]] = {s: [] for s in x}
+    for term in sp.Add.make_args(f):
+        for s in term.free_symbols & holding.keys():
+            holding[s].append(term)
+    return [sp.Add(*[sp.diff(term, s) for term in holding[s]]) for s in x]
+
+
+def hessian(f: sp.Expr, x: Sequence[sp.Symbol]) -> sp.Matrix:
+    """∇²f, as `sympy.hessian`, by the terms that are not zero."""
+    rows = [[sp.S.Zero] * len(x) for _ in x]
+    for i, slope in enumerate(gradient(f, x)):
+        for j, entry in enumerate(gradient(slope, x[i:]), i):
+            rows[i][j] = rows[j][i] = entry
+    return sp.Matrix(rows)
 
 
 def parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:

@@ -16,6 +16,7 @@ __all__ = [
     "curvature_kick_source",
     "gradient_kick_source",
     "polynomial_kick_source",
+    "polynomial_slope_source",
     "printed",
     "statements",
     "tuple_algebra",
@@ -198,6 +199,18 @@ def polynomial_kick_source(symbols: SymbolicHamiltonian, monomials: Monomials) -
                 slopes.append(slope)
     results = ["".join(terms) for terms in places]
     return _function("polynomial_kick", "q, numbers, work", q, slopes, results, "b") + "\n"
+
+
+def polynomial_slope_source(symbols: SymbolicHamiltonian, monomials: Monomials) -> str:
+    """``polynomial_slope(q, numbers, out)``: Σ_m e_m ∇q^m into out, of arrays."""
+    q = symbols.q
+    letters = [sp.Symbol(f"e_{m}", real=True) for m in range(len(monomials))]
+    P = sp.Add(*[e * sp.Mul(*map(sp.Pow, q, m)) for e, m in zip(letters, monomials, strict=True)])
+    lines = ["@njit(**OPTIONS)", "def polynomial_slope(q, numbers, out):"]
+    lines += [f"    {s} = q[{i}]" for i, s in enumerate(q) if P.has(s)]
+    lines += [f"    {e} = numbers[{m + 1}]" for m, e in enumerate(letters)]
+    slopes = statements([f"out[{i}]" for i in range(len(q))], [sp.diff(P, s) for s in q])
+    return "\n".join([*lines, *(f"    {line}" for line in slopes)])
 
 
 def _function(

@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels import families
 from sympflow.kernels.codegen import statements
+from sympflow.kernels.families import is_large
 from sympflow.kernels.modules import load_algebra, run_rows
 from sympflow.kernels.protocol import Kernel, Run, Steps
 
@@ -108,6 +110,10 @@ def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:
         If a function in H has no counterpart in compiled code.
     """
     variables = symbols.q + symbols.p
+    if is_large(symbols):
+        return f"NDOF = {symbols.ndof}\n\n\n" + families.gradient_and_hessian_source(
+            symbols.H, variables, "gradient_and_hessian"
+        )
     slopes = [sp.diff(symbols.H, s) for s in variables]
     triangle = [(i, j) for i in range(len(variables)) for j in range(i, len(variables))]
     entries = {ij: sp.diff(slopes[ij[0]], variables[ij[1]]) for ij in triangle}

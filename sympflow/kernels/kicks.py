@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ __all__ = ["kick_cycles", "kicks_source", "shapes"]
 PRODUCT = "fused_multiply_add"  # of `elementary`
 MOST_KEPT = 200  # sources
 MOST_OPERATIONS = 400  # of a kick whose shapes are tried: rewriting longer ones takes longer than it saves
+MOST_FACTORED = 160  # see `_work_of_factoring`: what takes SymPy a second or two
+MOST_MULTIPLIED = 3000  # terms, of what is factored or multiplied out
 MOST_TERMS = 120  # of a sum multiplied out
 MOST_NESTED = 12  # of a momentum's sum that is nested
 B, G, C = sp.symbols("b g c", real=True)
@@ -225,13 +228,19 @@ def shapes(symbols: SymbolicHamiltonian, terms: int, monomials: Monomials = ()) 
         W = [_dot(slope, velocity) / 2, _dot(velocity, products) / 2][: terms - 1]
         if any(f.has(*UNTOUCHED) or sp.count_ops(f) > MOST_OPERATIONS for f in W):
             return
-        W = [sp.factor(sp.powsimp(f)) for f in W]
+        W = [sp.powsimp(f) for f in W]
+        several = [len(_denominators(f)) > 1 and d > 1 for f in W]  # whose products SymPy would factor for minutes
+        if any(several) or any(_length(f) > MOST_MULTIPLIED for f in W):
+            return
+        W = [sp.factor(f) for f in W]
         changes = [
             -B * slope[i] + sp.Add(*[c * sp.diff(f, q[i]) for c, f in zip((G, -C), W, strict=False)]) for i in range(d)
         ]
     if any(f.has(*UNTOUCHED) or sp.count_ops(f) > MOST_OPERATIONS for f in changes):
         return
     yield [printable(p[i] + f) for i, f in enumerate(changes)]
+    if any(_work_of_factoring(f) > MOST_FACTORED or _length(f) > MOST_MULTIPLIED for f in changes):
+        return
     factored = [sp.factor(f) for f in changes]
     yield [printable(p[i] + _collected(f, q)) for i, f in enumerate(factored)]
     expanded = [_expanded(f, q) for f in changes]
@@ -333,6 +342,49 @@ def _expanded(f: sp.Expr, q: Sequence[sp.Symbol]) -> sp.Expr:
         coefficient, product = term.as_independent(*q, *back, as_Add=False)
         terms[product] = terms.get(product, sp.S.Zero) + coefficient
     return sp.Add(*[_times(c, product.xreplace(back)) for product, c in terms.items() if c != 0])
+
+
+def _work_of_factoring(f: sp.Expr) -> int:
+    """The degree of what a sum of slopes is divided by, times how many variables and how many denominators it has.
+
+    The time that SymPy takes to factor the sum grows out of all proportion with it: 0.1 s at 100, 1 s at 200 to 300,
+    minutes at 450.
+    """
+    denominators = _denominators(f)
+    return sum(denominators.values()) * len(f.free_symbols) * len(denominators)
+
+
+def _denominators(f: sp.Expr) -> dict[sp.Expr, int]:
+    """The sums that f is divided by, with the degrees of their highest powers."""
+    degrees: dict[sp.Expr, int] = {}
+    for power in f.atoms(sp.Pow):
+        base, exponent = power.as_base_exp()
+        if base.is_Add and exponent.is_Rational and exponent < 0:
+            degrees[base] = max(degrees.get(base, 0), _degree(base) * int(sp.ceiling(-exponent)))
+    return degrees
+
+
+def _length(f: sp.Expr) -> int:
+    """About how many terms f has when it is multiplied out; what is divided by counts as one."""
+    if f.is_Add:
+        return sum(map(_length, f.args))
+    if f.is_Mul:
+        return math.prod(map(_length, f.args))
+    if f.is_Pow and f.exp.is_Integer and f.exp > 0:
+        n = _length(f.base)
+        return math.comb(int(f.exp) + n - 1, int(f.exp))
+    return 1
+
+
+def _degree(f: sp.Expr) -> int:
+    """The degree of the powers in an expression, 1 for what is not polynomial."""
+    if f.is_Add:
+        return max(map(_degree, f.args))
+    if f.is_Mul:
+        return sum(map(_degree, f.args))
+    if f.is_Pow and f.exp.is_Integer and f.exp > 0:
+        return int(f.exp) * _degree(f.base)
+    return int(bool(f.free_symbols))
 
 
 def _times(coefficient: sp.Expr, product: sp.Expr) -> sp.Expr:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
+from sympflow.kernels.families import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_out
 from sympflow.kernels.modules import NEVER, load_algebra, run_one, run_rows
 from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
 from sympflow.kernels.protocol import Kernel, Run, Steps
@@ -75,6 +76,12 @@ class PartsLoops:
     def __init__(self, parts: ExactParts) -> None:
         if not all(isinstance(part, PartFunctions) for part in parts.rest):
             raise ValueError("`system` is given by plain functions: define it with from_sympy, or use backend='array'.")
+        rest = sum(written_out(part.H, (*part.q, *part.p)) for part in parts.rest)
+        if parts.ndof > MOST_IN_REGISTERS or rest > MOST_WRITTEN_OUT:
+            raise ValueError(
+                f"`system` is too large for compiled normal modes: {parts.ndof} degrees of freedom, about {rest:,} "
+                f"operations in its gradient, at most {MOST_IN_REGISTERS} and {MOST_WRITTEN_OUT}. Use backend='array'."
+            )
         parts_source(parts, False, False)
         self.parts = parts
         self._variants: dict[tuple[bool, bool], LoopFunctions] = {}

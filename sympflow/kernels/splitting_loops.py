@@ -60,9 +60,13 @@ class SplittingLoops:
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
         if system.symbols is not None:
             from sympflow.kernels.codegen import algebra_source  # SymPy, which Numba functions do without
+            from sympflow.kernels.families import is_large
 
             self._has_force_gradient = system.quadratic_kinetic
-            self._compile = partial(_symbolic_loops, system.symbols, algebra_source(system.symbols))
+            if is_large(system.symbols):
+                self._compile = partial(_family_loops, system)
+            else:
+                self._compile = partial(_symbolic_loops, system.symbols, algebra_source(system.symbols))
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
@@ -229,11 +233,49 @@ def symbolic_module(
     return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
 
 
+def _family_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
+    """The loops of a symbolic system of many terms, around loops over these: see `sympflow.kernels.families`."""
+    from sympflow.kernels.codegen import polynomial_slope_source
+    from sympflow.kernels.families import bend_source, gradient_source, product_source, warn_if_long
+
+    symbols = system.symbols
+    assert symbols is not None
+    warn_if_long(symbols.V, symbols.q, system.name)
+    sources = [f"import numpy as np\n\nNDOF = {symbols.ndof}", gradient_source(symbols.V, symbols.q, "gradient")]
+    if level in (FORCE_GRADIENT, CURVATURE):
+        sources.append(product_source(symbols.V, symbols.q, "hessian_vector"))
+    if level == CURVATURE:
+        sources.append(bend_source(symbols.V, symbols.q, "bend"))
+    if level == POLYNOMIAL:
+        sources.append(polynomial_slope_source(symbols, monomials))
+    M = system.inverse_mass
+    if system.quadratic_kinetic and (M is None or M.ndim == 1):
+        sources.append(_inverse_mass_source(M))
+        sources.append("" if M is None else f"INVERSE_MASS = np.array({M.tolist()})")
+    else:
+        sources.append(gradient_source(symbols.T, symbols.p, "apply_inverse_mass"))
+    sources.append(stages_source(kicks_of(level, len(monomials)), scheduled=False))
+    code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
+    before = ["elementary"] if "fast_" in code else []
+    header = _header(compensated, cache=True, scheduled=False)
+    return _array_functions(vars(load_module("\n\n\n".join([header, *map(template, before), code]))))
+
+
 _INVERSE_MASS_TIMES_V = {
     0: "out[i] = v[i]",
     1: "out[i] = INVERSE_MASS[i] * v[i]",
     2: "out[i] = 0.0\n        for j in range(NDOF):\n            out[i] += INVERSE_MASS[i, j] * v[j]",
 }
+
+
+def _inverse_mass_source(inverse_mass: np.ndarray | None) -> str:
+    rows = _INVERSE_MASS_TIMES_V[0 if inverse_mass is None else inverse_mass.ndim]
+    return f"@njit(**OPTIONS)\ndef apply_inverse_mass(v, out):\n    for i in range(NDOF):\n        {rows}"
+
+
+def _array_functions(module: dict[str, Any]) -> LoopFunctions:
+    names = ("rollout", "rollout_each", "rollout_processed", "rollout_processed_rows", "step_each")
+    return LoopFunctions(*(module[name] for name in names))
 
 
 def _array_loops(
@@ -246,8 +288,7 @@ def _array_loops(
     monomials: Monomials,
 ) -> LoopFunctions:
     """The loops around the user's Numba functions; compiled for this process only."""
-    rows = _INVERSE_MASS_TIMES_V[0 if inverse_mass is None else inverse_mass.ndim]
-    mass = f"@njit(**OPTIONS)\ndef apply_inverse_mass(v, out):\n    for i in range(NDOF):\n        {rows}"
+    mass = _inverse_mass_source(inverse_mass)
     header = _header(compensated, cache=False, scheduled=False)
     stages = stages_source(kicks_of(level), scheduled=False)
     functions: dict[str, Any] = {
@@ -258,5 +299,4 @@ def _array_loops(
     }
     texts = map(template, ("array_states", "loops"))
     exec("\n\n\n".join([header, mass, stages, *texts]), functions)
-    names = ("rollout", "rollout_each", "rollout_processed", "rollout_processed_rows", "step_each")
-    return LoopFunctions(*(functions[name] for name in names))
+    return _array_functions(functions)

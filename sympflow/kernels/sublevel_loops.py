@@ -11,6 +11,7 @@ from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import statements
+from sympflow.kernels.families import energy_source, is_large
 from sympflow.kernels.modules import load_algebra
 from sympflow.kernels.output_loops import all_between
 
@@ -61,11 +62,16 @@ def sublevel_source(symbols: SymbolicHamiltonian) -> str:
     n = len(variables)
     box = " & ".join(f"({v} >= low[{i}]) & ({v} <= high[{i}])" for i, v in enumerate(variables))
     lines = [f"{v} = x[{i}, n]" for i, v in enumerate(variables)]
-    lines += [*statements(["H"], [symbols.H]), f"inside &= {box} & (H > low[{n}]) & (H < high[{n}])"]
+    energy = ""
+    if is_large(symbols):
+        energy, value = f"{energy_source(symbols.H, variables, 'energy')}\n\n\n", ["H = energy(x[:, n])"]
+    else:
+        value = statements(["H"], [symbols.H])
+    lines += [*value, f"inside &= {box} & (H > low[{n}]) & (H < high[{n}])"]
     if symbols.ndof == 2:
         lines += ["L = abs(q1*p2 - q2*p1)", "inside &= (L >= low[5]) & (L <= high[5])"]
     body = "\n        ".join(lines)
-    return f"""@njit(**OPTIONS)
+    return f"""{energy}@njit(**OPTIONS)
 def all_within(x, low, high):
     inside = True
     for n in range(x.shape[1]):

@@ -12,6 +12,7 @@ import numpy as np
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import algebra_source, statements
+from sympflow.kernels.families import is_large
 from sympflow.kernels.modules import load_algebra, run_one, run_rows
 from sympflow.kernels.splitting_loops import symbolic_module
 from sympflow.kernels.stages import run_table, step_table
@@ -93,10 +94,12 @@ def reach_times(
 def lifted_rows(system: HamiltonianSystem, y: np.ndarray, c: float) -> np.ndarray | None:
     """States [q, t, p, B] (N, 2d + 2) with t = 0 and B = c − H of rows of `y` (N, 2d) of a symbolic system.
 
-    None unless c exceeds V at all of them, or where H has no compiled form.
+    None unless c exceeds V at all of them, or where H has no compiled form or is too large for states that are tuples.
     """
     symbols = system.symbols
     assert symbols is not None
+    if is_large(symbols):
+        return None
     lift = _LIFTS.get(symbols)
     if lift is None:
         lift = _LIFTS[symbols] = _compiled_lift(symbols)

@@ -242,7 +242,9 @@ class Study:
 
     @property
     def compiled(self) -> bool:
-        return self.integrator.compiles and self.dtype == "float64"
+        system = self.system
+        known = system.symbols is not None or system.numba_functions is not None or self.integrator.trained
+        return self.integrator.compiles and self.dtype == "float64" and known
 
     @property
     def most_steps(self) -> int:

@@ -65,7 +65,7 @@ HOSTILE = {
     "-" * 50_000 + "q": "nested",
     "**".join(["q"] * 300): "nested",
     "q" * 200_000: "characters",
-    "q + " * 24_000 + "q": "nested",
+    "q*" * 24_000 + "q": "nested",
     "\0q": "null",
     "": "syntax",
 }
@@ -134,3 +134,24 @@ def test_a_file_that_names_hostile_parts_is_refused(file, text, monkeypatch):
     with watched(), pytest.raises(ValueError, match=r"^`path` .* its parts are not all expressions"):
         load(file, system=systems.pendulum())
     assert [f.name for f in file.parent.iterdir()] == [file.name]
+
+
+def test_sums_of_thousands_of_terms_are_read():
+    terms = [f"{n}*{'q1' if n % 2 else 'q2'}" for n in range(1, 3001)]
+    total = 1500**2 * q1 + 1500 * 1501 * q2
+    assert read(" + ".join(terms)) == total
+    assert read(f"sin({' - '.join(terms)})/2 - q") == sp.sin(2 * q1 - total) / 2 - q
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "-q + 1.5e-3*q1 - 2e+3 + q2",
+        "Max(q - 1 + q1, q2 - q) - -q",
+        "Piecewise((q - q1 + 1, q + q2 - 1 > q1 - q), (0, True))",
+    ],
+)
+def test_sums_are_the_same_however_they_are_grouped(text, monkeypatch):
+    expected = read(text)
+    monkeypatch.setattr("sympflow.hamiltonian.expression.TERMS_IN_A_ROW", 1)
+    assert sp.expand(read(text) - expected) == 0

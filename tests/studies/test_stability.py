@@ -404,3 +404,11 @@ def test_a_flow_in_another_time_is_run_at_fractions_of_its_own_step():
     dt = solve(systems.kepler(0.6), flow, (0, 1)).stats["dt"]
     assert [(row.dt, row.status) for row in report.rows] == [(dt * f, "stable") for f in (0.25, 0.5, 1.0)]
     assert report.limits[0].stable == dt
+
+
+def test_a_system_of_plain_functions_takes_the_steps_of_arrays():
+    """Its methods run by array operations, which are 200 times as slow: at most max_steps/200 steps."""
+    plain = HamiltonianSystem(lambda q: 2 * (q**2).sum(-1), ndof=1, y0=[1.0, 0.0], dt=0.05)
+    report = stability(plain, ["verlet"], steps=[0.1], metrics=("energy",), min_steps=50, max_steps=10_000)
+    assert report.rows[0].n_steps == 50
+    assert report.limits[0].stable == pytest.approx(1.0)  # 2/ω at ω = 2

@@ -1,7 +1,8 @@
-"""The algebra of a system given by Numba functions: q and p are arrays, changed in place. Source text for `loops`.
+"""The algebra of a system given by Numba functions, or of many terms: q and p are arrays, changed in place.
 
-What comes before defines `NDOF`, the constants of `loops`, the system's ``gradient(q, out)`` and
-``hessian_vector(q, v, out)``, and ``apply_inverse_mass(v, out)``.
+Source text for `loops`. What comes before defines `NDOF`, the constants of `loops`, the system's ``gradient(q, out)``
+and ``hessian_vector(q, v, out)``, and ``apply_inverse_mass(v, out)``; where kicks have curvature terms or polynomials,
+``bend(q, v, out)`` and ``polynomial_slope(q, numbers, out)`` too.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -61,7 +62,7 @@ def move(x, error, change):
 
 @njit(**OPTIONS)
 def workspace():
-    return np.empty(NDOF), np.empty(NDOF), np.empty(NDOF)
+    return np.empty(NDOF), np.empty(NDOF), np.empty(NDOF), np.empty(NDOF)
 
 
 @njit(**OPTIONS)
@@ -87,7 +88,7 @@ def kick(q, numbers, work):
 @njit(**OPTIONS)
 def gradient_kick(q, numbers, work):
     b, g = numbers
-    slope, velocity, product = work
+    slope, velocity, product, _ = work
     forget(slope)
     gradient(q, slope)
     apply_inverse_mass(slope, velocity)
@@ -97,6 +98,33 @@ def gradient_kick(q, numbers, work):
         slope[i] *= -b
         product[i] *= g
     return slope, product
+
+
+@njit(**OPTIONS)
+def curvature_kick(q, numbers, work):
+    """−b∇V + g ∇²V v − c (∇²V M⁻¹∇²V v + ½ ∇³V(v, v)), v = M⁻¹∇V."""
+    b, g, c = numbers
+    change, velocity, product, bent = work
+    gradient(q, change)
+    apply_inverse_mass(change, velocity)
+    hessian_vector(q, velocity, product)
+    bend(q, velocity, bent)
+    for i in range(NDOF):
+        change[i] = g * product[i] - b * change[i] - c * bent[i]
+    apply_inverse_mass(product, velocity)
+    hessian_vector(q, velocity, product)
+    for i in range(NDOF):
+        change[i] -= c * product[i]
+    return change
+
+
+@njit(**OPTIONS)
+def polynomial_kick(q, numbers, work):
+    change = kick(q, numbers, work)
+    polynomial_slope(q, numbers, work[1])
+    for i in range(NDOF):
+        change[i] -= work[1][i]
+    return change
 
 
 @njit(**OPTIONS)

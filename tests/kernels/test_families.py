@@ -1,0 +1,151 @@
+"""Systems of many terms: loops over the terms of each kind, against the functions of arrays."""
+
+import itertools
+import warnings
+
+import numpy as np
+import pytest
+import sympy as sp
+from watchdog import watched
+
+from sympflow import HamiltonianSystem, solve
+from sympflow.hamiltonian.parts import linear_and_rest
+from sympflow.kernels import families
+from sympflow.kernels.kicks import kicks_source, shapes
+from sympflow.kernels.modules import load_algebra
+from sympflow.kernels.parts_loops import parts_loops
+from sympflow.kernels.splitting_loops import splitting_loops
+
+SITES = 18
+
+
+def chain(kinetic="p{0}**2/2"):
+    """Springs of Fermi, Pasta, Ulam and Tsingou between fixed ends, the last one of another kind."""
+    x = ["0", *(f"q{i}" for i in range(1, SITES + 1)), "0"]
+    springs = [f"({b} - {a})**2/2 + ({b} - {a})**3/12" for a, b in itertools.pairwise(x)]
+    moved = [kinetic.format(i) for i in range(1, SITES + 1)]
+    y0 = 0.3 * np.sin(np.arange(1, 2 * SITES + 1))
+    return HamiltonianSystem.from_sympy(" + ".join([*moved, *springs, f"cos(q{SITES})/7 + 3"]), y0=y0)
+
+
+SYSTEM = chain()
+
+
+def bodies(n, dim):
+    names = [[f"q{dim * i + k + 1}" for k in range(dim)] for i in range(n)]
+    kinetic = [f"p{i + 1}**2/2" for i in range(n * dim)]
+    pairs = [
+        f"-1.{i}/sqrt({' + '.join(f'({a} - {b})**2' for a, b in zip(names[i], names[j], strict=True))})"
+        for i in range(n)
+        for j in range(i)
+    ]
+    return HamiltonianSystem.from_sympy(" + ".join([*kinetic, *pairs]))
+
+
+def test_derivatives():
+    V, q = SYSTEM.symbols.V, SYSTEM.symbols.q
+    sources = [families.energy_source(V, q, "energy"), families.gradient_source(V, q, "slope")]
+    sources += [families.product_source(V, q, "product"), families.bend_source(V, q, "bend")]
+    module = load_algebra("\n\n\n".join(sources))
+    x, v = SYSTEM.y0[:SITES], np.cos(np.arange(SITES))
+    slope, product, bend = np.full((3, SITES), np.nan)
+    module.slope(x, slope)
+    module.product(x, v, product)
+    module.bend(x, v, bend)
+    H = SYSTEM.potential_hessian
+    np.testing.assert_allclose(module.energy(x), SYSTEM.potential(x), rtol=1e-14)
+    np.testing.assert_allclose(slope, -SYSTEM.force(x), atol=1e-14)
+    np.testing.assert_allclose(product, H(x) @ v, atol=1e-14)
+    # V is a cubic but for one cosine, of third derivative sin(q)/7: ∇²V(x + v) − ∇²V(x − v) is 2 ∇³V(v) of the cubic
+    cubic = x.copy()
+    cubic[-1] = 0.0
+    module.bend(cubic, v * (np.arange(SITES) < SITES - 1), bend)
+    v[-1] = 0.0
+    np.testing.assert_allclose(bend, (H(cubic + v) - H(cubic - v)) @ v / 4, atol=1e-14)
+
+
+def test_terms_that_differ_in_coordinates_and_constants_are_one_family():
+    system = bodies(10, 3)
+    (pairs,) = families.families(system.symbols.V, system.symbols.q)
+    assert pairs.coordinates.shape == (45, 6)
+    (masses,) = families.families(system.symbols.T, system.symbols.p)
+    assert masses.coordinates.shape == (30, 1)
+
+
+def test_families_add_up():
+    q = sp.symbols("q1:4", real=True)
+    V = sp.sympify("3*(q1*q2 + q2*q3 - 2*q3**2) + sin(2*q1) - sin(3*q2) + exp(-q3)*q1**3 + Max(q1, 0)").xreplace(
+        {sp.Symbol(s.name): s for s in q}
+    )
+    total = sp.S.Zero
+    for family in families.families(V, q):
+        for places, constants in zip(family.coordinates, family.constants, strict=True):
+            values = dict(zip(family.x, (q[i] for i in places), strict=True)) | dict(
+                zip(family.c, map(sp.nsimplify, constants), strict=True)
+            )
+            total += family.f.xreplace(values)
+    assert sp.expand(total - V) == 0
+
+
+@pytest.mark.parametrize("method", ["srkn14a", "implicit_midpoint"])
+def test_many_degrees_of_freedom_run_compiled(method):
+    compiled = solve(SYSTEM, method, (0, 1), dt=0.05)
+    assert compiled.stats["backend"] == "compiled"
+    arrays = solve(SYSTEM, method, (0, 1), dt=0.05, backend="array")
+    np.testing.assert_allclose(compiled.y, arrays.y, atol=1e-13)
+
+
+def test_batches_and_outputs_of_many_degrees_of_freedom():
+    y0 = np.stack([SYSTEM.y0, SYSTEM.y0 / 2])
+    batch = solve(SYSTEM, "srkn14a", (0, 1), y0=y0, dt=0.05, t_eval=[0.3, 1])
+    single = solve(SYSTEM, "srkn14a", (0, 1), y0=y0[1], dt=0.05, t_eval=[0.3, 1])
+    np.testing.assert_array_equal(batch.states[1], single.states)
+
+
+def test_the_modes_of_many_degrees_of_freedom_are_arrays():
+    assert solve(SYSTEM, "impulse", (0, 0.1), dt=0.05).stats["backend"] != "compiled"
+    with pytest.raises(ValueError, match=r"^`system` is too large for compiled normal modes"):
+        parts_loops(linear_and_rest(SYSTEM))
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        " + ".join(f"1/(q{i} - q{j})**12 - 2/(q{i} - q{j})**6" for i in range(1, 5) for j in range(1, i)),
+        " - ".join(["0", *(f"1/sqrt((q{i} - q{j})**2 + 0.01)" for i in range(1, 4) for j in range(1, i))]),
+        "(q1 + 2*q2 + 3*q3 + 1)**8 + (q1 - q2)**10",
+    ],
+)
+def test_kicks_are_found_without_factoring_what_takes_minutes(expression):
+    system = HamiltonianSystem.from_sympy(f"p1**2/2 + p2**2/2 + p3**2/2 + {expression}")
+    with watched():
+        assert "def gradient_kicked" in kicks_source(system.symbols, 1)
+        assert len(list(shapes(system.symbols, 2))) >= 1
+
+
+def test_a_warning_names_the_door_for_systems_of_very_many_kinds_of_terms(monkeypatch):
+    powers = [(a, b, c) for a in range(1, 5) for b in range(1, 5) for c in range(1, 4)]
+    terms = [f"q{1 + n % 3}**{a}*cos(q{1 + (n + 1) % 3})**{b}*sin(q4)**{c}" for n, (a, b, c) in enumerate(powers)]
+    system = HamiltonianSystem.from_sympy(f"p1**2 + p2**2 + p3**2 + p4**2 + {' + '.join(terms)}")
+    assert families.is_large(system.symbols)
+    monkeypatch.setattr(families, "MOST_COMPILED", 500)
+    with pytest.warns(UserWarning, match=r"compiling takes minutes\. Give it by Numba functions"):
+        families.warn_if_long(system.symbols.V, system.symbols.q, system.name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        families.warn_if_long(SYSTEM.symbols.V, SYSTEM.symbols.q, SYSTEM.name)
+
+
+def test_the_logarithmic_clock_of_many_degrees_of_freedom():
+    solution = solve(SYSTEM, "log_leapfrog", (0, 0.1), dt=0.05)
+    arrays = solve(SYSTEM, "log_leapfrog", (0, 0.1), dt=0.05, backend="array")
+    np.testing.assert_allclose(solution.y, arrays.y, atol=1e-12)
+
+
+def test_momenta_that_are_not_quadratic():
+    relativistic = chain("sqrt(1 + p{0}**2)")
+    compiled = splitting_loops(relativistic)
+    assert compiled.functions(0, False) is not None
+    solution = solve(relativistic, "verlet", (0, 0.2), dt=0.05)
+    arrays = solve(relativistic, "verlet", (0, 0.2), dt=0.05, backend="array")
+    np.testing.assert_allclose(solution.y, arrays.y, atol=1e-14)
