@@ -411,3 +411,14 @@ class TestParameters:
     def test_of_the_scene_are_checked_too(self, scene, error):
         with pytest.raises(error, match=f"^`{next(iter(scene))}` must be"):
             HamiltonianSystem.from_sympy("p**2/2 + q**2/2", **scene)
+
+
+def test_a_pickle_of_a_version_that_tested_no_functions_is_read():
+    system = systems.fput(m=1, omega=10.0)
+    state = {k: v for k, v in vars(system).items() if k not in ("functions_given", "_checked", "_params")}
+    old = HamiltonianSystem.__new__(HamiltonianSystem)
+    old.__setstate__({**state, "params": {"omega": 10.0}})
+    assert old.params == system.params
+    assert old.fingerprint == system.fingerprint
+    old.check_functions()
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(old)).force(old.y0[:2]), system.force(old.y0[:2]))
