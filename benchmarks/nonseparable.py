@@ -4,9 +4,9 @@
     python benchmarks/nonseparable.py --seconds 10     a look
 
 A SympFlow is trained on states below an energy for so many seconds, by Gauss–Newton. Then it, the Gauss methods and
-Tao's, dop853 beside them, run to T = 100 from the same state, compiled where they compile. The state error is the largest
-against gauss_legendre8 with dt = 0.01, the energy error the largest relative one, both over 1000 outputs. The run time
-is that of a call of `solve` with the final state as the only output, the shortest of nine.
+Tao's, dop853 beside them, run to T = 100 from the same state, compiled where they compile. The state error is the
+largest against gauss_legendre8 with dt = 0.01, the energy error the largest relative one, both over 1000 outputs. The
+run time is that of a call of `solve` with the final state as the only output, the shortest of nine.
 """
 
 # ruff: noqa: E402
