@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import numbers
 import re
 import reprlib
@@ -46,10 +47,20 @@ class SymbolicHamiltonian(Definition):
     H, V, T : sympy.Expr
         V and T are None unless H = T(p) + V(q).
     q, p : tuple of sympy.Symbol, length d
+    parameters : tuple of sympy.Symbol
+        Symbols of H beside q and p: only a `parametric` form has some.
+    values : tuple of float
+        Their values.
     """
 
+    parameters: tuple[sp.Symbol, ...] = ()
+    values: tuple[float, ...] = ()
+    _written: tuple[sp.Expr, dict[sp.Symbol, sp.Expr]] | None = None
+    """H as it was written, and the values of its parameters; None without any."""
+
     def __init__(self, expression: str | sp.Expr, params: Mapping[str, float] | None = None) -> None:
-        H = parse(expression, params or {})
+        written, values = _read(expression, checked_params(params))
+        H = _valued(written, values)
         ndof = max((_index(s) for s in H.free_symbols if _index(s)), default=0)
         if ndof == 0:
             raise ValueError("`expression` must depend on q1 … qd and p1 … pd (or q and p).")
@@ -59,10 +70,39 @@ class SymbolicHamiltonian(Definition):
         self.ndof = ndof
         self.q = tuple(sp.symbols(f"q1:{ndof + 1}", real=True))
         self.p = tuple(sp.symbols(f"p1:{ndof + 1}", real=True))
-        H = H.xreplace({sp.Symbol("q", real=True): self.q[0], sp.Symbol("p", real=True): self.p[0]})
+        numbered = {sp.Symbol("q", real=True): self.q[0], sp.Symbol("p", real=True): self.p[0]}
+        if values:
+            self._written = written.xreplace(numbered), values
+        self._set(H.xreplace(numbered))
+
+    def _set(self, H: sp.Expr) -> None:
         self.H: sp.Expr = _with_numeric_constants(H)
         self.V, self.T = _split(self.H, self.q, self.p)
         self.separable = self.V is not None
+
+    @cached_property
+    def parametric(self) -> SymbolicHamiltonian:
+        """H with symbols for what depends on parameters alone: one for all values that leave its structure as it is.
+
+        What is 0, 1 or −1 stays a number, and so do exponents. H itself, where nothing is left to replace, or where
+        symbols would change what is separable or quadratic.
+        """
+        if self._written is None:
+            return self
+        found: dict[sp.Expr, tuple[sp.Symbol, float]] = {}
+        try:
+            H = _with_letters(*self._written, found)
+        except (TypeError, OverflowError):  # a value that is no real number
+            return self
+        form = SymbolicHamiltonian.__new__(SymbolicHamiltonian)
+        form.ndof, form.q, form.p = self.ndof, self.q, self.p
+        states = {*self.q, *self.p}
+        form._set(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
+        used = form.H.free_symbols - states
+        kept = [(symbol, value) for symbol, value in found.values() if symbol in used]
+        form.parameters, form.values = tuple(s for s, _ in kept), tuple(v for _, v in kept)
+        alike = used == {*form.parameters} and form.separable == self.separable and (form.inverse_mass is None) == (self.inverse_mass is None)
+        return form if kept and alike and all(map(math.isfinite, form.values)) else self
 
     @cached_property
     def inverse_mass(self) -> sp.Matrix | None:
@@ -71,7 +111,7 @@ class SymbolicHamiltonian(Definition):
             return None
         M = hessian(self.T, self.p)
         p = sp.Matrix(self.p)
-        if M.free_symbols or sp.expand(self.T - (p.T * M * p)[0] / 2) != 0:
+        if M.free_symbols & {*self.p} or sp.expand(self.T - (p.T * M * p)[0] / 2) != 0:
             return None
         return M
 
@@ -215,7 +255,13 @@ def hessian(f: sp.Expr, x: Sequence[sp.Symbol]) -> sp.Matrix:
 
 def parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
     """The expression in real symbols, its parameters replaced by their values."""
-    params = checked_params(params)
+    return _valued(*_read(expression, checked_params(params)))
+
+
+def _read(
+    expression: str | sp.Expr, params: Mapping[str, float]
+) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
+    """The expression in real symbols, and the numbers for those that are parameters."""
     names = {name: sp.Symbol(name, real=True) for name in params}
     if isinstance(expression, str):
         try:
@@ -239,10 +285,20 @@ def parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
     if H.has(sp.I):
         raise ValueError("`expression` is complex: a Hamiltonian must be real, so leave the imaginary unit I out.")
     H = H.xreplace({s: sp.Symbol(s.name, real=True) for s in H.free_symbols})
-    for name, value in params.items():
+    for name in params:
         if names[name] not in H.free_symbols:
             raise ValueError(f"`params` has {name!r}, which the expression does not use: remove it.")
-        H = H.xreplace({names[name]: sp.nsimplify(value) if float(value).is_integer() else sp.Float(value)})
+    values = {
+        names[name]: sp.nsimplify(value) if float(value).is_integer() else sp.Float(value)
+        for name, value in params.items()
+    }
+    return H, values
+
+
+def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
+    """The expression, its parameters replaced by their values."""
+    for symbol, value in values.items():
+        H = H.xreplace({symbol: value})
     unknown = sorted(s.name for s in H.free_symbols if not _is_coordinate(s.name))
     if "t" in unknown:
         raise TypeError("`expression` depends on the time t: only autonomous Hamiltonians are supported.")
@@ -250,6 +306,48 @@ def parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
         meant = "".join(f" {_AMBIGUOUS[name]}." for name in unknown if name in _AMBIGUOUS)
         raise ValueError(f"`expression` holds {', '.join(unknown)} without a value: give it in `params`.{meant}")
     return H
+
+
+def _with_letters(
+    f: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], found: dict[sp.Expr, tuple[sp.Symbol, float]]
+) -> sp.Expr:
+    """The expression with symbols for its parts that depend on parameters alone; these, with their values, in `found`.
+
+    Numbers in front of such a part are no part of it: of the derivatives they are exact. Within functions of several
+    arguments and in exponents parameters are replaced by their values.
+    """
+    parameters = values.keys()
+    if not f.free_symbols & parameters:
+        return f
+    if f.free_symbols <= parameters:
+        number, part = f.as_coeff_Mul()
+        if part not in found:
+            value = float(part.xreplace(values))
+            if value in (0, 1, -1):
+                return number * int(value)
+            found[part] = sp.Symbol(f"parameter_{len(found)}", real=True), value
+        return number * found[part][0]
+    if f.is_Add:
+        fixed = [a for a in f.args if a.free_symbols <= parameters]
+        moving = [_with_letters(a, values, found) for a in _ordered(f.args) if not a.free_symbols <= parameters]
+        return sp.Add(_with_letters(sp.Add(*fixed), values, found), *moving)
+    if f.is_Mul:
+        fixed = [a for a in f.args if a.free_symbols <= parameters]
+        moving = [_with_letters(a, values, found) for a in _ordered(f.args) if not a.free_symbols <= parameters]
+        coefficient = _with_letters(sp.Mul(*fixed), values, found)
+        if len(moving) == 1 and moving[0].is_Add:  # as SymPy does it with a number
+            return sp.Add(*[coefficient * a for a in moving[0].args])
+        return sp.Mul(coefficient, *moving)
+    if f.is_Pow and f.base.free_symbols & parameters:
+        return _with_letters(f.base, values, found) ** f.exp.xreplace(values)
+    if isinstance(f, sp.Function) and len(f.args) == 1:
+        return f.func(_with_letters(f.args[0], values, found))
+    return f.xreplace(values)
+
+
+def _ordered(args: Sequence[sp.Expr]) -> list[sp.Expr]:
+    """Arguments in an order that is the same in each process."""
+    return sorted(args, key=sp.default_sort_key)
 
 
 _AMBIGUOUS = {

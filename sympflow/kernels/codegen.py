@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import sympy as sp
@@ -14,7 +15,9 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
 __all__ = [
     "algebra_source",
     "curvature_kick_source",
+    "as_factor",
     "gradient_kick_source",
+    "parameter_lines",
     "polynomial_kick_source",
     "polynomial_slope_source",
     "printed",
@@ -116,11 +119,12 @@ def algebra_source(symbols: SymbolicHamiltonian) -> str:
     q, p, d = symbols.q, symbols.p, symbols.ndof
     velocity = [sp.diff(symbols.T, s) for s in p]
     slope = [sp.diff(symbols.V, s) for s in q]
+    numbers = "numbers, " if symbols.parameters else ""
     parts = [
         f"NDOF = {d}",
         tuple_algebra(d),
-        _function("kick", "q, numbers, work", q, [-s for s in slope], [f"b*{{{i}}}" for i in range(d)], "b"),
-        _function("drift", "p, a, work", p, velocity, [f"a*{{{i}}}" for i in range(d)]),
+        _function(symbols, "kick", "q, numbers, work", [-s for s in slope], [f"b*{{{i}}}" for i in range(d)], "b"),
+        _function(symbols, "drift", f"p, a, {numbers}work", velocity, [f"a*{{{i}}}" for i in range(d)]),
     ]
     return "\n\n\n".join(parts) + "\n"
 
@@ -144,7 +148,7 @@ def gradient_kick_source(symbols: SymbolicHamiltonian) -> str:
     position = {ij: d + n for n, ij in enumerate(triangle) if entries[n] != 0}
 
     def velocity(j: int) -> str:
-        terms = [f"{float(M[j, k])!r}*{{{k}}}" if M[j, k] != 1 else f"{{{k}}}" for k in range(d) if M[j, k] != 0]
+        terms = [f"{as_factor(M[j, k])}*{{{k}}}" if M[j, k] != 1 else f"{{{k}}}" for k in range(d) if M[j, k] != 0]
         return terms[0] if len(terms) == 1 else f"({' + '.join(terms)})"
 
     own, other = [], []
@@ -160,7 +164,9 @@ def gradient_kick_source(symbols: SymbolicHamiltonian) -> str:
     results = [f"({', '.join(change)},)" for change in (own, other)]
     coupled = f"COUPLED = {any(term != '0.0' for term in other)}"
     return (
-        f"{coupled}\n\n\n" + _function("gradient_kick", "q, numbers, work", q, [*slope, *entries], results, "bg") + "\n"
+        f"{coupled}\n\n\n"
+        + _function(symbols, "gradient_kick", "q, numbers, work", [*slope, *entries], results, "bg")
+        + "\n"
     )
 
 
@@ -177,7 +183,7 @@ def curvature_kick_source(symbols: SymbolicHamiltonian) -> str:
     products = sp.hessian(symbols.V, q) * M * slope
     bent = [sp.diff(symbols.W, s) for s in q]
     results = [f"((g*{{{d + i}}} - b*{{{i}}}) - c*{{{2 * d + i}}})" for i in range(d)]
-    return _function("curvature_kick", "q, numbers, work", q, [*slope, *products, *bent], results, "bgc") + "\n"
+    return _function(symbols, "curvature_kick", "q, numbers, work", [*slope, *products, *bent], results, "bgc") + "\n"
 
 
 def polynomial_kick_source(symbols: SymbolicHamiltonian, monomials: Monomials) -> str:
@@ -198,7 +204,7 @@ def polynomial_kick_source(symbols: SymbolicHamiltonian, monomials: Monomials) -
                 places[i].append(f" - numbers[{m + 1}]*{{{len(slopes)}}}")
                 slopes.append(slope)
     results = ["".join(terms) for terms in places]
-    return _function("polynomial_kick", "q, numbers, work", q, slopes, results, "b") + "\n"
+    return _function(symbols, "polynomial_kick", "q, numbers, work", slopes, results, "b") + "\n"
 
 
 def polynomial_slope_source(symbols: SymbolicHamiltonian, monomials: Monomials) -> str:
@@ -213,24 +219,37 @@ def polynomial_slope_source(symbols: SymbolicHamiltonian, monomials: Monomials) 
     return "\n".join([*lines, *(f"    {line}" for line in slopes)])
 
 
+def as_factor(number: sp.Expr) -> str:
+    """Source text of a number, of M⁻¹ for instance, or of an expression in parameters, as a factor."""
+    return f"({printed(number)})" if number.free_symbols else repr(float(number))
+
+
+def parameter_lines(symbols: SymbolicHamiltonian, lines: Sequence[str]) -> list[str]:
+    """Assignments of the parameters that occur in lines of code; their values are the last ones of `numbers`."""
+    words, n = set(re.findall(r"\w+", " ".join(lines))), len(symbols.parameters)
+    return [f"{s} = numbers[-{n - i}]" for i, s in enumerate(symbols.parameters) if s.name in words]
+
+
 def _function(
+    symbols: SymbolicHamiltonian,
     name: str,
     arguments: str,
-    variables: Sequence[sp.Symbol],
     expressions: list[sp.Expr],
     results: list[str],
     letters: str = "",
 ) -> str:
     """A jitted function that returns the tuple `results`, ``{n}`` in them standing for the n-th expression.
 
-    Its first argument holds the variables, and `numbers` begin with those called by the `letters`.
+    Its first argument, q or p, holds the variables; `numbers` begin with those called by the `letters`.
     """
+    variables = symbols.q if arguments[0] == "q" else symbols.p
     names = [f"v_{n}" for n in range(len(expressions))]
     lines = ["@njit(**OPTIONS)", f"def {name}({arguments}):"]
     lines.append(f"    {', '.join(s.name for s in variables)}, = {arguments[0]}")
     lines += [f"    {letter} = numbers[{i}]" for i, letter in enumerate(letters)]
-    lines += [f"    {statement}" for statement in statements(names, expressions)]
-    lines.append(f"    return ({''.join(result.format(*names) + ', ' for result in results)})")
+    body = statements(names, expressions)
+    body.append(f"return ({''.join(result.format(*names) + ', ' for result in results)})")
+    lines += [f"    {line}" for line in [*parameter_lines(symbols, body), *body]]
     return "\n".join(lines)
 
 

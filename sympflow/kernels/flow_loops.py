@@ -161,9 +161,10 @@ class PrimedFlowKernel(Kernel):
             t, tables = abs(h), self._tables
             kernel = run_table(tables.scheme("primed kernel", t, back=h < 0), t)
             before, after = (single_table(tables.scheme("primed processor", t, back=back), t) for back in (True, False))
-            return before.packed, kernel.packed, after.packed
+            rows = self._splitting.rows
+            return rows(before), rows(kernel), rows(after)
 
-        return self._tables.kept(("processed", h), make)
+        return self._tables.kept(("processed", h, self._splitting.values), make)
 
 
 def _stages(tables: Sequence[np.ndarray], n_steps: int, n_saved: int) -> int:

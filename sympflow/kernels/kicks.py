@@ -12,7 +12,7 @@ import sympy as sp
 
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
-from sympflow.kernels.codegen import printed
+from sympflow.kernels.codegen import as_factor, parameter_lines, printed
 from sympflow.kernels.scheduling import FUSED, PRODUCTS, Schedule, nested
 from sympflow.kernels.stages import kicks_of
 
@@ -51,7 +51,8 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials 
     It is p − b∇V + g∇²V v − c∇(½ v·∇²V v), v = M⁻¹∇V, or p − b∇V − Σ_m e_m ∇q^m. ``kicked(q, p, table, j)`` is the
     fastest for one trajectory; the products of b, g, c and e alone are in row j of the table, which
     ``fill_coefficients(numbers, row)`` computes. ``kicked_lane(q, p, numbers)`` has the fewest operations, for many
-    trajectories at once. ``drifted(q, p, a)`` is the drift of a single one.
+    trajectories at once. ``drifted(q, p, a)`` is the drift of a single one. Where H has parameters, `numbers` end with
+    their values, and ``drifted(q, p, numbers, a)`` takes them too.
 
     Raises
     ------
@@ -96,7 +97,7 @@ def _source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> s
     fill: list[str] = []
     stored: list[str] = []
     kinds = kicks_of(level, len(monomials))
-    kept = list(kinds[0].numbers)
+    kept = [*kinds[0].numbers, *(s.name for s in symbols.parameters)]
     for kick in reversed(kinds):
         name, terms = kick.name, len(kick.numbers)
         tried = _tried(symbols, terms, f"{name[0]}_", monomials)
@@ -110,7 +111,8 @@ def _source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> s
         loads += [f"{v} = table[j, -{len(kept) - kept.index(v)}]" for v in taken]
         functions.append(_function(symbols, name, "q, p, table, j", [*loads, *one.lines], one.results))
         numbers = [f"{v} = numbers[{i}]" for i, v in enumerate(kick.numbers)]
-        lines = [*numbers, *many.coefficients, *many.lines]
+        lines = [*many.coefficients, *many.lines]
+        lines = [*numbers, *parameter_lines(symbols, [*lines, *many.results]), *lines]
         functions.append(_function(symbols, f"{name}_lane", "q, p, numbers", lines, many.results))
     given = f"{', '.join(kept)}, = numbers"
     rows = [given, *fill, *(f"row[{i}] = {name}" for i, name in enumerate([*stored, *kept]))]
@@ -122,19 +124,21 @@ def _source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> s
 def _drift_source(symbols: SymbolicHamiltonian) -> str:
     """``drifted(q, p, a)``, q + a M⁻¹p or q + a∇T, the products with a, for which no state waits, made first."""
     M, d = symbols.inverse_mass, symbols.ndof
+    numbers = "numbers, " if symbols.parameters else ""
     if M is None:
-        lines = ["v = drift(p, a, None)"]
+        lines = [f"v = drift(p, a, {numbers}None)"]
         moved = [f"{s} + v[{i}]" for i, s in enumerate(symbols.q)]
     else:
-        lines, moved = [], []
+        moved = []
         for i in range(d):
             at = symbols.q[i].name
             for j in range(d):
                 if M[i, j] != 0:
-                    factor = "a" if M[i, j] == 1 else f"(a*{float(M[i, j])!r})"
-                    at = f"{PRODUCT}({factor}, {symbols.p[j]}, {at})"
+                    a = "a" if M[i, j] == 1 else f"(a*{as_factor(M[i, j])})"
+                    at = f"{PRODUCT}({a}, {symbols.p[j]}, {at})"
             moved.append(at)
-    return _function(symbols, "drifted", "q, p, a", lines, moved)
+        lines = parameter_lines(symbols, moved)
+    return _function(symbols, "drifted", f"q, p, {numbers}a", lines, moved)
 
 
 def _names(assignments: Sequence[str]) -> list[str]:
@@ -322,7 +326,9 @@ def _dot(x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
     return sp.Add(*[a * b for a, b in zip(x, y, strict=True)])
 
 
-def _number(value: float) -> sp.Expr:
+def _number(value: sp.Expr) -> sp.Expr:
+    if value.free_symbols:
+        return value
     return sp.Integer(int(value)) if value == int(value) else sp.Float(value)
 
 

@@ -56,6 +56,7 @@ class SplittingLoops:
 
     def __init__(self, system: HamiltonianSystem) -> None:
         self.ndof = system.ndof
+        self.values: tuple[float, ...] = ()
         if not system.separable:
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
         if system.symbols is not None:
@@ -66,7 +67,9 @@ class SplittingLoops:
             if is_large(system.symbols):
                 self._compile = partial(_family_loops, system)
             else:
-                self._compile = partial(_symbolic_loops, system.symbols, algebra_source(system.symbols))
+                symbols = system.symbols.parametric
+                self.values = symbols.values
+                self._compile = partial(_symbolic_loops, symbols, algebra_source(symbols))
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
@@ -111,6 +114,10 @@ class SplittingLoops:
             self._variants[variant] = self._compile(*variant)
         return self._variants[variant]
 
+    def rows(self, table: StageTable) -> np.ndarray:
+        """What the loops read of a table, with the values of the system's parameters."""
+        return table.rows(self.values)
+
     def step_rows(
         self, table: StageTable, x: np.ndarray, h: np.ndarray, y: np.ndarray, monomials: Monomials = ()
     ) -> np.ndarray:
@@ -130,7 +137,7 @@ class SplittingLoops:
         y = np.ascontiguousarray(y, dtype=np.float64)
         out = np.empty(y.shape)
         x, h = np.ascontiguousarray(x), np.ascontiguousarray(h)
-        self.functions(table.level, False, monomials).step_rows(table.packed, x, h, y, out)
+        self.functions(table.level, False, monomials).step_rows(self.rows(table), x, h, y, out)
         return out
 
 
@@ -145,7 +152,7 @@ class SplittingKernel(Kernel):
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
         """`n_steps` steps of length `h` from one state: see `Kernel`."""
         functions = self._functions()
-        table = run_table(self.scheme, h).packed
+        table = self.loops.rows(run_table(self.scheme, h))
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(save), 2 * self.loops.ndof))
         n_finite = run_one(
@@ -157,7 +164,7 @@ class SplittingKernel(Kernel):
     def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         functions = self._functions()
-        table = run_table(self.scheme, h).packed
+        table = self.loops.rows(run_table(self.scheme, h))
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(y0), len(save), 2 * self.loops.ndof))
         n_finite = np.empty(len(y0), dtype=np.int64)
@@ -218,7 +225,8 @@ def symbolic_module(
     from sympflow.kernels.kicks import kicks_source
 
     kinds, scheduled = kicks_of(level, len(monomials)), not compensated
-    sources = [algebra, stages_source(kinds, scheduled), lanes_source(kinds, scheduled)]
+    n = len(symbols.parameters)
+    sources = [algebra, stages_source(kinds, scheduled, n), lanes_source(kinds, scheduled, n)]
     if scheduled:
         sources.append(kicks_source(symbols, level, monomials))
     elif level == POLYNOMIAL:

@@ -51,6 +51,23 @@ class StageTable:
             of_kicks = [self.kicks, self.gradients, self.curvatures][: 1 + self.level]
         return np.ascontiguousarray(np.stack([self.drifts, *of_kicks]))
 
+    def rows(self, values: tuple[float, ...]) -> np.ndarray:
+        """`packed`, and for each of the values of a system's parameters a row, the same for all stages."""
+        if not values:
+            return self.packed
+        rows = self._with_values.get(values)
+        if rows is None:
+            more = np.zeros((len(values), *self.packed.shape[1:]))
+            (more if more.ndim == 2 else more[..., 0])[:] = np.array(values)[:, None]
+            rows = np.concatenate([self.packed, more])
+            self._with_values.clear()  # systems with other values come one after the other
+            self._with_values[values] = rows
+        return rows
+
+    @cached_property
+    def _with_values(self) -> dict[tuple[float, ...], np.ndarray]:
+        return {}
+
     def scaled(self, h: float) -> StageTable:
         """The numbers of steps h, of those for h = 1."""
         return StageTable(
@@ -206,17 +223,23 @@ def kicks_of(level: int, n_monomials: int = 0) -> tuple[Kick, ...]:
     return (Kick("polynomial_kicked", ("b", *letters), powers, _added("polynomial_kick")),)
 
 
-def stages_source(kinds: Sequence[Kick], scheduled: bool) -> str:
+def stages_source(kinds: Sequence[Kick], scheduled: bool, n_parameters: int = 0) -> str:
     """The functions of the text `loops` that depend on the kinds of kick.
 
     ``numbers_of(table, j)`` are the numbers of kick j, ``numbers_at(table, j, x, h)`` those of a step h by polynomials
-    in x. ``stage`` is a kick and a drift of one trajectory.
+    in x; the values of the parameters of H come after them. ``stage`` is a kick and a drift of one trajectory.
     """
     rows = range(1, 1 + len(kinds[0].numbers))
-    numbers = "".join(f"table[{i}, j], " for i in rows)
+    constant = range(rows.stop, rows.stop + n_parameters)
+    numbers = "".join(f"table[{i}, j], " for i in (*rows, *constant))
     steps = {1: "h", 3: "h ** 3", 5: "h ** 5"}
-    values = (f"{steps[n]} * polynomial(table[{i}, j], x), " for i, n in zip(rows, kinds[0].powers, strict=True))
-    end = ["q, q_error = drift_by(q, p, q_error, a, work)", "return q, p, q_error, p_error"]
+    values = [f"{steps[n]} * polynomial(table[{i}, j], x), " for i, n in zip(rows, kinds[0].powers, strict=True)]
+    values += [f"table[{i}, j, 0], " for i in constant]
+    given = "numbers, " if n_parameters else ""
+    drifted = f"return move(q, q_error, drift(p, a, {given}work))"
+    if scheduled:
+        drifted = f"return drifted(q, p, {given}a), q_error"
+    end = [f"q, q_error = drift_by(q, p, q_error, {given}a, work)", "return q, p, q_error, p_error"]
     return f"""@njit(**OPTIONS)
 def numbers_of(table, j):
     return ({numbers})
@@ -228,8 +251,8 @@ def numbers_at(table, j, x, h):
 
 
 @njit(**OPTIONS, forceinline=True)
-def drift_by(q, p, q_error, a, work):
-    {"return drifted(q, p, a), q_error" if scheduled else "return move(q, q_error, drift(p, a, work))"}
+def drift_by(q, p, q_error, {given}a, work):
+    {drifted}
 
 
 @njit(**OPTIONS, forceinline=True)
@@ -237,26 +260,30 @@ def stage(q, p, q_error, p_error, numbers, a, j, work):
     {_cases(kinds, "numbers[{0}] != 0.0", [[*kick.application(scheduled, lane=False), *end] for kick in kinds])}"""
 
 
-def lanes_source(kinds: Sequence[Kick], scheduled: bool) -> str:
+def lanes_source(kinds: Sequence[Kick], scheduled: bool, n_parameters: int = 0) -> str:
     """The functions of the text `lanes` that depend on the kinds of kick; not scheduled, sums are compensated.
 
     ``stage_lanes`` is a kick and a drift of all lanes by the same numbers, ``stage_each`` of each lane by its own, by
     column j of a table.
     """
 
+    given = "numbers, " if n_parameters else ""
+
     def together(kick: Kick) -> list[str]:
         kicked = kick.application(scheduled, lane=True)
         if scheduled:
-            return _over_lanes([*kicked, "q, _ = move(q, None, drift(p, a, None))"])
-        drifted = "q, q_error = move(q, q_error, drift(p, a, None))"
+            return _over_lanes([*kicked, f"q, _ = move(q, None, drift(p, a, {given}None))"])
+        drifted = f"q, q_error = move(q, q_error, drift(p, a, {given}None))"
         taken, stored = "q_error, p_error = unpack_lane(error, lane)", "pack_lane(q_error, p_error, error, lane)"
         return _over_lanes([taken, *kicked, drifted, stored])
 
     def each(kick: Kick) -> list[str]:
         steps, places = {1: "H", 3: "H3", 5: "H5"}, range(len(kick.numbers))
         filled = [f"fill_lanes(Y, width, NUMBERS + {i}, table[{i + 1}, j], {steps[kick.powers[i]]})" for i in places]
-        numbers = "".join(f"Y[NUMBERS + {i}, lane], " for i in places)
-        drifted = "q, _ = move(q, None, drift(p, Y[A, lane], None))"
+        constant = range(n_parameters)
+        filled += [f"value_{i} = table[{1 + len(kinds[0].numbers) + i}, j, 0]" for i in constant]
+        numbers = "".join([f"Y[NUMBERS + {i}, lane], " for i in places] + [f"value_{i}, " for i in constant])
+        drifted = f"q, _ = move(q, None, drift(p, Y[A, lane], {given}None))"
         return [*filled, *_over_lanes([f"numbers = ({numbers})", *kick.application(True, lane=True), drifted])]
 
     # Kinds are told apart outside the loops: a loop with a branch in it, once it is long, is no longer made of vector
