@@ -101,7 +101,11 @@ class SymbolicHamiltonian(Definition):
         used = form.H.free_symbols - states
         kept = [(symbol, value) for symbol, value in found.values() if symbol in used]
         form.parameters, form.values = tuple(s for s, _ in kept), tuple(v for _, v in kept)
-        alike = used == {*form.parameters} and form.separable == self.separable and (form.inverse_mass is None) == (self.inverse_mass is None)
+        alike = (
+            used == {*form.parameters}
+            and form.separable == self.separable
+            and (form.inverse_mass is None) == (self.inverse_mass is None)
+        )
         return form if kept and alike and all(map(math.isfinite, form.values)) else self
 
     @cached_property
@@ -258,9 +262,7 @@ def parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
     return _valued(*_read(expression, checked_params(params)))
 
 
-def _read(
-    expression: str | sp.Expr, params: Mapping[str, float]
-) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
+def _read(expression: str | sp.Expr, params: Mapping[str, float]) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
     """The expression in real symbols, and the numbers for those that are parameters."""
     names = {name: sp.Symbol(name, real=True) for name in params}
     if isinstance(expression, str):

@@ -14,8 +14,8 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
 
 __all__ = [
     "algebra_source",
-    "curvature_kick_source",
     "as_factor",
+    "curvature_kick_source",
     "gradient_kick_source",
     "parameter_lines",
     "polynomial_kick_source",

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import numba
 import numpy as np
 import pytest
 from conftest import FULL_MASS_MATRIX, RELATIVISTIC
@@ -134,6 +135,63 @@ def test_functions_of_every_kind():
     system = HamiltonianSystem.from_sympy(f"(p1**2 + p2**2/2)/2 + cosh(p1) + {V}", y0=[0.5, 0.4, 0.1, 0.2])
     y = splitting_loops(system).kernel(VERLET).step(0.01, system.y0[None]).states[0]
     assert np.abs(y - plain_run(system, VERLET, 0.01, system.y0, 1)[-1]).max() < 1e-14
+
+
+# --- parameters -----------------------------------------------------------------------------------------------
+
+
+def with_parameters(**params):
+    text = "p1**2/(2*m) + p2**2/(2*M) + w**2*(q1**2 + q2**2)/2 + lam*(q1**n*q2 - q2**3/3)"
+    return HamiltonianSystem.from_sympy(text, params={"n": 2, **params}, y0=[0.1, 0.2, 0.3, -0.1])
+
+
+PARAMETERS = {"m": 1.5, "M": 0.7, "w": 1.3, "lam": 0.9}, {"m": 0.8, "M": 2, "w": 0.9, "lam": -0.4}
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+def test_other_values_of_parameters_compile_nothing(compensated):
+    scheme = VERLET if compensated else SCHEMES["chin4a"]
+    compiled = []
+
+    class Compilations(numba.core.event.Listener):
+        def on_start(self, event):
+            compiled.append(event)
+
+        def on_end(self, event):
+            pass
+
+    for i, params in enumerate(PARAMETERS):
+        system = with_parameters(**params)
+        kernel, save = splitting_loops(system).kernel(scheme, compensated), np.array([0, 3, 40])
+        y0 = system.y0 + 0.01 * np.arange(9)[:, None]
+        with numba.core.event.install_listener("numba:compile", Compilations()):
+            found = kernel.run(0.1, y0[1], 40, save).states, kernel.run_batch(0.1, y0, 40, save).states
+            step = kernel.step(np.linspace(0.05, 0.1, 9), y0).states if not compensated else None
+        assert bool(compiled) is False or i == 0
+        compiled.clear()
+        expected = plain_run(system, scheme, 0.1, y0, 40).swapaxes(0, 1)[:, save]
+        assert np.abs(found[0] - expected[1]).max() < 2e-14
+        assert np.abs(found[1] - expected).max() < 2e-14
+        if step is not None:
+            assert np.abs(step[-1] - plain_run(system, scheme, 0.1, y0[-1], 1)[-1]).max() < 2e-15
+
+
+@pytest.mark.parametrize(("level", "monomials"), [(0, ()), (1, ()), (2, ()), (3, ((4, 0), (2, 2)))])
+@pytest.mark.parametrize("compensated", [False, True])
+def test_code_depends_on_which_parameters_there_are_alone(monkeypatch, level, monomials, compensated):
+    texts = []
+
+    def load(text):
+        texts.append(text)
+        raise InterruptedError
+
+    monkeypatch.setattr("sympflow.kernels.splitting_loops.load_module", load)
+    for params in (*PARAMETERS, {**PARAMETERS[0], "n": 4}, {**PARAMETERS[0], "lam": 0}):
+        with pytest.raises(InterruptedError):
+            splitting_loops(with_parameters(**params)).functions(level, compensated, monomials)
+    assert texts[0] == texts[1]
+    assert len({*texts}) == 3  # an exponent, and a term that is left out, are other code
+    assert "0.9" not in texts[0]
 
 
 @pytest.mark.parametrize("mass", [None, [1.0, 2.0, 4.0]])
