@@ -316,7 +316,8 @@ def _with_letters(
     """The expression with symbols for its parts that depend on parameters alone; these, with their values, in `found`.
 
     Numbers in front of such a part are no part of it: of the derivatives they are exact. Within functions of several
-    arguments and in exponents parameters are replaced by their values.
+    arguments, in exponents, and in roots of products, of which SymPy takes numbers out, parameters are replaced by
+    their values.
     """
     parameters = values.keys()
     if not f.free_symbols & parameters:
@@ -340,7 +341,7 @@ def _with_letters(
         if len(moving) == 1 and moving[0].is_Add:  # as SymPy does it with a number
             return sp.Add(*[coefficient * a for a in moving[0].args])
         return sp.Mul(coefficient, *moving)
-    if f.is_Pow and f.base.free_symbols & parameters:
+    if f.is_Pow and f.base.free_symbols & parameters and (f.exp.is_Integer or not f.base.is_Mul):
         return _with_letters(f.base, values, found) ** f.exp.xreplace(values)
     if isinstance(f, sp.Function) and len(f.args) == 1:
         return f.func(_with_letters(f.args[0], values, found))

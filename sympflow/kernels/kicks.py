@@ -326,9 +326,7 @@ def _dot(x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
     return sp.Add(*[a * b for a, b in zip(x, y, strict=True)])
 
 
-def _number(value: sp.Expr) -> sp.Expr:
-    if value.free_symbols:
-        return value
+def _number(value: float) -> sp.Expr:
     return sp.Integer(int(value)) if value == int(value) else sp.Float(value)
 
 

@@ -52,6 +52,12 @@ class SplittingLoops:
     ----------
     system : HamiltonianSystem
         Separable, and symbolic or given by Numba functions.
+
+    Attributes
+    ----------
+    values : tuple of float
+        Of what depends on parameters of H alone: arguments of the loops, so that systems which differ in them share
+        these. In kicks with force gradients the values are part of the code.
     """
 
     def __init__(self, system: HamiltonianSystem) -> None:
@@ -67,9 +73,8 @@ class SplittingLoops:
             if is_large(system.symbols):
                 self._compile = partial(_family_loops, system)
             else:
-                symbols = system.symbols.parametric
-                self.values = symbols.values
-                self._compile = partial(_symbolic_loops, symbols, algebra_source(symbols))
+                self.values = system.symbols.parametric.values
+                self._compile = partial(_symbolic_loops, system.symbols, algebra_source(system.symbols))
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
@@ -115,8 +120,8 @@ class SplittingLoops:
         return self._variants[variant]
 
     def rows(self, table: StageTable) -> np.ndarray:
-        """What the loops read of a table, with the values of the system's parameters."""
-        return table.rows(self.values)
+        """What the loops read of a table; where they take the values of the system's parameters, with these."""
+        return table.rows(self.values if _takes_values(table.level) else ())
 
     def step_rows(
         self, table: StageTable, x: np.ndarray, h: np.ndarray, y: np.ndarray, monomials: Monomials = ()
@@ -203,9 +208,22 @@ def _header(compensated: bool, cache: bool, scheduled: bool) -> str:
     )
 
 
+def _takes_values(level: int) -> bool:
+    """True of kicks whose code is the same for all values of parameters.
+
+    In those with force gradients sums such as g ω⁴ − b ω² would round in another way than with numbers in the code.
+    """
+    return level not in (FORCE_GRADIENT, CURVATURE)
+
+
 def _symbolic_loops(
     symbols: SymbolicHamiltonian, algebra: str, level: int, compensated: bool, monomials: Monomials
 ) -> LoopFunctions:
+    if _takes_values(level) and symbols.parametric is not symbols:
+        from sympflow.kernels.codegen import algebra_source
+
+        symbols = symbols.parametric
+        algebra = algebra_source(symbols)
     after = ("loops", "aligned", "lanes")
     loops = symbolic_module(symbols, algebra, level, compensated, after, monomials)
     processed = loops.rollout_processed, loops.rollout_processed_rows
