@@ -17,6 +17,7 @@ from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import fingerprint
+from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class Parameters(dict[str, float]):
 
 
 class HamiltonianSystem(Hamiltonian):
-    """A Hamiltonian system x' = J∇H(x), x = [q, p], with H autonomous.
+    """A Hamiltonian system x' = J∇H(x), x = [q, p], with H autonomous; with `damping` p' = −∂H/∂q − Γp.
 
     Parameters
     ----------
@@ -66,6 +67,9 @@ class HamiltonianSystem(Hamiltonian):
     stiffness_matrix : array_like of shape (d, d), optional
         A symmetric K, part ½ qᵀKq of the potential, that methods with an exact linear flow take as their `linear_part`.
         Only with `potential`; of a symbolic system it is read off.
+    damping : float or array_like of shape (d,) or (d, d), optional
+        Γ: one rate, one for each p, or a symmetric positive semi-definite matrix; 0 is none. The splitting methods on
+        the splitting "kinetic" and the Runge–Kutta methods solve it; all else refuses it, with the reason.
     name : str
     domain : Domain, optional
         Ω, where flows are trained. Classical methods never need one.
@@ -108,6 +112,7 @@ class HamiltonianSystem(Hamiltonian):
         gradient: Callable[..., Any] | None = None,
         hessian_vector: Callable[..., Any] | None = None,
         stiffness_matrix: ArrayLike | None = None,
+        damping: float | ArrayLike | None = None,
         name: str = "custom",
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
@@ -135,6 +140,7 @@ class HamiltonianSystem(Hamiltonian):
                 raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
             self.stiffness_matrix = matrices.stiffness_matrix(stiffness_matrix, definition.ndof)
             self.stiffness_matrix.setflags(write=False)
+        self._set_friction(damping)
         self._set_scene({}, domain, y0, t_span, dt, energy_scale)
 
     @classmethod
@@ -143,6 +149,7 @@ class HamiltonianSystem(Hamiltonian):
         expression: str | sympy.Expr,
         *,
         params: Mapping[str, float] | None = None,
+        damping: float | ArrayLike | None = None,
         name: str = "custom",
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
@@ -162,13 +169,14 @@ class HamiltonianSystem(Hamiltonian):
         params : mapping of str to float, optional
             Values of the other symbols: finite real numbers. A name that is given here is a symbol whatever it means
             otherwise. `system.params` holds them, to be read only.
-        name, domain, y0, t_span, dt, energy_scale
+        damping, name, domain, y0, t_span, dt, energy_scale
             As for the class.
 
         Raises
         ------
         ValueError, TypeError
-            If the expression cannot be parsed, has symbols without a value, or depends on t.
+            If the expression cannot be parsed, has symbols without a value, or depends on t; if `damping` is not
+            symmetric, has negative rates, or another shape.
         """
         from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, checked_params
 
@@ -179,8 +187,13 @@ class HamiltonianSystem(Hamiltonian):
         inverse_mass = None if M is None else matrices.simplest(np.array(M.tolist(), dtype=float))
         Hamiltonian.__init__(self, name, symbols, inverse_mass, M is not None)
         self.symbols = symbols
+        self._set_friction(damping)
         self._set_scene(params, domain, y0, t_span, dt, energy_scale)
         return self
+
+    def _set_friction(self, damping: float | ArrayLike | None) -> None:
+        G = matrices.damping(damping, self.ndof)
+        self.friction = None if G is None else Friction(G)
 
     def _set_scene(
         self,
@@ -285,12 +298,14 @@ class HamiltonianSystem(Hamiltonian):
 
     @cached_property
     def fingerprint(self) -> tuple[float, ...]:
-        """H at 8 fixed states less H at a ninth: what tells a trained flow whether this is its system."""
+        """H at 8 fixed states less H at a ninth, then Γ: what tells a trained flow whether this is its system."""
         return fingerprint(self)
 
     def __repr__(self) -> str:
         params = ", ".join(f"{k}={v:g}" for k, v in self.params.items())
         kind = "separable" if self.separable else "not separable"
+        if self.damping is not None:
+            kind += f", damping {np.array2string(self.damping, threshold=9, precision=6).replace(chr(10), '')}"
         return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
 
 
@@ -303,6 +318,7 @@ COUNTED = {
     "potential_hessian": "hessian_evaluations",
     "hessian_vector": "hessian_evaluations",
     "hessian": "hessian_evaluations",
+    "field_jacobian": "hessian_evaluations",
     "third_derivative": "curvature_evaluations",
     "curvature_gradient": "curvature_evaluations",
 }
