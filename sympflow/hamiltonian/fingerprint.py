@@ -53,6 +53,21 @@ def _agree(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
     return np.allclose(u, v, rtol=0, atol=TOLERANCE * np.abs(finite).max(initial=0.0), equal_nan=True)
 
 
+def check_for_flows(system: Hamiltonian) -> None:
+    """Refuse a system with friction, which trained flows, of conservative systems, would leave out.
+
+    Raises
+    ------
+    ValueError
+        With the reason.
+    """
+    system.check_conservative(
+        "which no trained flow has",
+        "train and use flows of the system without `damping`, and solve this one by a splitting method such as "
+        "'verlet' or 'kahan_li8'",
+    )
+
+
 Known = WeakKeyDictionary["Hamiltonian", bool]
 
 
@@ -86,7 +101,7 @@ class Identity:
     @classmethod
     def of(cls, system: Hamiltonian, domain: Domain | None, seed: int = 20260103) -> Self:
         """Return the identity of a system, by seeded states of a domain; of one without friction."""
-        system.check_conservative("which no flow is trained for", "train one for the conservative system")
+        check_for_flows(system)
         states = np.empty((0, 2 * system.ndof)) if domain is None else _spread_states(system, domain, seed)
         energies = _energies(system, states) if len(states) else np.empty(0)
         expression = system.expression

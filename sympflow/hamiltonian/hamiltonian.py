@@ -129,9 +129,7 @@ class Hamiltonian:
             With `what` is asked, as a clause that follows the reason, and the remedy.
         """
         if self.friction is not None:
-            raise ValueError(
-                f"`system` {self.name!r} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}."
-            )
+            raise ValueError(f"`system` {self.name!r} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
 
     def learns(self, y: Array) -> bool:
         """Return True if torch follows numbers of H other than y (..., 2d), a tensor: such as a network's weights."""

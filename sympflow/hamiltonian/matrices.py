@@ -62,7 +62,7 @@ def damping(values: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
             )
         if np.array_equal(G, np.diag(np.diag(G))):
             G = np.diag(G).copy()
-    if G.ndim == 1 and (G == G[0]).all():
+    if G.ndim == 1 and (G[0] == G).all():
         G = np.array(G[0])
     return np.abs(G) if G.ndim < 2 and G.any() else G if G.any() else None
 

@@ -16,7 +16,15 @@ from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
 from sympflow.kernels.protocol import Kernel, Run, Steps
-from sympflow.kernels.stages import DampedDrift, StageTable, kicks_of, lanes_source, run_table, stages_source, step_table
+from sympflow.kernels.stages import (
+    DampedDrift,
+    StageTable,
+    kicks_of,
+    lanes_source,
+    run_table,
+    stages_source,
+    step_table,
+)
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 
 if TYPE_CHECKING:

@@ -122,6 +122,11 @@ def stability(
     family = (system,) if isinstance(system, HamiltonianSystem) else tuple(system)
     if not family or not all(isinstance(s, HamiltonianSystem) for s in family):
         raise TypeError("`system` must be a HamiltonianSystem or a sequence of them.")
+    for one in family:
+        one.check_conservative(
+            "so its energy error says nothing of stability",
+            "study the system without `damping`, or use sympflow.compare",
+        )
     unknown = [m for m in metrics if m not in METRICS]
     if isinstance(metrics, str) or unknown:
         raise ValueError(f"`metrics` must be a list of names from {', '.join(METRICS)}; got {metrics!r}.")

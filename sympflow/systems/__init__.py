@@ -11,6 +11,8 @@ from sympflow.lazy import announced, distribution, load_announced
 from sympflow.systems.celestial import kepler, kepler_ellipse, outer_solar_system, three_body
 from sympflow.systems.chains import fput, lax_eigenvalues, lennard_jones, oscillatory_energies, toda_lattice
 from sympflow.systems.textbook import (
+    damped_oscillator,
+    damped_pendulum,
     double_well,
     harmonic_oscillator,
     henon_heiles,
@@ -45,6 +47,8 @@ SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {
     "toda-lattice": toda_lattice,
     "lennard-jones": lennard_jones,
     "nonseparable": nonseparable,
+    "damped-oscillator": damped_oscillator,
+    "damped-pendulum": damped_pendulum,
 }
 """The built-in scenes by the name that the command line uses."""
 

@@ -38,7 +38,74 @@ def harmonic_oscillator(omega: float = 1.0) -> HamiltonianSystem:
     )
 
 
+def damped_oscillator(omega: float = 1.0, damping: float = 0.1) -> HamiltonianSystem:
+    """H = (p² + ω²q²)/2 with friction, p' = −ω²q − γp.
+
+    Parameters
+    ----------
+    omega : float
+        Angular frequency ω > 0 without friction, from 1e-100 to 1e100.
+    damping : float
+        γ ≥ 0: below 2ω the oscillator swings, from there on it creeps.
+
+    Notes
+    -----
+    Known truth, with Ω² = ω² − γ²/4: q(t) = e^{−γt/2}(q₀ cos Ωt + (p₀ + γq₀/2) sin(Ωt)/Ω), with the hyperbolic
+    functions where Ω² is negative; p = q'. The domain is that of `harmonic_oscillator`, which no motion leaves.
+
+    References
+    ----------
+    .. [1] L. D. Landau, E. M. Lifshitz, "Mechanics", 3rd ed., Pergamon 1976, § 25.
+    """
+    if not (isinstance(omega, int | float) and 1e-100 <= omega <= 1e100):
+        raise ValueError(f"`omega` must be positive and finite, from 1e-100 to 1e100; got {omega!r}.")
+    return HamiltonianSystem.from_sympy(
+        "(p**2 + omega**2*q**2)/2",
+        params={"omega": omega},
+        damping=_rate(damping),
+        name="damped_oscillator",
+        domain=harmonic_oscillator(omega).domain,
+        y0=[1.0, 0.0],
+        t_span=(0.0, 100.0 / omega),
+        dt=0.05 / omega,
+    )
+
+
 _H = "p**2/2 + 1 - cos(q)"
+
+
+def damped_pendulum(damping: float = 0.1) -> HamiltonianSystem:
+    """H = p²/2 + 1 − cos q with friction, p' = −sin q − γp.
+
+    Parameters
+    ----------
+    damping : float
+        γ ≥ 0.
+
+    Notes
+    -----
+    Known truth: the rate of change of the energy is −γp², and of every area in the plane −γ times it: the flow is
+    conformally symplectic. The domain is that of `pendulum`, H < 1.8, where all motions end at rest in q = 0.
+
+    References
+    ----------
+    .. [1] R. McLachlan, M. Perlmutter, "Conformal Hamiltonian systems", J. Geom. Phys. 39 (2001) 276–300.
+    """
+    return HamiltonianSystem.from_sympy(
+        _H,
+        damping=_rate(damping),
+        name="damped_pendulum",
+        domain=pendulum().domain,
+        y0=[1.5, 0.0],
+        t_span=(0.0, 100.0),
+        dt=0.05,
+    )
+
+
+def _rate(damping: float) -> float:
+    if isinstance(damping, bool) or not (isinstance(damping, int | float) and 0 <= damping < math.inf):
+        raise ValueError(f"`damping` must be a finite number, not negative; got {damping!r}.")
+    return damping
 
 
 def pendulum() -> HamiltonianSystem:

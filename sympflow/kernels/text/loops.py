@@ -60,7 +60,9 @@ def first_non_finite(q, p, table, first, n_steps, work):
     j = first
     for n in range(1, n_steps):
         for _ in range(link):
-            q, p, q_error, p_error = called_stage(q, p, q_error, p_error, numbers_of(table, j), drift_of(table, j), j, work)
+            q, p, q_error, p_error = called_stage(
+                q, p, q_error, p_error, numbers_of(table, j), drift_of(table, j), j, work
+            )
             j = j + 1 if j < link else 1
         end_q, end_p = close(q, p, q_error, p_error, table, work)
         if not is_finite(end_q, end_p):
@@ -148,7 +150,9 @@ def map_each(table, y, out):
         q, p = unpack(y[i])
         q_error, p_error = no_error(q), no_error(p)
         for j in range(table.shape[1]):
-            q, p, q_error, p_error = called_stage(q, p, q_error, p_error, numbers_of(table, j), drift_of(table, j), j, work)
+            q, p, q_error, p_error = called_stage(
+                q, p, q_error, p_error, numbers_of(table, j), drift_of(table, j), j, work
+            )
         pack(q, p, out[i])
 
 
