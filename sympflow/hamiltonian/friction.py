@@ -56,7 +56,7 @@ class Friction:
     def drift(self, p: Array, s: Any) -> tuple[Array, Array]:
         """∫₀ˢ e^{−Γu}p du and e^{−Γs}p, for p (..., d) and times s: a number, or one that broadcasts against p.
 
-        By the first, times M⁻¹, a drift with friction moves q; the second is its momentum at the end. s may be negative.
+        By the first, times M⁻¹, a drift with friction moves q; the second is its momentum at the end. s has any sign.
         """
         rates = _like(self.rates, p)
         mean, decay = _factors(rates, s)
@@ -72,7 +72,7 @@ class Friction:
         if self._modes is None:
             return mean.reshape(len(s), -1), decay.reshape(len(s), -1)
         Q = self._modes
-        return tuple((Q * each[:, None, :] @ Q.T).reshape(len(s), -1) for each in (mean, decay))  # type: ignore[return-value]
+        return tuple((Q * each[:, None, :] @ Q.T).reshape(len(s), -1) for each in (mean, decay))
 
 
 def _factors(rates: Array, s: Any) -> tuple[Array, Array]:

@@ -163,9 +163,7 @@ class LinearPart:
 
 def check_parts_conservative(system: Scene) -> None:
     """Refuse a system with friction, which the exact flows of parts of H do not have."""
-    system.check_conservative(
-        "which exact flows of parts of H leave out", "use the splitting 'kinetic', as of 'verlet'"
-    )
+    system.check_conservative("which exact flows of parts of H omit", "use the splitting 'kinetic', as of 'verlet'")
 
 
 def linear_part(system: Scene) -> LinearPart:

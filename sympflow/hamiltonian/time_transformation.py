@@ -50,7 +50,7 @@ def time_transformed(
     Raises
     ------
     ValueError
-        If the system is not separable, or has friction, or `shift` is not finite, or does not exceed V at the system's y0.
+        If the system is not separable, or has friction; if `shift` is not finite, or not above V at the system's y0.
 
     References
     ----------

@@ -61,8 +61,9 @@ class Composition(ABC):
     ) -> None:
         self.method, self.scheme = method, scheme
 
-    def check_length(self, dt: float) -> None:
-        """Raise a ValueError where steps dt are too long for what the splitting makes of them."""
+    def check_friction(self, dt: float) -> None:
+        """Raise a ValueError where the friction of the system asks for shorter steps than dt."""
+        raise ValueError(f"`method` {self.method!r} does not take friction: use the splitting 'kinetic'.")
 
     def lift(self, y: Array) -> Array:
         """The states on which steps are made, of states y (..., 2d); y itself where the phase space is not extended."""
@@ -137,15 +138,15 @@ class KineticPotential(Composition):
                 f"{system.name!r} has not: use a Runge–Kutta method such as 'dop853'."
             )
 
-    def check_length(self, dt: float) -> None:
+    def check_friction(self, dt: float) -> None:
         friction = self.system.friction
         if friction is None:
             return
         back = -sum(s.one for s in self.scheme.substeps if s.kind == "drift" and s.one < 0)
         if friction.largest * back * dt > MOST_GROWTH:
             raise ValueError(
-                f"`dt` {dt:.6g} is too long for method {self.method!r} with a damping of {friction.largest:.6g}: drifts "
-                f"of {back:.3g} of a step go back in time, where friction lets momenta grow by a factor "
+                f"`dt` {dt:.6g} is too long for method {self.method!r} with a damping of {friction.largest:.6g}: its "
+                f"drifts of {back:.3g} of a step go back in time, where friction lets momenta grow by a factor "
                 f"exp({friction.largest * back * dt:.3g}). Use a `dt` of at most "
                 f"{MOST_GROWTH / (friction.largest * back):.3g}, or a scheme without such drifts, as 'verlet' or "
                 "'chin4c'."

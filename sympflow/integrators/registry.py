@@ -239,7 +239,7 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
     The functions of a user's system are tested too, for states such as y0. Friction is refused here for every method
     that does not say that it takes it.
     """
-    if system.friction is not None and not (integrator.takes_friction and _speaks_for_itself(type(integrator))):
+    if system.friction is not None and not (integrator.takes_friction and _speaks_for_itself(type(integrator).__mro__)):
         what = "was trained without it" if integrator.trained else "does not take it"
         system.check_conservative(
             f"and method {integrator.name!r} {what}",
@@ -255,10 +255,10 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
 
 
 @cache
-def _speaks_for_itself(cls: type[Integrator]) -> bool:
+def _speaks_for_itself(bases: tuple[type, ...]) -> bool:
     """False for a class outside of the package that changes what a built-in class does, and inherits what that says."""
-    says = next(i for i, base in enumerate(cls.__mro__) if "takes_friction" in vars(base))
-    others = (base for base in cls.__mro__[:says] if not base.__module__.startswith("sympflow."))
+    says = next(i for i, base in enumerate(bases) if "takes_friction" in vars(base))
+    others = (base for base in bases[:says] if not base.__module__.startswith("sympflow."))
     return not any(_DUTIES & vars(base).keys() for base in others)
 
 

@@ -277,7 +277,7 @@ class Splitting(OwnStepper):
             return
         composition = self.composed(system)
         if system.friction is not None:
-            composition.check_length(self.step_length(system))
+            composition.check_friction(self.step_length(system))
             if self.compensated:
                 raise ValueError(
                     "`compensated` sums are for systems without friction, which forgets round-off: leave it out."

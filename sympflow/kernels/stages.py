@@ -235,7 +235,7 @@ class DampedDrift:
         return int(self.ndof**self.ndim)
 
     def source(self, first: int) -> str:
-        """``drift_of``, ``spread``, the integral, and ``damped``, the new momentum; `first` is the row of the numbers."""
+        """``drift_of``, ``spread``, the integral, and ``damped``, the new p; `first` is the row of the numbers."""
         n, d = self.size, self.ndof
         if self.in_place:
             assert self.ndim < 2

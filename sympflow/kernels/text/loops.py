@@ -9,11 +9,10 @@ Where `SCHEDULED`, kicks and ``drifted`` run in an order of operations that is f
 their coefficients.
 
 A table has a column for each stage; its first row holds the drifts, the others hold the numbers of the kicks, and with
-friction those of the drifts (`stages.DampedDrift`). A run
-executes the columns [opening, inner …, link, closing]. A step is the link (the first step, the opening) and the inner
-stages; consecutive steps share their common kick or drift in the link, and an output is the closing stage applied to a
-copy, so that what is saved never changes the trajectory. The constants `COMPENSATED` and `SCHEDULED` are known when it
-is compiled: Numba leaves dead branches out.
+friction those of the drifts (`stages.DampedDrift`). A run executes the columns [opening, inner …, link, closing]. A
+step is the link (the first step, the opening) and the inner stages; consecutive steps share their common kick or drift
+in the link, and an output is the closing stage applied to a copy, so that what is saved never changes the trajectory.
+The constants `COMPENSATED` and `SCHEDULED` are known when it is compiled: Numba leaves dead branches out.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
