@@ -64,7 +64,9 @@ def damping(values: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
             G = np.diag(G).copy()
     if G.ndim == 1 and (G[0] == G).all():
         G = np.array(G[0])
-    return np.abs(G) if G.ndim < 2 and G.any() else G if G.any() else None
+    if not G.any():
+        return None
+    return np.array(abs(G)) if G.ndim < 2 else G  # −0.0 is 0
 
 
 def _real(name: str, values: ArrayLike) -> np.ndarray:
