@@ -7,9 +7,9 @@
 Each method runs from the scene's y0 to T, compiled, with as few steps as meet a target, found by doubling and
 bisection; for dop853 it is the tolerance that is searched. The targets are errors of 1e-4 and 1e-8 over 100 outputs:
 of the energy, the largest relative one, and of the state, the largest of a coordinate or momentum against
-gauss_legendre8 with short steps. The run time is that of a call of `solve` with the final state as the only output, the shortest of several
-in processor time. A network SympFlow, trained for so many seconds by Gauss–Newton on states of the double pendulum,
-stands with the errors that it has.
+gauss_legendre8 with short steps. The run time is that of a call of `solve` with the final state as the only output, the
+shortest of several in processor time. A network SympFlow, trained for so many seconds by Gauss–Newton on states of the
+double pendulum, stands with the errors that it has.
 """
 
 # ruff: noqa: E402
