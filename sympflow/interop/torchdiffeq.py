@@ -20,7 +20,7 @@ import torchdiffeq
 from torch import Tensor
 
 from sympflow.arguments import check_not_traced
-from sympflow.arrays import differentiable, finite_states, one_lane, readable, transformed
+from sympflow.arrays import differentiable, finite_states, one_lane, readable, transformed, unfollowed
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import available, check_applies
@@ -249,7 +249,7 @@ def odeint_adjoint(
     Raises
     ------
     TypeError
-        With our methods, where torch follows y0, t or a parameter in forward mode or in a transform of `torch.func`:
+        With our methods, where torch follows y0, t, a parameter or a number of H in forward mode or in a transform of `torch.func`:
         this is for reverse mode, `backward` and `torch.autograd.grad`.
     """
     if not _is_ours(method, func, options):
@@ -278,7 +278,8 @@ def odeint_adjoint(
         own = [] if adjoint_params is not None or system is None else leaves(system, y)
         parameters = (*(given or ()), *own)
         flow = integrator.flow_for(system)  # type: ignore[arg-type]
-        if transformed(y, t, *parameters, *(() if flow is None else flow.parameters())):
+        field = [system.vector_field(unfollowed(y))] if system is not None and system.learns(y) else []
+        if transformed(y, t, *field, *parameters, *(() if flow is None else flow.parameters())):
             raise TypeError(
                 "`odeint_adjoint` is for reverse mode, backward() and torch.autograd.grad: in forward mode, and inside "
                 "torch.func, use odeint."
