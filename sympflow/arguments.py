@@ -30,9 +30,11 @@ def check_t_span(t_span: Any, ends_by_event: bool | None = None) -> tuple[float,
 
     None where there are no events that could end it.
     """
-    check_not_followed("t_span", t_span)
+    plain = type(t_span) is tuple and len(t_span) == 2 and {type(t_span[0]), type(t_span[1])} <= _PLAIN
+    if not plain:
+        check_not_followed("t_span", t_span)
     try:
-        if type(t_span) is tuple and len(t_span) == 2 and {type(t_span[0]), type(t_span[1])} <= _PLAIN:
+        if plain:
             t0, t1 = float(t_span[0]), float(t_span[1])
         elif isinstance(t_span, str | bytes | set | frozenset | dict):
             raise TypeError(type(t_span).__name__)
@@ -62,7 +64,9 @@ def check_t_span(t_span: Any, ends_by_event: bool | None = None) -> tuple[float,
 def check_not_followed(name: str, times: Any) -> None:
     """Raise a TypeError if times carry derivatives: where times are numbers they would be dropped in silence."""
     parts = times if type(times) in (tuple, list) else (times,)
-    if any(is_tensor(t) and differentiable(t) for t in parts):
+    for t in parts:
+        if type(t) is float or not is_tensor(t) or not differentiable(t):
+            continue
         raise TypeError(
             f"`{name}` is a tensor that torch differentiates or transforms, but the times of a solution are numbers: "
             "use sympflow.interop.torchdiffeq.odeint, whose times are differentiated, or pass `.detach()`."

@@ -290,7 +290,7 @@ def check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
         )
     if math.prod(y0.shape) == 0:
         raise ValueError(f"`y0` is an empty batch, of shape {tuple(y0.shape)}: pass at least one state.")
-    if not finite_states(y0).all():
+    if not (np.isfinite(y0) if type(y0) is np.ndarray else finite_states(y0)).all():
         raise ValueError("`y0` must be finite; it holds NaN or infinity. Remove these states.")
     return y0
 

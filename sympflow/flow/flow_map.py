@@ -93,6 +93,8 @@ class FlowMap(nn.Module):
     """The method of `solve` that runs it."""
     symplectic: ClassVar[bool] = False
     """True if ψ_t is the flow of a Hamiltonian, with an exact inverse."""
+    identity: Identity | None = None  # these two of flows in pickles of earlier versions, which did not have them
+    unfitted: tuple[tuple[float, float], ...] = ()
 
     def __init__(self, ndof: int, dt: float) -> None:
         super().__init__()
@@ -109,8 +111,7 @@ class FlowMap(nn.Module):
         self.domain: Domain | None = None
         self.fingerprint: tuple[float, ...] | None = None
         self.system_name: str | None = None
-        self.identity: Identity | None = None
-        self.unfitted: tuple[tuple[float, float], ...] = ()
+        self.identity, self.unfitted = None, ()
         self._origin: tuple[dict[str, Any], Origin] | None = None
         self.recipe: dict[str, Any] = {}
         self.figures: dict[str, Any] = {}

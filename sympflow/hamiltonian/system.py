@@ -221,6 +221,11 @@ class HamiltonianSystem(Hamiltonian):
             raise ValueError(f"`y0` must have shape ({2 * self.ndof},), [q, p]; got {state.shape}.")
         return state
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of a pickle, of earlier versions too: they kept `params` as such, and tested no functions."""
+        untested = {"functions_given": False, "_checked": frozenset(), "_params": Parameters(state.get("params", {}))}
+        vars(self).update({**untested, **{name: value for name, value in state.items() if name != "params"}})
+
     @property
     def params(self) -> Mapping[str, float]:
         """The values of the parameters, to be read only: they are part of H, from which all code is generated.

@@ -48,6 +48,7 @@ def known(key: tuple[Any, ...], make: Callable[[], T]) -> T:
 
 _KINDS_OF_SYSTEM: dict[tuple[Any, ...], int] = {}
 _KIND_OF: WeakKeyDictionary[HamiltonianSystem, int] = WeakKeyDictionary()
+_FLOWS_OF: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Any, ...], FlowMap]] = WeakKeyDictionary()
 
 
 def kind_of(system: HamiltonianSystem) -> int:
@@ -114,8 +115,13 @@ class FlowIntegrator(OwnStepper):
         """Return the flow that is used for a system: the one given, else the one shipped."""
         if self.flow is not None:
             return self.flow.bound(system)
-        name, tolerance = self.name, self.tolerance
-        return known((name, kind_of(system), tolerance), lambda: shipped(system, name, tolerance))
+        asked = name, tolerance = self.name, self.tolerance
+        flows = _FLOWS_OF.get(system)
+        if flows is None:
+            flows = _FLOWS_OF[system] = {}
+        if asked not in flows:
+            flows[asked] = known((name, kind_of(system), tolerance), lambda: shipped(system, name, tolerance))
+        return flows[asked]
 
     def check(self, system: HamiltonianSystem) -> None:
         if self.flow is not None:

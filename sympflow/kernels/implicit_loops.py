@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels import families
+from sympflow.kernels import terms
 from sympflow.kernels.codegen import statements
-from sympflow.kernels.families import is_large
 from sympflow.kernels.modules import load_algebra, run_rows
 from sympflow.kernels.protocol import Kernel, Run, Steps
+from sympflow.kernels.terms import is_large
 
 __all__ = ["ImplicitKernel", "implicit_kernel"]
 
@@ -111,7 +111,7 @@ def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:
     """
     variables = symbols.q + symbols.p
     if is_large(symbols):
-        return f"NDOF = {symbols.ndof}\n\n\n" + families.gradient_and_hessian_source(
+        return f"NDOF = {symbols.ndof}\n\n\n" + terms.gradient_and_hessian_source(
             symbols.H, variables, "gradient_and_hessian"
         )
     slopes = [sp.diff(symbols.H, s) for s in variables]

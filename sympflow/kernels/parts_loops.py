@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
-from sympflow.kernels.families import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_out
 from sympflow.kernels.modules import NEVER, load_algebra, run_one, run_rows
 from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
 from sympflow.kernels.protocol import Kernel, Run, Steps
+from sympflow.kernels.terms import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_out
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 

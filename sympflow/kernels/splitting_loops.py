@@ -60,7 +60,7 @@ class SplittingLoops:
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
         if system.symbols is not None:
             from sympflow.kernels.codegen import algebra_source  # SymPy, which Numba functions do without
-            from sympflow.kernels.families import is_large
+            from sympflow.kernels.terms import is_large
 
             self._has_force_gradient = system.quadratic_kinetic
             if is_large(system.symbols):
@@ -234,9 +234,9 @@ def symbolic_module(
 
 
 def _family_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
-    """The loops of a symbolic system of many terms, around loops over these: see `sympflow.kernels.families`."""
+    """The loops of a symbolic system of many terms, around loops over these: see `sympflow.kernels.terms`."""
     from sympflow.kernels.codegen import polynomial_slope_source
-    from sympflow.kernels.families import bend_source, gradient_source, product_source, warn_if_long
+    from sympflow.kernels.terms import bend_source, gradient_source, product_source, warn_if_long
 
     symbols = system.symbols
     assert symbols is not None

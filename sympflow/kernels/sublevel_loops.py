@@ -11,9 +11,9 @@ from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import statements
-from sympflow.kernels.families import energy_source, is_large
 from sympflow.kernels.modules import load_algebra
 from sympflow.kernels.output_loops import all_between
+from sympflow.kernels.terms import energy_source, is_large
 
 __all__ = ["all_within"]
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 import struct
 
 import pytest
@@ -297,3 +298,12 @@ def test_the_domain_of_a_file_is_a_domain(tmp_path):
     flow.domain = Ball([0.0, 0.0], 2.0)
     flow.save(tmp_path / "ball.safetensors")
     assert load(tmp_path / "ball.safetensors").domain == flow.domain
+
+
+def test_a_pickle_of_a_version_without_identities_is_read():
+    flow = SympFlow.primed(henon_heiles(), 3, dt=0.5)
+    for name in ("identity", "unfitted"):
+        vars(flow).pop(name, None)
+    again = pickle.loads(pickle.dumps(flow))
+    assert again.identity is None
+    assert again.unfitted == ()

@@ -411,3 +411,22 @@ class TestParameters:
     def test_of_the_scene_are_checked_too(self, scene, error):
         with pytest.raises(error, match=f"^`{next(iter(scene))}` must be"):
             HamiltonianSystem.from_sympy("p**2/2 + q**2/2", **scene)
+
+
+def test_a_pickle_of_a_version_that_tested_no_functions_is_read():
+    system = systems.fput(m=1, omega=10.0)
+    state = {k: v for k, v in vars(system).items() if k not in ("functions_given", "_checked", "_params")}
+    old = HamiltonianSystem.__new__(HamiltonianSystem)
+    old.__setstate__({**state, "params": {"omega": 10.0}})
+    assert old.params == system.params
+    assert old.fingerprint == system.fingerprint
+    old.check_functions()
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(old)).force(old.y0[:2]), system.force(old.y0[:2]))
+
+
+def test_long_sums_are_evaluated_in_pieces(monkeypatch):
+    monkeypatch.setattr("sympflow.hamiltonian.symbolic.LONGEST_SUM", 3)
+    system = HamiltonianSystem.from_sympy("p**2/2 + " + " + ".join(f"q**2/(q + {k})" for k in range(1, 9)))
+    q, k = np.array([0.3]), np.arange(1, 9)
+    assert math.isclose(system.potential(q), (q**2 / (q + k)).sum(), rel_tol=1e-14)
+    assert math.isclose(system.potential(torch.from_numpy(q)).item(), (q**2 / (q + k)).sum(), rel_tol=1e-14)

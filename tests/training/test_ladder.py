@@ -4,6 +4,7 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pytest
@@ -53,6 +54,7 @@ def three(folder, monkeypatch):
     files = tuple(ShippedFlow.of(path) for path in sorted(folder.glob("*.safetensors")))
     monkeypatch.setattr(catalogue, "_catalogue", lambda: files)
     monkeypatch.setattr(flows, "_KNOWN", {})
+    monkeypatch.setattr(flows, "_FLOWS_OF", WeakKeyDictionary())
     return files
 
 

@@ -10,7 +10,7 @@ from watchdog import watched
 
 from sympflow import HamiltonianSystem, solve
 from sympflow.hamiltonian.parts import linear_and_rest
-from sympflow.kernels import families
+from sympflow.kernels import terms
 from sympflow.kernels.kicks import kicks_source, shapes
 from sympflow.kernels.modules import load_algebra
 from sympflow.kernels.parts_loops import parts_loops
@@ -44,8 +44,8 @@ def bodies(n, dim):
 
 def test_derivatives():
     V, q = SYSTEM.symbols.V, SYSTEM.symbols.q
-    sources = [families.energy_source(V, q, "energy"), families.gradient_source(V, q, "slope")]
-    sources += [families.product_source(V, q, "product"), families.bend_source(V, q, "bend")]
+    sources = [terms.energy_source(V, q, "energy"), terms.gradient_source(V, q, "slope")]
+    sources += [terms.product_source(V, q, "product"), terms.bend_source(V, q, "bend")]
     module = load_algebra("\n\n\n".join(sources))
     x, v = SYSTEM.y0[:SITES], np.cos(np.arange(SITES))
     slope, product, bend = np.full((3, SITES), np.nan)
@@ -66,9 +66,9 @@ def test_derivatives():
 
 def test_terms_that_differ_in_coordinates_and_constants_are_one_family():
     system = bodies(10, 3)
-    (pairs,) = families.families(system.symbols.V, system.symbols.q)
+    (pairs,) = terms.families(system.symbols.V, system.symbols.q)
     assert pairs.coordinates.shape == (45, 6)
-    (masses,) = families.families(system.symbols.T, system.symbols.p)
+    (masses,) = terms.families(system.symbols.T, system.symbols.p)
     assert masses.coordinates.shape == (30, 1)
 
 
@@ -78,7 +78,7 @@ def test_families_add_up():
         {sp.Symbol(s.name): s for s in q}
     )
     total = sp.S.Zero
-    for family in families.families(V, q):
+    for family in terms.families(V, q):
         for places, constants in zip(family.coordinates, family.constants, strict=True):
             values = dict(zip(family.x, (q[i] for i in places), strict=True)) | dict(
                 zip(family.c, map(sp.nsimplify, constants), strict=True)
@@ -125,15 +125,15 @@ def test_kicks_are_found_without_factoring_what_takes_minutes(expression):
 
 def test_a_warning_names_the_door_for_systems_of_very_many_kinds_of_terms(monkeypatch):
     powers = [(a, b, c) for a in range(1, 5) for b in range(1, 5) for c in range(1, 4)]
-    terms = [f"q{1 + n % 3}**{a}*cos(q{1 + (n + 1) % 3})**{b}*sin(q4)**{c}" for n, (a, b, c) in enumerate(powers)]
-    system = HamiltonianSystem.from_sympy(f"p1**2 + p2**2 + p3**2 + p4**2 + {' + '.join(terms)}")
-    assert families.is_large(system.symbols)
-    monkeypatch.setattr(families, "MOST_COMPILED", 500)
+    products = [f"q{1 + n % 3}**{a}*cos(q{1 + (n + 1) % 3})**{b}*sin(q4)**{c}" for n, (a, b, c) in enumerate(powers)]
+    system = HamiltonianSystem.from_sympy(f"p1**2 + p2**2 + p3**2 + p4**2 + {' + '.join(products)}")
+    assert terms.is_large(system.symbols)
+    monkeypatch.setattr(terms, "MOST_COMPILED", 500)
     with pytest.warns(UserWarning, match=r"compiling takes minutes\. Give it by Numba functions"):
-        families.warn_if_long(system.symbols.V, system.symbols.q, system.name)
+        terms.warn_if_long(system.symbols.V, system.symbols.q, system.name)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        families.warn_if_long(SYSTEM.symbols.V, SYSTEM.symbols.q, SYSTEM.name)
+        terms.warn_if_long(SYSTEM.symbols.V, SYSTEM.symbols.q, SYSTEM.name)
 
 
 def test_the_logarithmic_clock_of_many_degrees_of_freedom():
