@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, differentiable, is_tensor, stack, to_numpy
+from sympflow.arrays import Array, differentiable, is_tensor, stack, to_numpy, unfollowed
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.function_checks import Tested, check_writes, test
 
@@ -56,11 +56,12 @@ class CallableHamiltonian(Definition):
     def learns(self, y: Array) -> bool:
         if self.numba_functions is not None:
             return False
+        y = unfollowed(y)
         try:
             slope = self.potential_gradient(y[..., : self.ndof]) if self.separable else self.gradient(y)
         except (TypeError, ValueError, RuntimeError):  # written for NumPy arrays: torch can follow nothing in it
             return False
-        return differentiable(slope) and not differentiable(y)
+        return differentiable(slope)
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""

@@ -162,6 +162,7 @@ def test_it_goes_on_with_fresh_points():
     assert flow.history[-1]["loss"] < flow.history[0]["loss"] / 3
 
 
+@pytest.mark.slow
 def test_it_beats_adam_by_far():
     """Equal architecture and points: 40 steps against 400 gradient steps on fresh points."""
     common = {**QUICK, "pairs": 2, "hidden": (8,), "points": 300, "matching_weight": 0.0}
