@@ -8,6 +8,8 @@ import reprlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, reduce
+from itertools import islice
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -317,6 +319,7 @@ def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tu
     return V, T
 
 
+LONGEST_SUM = 500
 _MAX_POWER = 16  # integer powers up to this are made of products
 _INTEGER_POWER = sp.Function("integer_power", real=True)
 
@@ -330,12 +333,29 @@ def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], lib
         If the library has no function for something in the expressions.
     """
     code = [_by_products(f) if library == "numpy" else f for f in expressions]
+    sums = [_in_pieces(f) for f in code]
+    pieces = [piece for f in sums for piece in f]
     try:
-        return sp.lambdify(variables, code, modules=_modules(library, code), cse=True)
+        function = sp.lambdify(variables, pieces, modules=_modules(library, code), cse=True)
     except (PrintMethodNotImplementedError, ValueError) as error:
         raise TypeError(
             f"`expression` has no derivative that {library} could evaluate: write it with smooth functions."
         ) from error
+    if len(pieces) == len(code):
+        return function
+
+    def summed(*columns: Any) -> list[Any]:
+        values = iter(function(*columns))
+        return [reduce(add, islice(values, len(f))) for f in sums]
+
+    return summed
+
+
+def _in_pieces(f: sp.Expr) -> list[sp.Expr]:
+    """A sum as sums of up to `LONGEST_SUM` terms: Python's compiler nests them as deep as they have terms."""
+    if not f.is_Add or len(f.args) <= LONGEST_SUM:
+        return [f]
+    return [sp.Add(*f.args[i : i + LONGEST_SUM]) for i in range(0, len(f.args), LONGEST_SUM)]
 
 
 def _by_products(f: sp.Expr) -> sp.Expr:

@@ -422,3 +422,11 @@ def test_a_pickle_of_a_version_that_tested_no_functions_is_read():
     assert old.fingerprint == system.fingerprint
     old.check_functions()
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(old)).force(old.y0[:2]), system.force(old.y0[:2]))
+
+
+def test_long_sums_are_evaluated_in_pieces(monkeypatch):
+    monkeypatch.setattr("sympflow.hamiltonian.symbolic.LONGEST_SUM", 3)
+    system = HamiltonianSystem.from_sympy("p**2/2 + " + " + ".join(f"q**2/(q + {k})" for k in range(1, 9)))
+    q, k = np.array([0.3]), np.arange(1, 9)
+    assert math.isclose(system.potential(q), (q**2 / (q + k)).sum(), rel_tol=1e-14)
+    assert math.isclose(system.potential(torch.from_numpy(q)).item(), (q**2 / (q + k)).sum(), rel_tol=1e-14)
