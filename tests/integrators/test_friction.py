@@ -18,6 +18,8 @@ from sympflow.integrators.base import FixedStep
 from sympflow.interop.scipy import as_scipy
 from sympflow.schemes import SCHEMES
 from sympflow.systems import damped_oscillator, damped_pendulum, pendulum
+from sympflow.testing.checks import CHECKS, check_integrator
+from sympflow.testing.laws import NotApplicable
 
 EVERY_SCHEME = pytest.mark.parametrize("name", SCHEMES)
 MATRIX = np.array([[0.5, 0.3], [0.3, 0.4]])
@@ -286,6 +288,29 @@ def test_third_parties_say_that_they_take_friction():
             solve(system, method)
     assert solve(system, Informed(dt=0.1), (0, 1.0)).success
     assert solve(pendulum(), Changed(dt=0.1), (0, 1.0)).success
+
+
+def test_the_check_of_integrators_knows_who_takes_friction():
+    check = {check.name: check for check in CHECKS}["friction_is_in_the_steps"]
+
+    class Lying(Changed):
+        @property
+        def takes_friction(self):
+            return True
+
+    class Informed4(sympflow.get("rk4")):
+        @property
+        def takes_friction(self):
+            return True
+
+    check(Informed4(dt=0.1))
+    check(sympflow.get("verlet")(dt=0.05))
+    with pytest.raises(NotApplicable):
+        check(Field(dt=0.05))
+    with pytest.raises(AssertionError, match="of a damped system is wrong by"):
+        check(Lying(dt=0.05))
+    with pytest.raises(ValueError, match="has friction"):
+        check_integrator(lambda: sympflow.get("verlet")(dt=0.05), damped_pendulum())
 
 
 def test_methods_of_peers_and_ours_within_them():
