@@ -49,6 +49,8 @@ from sympflow.hamiltonian.fingerprint import same_system
 from sympflow.schemes import SCHEMES
 from sympflow.systems import henon_heiles, kepler, pendulum
 
+pytestmark = pytest.mark.slow
+
 TINY = Scene(t_end=20.0, n_instants=20, trajectories=70)  # more than a block of the hand-written loops, and not two
 
 

@@ -244,7 +244,7 @@ class FlowMap(nn.Module):
             if inside.any():
                 warnings.warn(
                     f"The flow was fitted to labels, of which none is at a time between {low:g} and {high:g}: what it "
-                    f"gives at t = {times[inside][0]:g} was compared with nothing. Ask for results at multiples of its "
+                    "gives there was compared with nothing. Ask for results at multiples of its "  # one text for all t
                     f"Δt = {self.dt:g}, or train it with labels at more times, or by loss='labels+residual'.",
                     UserWarning,
                     stacklevel=3,

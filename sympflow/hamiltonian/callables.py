@@ -71,7 +71,8 @@ class CallableHamiltonian(Definition):
             like = torch.from_numpy(np.empty(0, like.dtype))
         if not self.separable:
             names = "hamiltonian", "gradient", "[q, p]"
-            test(Tested(names, self.hamiltonian, self.gradient, None, True, self._result_types), states, like, n_given)
+            functions = Tested(names, self.hamiltonian, self.gradient, None, True, 2, self._result_types)
+            test(functions, states, like, n_given)
             return
         if self.numba_functions is not None:
             _, gradient, hessian_vector = self.numba_functions
@@ -83,7 +84,7 @@ class CallableHamiltonian(Definition):
         names = "potential", "gradient", "q"
         product = None if self._hessian_vector is None else self.hessian_vector
         automatic = self._gradient is None
-        functions = Tested(names, self.potential, self.potential_gradient, product, automatic, self._result_types)
+        functions = Tested(names, self.potential, self.potential_gradient, product, automatic, 1, self._result_types)
         test(functions, states[:, : self.ndof], like, n_given)
 
     def _result_types(self, x: Array) -> list[tuple[str, Any]]:

@@ -52,7 +52,7 @@ class Hamiltonian:
         self.quadratic_kinetic = quadratic_kinetic
         self.stiffness_matrix: np.ndarray | None = None
         self.functions_given: bool = definition.given
-        self._checked: frozenset[tuple[type, Any]] = frozenset()
+        self._tested: dict[tuple[type, Any], np.ndarray] = {}  # how far, by the kind of states
 
     def hamiltonian(self, y: Array) -> Array:
         """H(y): (..., 2d) to (...)."""

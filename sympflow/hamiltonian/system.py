@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -223,7 +224,7 @@ class HamiltonianSystem(Hamiltonian):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the state of a pickle, of earlier versions too: they kept `params` as such, and tested no functions."""
-        untested = {"functions_given": False, "_checked": frozenset(), "_params": Parameters(state.get("params", {}))}
+        untested = {"functions_given": False, "_tested": {}, "_params": Parameters(state.get("params", {}))}
         vars(self).update({**untested, **{name: value for name, value in state.items() if name != "params"}})
 
     @property
@@ -256,15 +257,45 @@ class HamiltonianSystem(Hamiltonian):
             return
         like = np.empty(0) if y0 is None else y0
         kind = type(like), like.dtype
-        if kind in self._checked:
+        if kind in self._tested:
             return
-        from sympflow.hamiltonian.function_checks import FEW, probe_states
+        from sympflow.hamiltonian.function_checks import FEW, probe_states, reach
 
         given = one_lane(like) if math.prod(like.shape) else self.y0
         probes = probe_states(given, self.domain, 2 * self.ndof)
         n_given = min(FEW, math.prod(like.shape) // (2 * self.ndof))
         self._definition.check(probes, like, n_given)
-        self._checked |= {kind}
+        self._tested = self._tested | {kind: reach(probes[:, : self._arguments])}
+
+    def check_functions_along(self, y: Array) -> None:
+        """Test the functions of a user where a run went far beyond the states at which they were tested: `solve` does.
+
+        At the farthest of the states y a RuntimeWarning says what `check_functions` would refuse: the run is made.
+
+        Parameters
+        ----------
+        y : array or tensor of shape (..., 2d)
+        """
+        kind = type(y), y.dtype
+        reached = self._tested.get(kind)
+        if reached is None:
+            return
+        from sympflow.hamiltonian.function_checks import farther_states, reach
+
+        far = farther_states(one_lane(y).reshape(-1, 2 * self.ndof), reached).astype(float)
+        if not len(far):
+            return
+        try:
+            self._definition.check(far, y, 0)
+        except (ValueError, TypeError) as error:
+            warnings.warn(f"On this run, far from its start: {error}", RuntimeWarning, stacklevel=3)
+            return
+        self._tested = self._tested | {kind: reach(np.concatenate([reached, far[:, : self._arguments]]))}
+
+    @property
+    def _arguments(self) -> int:
+        """How many components of a state the given functions depend on: V is one of q alone."""
+        return self.ndof if self.separable else 2 * self.ndof
 
     # structure --------------------------------------------------------------------------------------
 

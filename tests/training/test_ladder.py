@@ -298,6 +298,7 @@ def test_every_flow_is_a_map_for_all_times(listed):
     assert at_end <= 10 * listed.one_step_error * max(1.0, omega)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LADDERS)
 def test_shipped_figures_hold(name):
     """Measured again, on states of another seed, over a tenth of the time: no rung is worse than its file says."""
