@@ -3,13 +3,14 @@
     python benchmarks/nonseparable.py                                five minutes, two and a half of them of training
     python benchmarks/nonseparable.py --systems schwarzschild        one scene
     python benchmarks/nonseparable.py --seconds 0                    without a network
+    python benchmarks/nonseparable.py --long                         a million steps of tao4, nothing else
 
 Each method runs from the scene's y0 to T, compiled, with as few steps as meet a target, found by doubling and
 bisection; for dop853 it is the tolerance that is searched. The targets are errors of 1e-4 and 1e-8 over 100 outputs:
 of the energy, the largest relative one, and of the state, the largest of a coordinate or momentum against
 gauss_legendre8 with short steps. The run time is that of a call of `solve` with the final state as the only output, the
 shortest of several in processor time. A network SympFlow, trained for so many seconds by Gauss–Newton on states of the
-double pendulum, stands with the errors that it has.
+double pendulum, stands with the errors that it has. Long runs tell whether the energy drifts and the copies part.
 """
 
 # ruff: noqa: E402
@@ -21,6 +22,7 @@ import math
 import time
 import warnings
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from measuring.machine import pin_to_one_thread
@@ -53,6 +55,8 @@ COURSES = {
     "nonseparable-textbook": (systems.nonseparable, 20.0),
 }
 """The scene and the time T of each fragment."""
+LONG = ((systems.double_pendulum, 0.1), (systems.schwarzschild, 1.0), (systems.charged_particle, 0.01))
+LONG_STEPS = 1_000_000
 SCENES = [make.__name__ for make, _ in COURSES.values()]
 
 
@@ -119,6 +123,20 @@ def trained(system: HamiltonianSystem, seconds: float) -> FlowMap:
         )
 
 
+def long_runs(folder: Path | None) -> None:
+    """The energy error and the distance of the copies over a million steps of tao4."""
+    rows = []
+    for make, dt in LONG:
+        sol = solve(make(), "tao4", (0.0, LONG_STEPS * dt), dt=dt, save_every=100)
+        error = np.abs(sol.energy_error())
+        tenth = len(error) // 10
+        largest = (f"{part.max():.3e}" for part in (error[:tenth], error[-tenth:]))
+        rows.append((f"`{make.__name__}`", f"{dt:g}", *largest, f"{sol.stats['copy_distance']:.1e}"))
+        print(fragments.row(rows[-1]), flush=True)
+    titles = ("scene", "dt", "energy error, first tenth", "last tenth", "largest distance of the copies")
+    fragments.write(folder, "nonseparable-long", fragments.table(titles, rows), "--long")
+
+
 def cell(runs: Runs, measure: str, target: float) -> tuple[float, str]:
     """The run time at a target, and that with its step in words."""
     n = runs.fewest(target, measure)
@@ -133,8 +151,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--systems", nargs="*", choices=SCENES, default=SCENES, metavar="scene")
     parser.add_argument("--seconds", type=float, default=150.0, help="of training; 0 for none")
+    parser.add_argument("--long", action="store_true", help="long runs alone")
     fragments.add_out(parser)
     options = parser.parse_args()
+    if not options.long:
+        race(options)
+    if options.long or options.systems == SCENES:
+        long_runs(options.out)
+
+
+def race(options: argparse.Namespace) -> None:
+    """The run times of all methods at the targets, on each scene."""
     columns = [(measure, target) for measure in MEASURES for target in TARGETS]
     winners = []
     for fragment, (make, T) in COURSES.items():
@@ -170,7 +197,8 @@ def main() -> None:
             body = f"{body}\n\n{line}"
         fragments.write(options.out, fragment, body, f"--systems {name}")
     titles = ("scene", *(f"{measure} {target:.0e}" for measure, target in columns))
-    fragments.write(options.out, "nonseparable", fragments.table(titles, winners))
+    if options.systems == SCENES:
+        fragments.write(options.out, "nonseparable", fragments.table(titles, winners))
 
 
 if __name__ == "__main__":

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.arrays import differentiable
+
 
 def inverse_mass(mass: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
     """M⁻¹ in its simplest form for a mass M: a number, (d,) or (d, d)."""
@@ -71,6 +73,11 @@ def damping(values: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
 
 def _real(name: str, values: ArrayLike) -> np.ndarray:
     """The values as an array of floats."""
+    if differentiable(values):
+        raise TypeError(
+            f"`{name}` is a tensor that torch differentiates or transforms, but it is kept as numbers: write H with "
+            "it, as HamiltonianSystem(hamiltonian=...), or pass `.detach()`."
+        )
     try:
         array = np.asarray(values)
         if array.dtype.kind not in "biufO":

@@ -54,7 +54,8 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
     if isinstance(method, type) and issubclass(method, Integrator):
         return method
     if not isinstance(method, str):
-        raise TypeError(f"`method` must be a name or an Integrator class; got {type(method).__name__}.")
+        hint = " Make one of it by sympflow.splitting_method(scheme)." if isinstance(method, Scheme) else ""
+        raise TypeError(f"`method` must be a name or an Integrator class; got {type(method).__name__}.{hint}")
     if method in TRIPLES:
         from sympflow.integrators.splitting import method_of_row
 

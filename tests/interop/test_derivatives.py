@@ -234,6 +234,16 @@ class TestNumbersOfH:
         with pytest.raises(TypeError, match=r"^`event_fn` is followed by the values.*torch\.func\.vmap"):
             vmap(crossing)(k[None])
 
+    @pytest.mark.parametrize("derivative", [jacfwd, jacrev, lambda f: partial(tangent_along_ones, f)])
+    def test_a_mass_is_kept_as_numbers_and_says_so(self, derivative):
+        def end(mass):
+            return odeint(
+                HamiltonianSystem(lambda q: torch.cos(q).sum(-1), ndof=1, mass=mass), self.y0, T, method="verlet"
+            )[-1]
+
+        with pytest.raises(TypeError, match=r"^`mass` is a tensor that torch differentiates"):
+            derivative(end)(torch.tensor(1.3, dtype=torch.float64))
+
     @pytest.mark.parametrize("transform", [jacfwd, jacrev, tangent_along_ones, lambda f, k: vmap(f)(k[None])])
     def test_the_adjoint_of_them_is_refused(self, transform):
         def end(k):
