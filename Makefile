@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test pytest lint bench docs clean
+.PHONY: help demo test pytest slow lint bench docs clean
 
 help:  ## Show the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -25,8 +25,12 @@ test: .venv/installed-test  ## Lint, types and tests, side by side
 
 # One thread for each of the two workers: on arrays as small as the tests' those of BLAS and torch only wait, spinning.
 pytest: export OMP_NUM_THREADS = 1
-pytest: .venv/installed-test  ## The tests alone
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+pytest: .venv/installed-test  ## The tests alone, without the long ones
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+
+slow: export OMP_NUM_THREADS = 1
+slow: .venv/installed-test  ## The long tests: documentation, benchmarks, properties, trainings, shipped figures
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
 lint: .venv/installed-test  ## Lint, types and the direction of imports
 	$(BIN)/ruff check .

@@ -1,12 +1,16 @@
-"""A network, Gauss methods and explicit ones on two copies where H does not split: the double pendulum.
+"""Methods where H does not split into T(p) + V(q): run time at a given error, on four scenes.
 
-    python benchmarks/nonseparable.py                  two and a half minutes of training, on one core
-    python benchmarks/nonseparable.py --seconds 10     a look
+    python benchmarks/nonseparable.py                                five minutes, two and a half of them of training
+    python benchmarks/nonseparable.py --systems schwarzschild        one scene
+    python benchmarks/nonseparable.py --seconds 0                    without a network
+    python benchmarks/nonseparable.py --long                         a million steps of tao4, nothing else
 
-A SympFlow is trained on states below an energy for so many seconds, by Gauss–Newton. Then it, the Gauss methods and
-Tao's, dop853 beside them, run to T = 100 from the same state, compiled where they compile. The state error is the
-largest against gauss_legendre8 with dt = 0.01, the energy error the largest relative one, both over 1000 outputs. The
-run time is that of a call of `solve` with the final state as the only output, the shortest of nine.
+Each method runs from the scene's y0 to T, compiled, with as few steps as meet a target, found by doubling and
+bisection; for dop853 it is the tolerance that is searched. The targets are errors of 1e-4 and 1e-8 over 100 outputs:
+of the energy, the largest relative one, and of the state, the largest of a coordinate or momentum against
+gauss_legendre8 with short steps. The run time is that of a call of `solve` with the final state as the only output, the
+shortest of several in processor time. A network SympFlow, trained for so many seconds by Gauss–Newton on states of the
+double pendulum, stands with the errors that it has. Long runs tell whether the energy drifts and the copies part.
 """
 
 # ruff: noqa: E402
@@ -14,8 +18,12 @@ run time is that of a call of `solve` with the final state as the only output, t
 from __future__ import annotations
 
 import argparse
+import math
 import time
 import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 from measuring.machine import pin_to_one_thread
 
@@ -23,34 +31,87 @@ pin_to_one_thread()
 
 import numpy as np
 from measuring import fragments
+from measuring.race import fewest_steps
 
-from sympflow import Box, EnergySublevel, HamiltonianSystem, max_energy_error, solve, train
+from sympflow import HamiltonianSystem, max_energy_error, solve, systems, train
 from sympflow.flow.flow_map import FlowMap
 
-DOUBLE_PENDULUM = "(p1**2 + 2*p2**2 - 2*p1*p2*cos(q1 - q2))/(2*(1 + sin(q1 - q2)**2)) - 2*cos(q1) - cos(q2)"
-T, OUTPUTS, REPEATS = 100.0, 1000, 9
-RUNS = (
-    *(("implicit_midpoint", dt) for dt in (0.1, 0.01)),
-    *(("gauss_legendre4", dt) for dt in (0.2, 0.1)),
-    *(("gauss_legendre6", dt) for dt in (0.4, 0.2)),
-    *(("gauss_legendre8", dt) for dt in (0.5, 0.25)),
-    *(("tao4", dt) for dt in (0.1, 0.05)),
-    *(("tao6", dt) for dt in (0.1, 0.05)),
-    *(("tao8", dt) for dt in (0.2, 0.1)),
+METHODS = (
+    "implicit_midpoint",
+    *(f"gauss_legendre{order}" for order in (4, 6, 8)),
+    *(f"tao{order}" for order in (2, 4, 6, 8)),
+    "dop853",
 )
+TARGETS = (1e-4, 1e-8)
+MEASURES = ("energy", "state")
+OUTPUTS, REPEATS, MOST_STEPS = 100, 7, 2**21
+REFERENCE_STEPS = 10_000
 
 
-def double_pendulum() -> HamiltonianSystem:
-    """Two unit masses on unit rods, g = 1, below an energy of 1 above rest."""
-    box = Box(low=[-1.1, -1.65, -2.1, -1.5], high=[1.1, 1.65, 2.1, 1.5])
-    return HamiltonianSystem.from_sympy(
-        DOUBLE_PENDULUM,
-        name="double_pendulum",
-        domain=EnergySublevel(-2.0, box),
-        y0=[0.6, 0.8, 0.0, 0.0],
-        t_span=(0.0, T),
-        dt=0.1,
-    )
+COURSES = {
+    "nonseparable-double-pendulum": (systems.double_pendulum, 100.0),
+    "nonseparable-schwarzschild": (systems.schwarzschild, 2000.0),
+    "nonseparable-charged-particle": (systems.charged_particle, 20.0),
+    "nonseparable-textbook": (systems.nonseparable, 20.0),
+}
+"""The scene and the time T of each fragment."""
+LONG = ((systems.double_pendulum, 0.1), (systems.schwarzschild, 1.0), (systems.charged_particle, 0.01))
+LONG_STEPS = 1_000_000
+SCENES = [make.__name__ for make, _ in COURSES.values()]
+
+
+@dataclass
+class Runs:
+    """Runs of one method on a scene by their fineness: steps, or for dop853 1/rtol."""
+
+    system: HamiltonianSystem
+    T: float
+    exact: np.ndarray
+    method: str
+    known: dict[int, dict[str, float]] = field(default_factory=dict)
+
+    def chosen(self, n: int) -> dict[str, Any]:
+        """The options of `solve`."""
+        return {"rtol": 1 / n, "atol": 1e-3 / n} if self.method == "dop853" else {"dt": self.T / n}
+
+    def error(self, n: int, measure: str) -> float:
+        """The largest error of the energy or the state; ∞ where the run failed."""
+        if n not in self.known:
+            times = np.linspace(0.0, self.T, self.exact.shape[1])
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # of steps that are too long
+                try:
+                    sol = solve(self.system, self.method, (0.0, self.T), t_eval=times, **self.chosen(n))
+                    self.known[n] = errors(sol, self.exact)
+                except ValueError:
+                    self.known[n] = dict.fromkeys(MEASURES, math.inf)
+        return self.known[n][measure]
+
+    def fewest(self, target: float, measure: str) -> int | None:
+        """The least fineness that meets the target; None if that takes too many steps."""
+        first, most = (100, 10**13) if self.method == "dop853" else (16, MOST_STEPS)
+        return fewest_steps(lambda n: self.error(n, measure), target, first, first, most)
+
+
+def errors(sol: Any, exact: np.ndarray) -> dict[str, float]:
+    """The largest errors of a run; ∞ where it failed."""
+    if not sol.success:
+        return dict.fromkeys(MEASURES, math.inf)
+    return {"energy": float(max_energy_error(sol)), "state": float(np.abs(sol.y - exact).max())}
+
+
+def run_time(system: HamiltonianSystem, T: float, method: Any, chosen: dict[str, Any]) -> float:
+    """The least processor time of a call."""
+    seconds = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        for _ in range(REPEATS):
+            begin = time.process_time()
+            solve(system, method, (0.0, T), t_eval=[T], **chosen)
+            seconds.append(time.process_time() - begin)
+            if sum(seconds) > 10:
+                break
+    return min(seconds)
 
 
 def trained(system: HamiltonianSystem, seconds: float) -> FlowMap:
@@ -62,32 +123,82 @@ def trained(system: HamiltonianSystem, seconds: float) -> FlowMap:
         )
 
 
+def long_runs(folder: Path | None) -> None:
+    """The energy error and the distance of the copies over a million steps of tao4."""
+    rows = []
+    for make, dt in LONG:
+        sol = solve(make(), "tao4", (0.0, LONG_STEPS * dt), dt=dt, save_every=100)
+        error = np.abs(sol.energy_error())
+        tenth = len(error) // 10
+        largest = (f"{part.max():.3e}" for part in (error[:tenth], error[-tenth:]))
+        rows.append((f"`{make.__name__}`", f"{dt:g}", *largest, f"{sol.stats['copy_distance']:.1e}"))
+        print(fragments.row(rows[-1]), flush=True)
+    titles = ("scene", "dt", "energy error, first tenth", "last tenth", "largest distance of the copies")
+    fragments.write(folder, "nonseparable-long", fragments.table(titles, rows), "--long")
+
+
+def cell(runs: Runs, measure: str, target: float) -> tuple[float, str]:
+    """The run time at a target, and that with its step in words."""
+    n = runs.fewest(target, measure)
+    if n is None:
+        return math.inf, "—"
+    seconds = run_time(runs.system, runs.T, runs.method, runs.chosen(n))
+    step = f"rtol {1 / n:.0e}" if runs.method == "dop853" else f"dt {runs.T / n:.2g}"
+    return seconds, f"{fragments.duration(seconds)} ({step})"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=150.0, help="of training")
+    parser.add_argument("--systems", nargs="*", choices=SCENES, default=SCENES, metavar="scene")
+    parser.add_argument("--seconds", type=float, default=150.0, help="of training; 0 for none")
+    parser.add_argument("--long", action="store_true", help="long runs alone")
     fragments.add_out(parser)
     options = parser.parse_args()
-    system = double_pendulum()
-    times = np.linspace(0.0, T, OUTPUTS + 1)
-    exact = solve(system, "gauss_legendre8", t_eval=times, dt=0.01).y
-    rows = []
-    flow = trained(system, options.seconds)
-    runs = [(f"SympFlow, {options.seconds:.0f} s of training", f"Δt = {flow.dt:g}", flow, {})]
-    runs += [(name, f"dt = {dt:g}", name, {"dt": dt}) for name, dt in RUNS]
-    runs += [("dop853", "rtol 1e-9", "dop853", {"rtol": 1e-9, "atol": 1e-12})]
-    for label, step, method, chosen in runs:
-        sol = solve(system, method, t_eval=times, **chosen)
-        seconds = []
-        for _ in range(REPEATS):
-            begin = time.perf_counter()
-            solve(system, method, t_eval=[T], **chosen)
-            seconds.append(time.perf_counter() - begin)
-        error = np.abs(sol.y - exact).max() if sol.success else np.inf
-        figures = (f"{max_energy_error(sol):.1e}", f"{error:.1e}")
-        rows.append((label, step, fragments.duration(min(seconds)), *figures))
-        print(fragments.row(rows[-1]), flush=True)
-    table = fragments.table(("method", "step", "run time", "energy error", "state error"), rows)
-    fragments.write(options.out, "nonseparable", table)
+    if not options.long:
+        race(options)
+    if options.long or options.systems == SCENES:
+        long_runs(options.out)
+
+
+def race(options: argparse.Namespace) -> None:
+    """The run times of all methods at the targets, on each scene."""
+    columns = [(measure, target) for measure in MEASURES for target in TARGETS]
+    winners = []
+    for fragment, (make, T) in COURSES.items():
+        name = make.__name__
+        if name not in options.systems:
+            continue
+        system = make()
+        times = np.linspace(0.0, T, OUTPUTS + 1)
+        exact = solve(system, "gauss_legendre8", (0.0, T), t_eval=times, dt=T / REFERENCE_STEPS).y
+        rows, cells = [], {}
+        print(f"\n{name}, T = {T:g}")
+        for method in METHODS:
+            runs = Runs(system, T, exact, method)
+            cells[method] = [cell(runs, measure, target) for measure, target in columns]
+            rows.append((f"`{method}`", *(text for _, text in cells[method])))
+            print(fragments.row(rows[-1]), flush=True)
+        best = [min(METHODS, key=lambda m, k=k: cells[m][k][0]) for k in range(len(columns))]
+        for k, method in enumerate(best):
+            at = METHODS.index(method)
+            rows[at] = tuple(f"**{x}**" if i == k + 1 else x for i, x in enumerate(rows[at]))
+        winners.append((f"`{name}`", *(f"`{m}`, {fragments.duration(cells[m][k][0])}" for k, m in enumerate(best))))
+        titles = ("method", *(f"{measure} {target:.0e}" for measure, target in columns))
+        body = fragments.table(titles, rows)
+        if name == "double_pendulum" and options.seconds:
+            flow = trained(system, options.seconds)
+            got = errors(solve(system, flow, (0.0, T), t_eval=times), exact)
+            line = (
+                f"A SympFlow after {options.seconds:.0f} s of training, Δt = {flow.dt:g}: "
+                f"{fragments.duration(run_time(system, T, flow, {}))}, with errors of "
+                f"{got['energy']:.1e} in the energy and {got['state']:.1e} in the state."
+            )
+            print(line, flush=True)
+            body = f"{body}\n\n{line}"
+        fragments.write(options.out, fragment, body, f"--systems {name}")
+    titles = ("scene", *(f"{measure} {target:.0e}" for measure, target in columns))
+    if options.systems == SCENES:
+        fragments.write(options.out, "nonseparable", fragments.table(titles, winners))
 
 
 if __name__ == "__main__":

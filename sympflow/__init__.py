@@ -39,6 +39,7 @@ _HOME = {
     "energy_growth": "metrics.energy",
     "volume_error": "metrics.symplectic",
     "symplecticity_defect": "metrics.symplectic",
+    "conformal_defect": "metrics.symplectic",
     "loop_area_error": "metrics.symplectic",
     "linear_stability": "metrics.linear_stability",
     "reference_error": "metrics.accuracy",
@@ -72,6 +73,7 @@ if TYPE_CHECKING:
     from sympflow.metrics.energy import energy_growth as energy_growth
     from sympflow.metrics.energy import max_energy_error as max_energy_error
     from sympflow.metrics.linear_stability import linear_stability as linear_stability
+    from sympflow.metrics.symplectic import conformal_defect as conformal_defect
     from sympflow.metrics.symplectic import loop_area_error as loop_area_error
     from sympflow.metrics.symplectic import symplecticity_defect as symplecticity_defect
     from sympflow.metrics.symplectic import volume_error as volume_error

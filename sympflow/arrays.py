@@ -136,6 +136,22 @@ def one_lane(x: Array) -> np.ndarray:
     return to_numpy(x) if found is None else found[(0,) * (found.ndim - x.ndim)]
 
 
+def unfollowed(x: Array) -> Array:
+    """Return `x` as a tensor that torch follows by no means, under `torch.func.vmap` its first lane; arrays pass.
+
+    `x.detach()` inside a transform of `torch.func` is a tensor of that transform still.
+    """
+    if not is_tensor(x):
+        return x
+    import torch
+
+    plain, order = _behind(x)
+    if plain is None:
+        return x.detach()
+    with torch._C._DisableFuncTorch():
+        return plain.permute(order)[(0,) * (plain.ndim - x.ndim)]
+
+
 def lanes(x: Array) -> int:
     """Return the number of axes, hidden in the shape of `x`, over which `torch.func.vmap` maps it."""
     return len(_behind(x)[1]) - x.ndim if is_tensor(x) else 0

@@ -154,6 +154,10 @@ def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> 
 
     The warning that the error is absolute is attributed to the caller `stacklevel` frames up.
     """
+    sol.system.check_conservative(
+        "so its energy is lost and no error",
+        "use sympflow.conformal_defect(sol), which is 0 for the exact flow, or sympflow.reference_error(sol)",
+    )
     with np.errstate(all="ignore"):
         states = to_numpy(sol.states)
         error = _energy(sol, states) - _energy(sol, sol.y0)[..., None]

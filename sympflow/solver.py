@@ -158,6 +158,8 @@ def solve(
         from sympflow.integrators.diagnosis import note_singularities
 
         note_singularities(outcome, integrator, problem)
+    if system.functions_given and readable(outcome.y):
+        system.check_functions_along(outcome.y)
     if integrator.trained:
         check_system_along(outcome, integrator, system, y_start)
     if action != "ignore" and readable(outcome.y):

@@ -20,6 +20,7 @@ if not BENCHMARKS.exists():
 sys.path.insert(0, str(BENCHMARKS))
 
 import drift
+import nonseparable
 import own_systems
 import peers
 import plugins
@@ -48,6 +49,8 @@ from sympflow import SympFlow, shipped_flows
 from sympflow.hamiltonian.fingerprint import same_system
 from sympflow.schemes import SCHEMES
 from sympflow.systems import henon_heiles, kepler, pendulum
+
+pytestmark = pytest.mark.slow
 
 TINY = Scene(t_end=20.0, n_instants=20, trajectories=70)  # more than a block of the hand-written loops, and not two
 
@@ -409,3 +412,19 @@ def test_a_scheme_and_a_step_are_one_method_and_each_is_timed():
     assert [name for name, *_ in found] == ["1 trajectory, 20 steps", "10 trajectories, 2 steps"]
     assert all(0 < time < math.inf for _, *times in found for time in times)
     assert plugins.table(found).count("\n") == 3
+
+
+# H that is not separable ------------------------------------------------------------------------------
+
+
+def test_a_tiny_race_where_h_does_not_split(tmp_path, monkeypatch):
+    small = {"METHODS": ("implicit_midpoint", "gauss_legendre4"), "REFERENCE_STEPS": 2000, "REPEATS": 1}
+    for name, value in (small | {"MOST_STEPS": 16384}).items():
+        monkeypatch.setattr(nonseparable, name, value)
+    nonseparable.race(argparse.Namespace(systems=["nonseparable"], seconds=0.0, out=tmp_path))
+    (fragment,) = tmp_path.glob("*.md")  # that of the winners takes all scenes
+    midpoint, gauss = fragment.read_text(encoding="utf-8").splitlines()[2:4]
+    assert midpoint.count("—") == 2  # too many steps at 1e-8
+    cells = gauss.split("|")
+    assert all(cells[k].strip().startswith("**") for k in (3, 5))  # the only one there
+    assert "—" not in gauss

@@ -27,6 +27,7 @@ def blocks(page):
     return list(BLOCK.finditer(page.read_text(encoding="utf-8")))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=lambda page: page.stem)
 @pytest.mark.filterwarnings("default")
 def test_the_code_on_a_page_runs(page, tmp_path, monkeypatch):
@@ -76,6 +77,7 @@ def test_every_public_name_is_in_the_reference():
         assert home is None or any(f"::: sympflow.{home}{end}" in reference for end in (f".{name}", "\n")), name
 
 
+@pytest.mark.slow
 def test_the_site_builds_without_warnings(tmp_path):
     pytest.importorskip("mkdocs", reason='the site needs pip install "sympflow[docs]"')
     pytest.importorskip("mkdocstrings", reason='the site needs pip install "sympflow[docs]"')

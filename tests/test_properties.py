@@ -14,6 +14,8 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.methods import NAMES
 from sympflow.schemes import SCHEMES
 
+pytestmark = pytest.mark.slow
+
 PENDULUM = systems.pendulum()
 OSCILLATOR = systems.harmonic_oscillator()
 HENON_HEILES = systems.henon_heiles()

@@ -34,7 +34,8 @@ OPTIONS = {
 }
 """Arguments of the library that commands have by other names: the first one counts that the command has."""
 PHRASES = {
-    "train one by flow = sympflow.train(system) and pass flow=flow": "train one by `sympflow train`, and name its file",
+    "train one by flow = sympflow.train(system) and pass flow=flow": "train one by `sympflow train` and "
+    "name its file, or take a method that needs none, such as gauss_legendre6",
     "train a flow and pass flow=flow": "train one by `sympflow train`, and name its file",
     "pass the path of a flow saved with flow.save(path)": "name a file that `sympflow train` wrote",
     "flows from other files are read by sympflow.load": "flows from other files are named by their path",

@@ -81,9 +81,11 @@ def solve(
         sol = solve_system(scene.system, chosen, span, state(y0), t_eval=times, backend=backend, **options)
         if to is not None:
             write_solution(sol, to)
-        worst = max_energy_error(sol) if len(sol.t) else np.nan
+        worst = ""
+        if scene.system.conservative:
+            worst = f", largest energy error {max_energy_error(sol) if len(sol.t) else np.nan:.2e}"
         out.print(in_options(sol.message, ctx), markup=False)
-        out.print(f"{len(sol.t)} outputs, largest energy error {worst:.2e}")
+        out.print(f"{len(sol.t)} outputs{worst}")
         out.print(", ".join(f"{k} = {v:.4g}" if isinstance(v, float) else f"{k} = {v}" for k, v in sol.stats.items()))
         if len(sol.t):
             show(f"y({sol.t[-1]:g}) = [{', '.join(f'{x:.12g}' for x in sol.y[:, -1])}]")

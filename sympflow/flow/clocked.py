@@ -26,6 +26,7 @@ from sympflow.flow.potentials import Potential, Time
 from sympflow.flow.primed_potentials import KINETIC, POTENTIAL, Binding, PrimedPotential
 from sympflow.flow.sympflow import UNCOMPENSATED, SympFlow
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
+from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, scheme_evaluations
 
@@ -163,6 +164,7 @@ class ClockedFlow(SympFlow):
 
     @staticmethod
     def _check(system: HamiltonianSystem) -> None:
+        check_for_flows(system)
         if "shift" not in system.params:
             raise ValueError("`system` is no logarithmic Hamiltonian: make one by sympflow.time_transformed(system).")
 

@@ -20,7 +20,7 @@ from sympflow.flow.certificate import Certificate, certify
 from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
-from sympflow.hamiltonian.fingerprint import Identity, same_system
+from sympflow.hamiltonian.fingerprint import Identity, check_for_flows, same_system
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 
@@ -44,12 +44,13 @@ class Origin:
 
 
 def check_system(system: Any) -> None:
-    """Raise TypeError unless `system` is a HamiltonianSystem; ValueError where functions of its user are wrong."""
+    """Raise TypeError unless `system` is a HamiltonianSystem; ValueError if it has friction, or wrong functions."""
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(
             f"`system` must be a HamiltonianSystem; got {type(system).__name__}: take a scene of sympflow.systems, or "
             "define one with HamiltonianSystem.from_sympy."
         )
+    check_for_flows(system)
     if system.functions_given:
         system.check_functions(torch.empty(0, dtype=torch.float64) if system.takes_tensors else None)
 
@@ -244,7 +245,7 @@ class FlowMap(nn.Module):
             if inside.any():
                 warnings.warn(
                     f"The flow was fitted to labels, of which none is at a time between {low:g} and {high:g}: what it "
-                    f"gives at t = {times[inside][0]:g} was compared with nothing. Ask for results at multiples of its "
+                    "gives there was compared with nothing. Ask for results at multiples of its "  # one text for all t
                     f"Δt = {self.dt:g}, or train it with labels at more times, or by loss='labels+residual'.",
                     UserWarning,
                     stacklevel=3,
@@ -400,6 +401,7 @@ class FlowMap(nn.Module):
 
     def identify(self, system: HamiltonianSystem, domain: Domain | None = None) -> None:
         """Make this the flow of a system, which it will know again: by its fingerprint, and by its H over a domain."""
+        check_for_flows(system)
         self.fingerprint, self.system_name = system.fingerprint, system.name
         self.identity = Identity.of(system, domain)
 

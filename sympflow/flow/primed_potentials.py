@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sympflow.arrays import Array, jvp
 from sympflow.flow.potentials import Potential, Time
+from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.hamiltonian import derivative, direction, length_of_change, step
 from sympflow.hamiltonian.monomials import Monomials, gradient, value
 
@@ -42,6 +43,7 @@ class Binding:
         return self._system
 
     def bind(self, system: HamiltonianSystem) -> None:
+        check_for_flows(system)
         self._system = system
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Binding:

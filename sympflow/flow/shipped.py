@@ -17,7 +17,7 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sympflow.hamiltonian.fingerprint import Identity, same_system
+from sympflow.hamiltonian.fingerprint import Identity, check_for_flows, same_system
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
@@ -222,6 +222,7 @@ def choose(
         raise ValueError(
             f"`tol` must be a positive number, a relative energy error; got {tol!r}: take 1e-6, for instance."
         )
+    check_for_flows(system)
     own = ShippedFlows([f for f in shipped_flows(system, kind) if transformed or f.shift is None])
     if not own:
         there = ", ".join(dict.fromkeys(f.system for f in shipped_flows(kind=kind)))

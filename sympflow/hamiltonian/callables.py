@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, differentiable, is_tensor, stack, to_numpy
+from sympflow.arrays import Array, differentiable, is_tensor, stack, to_numpy, unfollowed
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.function_checks import Tested, check_writes, test
 
@@ -56,11 +56,12 @@ class CallableHamiltonian(Definition):
     def learns(self, y: Array) -> bool:
         if self.numba_functions is not None:
             return False
+        y = unfollowed(y)
         try:
             slope = self.potential_gradient(y[..., : self.ndof]) if self.separable else self.gradient(y)
         except (TypeError, ValueError, RuntimeError):  # written for NumPy arrays: torch can follow nothing in it
             return False
-        return differentiable(slope) and not differentiable(y)
+        return differentiable(slope)
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
@@ -70,7 +71,8 @@ class CallableHamiltonian(Definition):
             like = torch.from_numpy(np.empty(0, like.dtype))
         if not self.separable:
             names = "hamiltonian", "gradient", "[q, p]"
-            test(Tested(names, self.hamiltonian, self.gradient, None, True, self._result_types), states, like, n_given)
+            functions = Tested(names, self.hamiltonian, self.gradient, None, True, 2, self._result_types)
+            test(functions, states, like, n_given)
             return
         if self.numba_functions is not None:
             _, gradient, hessian_vector = self.numba_functions
@@ -82,7 +84,7 @@ class CallableHamiltonian(Definition):
         names = "potential", "gradient", "q"
         product = None if self._hessian_vector is None else self.hessian_vector
         automatic = self._gradient is None
-        functions = Tested(names, self.potential, self.potential_gradient, product, automatic, self._result_types)
+        functions = Tested(names, self.potential, self.potential_gradient, product, automatic, 1, self._result_types)
         test(functions, states[:, : self.ndof], like, n_given)
 
     def _result_types(self, x: Array) -> list[tuple[str, Any]]:

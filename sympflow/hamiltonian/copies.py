@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sympflow.arrays import Array, concatenate
-from sympflow.hamiltonian.linear_part import LinearPart
+from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative
 from sympflow.hamiltonian.parts import ExactParts, PartFunctions
 
 if TYPE_CHECKING:
@@ -67,6 +67,7 @@ class FunctionsOfCopies:
 
 def two_copies(system: HamiltonianSystem, omega: float) -> ExactParts:
     """H(q, y), H(x, p) and the coupling, in the order of a splitting with the coupling innermost."""
+    check_parts_conservative(system)
     import sympy as sp
 
     d, symbols = system.ndof, system.symbols

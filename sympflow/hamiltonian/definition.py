@@ -43,7 +43,10 @@ class Definition:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""
 
     def learns(self, y: Array) -> bool:
-        """Return True if torch follows numbers within the functions at the states y (..., 2d), such as weights."""
+        """Return True if torch follows numbers within the functions at the states y (..., 2d), such as weights.
+
+        Inside a transform of `torch.func`, which takes hold of all that is computed there, also where it follows none.
+        """
         return False
 
     def potential_hessian(self, q: Array) -> Array:

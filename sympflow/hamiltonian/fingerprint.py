@@ -28,10 +28,11 @@ TOLERANCE = 1e-9
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
-    """H at 8 fixed states less H at a ninth."""
+    """H at 8 fixed states less H at a ninth; the entries of Γ follow, of a system with friction."""
     with np.errstate(all="ignore"):
         H = to_numpy(system.hamiltonian(_fixed_states(system.ndof)))
-    return tuple((H[1:] - H[0]).tolist())
+    friction = () if system.damping is None else system.damping.ravel().tolist()
+    return (*(H[1:] - H[0]).tolist(), *friction)
 
 
 def _fixed_states(ndof: int) -> np.ndarray:
@@ -52,12 +53,27 @@ def _agree(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
     return np.allclose(u, v, rtol=0, atol=TOLERANCE * np.abs(finite).max(initial=0.0), equal_nan=True)
 
 
+def check_for_flows(system: Hamiltonian) -> None:
+    """Refuse a system with friction, which trained flows, of conservative systems, would leave out.
+
+    Raises
+    ------
+    ValueError
+        With the reason.
+    """
+    system.check_conservative(
+        "which no trained flow has",
+        "train and use flows of the system without `damping`, and solve this one by a splitting method such as "
+        "'verlet' or 'kahan_li8'",
+    )
+
+
 Known = WeakKeyDictionary["Hamiltonian", bool]
 
 
 @dataclass(eq=False)
 class Identity:
-    """The H of a system as a flow keeps it, to know it again all over its domain, and along a run.
+    """The H of a conservative system as a flow keeps it, to know it again all over its domain, and along a run.
 
     A fingerprint probes H near the origin alone, and two systems may agree there and differ where the flow is used.
 
@@ -84,7 +100,8 @@ class Identity:
 
     @classmethod
     def of(cls, system: Hamiltonian, domain: Domain | None, seed: int = 20260103) -> Self:
-        """Return the identity of a system, by seeded states of a domain."""
+        """Return the identity of a system, by seeded states of a domain; of one without friction."""
+        check_for_flows(system)
         states = np.empty((0, 2 * system.ndof)) if domain is None else _spread_states(system, domain, seed)
         energies = _energies(system, states) if len(states) else np.empty(0)
         expression = system.expression
@@ -96,6 +113,8 @@ class Identity:
         """Return True if H of a system has these energies at these states, up to a constant; found out once."""
         if self._last is not None and self._last() is system:  # in nearly all calls
             return True
+        if not system.conservative:
+            return False
         found = self._agreed.get(system)
         if found is None:
             found = self._agreed[system] = self.is_proved(system) or self.first_difference(system) is None
@@ -141,6 +160,8 @@ class Identity:
         """Return True if the formula of a system is this one, up to a constant; found out once."""
         if self._last is not None and self._last() is system:
             return True
+        if not system.conservative:
+            return False
         found = self._proved.get(system)
         if found is None:
             found = self._proved[system] = self._prove(system)

@@ -23,6 +23,10 @@ EVERY_COMPONENT = 64
 DIRECTIONS = 8
 STEPS = {np.dtype(np.float64): (1e-5, 1e-4), np.dtype(np.float32): (3e-3, 1e-2)}
 """Steps of the differences, relative to the size of the state: a derivative is wrong if both say so."""
+FINER = [10.0**-k for k in range(1, 10)]
+"""Fractions of the smaller step that are tried before a derivative is refused: a function may vary within the step."""
+FARTHER = 0.25
+"""A run is tested where it left the states tested before by this share of their extent."""
 REMEDY = "where all is as it should be, pass check=False to HamiltonianSystem."
 
 
@@ -47,6 +51,32 @@ def probe_states(given: np.ndarray | None, domain: Domain | None, width: int) ->
     return np.concatenate(found)
 
 
+def reach(states: np.ndarray) -> np.ndarray:
+    """The least and the largest components (2, width) that a run may have without another test, by states tested."""
+    low, high = states.min(0), states.max(0)
+    with np.errstate(over="ignore"):
+        lengths = high - low
+        margin = FARTHER * np.maximum(lengths, 0.1 * lengths.max())
+        return np.stack([low - margin, high + margin])
+
+
+def farther_states(y: np.ndarray, reached: np.ndarray) -> np.ndarray:
+    """Those of the states (N, width) of a run that lie farthest beyond what `reach` gave, of its first components."""
+    low, high = reached
+    seen = y[:, : len(low)]
+    if (seen.min(0) >= low).all() and (seen.max(0) <= high).all():
+        return y[:0]
+    y = y[np.isfinite(y).all(-1)]
+    if not len(y):
+        return y
+    seen = y[:, : len(low)]
+    rows = np.concatenate([seen.argmin(0), seen.argmax(0)])
+    with np.errstate(over="ignore"):
+        beyond = np.concatenate([low - seen.min(0), seen.max(0) - high])
+        order = np.argsort(-beyond / np.tile(np.where(high > low, high - low, 1.0), 2))
+    return y[list(dict.fromkeys(rows[order[beyond[order] > 0]].tolist()))[:FEW]]
+
+
 @dataclass(frozen=True)
 class Tested:
     """A function of states x (..., n), its gradient, and its Hessian times a vector where that was given.
@@ -57,6 +87,8 @@ class Tested:
         Those of the functions, and of the state, in messages.
     automatic : bool
         True if the gradient is an automatic one.
+    parts : int
+        2 if x is [q, p], two halves of sizes of their own, else 1.
     result_types : callable, optional
         The types in which the user's own functions answer.
     """
@@ -66,6 +98,7 @@ class Tested:
     gradient: Callable[[Array], Array]
     hessian_vector: Callable[[Array, Array], Array] | None = None
     automatic: bool = False
+    parts: int = 1
     result_types: Callable[[Array], list[tuple[str, Any]]] | None = None
 
 
@@ -184,35 +217,50 @@ def _check_batches(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) ->
             )
 
 
-def _directions(x: np.ndarray, chosen: Sequence[int] | None) -> np.ndarray:
+def _directions(x: np.ndarray, chosen: Sequence[int] | None, parts: int) -> np.ndarray:
     """Directions (N, m, n) at states (N, n), of the size of these: those of chosen components, or random ones."""
-    largest = np.abs(x).max(-1, keepdims=True)
-    size = np.maximum(np.abs(x), 0.1 * np.where(largest > 0, largest, 1.0))
+    groups = np.abs(x).reshape(len(x), parts, -1)
+    largest = groups.max(-1, keepdims=True)
+    size = np.maximum(groups, 0.1 * np.where(largest > 0, largest, 1.0)).reshape(x.shape)
     if chosen is not None:
         return size[:, None, :] * np.eye(x.shape[-1])[list(chosen)]
     rng = np.random.Generator(np.random.PCG64(20260103))
     return size[:, None, :] * rng.uniform(-1, 1, (DIRECTIONS, x.shape[-1]))
 
 
+def _values(function: Callable[[Array], Array], states: Array) -> np.ndarray:
+    """A function at states (N, n), NaN where it fails, as beyond the end of its domain."""
+    try:
+        return _numbers(function(states))
+    except Exception:  # whatever a user's function raises
+        found: list[np.ndarray | None] = []
+        for state in states:
+            try:
+                found.append(_numbers(function(state)))
+            except Exception:
+                found.append(None)
+    nothing = np.full(next((v.shape for v in found if v is not None), ()), np.nan)
+    return np.stack([nothing if v is None else v for v in found])
+
+
 def _differences(
     function: Callable[[Array], Array], x: Array, w: np.ndarray, h: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Central differences of a function along w (N, m, n) at x (N, n): (N, m, …), and how far they may be off.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Central differences of a function along w (N, m, n) at x (N, n): (N, m, …), and by what they may be off.
 
-    The one is as uncertain as the slopes on both sides differ, and as rounding makes it: that is seen in the values at
-    states a few units in the last place away.
+    That is the difference of the slopes on both sides, and rounding, which is seen in the values at states a few units
+    in the last place away.
     """
     eps = np.finfo(_precision(x)).eps
     at = _numbers(x)[:, None, :]
     lengths = np.array([h, -h, 2 * eps, -2 * eps, 4 * eps, 0.0]).reshape(-1, 1, 1, 1)
     states = at + lengths * w
-    flat = as_like(states.reshape(-1, x.shape[-1]), x)
-    values = _numbers(function(flat))
+    values = _values(function, as_like(states.reshape(-1, x.shape[-1]), x))
     values = values.reshape(*states.shape[:-1], *values.shape[1:])
     up, down, *near, here = values
     rounding = np.max([np.abs(v - here) for v in near], axis=0) + 4 * eps * np.abs(here)
     ahead, behind = (up - here) / h, (here - down) / h
-    return (ahead + behind) / 2, 2 * np.abs(ahead - behind) + 16 * rounding / h
+    return (ahead + behind) / 2, np.abs(ahead - behind), 16 * rounding / h
 
 
 def _certainly_wrong(
@@ -223,9 +271,15 @@ def _certainly_wrong(
     floor = 10 * small if _precision(x) == np.float64 else 3 * small
     wrong = np.ones(claimed.shape, dtype=bool)
     for h in (large, small):
-        found, uncertain = _differences(function, x, w, h)
+        found, bend, rounding = _differences(function, x, w, h)
         beside = floor * np.maximum(np.abs(found), np.abs(claimed))
-        wrong &= np.abs(found - claimed) > beside + uncertain  # False where one of them is not finite
+        wrong &= np.abs(found - claimed) > beside + 2 * bend + rounding  # False where one of them is not finite
+    for fraction in FINER:
+        if not wrong.any():
+            break
+        finer, _, rounding = _differences(function, x, w, fraction * small)
+        apart = 0.1 * np.abs(found - claimed)
+        wrong &= ~((np.abs(finer - claimed) < apart) & (rounding < apart))
     return wrong, found
 
 
@@ -233,7 +287,7 @@ def _check_gradient(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -
     n = x.shape[-1]
     at = _numbers(x)
     if n > EVERY_COMPONENT:
-        w = _directions(at, None)
+        w = _directions(at, None, functions.parts)
         wrong, _ = _certainly_wrong(functions.value, x, w, (w * g[:, None]).sum(-1))
         if not wrong.any():
             return
@@ -241,7 +295,7 @@ def _check_gradient(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -
         x, at, g = x[worst : worst + 1], at[worst : worst + 1], g[worst : worst + 1]
     for start in range(0, n, EVERY_COMPONENT):
         chosen = range(start, min(start + EVERY_COMPONENT, n))
-        w = _directions(at, chosen)
+        w = _directions(at, chosen, functions.parts)
         size = w.sum(-1)
         wrong, found = _certainly_wrong(functions.value, x, w, size * g[:, list(chosen)])
         if wrong.any():
@@ -266,7 +320,7 @@ def _refuse(functions: Tested, state: Array, k: int, given: float, found: float,
 
 def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
     assert functions.hessian_vector is not None
-    w = _directions(_numbers(x), None)[:, :1]
+    w = _directions(_numbers(x), None, 1)[:, :1]
     v = as_like(w[:, 0], x)
     claimed = np.stack([_numbers(functions.hessian_vector(x[i], v[i])) for i in range(len(x))])
     batch = _numbers(functions.hessian_vector(x, v))

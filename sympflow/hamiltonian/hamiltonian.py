@@ -11,6 +11,7 @@ import numpy as np
 from sympflow.arrays import Array, concatenate, is_tensor
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 
@@ -38,7 +39,11 @@ class Hamiltonian:
         A quadratic part ½ qᵀKq of V that was named, of a definition without symbols.
     functions_given : bool
         True if H is given by functions of a user, which are to be checked.
+    friction : Friction or None
+        What −Γp does, of a damped system. Whatever leaves it out must refuse the system: see `check_conservative`.
     """
+
+    friction: Friction | None = None
 
     def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
         self.name = name
@@ -52,7 +57,7 @@ class Hamiltonian:
         self.quadratic_kinetic = quadratic_kinetic
         self.stiffness_matrix: np.ndarray | None = None
         self.functions_given: bool = definition.given
-        self._checked: frozenset[tuple[type, Any]] = frozenset()
+        self._tested: dict[tuple[type, Any], np.ndarray] = {}  # how far, by the kind of states
 
     def hamiltonian(self, y: Array) -> Array:
         """H(y): (..., 2d) to (...)."""
@@ -80,13 +85,51 @@ class Hamiltonian:
         return concatenate([_rows(A, 0 * A), _rows(0 * B, B)]).swapaxes(-1, -2)
 
     def vector_field(self, y: Array) -> Array:
-        """J∇H(y) = [∇_pH, −∇_qH]: (..., 2d) to (..., 2d)."""
+        """J∇H(y) = [∇_pH, −∇_qH], with friction [∇_pH, −∇_qH − Γp]: (..., 2d) to (..., 2d)."""
         self._check_width(y)
-        d = self.ndof
+        d, friction = self.ndof, self.friction
         if self.separable:
-            return concatenate([self.velocity(y[..., d:]), self.force(y[..., :d])])
+            force = self.force(y[..., :d])
+            if friction is not None:
+                force = force + friction.force(y[..., d:])
+            return concatenate([self.velocity(y[..., d:]), force])
         g = self._definition.gradient(y)
-        return concatenate([g[..., d:], -g[..., :d]])
+        force = -g[..., :d]
+        if friction is not None:
+            force = force + friction.force(y[..., d:])
+        return concatenate([g[..., d:], force])
+
+    def field_jacobian(self, y: Array) -> Array:
+        """The Jacobian of `vector_field`, J∇²H(y), with friction less Γ in the rows and columns of p: (..., 2d, 2d)."""
+        d, S = self.ndof, self.hessian(y)
+        rows = [S[..., d:, :], -S[..., :d, :]]
+        A = _library(S).cat(rows, dim=-2) if is_tensor(S) else np.concatenate(rows, axis=-2)
+        if self.friction is None:
+            return A
+        G = np.zeros((2 * d, 2 * d))
+        G[d:, d:] = self.friction.matrix(d)
+        return A - _like(G, A)
+
+    @property
+    def damping(self) -> np.ndarray | None:
+        """Γ of the friction −Γp, to be read only: (), one rate γ for all momenta, (d,) or (d, d); None without."""
+        return None if self.friction is None else self.friction.damping
+
+    @property
+    def conservative(self) -> bool:
+        """True without friction."""
+        return self.friction is None
+
+    def check_conservative(self, what: str, remedy: str) -> None:
+        """Refuse a system with friction where it would be left out, or what is asked does not hold with it.
+
+        Raises
+        ------
+        ValueError
+            With `what` is asked, as a clause that follows the reason, and the remedy.
+        """
+        if self.friction is not None:
+            raise ValueError(f"`system` {self.name!r} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
 
     def learns(self, y: Array) -> bool:
         """Return True if torch follows numbers of H other than y (..., 2d), a tensor: such as a network's weights."""

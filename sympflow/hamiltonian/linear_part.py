@@ -40,6 +40,8 @@ class Scene(Protocol):
 
     def kinetic_hessian(self, p: Any) -> Any: ...
 
+    def check_conservative(self, what: str, remedy: str) -> None: ...
+
 
 @dataclass(frozen=True)
 class LinearPart:
@@ -159,6 +161,11 @@ class LinearPart:
         return float(self.frequencies.max(initial=0.0) * self.interval)
 
 
+def check_parts_conservative(system: Scene) -> None:
+    """Refuse a system with friction, which the exact flows of parts of H do not have."""
+    system.check_conservative("which exact flows of parts of H omit", "use the splitting 'kinetic', as of 'verlet'")
+
+
 def linear_part(system: Scene) -> LinearPart:
     """The quadratic part of a system, read off its symbols or made from its `stiffness_matrix`.
 
@@ -168,8 +175,10 @@ def linear_part(system: Scene) -> LinearPart:
     Raises
     ------
     ValueError
-        If there is none; or if it is stiff in a direction that turns over the domain, which no constant K follows.
+        If there is none; or if it is stiff in a direction that turns over the domain, which no constant K follows; or
+        if the system has friction.
     """
+    check_parts_conservative(system)
     part: LinearPart | None
     if system.stiffness_matrix is not None:
         K = system.stiffness_matrix

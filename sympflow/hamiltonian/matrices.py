@@ -1,9 +1,11 @@
-"""The matrices that a user gives, the mass M and the stiffness K: checked, and in their simplest form."""
+"""The matrices that a user gives, the mass M, the stiffness K, the damping Γ: checked, in their simplest form."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
+
+from sympflow.arrays import differentiable
 
 
 def inverse_mass(mass: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
@@ -36,8 +38,46 @@ def stiffness_matrix(matrix: ArrayLike, ndof: int) -> np.ndarray:
     return (K + K.T) / 2
 
 
+def damping(values: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
+    """Γ in its simplest form, () for one rate, (d,) or (d, d), of a number, (d,) or (d, d); None for no friction."""
+    if values is None:
+        return None
+    G = _real("damping", values)
+    if G.shape not in ((), (ndof,), (ndof, ndof)):
+        raise ValueError(
+            f"`damping` must be a number, one for each p, of shape ({ndof},), or a matrix of shape ({ndof}, {ndof}); "
+            f"got shape {G.shape}."
+        )
+    if G.ndim < 2:
+        if not (np.isfinite(G).all() and (G >= 0).all()):
+            raise ValueError(
+                f"`damping` must be finite and not negative, for friction takes energy away; got {values!r}."
+            )
+    else:
+        _check_symmetric("damping", G)
+        G = (G + G.T) / 2
+        rates = np.linalg.eigvalsh(G)
+        if rates[0] < -8 * ndof * np.finfo(float).eps * abs(rates).max():
+            raise ValueError(
+                "`damping` must be a positive semi-definite matrix, for friction takes energy away; its smallest "
+                f"eigenvalue is {rates[0]:g}."
+            )
+        if np.array_equal(G, np.diag(np.diag(G))):
+            G = np.diag(G).copy()
+    if G.ndim == 1 and (G[0] == G).all():
+        G = np.array(G[0])
+    if not G.any():
+        return None
+    return np.array(abs(G)) if G.ndim < 2 else G  # −0.0 is 0
+
+
 def _real(name: str, values: ArrayLike) -> np.ndarray:
     """The values as an array of floats."""
+    if differentiable(values):
+        raise TypeError(
+            f"`{name}` is a tensor that torch differentiates or transforms, but it is kept as numbers: write H with "
+            "it, as HamiltonianSystem(hamiltonian=...), or pass `.detach()`."
+        )
     try:
         array = np.asarray(values)
         if array.dtype.kind not in "biufO":

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, stack
-from sympflow.hamiltonian.linear_part import LinearPart, linear_part, read_off
+from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative, linear_part, read_off
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, parse
 
 if TYPE_CHECKING:
@@ -345,6 +345,7 @@ def exact_parts(system: HamiltonianSystem, expressions: Sequence[str] | None = N
     ValueError
         If a part is not solved exactly, or the parts do not add up to H.
     """
+    check_parts_conservative(system)
     if system.symbols is None:
         if expressions is not None:
             raise ValueError("`parts` are read as symbols, which the system has not: define it with from_sympy.")

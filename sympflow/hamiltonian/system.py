@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -17,6 +18,7 @@ from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import fingerprint
+from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 
 if TYPE_CHECKING:
@@ -44,7 +46,7 @@ class Parameters(dict[str, float]):
 
 
 class HamiltonianSystem(Hamiltonian):
-    """A Hamiltonian system x' = J∇H(x), x = [q, p], with H autonomous.
+    """A Hamiltonian system x' = J∇H(x), x = [q, p], with H autonomous; with `damping` p' = −∂H/∂q − Γp.
 
     Parameters
     ----------
@@ -66,6 +68,9 @@ class HamiltonianSystem(Hamiltonian):
     stiffness_matrix : array_like of shape (d, d), optional
         A symmetric K, part ½ qᵀKq of the potential, that methods with an exact linear flow take as their `linear_part`.
         Only with `potential`; of a symbolic system it is read off.
+    damping : float or array_like of shape (d,) or (d, d), optional
+        Γ: one rate, one for each p, or a symmetric positive semi-definite matrix; 0 is none. The splitting methods on
+        the splitting "kinetic" and the Runge–Kutta methods solve it; all else refuses it, with the reason.
     name : str
     domain : Domain, optional
         Ω, where flows are trained. Classical methods never need one.
@@ -108,6 +113,7 @@ class HamiltonianSystem(Hamiltonian):
         gradient: Callable[..., Any] | None = None,
         hessian_vector: Callable[..., Any] | None = None,
         stiffness_matrix: ArrayLike | None = None,
+        damping: float | ArrayLike | None = None,
         name: str = "custom",
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
@@ -135,6 +141,7 @@ class HamiltonianSystem(Hamiltonian):
                 raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
             self.stiffness_matrix = matrices.stiffness_matrix(stiffness_matrix, definition.ndof)
             self.stiffness_matrix.setflags(write=False)
+        self._set_friction(damping)
         self._set_scene({}, domain, y0, t_span, dt, energy_scale)
 
     @classmethod
@@ -143,6 +150,7 @@ class HamiltonianSystem(Hamiltonian):
         expression: str | sympy.Expr,
         *,
         params: Mapping[str, float] | None = None,
+        damping: float | ArrayLike | None = None,
         name: str = "custom",
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
@@ -162,13 +170,14 @@ class HamiltonianSystem(Hamiltonian):
         params : mapping of str to float, optional
             Values of the other symbols: finite real numbers. A name that is given here is a symbol whatever it means
             otherwise. `system.params` holds them, to be read only.
-        name, domain, y0, t_span, dt, energy_scale
+        damping, name, domain, y0, t_span, dt, energy_scale
             As for the class.
 
         Raises
         ------
         ValueError, TypeError
-            If the expression cannot be parsed, has symbols without a value, or depends on t.
+            If the expression cannot be parsed, has symbols without a value, or depends on t; if `damping` is not
+            symmetric, has negative rates, or another shape.
         """
         from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, checked_params
 
@@ -179,8 +188,13 @@ class HamiltonianSystem(Hamiltonian):
         inverse_mass = None if M is None else matrices.simplest(np.array(M.tolist(), dtype=float))
         Hamiltonian.__init__(self, name, symbols, inverse_mass, M is not None)
         self.symbols = symbols
+        self._set_friction(damping)
         self._set_scene(params, domain, y0, t_span, dt, energy_scale)
         return self
+
+    def _set_friction(self, damping: float | ArrayLike | None) -> None:
+        G = matrices.damping(damping, self.ndof)
+        self.friction = None if G is None else Friction(G)
 
     def _set_scene(
         self,
@@ -223,7 +237,7 @@ class HamiltonianSystem(Hamiltonian):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the state of a pickle, of earlier versions too: they kept `params` as such, and tested no functions."""
-        untested = {"functions_given": False, "_checked": frozenset(), "_params": Parameters(state.get("params", {}))}
+        untested = {"functions_given": False, "_tested": {}, "_params": Parameters(state.get("params", {}))}
         vars(self).update({**untested, **{name: value for name, value in state.items() if name != "params"}})
 
     @property
@@ -256,15 +270,45 @@ class HamiltonianSystem(Hamiltonian):
             return
         like = np.empty(0) if y0 is None else y0
         kind = type(like), like.dtype
-        if kind in self._checked:
+        if kind in self._tested:
             return
-        from sympflow.hamiltonian.function_checks import FEW, probe_states
+        from sympflow.hamiltonian.function_checks import FEW, probe_states, reach
 
         given = one_lane(like) if math.prod(like.shape) else self.y0
         probes = probe_states(given, self.domain, 2 * self.ndof)
         n_given = min(FEW, math.prod(like.shape) // (2 * self.ndof))
         self._definition.check(probes, like, n_given)
-        self._checked |= {kind}
+        self._tested = self._tested | {kind: reach(probes[:, : self._arguments])}
+
+    def check_functions_along(self, y: Array) -> None:
+        """Test the functions of a user where a run went far beyond the states at which they were tested: `solve` does.
+
+        At the farthest of the states y a RuntimeWarning says what `check_functions` would refuse: the run is made.
+
+        Parameters
+        ----------
+        y : array or tensor of shape (..., 2d)
+        """
+        kind = type(y), y.dtype
+        reached = self._tested.get(kind)
+        if reached is None:
+            return
+        from sympflow.hamiltonian.function_checks import farther_states, reach
+
+        far = farther_states(one_lane(y).reshape(-1, 2 * self.ndof), reached).astype(float)
+        if not len(far):
+            return
+        try:
+            self._definition.check(far, y, 0)
+        except (ValueError, TypeError) as error:
+            warnings.warn(f"On this run, far from its start: {error}", RuntimeWarning, stacklevel=3)
+            return
+        self._tested = self._tested | {kind: reach(np.concatenate([reached, far[:, : self._arguments]]))}
+
+    @property
+    def _arguments(self) -> int:
+        """How many components of a state the given functions depend on: V is one of q alone."""
+        return self.ndof if self.separable else 2 * self.ndof
 
     # structure --------------------------------------------------------------------------------------
 
@@ -285,12 +329,14 @@ class HamiltonianSystem(Hamiltonian):
 
     @cached_property
     def fingerprint(self) -> tuple[float, ...]:
-        """H at 8 fixed states less H at a ninth: what tells a trained flow whether this is its system."""
+        """H at 8 fixed states less H at a ninth, then Γ: what tells a trained flow whether this is its system."""
         return fingerprint(self)
 
     def __repr__(self) -> str:
         params = ", ".join(f"{k}={v:g}" for k, v in self.params.items())
         kind = "separable" if self.separable else "not separable"
+        if self.damping is not None:
+            kind += f", damping {np.array2string(self.damping, threshold=9, precision=6).replace(chr(10), '')}"
         return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
 
 
@@ -303,6 +349,7 @@ COUNTED = {
     "potential_hessian": "hessian_evaluations",
     "hessian_vector": "hessian_evaluations",
     "hessian": "hessian_evaluations",
+    "field_jacobian": "hessian_evaluations",
     "third_derivative": "curvature_evaluations",
     "curvature_gradient": "curvature_evaluations",
 }

@@ -50,7 +50,7 @@ def time_transformed(
     Raises
     ------
     ValueError
-        If the system is not separable, or `shift` is not finite, or does not exceed V at the system's y0.
+        If the system is not separable, or has friction; if `shift` is not finite, or not above V at the system's y0.
 
     References
     ----------
@@ -68,6 +68,9 @@ def time_transformed(
     >>> bool(sol.y[2, -1] > 600)  # the physical time
     True
     """
+    system.check_conservative(
+        "and no Hamiltonian in another time", "solve it in the physical time, by 'verlet' or 'dop853' for instance"
+    )
     if not system.separable:
         raise ValueError(
             f"`system` {system.name!r} is not separable, so its logarithmic Hamiltonian is not either: use an implicit "

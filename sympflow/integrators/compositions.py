@@ -53,11 +53,17 @@ class Composition(ABC):
     """True if the steps are made on an extended phase space, whose states a run keeps from step to step."""
     counts_as_scheme: ClassVar[bool] = True
     """True if a step evaluates as many forces as the scheme says, whatever the system."""
+    takes_friction: ClassVar[bool] = False
+    """True if one of the parts holds the friction of a damped system."""
 
     def __init__(
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
     ) -> None:
         self.method, self.scheme = method, scheme
+
+    def check_friction(self, dt: float) -> None:
+        """Raise a ValueError where the friction of the system asks for shorter steps than dt."""
+        raise ValueError(f"`method` {self.method!r} does not take friction: use the splitting 'kinetic'.")
 
     def lift(self, y: Array) -> Array:
         """The states on which steps are made, of states y (..., 2d); y itself where the phase space is not extended."""
@@ -96,10 +102,21 @@ class Composition(ABC):
         """Evaluations of forces and their derivatives, as `FixedStep.evaluations`."""
 
 
+MOST_GROWTH = 1.0
+"""The largest γΣ|a|dt over the drifts of a step that go back in time: momenta grow by at most e within a step."""
+
+
 class KineticPotential(Composition):
-    """H = T(p) + V(q): drifts q += a h ∇T(p) and kicks p −= b h ∇V(q)."""
+    """H = T(p) + V(q): drifts q += a h ∇T(p) and kicks p −= b h ∇V(q).
+
+    With friction a drift is the exact flow of q' = M⁻¹p, p' = −Γp, and the kicks stay as they are. Among vector fields
+    that are polynomials in p, kicks have the degree −1, and of drifts the friction lowers the degree: brackets of kicks
+    and drifts that vanish without friction by their degree vanish with it, those of Nyström and force-gradient schemes
+    among them, and brackets of degree −1, such as force gradients, are the same. So every scheme keeps its order.
+    """
 
     compensates: ClassVar[bool] = True
+    takes_friction: ClassVar[bool] = True
 
     def __init__(
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
@@ -115,6 +132,25 @@ class KineticPotential(Composition):
                 f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.name!r} has not: use a scheme "
                 "for any separable system, such as 'kahan_li8'."
             )
+        if system.friction is not None and not system.quadratic_kinetic:
+            raise ValueError(
+                f"`method` {method!r} solves friction exactly where the kinetic energy is ½ pᵀM⁻¹p, which "
+                f"{system.name!r} has not: use a Runge–Kutta method such as 'dop853'."
+            )
+
+    def check_friction(self, dt: float) -> None:
+        friction = self.system.friction
+        if friction is None:
+            return
+        back = -sum(s.one for s in self.scheme.substeps if s.kind == "drift" and s.one < 0)
+        if friction.largest * back * dt > MOST_GROWTH:
+            raise ValueError(
+                f"`dt` {dt:.6g} is too long for method {self.method!r} with a damping of {friction.largest:.6g}: its "
+                f"drifts of {back:.3g} of a step go back in time, where friction lets momenta grow by a factor "
+                f"exp({friction.largest * back * dt:.3g}). Use a `dt` of at most "
+                f"{MOST_GROWTH / (friction.largest * back):.3g}, or a scheme without such drifts, as 'verlet' or "
+                "'chin4c'."
+            )
 
     def step(self, y: Array, h: Any) -> Array:
         system = self.system
@@ -122,7 +158,7 @@ class KineticPotential(Composition):
         h = per_state(h, y)
         for substep in self.scheme.substeps:
             if substep.kind == "drift":
-                q = q + (substep.one * h) * system.velocity(p)
+                q, p = _drift(system, q, p, substep.one * h)
             else:
                 p = p + _kick(system, q, substep, h, self.scheme.monomials)
         return concatenate([q, p])
@@ -133,7 +169,7 @@ class KineticPotential(Composition):
         h = per_state(h, y)
         for substep in reversed(self.scheme.substeps):
             if substep.kind == "drift":
-                q = q - (substep.one * h) * system.velocity(p)
+                q, p = _drift(system, q, p, -(substep.one * h))
             else:
                 p = p - _kick(system, q, substep, h, self.scheme.monomials)
         return concatenate([q, p])
@@ -149,15 +185,23 @@ class KineticPotential(Composition):
         A = np.broadcast_to(np.eye(2 * d, dtype=y.dtype), (*y.shape, 2 * d)).copy()
         for kind, c, *_ in self.scheme.substeps:
             if kind == "drift":
-                q = q + c * h * system.velocity(p)
-                A[..., :d, :] += c * h[..., None] * (system.kinetic_hessian(p) @ A[..., d:, :])
+                if system.friction is None:
+                    A[..., :d, :] += c * h[..., None] * (system.kinetic_hessian(p) @ A[..., d:, :])
+                else:
+                    mean, end = system.friction.drift(A[..., d:, :].swapaxes(-1, -2), c * h[..., None])
+                    A[..., :d, :] += system.kinetic_hessian(p) @ mean.swapaxes(-1, -2)
+                    A[..., d:, :] = end.swapaxes(-1, -2)
+                q, p = _drift(system, q, p, c * h)
             else:
                 A[..., d:, :] -= c * h[..., None] * (system.potential_hessian(q) @ A[..., :d, :])
                 p = p + c * h * system.force(q)
         return np.concatenate([q, p], axis=-1), A
 
     def kernel(self, compensated: bool) -> Kernel:
-        return _splitting_loops()(self.system).kernel(self.scheme, compensated)
+        loops = _splitting_loops()(self.system)
+        if self.system.friction is None:
+            return loops.kernel(self.scheme, compensated)
+        return loops.damped_kernel(self.scheme, self.step)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
@@ -169,6 +213,14 @@ def _splitting_loops() -> Callable[[HamiltonianSystem], SplittingLoops]:
     from sympflow.kernels.splitting_loops import splitting_loops
 
     return splitting_loops
+
+
+def _drift(system: HamiltonianSystem, q: Array, p: Array, s: Any) -> tuple[Array, Array]:
+    """The states after a drift over s, of which friction is a part."""
+    if system.friction is None:
+        return q + s * system.velocity(p), p
+    mean, end = system.friction.drift(p, s)
+    return q + system.velocity(mean), end
 
 
 def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials: Monomials) -> Array:

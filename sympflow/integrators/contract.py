@@ -15,6 +15,8 @@ Its duties:
    `problem.events`, if there are any, and ends where that says.
 
 9. `arrays_only` says so, where `step` and `run` take NumPy arrays only.
+10. `takes_friction` is False, and a damped system is refused before the integrator sees it; or the method takes the
+   friction −Γp into account, as one that steps by `system.vector_field` does.
 
 `FixedStep`, in `sympflow.integrators.base`, does 4, 5, 6 and 8 for any integrator that has a step: a new one needs
 duties 1 to 3 only, and its forces are counted. Whatever a run changes, such as its kernel and its counts, belongs to a
@@ -162,6 +164,11 @@ class Integrator:
     def summary(cls) -> str:
         """Return the `source`, or the first line of the docstring of a method that gives none."""
         return cls.source or (cls.__doc__ or "").partition("\n")[0]
+
+    @property
+    def takes_friction(self) -> bool:
+        """True if every step holds the friction −Γp of a damped system; where it does not, the system is refused."""
+        return False
 
     def check(self, system: HamiltonianSystem) -> None:
         """Raise a ValueError with the reason if the method does not apply to the system."""

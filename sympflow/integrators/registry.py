@@ -54,7 +54,8 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
     if isinstance(method, type) and issubclass(method, Integrator):
         return method
     if not isinstance(method, str):
-        raise TypeError(f"`method` must be a name or an Integrator class; got {type(method).__name__}.")
+        hint = " Make one of it by sympflow.splitting_method(scheme)." if isinstance(method, Scheme) else ""
+        raise TypeError(f"`method` must be a name or an Integrator class; got {type(method).__name__}.{hint}")
     if method in TRIPLES:
         from sympflow.integrators.splitting import method_of_row
 
@@ -236,14 +237,34 @@ class naming_plugin:
 def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array | None = None) -> None:
     """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named.
 
-    The functions of a user's system are tested too, for states such as y0.
+    The functions of a user's system are tested too, for states such as y0. Friction is refused here for every method
+    that does not say that it takes it.
     """
+    if system.friction is not None and not (integrator.takes_friction and _speaks_for_itself(type(integrator).__mro__)):
+        what = "was trained without it" if integrator.trained else "does not take it"
+        system.check_conservative(
+            f"and method {integrator.name!r} {what}",
+            "use a splitting method on the splitting 'kinetic', such as 'verlet' or 'kahan_li8', or a Runge–Kutta "
+            "method such as 'dop853' or 'dopri5'",
+        )
     system.check_functions(y0)
     if type(integrator) not in _loaded:
         integrator.check(system)
         return
     with naming_plugin(integrator, passes=(ValueError,)):
         integrator.check(system)
+
+
+@cache
+def _speaks_for_itself(bases: tuple[type, ...]) -> bool:
+    """False for a class outside of the package that changes what a built-in class does, and inherits what that says."""
+    says = next(i for i, base in enumerate(bases) if "takes_friction" in vars(base))
+    others = (base for base in bases[:says] if not base.__module__.startswith("sympflow."))
+    return not any(_DUTIES & vars(base).keys() for base in others)
+
+
+_DUTIES = {"step", "inverse", "tangent", "run", "steps", "stepper", "own_stepper", "rollout", "substep", "composed"}
+"""The methods of an integrator that make its steps."""
 
 
 def name_of(integrator: Integrator) -> str:

@@ -22,6 +22,10 @@ class ExplicitStep(Integrator):
     A: ClassVar[Any]
     B: ClassVar[Any]
 
+    @property
+    def takes_friction(self) -> bool:
+        return True
+
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         """One step without error control."""
         h = per_state(h, y)
@@ -36,15 +40,14 @@ class ExplicitStep(Integrator):
         h = np.asarray(h, dtype=y.dtype)[..., None]
         if not system.has_hessian_vector:
             system.hessian(y)  # which says so, before anything large is made
-        d, identity = system.ndof, np.eye(y.shape[-1], dtype=y.dtype)
+        identity = np.eye(y.shape[-1], dtype=y.dtype)
         K: list[np.ndarray] = []
         dK: list[np.ndarray] = []
         for row in self.A[: len(self.B)]:
             Y = y + h * weighted(row, K) if K else y
             dY = identity + h[..., None] * weighted(row, dK) if K else identity
             K.append(system.vector_field(Y))
-            hessian = system.hessian(Y)
-            dK.append(np.concatenate([hessian[..., d:, :], -hessian[..., :d, :]], axis=-2) @ dY)
+            dK.append(system.field_jacobian(Y) @ dY)
         return y + h * weighted(self.B, K), identity + h[..., None] * weighted(self.B, dK)
 
 

@@ -267,11 +267,21 @@ class Splitting(OwnStepper):
         other = [mine for mine, own in ((self.splitting, cls.splitting), (self.clock, cls.clock)) if mine != own]
         return f"{self.name} ({', '.join(other)})" if other else self.name
 
+    @property
+    def takes_friction(self) -> bool:
+        return SPLITTINGS[self.splitting].takes_friction and self.clock == "physical"
+
     def check(self, system: HamiltonianSystem) -> None:
-        if self.clock == "physical":
-            self.composed(system)
-        else:
+        if self.clock != "physical":
             self.on_clock(system)
+            return
+        composition = self.composed(system)
+        if system.friction is not None:
+            composition.check_friction(self.step_length(system))
+            if self.compensated:
+                raise ValueError(
+                    "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
+                )
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         clock = self.on_clock(system)

@@ -93,6 +93,10 @@ class Watched(Integrator):
 
     finds_events: ClassVar[bool] = True
 
+    @property
+    def takes_friction(self) -> bool:
+        return True
+
     def outputs(self, problem: Problem) -> tuple[np.ndarray, dict[str, Any]]:
         """The times to report, and what the statistics say of the steps."""
         raise NotImplementedError

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
@@ -25,7 +25,11 @@ N_WITHIN = 6  # states of the domain
 MOST_ROWS = 256  # of a batch, whose velocities are compared
 FIRST_LOOK, LONGEST_GAP = 13, 64  # steps of a run before it is compared again
 
+MOST_FUNCTIONS = 64  # right-hand sides that a system remembers
+
 _WITHIN: WeakKeyDictionary[HamiltonianSystem, np.ndarray] = WeakKeyDictionary()  # drawn once for each system
+_COMPARED: WeakKeyDictionary[HamiltonianSystem, dict[int, tuple[ref[Any], np.ndarray]]] = WeakKeyDictionary()
+"""For each system the right-hand sides that whole runs found to be it, by their ids; the bounds of [t, q, p] there."""
 
 
 class Comparison:
@@ -47,12 +51,15 @@ class Comparison:
     ----------
     states_compared : int
         States at which the method's own velocity was evaluated so far.
+    known : bool
+        True if an earlier run compared this very right-hand side, so that its start and end are enough.
     """
 
     def __init__(self, argument: str, integrator: FixedStep, system: HamiltonianSystem | None, remedy: str) -> None:
         self.argument, self.integrator, self.system, self.remedy = argument, integrator, system, remedy
         self.flow = integrator.given_flow if system is None else integrator.flow_for(system)
-        self.states_compared = 0
+        self.states_compared, self.known = 0, False
+        self._given: Any = None
         self._next, self._gap = FIRST_LOOK, FIRST_LOOK
 
     # at the start ---------------------------------------------------------------------------------
@@ -87,8 +94,12 @@ class Comparison:
         states = np.concatenate([y[None], _drawn(self.flow.domain_for(self.system), y.size)])
         self._close_to_flow(np.zeros(len(states)), states, self.system.vector_field(states))
 
-    def at_start(self, fun: RightHandSide, y0: np.ndarray, t_span: tuple[float, float]) -> None:
+    def at_start(
+        self, fun: RightHandSide, y0: np.ndarray, t_span: tuple[float, float], given: Callable[..., Any] | None = None
+    ) -> None:
         """Compare at several states and times: y0 (..., 2d), states around it, and states of the domain.
+
+        At y0 alone, if `given`, the function of the user, is remembered from a run with such states and times.
 
         Raises
         ------
@@ -97,7 +108,12 @@ class Comparison:
         """
         t0 = t_span[0]
         self.at(t0, y0, fun(t0, y0), fun)
-        for t, y in zip(_times(t_span, 16), self._probes(y0), strict=False):
+        self.known = self._remembers(given, _bounds(t_span, [y0]))
+        if self.known:
+            return
+        probes = self._probes(y0)
+        self._given, self._bounds = given, _bounds(t_span, [y0, *probes])
+        for t, y in zip(_times(t_span, 16), probes, strict=False):
             slope = _quietly(fun, t, y)
             if slope is None:
                 continue
@@ -110,6 +126,32 @@ class Comparison:
             if self._ground() is not None:
                 states = y.reshape(-1, y.shape[-1])
                 self._close_to_flow(np.full(len(states), t), states, slope.reshape(states.shape))
+
+    def remember(self) -> None:
+        """Remember the right-hand side, weakly, once all comparisons of a run have found it to be the system."""
+        if self.system is None or self._given is None or self.known:
+            return
+        try:
+            given = ref(self._given)
+        except TypeError:
+            return
+        known, key, bounds = _COMPARED.setdefault(self.system, {}), id(self._given), self._bounds
+        if key in known and known[key][0]() is self._given:
+            before = known[key][1]
+            bounds = np.stack([np.minimum(before[0], bounds[0]), np.maximum(before[1], bounds[1])])
+        if key not in known and len(known) >= MOST_FUNCTIONS:
+            for dead in [k for k, (function, _) in known.items() if function() is None] or list(known):
+                del known[dead]
+        known[key] = given, bounds
+
+    def _remembers(self, given: Any, bounds: np.ndarray) -> bool:
+        """True if `given` was compared where these bounds of [t, q, p] lie within."""
+        if self.system is None or given is None or self.system not in _COMPARED:
+            return False
+        function, known = _COMPARED[self.system].get(id(given), (None, bounds))
+        if function is None or function() is not given:
+            return False
+        return bool((known[0] <= bounds[0]).all() and (known[1] >= bounds[1]).all())
 
     def _probes(self, y0: np.ndarray) -> list[np.ndarray]:
         """States like y0 (..., 2d): each of its rows moves to each distance, and to each state of the domain, in turn.
@@ -249,6 +291,12 @@ def _quietly(fun: RightHandSide, t: float, y: np.ndarray) -> np.ndarray | None:
     except Exception:
         return None
     return slope if slope.shape == y.shape else None
+
+
+def _bounds(t_span: tuple[float, float], states: Sequence[np.ndarray]) -> np.ndarray:
+    """The least and the largest time, and value of each component of the states (..., 2d): (2, 1 + 2d)."""
+    rows = np.concatenate([y.reshape(-1, y.shape[-1]) for y in states])
+    return np.array([[min(t_span), *rows.min(0)], [max(t_span), *rows.max(0)]])
 
 
 def _times(t_span: tuple[float, float], n: int) -> list[float]:

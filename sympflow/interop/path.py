@@ -130,7 +130,7 @@ class Path:
         """True if torch follows numbers of the map: the weights of the flow, or those of H."""
         if differentiable(*self.weights()):
             return True
-        return self.system is not None and self.system.learns(self.y0.detach())
+        return self.system is not None and self.system.learns(self.y0)
 
     def weights(self) -> list[Tensor]:
         """The weights of the flow, if there is one."""
@@ -153,7 +153,7 @@ class Path:
         TypeError
             If the values of the states are hidden, by `torch.func.vmap` or `torch.compile`.
         """
-        if not readable(self.y0):
+        if not readable(self.y0) or (self.eager and not readable(self.step(self.y0, self.h))):
             raise TypeError(
                 "`event_fn` is followed by the values of the states, which torch.func.vmap and torch.compile hide: "
                 "call it outside of them, for one event at a time."

@@ -177,7 +177,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
         self._comparison.with_flow(self.y)
         self._fun: Any = None if fun is self._solved else fun  # None: there is nothing to compare
         if self._fun is not None:
-            self._comparison.at_start(self._slope, self.y, (self.t, self.t_bound))
+            self._comparison.at_start(self._slope, self.y, (self.t, self.t_bound), fun)
         self._count_compared()
 
     def _compare_again(self, last: bool) -> None:
@@ -185,6 +185,8 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
         if self._fun is not None and (last or self._comparison.is_due(self._k)):
             self._comparison.at(self.t, self.y, self._slope(self.t, self.y), self._slope, self._grid.t0)
             self._count_compared()
+            if last:
+                self._comparison.remember()
 
     def _slope(self, t: float, y: np.ndarray) -> np.ndarray:
         """`fun` in the precision in which it answers."""

@@ -20,7 +20,7 @@ import torchdiffeq
 from torch import Tensor
 
 from sympflow.arguments import check_not_traced
-from sympflow.arrays import differentiable, finite_states, one_lane, readable, transformed
+from sympflow.arrays import differentiable, finite_states, one_lane, readable, transformed, unfollowed
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import available, check_applies
@@ -249,8 +249,8 @@ def odeint_adjoint(
     Raises
     ------
     TypeError
-        With our methods, where torch follows y0, t or a parameter in forward mode or in a transform of `torch.func`:
-        this is for reverse mode, `backward` and `torch.autograd.grad`.
+        With our methods, where torch follows y0, t, a parameter or a number of H in forward mode or in a transform of
+        `torch.func`: this is for reverse mode, `backward` and `torch.autograd.grad`.
     """
     if not _is_ours(method, func, options):
         arguments: dict[str, Any] = {"rtol": rtol, "atol": atol, "method": method, "options": options}
@@ -278,7 +278,8 @@ def odeint_adjoint(
         own = [] if adjoint_params is not None or system is None else leaves(system, y)
         parameters = (*(given or ()), *own)
         flow = integrator.flow_for(system)  # type: ignore[arg-type]
-        if transformed(y, t, *parameters, *(() if flow is None else flow.parameters())):
+        field = [system.vector_field(unfollowed(y))] if system is not None and system.learns(y) else []
+        if transformed(y, t, *field, *parameters, *(() if flow is None else flow.parameters())):
             raise TypeError(
                 "`odeint_adjoint` is for reverse mode, backward() and torch.autograd.grad: in forward mode, and inside "
                 "torch.func, use odeint."
@@ -454,7 +455,8 @@ class _Compared:
         if isinstance(func, HamiltonianSystem):
             comparison.with_system(func)
         self.like, self.times, self.t0 = y, t, float(one_lane(t)[0])
-        comparison.at_start(self._slope, one_lane(y), (float(one_lane(t)[0]), float(one_lane(t)[-1])))
+        span = self.t0, float(one_lane(t)[-1])
+        comparison.at_start(self._slope, one_lane(y), span, func if readable(y) and readable(t) else None)
 
     def _slope(self, t: float, y: np.ndarray) -> np.ndarray:
         """`func` at states like y0, in their precision and form."""
@@ -469,6 +471,10 @@ class _Compared:
             return path.y0[None]
         if self.func is None:
             return torch.cat([path.y0[None], path(elapsed)])
+        if self.comparison.known:
+            states = path(elapsed)
+            self.along(t[-1:], states[-1:])
+            return torch.cat([path.y0[None], states])
         n_steps = int(float(one_lane(elapsed)[-1]) / path.h) if readable(t) else 0
         n_more = min(_CHECKPOINTS - 1, n_steps) if len(elapsed) < _CHECKPOINTS else 0
         count = np.unique(n_steps * (np.arange(n_more) + 0.38) / max(n_more, 1) // 1)
@@ -478,6 +484,7 @@ class _Compared:
         outputs = states[len(more) :]
         some = np.unique(np.linspace(0, len(elapsed) - 1, _CHECKPOINTS).astype(int)).tolist()
         self.along(t[1:][some], outputs[some])
+        self.comparison.remember()
         return torch.cat([path.y0[None], outputs])
 
     def along(self, t: Tensor, states: Tensor) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -16,10 +16,19 @@ from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
 from sympflow.kernels.protocol import Kernel, Run, Steps
-from sympflow.kernels.stages import StageTable, kicks_of, lanes_source, run_table, stages_source, step_table
+from sympflow.kernels.stages import (
+    DampedDrift,
+    StageTable,
+    kicks_of,
+    lanes_source,
+    run_table,
+    stages_source,
+    step_table,
+)
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 __all__ = ["SplittingKernel", "SplittingLoops", "splitting_loops", "symbolic_module"]
@@ -57,11 +66,11 @@ class SplittingLoops:
     ----------
     values : tuple of float
         Of what depends on parameters of H alone: arguments of the loops, so that systems which differ in them share
-        these. In kicks with force gradients the values are part of the code.
+        these. With friction, and in kicks with force gradients, the values are part of the code.
     """
 
     def __init__(self, system: HamiltonianSystem) -> None:
-        self.ndof = system.ndof
+        self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
         if not system.separable:
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
@@ -71,14 +80,16 @@ class SplittingLoops:
 
             self._has_force_gradient = system.quadratic_kinetic
             if is_large(system.symbols):
-                self._compile = partial(_family_loops, system)
+                self._compile = partial(_family_loops, system, _damped_drift(system, True))
             else:
-                self.values = system.symbols.parametric.values
-                self._compile = partial(_symbolic_loops, system.symbols, algebra_source(system.symbols))
+                damped = _damped_drift(system, False)
+                self.values = () if damped else system.symbols.parametric.values
+                self._compile = partial(_symbolic_loops, system.symbols, algebra_source(system.symbols), damped)
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
-            self._compile = partial(_array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass)
+            damped = _damped_drift(system, True)
+            self._compile = partial(_array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, damped)
         else:
             raise ValueError(
                 "`system` cannot be compiled: it is given by plain functions. Define it with "
@@ -97,6 +108,10 @@ class SplittingLoops:
             Sum with Kahan's compensation, which lowers the growth of round-off, in runs.
         """
         return SplittingKernel(self, scheme, compensated)
+
+    def damped_kernel(self, scheme: Scheme, step: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> DampedKernel:
+        """The loops of one scheme on a system with friction; single steps are made by `step(y, h)` on arrays."""
+        return DampedKernel(self, scheme, step)
 
     def functions(self, level: int, compensated: bool, monomials: Monomials = ()) -> LoopFunctions:
         """The compiled functions for kicks of a level, see `Scheme`.
@@ -154,10 +169,14 @@ class SplittingKernel(Kernel):
     def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool = False) -> None:
         self.loops, self.scheme, self.compensated = loops, scheme, compensated
 
+    def table(self, h: float) -> np.ndarray:
+        """The numbers of a run whose steps are h, as the loops read them."""
+        return self.loops.rows(run_table(self.scheme, h))
+
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
         """`n_steps` steps of length `h` from one state: see `Kernel`."""
         functions = self._functions()
-        table = self.loops.rows(run_table(self.scheme, h))
+        table = self.table(h)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(save), 2 * self.loops.ndof))
         n_finite = run_one(
@@ -169,7 +188,7 @@ class SplittingKernel(Kernel):
     def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         functions = self._functions()
-        table = self.loops.rows(run_table(self.scheme, h))
+        table = self.table(h)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(y0), len(save), 2 * self.loops.ndof))
         n_finite = np.empty(len(y0), dtype=np.int64)
@@ -188,6 +207,50 @@ class SplittingKernel(Kernel):
 
     def _functions(self) -> LoopFunctions:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials)
+
+
+class DampedKernel(SplittingKernel):
+    """The compiled loops of one scheme on a system with friction; its tables hold exponentials, not powers, of steps.
+
+    A step by itself, of a length of its own for each state, is made by array operations.
+    """
+
+    def __init__(
+        self, loops: SplittingLoops, scheme: Scheme, step: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    ) -> None:
+        super().__init__(loops, scheme)
+        self._step = step
+
+    def table(self, h: float) -> np.ndarray:
+        assert self.loops.friction is not None
+        return _damped_table(self.scheme, h, self.loops.friction)
+
+    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+        return Steps(self._step(np.asarray(y, dtype=np.float64), np.asarray(h, dtype=np.float64)))
+
+
+@lru_cache(maxsize=256)
+def _damped_table(scheme: Scheme, h: float, friction: Friction) -> np.ndarray:
+    """`run_table` with the rows of `DampedDrift`."""
+    table = run_table(scheme, h)
+    mean, decay = friction.factors(table.drifts)
+    return np.ascontiguousarray(np.concatenate([table.packed, mean.T, decay.T]))
+
+
+MOST_COUPLED = 6
+"""Degrees of freedom of a damping matrix in compiled loops, where the two maps of each drift are 2d² numbers."""
+
+
+def _damped_drift(system: HamiltonianSystem, in_place: bool) -> DampedDrift | None:
+    """The drift of a system with friction as code; None without."""
+    if system.damping is None:
+        return None
+    if system.damping.ndim == 2 and (in_place or system.ndof > MOST_COUPLED):
+        raise ValueError(
+            f"`system` {system.name!r} has a damping matrix, which is compiled for symbolic systems of up to "
+            f"{MOST_COUPLED} degrees of freedom: use backend='array'."
+        )
+    return DampedDrift(system.damping.ndim, system.ndof, in_place)
 
 
 @dataclass(frozen=True)
@@ -217,15 +280,20 @@ def _takes_values(level: int) -> bool:
 
 
 def _symbolic_loops(
-    symbols: SymbolicHamiltonian, algebra: str, level: int, compensated: bool, monomials: Monomials
+    symbols: SymbolicHamiltonian,
+    algebra: str,
+    friction: DampedDrift | None,
+    level: int,
+    compensated: bool,
+    monomials: Monomials,
 ) -> LoopFunctions:
-    if _takes_values(level) and symbols.parametric is not symbols:
+    if friction is None and _takes_values(level) and symbols.parametric is not symbols:
         from sympflow.kernels.codegen import algebra_source
 
         symbols = symbols.parametric
         algebra = algebra_source(symbols)
     after = ("loops", "aligned", "lanes")
-    loops = symbolic_module(symbols, algebra, level, compensated, after, monomials)
+    loops = symbolic_module(symbols, algebra, level, compensated, after, monomials, friction)
     processed = loops.rollout_processed, loops.rollout_processed_rows
     return LoopFunctions(loops.rollout, loops.rollout_lanes, *processed, loops.step_lanes)
 
@@ -237,6 +305,7 @@ def symbolic_module(
     compensated: bool,
     after: Sequence[str],
     monomials: Monomials = (),
+    friction: DampedDrift | None = None,
 ) -> ModuleType:
     """The algebra of a symbolic system, its kicks and the texts of loops `after` them, as a module."""
     from sympflow.kernels.codegen import curvature_kick_source, gradient_kick_source, polynomial_kick_source
@@ -244,7 +313,7 @@ def symbolic_module(
 
     kinds, scheduled = kicks_of(level, len(monomials)), not compensated
     n = len(symbols.parameters)
-    sources = [algebra, stages_source(kinds, scheduled, n), lanes_source(kinds, scheduled, n)]
+    sources = [algebra, stages_source(kinds, scheduled, friction, n), lanes_source(kinds, scheduled, friction, n)]
     if scheduled:
         sources.append(kicks_source(symbols, level, monomials))
     elif level == POLYNOMIAL:
@@ -259,7 +328,9 @@ def symbolic_module(
     return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
 
 
-def _family_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
+def _family_loops(
+    system: HamiltonianSystem, friction: DampedDrift | None, level: int, compensated: bool, monomials: Monomials
+) -> LoopFunctions:
     """The loops of a symbolic system of many terms, around loops over these: see `sympflow.kernels.terms`."""
     from sympflow.kernels.codegen import polynomial_slope_source
     from sympflow.kernels.terms import bend_source, gradient_source, product_source, warn_if_long
@@ -280,7 +351,7 @@ def _family_loops(system: HamiltonianSystem, level: int, compensated: bool, mono
         sources.append("" if M is None else f"INVERSE_MASS = np.array({M.tolist()})")
     else:
         sources.append(gradient_source(symbols.T, symbols.p, "apply_inverse_mass"))
-    sources.append(stages_source(kicks_of(level, len(monomials)), scheduled=False))
+    sources.append(stages_source(kicks_of(level, len(monomials)), False, friction))
     code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
     before = ["elementary"] if "fast_" in code else []
     header = _header(compensated, cache=True, scheduled=False)
@@ -309,6 +380,7 @@ def _array_loops(
     gradient: Any,
     hessian_vector: Any | None,
     inverse_mass: np.ndarray | None,
+    friction: DampedDrift | None,
     level: int,
     compensated: bool,
     monomials: Monomials,
@@ -316,7 +388,7 @@ def _array_loops(
     """The loops around the user's Numba functions; compiled for this process only."""
     mass = _inverse_mass_source(inverse_mass)
     header = _header(compensated, cache=False, scheduled=False)
-    stages = stages_source(kicks_of(level), scheduled=False)
+    stages = stages_source(kicks_of(level), False, friction)
     functions: dict[str, Any] = {
         "NDOF": ndof,
         "INVERSE_MASS": inverse_mass,

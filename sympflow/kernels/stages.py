@@ -11,6 +11,7 @@ import numpy as np
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 
 __all__ = [
+    "DampedDrift",
     "Kick",
     "StageTable",
     "kicks_of",
@@ -223,11 +224,101 @@ def kicks_of(level: int, n_monomials: int = 0) -> tuple[Kick, ...]:
     return (Kick("polynomial_kicked", ("b", *letters), powers, _added("polynomial_kick")),)
 
 
-def stages_source(kinds: Sequence[Kick], scheduled: bool, n_parameters: int = 0) -> str:
-    """The functions of the text `loops` that depend on the kinds of kick.
+# drifts with friction as code ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DampedDrift:
+    """A drift with friction as code: its numbers are the linear maps p ↦ ∫e^{−Γu}p du and p ↦ e^{−Γs}p.
+
+    They are the last rows of a table: one number each for Γ = γ, d for a diagonal Γ, d² for a matrix.
+
+    Attributes
+    ----------
+    ndim : int
+        Of Γ: 0, 1 or 2.
+    ndof : int
+    in_place : bool
+        True if states are arrays, changed in place, as in the text `array_states`.
+    """
+
+    ndim: int
+    ndof: int
+    in_place: bool
+
+    @property
+    def size(self) -> int:
+        """The numbers of one of the maps."""
+        return int(self.ndof**self.ndim)
+
+    def source(self, first: int) -> str:
+        """``drift_of``, ``spread``, the integral, and ``damped``, the new p; `first` is the row of the numbers."""
+        n, d = self.size, self.ndof
+        if self.in_place:
+            assert self.ndim < 2
+            number = "a[0]", "a[1]"
+            if self.ndim:
+                number = "a[i]", f"a[{d} + i]"
+            return f"""@njit(**OPTIONS, forceinline=True)
+def drift_of(table, j):
+    return table[{first}:, j]
+
+
+@njit(**OPTIONS)
+def spread(p, a, work):
+    for i in range(NDOF):
+        work[1][i] = {number[0]} * p[i]
+    return work[1]
+
+
+@njit(**OPTIONS)
+def damped(p, a):
+    for i in range(NDOF):
+        p[i] *= {number[1]}
+    return p"""
+
+        def times(offset: int) -> str:
+            if self.ndim == 2:
+                sums = (" + ".join(f"a[{offset + d * i + k}]*p[{k}]" for k in range(d)) for i in range(d))
+            else:
+                sums = (f"a[{offset + (i if self.ndim else 0)}]*p[{i}]" for i in range(d))
+            return "(" + "".join(f"{each}, " for each in sums) + ")"
+
+        return f"""@njit(**OPTIONS, forceinline=True)
+def drift_of(table, j):
+    return ({"".join(f"table[{first + i}, j], " for i in range(2 * n))})
+
+
+@njit(**OPTIONS, forceinline=True)
+def spread(p, a, work):
+    return {times(0)}
+
+
+@njit(**OPTIONS, forceinline=True)
+def damped(p, a):
+    return {times(n)}"""
+
+    def drifted(self, move: str) -> list[str]:
+        """The lines of a drift, of those of one without friction: of q by ``{p}`` over ``{a}``."""
+        if self.ndim == 0:  # the integral is a drift over another time
+            return [move.format(p="p", a="a[0]"), "p = damped(p, a)"]
+        spread = "spread(p, a, work)" if self.in_place else "spread(p, a, None)"
+        return [move.format(p=spread, a="1.0"), "p = damped(p, a)"]
+
+
+_DRIFT_OF = """@njit(**OPTIONS, forceinline=True)
+def drift_of(table, j):
+    return table[0, j]"""
+
+
+def stages_source(
+    kinds: Sequence[Kick], scheduled: bool, friction: DampedDrift | None = None, n_parameters: int = 0
+) -> str:
+    """The functions of the text `loops` that depend on the kinds of kick, and on friction.
 
     ``numbers_of(table, j)`` are the numbers of kick j, ``numbers_at(table, j, x, h)`` those of a step h by polynomials
-    in x; the values of the parameters of H come after them. ``stage`` is a kick and a drift of one trajectory.
+    in x; the values of the parameters of H, which are taken where there is no friction, come after them.
+    ``drift_of(table, j)`` are those of a drift. ``stage`` is a kick and a drift of one trajectory.
     """
     rows = range(1, 1 + len(kinds[0].numbers))
     constant = range(rows.stop, rows.stop + n_parameters)
@@ -239,10 +330,15 @@ def stages_source(kinds: Sequence[Kick], scheduled: bool, n_parameters: int = 0)
     drifted = f"return move(q, q_error, drift(p, a, {given}work))"
     if scheduled:
         drifted = f"return drifted(q, p, {given}a), q_error"
-    end = [f"q, q_error = drift_by(q, p, q_error, {given}a, work)", "return q, p, q_error, p_error"]
+    move = f"q, q_error = drift_by(q, {{p}}, q_error, {given}{{a}}, work)"
+    moved = [move.format(p="p", a="a")] if friction is None else friction.drifted(move)
+    end = [*moved, "return q, p, q_error, p_error"]
     return f"""@njit(**OPTIONS)
 def numbers_of(table, j):
     return ({numbers})
+
+
+{_DRIFT_OF if friction is None else friction.source(1 + len(kinds[0].numbers))}
 
 
 @njit(**OPTIONS)
@@ -260,7 +356,9 @@ def stage(q, p, q_error, p_error, numbers, a, j, work):
     {_cases(kinds, "numbers[{0}] != 0.0", [[*kick.application(scheduled, lane=False), *end] for kick in kinds])}"""
 
 
-def lanes_source(kinds: Sequence[Kick], scheduled: bool, n_parameters: int = 0) -> str:
+def lanes_source(
+    kinds: Sequence[Kick], scheduled: bool, friction: DampedDrift | None = None, n_parameters: int = 0
+) -> str:
     """The functions of the text `lanes` that depend on the kinds of kick; not scheduled, sums are compensated.
 
     ``stage_lanes`` is a kick and a drift of all lanes by the same numbers, ``stage_each`` of each lane by its own, by
@@ -272,7 +370,9 @@ def lanes_source(kinds: Sequence[Kick], scheduled: bool, n_parameters: int = 0) 
     def together(kick: Kick) -> list[str]:
         kicked = kick.application(scheduled, lane=True)
         if scheduled:
-            return _over_lanes([*kicked, f"q, _ = move(q, None, drift(p, a, {given}None))"])
+            move = f"q, _ = move(q, None, drift({{p}}, {{a}}, {given}None))"
+            moved = [move.format(p="p", a="a")] if friction is None else friction.drifted(move)
+            return _over_lanes([*kicked, *moved])
         drifted = f"q, q_error = move(q, q_error, drift(p, a, {given}None))"
         taken, stored = "q_error, p_error = unpack_lane(error, lane)", "pack_lane(q_error, p_error, error, lane)"
         return _over_lanes([taken, *kicked, drifted, stored])

@@ -56,7 +56,7 @@ def check_problem(reference: object, system: HamiltonianSystem, t0: float, y0: n
     """Raise a ValueError if a reference is none of this problem: another system, another y0, another energy.
 
     A Solution tells its system, whose vector field is compared along it, and its y0. Of states alone the energy is all
-    that can be looked at.
+    that can be looked at, where it is kept.
     """
     if isinstance(reference, Solution):
         if reference.system is not system and not _same_field(reference, system):
@@ -70,7 +70,7 @@ def check_problem(reference: object, system: HamiltonianSystem, t0: float, y0: n
             raise ValueError("`reference` is a solution from another `y0`: solve from the one that is compared.")
         return
     states = states_of(reference.y if isinstance(reference, Reference) else reference)
-    if states.shape[:-1] != y0.shape:
+    if states.shape[:-1] != y0.shape or not system.conservative:
         return  # the shape is refused where it is needed
     with np.errstate(all="ignore"):
         H0 = to_numpy(system.hamiltonian(y0))

@@ -48,6 +48,7 @@ def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.nda
         If `sol` is not a Solution.
     """
     check_solution(sol)
+    _check_kept(sol, "volume")
     batch = sol.y.shape[:-2]
     lost = failed(sol)
     total = np.zeros(batch)
@@ -83,6 +84,12 @@ def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.nda
         return np.where(lost, np.inf, total)[()]
     gone = lost[..., None] & ~np.isfinite(to_numpy(sol.states)).all(-1)
     return np.where(gone, np.inf, np.moveaxis(series, 0, -1))
+
+
+def _check_kept(sol: Solution, what: str) -> None:
+    sol.system.check_conservative(
+        f"by which phase-space {what} shrinks and is not kept", "use sympflow.conformal_defect(sol)"
+    )
 
 
 def _hold(series: np.ndarray, ends: np.ndarray, values: np.ndarray, t: np.ndarray) -> None:
@@ -121,12 +128,55 @@ def symplecticity_defect(
         If `scale` is not positive and finite, or has another shape.
     """
     check_solution(sol)
+    sol.system.check_conservative(
+        "by which its flow is not symplectic", "use sympflow.conformal_defect(sol), which is 0 for the exact flow"
+    )
+    return _form_defect(sol, 0.0, relative, scale)
+
+
+def conformal_defect(sol: Solution, relative: bool = False, scale: ArrayLike | None = None) -> np.floating | np.ndarray:
+    """max over the executed steps of ‖AᵀJA − e^{−γh}J‖₂, (...), of a system with the friction −γp.
+
+    The flow of such a system is conformally symplectic: it shrinks the symplectic form by e^{−γh} in a time h [1]_, and
+    phase-space volume by e^{−dγh}. So is every step that is composed of kicks and of drifts with friction, up to
+    the rounding of A. Without friction it is `symplecticity_defect`.
+
+    Parameters
+    ----------
+    sol : Solution
+    relative, scale
+        As for `symplecticity_defect`.
+
+    Raises
+    ------
+    TypeError
+        If `sol` is not a Solution, or `scale` is no number or array of numbers.
+    ValueError
+        If momenta have different rates of friction, so that the flow is not conformally symplectic; if `scale` is not
+        positive and finite, or has another shape.
+
+    References
+    ----------
+    .. [1] R. McLachlan, M. Perlmutter, "Conformal Hamiltonian systems", J. Geom. Phys. 39 (2001) 276–300.
+    """
+    check_solution(sol)
+    friction = sol.system.friction
+    if friction is not None and not friction.isotropic:
+        raise ValueError(
+            f"`sol` is of {sol.system.name!r}, whose momenta have different rates of friction: its flow is not "
+            "conformally symplectic. Use sympflow.reference_error(sol)."
+        )
+    return _form_defect(sol, 0.0 if friction is None else friction.largest, relative, scale)
+
+
+def _form_defect(sol: Solution, rate: float, relative: bool, scale: ArrayLike | None) -> np.floating | np.ndarray:
+    """max over the executed steps of ‖AᵀJA − e^{−γh}J‖₂, γ the rate, in the variables (s q, p/s)."""
     d = sol.system.ndof
     s = natural_scale(sol.system) if scale is None else _factors(scale, d)
     if not (np.isfinite(s) & (s > 0)).all():
         raise ValueError(f"`scale` must be positive and finite, one factor for each q; got {s.tolist()}.")
     worst = np.zeros(sol.y.shape[:-2])
-    for _, _, A in step_tangents(sol):
+    for _, h, A in step_tangents(sol):
         n = A.shape[-1] // 2
         weights = np.concatenate([np.tile(s, n // d), np.tile(1 / s, n // d)])
         J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
@@ -134,7 +184,8 @@ def symplecticity_defect(
             scaled = weights[:, None] * A / weights
             finite = np.isfinite(scaled).all((-2, -1))
             scaled = np.where(finite[..., None, None], scaled, 0.0)
-            form = scaled.swapaxes(-1, -2) @ J @ scaled - J
+            kept = J if rate == 0 else np.exp(-rate * h)[..., None, None] * J
+            form = scaled.swapaxes(-1, -2) @ J @ scaled - kept
             finite &= np.isfinite(form).all((-2, -1))
             defect = np.linalg.norm(np.where(finite[..., None, None], form, 0.0), 2, axis=(-2, -1))
             if relative:
@@ -209,6 +260,7 @@ def loop_area_error(sol: Solution) -> np.ndarray:
         If the solution is not one of a loop.
     """
     check_solution(sol)
+    _check_kept(sol, "area")
     if sol.system.ndof != 1:
         raise ValueError(f"`sol` must have one degree of freedom for a loop in the plane; it has {sol.system.ndof}.")
     y0 = to_numpy(sol.y0).astype(float)

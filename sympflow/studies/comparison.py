@@ -116,6 +116,10 @@ def compare(
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     asked = _check_metrics(metrics)
     check_counts(n_outputs=n_outputs, repeats=repeats)
+    unkept = [m for m in asked if m not in ("error", "reversal")]
+    if unkept or match == "energy_error":
+        what = f"which `metrics` {', '.join(map(repr, unkept))}" if unkept else "which `match` 'energy_error'"
+        system.check_conservative(f"{what} presume is not there", "pass metrics=['error'], and match by 'time'")
     if match is not None and match not in MATCHES:
         raise ValueError(f"`match` must be one of {', '.join(map(repr, MATCHES))}, or None; got {match!r}.")
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)

@@ -94,6 +94,9 @@ def work_precision(
     """
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    system.check_conservative(
+        "so there is no energy error to draw", "use sympflow.compare(system, methods, metrics=['error'])"
+    )
     tolerances = positive_numbers("tolerances", tolerances)
     if steps is not None:
         steps = positive_numbers("steps", steps)

@@ -42,6 +42,7 @@ ORBIT, MOST_OF_ORBIT = 64, 1000  # states along an orbit at which frequencies ar
 FINE, COARSE = 2 ** (1 / 8), 2 ** (1 / 4)  # ratio of the steps that are tried, compiled and not
 OCTAVES = 3  # below the first unstable one of steps that are doubled, in which all of these are tried
 HALVINGS = 24
+WITHIN = (0.1, 0.5, 0.9, 0.99)  # places in a window of linear instability that are tried, compiled; else its middle
 SHOWN_INTERVALS = 3
 PRECISION = 1.002  # the shortest unstable step found, in units of the longest stable one
 STABLE = ("stable", "bounded")
@@ -73,8 +74,8 @@ def stability(
     drifts, it is known for certain, from the trace of a step: see `sympflow.metrics.linear_stability`. Else steps are
     doubled from an eighth of that limit for small oscillations, or of the system's `dt`, until one is unstable; in
     the three octaves below it steps at ratios of 2^(1/8) are tried, of 2^(1/4) for methods that are not compiled, and
-    in every window of linear instability the middle; the first loss is found by bisection, to 0.2 %. The answer does
-    not depend on `steps`, unless one of them is unstable below it: then that one counts.
+    in every window of linear instability four steps, or its middle; the first loss is found by bisection, to 0.2 %.
+    The answer does not depend on `steps`, unless one of them is unstable below it: then that one counts.
 
     Parameters
     ----------
@@ -122,6 +123,11 @@ def stability(
     family = (system,) if isinstance(system, HamiltonianSystem) else tuple(system)
     if not family or not all(isinstance(s, HamiltonianSystem) for s in family):
         raise TypeError("`system` must be a HamiltonianSystem or a sequence of them.")
+    for one in family:
+        one.check_conservative(
+            "so its energy error says nothing of stability",
+            "study the system without `damping`, or use sympflow.compare",
+        )
     unknown = [m for m in metrics if m not in METRICS]
     if isinstance(metrics, str) or unknown:
         raise ValueError(f"`metrics` must be a list of names from {', '.join(METRICS)}; got {metrics!r}.")
@@ -577,7 +583,8 @@ class Search:
         low: float | None = None
         for h in sorted({*steps, *inside}):
             if not self.stable(h):
-                return *self._bisected(low, h), ""
+                low, high = self._bisected(low, h)
+                return low, high, "" if low is None else self._passed_over(low)
             low = h
         return low, None, remark
 
@@ -596,11 +603,24 @@ class Search:
         return h
 
     def _in_windows(self) -> list[float]:
-        """Steps where small oscillations are unstable, in each window one."""
+        """Steps where small oscillations are unstable, a few in each window."""
         linear = self.study.linear
         if linear is None:
             return []
-        return [(w.start + (w.stop if w.stop < math.inf else PRECISION * w.start)) / 2 for w in linear.windows]
+        ends = [(w.start, w.stop if w.stop < math.inf else PRECISION * w.start) for w in linear.windows]
+        places = WITHIN if self.study.compiled else (0.5,)
+        return [start + place * (stop - start) for start, stop in ends for place in places]
+
+    def _passed_over(self, low: float) -> str:
+        """A remark on the windows where small oscillations grow, but no run here above the bound."""
+        study = self.study
+        if study.linear is None or study.small is None or study.small.equilibrium is None:
+            return ""
+        passed = [f"{w.start:.5g} to {min(w.stop, low):.5g}" for w in study.linear.windows if w.start < low]
+        if not passed:
+            return ""
+        shown = ", ".join(passed[:SHOWN_INTERVALS]) + (", …" if len(passed) > SHOWN_INTERVALS else "")
+        return f"below the bound, though small oscillations grow at {shown}"
 
     def _bisected(self, low: float | None, high: float) -> tuple[float | None, float]:
         for _ in range(HALVINGS if low is None else 0):
@@ -638,8 +658,9 @@ class StepLimit:
     energy_error : float
         The largest energy error with `stable`, or just below.
     reached : str
-        A remark: that all steps are stable, up to the flow's Δt or the length of the interval; or that
-        the solution itself is singular, or leaves the flow's domain, so that none is.
+        A remark: that all steps are stable, up to the flow's Δt or the length of the interval; that
+        the solution itself is singular, or leaves the flow's domain, so that none is; or the windows of steps below
+        `stable` where small oscillations grow, though no run here exceeds the bound: longer runs may.
     frequency : float or None
         ω of the fastest small oscillation about the equilibrium, or, where none is found, the largest along the orbit.
     linear : float or None

@@ -8,13 +8,25 @@ from typing import TYPE_CHECKING, Any
 
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.lazy import announced, distribution, load_announced
-from sympflow.systems.celestial import kepler, kepler_ellipse, outer_solar_system, three_body
+from sympflow.systems.celestial import (
+    kepler,
+    kepler_ellipse,
+    outer_solar_system,
+    perihelion_angle,
+    schwarzschild,
+    three_body,
+)
 from sympflow.systems.chains import fput, lax_eigenvalues, lennard_jones, oscillatory_energies, toda_lattice
 from sympflow.systems.textbook import (
+    charged_particle,
+    damped_oscillator,
+    damped_pendulum,
+    double_pendulum,
     double_well,
     harmonic_oscillator,
     henon_heiles,
     henon_heiles_escape,
+    magnetic_moment,
     nonseparable,
     pendulum,
     pendulum_separatrix,
@@ -45,6 +57,11 @@ SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {
     "toda-lattice": toda_lattice,
     "lennard-jones": lennard_jones,
     "nonseparable": nonseparable,
+    "double-pendulum": double_pendulum,
+    "schwarzschild": schwarzschild,
+    "charged-particle": charged_particle,
+    "damped-oscillator": damped_oscillator,
+    "damped-pendulum": damped_pendulum,
 }
 """The built-in scenes by the name that the command line uses."""
 
@@ -153,5 +170,5 @@ def _key(name: str) -> str:
 
 
 __all__ = ["SYSTEMS", "available", "from_toml", "get", "register"]
-__all__ += ["kepler_ellipse", "lax_eigenvalues", "oscillatory_energies"]
+__all__ += ["kepler_ellipse", "lax_eigenvalues", "magnetic_moment", "oscillatory_energies", "perihelion_angle"]
 __all__ += [factory.__name__ for factory in SYSTEMS.values()]

@@ -1,4 +1,4 @@
-"""Celestial scenes: the Kepler problem, the Pythagorean three-body problem, the outer solar system."""
+"""Celestial scenes: the Kepler problem and its relativistic twin, the Pythagorean three-body problem, the planets."""
 
 from __future__ import annotations
 
@@ -64,6 +64,83 @@ def _shell(e: float) -> Domain:
     widest = math.sqrt(1 + 2 * high * momentum[0] ** 2)
     q, p = 1.05 * (1 + widest), (1 + widest) / momentum[0]  # apocentre, and speed at pericentre
     return EnergySublevel(high, Box([-q, -q, -p, -p], [q, q, p, p]), above=low, angular_momentum=momentum)
+
+
+def schwarzschild(semilatus: float = 12.0, e: float = 0.5) -> HamiltonianSystem:
+    """H = [(1 − 2/r) p_r² + p_φ²/r² − E²/(1 − 2/r)]/2: a test particle about a black hole of unit mass, G = c = 1.
+
+    q = (r, φ) and p = (p_r, p_φ) in the plane of the orbit, in Schwarzschild's coordinates; the coordinate time is
+    eliminated by its constant momentum −E, and t is the proper time. On the orbit H = −1/2.
+
+    Parameters
+    ----------
+    semilatus : float
+        ℓ > 6 + 2e, up to 1e6: the orbit from y0 goes from r = ℓ/(1 + e), where it starts with φ = 0, to ℓ/(1 − e).
+    e : float
+        Eccentricity, 0 ≤ e ≤ 0.95.
+
+    Notes
+    -----
+    Known truths: H = −1/2, p_φ = ℓ/√(ℓ − 3 − e²), E² = ((ℓ − 2)² − 4e²)/(ℓ(ℓ − 3 − e²)); from one perihelion to the
+    next φ grows by `perihelion_angle`, which is 2π for Kepler's ellipse and about 2π + 6π/ℓ far out.
+
+    The domain holds the orbits of the same E with |H + 1/2| < 0.01/ℓ near this one, and φ of the default interval. That
+    is 20 periods of the ellipse with the same ends; the default step is a 500th of one.
+
+    References
+    ----------
+    .. [1] C. Darwin, "The gravity field of a particle", Proc. R. Soc. Lond. A 249 (1959) 180–194.
+    .. [2] S. Chandrasekhar, "The Mathematical Theory of Black Holes", Oxford 1983, § 19.
+    """
+    _check_orbit(semilatus, e)
+    L = semilatus / math.sqrt(semilatus - 3 - e * e)
+    E2 = ((semilatus - 2) ** 2 - 4 * e * e) / (semilatus * (semilatus - 3 - e * e))
+    period = 2 * math.pi * (semilatus / (1 - e * e)) ** 1.5
+    inner, outer = semilatus / (1 + e), semilatus / (1 - e)
+    widest = 21 * perihelion_angle(semilatus, e)
+    p_r = 2 * (e + 0.1) / math.sqrt(semilatus - 6 - 2 * e)
+    return HamiltonianSystem.from_sympy(
+        "((1 - 2/q1)*p1**2 + p2**2/q1**2 - E2/(1 - 2/q1))/2",
+        params={"E2": E2},
+        name="schwarzschild",
+        domain=EnergySublevel(
+            -0.5 + 0.01 / semilatus,
+            Box([0.98 * inner, -1.0, -p_r, 0.99 * L], [1.02 * outer, widest, p_r, 1.01 * L]),
+            above=-0.5 - 0.01 / semilatus,
+        ),
+        y0=[inner, 0.0, 0.0, L],
+        t_span=(0.0, 20 * period),
+        dt=period / 500,
+    )
+
+
+def perihelion_angle(semilatus: float, e: float) -> float:
+    """The angle φ from one perihelion to the next of an orbit of `schwarzschild`: 4√(ℓ/μ) K(4e/μ), μ = ℓ − 6 + 2e.
+
+    K is the complete elliptic integral of the first kind of the parameter m. What exceeds 2π is the advance of the
+    perihelion.
+
+    Raises
+    ------
+    ValueError
+        If there is no such orbit.
+    """
+    _check_orbit(semilatus, e)
+    mu = semilatus - 6 + 2 * e
+    a, b = 1.0, math.sqrt(1 - 4 * e / mu)  # K is π/2 over their arithmetic–geometric mean
+    while abs(a - b) > 1e-15 * a:
+        a, b = (a + b) / 2, math.sqrt(a * b)
+    return 2 * math.pi * math.sqrt(semilatus / mu) / a
+
+
+def _check_orbit(semilatus: float, e: float) -> None:
+    if not (isinstance(e, int | float) and 0 <= e <= 0.95):
+        raise ValueError(f"`e` must be an eccentricity, 0 ≤ e ≤ 0.95; got {e!r}.")
+    if not (isinstance(semilatus, int | float) and 6 + 2 * e < semilatus <= 1e6):
+        raise ValueError(
+            f"`semilatus` must be above 6 + 2e = {6 + 2 * e:g}, within which no orbit is bound and stable, and at most "
+            f"1e6; got {semilatus!r}."
+        )
 
 
 MASSES = (3, 4, 5)

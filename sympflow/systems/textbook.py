@@ -1,9 +1,10 @@
-"""Textbook scenes of one and two degrees of freedom."""
+"""Textbook scenes of one to three degrees of freedom."""
 
 from __future__ import annotations
 
 import math
 
+from sympflow.arrays import Array
 from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -38,7 +39,74 @@ def harmonic_oscillator(omega: float = 1.0) -> HamiltonianSystem:
     )
 
 
+def damped_oscillator(omega: float = 1.0, damping: float = 0.1) -> HamiltonianSystem:
+    """H = (p² + ω²q²)/2 with friction, p' = −ω²q − γp.
+
+    Parameters
+    ----------
+    omega : float
+        Angular frequency ω > 0 without friction, from 1e-100 to 1e100.
+    damping : float
+        γ ≥ 0: below 2ω the oscillator swings, from there on it creeps.
+
+    Notes
+    -----
+    Known truth, with Ω² = ω² − γ²/4: q(t) = e^{−γt/2}(q₀ cos Ωt + (p₀ + γq₀/2) sin(Ωt)/Ω), with the hyperbolic
+    functions where Ω² is negative; p = q'. The domain is that of `harmonic_oscillator`, which no motion leaves.
+
+    References
+    ----------
+    .. [1] L. D. Landau, E. M. Lifshitz, "Mechanics", 3rd ed., Pergamon 1976, § 25.
+    """
+    if not (isinstance(omega, int | float) and 1e-100 <= omega <= 1e100):
+        raise ValueError(f"`omega` must be positive and finite, from 1e-100 to 1e100; got {omega!r}.")
+    return HamiltonianSystem.from_sympy(
+        "(p**2 + omega**2*q**2)/2",
+        params={"omega": omega},
+        damping=_rate(damping),
+        name="damped_oscillator",
+        domain=harmonic_oscillator(omega).domain,
+        y0=[1.0, 0.0],
+        t_span=(0.0, 100.0 / omega),
+        dt=0.05 / omega,
+    )
+
+
 _H = "p**2/2 + 1 - cos(q)"
+
+
+def damped_pendulum(damping: float = 0.1) -> HamiltonianSystem:
+    """H = p²/2 + 1 − cos q with friction, p' = −sin q − γp.
+
+    Parameters
+    ----------
+    damping : float
+        γ ≥ 0.
+
+    Notes
+    -----
+    Known truth: the rate of change of the energy is −γp², and of every area in the plane −γ times it: the flow is
+    conformally symplectic. The domain is that of `pendulum`, H < 1.8, where all motions end at rest in q = 0.
+
+    References
+    ----------
+    .. [1] R. McLachlan, M. Perlmutter, "Conformal Hamiltonian systems", J. Geom. Phys. 39 (2001) 276–300.
+    """
+    return HamiltonianSystem.from_sympy(
+        _H,
+        damping=_rate(damping),
+        name="damped_pendulum",
+        domain=pendulum().domain,
+        y0=[1.5, 0.0],
+        t_span=(0.0, 100.0),
+        dt=0.05,
+    )
+
+
+def _rate(damping: float) -> float:
+    if isinstance(damping, bool) or not (isinstance(damping, int | float) and 0 <= damping < math.inf):
+        raise ValueError(f"`damping` must be a finite number, not negative; got {damping!r}.")
+    return damping
 
 
 def pendulum() -> HamiltonianSystem:
@@ -277,3 +345,91 @@ def nonseparable(amplitude: float = 3.0) -> HamiltonianSystem:
         t_span=(0.0, 100.0),
         dt=0.05 / math.sqrt(1 + amplitude**2),
     )
+
+
+def double_pendulum() -> HamiltonianSystem:
+    """Two unit masses on unit rods with g = 1; the angles q₁ and q₂ are from the downward vertical.
+
+    H = (p₁² + 2p₂² − 2p₁p₂ cos(q₁ − q₂)) / (2(1 + sin²(q₁ − q₂))) − 2 cos q₁ − cos q₂.
+
+    Notes
+    -----
+    Known truth: small oscillations about the rest have the angular frequencies √(2 ± √2), and the angle of the second
+    rod is ∓√2 times that of the first. At rest H is −3. The domain is H < −2, in which no rod turns over; from y0,
+    the angles 0.6 and 0.8 at rest, H = −2 cos 0.6 − cos 0.8.
+
+    References
+    ----------
+    .. [1] L. D. Landau, E. M. Lifshitz, "Mechanics", 3rd ed., Butterworth–Heinemann 1976, § 5 and § 23.
+    """
+    box = Box(low=[-1.1, -1.65, -2.1, -1.5], high=[1.1, 1.65, 2.1, 1.5])
+    return HamiltonianSystem.from_sympy(
+        "(p1**2 + 2*p2**2 - 2*p1*p2*cos(q1 - q2))/(2*(1 + sin(q1 - q2)**2)) - 2*cos(q1) - cos(q2)",
+        name="double_pendulum",
+        domain=EnergySublevel(-2.0, box),
+        y0=[0.6, 0.8, 0.0, 0.0],
+        t_span=(0.0, 100.0),
+        dt=0.05,
+    )
+
+
+def charged_particle(field: float = 10.0) -> HamiltonianSystem:
+    """H = |p − A(q)|²/2, A = B(1 + q₃²)(−q₂, q₁, 0)/2: a unit charge and mass in a magnetic bottle.
+
+    The field is (−B q₁q₃, −B q₂q₃, B(1 + q₃²)): its strength on the axis doubles from the middle to q₃ = 1, and the
+    particle is reflected where it is strong.
+
+    Parameters
+    ----------
+    field : float
+        B from 5 to 100, the strength in the middle and the angular frequency of the gyration there.
+
+    Notes
+    -----
+    Known truths: the speed √(2H) and q₁p₂ − q₂p₁ are constant. In the plane q₃ = 0 the particle gyrates with frequency
+    B; about a gyration around the axis, small oscillations along it have the speed as their frequency. The magnetic
+    moment, `magnetic_moment`, is an adiabatic invariant: for large B it is nearly constant.
+
+    From y0, at (½, 0, 0) with a velocity of (0, 1, ½), H = 5/8, and the gyration has a radius of 1/B; it is
+    reflected near |q₃| = ½. The domain is H < 0.7 in a box about the bottle. The default interval is (0, 50), the
+    default step 0.1/B.
+
+    References
+    ----------
+    .. [1] T. G. Northrop, "The Adiabatic Motion of Charged Particles", Interscience 1963, chapter 1.
+    """
+    if not (isinstance(field, int | float) and 5 <= field <= 100):
+        raise ValueError(f"`field` must be positive, a strength from 5 to 100; got {field!r}.")
+    radius, length = 0.75 + 2 / field, 0.8
+    p = math.sqrt(1.4)  # the speed in the domain
+    across = p + field * (1 + length**2) * radius / 2
+    high = [radius, radius, length, across, across, p]
+    return HamiltonianSystem.from_sympy(
+        "((p1 + B*(1 + q3**2)*q2/2)**2 + (p2 - B*(1 + q3**2)*q1/2)**2 + p3**2)/2",
+        params={"B": field},
+        name="charged_particle",
+        domain=EnergySublevel(0.7, Box([-x for x in high], high)),
+        y0=[0.5, 0.0, 0.0, 0.0, 1 + field / 4, 0.5],
+        t_span=(0.0, 50.0),
+        dt=0.1 / field,
+    )
+
+
+def magnetic_moment(system: HamiltonianSystem, y: Array) -> Array:
+    """The magnetic moment v⊥²/(2|B|) of `charged_particle`, v⊥ across the field: (..., 6) to (...).
+
+    For a solution, y is ``sol.states``.
+
+    Raises
+    ------
+    ValueError
+        If the system is not `charged_particle`.
+    """
+    if system.name != "charged_particle":
+        raise ValueError(f"`system` must be charged_particle(...), whose field is known; got {system.name!r}.")
+    B, q1, q2, q3, v3 = system.params["B"], y[..., 0], y[..., 1], y[..., 2], y[..., 5]
+    axial = B * (1 + q3**2)
+    v1, v2 = y[..., 3] + axial * q2 / 2, y[..., 4] - axial * q1 / 2
+    strength2 = axial**2 + (B * q3) ** 2 * (q1**2 + q2**2)
+    along = axial * v3 - B * q3 * (q1 * v1 + q2 * v2)
+    return (v1**2 + v2**2 + v3**2 - along**2 / strength2) / (2 * strength2**0.5)

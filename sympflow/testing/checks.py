@@ -106,6 +106,10 @@ def check_integrator(factory: Factory, system: HamiltonianSystem | None = None) 
     integrator = _made(factory)
     if not (system is None or isinstance(system, HamiltonianSystem)):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    if system is not None:
+        system.check_conservative(
+            "and most laws are those of conservative ones", "leave `system` out: one check has friction of its own"
+        )
     integrator.check(default_system() if system is None else system)
     passed, skipped = [], {}
     for check in CHECKS:

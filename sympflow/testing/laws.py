@@ -506,6 +506,33 @@ def states_within_a_step_belong_to_it(integrator: Integrator, system: Hamiltonia
     assert error <= 20 * allowed + 1e-3 * np.abs(sol.y).max(), f"within steps it is wrong by {error:.1e}"
 
 
+@cache
+def _damped() -> tuple[HamiltonianSystem, np.ndarray, float]:
+    """The default system with friction, its state at T_END, and how far friction moves that."""
+    system = default_system()
+    assert system.symbols is not None
+    damped = HamiltonianSystem.from_sympy(system.symbols.H, damping=0.5, y0=system.y0, dt=system.dt, name="damped")
+    end = exact(damped)
+    return damped, end, float(np.abs(end - exact(system)).max())
+
+
+def friction_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem) -> None:
+    """A method that says `takes_friction` solves a damped system: nearer to its solution than to that without."""
+    if not integrator.takes_friction:
+        raise NotApplicable("it does not say that it takes friction, so damped systems are refused for it")
+    damped, end, effect = _damped()
+    try:
+        integrator.check(damped)
+    except ValueError as reason:
+        raise NotApplicable(f"it does not apply to the default system with friction ({reason})") from None
+    sol = run(integrator, damped, (0.0, T_END), t_eval=[T_END], backend="array")
+    error = float(np.abs(sol.y[..., 0] - end).max())
+    assert error < effect / 4, (
+        f"the end of a damped system is wrong by {error:.1e}, and friction moves it by {effect:.1e}: take −Γp into "
+        "every step, as system.vector_field does, or do not say `takes_friction`"
+    )
+
+
 def the_start_time_does_not_matter(integrator: Integrator, system: HamiltonianSystem) -> None:
     """The system is autonomous: a run from t0 = 5.25 is that from 0, and so is a step."""
     t0, times = 5.25, np.array([0.5, 1.111, T_END])
@@ -608,6 +635,7 @@ OF_CONSISTENCY: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (
     the_run_is_its_steps,
     states_within_a_step_belong_to_it,
     the_start_time_does_not_matter,
+    friction_is_in_the_steps,
     every_event_is_found,
     save_every_thins_the_outputs,
     a_batch_reports_its_failures,

@@ -56,6 +56,12 @@ def test_compare_takes_several_systems_with_their_parameters(tmp_path):
     assert (tmp_path / "harmonic-oscillator-omega=10.csv").exists()
 
 
+def test_solve_without_a_flow_names_a_method_that_needs_none():
+    result = run("solve", "harmonic-oscillator", "--omega", "10")
+    assert result.exit_code == 2
+    assert "or take a method that needs none, such as gauss_legendre6." in " ".join(result.output.split())
+
+
 def test_compare_survives_methods_that_do_not_apply_but_fails_if_none_does():
     result = run("compare", "harmonic-oscillator", "--omega", "10", "--methods", "sympflow,verlet", *FAST)
     assert result.exit_code == 0

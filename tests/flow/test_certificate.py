@@ -34,6 +34,7 @@ FLOWS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FLOWS)
 def test_the_bound_holds_along_orbits(name):
     """|H(ψ_kΔt x) − H(x)| ≤ kδ at every step until the orbit leaves Ω, for states of another seed."""
@@ -69,6 +70,7 @@ def test_delta_is_the_integral_of_the_rate():
     assert found.delta.median == found.delta.q95 <= found.delta.largest  # which is searched for near the state
 
 
+@pytest.mark.slow
 def test_delta_is_not_exceeded_by_states_that_are_drawn_later():
     """A state at which a step of the Kepler flow gains twice the largest of 2000 samples; and 20,000 others."""
     kepler = systems.kepler()

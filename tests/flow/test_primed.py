@@ -237,6 +237,7 @@ def test_gradients_flow_through_a_processed_run():
 # frozen, it is a scheme: the compiled loops ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("span", "rows"), [((0.0, 5.0), ()), ((0.0, 5.0), (3,)), ((0.5, 4.77), (2, 5)), ((4.0, 0.3), ())]
 )

@@ -154,6 +154,7 @@ def harmonic_pair():
     )
 
 
+@pytest.mark.slow
 def test_a_fit_lowers_the_error_at_all_times():
     system = harmonic_pair()
     start = SympFlow.split(system, 2, dt=0.25, terms=4)
@@ -199,6 +200,7 @@ def test_split_flows_train_as_all_others_do(tmp_path):
         train(system, flow=start, loss="residual")
 
 
+@pytest.mark.slow
 def test_the_shipped_flow_of_fput_reaches_its_figures():
     system = fput(omega=50.0)
     sol = solve(system, t_eval=np.linspace(0, 200, 1001))

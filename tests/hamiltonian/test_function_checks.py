@@ -143,6 +143,71 @@ def test_right_functions_pass(functions, y0):
         HamiltonianSystem(**functions).check_functions(y0)
 
 
+def within(q):
+    if (q > 1).any():
+        raise ValueError("beyond the end")
+    return q
+
+
+def edge(q):
+    return 0.5 / np.sqrt(1 - within(q))
+
+
+@pytest.mark.parametrize(
+    ("functions", "y0"),
+    [
+        ({"potential": lambda q: torch.cos(1e6 * q).sum(-1), "ndof": 1}, np.array([3.0, 1.0])),
+        (
+            {"hamiltonian": lambda q, p: (p**2).sum(-1) / 2e9 - 1e10 * torch.cos(q).sum(-1), "ndof": 1},
+            np.array([0.3, 1e9]),
+        ),
+        (
+            {"potential": lambda q: -np.sqrt(1 - within(q)).sum(-1), "gradient": edge, "ndof": 1},
+            np.array([1 - 1e-9, 0]),
+        ),
+    ],
+    ids=["a period shorter than a difference", "an angle and a large momentum", "raises beyond its domain"],
+)
+def test_what_differences_cannot_resolve_is_not_refused(functions, y0):
+    HamiltonianSystem(**functions).check_functions(y0)
+
+
+def test_halves_of_other_sizes_are_tested_by_their_own():
+    def hamiltonian(q, p):
+        return (p.detach() ** 2).sum(-1) / 2e-26 + 1e-2 * (q**2).sum(-1)
+
+    refused(r"^`hamiltonian` is cut off .* component 1", np.array([1e-10, 1e-23]), hamiltonian=hamiltonian, ndof=1)
+
+
+FAR = QUARTIC | {"gradient": lambda q: np.where(abs(q) > 2, 0, q**3), "y0": np.array([0.3, 0.2, 3.0, 3.0])}
+
+
+@pytest.mark.parametrize("t_eval", [None, [0.8]])
+@pytest.mark.parametrize("method", ["verlet", "rk45"])
+def test_a_run_that_goes_where_the_functions_are_wrong_warns(method, t_eval):
+    with pytest.warns(RuntimeWarning, match=r"^On this run, far from its start: `gradient` is not that of `potential`"):
+        solve(HamiltonianSystem(**FAR), method, (0, 4 if t_eval is None else 0.8), t_eval=t_eval)
+
+
+def test_a_run_tests_only_where_no_run_was_and_never_by_check_false():
+    calls = []
+
+    def gradient(q):
+        calls.append(q.shape)
+        return q**3
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        solve(HamiltonianSystem(**FAR, check=False), "verlet", (0, 4))
+        system = HamiltonianSystem(**FAR | {"gradient": gradient})
+        counts = []
+        for _ in range(3):
+            calls.clear()
+            solve(system, "rk4", (0, 4))
+            counts.append(len(calls))
+    assert counts[0] > counts[1] == counts[2]
+
+
 def test_one_wrong_component_of_many_is_found():
     def gradient(q):
         return q**3 * (1 + (np.arange(300) == 177))

@@ -1,5 +1,7 @@
 """Methods for any H on two copies of phase space."""
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -72,6 +74,29 @@ def test_events_and_dense_output_are_of_the_mean_of_the_copies(system):
 def test_copies_that_drift_apart_are_told(system):
     with pytest.warns(RuntimeWarning, match="two copies that method 'tao4' keeps differ by up to .* change `omega`"):
         sympflow.solve(system, "tao4", (0, 100), dt=0.05, omega=0.5)
+
+
+def test_a_run_goes_back_is_thinned_and_pickled(system):
+    forward = sympflow.solve(system, "tao4", (0, 2), dt=0.05, dense_output=True)
+    back = sympflow.solve(system, "tao4", (2, 0), forward.y[:, -1], dt=0.05)
+    # the copies start anew at the end, where they were apart
+    assert np.abs(back.y[:, -1] - system.y0).max() < 100 * forward.stats["copy_distance"]
+    thin = sympflow.solve(system, "tao4", (0, 2), dt=0.05, save_every=8)
+    np.testing.assert_array_equal(thin.y, forward.y[:, ::8])
+    same = pickle.loads(pickle.dumps(forward))
+    t = np.linspace(0, 2, 7)
+    np.testing.assert_array_equal(same.sol(t), forward.sol(t))
+    assert sympflow.symplecticity_defect(same) < 1e-13
+
+
+@pytest.mark.parametrize("backend", ["compiled", "array"])
+def test_one_trajectory_that_fails_leaves_the_others(system, backend):
+    y0 = np.array([system.y0, [1e200, 1e200], [0.2, 0.0]])
+    sol = sympflow.solve(system, "tao4", (0, 1), y0, dt=0.05, backend=backend)
+    np.testing.assert_array_equal(sol.status, [0, -1, 0])
+    alone = sympflow.solve(system, "tao4", (0, 1), y0[2], dt=0.05, backend=backend)
+    np.testing.assert_allclose(sol.y[2], alone.y, rtol=0, atol=1e-13)
+    assert np.isfinite(sol.y[[0, 2]]).all()
 
 
 def test_what_has_no_meaning_is_refused(system):

@@ -87,6 +87,7 @@ def test_the_time_of_an_output_is_met_to_rounding():
     assert np.array_equal(sol.t, t)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_close_binary_and_its_escape(method):
     limits = {"log_leapfrog": (1e-3, None), "log_blanes_moan4": (1e-5, 0.1), "log_kahan_li8": (1e-9, 1e-2)}
@@ -159,6 +160,7 @@ def test_one_compiled_pass_makes_what_the_run_by_chunks_makes(method, t_end, clo
             assert made.stats["n_steps"] == expected.stats["n_steps"]
 
 
+@pytest.mark.slow
 def test_the_compiled_pass_leaves_to_the_run_by_chunks_what_does_not_end():
     system, integrator, end = systems.henon_heiles(), get("log_leapfrog")(dt=0.2), np.array([10.0])
     staying, escaping = np.array([0.0, 0.0, 0.0, 0.1]), np.array([0.0, 0.0, 0.0, 0.7])

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from sympflow import available, compare, get, poincare_section, register, solve, systems
+from sympflow import Scheme, available, compare, get, poincare_section, register, solve, systems
 from sympflow.integrators import registry
 from sympflow.integrators.base import FixedStep
 from sympflow.schemes import SCHEMES
@@ -266,3 +266,8 @@ def test_max_step_of_a_fixed_step_method_is_explained():
 def test_other_names_of_the_step_are_answered_with_ours(name):
     with pytest.raises(TypeError, match=rf"^`{name}` is not an option of method 'verlet'.*: the step .* is `dt`"):
         solve(systems.pendulum(), "verlet", (0, 1), **{name: 0.1})
+
+
+def test_a_scheme_for_a_method_is_pointed_to_splitting_method():
+    with pytest.raises(TypeError, match=r"^`method` must be .* got Scheme\. Make one of it by"):
+        get(Scheme("euler_of_mine", order=1, kicks=(1.0,), drifts=(1.0,)))

@@ -1,6 +1,8 @@
 """Derivatives and transforms of torch through `odeint`, `solve` and flows: right, or refused, never silently zero."""
 
+from functools import partial
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from torch.autograd.functional import jacobian
 from torch.func import functional_call, grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 from sympflow import HamiltonianSystem, MLPFlow, SympFlow, get, solve, systems
-from sympflow.interop.torchdiffeq import odeint, odeint_event
+from sympflow.interop.torchdiffeq import odeint, odeint_adjoint, odeint_dense, odeint_event
 
 PENDULUM, OSCILLATOR = systems.pendulum(), systems.harmonic_oscillator()
 KINDS = ["verlet", "kahan_li8", "chin4a", "gauss_legendre4", "strang_parts", "mollified_impulse", "sympflow", "mlp"]
@@ -189,9 +191,13 @@ class _End(torch.nn.Module):
 class TestNumbersOfH:
     """Tensors within the functions of a system that torch follows, though y0 is a plain tensor."""
 
+    y0 = Y[0]  # made here: a Y[0] within a transform of torch.func would be a tensor of that transform
+
+    def system(self, k):
+        return HamiltonianSystem(lambda q: -k * torch.cos(q).sum(-1), ndof=1)
+
     def end(self, k, method="verlet"):
-        system = HamiltonianSystem(lambda q: -k * torch.cos(q).sum(-1), ndof=1)
-        return odeint(system, Y[0], T, method=method, options={"dt": 0.1})[-1]
+        return odeint(self.system(k), self.y0, T, method=method, options={"dt": 0.1})[-1]
 
     @pytest.mark.parametrize("method", ["verlet", "gauss_legendre4"])
     def test_their_derivatives(self, method):
@@ -210,6 +216,42 @@ class TestNumbersOfH:
     def test_vmap_over_them(self):
         k = torch.tensor([0.5, 1.0, 1.5], dtype=torch.float64)
         torch.testing.assert_close(vmap(self.end)(k), torch.stack([self.end(each) for each in k]), **CLOSE)
+
+    def test_of_dense_output_and_event_times(self):
+        def within(k):
+            return odeint_dense(self.system(k), self.y0, 0.0, 0.7, method="verlet", options={"dt": 0.1})(T[1])
+
+        def crossing(k):
+            return odeint_event(self.system(k), self.y0, T[0], event_fn=lambda t, y: y[0] - 0.3, method="verlet")[0]
+
+        k = torch.tensor(1.3, dtype=torch.float64)
+        for f in (within, crossing):
+            J = jacobian(f, k)
+            assert J.abs().min() > 0.01
+            torch.testing.assert_close(jacfwd(f)(k), J, rtol=0, atol=1e-9)
+            torch.testing.assert_close(jacrev(f)(k), J, rtol=0, atol=1e-9)
+            torch.testing.assert_close(tangent_along_ones(f, k), J, rtol=0, atol=1e-9)
+        with pytest.raises(TypeError, match=r"^`event_fn` is followed by the values.*torch\.func\.vmap"):
+            vmap(crossing)(k[None])
+
+    @pytest.mark.parametrize("derivative", [jacfwd, jacrev, lambda f: partial(tangent_along_ones, f)])
+    def test_a_mass_is_kept_as_numbers_and_says_so(self, derivative):
+        def end(mass):
+            return odeint(
+                HamiltonianSystem(lambda q: torch.cos(q).sum(-1), ndof=1, mass=mass), self.y0, T, method="verlet"
+            )[-1]
+
+        with pytest.raises(TypeError, match=r"^`mass` is a tensor that torch differentiates"):
+            derivative(end)(torch.tensor(1.3, dtype=torch.float64))
+
+    @pytest.mark.parametrize("transform", [jacfwd, jacrev, tangent_along_ones, lambda f, k: vmap(f)(k[None])])
+    def test_the_adjoint_of_them_is_refused(self, transform):
+        def end(k):
+            return odeint_adjoint(self.system(k), self.y0, T, method="verlet", options={"dt": 0.1})[-1]
+
+        with pytest.raises(TypeError, match=r"^`odeint_adjoint` is for reverse mode"):
+            apply = transform(end) if transform in (jacfwd, jacrev) else partial(transform, end)
+            apply(torch.tensor(1.3, dtype=torch.float64))
 
 
 class TestEvents:
@@ -384,6 +426,7 @@ class TestBatchesUnderVmap:
 def test_a_flow_that_ships_is_read_outside_of_a_transform(monkeypatch):
     """What is kept from call to call must not be a tensor of a transform that has ended."""
     monkeypatch.setattr("sympflow.integrators.flows._KNOWN", {})
+    monkeypatch.setattr("sympflow.integrators.flows._FLOWS_OF", WeakKeyDictionary())
     end = problem("sympflow")[1]
     first = vmap(jacfwd(end))(Y)
     torch.testing.assert_close(jacobian(end, Y[0]), first[0], **CLOSE)

@@ -1,5 +1,7 @@
 """Our methods inside torchdiffeq's `odeint` and `odeint_event`: the numbers of `solve`, and exact gradients."""
 
+import gc
+import weakref
 from importlib import import_module
 
 import numpy as np
@@ -501,6 +503,65 @@ class TestRegistration:
 
 def right_hand_side(t, y):
     return torch.stack([y[1], -torch.sin(y[0])])
+
+
+class Counted:
+    """The pendulum as a plain function that counts its calls, and can become another one."""
+
+    def __init__(self):
+        self.calls, self.k = 0, 1.0
+
+    def __call__(self, t, y):
+        self.calls += 1
+        return torch.stack([y[..., 1], -self.k * torch.sin(y[..., 0])], -1)
+
+    def run(self, y0=(1.0, 0.5), t=(0.0, 1.0), system=PENDULUM):
+        """The calls that a run costs."""
+        before = self.calls
+        odeint(self, times(*y0), times(*t), method="verlet", options={"dt": 0.1, "system": system})
+        return self.calls - before
+
+
+class TestRemembered:
+    """A right-hand side that a whole run found to be the system is compared at start and end alone in the next."""
+
+    def test_what_was_compared_is_not_compared_again(self):
+        func = Counted()
+        first = func.run()
+        assert first > 15
+        assert func.run() == func.run(t=(0.2, 0.8)) == 2
+
+    def test_elsewhere_it_is_compared_in_full(self):
+        func, fresh = Counted(), Counted()
+        first = func.run()
+        assert func.run(t=(0.0, 3.0)) >= first
+        assert func.run(y0=(-2.5, 0.5)) >= first
+        assert func.run(system=systems.pendulum()) >= first
+        assert fresh.run() == first
+        assert func.run(y0=(-2.5, 0.5), t=(0.0, 3.0)) == 2  # by now it is known there
+
+    def test_a_change_of_the_function_is_seen(self):
+        func = Counted()
+        func.run()
+        func.k = 1.01
+        with pytest.raises(ValueError, match=r"^`func` is not the system"):
+            func.run()
+
+    def test_what_was_refused_is_not_remembered(self):
+        func = Counted()
+        func.k = 1.01
+        with pytest.raises(ValueError, match=r"^`func` is not the system"):
+            func.run()
+        func.k = 1.0
+        assert func.run() > 15
+
+    def test_nothing_is_kept_alive(self):
+        func, system = Counted(), systems.pendulum()
+        func.run(system=system)
+        kept = weakref.ref(func), weakref.ref(system)
+        del func, system
+        gc.collect()
+        assert [reference() for reference in kept] == [None, None]
 
 
 class TestAnotherSystem:

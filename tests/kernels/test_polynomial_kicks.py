@@ -16,6 +16,8 @@ from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import Scheme
 from sympflow.training.starts import Primed
 
+pytestmark = pytest.mark.slow
+
 EPS = np.finfo(float).eps
 HH, QUARTIC = systems.henon_heiles(), systems.quartic()
 MONOMIALS = ((2, 0), (1, 1), (0, 3), (2, 3))

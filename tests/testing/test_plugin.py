@@ -60,6 +60,7 @@ def test_the_command_line_knows_its_system_and_its_method(installed):
     assert "backend = compiled" in result.stdout
 
 
+@pytest.mark.slow
 def test_it_passes_its_own_tests(installed):
     result = run("-m", "pytest", "-q", "-p", "no:cacheprovider", str(PLUGIN / "tests"), path=installed)
     assert result.returncode == 0, result.stdout

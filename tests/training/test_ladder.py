@@ -4,6 +4,7 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pytest
@@ -53,6 +54,7 @@ def three(folder, monkeypatch):
     files = tuple(ShippedFlow.of(path) for path in sorted(folder.glob("*.safetensors")))
     monkeypatch.setattr(catalogue, "_catalogue", lambda: files)
     monkeypatch.setattr(flows, "_KNOWN", {})
+    monkeypatch.setattr(flows, "_FLOWS_OF", WeakKeyDictionary())
     return files
 
 
@@ -296,6 +298,7 @@ def test_every_flow_is_a_map_for_all_times(listed):
     assert at_end <= 10 * listed.one_step_error * max(1.0, omega)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LADDERS)
 def test_shipped_figures_hold(name):
     """Measured again, on states of another seed, over a tenth of the time: no rung is worse than its file says."""

@@ -9,6 +9,7 @@ from sympflow import Box, EnergySublevel, HamiltonianSystem, systems, train
 from sympflow.flow.primed import PrimedFlow
 
 
+@pytest.mark.slow
 def test_own_system_in_a_minute(monkeypatch, capsys):
     example = load_example("own_system_in_a_minute")
     trained = []

@@ -107,6 +107,7 @@ def test_a_blow_up_is_not_a_small_error():
     assert figures["error_100"] is None
 
 
+@pytest.mark.slow
 def test_the_command_trains_and_measures(tmp_path, monkeypatch, capsys):
     fits = [NewFit(optimizer="gauss-newton", points=n, steps=k, seed=i) for i, (n, k) in enumerate(((40, 2), (50, 1)))]
     judge = replace(RECIPES["henon_heiles"].judge, initial=lambda: np.full((2, 4), 0.1))

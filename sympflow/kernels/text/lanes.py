@@ -58,12 +58,12 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop):
             block = min(CHECK_EVERY, n_steps - n)
             if saved < len(save):
                 block = min(block, save[saved] - n)
-            numbers, a = numbers_of(table, first), table[0, first]
+            numbers, a = numbers_of(table, first), drift_of(table, first)
             for _ in range(block):
                 stage_lanes(Y, error, width, numbers, a)
                 for j in range(1, link):
-                    stage_lanes(Y, error, width, numbers_of(table, j), table[0, j])
-                numbers, a = numbers_of(table, link), table[0, link]
+                    stage_lanes(Y, error, width, numbers_of(table, j), drift_of(table, j))
+                numbers, a = numbers_of(table, link), drift_of(table, link)
             next_saved = saved
             while next_saved < len(save) and save[next_saved] == n + block:
                 next_saved += 1
@@ -148,7 +148,7 @@ def map_lanes(table, y, out):
             q, p = unpack(y[block_start + min(lane, count - 1)])
             pack_lane(q, p, Y, lane)
         for j in range(table.shape[1]):
-            stage_lanes(Y, error, width, numbers_of(table, j), table[0, j])
+            stage_lanes(Y, error, width, numbers_of(table, j), drift_of(table, j))
         for lane in range(count):
             q, p = unpack_lane(Y, lane)
             pack(q, p, out[block_start + lane])

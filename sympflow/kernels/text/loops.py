@@ -3,15 +3,16 @@
 The algebra says what a state is: q and p are tuples held in registers (a symbolic system) or arrays changed in place
 (Numba functions). It defines ``unpack``, ``pack``, ``copy``, ``is_finite``, ``move``, ``no_error``, ``drift``,
 ``workspace``, and functions for each kind of kick. `sympflow.kernels.stages` writes what depends on the kinds of kick:
-``numbers_of`` and ``numbers_at``, which read the numbers of a kick from a table, and ``stage``, a kick and a drift.
+``numbers_of`` and ``numbers_at``, which read the numbers of a kick from a table, ``drift_of``, which reads those of a
+drift, and ``stage``, a kick and a drift.
 Where `SCHEDULED`, kicks and ``drifted`` run in an order of operations that is fast, and ``fill_coefficients`` prepares
 their coefficients.
 
-A table has a column for each stage; its first row holds the drifts, the others hold the numbers of the kicks. A run
-executes the columns [opening, inner …, link, closing]. A step is the link (the first step, the opening) and the inner
-stages; consecutive steps share their common kick or drift in the link, and an output is the closing stage applied to a
-copy, so that what is saved never changes the trajectory. The constants `COMPENSATED` and `SCHEDULED` are known when it
-is compiled: Numba leaves dead branches out.
+A table has a column for each stage; its first row holds the drifts, the others hold the numbers of the kicks, and with
+friction those of the drifts (`stages.DampedDrift`). A run executes the columns [opening, inner …, link, closing]. A
+step is the link (the first step, the opening) and the inner stages; consecutive steps share their common kick or drift
+in the link, and an output is the closing stage applied to a copy, so that what is saved never changes the trajectory.
+The constants `COMPENSATED` and `SCHEDULED` are known when it is compiled: Numba leaves dead branches out.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -46,7 +47,7 @@ def close(q, p, q_error, p_error, table, work):
     """The end of a step, from the running state before its last stage, which is left as it is."""
     q, p, q_error, p_error = copy(q), copy(p), copy(q_error), copy(p_error)
     last = table.shape[1] - 1
-    q, p, _, _ = called_stage(q, p, q_error, p_error, numbers_of(table, last), table[0, last], last, work)
+    q, p, _, _ = called_stage(q, p, q_error, p_error, numbers_of(table, last), drift_of(table, last), last, work)
     return q, p
 
 
@@ -58,7 +59,9 @@ def first_non_finite(q, p, table, first, n_steps, work):
     j = first
     for n in range(1, n_steps):
         for _ in range(link):
-            q, p, q_error, p_error = called_stage(q, p, q_error, p_error, numbers_of(table, j), table[0, j], j, work)
+            q, p, q_error, p_error = called_stage(
+                q, p, q_error, p_error, numbers_of(table, j), drift_of(table, j), j, work
+            )
             j = j + 1 if j < link else 1
         end_q, end_p = close(q, p, q_error, p_error, table, work)
         if not is_finite(end_q, end_p):
@@ -94,7 +97,7 @@ def rollout(table, y0, n_steps, save, out, stop):
             block = min(block, save[saved] - n)
         start_q, start_p, begin = copy(q), copy(p), j
         for _ in range(block * link):
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, numbers_of(table, j), table[0, j], j, work)
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, numbers_of(table, j), drift_of(table, j), j, work)
             j = j + 1 if j < link else 1
         end_q, end_p = close(q, p, q_error, p_error, table, work)
         if not is_finite(end_q, end_p):
@@ -146,7 +149,9 @@ def map_each(table, y, out):
         q, p = unpack(y[i])
         q_error, p_error = no_error(q), no_error(p)
         for j in range(table.shape[1]):
-            q, p, q_error, p_error = called_stage(q, p, q_error, p_error, numbers_of(table, j), table[0, j], j, work)
+            q, p, q_error, p_error = called_stage(
+                q, p, q_error, p_error, numbers_of(table, j), drift_of(table, j), j, work
+            )
         pack(q, p, out[i])
 
 

@@ -1,0 +1,93 @@
+"""Friction p' = −Γp, alone and with the drift q' = M⁻¹p: linear fields, of which the flows are exact."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sympflow.arrays import Array, is_tensor, library
+
+
+class Friction:
+    """The friction of a damped system, p' = −∂H/∂q − Γp.
+
+    Parameters
+    ----------
+    damping : ndarray of shape (), (d,) or (d, d)
+        Γ, symmetric and positive semi-definite, in its simplest form: see `matrices.damping`.
+
+    Attributes
+    ----------
+    rates : ndarray of shape () or (d,)
+        The eigenvalues of Γ, none negative.
+    """
+
+    def __init__(self, damping: np.ndarray) -> None:
+        self.damping = damping
+        damping.setflags(write=False)
+        self.rates, self._modes = damping, None
+        if damping.ndim == 2:
+            rates, self._modes = np.linalg.eigh(damping)
+            self.rates = np.maximum(rates, 0.0)  # −0 and what rounding leaves below it
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Friction, (self.damping.copy(),)
+
+    @property
+    def isotropic(self) -> bool:
+        """True for Γ = γ, one rate for all momenta: then the flow is conformally symplectic."""
+        return self.damping.ndim == 0
+
+    @property
+    def largest(self) -> float:
+        """The largest of the rates."""
+        return float(self.rates.max())
+
+    def matrix(self, ndof: int) -> np.ndarray:
+        """Γ as a matrix (d, d)."""
+        return self.damping if self.damping.ndim == 2 else np.diag(np.broadcast_to(self.damping, ndof))
+
+    def force(self, p: Array) -> Array:
+        """−Γp: (..., d) to (..., d)."""
+        G = _like(self.damping, p)
+        return -(p @ G) if G.ndim == 2 else -(G * p)
+
+    def drift(self, p: Array, s: Any) -> tuple[Array, Array]:
+        """∫₀ˢ e^{−Γu}p du and e^{−Γs}p, for p (..., d) and times s: a number, or one that broadcasts against p.
+
+        By the first, times M⁻¹, a drift with friction moves q; the second is its momentum at the end. s has any sign.
+        """
+        rates = _like(self.rates, p)
+        mean, decay = _factors(rates, s)
+        if self._modes is None:
+            return mean * p, decay * p
+        Q = _like(self._modes, p)
+        z = p @ Q
+        return (mean * z) @ Q.T, (decay * z) @ Q.T
+
+    def factors(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The two linear maps of `drift` for times s (m,), as numbers: (m, 1), diagonals (m, d) or matrices (m, d²)."""
+        mean, decay = _factors(self.rates, s if self.rates.ndim == 0 else s[:, None])
+        if self._modes is None:
+            return mean.reshape(len(s), -1), decay.reshape(len(s), -1)
+        Q = self._modes
+        return tuple((Q * each[:, None, :] @ Q.T).reshape(len(s), -1) for each in (mean, decay))
+
+
+def _factors(rates: Array, s: Any) -> tuple[Array, Array]:
+    """(1 − e^{−γs})/γ and e^{−γs}, the first s where γs is 0."""
+    x = rates * s
+    xp = library(x)
+    x = x if is_tensor(x) else np.asarray(x)
+    still = x == 0
+    safe = xp.where(still, 1.0 + 0.0 * x, x)
+    return s * xp.where(still, 1.0 + 0.0 * x, -xp.expm1(-safe) / safe), xp.exp(-x)
+
+
+def _like(constant: np.ndarray, x: Array) -> Array:
+    if is_tensor(x):
+        import torch
+
+        return torch.tensor(constant, dtype=x.dtype, device=x.device)
+    return constant.astype(x.dtype, copy=False)
