@@ -64,7 +64,7 @@ def farther_states(y: np.ndarray, reached: np.ndarray) -> np.ndarray:
     """Those of the states (N, width) of a run that lie farthest beyond what `reach` gave, of its first components."""
     low, high = reached
     seen = y[:, : len(low)]
-    if (seen.min(0) >= low).all() and (seen.max(0) <= high).all():
+    if not len(y) or ((seen.min(0) >= low).all() and (seen.max(0) <= high).all()):
         return y[:0]
     y = y[np.isfinite(y).all(-1)]
     if not len(y):
