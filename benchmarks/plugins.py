@@ -1,4 +1,4 @@
-"""What a third party's method costs: Ruth's, as a scheme and written as a step, with and without a batch.
+"""Cost of a third party's method: Ruth's, as a scheme and written as a step, with and without a batch.
 
     python benchmarks/plugins.py                      # a table; seconds on one core
     python benchmarks/plugins.py --out docs/measured
@@ -63,7 +63,7 @@ def best(both: tuple[Callable[[], Any], ...], repeats: int) -> list[float]:
 
 
 def rows(scale: int = 1, repeats: int = REPEATS) -> list[tuple[str, float, float]]:
-    """What is run, and the times of the scheme and of the step; with fewer steps by the factor `scale`."""
+    """Label of a run, and the times of the scheme and of the step; with fewer steps by the factor `scale`."""
     found = []
     for n_steps, trajectories in ((2000 // scale, 1), (200 // scale, 1000 // scale)):
         name = f"{trajectories} {'trajectory' if trajectories == 1 else 'trajectories'}, {n_steps} steps"

@@ -119,6 +119,22 @@ def values(x: Any) -> np.ndarray | None:
         return plain.cpu().numpy().transpose(order)
 
 
+def values_of_times(t: Any, remedy: str) -> np.ndarray:
+    """Return the values of times that say how many steps are made, as `values` does.
+
+    Raises
+    ------
+    TypeError
+        If there are none, with the remedy.
+    """
+    found = values(t)
+    if found is None:
+        raise TypeError(
+            f"`t` is a tensor without values where torch.compile traces, but it says how many steps are made: {remedy}."
+        )
+    return found
+
+
 def has_values(x: Array) -> bool:
     """Return True unless `x` is a tensor without values, in a graph that `torch.compile` traces."""
     return not is_tensor(x) or _behind(x)[0] is not None

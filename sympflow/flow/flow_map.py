@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.arguments import plain
-from sympflow.arrays import differentiable, finite_states, has_values, is_tensor, readable, values
+from sympflow.arrays import differentiable, finite_states, has_values, is_tensor, readable, values, values_of_times
 from sympflow.flow.certificate import Certificate, certify
 from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
@@ -596,20 +596,8 @@ class FlowMap(nn.Module):
 
 
 def to_values(t: Tensor) -> np.ndarray:
-    """Return the values of times, with those of all lanes of `torch.func.vmap`.
-
-    Raises
-    ------
-    TypeError
-        If there are none, in a graph that `torch.compile` traces.
-    """
-    found = values(t)
-    if found is None:
-        raise TypeError(
-            "`t` is a tensor without values where torch.compile traces, but it says how many steps of Δt are made: "
-            "pass a number, or call psi(t, x), for t in [0, Δt]."
-        )
-    return found
+    """Values of times, with those of all lanes of `torch.func.vmap`."""
+    return values_of_times(t, "pass a number, or call psi(t, x), for t in [0, Δt]")
 
 
 def _where(active: Tensor, step: Callable[[Tensor, Tensor], Tensor], t: Tensor, x: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ LONGEST_EXPRESSION = 20_000
 LONGEST_COMPARED = 2_000
 """Characters of two formulas that are compared as such, where their texts differ."""
 TOLERANCE = 1e-9
-"""Of the largest difference of energies among the states."""
+"""Share of the largest difference of energies among the states."""
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:

@@ -61,7 +61,7 @@ def reach(states: np.ndarray) -> np.ndarray:
 
 
 def farther_states(y: np.ndarray, reached: np.ndarray) -> np.ndarray:
-    """Those of the states (N, width) of a run that lie farthest beyond what `reach` gave, of its first components."""
+    """States of a run (N, width), a few, that lie farthest beyond what `reach` gave, in its first components."""
     low, high = reached
     seen = y[:, : len(low)]
     if not len(y) or ((seen.min(0) >= low).all() and (seen.max(0) <= high).all()):

@@ -49,8 +49,8 @@ class Composition(ABC):
 
     compensates: ClassVar[bool] = False
     """True if there are compensated sums."""
-    extends: ClassVar[bool] = False
-    """True if the steps are made on an extended phase space, whose states a run keeps from step to step."""
+    keeps: ClassVar[str] = ""
+    """Name of what a run keeps from step to step beside the state, where steps are made on an extended phase space."""
     counts_as_scheme: ClassVar[bool] = True
     """True if a step evaluates as many forces as the scheme says, whatever the system."""
     takes_friction: ClassVar[bool] = False
@@ -435,7 +435,7 @@ class TwoCopies(SolvableParts):
     """Strang steps over H(q, y), H(x, p) and the coupling of two copies of phase space, for any H: see `copies`."""
 
     label = "copies"
-    extends = True
+    keeps = "the second copy of phase space"
 
     def __init__(
         self,

@@ -138,7 +138,7 @@ class Integrator:
     tangent_holds: ClassVar[str] = ""
     """The quantity that `tangent` holds fixed though a step from a neighbouring state would change it."""
     keeps: ClassVar[str] = ""
-    """What a run keeps from step to step beside the state y, and `step` from y alone does not know."""
+    """Name of what a run keeps from step to step beside the state y, so that `step` from y alone does not know it."""
 
     @classmethod
     def options(cls) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What is looked at after a run of a trained flow: is the system its own, and where did the solution leave Ω?"""
+"""Checks after a run of a trained flow: is the system its own, and where did the solution leave Ω?"""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from sympflow.events import EventSearch
 from sympflow.integrators.contract import Outcome, Problem
 
 APART = 0.1
-"""Of the largest coordinate or momentum of the run: the distance of two copies beyond which its states mean little."""
+"""Distance of two copies, over the largest coordinate or momentum of the run, beyond which its states mean little."""
 
 
 class Extension(Protocol):

@@ -314,63 +314,20 @@ class ImplicitMidpoint(Gauss):
     tableau: ClassVar[Tableau] = gauss_legendre(1)
 
 
-@dataclass(frozen=True)
-class GaussLegendre4(Gauss):
-    """The Gauss–Legendre method of two stages: order 4, symplectic, symmetric, A-stable.
-
-    Parameters
-    ----------
-    dt, compensated
-        As for `Gauss`.
-
-    References
-    ----------
-    .. [1] E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, 2nd ed. (Springer 2006), II.1.3, VI.4.
-    """
-
-    name: ClassVar[str] = "gauss_legendre4"
-    source: ClassVar[str] = f"{_BUTCHER}, the Gauss method of two stages; {_SYMPLECTIC}"
-    order: ClassVar[int | None] = 4
-    tableau: ClassVar[Tableau] = gauss_legendre(2)
+def _gauss_legendre_method(stages: int, count: str) -> type[Gauss]:
+    """The integrator class of the Gauss–Legendre method of so many stages."""
+    summary = f"The Gauss–Legendre method of {count} stages: order {2 * stages}, symplectic, symmetric, A-stable."
+    namespace: dict[str, Any] = {
+        "name": f"gauss_legendre{2 * stages}",
+        "source": f"{_BUTCHER}, the Gauss method of {count} stages; {_SYMPLECTIC}",
+        "order": 2 * stages,
+        "tableau": gauss_legendre(stages),
+        "__doc__": f"{summary}\n\n{Gauss.__doc__}",
+        "__module__": __name__,
+    }
+    return dataclass(frozen=True)(type(f"GaussLegendre{2 * stages}", (Gauss,), namespace))
 
 
-@dataclass(frozen=True)
-class GaussLegendre6(Gauss):
-    """The Gauss–Legendre method of three stages: order 6, symplectic, symmetric, A-stable.
-
-    Parameters
-    ----------
-    dt, compensated
-        As for `Gauss`.
-
-    References
-    ----------
-    .. [1] J. C. Butcher, "Implicit Runge–Kutta processes", Math. Comp. 18 (1964) 50–64.
-    .. [2] E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, 2nd ed. (Springer 2006), II.1.3, VI.4.
-    """
-
-    name: ClassVar[str] = "gauss_legendre6"
-    source: ClassVar[str] = f"{_BUTCHER}, the Gauss method of three stages; {_SYMPLECTIC}"
-    order: ClassVar[int | None] = 6
-    tableau: ClassVar[Tableau] = gauss_legendre(3)
-
-
-@dataclass(frozen=True)
-class GaussLegendre8(Gauss):
-    """The Gauss–Legendre method of four stages: order 8, symplectic, symmetric, A-stable.
-
-    Parameters
-    ----------
-    dt, compensated
-        As for `Gauss`.
-
-    References
-    ----------
-    .. [1] J. C. Butcher, "Implicit Runge–Kutta processes", Math. Comp. 18 (1964) 50–64.
-    .. [2] E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, 2nd ed. (Springer 2006), II.1.3, VI.4.
-    """
-
-    name: ClassVar[str] = "gauss_legendre8"
-    source: ClassVar[str] = f"{_BUTCHER}, the Gauss method of four stages; {_SYMPLECTIC}"
-    order: ClassVar[int | None] = 8
-    tableau: ClassVar[Tableau] = gauss_legendre(4)
+GaussLegendre4 = _gauss_legendre_method(2, "two")
+GaussLegendre6 = _gauss_legendre_method(3, "three")
+GaussLegendre8 = _gauss_legendre_method(4, "four")

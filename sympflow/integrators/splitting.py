@@ -92,19 +92,18 @@ class OfClock:
 
 
 class OfGrid:
-    """Whether a peer can drive the steps: equal ones in t, of the state y alone."""
+    """True if a peer can drive the steps: equal ones in t, of the state y alone."""
 
     def __get__(self, method: Splitting | None, cls: type[Splitting]) -> bool:
         triple = cls if method is None else method
-        return not (CLOCKS[triple.clock].in_another_time or SPLITTINGS[triple.splitting].extends)
+        return not (CLOCKS[triple.clock].in_another_time or SPLITTINGS[triple.splitting].keeps)
 
 
 class Kept:
-    """What a run keeps beside y."""
+    """Name of what a run keeps beside y: that of the splitting."""
 
     def __get__(self, method: Splitting | None, cls: type[Splitting]) -> str:
-        extends = SPLITTINGS[(cls if method is None else method).splitting].extends
-        return "the second copy of phase space" if extends else ""
+        return SPLITTINGS[(cls if method is None else method).splitting].keeps
 
 
 @dataclass(frozen=True, repr=False)

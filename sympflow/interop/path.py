@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sympflow.arrays import differentiable, readable, to_numpy, values
+from sympflow.arrays import differentiable, readable, to_numpy, values_of_times
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid
@@ -22,6 +22,11 @@ MAX_EVENT_STEPS = 1_000_000
 _EPS = 4 * float(np.finfo(float).eps)
 BeforeStep = Callable[[float, Tensor, float], None]
 """Called before a step with the elapsed time, the state and the signed length."""
+
+
+def numbers(t: Tensor) -> np.ndarray:
+    """Values of times, of all lanes of `torch.func.vmap`, (..., n)."""
+    return values_of_times(t, "use sympflow.solve, whose times are numbers")
 
 
 class Path:
@@ -380,23 +385,6 @@ class _PulledBack(torch.autograd.Function):
                 if of_h is not None:
                     of_s[i] = of_h.sum()
         return None, of_s.to(ctx.dtype) if ctx.needs_input_grad[1] else None, a, *of_parameters
-
-
-def numbers(t: Tensor) -> np.ndarray:
-    """The values of times, of all lanes of `torch.func.vmap`, (..., n).
-
-    Raises
-    ------
-    TypeError
-        If there are none, in a graph that `torch.compile` traces.
-    """
-    found = values(t)
-    if found is None:
-        raise TypeError(
-            "`t` is a tensor without values where torch.compile traces, but it says how many steps are made: use "
-            "sympflow.solve, whose times are numbers."
-        )
-    return found
 
 
 def leaves(system: HamiltonianSystem, y: Tensor) -> list[Tensor]:

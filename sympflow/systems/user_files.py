@@ -102,13 +102,13 @@ def factory(path: str | os.PathLike[str], name: str | None = None) -> Callable[.
             return factory(file, names[0])
         has = f"it has {', '.join(names)}" if names else "it has none"
         raise ValueError(f"`system` {str(file)!r} lacks the name of a system in it ({has}): write {file.name}:NAME.")
-    if not hasattr(module, name):
+    if name not in vars(module):
         candidates = _candidates(module)
         close = difflib.get_close_matches(name, candidates, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
         has = f"It has {', '.join(candidates)}." if candidates else "It has no system."
         raise ValueError(f"`system` {name!r} is not in {str(file)!r}.{hint} {has}")
-    found = getattr(module, name)
+    found = vars(module)[name]
     if isinstance(found, HamiltonianSystem):
         return lambda: found
     if not callable(found):

@@ -27,7 +27,7 @@ def test_every_row_is_a_scheme_a_splitting_and_a_clock_of_the_tables(name):
     assert (method.splitting, method.clock) == (row.splitting, row.clock)
     assert method.source
     assert method.finds_events == (row.clock == "physical")
-    assert method.on_grid == (row.clock == "physical" and not SPLITTINGS[row.splitting].extends)
+    assert method.on_grid == (row.clock == "physical" and not SPLITTINGS[row.splitting].keeps)
     assert pickle.loads(pickle.dumps(method)) == method
 
 
