@@ -59,7 +59,7 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials 
     ValueError
         If a function in H has no counterpart in compiled code.
     """
-    key = symbols.H, level, monomials
+    key = symbols.H, symbols.parameters, level, monomials
     if key not in _SOURCES:
         if len(_SOURCES) >= MOST_KEPT:
             del _SOURCES[next(iter(_SOURCES))]
@@ -88,7 +88,7 @@ def kick_cycles(symbols: SymbolicHamiltonian, level: int) -> float:
     return min(_scheduled(symbols, shape, "kick_", common).cycles for common in (True, False))
 
 
-_SOURCES: dict[tuple[sp.Expr, int, Monomials], str] = {}
+_SOURCES: dict[tuple[sp.Expr, tuple[sp.Symbol, ...], int, Monomials], str] = {}
 """Sources by H: systems are often made again, and the search takes a tenth of a second or more."""
 
 

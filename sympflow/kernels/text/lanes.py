@@ -22,12 +22,12 @@ def empty_lanes():
 
 
 @njit(**OPTIONS)
-def close_lane(Y, error, lane, table, work):
+def close_lane(Y, error, lane, table, k, work):
     q, p = unpack_lane(Y, lane)
     q_error, p_error = no_error(q), no_error(p)
     if COMPENSATED:
         q_error, p_error = unpack_lane(error, lane)
-    return close(q, p, q_error, p_error, table, work)
+    return close(q, p, q_error, p_error, table, k, work)
 
 
 @njit(**OPTIONS)
@@ -58,12 +58,12 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop):
             block = min(CHECK_EVERY, n_steps - n)
             if saved < len(save):
                 block = min(block, save[saved] - n)
-            numbers, a = numbers_of(table, first), drift_of(table, first)
-            for _ in range(block):
+            numbers, a = numbers_of(table, first, n), drift_of(table, first)
+            for k in range(n, n + block):
                 stage_lanes(Y, error, width, numbers, a)
                 for j in range(1, link):
-                    stage_lanes(Y, error, width, numbers_of(table, j), drift_of(table, j))
-                numbers, a = numbers_of(table, link), drift_of(table, link)
+                    stage_lanes(Y, error, width, numbers_of(table, j, k), drift_of(table, j))
+                numbers, a = numbers_of(table, link, k + 1), drift_of(table, link)
             next_saved = saved
             while next_saved < len(save) and save[next_saved] == n + block:
                 next_saved += 1
@@ -71,10 +71,10 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop):
                 i = block_start + lane
                 if n_finite[i] < n_steps:
                     continue
-                q, p = close_lane(Y, error, lane, table, work)
+                q, p = close_lane(Y, error, lane, table, n + block, work)
                 if not is_finite(q, p):
                     q, p = unpack_lane(start, lane)
-                    before = first_non_finite(q, p, table, first, block, work) - 1
+                    before = first_non_finite(q, p, table, first, n, block, work) - 1
                     n_finite[i] = n + before
                     n_alive -= 1
                     fill_with_nan(out[i], saved)
@@ -113,8 +113,8 @@ def fill_lanes(Y, width, row, coefficients, factor):
 
 
 @njit(**OPTIONS)
-def step_lanes(table, x, h, y, out):
-    """`step_each`, `LANES` rows at a time.
+def step_lanes(table, x, h, t, y, out):
+    """`step_each`, `LANES` rows at a time, of systems that do not depend on the time.
 
     All numbers lie in one array: of several the compiler would have to find out that they do not overlap.
     """
