@@ -17,7 +17,7 @@ import sympy as sp
 
 from sympflow.hamiltonian.driving import DURATION, Samples, drift, sampled
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.kernels.codegen import printed, statements
+from sympflow.kernels.codegen import printed, sampled_name, statements
 from sympflow.kernels.stages import Kick, numbers_of_kicks, time_lines
 
 __all__ = ["Driving", "driven_form"]
@@ -80,18 +80,17 @@ class Driving:
         names = [s.name for s in self.letters]
         integrals = [f"integral_{i}" for i in range(len(self.means))]
         wanted = [*self.letters.values(), *(integral for _, integral in self.means.values())]
-        in_code = {self.time: sp.Symbol("time", real=True), DURATION: sp.Symbol("length", real=True)}
-        lines = statements([*names, *integrals], [f.xreplace(in_code).replace(sampled, _called) for f in wanted])
+        lines = statements([*names, *integrals], [in_code(f, self.time, "time") for f in wanted])
         for (mean, (f, _)), integral in zip(self.means.items(), integrals, strict=True):
-            now = printed(f.xreplace(in_code).replace(sampled, _called))
+            now = printed(in_code(f, self.time, "time"))
             lines.append(f"{mean} = {integral} / length if length != 0.0 else {now}")
         return lines
 
-    @cached_property
+    @property
     def _sampled_sources(self) -> list[str]:
-        wanted = [*self.letters.values(), *(f for pair in self.means.values() for f in pair)]
-        functions = {(a.name_of_samples, a.order) for f in wanted for a in f.atoms(sampled)}
-        return [_sampled_source(name, order, self.samples[name]) for name, order in sorted(functions)]
+        return sampled_sources(
+            [*self.letters.values(), *(f for pair in self.means.values() for f in pair)], self.samples
+        )
 
 
 def driven_form(symbols: SymbolicHamiltonian) -> Driving:
@@ -149,13 +148,21 @@ def _with_letters(
 # functions of samples ---------------------------------------------------------------------------------------------
 
 
-def _called(name: sp.Basic, order: sp.Expr, at: sp.Expr) -> sp.Expr:
-    """A call of the compiled function of samples."""
-    return sp.Function(_function_name(str(name), int(order)), real=True)(at)
+def in_code(f: sp.Expr, time: sp.Symbol, name: str) -> sp.Expr:
+    """The expression with the variable `name` for the time, and `length` for a duration."""
+    return f.xreplace({time: sp.Symbol(name, real=True), DURATION: sp.Symbol("length", real=True)})
 
 
-def _function_name(name: str, order: int) -> str:
-    return f"sampled_{name}_{order}".replace("-", "m")
+def sampled_sources(expressions: Sequence[sp.Expr], samples: Mapping[str, Samples]) -> list[str]:
+    """The functions of samples that the expressions hold.
+
+    Raises
+    ------
+    ValueError
+        As `_sampled_source`.
+    """
+    functions = {(a.name_of_samples, a.order) for f in expressions for a in f.atoms(sampled)}
+    return [_sampled_source(name, order, samples[name]) for name, order in sorted(functions)]
 
 
 def _sampled_source(name: str, order: int, samples: Samples) -> str:
@@ -164,34 +171,32 @@ def _sampled_source(name: str, order: int, samples: Samples) -> str:
     Raises
     ------
     ValueError
-        If there are too many for compiled code to hold, or the integral is that of periodic ones.
+        If there are more than compiled code holds.
     """
-    c, x = samples.derivative(order)
+    c, x = samples.polynomials(order), samples.x
     if c.size > MOST_SAMPLED:
         raise ValueError(
             f"`params` has samples of {len(x)} times, more than compiled code holds: give fewer than "
             f"{MOST_SAMPLED // len(c)}, or use backend='array'."
         )
-    if samples.periodic and order < 0:
-        raise ValueError("`params` has periodic samples within the kinetic energy: use backend='array'.")
-    called, n = _function_name(name, order), len(x) - 1
-    width = (x[-1] - x[0]) / n
-    uniform = bool(np.all(np.abs(np.diff(x) - width) <= UNIFORM * width))
-    lines = []
+    called, n, first, last = sampled_name(name, order), len(x) - 1, float(x[0]), float(x[-1])
+    width = (last - first) / n
+    lines, rest = [], ""
     if samples.periodic:
-        lines.append(f"t = t - {x[-1] - x[0]!r} * math.floor((t - {float(x[0])!r}) / {float(x[-1] - x[0])!r})")
-    if uniform:
-        lines.append(f"i = int(math.floor((t - {float(x[0])!r}) * {float(1 / width)!r}))")
+        lines += [f"turns = math.floor((t - {first!r}) / {last - first!r})", f"t = t - turns * {last - first!r}"]
+        rest = f" + turns * {float(np.polyval(c[:, -1], last - float(x[-2])))!r}" if order < 0 else ""
+    if np.all(np.abs(np.diff(x) - width) <= UNIFORM * width):
+        lines.append(f"i = int(math.floor((t - {first!r}) * {1 / width!r}))")
     else:
         lines.append(f"i = np.searchsorted(TIMES_{called}, t, side='right') - 1")
     lines += [f"i = max(0, min(i, {n - 1}))", f"s = t - TIMES_{called}[i]", f"total = OF_{called}[i, 0]"]
     lines += [f"total = total * s + OF_{called}[i, {k}]" for k in range(1, len(c))]
-    constants = (
-        f"TIMES_{called} = np.array({x.tolist()})\nOF_{called} = np.array({np.ascontiguousarray(c.T).tolist()})"
+    constants = f"TIMES_{called} = np.array({x.tolist()})\nOF_{called} = np.array({c.T.tolist()})"
+    return "\n    ".join(
+        [f"import numpy as np\n\n{constants}\n\n\n@njit(**OPTIONS)\ndef {called}(t):", *lines, f"return total{rest}"]
     )
-    return f"import numpy as np\n\n{constants}\n\n\n" + _function(f"{called}(t)", lines, ["total"], False)
 
 
-def _function(head: str, lines: Sequence[str], results: Sequence[str], several: bool = True) -> str:
-    returned = f"return ({''.join(f'{result}, ' for result in results)})" if several else f"return {results[0]}"
+def _function(head: str, lines: Sequence[str], results: Sequence[str]) -> str:
+    returned = f"return ({''.join(f'{result}, ' for result in results)})"
     return "\n    ".join([f"@njit(**OPTIONS)\ndef {head}:", *lines, returned])

@@ -225,8 +225,8 @@ def bend_source(
     return _source(f, variables, name, "q, v, out", "out[:] = 0.0", bend, letters=letters)
 
 
-def gradient_and_hessian_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> str:
-    """``name(q, out, S)``: ∇f into out and ∇²f into S."""
+def gradient_and_hessian_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, time: str) -> str:
+    """``name(q, out, S, time)``: ∇f into out and ∇²f into S, of f that may hold the symbol of that time."""
 
     def both(family: Family) -> dict[str, sp.Expr]:
         slopes = _slopes(family.f, family.x)
@@ -236,7 +236,7 @@ def gradient_and_hessian_source(f: sp.Expr, variables: Sequence[sp.Symbol], name
                 targets[f"S[i_{j}, i_{k}]"] = entry
         return targets
 
-    return _source(f, variables, name, "q, out, S", "out[:] = 0.0\n    S[:] = 0.0", both)
+    return _source(f, variables, name, f"q, out, S, {time}", "out[:] = 0.0\n    S[:] = 0.0", both)
 
 
 def _slopes(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[sp.Expr]:
