@@ -8,7 +8,7 @@ import pytest
 import sympflow
 from sympflow import HamiltonianSystem, solve
 
-LAM = np.array([0.3, 0.0, 1.0, 0.7, 0.3, -1.0, 0.5])
+LAM = np.array([0.3, 0.0, 0.7, 0.3])
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ class TestTrajectories:
     def test_shapes_broadcast_with_those_of_the_states(self, system, y0):
         grid = {"lam": LAM[:, None], "m": [1.0, 2.0]}
         sol = solve(system, "verlet", (0, 1), params=grid, dt=0.25, dense_output=True)
-        assert sol.y.shape == (7, 2, 4, 5) and sol.params["m"].shape == (7, 2)
+        assert sol.y.shape == (4, 2, 4, 5) and sol.params["m"].shape == (4, 2)
         np.testing.assert_array_equal(sol.sol(1.0), sol.y[..., -1])
         one = solve(system.with_params(lam=LAM[3], m=2.0), "verlet", (0, 1), system.y0[None], dt=0.25, dense_output=True)
         np.testing.assert_array_equal(sol.sol([0.1, 0.6])[3, 1], one.sol([0.1, 0.6])[0])
@@ -69,11 +69,11 @@ class TestTrajectories:
 
     def test_a_failure_is_of_its_trajectory_alone(self, system, y0):
         y0 = y0.copy()
-        y0[3] = 1e3
+        y0[2] = 1e3
         sol = solve(system, "verlet", (0, 3), y0, params={"lam": LAM}, dt=0.25)
-        assert sol.status.tolist() == [0, 0, 0, -1, 0, 0, 0]
-        assert "the first at 3 (lam = 0.7)" in sol.message and np.isfinite(sol.stats["failed_at"][3])
-        np.testing.assert_array_equal(sol.y[4], own(system, "verlet", y0, 4, dt=0.25).y[0])
+        assert sol.status.tolist() == [0, 0, -1, 0]
+        assert "the first at 2 (lam = 0.7)" in sol.message and np.isfinite(sol.stats["failed_at"][2])
+        np.testing.assert_array_equal(sol.y[3], own(system, "verlet", y0, 3, dt=0.25).y[0])
 
     def test_pickles(self, system, y0):
         sol = solve(system, "verlet", (0, 1), y0, params={"lam": LAM}, dt=0.25)
@@ -116,11 +116,11 @@ class TestRefusals:
             ({"lam": "a"}, TypeError, "finite real numbers"),
             ({"lam": [True]}, TypeError, "finite real numbers"),
             ({"lam": [1.0, np.nan]}, ValueError, r"lam = nan at \(1,\)"),
-            ({"lam": np.ones(3)}, ValueError, r"broadcast with the batch \(7,\)"),
+            ({"lam": np.ones(3)}, ValueError, r"broadcast with the batch \(4,\)"),
             ({"lam": []}, ValueError, "no values of lam"),
             ({}, ValueError, "empty"),
             (3, TypeError, "a mapping"),
-            ({"m": [1.0] * 6 + [0.0]}, ValueError, r"m = 0 \(trajectory 6\)"),
+            ({"m": [1.0, 1.0, 1.0, 0.0]}, ValueError, r"m = 0 \(trajectory 3\)"),
         ],
     )
     def test_bad_values(self, system, y0, params, error, words):

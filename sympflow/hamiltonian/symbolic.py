@@ -75,6 +75,7 @@ class SymbolicHamiltonian(Definition):
         self.p = tuple(sp.symbols(f"p1:{ndof + 1}", real=True))
         numbered = {sp.Symbol("q", real=True): self.q[0], sp.Symbol("p", real=True): self.p[0]}
         if values:
+            _check_values(H, values)
             self._written = written.xreplace(numbered), values
         self._set(H.xreplace(numbered))
 
@@ -330,6 +331,14 @@ def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
         meant = "".join(f" {_AMBIGUOUS[name]}." for name in unknown if name in _AMBIGUOUS)
         raise ValueError(f"`expression` holds {', '.join(unknown)} without a value: give it in `params`.{meant}")
     return H
+
+
+def _check_values(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
+    """Refuse values with which H is not finite or not real, as a mass of 0 or the root of a negative number."""
+    numbers = [abs(a) for a in H.atoms(sp.Number)]
+    if H.has(sp.I, sp.zoo, sp.nan, sp.oo) or any(a > LARGEST for a in numbers):
+        shown = ", ".join(f"{s} = {float(value):.9g}" for s, value in values.items())
+        raise ValueError(f"`params` has {shown}, with which the expression is not a finite real one: change them.")
 
 
 class _Letters:
