@@ -173,7 +173,7 @@ def physical_solution(sol: Solution) -> Solution:
     if apart > LARGEST_DIFFERENCE * size:
         warnings.warn(
             f"The doubled variables q₋, p₋ have grown to {apart:.3g}: the run has left the physical limit. Reduce "
-            "`dt`, or project every step, by the method 'physical'.",
+            "`dt`, or project every step, solve(system, 'projected', of=method).",
             RuntimeWarning,
             stacklevel=3,
         )

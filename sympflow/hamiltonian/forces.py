@@ -63,9 +63,7 @@ class SymbolicForce:
     def _valued(self, f: sp.Expr, values: Mapping[str, float]) -> sp.Expr:
         """The expression in the system's coordinates, its parameters replaced by their values."""
         d = len(self.q)
-        known: dict[sp.Symbol, sp.Expr] = {
-            sp.Symbol(name, real=True): _number(value) for name, value in values.items()
-        }
+        known: dict[sp.Symbol, sp.Expr] = {sp.Symbol(name, real=True): _number(value) for name, value in values.items()}
         if d == 1:
             known |= {sp.Symbol("q", real=True): self.q[0], sp.Symbol("p", real=True): self.p[0]}
         f = f.xreplace(known)
@@ -111,9 +109,7 @@ class SymbolicForce:
         F, q = self.expressions, self.q
         if any(f.free_symbols & {*self.p} for f in F):
             return False
-        return all(
-            sp.expand(sp.diff(F[i], q[j]) - sp.diff(F[j], q[i])) == 0 for i in range(len(q)) for j in range(i)
-        )
+        return all(sp.expand(sp.diff(F[i], q[j]) - sp.diff(F[j], q[i])) == 0 for i in range(len(q)) for j in range(i))
 
 
 def doubled_hamiltonian(system: HamiltonianSystem, force: SymbolicForce) -> sp.Expr:

@@ -12,7 +12,6 @@ import numpy as np
 from sympflow.arrays import Array, concatenate, is_tensor
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.doubling import DoubledSystem
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
@@ -26,6 +25,24 @@ class ExternalForce(Protocol):
 
     def jacobian(self, q: Array, p: Array) -> Array:
         """∂F/∂(q, p): (..., d), each, to (..., d, 2d)."""
+        ...
+
+
+class Doubled(Protocol):
+    """A system in twice the variables: see `sympflow.doubled`."""
+
+    physical: Any
+
+    def lift(self, y: Array) -> Array:
+        """The state for a physical one: (..., 2d) to (..., 4d)."""
+        ...
+
+    def physical_limit(self, y: Array) -> Array:
+        """The physical part of a state: (..., 4d) to (..., 2d)."""
+        ...
+
+    def difference(self, y: Array) -> Array:
+        """The rest of a state, 0 in the physical limit: (..., 4d) to (..., 2d)."""
         ...
 
 
@@ -135,7 +152,7 @@ class Hamiltonian:
         forced.name, forced.external_force = f"{self.name}_forced", force
         return forced
 
-    def as_doubled(self) -> DoubledSystem:
+    def as_doubled(self) -> Doubled:
         """Return the system itself if it is a doubled one.
 
         Raises
@@ -144,8 +161,8 @@ class Hamiltonian:
             If it is none.
         """
         raise ValueError(
-            f"`system` {self.name!r} is no doubled one, so that its solution is the physical one as it is: leave "
-            "physical() out."
+            f"`system` {self.name!r} is no doubled one, so that its states are the physical ones as they are: make one "
+            "by sympflow.doubled(system, force), or leave out what asks for its physical limit."
         )
 
     def lift(self, y: Array) -> Array:
