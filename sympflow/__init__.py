@@ -19,6 +19,7 @@ _HOME = {
     "time_transformed": "hamiltonian.time_transformation",
     "doubled": "hamiltonian.doubling",
     "solve": "solver",
+    "ensemble": "ensembles.sweep",
     "Solution": "solution",
     "get": "integrators.registry",
     "available": "integrators.registry",
@@ -53,6 +54,7 @@ __all__ = ["__version__", *_HOME, *_MODULES]  # noqa: PLE0604
 if TYPE_CHECKING:
     from sympflow import interop as interop
     from sympflow import systems as systems
+    from sympflow.ensembles.sweep import ensemble as ensemble
     from sympflow.flow.files import load as load
     from sympflow.flow.mlp import MLPFlow as MLPFlow
     from sympflow.flow.shipped import shipped_flows as shipped_flows
