@@ -97,15 +97,15 @@ def test_damage_is_told(tmp_path):
 
 
 def test_places_that_are_no_store(tmp_path):
-    with pytest.raises(FileNotFoundError, match="`store` .* does not exist"):
+    with pytest.raises(FileNotFoundError, match=r"`store` .* does not exist"):
         Store.open(tmp_path / "none.zarr")
     for contents in ("", "{}", '{"metadata": []}'):
         Path(tmp_path / ".zmetadata").write_text(contents)
-        with pytest.raises(ValueError, match="`store` .* is no store of sympflow"):
+        with pytest.raises(ValueError, match=r"`store` .* is no store of sympflow"):
             Store.open(tmp_path)
     with pytest.raises(ValueError, match="is no store"):
         Store.open(tmp_path / ".zmetadata")
-    with pytest.raises(FileExistsError, match="`store` .* exists"):
+    with pytest.raises(FileExistsError, match=r"`store` .* exists"):
         Store.create(tmp_path, FIELDS, {})
     with pytest.raises(StoreError, match=r"`store` .* cannot be written"):
         Store.create("/dev/null/run.zarr", FIELDS, {})
@@ -113,9 +113,9 @@ def test_places_that_are_no_store(tmp_path):
 
 def test_one_writer_at_a_time(tmp_path):
     store = made(tmp_path / "run.zarr")
-    with store.locked():
-        with pytest.raises(StoreError, match="is being written by another process"), Store.open(store.path).locked():
-            pass
+    refused = pytest.raises(StoreError, match="is being written by another process")
+    with store.locked(), refused, Store.open(store.path).locked():
+        pass
     with store.locked():
         pass
 

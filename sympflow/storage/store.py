@@ -193,9 +193,7 @@ class Store:
         known = self.fields[name]
         assert known.chunks is not None
         values = np.asarray(values)
-        if values.ndim != len(known.chunks) or any(
-            n > most for n, most in zip(values.shape, known.chunks, strict=True)
-        ):
+        if values.ndim != len(known.chunks) or (np.array(values.shape) > known.chunks).any():
             raise ValueError(f"`values` of shape {values.shape} are no chunk of {name!r}, of shape {known.chunks}.")
         if values.shape == known.chunks:
             chunk = np.ascontiguousarray(values, dtype=known.dtype)
@@ -203,7 +201,7 @@ class Store:
             chunk = np.full(known.chunks, np.nan if known.dtype.kind == "f" else 0, dtype=known.dtype)
             chunk[tuple(map(slice, values.shape))] = values
         with _told(self.path):
-            _replace(self._file(name, index), zlib.compress(chunk, 0))
+            _replace(self._file(name, index), zlib.compress(memoryview(chunk), 0))
 
     def read(self, name: str, index: tuple[int, ...] | None = None) -> np.ndarray:
         """Return a chunk, or the whole array; NaN, or 0 of other numbers, where nothing has been written.
