@@ -237,11 +237,14 @@ class naming_plugin:
 def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array | None = None) -> None:
     """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named.
 
-    The functions of a user's system are tested too, for states such as y0. Friction, and H that depends on t, are
-    refused here for every method that does not say that it takes them.
+    The functions of a user's system are tested too, for states such as y0. Friction, forces that are none of H, and H
+    that depends on t are refused here for every method that does not say that it takes them.
     """
     mro = type(integrator).__mro__
-    if system.friction is not None and not (integrator.takes_friction and _speaks_for_itself(mro, "takes_friction")):
+    own_words = system.conservative or _speaks_for_itself(mro, "takes_friction")
+    if system.external_force is not None and not (integrator.takes_forces and own_words):
+        system.check_conservative(f"which method {integrator.name!r} does not take", "")
+    if system.friction is not None and not (integrator.takes_friction and own_words):
         what = "was trained without it" if integrator.trained else "does not take it"
         system.check_conservative(
             f"and method {integrator.name!r} {what}",
