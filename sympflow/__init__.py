@@ -17,6 +17,7 @@ _HOME = {
     "EnergySublevel": "hamiltonian.domain",
     "Tube": "hamiltonian.domain",
     "time_transformed": "hamiltonian.time_transformation",
+    "doubled": "hamiltonian.doubling",
     "solve": "solver",
     "ensemble": "ensembles.sweep",
     "Solution": "solution",
@@ -62,6 +63,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.domain import Box as Box
     from sympflow.hamiltonian.domain import EnergySublevel as EnergySublevel
     from sympflow.hamiltonian.domain import Tube as Tube
+    from sympflow.hamiltonian.doubling import doubled as doubled
     from sympflow.hamiltonian.system import HamiltonianSystem as HamiltonianSystem
     from sympflow.hamiltonian.time_transformation import time_transformed as time_transformed
     from sympflow.integrators.registry import available as available

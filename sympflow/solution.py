@@ -131,6 +131,24 @@ class Solution:
                 ),
             )
 
+    def physical(self) -> Solution:
+        """The solution of the physical system, of a solution of a doubled one (`sympflow.doubled`).
+
+        Its states are [q₊, p₊], its system the one with friction and the external force, and `stats["difference"]` is
+        the largest |q₋| or |p₋| of the run, 0 in the physical limit. Metrics of what is not kept refuse it.
+
+        Raises
+        ------
+        ValueError
+            If the system is no doubled one.
+
+        Warns
+        -----
+        RuntimeWarning
+            If the difference has grown beyond 1e-6 of the states.
+        """
+        return physical_solution(self)
+
     def energy(self) -> Array:
         """H along the solution: (..., n)."""
         with np.errstate(all="ignore"):
@@ -190,6 +208,46 @@ class Solution:
         return self
 
 
+LARGEST_DIFFERENCE = 1e-6
+"""Difference of the two copies, over the largest number of the states, beyond which a physical solution warns."""
+
+
+def physical_solution(sol: Solution) -> Solution:
+    """The physical part of a solution of a doubled system: see `Solution.physical`."""
+    doubled = sol.system.as_doubled()
+    with np.errstate(all="ignore"):
+        apart, size = (abs(to_numpy(y)).max(initial=0.0) for y in (doubled.difference(sol.states), sol.states))
+    if apart > LARGEST_DIFFERENCE * size:
+        warnings.warn(
+            f"The doubled variables q₋, p₋ have grown to {apart:.3g}: the run has left the physical limit. Reduce "
+            "`dt`, or project every step, solve(system, 'projected', of=method).",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+    limit = doubled.physical_limit
+    return replace(
+        sol,
+        y=limit(sol.states).swapaxes(-1, -2),
+        system=doubled.physical,
+        y0=limit(sol.y0),
+        stats={**sol.stats, "difference": float(apart)},
+        sol=None if sol.sol is None else _PhysicalOutput(sol.sol, limit),
+        y_events=None if sol.y_events is None else [limit(y) for y in sol.y_events],
+    )
+
+
+@dataclass(frozen=True)
+class _PhysicalOutput:
+    """The physical part of the dense output of a doubled system."""
+
+    sol: Callable[[Any], Array]
+    limit: Callable[[Array], Array]
+
+    def __call__(self, t: Any) -> Array:
+        y = self.sol(t)
+        return self.limit(y) if np.ndim(t) == 0 else self.limit(y.swapaxes(-1, -2)).swapaxes(-1, -2)
+
+
 def check_solution(sol: object, name: str = "sol") -> None:
     """Raise a TypeError unless `sol` is a Solution."""
     if not isinstance(sol, Solution):
@@ -226,7 +284,7 @@ def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> 
 def _energy(sol: Solution, y: Array) -> np.ndarray:
     """H in float64, whatever the precision of the run, of each trajectory at its states (..., k, 2d) or (..., 2d)."""
     with np.errstate(all="ignore"):
-        if sol.rows is not None and not sol.rows.uniform:
+        if sol.rows is not None and not sol.rows.uniform and sol.system.autonomous:
             return sol.rows.hamiltonian(to_numpy(y).astype(float))
         return np.asarray(sol.system.hamiltonian(to_numpy(y).astype(float)))
 
@@ -293,6 +351,7 @@ class Joined:
 
 def _scattered(pieces: Sequence[tuple[np.ndarray, Any]], shape: tuple[int, ...]) -> Any:
     """Arrays (k, ...) of some trajectories each as one, (*shape, ...)."""
+    whole: Any
     order = np.concatenate([index for index, _ in pieces])
     back = np.argsort(order)
     if is_tensor(pieces[0][1]):

@@ -216,12 +216,12 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
     states = problem.y0.reshape(-1, problem.y0.shape[-1])
     pieces = []
     for group in rows.by_form() if action == "ignore" else rows.distinct():
-        together = replace(problem, system=group.system, y0=states[group.index], letters=group.letters)
+        together = replace(problem, system=group.system, y0=states[group.places], letters=group.letters)
         if group.letters is None or integrator.takes_letters(together):
-            pieces.append((group.index, _solved(integrator, together, action)))
+            pieces.append((group.places, _solved(integrator, together, action)))
             continue
-        for few, system, _ in rows.taken(group.index).distinct():
-            index = group.index[few]
+        for few, system, _ in rows.taken(group.places).distinct():
+            index = group.places[few]
             alone = replace(problem, system=system, y0=states[index])
             pieces.append((index, _solved(integrator, alone, action)))
     return joined(pieces, problem.system, problem.y0, rows)
@@ -332,10 +332,7 @@ def check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
     else:
         y0 = _as_floats(y0, _check_dtype(dtype))
     if y0.ndim == 0 or y0.shape[-1] != size:
-        raise ValueError(
-            f"`y0` must have shape (..., {size}) for {system.name!r}, [q, p] with {system.ndof} each; got "
-            f"{tuple(y0.shape)}."
-        )
+        y0 = system.lift(y0)
     if math.prod(y0.shape) == 0:
         raise ValueError(f"`y0` is an empty batch, of shape {tuple(y0.shape)}: pass at least one state.")
     if not (np.isfinite(y0) if type(y0) is np.ndarray else finite_states(y0)).all():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ class Rows(NamedTuple):
 
     Attributes
     ----------
-    index : ndarray of int, shape (n,)
+    places : ndarray of int, shape (n,)
         Which of the batch, in the order of its flattened shape.
     system : HamiltonianSystem
         The system of the first of them.
@@ -31,7 +31,7 @@ class Rows(NamedTuple):
         For each the values of `system.symbols.parametric.parameters`; None where `system` is that of all.
     """
 
-    index: np.ndarray
+    places: np.ndarray
     system: HamiltonianSystem
     letters: np.ndarray | None = None
 
@@ -172,7 +172,7 @@ class ParameterRows:
         return {"system": self.system, "values": self.values, "shape": self.shape}
 
 
-_ROUNDED_ONCE = {
+_ROUNDED_ONCE: dict[Any, Callable[[np.ndarray], np.ndarray]] = {
     sp.Integer(-1): lambda x: 1 / x,
     sp.Integer(2): lambda x: x * x,
     sp.Rational(1, 2): np.sqrt,
