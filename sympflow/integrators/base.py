@@ -272,7 +272,7 @@ class KernelStepper(Stepper):
         self.iterations = 0
 
     def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
-        start = {} if self.system.autonomous else {"t0": t0}
+        start: dict[str, Any] = {} if self.system.autonomous else {"t0": t0}
         if y0.ndim == 1:
             states, last, iterations = self.kernel.run(h, y0, n_steps, save, **start)
             self.iterations += iterations
@@ -409,7 +409,7 @@ def shorter_steps(stepper: Stepper, grid: Grid, y: Array, count: np.ndarray, rem
     together = last - first == len(extra) - 1  # nearly always, and a slice is copied ten times sooner
     rows: Any = slice(first, last + 1) if together and not is_tensor(y) else extra
     states = y[rows]
-    lengths, t = h, 0.0
+    lengths, t = h, np.zeros(())
     if y.ndim != 2:
         lengths = np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy()
     if not stepper.system.autonomous:

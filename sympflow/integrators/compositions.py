@@ -70,6 +70,7 @@ class Composition(ABC):
 
     def check_driving(self) -> None:
         """Raise a ValueError where the parts of a driven system have no exact flows."""
+        raise ValueError(f"`method` {self.method!r} does not take a driven system: use the splitting 'kinetic'.")
 
     def lift(self, y: Array) -> Array:
         """The states on which steps are made, of states y (..., 2d); y itself where the phase space is not extended."""
@@ -98,9 +99,7 @@ class Composition(ABC):
         """The step and its Jacobian (..., 2d, 2d); None where `step` itself is to be differentiated."""
         return None
 
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0
-    ) -> tuple[Array, np.ndarray]:
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
         """Many steps by array operations, as `base.rollout`."""
         return rollout(lambda k, y: self.step(y, h, t0 + k * h), y0, n_steps, save)
 
@@ -126,8 +125,8 @@ class KineticPotential(Composition):
     among them, and brackets of degree −1, such as force gradients, are the same. So every scheme keeps its order.
 
     Where H depends on t, the drift is the flow of T(p, t) + E, with which the time moves, E its momentum, and a kick is
-    at a time that stands still, force gradients too. A drift raises the degree by at most 1 if E counts 2, a kick lowers
-    it by 1 as before, and so every scheme keeps its order once more.
+    at a time that stands still, force gradients too. A drift raises the degree by at most 1 if E counts 2, a kick
+    lowers it by 1 as before, and so every scheme keeps its order once more.
     """
 
     compensates: ClassVar[bool] = True
@@ -301,9 +300,7 @@ class ExactMaps(Composition):
         back = [m.inverse() for m in reversed(self.maps(h))]
         return parts.from_modes(*parts.apply(back, *parts.to_modes(y)))
 
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0
-    ) -> tuple[Array, np.ndarray]:
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
         return rollout_in_modes(self.parts, self.maps(h), y0, n_steps, save)
 
     def kernel(self, compensated: bool) -> Kernel:

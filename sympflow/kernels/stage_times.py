@@ -1,9 +1,9 @@
 """Systems whose H depends on t as code: what depends on t alone is computed once a stage, outside loops over states.
 
 The extended Hamiltonian T(p, t) + E + V(q, t) is split into a drift, which moves q and t, and a kick at a fixed time.
-Let the degree of E be 2 and that of p be 1: the drift raises the degree of a polynomial in p by at most 1, a kick lowers
-it by 1. So all brackets that vanish by their degree where H does not depend on t vanish here, those of Nyström and
-force-gradient schemes among them, and the kicks of these are taken at a fixed time as well.
+Let the degree of E be 2 and that of p be 1: the drift raises the degree of a polynomial in p by at most 1, a kick
+lowers it by 1. So all brackets that vanish by their degree where H does not depend on t vanish here, those of Nyström
+and force-gradient schemes among them, and the kicks of these are taken at a fixed time as well.
 """
 
 from __future__ import annotations
@@ -103,13 +103,15 @@ def driven_form(symbols: SymbolicHamiltonian) -> Driving:
     """
     t = symbols.time
     assert t is not None
+    assert symbols.T is not None
     values = dict(zip(symbols.parameters, map(sp.Float, symbols.values), strict=True))
     of_V: dict[sp.Expr, sp.Symbol] = {}
     V = _with_letters(symbols.V, t, {*symbols.parameters}, of_V, "letter")
     T, of_T = _kinetic(symbols, symbols.T.xreplace(values) if symbols.T.has(t) else symbols.T)
     letters = {s: f for f, s in of_V.items()}
     means = {s: (f, drift((f,), t)[0]) for f, s in of_T.items()}
-    form = symbols.with_parameters(T + V, (*symbols.parameters, *letters, *means), symbols.values)
+    form = symbols.like(T + V)
+    form.parameters, form.values = (*symbols.parameters, *letters, *means), symbols.values
     return Driving(form, t, letters, means, symbols.samples)
 
 
@@ -123,8 +125,8 @@ def _kinetic(symbols: SymbolicHamiltonian, T: sp.Expr) -> tuple[sp.Expr, dict[sp
         if not any(sp.diff(lettered, s).free_symbols & letters for s in letters):
             return lettered, found
     raise ValueError(
-        f"`system` has the kinetic energy {symbols.T}, which is no sum of products of functions of {symbols.time} and of "
-        "p: use an implicit method such as 'gauss_legendre6'."
+        f"`system` has the kinetic energy {symbols.T}, which is no sum of products of functions of {symbols.time} and "
+        "of p: use an implicit method such as 'gauss_legendre6'."
     )
 
 
@@ -166,7 +168,9 @@ def sampled_sources(expressions: Sequence[sp.Expr], samples: Mapping[str, Sample
 
 
 def _sampled_source(name: str, order: int, samples: Samples) -> str:
-    """A derivative of samples: the polynomial of the interval of t, found at once where all are equal, else by bisection.
+    """A derivative of samples: the polynomial of the interval of t.
+
+    The interval is found at once where all are equal, else by bisection.
 
     Raises
     ------

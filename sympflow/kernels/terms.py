@@ -192,9 +192,7 @@ def energy_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> str:
     return _source(f, variables, name, "q", before, lambda family: {"total": family.f}, after)
 
 
-def gradient_source(
-    f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()
-) -> str:
+def gradient_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()) -> str:
     """``name(q, out)``: ∇f into out; with letters in f ``name(q, out, numbers)``, of which the last are theirs."""
 
     def slopes(family: Family) -> dict[str, sp.Expr]:
@@ -203,9 +201,7 @@ def gradient_source(
     return _source(f, variables, name, "q, out", "out[:] = 0.0", slopes, letters=letters)
 
 
-def product_source(
-    f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()
-) -> str:
+def product_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()) -> str:
     """``name(q, v, out)``: ∇²f v into out."""
 
     def product(family: Family) -> dict[str, sp.Expr]:
@@ -214,9 +210,7 @@ def product_source(
     return _source(f, variables, name, "q, v, out", "out[:] = 0.0", product, letters=letters)
 
 
-def bend_source(
-    f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()
-) -> str:
+def bend_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()) -> str:
     """``name(q, v, out)``: ½ ∇³f(v, v) into out."""
 
     def bend(family: Family) -> dict[str, sp.Expr]:

@@ -56,8 +56,7 @@ def close(q, p, q_error, p_error, table, k, work):
 
 @njit(**OPTIONS)
 def first_non_finite(q, p, table, first, k, n_steps, work):
-    """The first of `n_steps` steps from a running state, that of step k, whose end is not finite; `n_steps` if none is.
-    """
+    """The first of `n_steps` steps from a running state, that of step k, whose end is not finite; `n_steps` if none is."""
     link = table.shape[1] - 2
     q_error, p_error = no_error(q), no_error(p)
     j = first
@@ -123,9 +122,7 @@ def rollout(table, y0, n_steps, save, out, stop, first, running):
         start_q, start_p, begin = copy(q), copy(p), j
         k = n
         for _ in range(block * link):
-            q, p, q_error, p_error = stage(
-                q, p, q_error, p_error, numbers_of(table, j, k), drift_of(table, j), j, work
-            )
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, numbers_of(table, j, k), drift_of(table, j), j, work)
             j = j + 1 if j < link else 1
             k = k + 1 if j == link else k
         end_q, end_p = close(q, p, q_error, p_error, table, k, work)
