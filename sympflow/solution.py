@@ -107,9 +107,9 @@ class Solution:
         return physical_solution(self)
 
     def energy(self) -> Array:
-        """H along the solution: (..., n)."""
+        """H along the solution, of a driven system at the times of its states: (..., n)."""
         with np.errstate(all="ignore"):
-            return self.system.hamiltonian(self.states)
+            return self.system.hamiltonian(self.states, np.broadcast_to(self.t, self.states.shape[:-1]))
 
     def energy_error(self) -> np.ndarray:
         """Relative energy error over time, (..., n), with its sign; inf where H is beyond floats.
@@ -121,7 +121,7 @@ class Solution:
     def energy_scale(self) -> np.ndarray:
         """The scale of the energy errors of each trajectory, (...); see `sympflow.metrics.energy.energy_scale`."""
         declared = self.system.energy_scale
-        H0 = np.abs(_energy(self, self.y0))
+        H0 = np.abs(_energy(self, self.y0, self.t_span[0]))
         if declared is not None:
             return np.full_like(H0, declared)
         return np.where(H0 < SMALLEST_SCALE, np.nan, H0)
@@ -216,9 +216,10 @@ def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> 
         "so its energy is lost and no error",
         "use sympflow.conformal_defect(sol), which is 0 for the exact flow, or sympflow.reference_error(sol)",
     )
+    sol.system.check_autonomous("so its energy is not kept and has no error", "use sympflow.energy_balance_error(sol)")
     with np.errstate(all="ignore"):
-        states = to_numpy(sol.states)
-        error = _energy(sol, states) - _energy(sol, sol.y0)[..., None]
+        states, t0 = to_numpy(sol.states), sol.t_span[0]
+        error = _energy(sol, states, t0) - _energy(sol, sol.y0, t0)[..., None]
         if np.isnan(error).any():
             error = np.where(np.isnan(error) & np.isfinite(states).all(-1), np.inf, error)
         if not relative:
@@ -234,7 +235,7 @@ def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> 
         return np.where(np.isinf(error), error, compared)  # H(y0) may be infinite itself: inf/inf
 
 
-def _energy(sol: Solution, y: Array) -> np.ndarray:
+def _energy(sol: Solution, y: Array, t: float) -> np.ndarray:
     """H in float64, whatever the precision of the run."""
     with np.errstate(all="ignore"):
-        return np.asarray(sol.system.hamiltonian(to_numpy(y).astype(float)))
+        return np.asarray(sol.system.hamiltonian(to_numpy(y).astype(float), t))

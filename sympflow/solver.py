@@ -121,6 +121,7 @@ def solve(
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span, search is not None and search.may_end_run)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
     integrator = integrator.resolved(system, y_start, abs(t1 - t0))
+    system.check_times(t0, t1)
     check_applies(integrator, system, y_start)
     integrator.check_library(y_start)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)

@@ -28,11 +28,31 @@ TOLERANCE = 1e-9
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
-    """H at 8 fixed states less H at a ninth; the entries of Γ follow, of a system with friction."""
+    """H at 8 fixed states less H at a ninth.
+
+    The entries of Γ follow, of a system with friction; of a driven one, of which those are at the first of some times,
+    the changes to the others.
+    """
+    states, times = _fixed_states(system.ndof), fixed_times(system)
     with np.errstate(all="ignore"):
-        H = to_numpy(system.hamiltonian(_fixed_states(system.ndof)))
+        first, *others = (to_numpy(system.hamiltonian(states, t)) for t in times)
+        first, others = first[1:] - first[0], [H[1:] - H[0] for H in others]
     friction = () if system.damping is None else system.damping.ravel().tolist()
-    return (*(H[1:] - H[0]).tolist(), *friction)
+    return (*first.tolist(), *friction, *(x for H in others for x in (H - first).tolist()))
+
+
+FIXED_TIMES = (0.0, 0.37, 1.31, 4.73)
+"""Times at which a drive is probed; where its samples end, parts of their span."""
+
+
+def fixed_times(system: Hamiltonian) -> tuple[float | None, ...]:
+    """The times at which H of a system is probed: None alone for one that does not depend on the time."""
+    if system.autonomous:
+        return (None,)
+    span = None if system.symbols is None else system.symbols.span
+    if span is None:
+        return FIXED_TIMES
+    return tuple(span[0] + t / 5 * (span[1] - span[0]) for t in FIXED_TIMES)
 
 
 def _fixed_states(ndof: int) -> np.ndarray:
@@ -154,7 +174,7 @@ class Identity:
         if len(self.states):
             finite = np.flatnonzero(np.isfinite(self.energies))
             i = int(finite[0]) if finite.size else 0
-            return float(_energies(system, self.states[i : i + 1])[0]), float(self.energies[i])
+            return float(_energies(system, self.states[i : i + 1], i)[0]), float(self.energies[i])
         read, state = _read(self.expression, system.ndof), _fixed_states(system.ndof)[:1]
         assert read is not None
         return float(_energies(system, state)[0]), float(_energies(read, state)[0])
@@ -227,9 +247,12 @@ def _floats(values: Any, ndim: int) -> np.ndarray:
         raise ValueError("its numbers are no array of floats") from None
 
 
-def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
+def _energies(system: Hamiltonian, states: np.ndarray, first: int = 0) -> np.ndarray:
+    """H at states (n, 2d), each at one of the fixed times in turn, of which `first` is that of the first state."""
+    times = fixed_times(system)
+    t = None if system.autonomous else np.array([times[(first + i) % len(times)] for i in range(len(states))])
     with np.errstate(all="ignore"):
-        return to_numpy(system.hamiltonian(states)).astype(float)
+        return to_numpy(system.hamiltonian(states, t)).astype(float)
 
 
 @lru_cache(maxsize=16)
@@ -240,9 +263,14 @@ def _read(expression: str | None, ndof: int) -> Hamiltonian | None:
 
     if expression is None:
         return None
-    try:
-        symbols = SymbolicHamiltonian(expression)
-    except (ValueError, TypeError):
+    symbols = None
+    for time in (None, "t"):
+        try:
+            symbols = SymbolicHamiltonian(expression, time=time)
+            break
+        except (ValueError, TypeError):
+            continue
+    if symbols is None:
         return None
     system = Hamiltonian("", symbols, None, False)
     system.symbols = symbols
