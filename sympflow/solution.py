@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -88,6 +88,24 @@ class Solution:
         """The states with [q, p] last: (..., n, 2d)."""
         return self.y.swapaxes(-1, -2)
 
+    def physical(self) -> Solution:
+        """The solution of the physical system, of a solution of a doubled one (`sympflow.doubled`).
+
+        Its states are [q₊, p₊], its system the one with friction and the external force, and `stats["difference"]` is
+        the largest |q₋| or |p₋| of the run, 0 in the physical limit. Metrics of what is not kept refuse it.
+
+        Raises
+        ------
+        ValueError
+            If the system is no doubled one.
+
+        Warns
+        -----
+        RuntimeWarning
+            If the difference has grown beyond 1e-6 of the states.
+        """
+        return physical_solution(self)
+
     def energy(self) -> Array:
         """H along the solution: (..., n)."""
         with np.errstate(all="ignore"):
@@ -141,6 +159,46 @@ class Solution:
         if not self.success:
             raise RuntimeError(self.message)
         return self
+
+
+LARGEST_DIFFERENCE = 1e-6
+"""Difference of the two copies, over the largest number of the states, beyond which a physical solution warns."""
+
+
+def physical_solution(sol: Solution) -> Solution:
+    """The physical part of a solution of a doubled system: see `Solution.physical`."""
+    doubled = sol.system.as_doubled()
+    with np.errstate(all="ignore"):
+        apart, size = (abs(to_numpy(y)).max(initial=0.0) for y in (doubled.difference(sol.states), sol.states))
+    if apart > LARGEST_DIFFERENCE * size:
+        warnings.warn(
+            f"The doubled variables q₋, p₋ have grown to {apart:.3g}: the run has left the physical limit. Reduce "
+            "`dt`, or project every step, solve(system, 'projected', of=method).",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+    limit = doubled.physical_limit
+    return replace(
+        sol,
+        y=limit(sol.states).swapaxes(-1, -2),
+        system=doubled.physical,
+        y0=limit(sol.y0),
+        stats={**sol.stats, "difference": float(apart)},
+        sol=None if sol.sol is None else _PhysicalOutput(sol.sol, limit),
+        y_events=None if sol.y_events is None else [limit(y) for y in sol.y_events],
+    )
+
+
+@dataclass(frozen=True)
+class _PhysicalOutput:
+    """The physical part of the dense output of a doubled system."""
+
+    sol: Callable[[Any], Array]
+    limit: Callable[[Array], Array]
+
+    def __call__(self, t: Any) -> Array:
+        y = self.sol(t)
+        return self.limit(y) if np.ndim(t) == 0 else self.limit(y.swapaxes(-1, -2)).swapaxes(-1, -2)
 
 
 def check_solution(sol: object, name: str = "sol") -> None:

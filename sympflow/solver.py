@@ -286,10 +286,7 @@ def check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
     else:
         y0 = _as_floats(y0, _check_dtype(dtype))
     if y0.ndim == 0 or y0.shape[-1] != size:
-        raise ValueError(
-            f"`y0` must have shape (..., {size}) for {system.name!r}, [q, p] with {system.ndof} each; got "
-            f"{tuple(y0.shape)}."
-        )
+        y0 = system.lift(y0)
     if math.prod(y0.shape) == 0:
         raise ValueError(f"`y0` is an empty batch, of shape {tuple(y0.shape)}: pass at least one state.")
     if not (np.isfinite(y0) if type(y0) is np.ndarray else finite_states(y0)).all():

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 
@@ -13,6 +14,36 @@ from sympflow.arrays import Array, concatenate, is_tensor
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+
+
+class ExternalForce(Protocol):
+    """F(q, p) in p' = −∂H/∂q + F, that no H has."""
+
+    def __call__(self, q: Array, p: Array) -> Array:
+        """F: (..., d), each, to (..., d)."""
+        ...
+
+    def jacobian(self, q: Array, p: Array) -> Array:
+        """∂F/∂(q, p): (..., d), each, to (..., d, 2d)."""
+        ...
+
+
+class Doubled(Protocol):
+    """A system in twice the variables: see `sympflow.doubled`."""
+
+    physical: Any
+
+    def lift(self, y: Array) -> Array:
+        """The state for a physical one: (..., 2d) to (..., 4d)."""
+        ...
+
+    def physical_limit(self, y: Array) -> Array:
+        """The physical part of a state: (..., 4d) to (..., 2d)."""
+        ...
+
+    def difference(self, y: Array) -> Array:
+        """The rest of a state, 0 in the physical limit: (..., 4d) to (..., 2d)."""
+        ...
 
 
 class Hamiltonian:
@@ -44,6 +75,8 @@ class Hamiltonian:
     """
 
     friction: Friction | None = None
+    external_force: ExternalForce | None = None
+    """F of the physical limit of a doubled system, p' = −∂H/∂q + F; it is part of `vector_field`."""
 
     def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
         self.name = name
@@ -87,28 +120,63 @@ class Hamiltonian:
     def vector_field(self, y: Array) -> Array:
         """J∇H(y) = [∇_pH, −∇_qH], with friction [∇_pH, −∇_qH − Γp]: (..., 2d) to (..., 2d)."""
         self._check_width(y)
-        d, friction = self.ndof, self.friction
+        d = self.ndof
         if self.separable:
-            force = self.force(y[..., :d])
-            if friction is not None:
-                force = force + friction.force(y[..., d:])
-            return concatenate([self.velocity(y[..., d:]), force])
-        g = self._definition.gradient(y)
-        force = -g[..., :d]
-        if friction is not None:
-            force = force + friction.force(y[..., d:])
-        return concatenate([g[..., d:], force])
+            velocity, force = self.velocity(y[..., d:]), self.force(y[..., :d])
+        else:
+            g = self._definition.gradient(y)
+            velocity, force = g[..., d:], -g[..., :d]
+        if self.friction is not None:
+            force = force + self.friction.force(y[..., d:])
+        if self.external_force is not None:
+            force = force + self.external_force(y[..., :d], y[..., d:])
+        return concatenate([velocity, force])
 
     def field_jacobian(self, y: Array) -> Array:
         """The Jacobian of `vector_field`, J∇²H(y), with friction less Γ in the rows and columns of p: (..., 2d, 2d)."""
         d, S = self.ndof, self.hessian(y)
         rows = [S[..., d:, :], -S[..., :d, :]]
         A = _library(S).cat(rows, dim=-2) if is_tensor(S) else np.concatenate(rows, axis=-2)
-        if self.friction is None:
-            return A
-        G = np.zeros((2 * d, 2 * d))
-        G[d:, d:] = self.friction.matrix(d)
-        return A - _like(G, A)
+        if self.friction is not None:
+            G = np.zeros((2 * d, 2 * d))
+            G[d:, d:] = self.friction.matrix(d)
+            A = A - _like(G, A)
+        if self.external_force is not None:
+            F = self.external_force.jacobian(y[..., :d], y[..., d:])
+            A = A + _rows_below(F)
+        return A
+
+    def with_force(self, force: ExternalForce) -> Self:
+        """Return the system with p' = −∂H/∂q − Γp + F(q, p), which its vector field, and no H, holds."""
+        forced = copy.copy(self)
+        forced.name, forced.external_force = f"{self.name}_forced", force
+        return forced
+
+    def as_doubled(self) -> Doubled:
+        """Return the system itself if it is a doubled one.
+
+        Raises
+        ------
+        ValueError
+            If it is none.
+        """
+        raise ValueError(
+            f"`system` {self.name!r} is no doubled one, so that its states are the physical ones as they are: make one "
+            "by sympflow.doubled(system, force), or leave out what asks for its physical limit."
+        )
+
+    def lift(self, y: Array) -> Array:
+        """The states (..., 2d) for `y` of another width; only doubled systems have such.
+
+        Raises
+        ------
+        ValueError
+            For any other system.
+        """
+        raise ValueError(
+            f"`y0` must have shape (..., {2 * self.ndof}) for {self.name!r}, [q, p] with {self.ndof} each; got "
+            f"{tuple(y.shape)}."
+        )
 
     @property
     def damping(self) -> np.ndarray | None:
@@ -117,17 +185,25 @@ class Hamiltonian:
 
     @property
     def conservative(self) -> bool:
-        """True without friction."""
-        return self.friction is None
+        """True without friction or an external force."""
+        return self.friction is None and self.external_force is None
 
     def check_conservative(self, what: str, remedy: str) -> None:
         """Refuse a system with friction where it would be left out, or what is asked does not hold with it.
+
+        With an external force the remedy is always the same: the vector field, or the doubled system.
 
         Raises
         ------
         ValueError
             With `what` is asked, as a clause that follows the reason, and the remedy.
         """
+        if self.external_force is not None:
+            raise ValueError(
+                f"`system` {self.name!r} has a force that is none of H, p' = −∂H/∂q + F, {what}: solve it by a "
+                "Runge–Kutta method such as 'dop853', or its doubled system by any method, and judge the physical "
+                "solution by sympflow.reference_error(sol)."
+            )
         if self.friction is not None:
             raise ValueError(f"`system` {self.name!r} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
 
@@ -268,6 +344,12 @@ class Hamiltonian:
     def numba_functions(self) -> tuple[Any, Any, Any] | None:
         """(potential, gradient, hessian_vector) if the system was given by Numba functions, else None."""
         return self._definition.numba_functions
+
+
+def _rows_below(F: Array) -> Array:
+    """(..., d, 2d) below as many rows of 0."""
+    xp = _library(F)
+    return xp.cat([0 * F, F], dim=-2) if is_tensor(F) else xp.concatenate([0 * F, F], axis=-2)
 
 
 def _rows(left: Array, right: Array) -> Array:

@@ -16,7 +16,8 @@ Its duties:
 
 9. `arrays_only` says so, where `step` and `run` take NumPy arrays only.
 10. `takes_friction` is False, and a damped system is refused before the integrator sees it; or the method takes the
-   friction −Γp into account, as one that steps by `system.vector_field` does.
+   friction −Γp into account, as one that steps by `system.vector_field` does. `takes_forces` says the same of a force
+   that is none of H, which only `vector_field` holds.
 
 `FixedStep`, in `sympflow.integrators.base`, does 4, 5, 6 and 8 for any integrator that has a step: a new one needs
 duties 1 to 3 only, and its forces are counted. Whatever a run changes, such as its kernel and its counts, belongs to a
@@ -168,6 +169,11 @@ class Integrator:
     @property
     def takes_friction(self) -> bool:
         """True if every step holds the friction −Γp of a damped system; where it does not, the system is refused."""
+        return False
+
+    @property
+    def takes_forces(self) -> bool:
+        """True if every step holds any force beside −∂H/∂q, as one by `system.vector_field` does."""
         return False
 
     def check(self, system: HamiltonianSystem) -> None:

@@ -237,10 +237,13 @@ class naming_plugin:
 def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array | None = None) -> None:
     """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named.
 
-    The functions of a user's system are tested too, for states such as y0. Friction is refused here for every method
-    that does not say that it takes it.
+    The functions of a user's system are tested too, for states such as y0. Friction, and forces that are none of H, are
+    refused here for every method that does not say that it takes them.
     """
-    if system.friction is not None and not (integrator.takes_friction and _speaks_for_itself(type(integrator).__mro__)):
+    own_words = system.conservative or _speaks_for_itself(type(integrator).__mro__)
+    if system.external_force is not None and not (integrator.takes_forces and own_words):
+        system.check_conservative(f"which method {integrator.name!r} does not take", "")
+    if system.friction is not None and not (integrator.takes_friction and own_words):
         what = "was trained without it" if integrator.trained else "does not take it"
         system.check_conservative(
             f"and method {integrator.name!r} {what}",

@@ -160,6 +160,8 @@ def conformal_defect(sol: Solution, relative: bool = False, scale: ArrayLike | N
     .. [1] R. McLachlan, M. Perlmutter, "Conformal Hamiltonian systems", J. Geom. Phys. 39 (2001) 276–300.
     """
     check_solution(sol)
+    if sol.system.external_force is not None:
+        sol.system.check_conservative("by which its flow is not conformally symplectic", "")
     friction = sol.system.friction
     if friction is not None and not friction.isotropic:
         raise ValueError(
