@@ -437,7 +437,7 @@ class FlowMap(nn.Module):
         if self.is_without_friction_of(system):
             raise ValueError(
                 f"`system` {system.name!r} has friction, and the flow was trained without: its numbers cancel the "
-                "errors of the conservative field alone, and with friction it would be ten to a hundred times less "
+                "errors of the conservative field alone, and with friction it would be tens to hundreds of times less "
                 "accurate. Fit one to the damped system by sympflow.train(system), or from these numbers by "
                 "sympflow.train(system, flow=flow.transferred(system))."
             )
