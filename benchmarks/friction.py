@@ -123,7 +123,7 @@ def trained(rate: float, quick: bool) -> str:
             for dt, stages in starts[: 1 if quick else None]
         ]
         for target in (1e-2,) if quick else (1e-4, 1e-6, 1e-8):
-            row = race(Measure(system, "state", 20.0), target, flows, None, 7, 1000)
+            row = race(Measure(system, "state", 20.0), target, flows, None, 25, 1000, span=100.0 / rate)
             if row is None:
                 print(f"{name}: no flow reaches {target:g}", flush=True)
                 continue

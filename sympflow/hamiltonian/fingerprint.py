@@ -58,7 +58,7 @@ def _close(u: np.ndarray, v: np.ndarray) -> bool:
 
 
 def check_for_flows(system: Hamiltonian) -> None:
-    """Refuse a system with friction, which flows that are not primed have not.
+    """Refuse a system with friction, or a driven one, for flows that are not primed: they would leave that out.
 
     Raises
     ------
@@ -69,6 +69,9 @@ def check_for_flows(system: Hamiltonian) -> None:
         "which trained flows have only where they are primed, with H = ½ pᵀM⁻¹p + V(q)",
         "fit such a flow by sympflow.train(system), or use a splitting method such as 'verlet' or 'kahan_li8', or a "
         "Runge–Kutta method such as 'dop853'",
+    )
+    system.check_autonomous(
+        "which no trained flow has", "solve it by a splitting method such as 'verlet' or 'kahan_li8'"
     )
 
 
