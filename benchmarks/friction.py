@@ -26,9 +26,8 @@ from measuring import fragments
 from measuring.race import Measure, race
 
 import sympflow
-from sympflow import HamiltonianSystem, SympFlow, solve
+from sympflow import HamiltonianSystem, SympFlow, solve, systems
 from sympflow.flow.primed import PrimedFlow
-from sympflow import systems
 from sympflow.systems import damped_pendulum, henon_heiles, pendulum
 
 TRAJECTORIES = 256
@@ -107,7 +106,7 @@ STARTS = {"pendulum": ((1.0, 3), (0.5, 3)), "henon_heiles": ((1.4, 3), (0.8, 3))
 def trained(rate: float, quick: bool) -> str:
     """Flows that are fitted to damped systems against every splitting scheme, at equal error of the state at T = 20."""
     lines = [
-        "| scene, target | flow | fit | conformal defect | forces saved | one trajectory | 1000 outputs | batch of 1000 |",
+        "| scene, target | flow | fit | conformal defect | forces saved | one trajectory | 1000 outputs | batch |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     options = {"restarts": 2, "steps": 20} if quick else {"time_budget": 45.0}

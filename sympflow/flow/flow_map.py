@@ -408,7 +408,7 @@ class FlowMap(nn.Module):
         ValueError
             If the system has friction, and the family of the flow has not.
         """
-        self._check_friction(system)
+        check_for_flows(system, self.takes_friction)
         self.fingerprint, self.system_name = system.fingerprint, system.name
         self.identity = Identity.of(system, domain)
 
@@ -424,7 +424,7 @@ class FlowMap(nn.Module):
     def check_system(self, system: HamiltonianSystem) -> None:
         """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
         check_system(system)
-        self._check_friction(system)
+        check_for_flows(system, self.takes_friction)
         if self.fingerprint is not None and self.matches(system):
             return
         origin = self.origin
@@ -450,10 +450,6 @@ class FlowMap(nn.Module):
                 f"`system` {system.name!r} is not the one that this flow was trained for ({self.system_name!r}, or its "
                 f"parameters differ): {remedy}"
             )
-
-    def _check_friction(self, system: HamiltonianSystem) -> None:
-        if not self.takes_friction:
-            check_for_flows(system)
 
     def is_without_friction_of(self, system: HamiltonianSystem) -> bool:
         """Return True if the flow is that of a damped system without its friction."""

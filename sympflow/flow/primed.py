@@ -42,6 +42,7 @@ from sympflow.flow.primed_potentials import (
 )
 from sympflow.flow.sympflow import SympFlow
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
+from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.monomials import MOST_MONOMIALS, Monomials, monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE as CURVATURE_LEVEL
@@ -463,6 +464,7 @@ class PrimedFlow(SympFlow):
         )
         processor, curvature, polynomial = map(plain, (processor, curvature, polynomial))
         check_system(system)
+        check_for_flows(system, cls.takes_friction)
         check_flag("palindromic", palindromic)
         check_flag("curvature", curvature)
         if force_gradient is not None:
@@ -673,6 +675,7 @@ class PrimedFlow(SympFlow):
             If the system has not as many degrees of freedom, or no such flow.
         """
         check_system(system)
+        check_for_flows(system, self.takes_friction)
         if system.ndof != self.ndof:
             raise ValueError(f"`system` has {system.ndof} degrees of freedom, the flow {self.ndof}: give one of those.")
         if not system.separable or (self.terms and not (system.quadratic_kinetic and system.has_hessian_vector)):

@@ -57,19 +57,26 @@ def _close(u: np.ndarray, v: np.ndarray) -> bool:
     return np.allclose(u, v, rtol=0, atol=TOLERANCE * np.abs(finite).max(initial=0.0), equal_nan=True)
 
 
-def check_for_flows(system: Hamiltonian) -> None:
-    """Refuse a system with friction, or a driven one, for flows that are not primed: they would leave that out.
+def check_for_flows(system: Hamiltonian, takes_friction: bool = False) -> None:
+    """Refuse a system of which a flow would leave something out: friction, a force that is none of H, or the time.
+
+    Parameters
+    ----------
+    system : Hamiltonian
+    takes_friction : bool
+        True for flows that hold the friction −Γp.
 
     Raises
     ------
     ValueError
         With the reason.
     """
-    system.check_conservative(
-        "which trained flows have only where they are primed, with H = ½ pᵀM⁻¹p + V(q)",
-        "fit such a flow by sympflow.train(system), or use a splitting method such as 'verlet' or 'kahan_li8', or a "
-        "Runge–Kutta method such as 'dop853'",
-    )
+    if system.external_force is not None or not takes_friction:
+        system.check_conservative(
+            "which trained flows have only where they are primed, with H = ½ pᵀM⁻¹p + V(q)",
+            "fit such a flow by sympflow.train(system), or use a splitting method such as 'verlet' or 'kahan_li8', or "
+            "a Runge–Kutta method such as 'dop853'",
+        )
     system.check_autonomous(
         "which no trained flow has", "solve it by a splitting method such as 'verlet' or 'kahan_li8'"
     )
@@ -77,7 +84,7 @@ def check_for_flows(system: Hamiltonian) -> None:
 
 def without_friction(mine: Sequence[float], identity: Identity | None, system: Hamiltonian) -> bool:
     """Return True if a fingerprint and an identity are those of a damped system without its friction."""
-    if system.conservative or not same_system(mine, fingerprint(system)[:PROBES]):
+    if system.friction is None or not same_system(mine, fingerprint(system)[:PROBES]):
         return False
     return identity is None or identity.agrees(system)
 

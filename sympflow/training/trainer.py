@@ -235,8 +235,7 @@ def fit_flow(
     domain = _domain_for(system, domain)
     untold = flow is None and asked.restarts is None and asked.steps is None
     kind = _kind_of(system, flow, new, asked)
-    if kind != "primed":
-        check_for_flows(system)
+    check_for_flows(system, takes_friction=kind == "primed")
     hurried = untold and session.time_budget is None and session.resume is None and kind == "primed" and asked.searches
     if hurried:
         session.time_budget = BUDGET
