@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -39,12 +39,18 @@ class Reduction(ABC):
 
     in_python: ClassVar[bool] = False
     """True if Python code runs for each orbit, so that threads would wait for each other."""
+    state: ClassVar[str] = ""
+    """The field that holds states [q, p] along its first axis, which a Dataset has as q and p."""
     takes_params: ClassVar[bool] = False
     """True if the orbits of a chunk may have different parameters, those of `chunk.params`."""
 
     @abstractmethod
     def fields(self, problem: Chunk) -> Fields:
         """Return the fields of one orbit, for a problem that is given as a chunk of some first orbits."""
+
+    def settings(self) -> dict[str, Any]:
+        """Return what the reduction was made with: by that a store knows it again. Dataclasses tell their fields."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.compare} if is_dataclass(self) else vars(self)
 
     @abstractmethod
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
@@ -58,6 +64,8 @@ class Reduction(ABC):
 class States(Reduction):
     """The states at the times of `t_eval`, or after each step: `y`, (2d, m) of each orbit."""
 
+    state: ClassVar[str] = "y"
+
     def fields(self, problem: Chunk) -> Fields:
         return {"y": ((problem.y0.shape[1], problem.times.size), np.dtype(float))}
 
@@ -68,6 +76,8 @@ class States(Reduction):
 @dataclass(frozen=True)
 class Final(Reduction):
     """The state at the end of `t_span`: `final`, (2d,) of each orbit."""
+
+    state: ClassVar[str] = "final"
 
     def fields(self, problem: Chunk) -> Fields:
         return {"final": ((problem.y0.shape[1],), np.dtype(float))}

@@ -3,39 +3,39 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import (
-    MAX_ASKED_VALUES,
-    check_counts,
-    check_t_eval,
-    check_t_span,
-    floats,
-)
-from sympflow.arrays import is_tensor
+from sympflow._version import __version__
+from sympflow.arguments import MAX_ASKED_VALUES, check_counts, check_flag, check_t_eval, check_t_span, floats
 from sympflow.ensembles.chunks import MOST_VALUES, Chunk
-from sympflow.ensembles.reductions import Fields, Reduction, reduction
-from sympflow.hamiltonian.domain import Domain
+from sympflow.ensembles.orbits import Drawn, Given, initial_states
+from sympflow.ensembles.reductions import Reduction, reduction
+from sympflow.ensembles.results import Block, Done, Ensemble, Keeper, Layout, Memory, blocks, chunk_shape
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
-from sympflow.integrators.registry import build, check_applies
+from sympflow.integrators.registry import build, check_applies, name_of
 from sympflow.kernels.modules import at_most
-from sympflow.solver import BACKENDS, check_y0
-from sympflow.workers import LostWorkers, Unpicklable, checked_workers, mapped
+from sympflow.solver import BACKENDS
+from sympflow.workers import LostWorkers, Parcel, Unpicklable, checked_workers, mapped
 
-DRAWN = 4096
-"""States that a sampler draws at a time, from a seed and their number, so that no state depends on the chunks."""
+if TYPE_CHECKING:
+    import os
+
+    from sympflow.ensembles.stores import EnsembleStore
+
 MOST_WORK = 50_000_000
 """Steps times degrees of freedom of a chunk, of about a quarter of a second."""
 LONGEST_CHUNK, SHORTEST_CHUNK = 65536, 64
 PIECES = 16  # chunks, or more, of which a large ensemble is made
+MOST_PIECES = 10_000_000
 
 
 def ensemble(
@@ -51,6 +51,8 @@ def ensemble(
     reduce: Any = None,
     workers: Any = 1,
     chunk: int | None = None,
+    store: str | os.PathLike[str] | None = None,
+    resume: bool = False,
     progress: bool | Callable[[int, int], Any] = False,
     backend: str = "auto",
     **options: Any,
@@ -88,7 +90,12 @@ def ensemble(
         there are cores; a `concurrent.futures.Executor`, a `dask.distributed.Client`, or anything else with `.map`;
         a function such as `map`; or a `joblib.Parallel`.
     chunk : int, optional
-        Orbits that a worker is given at a time.
+        Orbits that a worker is given at a time; a store that is there already keeps its own.
+    store : path, optional
+        A folder, in zarr's format, into which the workers write what is kept, each chunk when it is done, so that none
+        of it stays in memory. `xarray.open_zarr` reads it; workers on other machines must see it by the same path.
+    resume : bool
+        Go on with the store of the same ensemble, if there is one: what is there is not done again.
     progress : bool or callable
         True prints how far the ensemble is; a callable is called with the numbers of orbits done and in all.
     backend : "auto", "compiled" or "array"
@@ -106,7 +113,9 @@ def ensemble(
     ValueError, TypeError
         For bad arguments, at once.
     RuntimeError
-        If workers die again and again.
+        If workers die again and again. What is in the store is kept.
+    OSError
+        If the store cannot be written, as on a full disk. What is in it is kept.
 
     Examples
     --------
@@ -124,8 +133,11 @@ def ensemble(
     if not isinstance(backend, str) or backend not in BACKENDS:
         raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
     workers = checked_workers(workers)
+    check_flag("resume", resume)
+    if resume and store is None:
+        raise ValueError("`resume` goes on with a `store`: name one.")
     kept = reduction(reduce)
-    orbits = _orbits(system, y0, n, seed)
+    orbits = initial_states(system, y0, n, seed)
     fixed, axes = _axes(system, params)
     if fixed:
         changed: Any = system
@@ -135,120 +147,46 @@ def ensemble(
     check_applies(integrator, system, first)
     task = Task(system, integrator, (t0, t1), times, axes, kept, backend)
     problem = task.problem(first)
+    report = _reporter(progress, math.prod(map(len, axes.values())) * len(orbits))
+    start = time.perf_counter()
     with at_most(1):
         fields = kept.fields(problem)
-    shape = (*(len(values) for values in axes.values()), len(orbits))
-    size = sum(math.prod(s) for s, _ in fields.values())
-    if math.prod(shape) * size > MAX_ASKED_VALUES:
-        raise ValueError(
-            f"`reduce` keeps {size} numbers of each of {' × '.join(map(str, shape))} = {math.prod(shape):,} orbits, "
-            f"{math.prod(shape) * size * 8 / 2**30:.3g} GiB in all, more than {MAX_ASKED_VALUES:.0e} numbers: keep "
-            "less, by `t_eval` or `reduce`."
-        )
-    if chunk is None:
-        chunk = default_chunk(problem, size, math.prod(shape))
-    check_counts(chunk=chunk)
-    pieces = blocks(shape, int(chunk))
-    parallel = kept.in_python or not problem.compiled
+    layout = Layout(axes, len(orbits), system.ndof, problem.times if kept.state == "y" else times, fields, kept.state)
+    sizes = _chunk_shape(layout, problem, chunk, store is None)
+    attributes = {
+        "system": system.name,
+        "method": name_of(integrator),
+        "options": str(integrator),
+        "t_span": [t0, t1],
+        "params": json.dumps(dict(system.params)),
+        "sympflow_version": __version__,
+    }
+    keeper: Keeper = Memory(layout, orbits, attributes)
+    if store is not None:
+        from sympflow.ensembles.stores import KNOWN, EnsembleStore, identity
 
-    result = Ensemble(problem.t_eval, dict(fields), orbits, axes, shape, system, integrator, (t0, t1))
-    report = _reporter(progress, math.prod(shape))
-    items = ((piece, orbits.sent(*piece.ranges[-1])) for piece in pieces)
-    start = time.perf_counter()
+        known = identity(system, integrator, (t0, t1), times, orbits, axes, kept, backend)
+        keeper = made = EnsembleStore.at(store, layout, sizes, attributes | {KNOWN: json.dumps(known)}, bool(resume))
+        sizes, task = made.sizes, replace(task, store=made)
+    pieces = blocks(layout.shape, sizes)
+    left = [piece for piece in pieces if not keeper.is_done(piece)]
+    report(sum(piece.size for piece in pieces) - sum(piece.size for piece in left))
+    items = ((piece, orbits.sent(*piece.ranges[-1])) for piece in left)
+    done = len(pieces) - len(left)
     try:
-        for index, done in mapped(run_piece, task, items, workers, processes=parallel):
-            result.place(pieces[index], done)
-            report(pieces[index].size)
+        for index, answer in mapped(run_piece, task, items, workers, processes=kept.in_python or not problem.compiled):
+            keeper.place(left[index], answer)
+            done += 1
+            report(left[index].size)
     except Unpicklable as error:
         raise _unpicklable(task, orbits, error) from error
     except LostWorkers as error:
-        raise RuntimeError(f"{error} Nothing is kept of this run.") from error
-    result.wall_time = time.perf_counter() - start
-    return result
-
-
-# the orbits ----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Given:
-    """Initial states that were given."""
-
-    y0: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.y0)
-
-    def states(self, start: int, stop: int) -> np.ndarray:
-        return self.y0[start:stop]
-
-    def sent(self, start: int, stop: int) -> Given:
-        """What a worker needs for the states start … stop: these, numbered from 0."""
-        return Given(self.y0[start:stop])
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """Initial states that a sampler draws where they are needed, `DRAWN` at a time."""
-
-    sampler: Any
-    n: int
-    seed: int
-    width: int
-    start: int = 0
-
-    def __len__(self) -> int:
-        return self.n
-
-    def states(self, start: int, stop: int) -> np.ndarray:
-        start, stop = self.start + start, self.start + stop
-        out = np.empty((stop - start, self.width))
-        for block in range(start // DRAWN, -(-stop // DRAWN)):
-            low, high = max(start, block * DRAWN), min(stop, (block + 1) * DRAWN)
-            out[low - start : high - start] = self._block(block)[low - block * DRAWN : high - block * DRAWN]
-        return out
-
-    def _block(self, block: int) -> np.ndarray:
-        seeds = np.random.SeedSequence([self.seed, block])
-        if isinstance(self.sampler, Domain):
-            return self.sampler.sample(DRAWN, int(seeds.generate_state(1)[0]))
-        states = np.asarray(self.sampler(np.random.default_rng(seeds), DRAWN))
-        if states.shape != (DRAWN, self.width) or states.dtype.kind not in "fiu":
-            raise ValueError(
-                f"`y0` must draw real states of shape ({DRAWN}, {self.width}) when called with (rng, {DRAWN}); got "
-                f"{states.dtype} of shape {states.shape}."
-            )
-        if not np.isfinite(states).all():
-            raise ValueError("`y0` draws states that are not finite: mend the sampler.")
-        return states
-
-    def sent(self, start: int, stop: int) -> Drawn:
-        """What a worker needs for the states start … stop: the sampler, and where to begin."""
-        return Drawn(self.sampler, stop - start, self.seed, self.width, self.start + start)
-
-
-def _orbits(system: HamiltonianSystem, y0: Any, n: int | None, seed: int) -> Given | Drawn:
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
-    samples = isinstance(y0, Domain) or (callable(y0) and not isinstance(y0, type))
-    if samples:
-        if n is None:
-            raise ValueError("`n` is needed: the number of states to draw from `y0`.")
-        check_counts(n=n)
-        drawn = Drawn(y0, int(n), int(seed), 2 * system.ndof)
-        if isinstance(y0, Domain) and y0.sample(1).shape != (1, drawn.width):
-            raise ValueError(
-                f"`y0` is a domain of states of another length than {drawn.width}, that of {system.name!r}."
-            )
-        return drawn
-    if n is not None:
-        raise ValueError("`n` is for drawing states from a domain or a sampler: leave it out, or pass one as `y0`.")
-    if is_tensor(y0):
-        raise TypeError("`y0` is a tensor, which an ensemble does not take: pass y0.numpy().")
-    given = check_y0(system, system.y0 if y0 is None else y0, None)
-    if given.ndim > 2:
-        raise ValueError(f"`y0` must have shape (N, {given.shape[-1]}); got {given.shape}: reshape it.")
-    return Given(np.atleast_2d(given))
+        whatever = "Nothing is kept: name a `store`, which is."
+        if store is not None:
+            whatever = f"{done} of {len(pieces)} chunks are in `store` {str(store)!r}: call again with resume=True."
+        raise RuntimeError(f"{error} {whatever}") from error
+    seconds = time.perf_counter() - start
+    return Ensemble(layout.times, axes, system, integrator, (t0, t1), orbits, keeper, seconds)
 
 
 def _axes(
@@ -283,52 +221,37 @@ def _axes(
 # chunks --------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Block:
-    """A block of the grid of parameters and orbits: its ranges, one an axis; in C order its orbits are consecutive."""
-
-    ranges: tuple[tuple[int, int], ...]
-    first: int
-
-    @property
-    def size(self) -> int:
-        return math.prod(stop - start for start, stop in self.ranges)
-
-    @property
-    def index(self) -> tuple[slice, ...]:
-        return tuple(slice(*ends) for ends in self.ranges)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return tuple(stop - start for start, stop in self.ranges)
-
-
-def chunk_shape(shape: tuple[int, ...], chunk: int) -> tuple[int, ...]:
-    """The shape of a block of at most `chunk` orbits: whole axes at the end, a part of one before them."""
-    lengths, left = [], chunk
-    for length in reversed(shape):
-        lengths.append(min(length, max(1, left)))
-        left = left // length
-    return tuple(reversed(lengths))
-
-
-def blocks(shape: tuple[int, ...], chunk: int) -> list[Block]:
-    """The blocks of a grid, in C order."""
-    sizes = chunk_shape(shape, chunk)
-    axes = [[(i, min(i + k, n)) for i in range(0, n, k)] for n, k in zip(shape, sizes, strict=True)]
-    return [
-        Block(ranges, int(np.ravel_multi_index([start for start, _ in ranges], shape)))
-        for ranges in itertools.product(*axes)
-    ]
-
-
-def default_chunk(problem: Chunk, size: int, total: int) -> int:
-    """Orbits of a chunk: for a quarter of a second of compiled steps, and no more than memory that is soon filled."""
-    t0, t1 = problem.t_span
-    length = problem.integrator.step_length(problem.system) or problem.system.dt
-    work = max(1, int(abs(t1 - t0) / length)) * problem.system.ndof
-    most = min(MOST_WORK // work, MOST_VALUES // max(size, 2 * problem.system.ndof), LONGEST_CHUNK, total // PIECES)
-    return SHORTEST_CHUNK * max(1, most // SHORTEST_CHUNK)
+def _chunk_shape(layout: Layout, problem: Chunk, chunk: int | None, in_memory: bool) -> tuple[int, ...]:
+    """The shape of a chunk; a ValueError says how large an ensemble is that does not fit."""
+    size = sum(math.prod(s) for s, _ in layout.fields.values())
+    total = math.prod(layout.shape)
+    grid = f"{' × '.join(f'{n:,}' for n in layout.shape)} orbits"
+    if in_memory and total * size > MAX_ASKED_VALUES:
+        raise ValueError(
+            f"`store` is needed: {size:,} numbers of each of {grid} are {total * size * 8 / 2**30:.3g} GiB, more than "
+            f"{MAX_ASKED_VALUES:.0e} numbers. Name one, or keep less by `t_eval` or `reduce`."
+        )
+    if chunk is None:
+        t0, t1 = problem.t_span
+        length = problem.integrator.step_length(problem.system) or problem.system.dt
+        work = max(1, int(abs(t1 - t0) / length)) * problem.system.ndof
+        most = min(MOST_WORK // work, MOST_VALUES // max(size, 2 * problem.system.ndof), LONGEST_CHUNK, total // PIECES)
+        chunk = SHORTEST_CHUNK * max(1, most // SHORTEST_CHUNK)
+    check_counts(chunk=chunk)
+    sizes = chunk_shape(layout.shape, int(chunk))
+    values = math.prod(sizes) * size
+    if values > MAX_ASKED_VALUES:
+        raise ValueError(
+            f"`chunk` of {math.prod(sizes):,} orbits with {size:,} numbers each is {values * 8 / 2**30:.3g} GiB, more "
+            f"than {MAX_ASKED_VALUES:.0e} numbers: choose at most {max(1, MAX_ASKED_VALUES // size):,}."
+        )
+    pieces = math.prod(-(-n // k) for n, k in zip(layout.shape, sizes, strict=True))
+    if pieces > MOST_PIECES:
+        raise ValueError(
+            f"`chunk` of {math.prod(sizes):,} cuts {grid} into {pieces:,} chunks, more than {MOST_PIECES:.0e}: choose "
+            "a larger one, or a smaller grid."
+        )
+    return sizes
 
 
 @dataclass(frozen=True)
@@ -342,6 +265,7 @@ class Task:
     axes: dict[str, np.ndarray]
     reduction: Reduction
     backend: str
+    store: EnsembleStore | None = None
 
     def problem(self, y0: np.ndarray) -> Chunk:
         """The chunk of some first orbits, at the first values of the parameters."""
@@ -354,17 +278,8 @@ class Task:
         return Chunk(system, self.integrator, self.t_span, self.t_eval, y0, backend=self.backend, first=first)
 
 
-@dataclass(frozen=True)
-class Done:
-    """The fields (n, ...) of the orbits of a block, their statuses (n,), and the messages of those that failed."""
-
-    fields: dict[str, np.ndarray]
-    status: np.ndarray
-    messages: dict[int, str]
-
-
 def run_piece(task: Task, item: tuple[Block, Given | Drawn]) -> Done:
-    """Run the orbits of a block, on this thread alone."""
+    """Run the orbits of a block, on this thread alone, and write them into the store, if there is one."""
     block, orbits = item
     y0 = orbits.states(0, len(orbits))
     grid = [values[slice(*ends)] for values, ends in zip(task.axes.values(), block.ranges[:-1], strict=True)]
@@ -375,8 +290,14 @@ def run_piece(task: Task, item: tuple[Block, Given | Drawn]) -> Done:
             chunk = task.chunk(named, y0, block.first + i * len(y0))
             fields = task.reduction.reduce(chunk)
             parts.append(Done(fields, chunk.status, {i * len(y0) + k: text for k, text in chunk.messages.items()}))
-    if len(parts) == 1:
-        return parts[0]
+    done = parts[0] if len(parts) == 1 else _joined(parts)
+    if task.store is None:
+        return done
+    task.store.write(block, done, y0)
+    return Done({}, done.status[:0], {})
+
+
+def _joined(parts: list[Done]) -> Done:
     fields = {name: np.concatenate([part.fields[name] for part in parts]) for name in parts[0].fields}
     messages = {row: text for part in parts for row, text in part.messages.items()}
     return Done(fields, np.concatenate([part.status for part in parts]), messages)
@@ -384,8 +305,6 @@ def run_piece(task: Task, item: tuple[Block, Given | Drawn]) -> Done:
 
 def _unpicklable(task: Task, orbits: Given | Drawn, error: Exception) -> TypeError:
     """The error that names which argument cannot be sent to processes."""
-    from sympflow.workers import Parcel
-
     parts = {"system": task.system, "method": task.integrator, "reduce": task.reduction, "y0": orbits.sent(0, 1)}
     for name, part in parts.items():
         try:
@@ -396,84 +315,6 @@ def _unpicklable(task: Task, orbits: Given | Drawn, error: Exception) -> TypeErr
                 "use workers=1."
             )
     return TypeError(f"`workers` cannot be sent their work ({error}): use workers=1.")
-
-
-# the result ----------------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class Ensemble:
-    """The result of `ensemble`.
-
-    Attributes
-    ----------
-    t : ndarray of shape (m,) or None
-        The times of `t_eval`.
-    y : ndarray of shape (..., N, 2d, m)
-        The states, where nothing was reduced; an axis in front for each of `params` that is an array.
-    fields : dict of str to ndarray of shape (..., N, ...)
-        What was kept of each orbit, by name; each is an attribute too.
-    status : ndarray of shape (..., N), of int8
-        0, or −1 for an orbit that failed, whose row is NaN.
-    messages : dict of tuple of int to str
-        Messages of the orbits that failed, by their indices.
-    params : dict of str to ndarray
-        The axes of the grid of parameters.
-    y0 : ndarray of shape (N, 2d)
-    wall_time : float
-        Seconds.
-    """
-
-    t: np.ndarray | None
-    layout: Fields = field(repr=False)
-    orbits: Given | Drawn = field(repr=False)
-    params: dict[str, np.ndarray]
-    shape: tuple[int, ...]
-    system: HamiltonianSystem = field(repr=False)
-    integrator: Integrator
-    t_span: tuple[float, float]
-    wall_time: float = 0.0
-    fields: dict[str, np.ndarray] = field(init=False, repr=False)
-    status: np.ndarray = field(init=False, repr=False)
-    messages: dict[tuple[int, ...], str] = field(init=False, repr=False, default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.fields = {name: np.empty((*self.shape, *shape), dtype) for name, (shape, dtype) in self.layout.items()}
-        self.status = np.zeros(self.shape, dtype=np.int8)
-
-    def place(self, block: Block, done: Done) -> None:
-        """Put the orbits of a block where they belong."""
-        for name, values in done.fields.items():
-            self.fields[name][block.index] = values.reshape(*block.shape, *values.shape[1:])
-        self.status[block.index] = done.status.reshape(block.shape)
-        for row, text in done.messages.items():
-            index = np.unravel_index(block.first + row, self.shape)
-            self.messages[tuple(map(int, index))] = text
-
-    def __getattr__(self, name: str) -> Any:
-        fields = self.__dict__.get("fields", {})
-        if name in fields:
-            return fields[name]
-        raise AttributeError(f"the ensemble has no {name!r}: of each orbit it has {', '.join(fields) or 'nothing'}.")
-
-    @property
-    def y0(self) -> np.ndarray:
-        """The initial states (N, 2d)."""
-        return self.orbits.states(0, len(self.orbits))
-
-    @property
-    def success(self) -> bool:
-        """True if no orbit failed."""
-        return not self.status.any()
-
-    @property
-    def message(self) -> str:
-        """What became of the orbits, in words."""
-        failed = int(np.count_nonzero(self.status))
-        if not failed:
-            return f"All {self.status.size:,} orbits reached the end."
-        index, text = min(self.messages.items())
-        return f"{failed:,} of {self.status.size:,} orbits failed, the first of them {list(index)}: {text}"
 
 
 def _reporter(progress: bool | Callable[[int, int], Any], total: int) -> Callable[[int], None]:

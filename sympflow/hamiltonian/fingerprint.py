@@ -25,22 +25,16 @@ LONGEST_COMPARED = 2_000
 """Characters of two formulas that are compared as such, where their texts differ."""
 TOLERANCE = 1e-9
 """Share of the largest difference of energies among the states, and of the largest entry of Γ."""
-LATEST, GOLDEN = 20.0, (5**0.5 - 1) / 2
-"""Times at which a driven H is probed are multiples of the golden ratio, modulo 1, of the first."""
 PROBES = 8
 """Fixed states whose energies begin a fingerprint."""
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
-    """H at 8 fixed states less H at a ninth; the entries of Γ follow, of a system with friction.
-
-    Of a driven system each of the 8 has its own time, at which H at the ninth is taken too.
-    """
-    states = _fixed_states(system.ndof)
-    ninth = np.broadcast_to(states[0], states[1:].shape)
-    H = _energies(system, states[1:]) - _energies(system, ninth)
+    """H at 8 fixed states less H at a ninth; the entries of Γ follow, of a system with friction."""
+    with np.errstate(all="ignore"):
+        H = to_numpy(system.hamiltonian(_fixed_states(system.ndof)))
     friction = () if system.damping is None else system.damping.ravel().tolist()
-    return (*H.tolist(), *friction)
+    return (*(H[1:] - H[0]).tolist(), *friction)
 
 
 def _fixed_states(ndof: int) -> np.ndarray:
@@ -177,7 +171,7 @@ class Identity:
         if len(self.states):
             finite = np.flatnonzero(np.isfinite(self.energies))
             i = int(finite[0]) if finite.size else 0
-            return float(_energies(system, self.states[: i + 1])[i]), float(self.energies[i])
+            return float(_energies(system, self.states[i : i + 1])[0]), float(self.energies[i])
         read, state = _read(self.expression, system.ndof), _fixed_states(system.ndof)[:1]
         assert read is not None
         return float(_energies(system, state)[0]), float(_energies(read, state)[0])
@@ -249,10 +243,8 @@ def _floats(values: Any, ndim: int) -> np.ndarray:
 
 
 def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
-    """H at the states (n, 2d), of a driven system each at a time that its number gives."""
-    times = None if system.autonomous else LATEST * (np.arange(1, len(states) + 1) * GOLDEN % 1.0)
     with np.errstate(all="ignore"):
-        return to_numpy(system.hamiltonian(states, times)).astype(float)
+        return to_numpy(system.hamiltonian(states)).astype(float)
 
 
 @lru_cache(maxsize=16)
