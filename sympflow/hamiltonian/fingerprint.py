@@ -25,36 +25,22 @@ LONGEST_COMPARED = 2_000
 """Characters of two formulas that are compared as such, where their texts differ."""
 TOLERANCE = 1e-9
 """Share of the largest difference of energies among the states, and of the largest entry of Γ."""
+LATEST, GOLDEN = 20.0, (5**0.5 - 1) / 2
+"""Times at which a driven H is probed are multiples of the golden ratio, modulo 1, of the first."""
 PROBES = 8
 """Fixed states whose energies begin a fingerprint."""
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
-    """H at 8 fixed states less H at a ninth.
+    """H at 8 fixed states less H at a ninth; the entries of Γ follow, of a system with friction.
 
-    The entries of Γ follow, of a system with friction; of a driven one, of which those are at the first of some times,
-    the changes to the others.
+    Of a driven system each of the 8 has its own time, at which H at the ninth is taken too.
     """
-    states, times = _fixed_states(system.ndof), fixed_times(system)
-    with np.errstate(all="ignore"):
-        first, *others = (to_numpy(system.hamiltonian(states, t)) for t in times)
-        first, others = first[1:] - first[0], [H[1:] - H[0] for H in others]
+    states = _fixed_states(system.ndof)
+    ninth = np.broadcast_to(states[0], states[1:].shape)
+    H = _energies(system, states[1:]) - _energies(system, ninth)
     friction = () if system.damping is None else system.damping.ravel().tolist()
-    return (*first.tolist(), *friction, *(x for H in others for x in (H - first).tolist()))
-
-
-FIXED_TIMES = (0.0, 0.37, 1.31, 4.73)
-"""Times at which a drive is probed; where its samples end, parts of their span."""
-
-
-def fixed_times(system: Hamiltonian) -> tuple[float | None, ...]:
-    """The times at which H of a system is probed: None alone for one that does not depend on the time."""
-    if system.autonomous:
-        return (None,)
-    span = None if system.symbols is None else system.symbols.span
-    if span is None:
-        return FIXED_TIMES
-    return tuple(span[0] + t / 5 * (span[1] - span[0]) for t in FIXED_TIMES)
+    return (*H.tolist(), *friction)
 
 
 def _fixed_states(ndof: int) -> np.ndarray:
@@ -191,7 +177,7 @@ class Identity:
         if len(self.states):
             finite = np.flatnonzero(np.isfinite(self.energies))
             i = int(finite[0]) if finite.size else 0
-            return float(_energies(system, self.states[i : i + 1], i)[0]), float(self.energies[i])
+            return float(_energies(system, self.states[: i + 1])[i]), float(self.energies[i])
         read, state = _read(self.expression, system.ndof), _fixed_states(system.ndof)[:1]
         assert read is not None
         return float(_energies(system, state)[0]), float(_energies(read, state)[0])
@@ -262,12 +248,18 @@ def _floats(values: Any, ndim: int) -> np.ndarray:
         raise ValueError("its numbers are no array of floats") from None
 
 
-def _energies(system: Hamiltonian, states: np.ndarray, first: int = 0) -> np.ndarray:
-    """H at states (n, 2d), each at one of the fixed times in turn, of which `first` is that of the first state."""
-    times = fixed_times(system)
-    t = None if system.autonomous else np.array([times[(first + i) % len(times)] for i in range(len(states))])
+def _probed_times(system: Hamiltonian, n: int) -> np.ndarray:
+    """The times (n,) of states, within the samples of a function of t if there are some."""
+    span = None if system.symbols is None else system.symbols.span
+    low, high = (0.0, LATEST) if span is None else span
+    return low + (high - low) * (np.arange(1, n + 1) * GOLDEN % 1.0)
+
+
+def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
+    """H at the states (n, 2d), of a driven system each at a time that its number gives."""
+    times = None if system.autonomous else _probed_times(system, len(states))
     with np.errstate(all="ignore"):
-        return to_numpy(system.hamiltonian(states, t)).astype(float)
+        return to_numpy(system.hamiltonian(states, times)).astype(float)
 
 
 @lru_cache(maxsize=16)
