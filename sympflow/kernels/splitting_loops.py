@@ -150,10 +150,15 @@ class SplittingLoops:
     def rows(self, table: StageTable, h: float = 1.0, t0: float = 0.0) -> np.ndarray:
         """What the loops read of a table; where they take the values of the system's parameters, with these.
 
-        Those of a driven system read the time too, that of a step h that begins at t0.
+        With friction the maps of the drifts are among them, of numbers for one h. Those of a driven system read the
+        time too, that of a step h that begins at t0.
         """
+        if self.friction is not None:
+            table = _with_friction(table, self.friction)
         if self.driven:
             return table.timed_rows(self.values, h, t0)
+        if self.friction is not None:
+            return table.packed
         return table.rows(self.values if _takes_values(table.level) else ())
 
     def step_rows(
@@ -282,8 +287,11 @@ class DampedKernel(SplittingKernel):
 
 @lru_cache(maxsize=256)
 def _damped_table(scheme: Scheme, h: float, friction: Friction) -> StageTable:
-    """`run_table` with the rows of `DampedDrift`."""
-    table = run_table(scheme, h)
+    return _with_friction(run_table(scheme, h), friction)
+
+
+def _with_friction(table: StageTable, friction: Friction) -> StageTable:
+    """A table with the rows of `DampedDrift`."""
     mean, decay = friction.factors(table.drifts)
     return replace(table, more=np.concatenate([mean.T, decay.T]))
 

@@ -1,4 +1,4 @@
-"""Compiled loops of driven systems, H(t, q, p): the order of every scheme, the time of every stage, samples, friction."""
+"""Compiled loops of driven systems, H(t, q, p): orders, the times of the stages, samples, friction."""
 
 import math
 
@@ -6,6 +6,7 @@ import numba
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+
 from sympflow import HamiltonianSystem, get, solve
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES
@@ -109,7 +110,9 @@ def test_samples_are_compiled(uniform):
 
 def test_periodic_samples_go_on():
     times = np.linspace(0, 2 * math.pi, 30)
-    spline = CubicSpline(times, np.append(1 + 0.3 * np.sin(times[:-1]), 1.0), bc_type="periodic", extrapolate="periodic")
+    spline = CubicSpline(
+        times, np.append(1 + 0.3 * np.sin(times[:-1]), 1.0), bc_type="periodic", extrapolate="periodic"
+    )
     system = HamiltonianSystem.from_sympy("a*p**2/2 + q**2/2", time="t", params={"a": spline})
     found, arrays = (
         solve(system, "verlet", t_span=(-9, 9), y0=START, dt=0.1, backend=b) for b in ("compiled", "array")

@@ -56,7 +56,7 @@ def close(q, p, q_error, p_error, table, k, work):
 
 @njit(**OPTIONS)
 def first_non_finite(q, p, table, first, k, n_steps, work):
-    """The first of `n_steps` steps from a running state, that of step k, whose end is not finite; `n_steps` if none is."""
+    """The first of `n_steps` steps from a running state, that of step k, whose end is not finite, or `n_steps`."""
     link = table.shape[1] - 2
     q_error, p_error = no_error(q), no_error(p)
     j = first
