@@ -59,10 +59,13 @@ class SymbolicHamiltonian(Definition):
         Symbols of H beside q and p: only a `parametric` form has some.
     values : tuple of float
         Their values.
+    meanings : tuple of sympy.Expr
+        What they stand for, in the symbols of H as it was written.
     """
 
     parameters: tuple[sp.Symbol, ...] = ()
     values: tuple[float, ...] = ()
+    meanings: tuple[sp.Expr, ...] = ()
     _written: tuple[sp.Expr, dict[sp.Symbol, sp.Expr]] | None = None
     """H as it was written, and the values of its parameters; None without any."""
 
@@ -98,6 +101,7 @@ class SymbolicHamiltonian(Definition):
         self.p = tuple(sp.symbols(f"p1:{ndof + 1}", real=True))
         numbered = {sp.Symbol("q", real=True): self.q[0], sp.Symbol("p", real=True): self.p[0]}
         if values:
+            _check_values(H, values)
             self._written = written.xreplace(numbered), values
         self._set(H.xreplace(numbered))
 
@@ -115,9 +119,9 @@ class SymbolicHamiltonian(Definition):
         """
         if self._written is None or self.timed:
             return self
-        found: dict[sp.Expr, tuple[sp.Symbol, float]] = {}
+        letters = _Letters(self._written[1])
         try:
-            H = _with_letters(*self._written, found)
+            H = letters.put_into(self._written[0])
         except (TypeError, OverflowError):  # a value that is no real number
             return self
         form = SymbolicHamiltonian.__new__(SymbolicHamiltonian)
@@ -125,14 +129,32 @@ class SymbolicHamiltonian(Definition):
         states = {*self.q, *self.p}
         form._set(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
         used = form.H.free_symbols - states
-        kept = [(symbol, value) for symbol, value in found.values() if symbol in used]
-        form.parameters, form.values = tuple(s for s, _ in kept), tuple(v for _, v in kept)
+        kept = [(part, *letter) for part, letter in letters.found.items() if letter[0] in used]
+        form.meanings, form.parameters, form.values = (tuple(row[i] for row in kept) for i in range(3))
         alike = (
             used == {*form.parameters}
             and form.separable == self.separable
             and (form.inverse_mass is None) == (self.inverse_mass is None)
         )
         return form if kept and alike and all(map(math.isfinite, form.values)) else self
+
+    @property
+    def written(self) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
+        """H as it was written, in the numbered coordinates, and the values of its parameters."""
+        return (self.H, {}) if self._written is None else self._written
+
+    @cached_property
+    def parametric_parts(self) -> tuple[list[sp.Expr], set[sp.Symbol]]:
+        """Parts of H, as written, that are letters or 0, ±1 in the `parametric` form, and parameters that stay numbers.
+
+        Raises
+        ------
+        TypeError, OverflowError
+            If the value of such a part is no real number.
+        """
+        letters = _Letters(self.written[1])
+        letters.put_into(self.written[0])
+        return [*letters.found, *letters.numbers], letters.replaced
 
     @property
     def timed(self) -> bool:  # type: ignore[override]
@@ -401,6 +423,11 @@ def _symbolic(name: str, value: Any, time: sp.Symbol | None) -> sp.Expr:
     if isinstance(value, Samples):
         assert time is not None
         return sampled_parameter(name, value, time)
+    return exact(value)
+
+
+def exact(value: float) -> sp.Expr:
+    """The number as it stands in an expression: integers as such."""
     return sp.nsimplify(value) if float(value).is_integer() else sp.Float(value)
 
 
@@ -417,42 +444,70 @@ def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | N
     return H
 
 
-def _with_letters(
-    f: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], found: dict[sp.Expr, tuple[sp.Symbol, float]]
-) -> sp.Expr:
-    """The expression with symbols for its parts that depend on parameters alone; these, with their values, in `found`.
+def _check_values(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
+    """Refuse values with which H is not finite or not real, as a mass of 0 or the root of a negative number."""
+    numbers = [abs(a) for a in H.atoms(sp.Number)]
+    if H.has(sp.I, sp.zoo, sp.nan, sp.oo) or any(a > LARGEST for a in numbers):
+        shown = ", ".join(f"{s} = {float(value):.9g}" for s, value in values.items() if value.is_number)
+        raise ValueError(f"`params` has {shown}, with which the expression is not a finite real one: change them.")
+
+
+class _Letters:
+    """Symbols for the parts of H that depend on parameters alone, with the values of these parts.
 
     Numbers in front of such a part are no part of it: of the derivatives they are exact. Within functions of several
     arguments, in exponents, and in roots of products, of which SymPy takes numbers out, parameters are replaced by
     their values.
+
+    Attributes
+    ----------
+    found : dict of Expr to (Symbol, float)
+    numbers : dict of Expr to float
+        The parts whose values, 0, 1 or −1, stay numbers.
+    replaced : set of Symbol
+        The parameters that were replaced by their values somewhere.
     """
-    parameters = values.keys()
-    if not f.free_symbols & parameters:
-        return f
-    if f.free_symbols <= parameters:
-        number, part = f.as_coeff_Mul()
-        if part not in found:
-            value = float(part.xreplace(values))
-            if value in (0, 1, -1):
-                return number * int(value)
-            found[part] = sp.Symbol(f"parameter_{len(found)}", real=True), value
-        return number * found[part][0]
-    if f.is_Add:
-        fixed = [a for a in f.args if a.free_symbols <= parameters]
-        moving = [_with_letters(a, values, found) for a in _ordered(f.args) if not a.free_symbols <= parameters]
-        return sp.Add(_with_letters(sp.Add(*fixed), values, found), *moving)
-    if f.is_Mul:
-        fixed = [a for a in f.args if a.free_symbols <= parameters]
-        moving = [_with_letters(a, values, found) for a in _ordered(f.args) if not a.free_symbols <= parameters]
-        coefficient = _with_letters(sp.Mul(*fixed), values, found)
-        if len(moving) == 1 and moving[0].is_Add:  # as SymPy does it with a number
-            return sp.Add(*[coefficient * a for a in moving[0].args])
-        return sp.Mul(coefficient, *moving)
-    if f.is_Pow and f.base.free_symbols & parameters and (f.exp.is_Integer or not f.base.is_Mul):
-        return _with_letters(f.base, values, found) ** f.exp.xreplace(values)
-    if isinstance(f, sp.Function) and len(f.args) == 1:
-        return f.func(_with_letters(f.args[0], values, found))
-    return f.xreplace(values)
+
+    def __init__(self, values: Mapping[sp.Symbol, sp.Expr]) -> None:
+        self.values = values
+        self.found: dict[sp.Expr, tuple[sp.Symbol, float]] = {}
+        self.numbers: dict[sp.Expr, float] = {}
+        self.replaced: set[sp.Symbol] = set()
+
+    def put_into(self, f: sp.Expr) -> sp.Expr:
+        """The expression with these symbols."""
+        parameters = self.values.keys()
+        if not f.free_symbols & parameters:
+            return f
+        if f.free_symbols <= parameters:
+            number, part = f.as_coeff_Mul()
+            if part not in self.found:
+                value = float(part.xreplace(self.values))
+                if value in (0, 1, -1):
+                    self.numbers[part] = value
+                    return number * int(value)
+                self.found[part] = sp.Symbol(f"parameter_{len(self.found)}", real=True), value
+            return number * self.found[part][0]
+        if f.is_Add:
+            fixed = [a for a in f.args if a.free_symbols <= parameters]
+            moving = [self.put_into(a) for a in _ordered(f.args) if not a.free_symbols <= parameters]
+            return sp.Add(self.put_into(sp.Add(*fixed)), *moving)
+        if f.is_Mul:
+            fixed = [a for a in f.args if a.free_symbols <= parameters]
+            moving = [self.put_into(a) for a in _ordered(f.args) if not a.free_symbols <= parameters]
+            coefficient = self.put_into(sp.Mul(*fixed))
+            if len(moving) == 1 and moving[0].is_Add:  # as SymPy does it with a number
+                return sp.Add(*[coefficient * a for a in moving[0].args])
+            return sp.Mul(coefficient, *moving)
+        if f.is_Pow and f.base.free_symbols & parameters and (f.exp.is_Integer or not f.base.is_Mul):
+            return self.put_into(f.base) ** self._replaced(f.exp)
+        if isinstance(f, sp.Function) and len(f.args) == 1:
+            return f.func(self.put_into(f.args[0]))
+        return self._replaced(f)
+
+    def _replaced(self, f: sp.Expr) -> sp.Expr:
+        self.replaced |= f.free_symbols & self.values.keys()
+        return f.xreplace(self.values)
 
 
 def _ordered(args: Sequence[sp.Expr]) -> list[sp.Expr]:

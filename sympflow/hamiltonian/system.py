@@ -6,7 +6,7 @@ import copy
 import math
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property, lru_cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -288,6 +288,71 @@ class HamiltonianSystem(Hamiltonian):
         A system with others is made by `HamiltonianSystem.from_sympy`, or by the function of its scene.
         """
         return self._params
+
+    def check_parameters(self, names: Iterable[str]) -> None:
+        """Refuse names that are no parameters of H.
+
+        Raises
+        ------
+        TypeError
+            If the system is given by functions.
+        ValueError
+            With the names that it has.
+        """
+        if self.symbols is None:
+            raise TypeError(
+                f"`params` are of symbolic systems, and {self.name!r} is given by functions, which hold their values: "
+                "make a system for each, or define it with HamiltonianSystem.from_sympy(..., params=...)."
+            )
+        if self.external_force is not None:
+            raise ValueError(
+                f"`params` of {self.name!r} are those of H and not of its external force: make a system for each value."
+            )
+        known = [s.name for s in self.symbols.written[1]]
+        for name in names:
+            if name not in known:
+                has = f"which has {', '.join(known)}" if known else "which has none: write H with symbols for them"
+                raise ValueError(f"`params` has {name!r}, no parameter of {self.name!r}, {has}.")
+
+    def with_params(self, **values: float) -> HamiltonianSystem:
+        """The same system with other values of some parameters: what is compiled, in most methods, serves both.
+
+        The scene stays as it is: `y0`, `t_span`, `dt`, the domain and the friction; of a driven system the `period`
+        unless values of the driving change.
+
+        Parameters
+        ----------
+        **values : float
+            By the names in `params`; the others keep theirs.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If the system has no such parameter or is given by functions, or H has no meaning for a value.
+
+        Examples
+        --------
+        >>> system = HamiltonianSystem.from_sympy("p**2/2 + k*q**2/2", params={"k": 1.5})
+        >>> system.with_params(k=2.5).params
+        {'k': 2.5}
+        """
+        self.check_parameters(values)
+        assert self.symbols is not None
+        H, time = self.symbols.written[0], self.symbols.time
+        driving = set() if time is None else {s.name for s in H.diff(time).free_symbols}
+        return HamiltonianSystem.from_sympy(
+            H,
+            params={**self.params, **values},
+            time=time,
+            period=None if driving & values.keys() else self.period,
+            damping=self.damping,
+            name=self.name,
+            domain=self.domain,
+            y0=self.y0,
+            t_span=self.t_span,
+            dt=self.dt,
+            energy_scale=self.energy_scale,
+        )
 
     def check_functions(self, y0: Array | None = None) -> None:
         """Test once that the functions of a user agree with each other: `solve`, `train` and their like call it.

@@ -98,6 +98,8 @@ class Problem:
     dense_output: bool = False
     backend: str = "auto"
     events: EventSearch | None = None
+    letters: np.ndarray | None = None
+    """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
 
 
 @dataclass
@@ -171,6 +173,10 @@ class Integrator:
     @property
     def takes_friction(self) -> bool:
         """True if every step holds the friction −Γp of a damped system; where it does not, the system is refused."""
+        return False
+
+    def takes_letters(self, problem: Problem) -> bool:
+        """True if a run takes values of parameters for each trajectory, as numbers of one compiled run."""
         return False
 
     @property
