@@ -24,6 +24,7 @@ from sympflow.schemes import SCHEMES, Scheme, checked_scheme, scheme_evaluations
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
+    from sympflow.kernels.tangent_loops import TangentKernel
 
 
 @dataclass(frozen=True)
@@ -297,6 +298,17 @@ class Splitting(OwnStepper):
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         known = None if self.keeps else (self.on_clock(system) or self.composed(system)).tangent(y, h)
         return super().tangent(system, t, y, h) if known is None else known
+
+    def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
+        scheme = self.kicks_and_drifts
+        if scheme is None or self.compensated:
+            raise ValueError(
+                f"`method` {self.name!r} has compiled deviation vectors on the splitting 'kinetic' and the clock "
+                "'physical' only, without compensated sums: use backend='auto'."
+            )
+        from sympflow.kernels.tangent_loops import tangent_kernel
+
+        return tangent_kernel(system, scheme, vectors)
 
     def jacobian(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> np.ndarray:
         if not self.keeps:

@@ -31,7 +31,15 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = ["SplittingKernel", "SplittingLoops", "splitting_loops", "symbolic_module"]
+__all__ = [
+    "SplittingKernel",
+    "SplittingLoops",
+    "damped_drift",
+    "damped_table",
+    "splitting_loops",
+    "symbolic_module",
+    "takes_values",
+]
 
 
 def splitting_loops(system: HamiltonianSystem) -> SplittingLoops:
@@ -80,15 +88,15 @@ class SplittingLoops:
 
             self._has_force_gradient = system.quadratic_kinetic
             if is_large(system.symbols):
-                self._compile = partial(_family_loops, system, _damped_drift(system, True))
+                self._compile = partial(_family_loops, system, damped_drift(system, True))
             else:
-                damped = _damped_drift(system, False)
+                damped = damped_drift(system, False)
                 self.values = () if damped else system.symbols.parametric.values
                 self._compile = partial(_symbolic_loops, system.symbols, algebra_source(system.symbols), damped)
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
-            damped = _damped_drift(system, True)
+            damped = damped_drift(system, True)
             self._compile = partial(_array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, damped)
         else:
             raise ValueError(
@@ -136,7 +144,7 @@ class SplittingLoops:
 
     def rows(self, table: StageTable) -> np.ndarray:
         """What the loops read of a table; where they take the values of the system's parameters, with these."""
-        return table.rows(self.values if _takes_values(table.level) else ())
+        return table.rows(self.values if takes_values(table.level) else ())
 
     def step_rows(
         self, table: StageTable, x: np.ndarray, h: np.ndarray, y: np.ndarray, monomials: Monomials = ()
@@ -223,14 +231,14 @@ class DampedKernel(SplittingKernel):
 
     def table(self, h: float) -> np.ndarray:
         assert self.loops.friction is not None
-        return _damped_table(self.scheme, h, self.loops.friction)
+        return damped_table(self.scheme, h, self.loops.friction)
 
     def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
         return Steps(self._step(np.asarray(y, dtype=np.float64), np.asarray(h, dtype=np.float64)))
 
 
 @lru_cache(maxsize=256)
-def _damped_table(scheme: Scheme, h: float, friction: Friction) -> np.ndarray:
+def damped_table(scheme: Scheme, h: float, friction: Friction) -> np.ndarray:
     """`run_table` with the rows of `DampedDrift`."""
     table = run_table(scheme, h)
     mean, decay = friction.factors(table.drifts)
@@ -241,7 +249,7 @@ MOST_COUPLED = 6
 """Degrees of freedom of a damping matrix in compiled loops, where the two maps of each drift are 2d² numbers."""
 
 
-def _damped_drift(system: HamiltonianSystem, in_place: bool) -> DampedDrift | None:
+def damped_drift(system: HamiltonianSystem, in_place: bool) -> DampedDrift | None:
     """The drift of a system with friction as code; None without."""
     if system.damping is None:
         return None
@@ -271,7 +279,7 @@ def _header(compensated: bool, cache: bool, scheduled: bool) -> str:
     )
 
 
-def _takes_values(level: int) -> bool:
+def takes_values(level: int) -> bool:
     """True of kicks whose code is the same for all values of parameters.
 
     In those with force gradients sums such as g ω⁴ − b ω² would round in another way than with numbers in the code.
@@ -287,7 +295,7 @@ def _symbolic_loops(
     compensated: bool,
     monomials: Monomials,
 ) -> LoopFunctions:
-    if friction is None and _takes_values(level) and symbols.parametric is not symbols:
+    if friction is None and takes_values(level) and symbols.parametric is not symbols:
         from sympflow.kernels.codegen import algebra_source
 
         symbols = symbols.parametric

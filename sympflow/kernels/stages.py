@@ -240,11 +240,14 @@ class DampedDrift:
     ndof : int
     in_place : bool
         True if states are arrays, changed in place, as in the text `array_states`.
+    copies : int
+        States of `ndof` that a state is made of, one after the other: an orbit, and its deviation vectors.
     """
 
     ndim: int
     ndof: int
     in_place: bool
+    copies: int = 1
 
     @property
     def size(self) -> int:
@@ -278,10 +281,11 @@ def damped(p, a):
     return p"""
 
         def times(offset: int) -> str:
+            places = [(c * d, i) for c in range(self.copies) for i in range(d)]
             if self.ndim == 2:
-                sums = (" + ".join(f"a[{offset + d * i + k}]*p[{k}]" for k in range(d)) for i in range(d))
+                sums = (" + ".join(f"a[{offset + d * i + k}]*p[{c + k}]" for k in range(d)) for c, i in places)
             else:
-                sums = (f"a[{offset + (i if self.ndim else 0)}]*p[{i}]" for i in range(d))
+                sums = (f"a[{offset + (i if self.ndim else 0)}]*p[{c + i}]" for c, i in places)
             return "(" + "".join(f"{each}, " for each in sums) + ")"
 
         return f"""@njit(**OPTIONS, forceinline=True)

@@ -16,7 +16,7 @@ from sympflow.integrators.registry import build
 from sympflow.solution import Solution
 from sympflow.solver import solve
 from sympflow.studies.attempts import Attempt, Row
-from sympflow.studies.crossings import Plane, crossings
+from sympflow.metrics.crossings import Plane, crossings
 from sympflow.studies.figure_style import (
     TEXT,
     dress,
