@@ -15,7 +15,10 @@ INK, SOFT, RULE, FILL = "#1d2433", "#5b6478", "#8a93a8", "#eef1fb"
 
 ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("commands",), "the command line"),
-    (("studies", "training", "testing"), "several runs; fits and what ships; checks of integrators"),
+    (
+        ("studies", "training", "testing", "ensembles"),
+        "several runs; fits and what ships; checks of integrators; many orbits",
+    ),
     (("metrics",), "energy, symplecticity, accuracy: of the map as executed"),
     (("solver",), "solve(): checks, picks the integrator, returns a Solution"),
     (("solution", "interop"), "the result; SciPy, torchdiffeq, torchode: our methods there"),
@@ -24,7 +27,7 @@ ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("kernels",), "compiled loops behind one protocol"),
     (("systems",), "the built-in scenes"),
     (("hamiltonian",), "H, its structure and derivatives; domains"),
-    (("schemes", "events"), "tables of numbers; zeros along a run"),
+    (("schemes", "events", "workers"), "tables of numbers; zeros along a run; a map over workers"),
     (("arguments",), "checks of what users give"),
     (("arrays",), "operations that NumPy and torch spell differently"),
 )

@@ -17,7 +17,9 @@ _HOME = {
     "EnergySublevel": "hamiltonian.domain",
     "Tube": "hamiltonian.domain",
     "time_transformed": "hamiltonian.time_transformation",
+    "doubled": "hamiltonian.doubling",
     "solve": "solver",
+    "ensemble": "ensembles.sweep",
     "Solution": "solution",
     "get": "integrators.registry",
     "available": "integrators.registry",
@@ -55,6 +57,7 @@ __all__ = ["__version__", *_HOME, *_MODULES]  # noqa: PLE0604
 if TYPE_CHECKING:
     from sympflow import interop as interop
     from sympflow import systems as systems
+    from sympflow.ensembles.sweep import ensemble as ensemble
     from sympflow.flow.files import load as load
     from sympflow.flow.mlp import MLPFlow as MLPFlow
     from sympflow.flow.shipped import shipped_flows as shipped_flows
@@ -63,6 +66,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.domain import Box as Box
     from sympflow.hamiltonian.domain import EnergySublevel as EnergySublevel
     from sympflow.hamiltonian.domain import Tube as Tube
+    from sympflow.hamiltonian.doubling import doubled as doubled
     from sympflow.hamiltonian.system import HamiltonianSystem as HamiltonianSystem
     from sympflow.hamiltonian.time_transformation import time_transformed as time_transformed
     from sympflow.integrators.registry import available as available

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, to_numpy
+from sympflow.arrays import Array, is_tensor, to_numpy
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
+    from sympflow.hamiltonian.parameter_rows import ParameterRows
     from sympflow.hamiltonian.system import HamiltonianSystem
     from sympflow.integrators.contract import Integrator
 
@@ -49,6 +50,9 @@ class Solution:
         blow_up_time, an estimate (in a batch arrays, NaN for the others); newton_iterations of implicit methods.
     system, integrator, t_span, y0
         The problem that was solved and the method that did it: metrics execute the run again from these.
+    rows : ParameterRows or None
+        The parameters of each trajectory, where `solve` was given `params`: see `params` and `by_parameters`. `system`
+        is then the one that was given, unless all trajectories have the same values.
     """
 
     t: np.ndarray = field(repr=False)
@@ -63,6 +67,7 @@ class Solution:
     sol: Callable[[Any], Array] | None = field(default=None, repr=False)
     t_events: list[np.ndarray] | None = field(default=None, repr=False)
     y_events: list[np.ndarray] | None = field(default=None, repr=False)
+    rows: ParameterRows | None = field(default=None, repr=False)
 
     @property
     def nfev(self) -> int:
@@ -88,9 +93,69 @@ class Solution:
         """The states with [q, p] last: (..., n, 2d)."""
         return self.y.swapaxes(-1, -2)
 
+    @property
+    def params(self) -> dict[str, Any]:
+        """The values of the parameters by their names: numbers, and arrays (...) of those that `solve` was given."""
+        return {**self.system.params, **({} if self.rows is None else self.rows.values)}
+
+    @property
+    def varied(self) -> bool:
+        """True if trajectories have parameters of their own."""
+        return self.rows is not None and not self.rows.uniform
+
+    def by_parameters(self) -> Iterator[tuple[np.ndarray, Solution]]:
+        """The trajectories by the values of their parameters, each group as a solution of its own system.
+
+        Yields
+        ------
+        index : ndarray of int, shape (k,)
+            Places in the flattened batch.
+        sol : Solution
+            Of k trajectories.
+        """
+        assert self.rows is not None
+        for index, system, _ in self.rows.distinct():
+            status = np.broadcast_to(self.status, self.rows.shape).reshape(-1)[index]
+            stats = {name: _taken(value, index, self.rows.shape) for name, value in self.stats.items()}
+            yield (
+                index,
+                replace(
+                    self,
+                    y=self.y.reshape(-1, *self.y.shape[-2:])[index],
+                    status=status,
+                    stats=stats,
+                    system=system,
+                    y0=self.y0.reshape(-1, self.y0.shape[-1])[index],
+                    sol=None,
+                    rows=None,
+                ),
+            )
+
+    def physical(self) -> Solution:
+        """The solution of the physical system, of a solution of a doubled one (`sympflow.doubled`).
+
+        Its states are [q₊, p₊], its system the one with friction and the external force, and `stats["difference"]` is
+        the largest |q₋| or |p₋| of the run, 0 in the physical limit. Metrics of what is not kept refuse it.
+
+        Raises
+        ------
+        ValueError
+            If the system is no doubled one.
+
+        Warns
+        -----
+        RuntimeWarning
+            If the difference has grown beyond 1e-6 of the states.
+        """
+        return physical_solution(self)
+
     def energy(self) -> Array:
         """H along the solution: (..., n)."""
         with np.errstate(all="ignore"):
+            if self.varied and not is_tensor(self.y):
+                return _energy(self, self.states)
+            if self.varied:
+                return gathered(self, lambda part: part.energy())
             return self.system.hamiltonian(self.states)
 
     def energy_error(self) -> np.ndarray:
@@ -143,6 +208,46 @@ class Solution:
         return self
 
 
+LARGEST_DIFFERENCE = 1e-6
+"""Difference of the two copies, over the largest number of the states, beyond which a physical solution warns."""
+
+
+def physical_solution(sol: Solution) -> Solution:
+    """The physical part of a solution of a doubled system: see `Solution.physical`."""
+    doubled = sol.system.as_doubled()
+    with np.errstate(all="ignore"):
+        apart, size = (abs(to_numpy(y)).max(initial=0.0) for y in (doubled.difference(sol.states), sol.states))
+    if apart > LARGEST_DIFFERENCE * size:
+        warnings.warn(
+            f"The doubled variables q₋, p₋ have grown to {apart:.3g}: the run has left the physical limit. Reduce "
+            "`dt`, or project every step, solve(system, 'projected', of=method).",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+    limit = doubled.physical_limit
+    return replace(
+        sol,
+        y=limit(sol.states).swapaxes(-1, -2),
+        system=doubled.physical,
+        y0=limit(sol.y0),
+        stats={**sol.stats, "difference": float(apart)},
+        sol=None if sol.sol is None else _PhysicalOutput(sol.sol, limit),
+        y_events=None if sol.y_events is None else [limit(y) for y in sol.y_events],
+    )
+
+
+@dataclass(frozen=True)
+class _PhysicalOutput:
+    """The physical part of the dense output of a doubled system."""
+
+    sol: Callable[[Any], Array]
+    limit: Callable[[Array], Array]
+
+    def __call__(self, t: Any) -> Array:
+        y = self.sol(t)
+        return self.limit(y) if np.ndim(t) == 0 else self.limit(y.swapaxes(-1, -2)).swapaxes(-1, -2)
+
+
 def check_solution(sol: object, name: str = "sol") -> None:
     """Raise a TypeError unless `sol` is a Solution."""
     if not isinstance(sol, Solution):
@@ -177,6 +282,109 @@ def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> 
 
 
 def _energy(sol: Solution, y: Array) -> np.ndarray:
-    """H in float64, whatever the precision of the run."""
+    """H in float64, whatever the precision of the run, of each trajectory at its states (..., k, 2d) or (..., 2d)."""
     with np.errstate(all="ignore"):
+        if sol.rows is not None and not sol.rows.uniform and sol.system.autonomous:
+            return sol.rows.hamiltonian(to_numpy(y).astype(float))
         return np.asarray(sol.system.hamiltonian(to_numpy(y).astype(float)))
+
+
+# trajectories with parameters of their own -----------------------------------------------------------------------
+
+
+def gathered(sol: Solution, measure: Callable[[Solution], Any]) -> Any:
+    """The results (...) of a measure of each group of trajectories (k, ...) that have the same parameters."""
+    assert sol.rows is not None
+    pieces = [(index, measure(part)) for index, part in sol.by_parameters()]
+    return _scattered(pieces, sol.rows.shape)
+
+
+def joined(
+    pieces: Sequence[tuple[np.ndarray, Solution]], system: HamiltonianSystem, y0: Array, rows: ParameterRows
+) -> Solution:
+    """One solution of solutions (k, 2d, n) of some trajectories each, by their places in the flattened batch.
+
+    Raises
+    ------
+    ValueError
+        If their outputs are at other times.
+    """
+    first = pieces[0][1]
+    for _, part in pieces[1:]:
+        if not np.array_equal(part.t, first.t):
+            raise ValueError(
+                f"`t_eval` is needed: method {first.integrator.name!r} chooses its steps for each value of the "
+                "parameters, so that their outputs are at other times."
+            )
+    dense = None if first.sol is None else Joined([(i, part.sol) for i, part in pieces if part.sol], rows.shape)
+    status = _scattered([(i, np.asarray(part.status)) for i, part in pieces], rows.shape)
+    bad = [(i[np.asarray(part.status) < 0], part) for i, part in pieces if not part.success]
+    message = first.message
+    if bad:
+        index, part = min(bad, key=lambda piece: int(piece[0][0]))
+        where = ", ".join(map(str, np.unravel_index(int(index[0]), rows.shape)))
+        values = ", ".join(f"{name} = {value.reshape(-1)[index[0]]:.9g}" for name, value in rows.values.items())
+        failed = sum(len(i) for i, _ in bad)
+        message = f"{failed} of {status.size} trajectories failed, the first at {where} ({values}). {part.message}"
+    return replace(
+        first,
+        y=_scattered([(i, part.y) for i, part in pieces], rows.shape),
+        status=status,
+        message=message,
+        stats=_joined_stats([(i, part.stats) for i, part in pieces], rows.shape),
+        system=system,
+        y0=y0,
+        sol=dense,
+        rows=rows,
+    )
+
+
+class Joined:
+    """Dense output of a batch whose trajectories were solved in groups: sol(t) is (..., 2d), or (..., 2d, n)."""
+
+    def __init__(self, pieces: Sequence[tuple[np.ndarray, Callable[[Any], Array]]], shape: tuple[int, ...]) -> None:
+        self.pieces, self.shape = pieces, shape
+
+    def __call__(self, t: Any) -> Array:
+        return _scattered([(index, sol(t)) for index, sol in self.pieces], self.shape)
+
+
+def _scattered(pieces: Sequence[tuple[np.ndarray, Any]], shape: tuple[int, ...]) -> Any:
+    """Arrays (k, ...) of some trajectories each as one, (*shape, ...)."""
+    whole: Any
+    order = np.concatenate([index for index, _ in pieces])
+    back = np.argsort(order)
+    if is_tensor(pieces[0][1]):
+        import torch
+
+        whole = torch.cat([values for _, values in pieces])[torch.as_tensor(back)]
+        return whole.reshape(*shape, *whole.shape[1:])
+    if len(pieces) == 1 and (order == np.arange(len(order))).all():
+        whole = np.asarray(pieces[0][1])
+    else:
+        whole = np.concatenate([np.asarray(values) for _, values in pieces])[back]
+    return whole.reshape(*shape, *whole.shape[1:])
+
+
+def _joined_stats(pieces: Sequence[tuple[np.ndarray, dict[str, Any]]], shape: tuple[int, ...]) -> dict[str, Any]:
+    """Times are added, counts are the largest, arrays (k,) one array with NaN where some have none."""
+    stats: dict[str, Any] = {}
+    for name in dict.fromkeys(name for _, own in pieces for name in own):
+        values = [own[name] for _, own in pieces if name in own]
+        if any(isinstance(value, np.ndarray) for value in values):
+            full = [(i, np.broadcast_to(own.get(name, np.nan), i.shape)) for i, own in pieces]
+            stats[name] = _scattered(full, shape)
+        elif name == "wall_time":
+            stats[name] = sum(values)
+        elif isinstance(values[0], int | float):
+            stats[name] = max(values)
+        else:
+            stats[name] = values[0]
+    return stats
+
+
+def _taken(value: Any, index: np.ndarray, shape: tuple[int, ...]) -> Any:
+    """The part of an array of the batch's shape; other values as they are."""
+    if isinstance(value, np.ndarray) and value.shape[: len(shape)] == shape:
+        return value.reshape(-1, *value.shape[len(shape) :])[index]
+    return value

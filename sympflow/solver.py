@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,7 +28,10 @@ from sympflow.integrators.contract import Failure, Integrator, Outcome, Problem
 from sympflow.integrators.domain_exit import check_domain, check_system_along
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
 from sympflow.integrators.registry import build, check_applies, naming_plugin
-from sympflow.solution import Solution
+from sympflow.solution import Solution, joined
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.parameter_rows import ParameterRows
 
 BACKENDS = ("auto", "compiled", "array")
 MAX_EVENT_SAMPLES = 100_000_000
@@ -41,6 +45,7 @@ def solve(
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | Array | None = None,
     *,
+    params: Mapping[str, ArrayLike] | None = None,
     t_eval: ArrayLike | None = None,
     dense_output: bool = False,
     save_every: int | None = None,
@@ -64,6 +69,12 @@ def solve(
     y0 : array_like or tensor of shape (..., 2d), optional
         Initial state [q, p], or a batch of them. The default is the system's. A NumPy array gives float64 (integers are
         promoted); a tensor gives a tensor of its dtype and device, and gradients flow to it.
+    params : mapping of str to array_like, optional
+        Values of parameters of the system for each trajectory: numbers, or arrays that broadcast with the batch of y0;
+        of one state y0 they make a batch. The others keep the system's values. Splitting methods on the splitting
+        "kinetic" take them as numbers of one compiled run; elsewhere trajectories of equal values run together, one
+        set of values after the other. Either way each trajectory is, bit by bit, that of a batch on
+        ``system.with_params(...)``. A trained flow holds for its own parameters alone.
     t_eval : array_like of shape (n,), optional
         Times to report, ordered from start to end. The default is every step. No other state is stored.
     dense_output : bool
@@ -120,9 +131,11 @@ def solve(
     search = check_events(events, event_step)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span, search is not None and search.may_end_run)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
-    integrator = integrator.resolved(system, y_start, abs(t1 - t0))
-    check_applies(integrator, system, y_start)
-    integrator.check_library(y_start)
+    rows = None
+    if params is not None:
+        rows, y_start = check_params(system, params, y_start, integrator)
+        if rows.uniform:
+            system = rows.system_of(0)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
     every = check_save_every(save_every, times)
     if not isinstance(backend, str) or backend not in BACKENDS:
@@ -142,8 +155,21 @@ def solve(
     if search is not None:
         check_event_search(search, y_start, abs(t1 - t0))
     problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend, search)
+    if rows is None or rows.uniform:
+        sol = _solved(integrator, problem, action)
+        sol.rows = rows
+        return sol
+    return _solved_rows(integrator, problem, action, rows)
+
+
+def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
+    """The solution of a validated problem."""
+    system, y_start = problem.system, problem.y0
+    integrator = integrator.resolved(system, y_start, abs(problem.t1 - problem.t0))
+    check_applies(integrator, system, y_start)
+    integrator.check_library(y_start)
     run = _run
-    if t1 in (math.inf, -math.inf):
+    if problem.t1 in (math.inf, -math.inf):
         run = _run_endless
     else:
         check_memory(integrator, problem)
@@ -154,7 +180,7 @@ def solve(
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
     failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
-    if failed and readable(y_start):
+    if failed and problem.letters is None and readable(y_start):
         from sympflow.integrators.diagnosis import note_singularities
 
         note_singularities(outcome, integrator, problem)
@@ -173,12 +199,32 @@ def solve(
         stats=outcome.stats,
         system=system,
         integrator=integrator,
-        t_span=(t0, problem.t1),
+        t_span=(problem.t0, problem.t1),
         y0=y_start,
         sol=outcome.sol,
         t_events=None if problem.events is None else problem.events.times(),
         y_events=None if problem.events is None else problem.events.states(y_start),
     )
+
+
+def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows) -> Solution:
+    """The solution of a batch whose trajectories have parameters of their own.
+
+    Those whose values are numbers of one run are solved together, and where the method or the system has no such run,
+    those of equal values.
+    """
+    states = problem.y0.reshape(-1, problem.y0.shape[-1])
+    pieces = []
+    for group in rows.by_form() if action == "ignore" else rows.distinct():
+        together = replace(problem, system=group.system, y0=states[group.places], letters=group.letters)
+        if group.letters is None or integrator.takes_letters(together):
+            pieces.append((group.places, _solved(integrator, together, action)))
+            continue
+        for few, system, _ in rows.taken(group.places).distinct():
+            index = group.places[few]
+            alone = replace(problem, system=system, y0=states[index])
+            pieces.append((index, _solved(integrator, alone, action)))
+    return joined(pieces, problem.system, problem.y0, rows)
 
 
 def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
@@ -286,10 +332,7 @@ def check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
     else:
         y0 = _as_floats(y0, _check_dtype(dtype))
     if y0.ndim == 0 or y0.shape[-1] != size:
-        raise ValueError(
-            f"`y0` must have shape (..., {size}) for {system.name!r}, [q, p] with {system.ndof} each; got "
-            f"{tuple(y0.shape)}."
-        )
+        y0 = system.lift(y0)
     if math.prod(y0.shape) == 0:
         raise ValueError(f"`y0` is an empty batch, of shape {tuple(y0.shape)}: pass at least one state.")
     if not (np.isfinite(y0) if type(y0) is np.ndarray else finite_states(y0)).all():
@@ -326,6 +369,25 @@ def _check_dtype(dtype: Any) -> np.dtype:
     if chosen not in (np.float32, np.float64):
         raise ValueError(f"`dtype` must be 'float32' or 'float64'; got {dtype!r}.")
     return chosen
+
+
+def check_params(
+    system: HamiltonianSystem, params: Any, y0: Array, integrator: Integrator
+) -> tuple[ParameterRows, Array]:
+    """The parameters of each trajectory, and y0 broadcast with them."""
+    from sympflow.hamiltonian.parameter_rows import checked_rows
+
+    rows = checked_rows(system, params, tuple(y0.shape[:-1]))
+    if integrator.trained:
+        other = [name for name, values in rows.values.items() if (values != system.params[name]).any()]
+        if other:
+            own = ", ".join(f"{name} = {system.params[name]:.9g}" for name in other)
+            raise ValueError(
+                f"`params` changes {', '.join(other)}, and a trained flow, as of method {integrator.name!r}, holds for "
+                f"its own parameters ({own}): train one for each value, or use a classical method such as 'kahan_li8'."
+            )
+    shape = (*rows.shape, y0.shape[-1])
+    return rows, (y0.expand(shape) if is_tensor(y0) else np.broadcast_to(y0, shape).copy())
 
 
 def check_events(events: Any, event_step: Any) -> EventSearch | None:

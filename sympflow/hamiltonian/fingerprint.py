@@ -24,7 +24,9 @@ LONGEST_EXPRESSION = 20_000
 LONGEST_COMPARED = 2_000
 """Characters of two formulas that are compared as such, where their texts differ."""
 TOLERANCE = 1e-9
-"""Share of the largest difference of energies among the states."""
+"""Share of the largest difference of energies among the states, and of the largest entry of Γ."""
+PROBES = 8
+"""Fixed states whose energies begin a fingerprint."""
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
@@ -40,32 +42,51 @@ def _fixed_states(ndof: int) -> np.ndarray:
 
 
 def same_system(a: Sequence[float], b: Sequence[float]) -> bool:
-    """Return True if two fingerprints agree to nine digits of the largest."""
+    """Return True if two fingerprints agree to nine digits of the largest, of the energies and of Γ each."""
     return a == b or _agree(tuple(a), tuple(b))
 
 
 @lru_cache(maxsize=256)
 def _agree(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
     u, v = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    if u.shape != v.shape:
-        return False
+    return u.shape == v.shape and all(_close(u[part], v[part]) for part in (slice(PROBES), slice(PROBES, None)))
+
+
+def _close(u: np.ndarray, v: np.ndarray) -> bool:
     finite = u[np.isfinite(u)]
     return np.allclose(u, v, rtol=0, atol=TOLERANCE * np.abs(finite).max(initial=0.0), equal_nan=True)
 
 
-def check_for_flows(system: Hamiltonian) -> None:
-    """Refuse a system with friction, which trained flows, of conservative systems, would leave out.
+def check_for_flows(system: Hamiltonian, takes_friction: bool = False) -> None:
+    """Refuse a system of which a flow would leave something out: friction, a force that is none of H, or the time.
+
+    Parameters
+    ----------
+    system : Hamiltonian
+    takes_friction : bool
+        True for flows that hold the friction −Γp.
 
     Raises
     ------
     ValueError
         With the reason.
     """
-    system.check_conservative(
-        "which no trained flow has",
-        "train and use flows of the system without `damping`, and solve this one by a splitting method such as "
-        "'verlet' or 'kahan_li8'",
+    if system.external_force is not None or not takes_friction:
+        system.check_conservative(
+            "which trained flows have only where they are primed, with H = ½ pᵀM⁻¹p + V(q)",
+            "fit such a flow by sympflow.train(system), or use a splitting method such as 'verlet' or 'kahan_li8', or "
+            "a Runge–Kutta method such as 'dop853'",
+        )
+    system.check_autonomous(
+        "which no trained flow has", "solve it by a splitting method such as 'verlet' or 'kahan_li8'"
     )
+
+
+def without_friction(mine: Sequence[float], identity: Identity | None, system: Hamiltonian) -> bool:
+    """Return True if a fingerprint and an identity are those of a damped system without its friction."""
+    if system.friction is None or not same_system(mine, fingerprint(system)[:PROBES]):
+        return False
+    return identity is None or identity.agrees(system)
 
 
 Known = WeakKeyDictionary["Hamiltonian", bool]
@@ -73,7 +94,9 @@ Known = WeakKeyDictionary["Hamiltonian", bool]
 
 @dataclass(eq=False)
 class Identity:
-    """The H of a conservative system as a flow keeps it, to know it again all over its domain, and along a run.
+    """The H of a system as a flow keeps it, to know it again all over its domain, and along a run.
+
+    It tells nothing of friction, of which the fingerprint has Γ.
 
     A fingerprint probes H near the origin alone, and two systems may agree there and differ where the flow is used.
 
@@ -100,8 +123,7 @@ class Identity:
 
     @classmethod
     def of(cls, system: Hamiltonian, domain: Domain | None, seed: int = 20260103) -> Self:
-        """Return the identity of a system, by seeded states of a domain; of one without friction."""
-        check_for_flows(system)
+        """Return the identity of a system, by seeded states of a domain."""
         states = np.empty((0, 2 * system.ndof)) if domain is None else _spread_states(system, domain, seed)
         energies = _energies(system, states) if len(states) else np.empty(0)
         expression = system.expression
@@ -113,8 +135,6 @@ class Identity:
         """Return True if H of a system has these energies at these states, up to a constant; found out once."""
         if self._last is not None and self._last() is system:  # in nearly all calls
             return True
-        if not system.conservative:
-            return False
         found = self._agreed.get(system)
         if found is None:
             found = self._agreed[system] = self.is_proved(system) or self.first_difference(system) is None
@@ -160,8 +180,6 @@ class Identity:
         """Return True if the formula of a system is this one, up to a constant; found out once."""
         if self._last is not None and self._last() is system:
             return True
-        if not system.conservative:
-            return False
         found = self._proved.get(system)
         if found is None:
             found = self._proved[system] = self._prove(system)

@@ -16,7 +16,10 @@ Its duties:
 
 9. `arrays_only` says so, where `step` and `run` take NumPy arrays only.
 10. `takes_friction` is False, and a damped system is refused before the integrator sees it; or the method takes the
-   friction −Γp into account, as one that steps by `system.vector_field` does.
+   friction −Γp into account, as one that steps by `system.vector_field` does. `takes_forces` says the same of a force
+   that is none of H, which only `vector_field` holds.
+11. `takes_driving` is False, and a driven system, H(t, q, p), is refused before the integrator sees it; or the method
+   takes H and its derivatives at the times of its stages, t + c·h, as `system.vector_field(y, t + c * h)` does.
 
 `FixedStep`, in `sympflow.integrators.base`, does 4, 5, 6 and 8 for any integrator that has a step: a new one needs
 duties 1 to 3 only, and its forces are counted. Whatever a run changes, such as its kernel and its counts, belongs to a
@@ -96,6 +99,8 @@ class Problem:
     dense_output: bool = False
     backend: str = "auto"
     events: EventSearch | None = None
+    letters: np.ndarray | None = None
+    """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
 
 
 @dataclass
@@ -171,6 +176,20 @@ class Integrator:
         """True if every step holds the friction −Γp of a damped system; where it does not, the system is refused."""
         return False
 
+    def takes_letters(self, problem: Problem) -> bool:
+        """True if a run takes values of parameters for each trajectory, as numbers of one compiled run."""
+        return False
+
+    @property
+    def takes_driving(self) -> bool:
+        """True if every step takes H at its times, of a driven system H(t, q, p); where not, the system is refused."""
+        return False
+
+    @property
+    def takes_forces(self) -> bool:
+        """True if every step holds any force beside −∂H/∂q, as one by `system.vector_field` does."""
+        return False
+
     def check(self, system: HamiltonianSystem) -> None:
         """Raise a ValueError with the reason if the method does not apply to the system."""
 
@@ -228,7 +247,7 @@ class Integrator:
         return forward_tangent(lambda x, lengths: self.step(system, t, x, lengths), y, h)
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
-        """The compiled loops of steps that carry so many deviation vectors along; a ValueError says why there are none."""
+        """The compiled loops of steps with so many deviation vectors; a ValueError says why there are none."""
         raise ValueError(f"`method` {self.name!r} has no compiled deviation vectors: use backend='auto'.")
 
     def jacobian(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> np.ndarray:

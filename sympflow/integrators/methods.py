@@ -93,8 +93,9 @@ CLASSES: dict[str, str] = {
     "gauss_legendre8": "implicit:GaussLegendre8",
 }
 """The other methods: module and class."""
-UNLISTED = {"log_sympflow": "flows:LogSympFlow"}
-"""A class that "sympflow" resolves to, for a flow in another time."""
+UNLISTED = {"log_sympflow": "flows:LogSympFlow", "projected": "projected:Projected"}
+"""Classes that stand on others: what "sympflow" resolves to for a flow in another time, and the steps of another method
+on a doubled system, projected."""
 TORCHDIFFEQ = (*ADAPTIVE, *FIXED, *MULTISTEP)
 
 NAMES = frozenset((*TRIPLES, *CLASSES, *TORCHDIFFEQ))

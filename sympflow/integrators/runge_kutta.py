@@ -26,6 +26,10 @@ class ExplicitStep(Integrator):
     def takes_friction(self) -> bool:
         return True
 
+    @property
+    def takes_forces(self) -> bool:
+        return True
+
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         """One step without error control."""
         h = per_state(h, y)

@@ -97,6 +97,10 @@ class Watched(Integrator):
     def takes_friction(self) -> bool:
         return True
 
+    @property
+    def takes_forces(self) -> bool:
+        return True
+
     def outputs(self, problem: Problem) -> tuple[np.ndarray, dict[str, Any]]:
         """The times to report, and what the statistics say of the steps."""
         raise NotImplementedError

@@ -13,7 +13,7 @@ from sympflow.hamiltonian.parts import ExactParts, Map
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import run_one, run_rows
 from sympflow.kernels.parts_loops import parts_loops
-from sympflow.kernels.protocol import Kernel, Run, Steps
+from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, opened
 from sympflow.kernels.splitting_loops import LoopFunctions, SplittingKernel, splitting_loops
 from sympflow.kernels.stages import StageTable, run_table, single_table
 from sympflow.kernels.timed_loops import reach_times
@@ -26,6 +26,9 @@ __all__ = [
     "SplitFlowKernel",
     "TableSource",
 ]
+
+
+ArrayStep = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class TableSource(Protocol):
@@ -79,11 +82,20 @@ class PrimedFlowKernel(Kernel):
         The flow's, one that can be compiled.
     compensated : bool
         Sum with Kahan's compensation in runs.
+    step : callable, optional
+        ψ̄_h of rows y (N, 2d) by array operations, ``step(h, y)`` with h (N,): of a system with friction, where the
+        numbers of a step are no polynomials in h.
     """
 
     saves_finite = True
 
-    def __init__(self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False) -> None:
+    def __init__(
+        self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False, step: ArrayStep | None = None
+    ) -> None:
+        if system.friction is not None and compensated:
+            raise ValueError(
+                "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
+            )
         if tables.level >= CURVATURE and system.symbols is None:
             raise ValueError(
                 f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled: "
@@ -91,43 +103,61 @@ class PrimedFlowKernel(Kernel):
             )
         self.system = system
         self._tables, self._splitting, self._compensated = tables, splitting_loops(system), compensated
+        self._step = None if system.friction is None else step
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         """Count those of the numbers that the kernel has: see `Kernel`."""
         return self._tables.evaluations(n_steps, n_saved, n_extra, "compiled")
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` times ψ̄_h from one state: see `Kernel`."""
         if not self._tables.processed:
-            return self._kernel(h).run(abs(h), y0, n_steps, save)
+            return self._kernel(h).run(abs(h), y0, n_steps, save, carry)
         tables, rollout = self._processed(h), self._functions().rollout_processed
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(save), len(y0)))
-        work = _stages(tables, n_steps, len(save)) * len(y0) // 2
-        n_finite = run_one(lambda stop: rollout(*tables, y0, n_steps, save, out, stop), work)
+        first, running = opened(carry, len(y0) * (1 + self._compensated))
+        work = _stages(tables, n_steps - first, len(save)) * len(y0) // 2
+        n_finite = run_one(lambda stop: rollout(*tables, y0, n_steps, save, out, stop, first, running), work)
+        if carry is not None:
+            carry.advance(n_steps, running)
         return Run(out, n_finite)
 
-    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+    def run_batch(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        threads: int | None = None,
+        carry: Carry | None = None,
+    ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         if len(y0) == 1:
-            return _as_batch(self.run(h, y0[0], n_steps, save))
+            return _one_row(self.run, h, y0, n_steps, save, carry)
         if not self._tables.processed:
-            return self._kernel(h).run_batch(abs(h), y0, n_steps, save, threads)
+            return self._kernel(h).run_batch(abs(h), y0, n_steps, save, threads, carry)
         tables, rollout = self._processed(h), self._functions().rollout_processed_batch
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(y0), len(save), y0.shape[1]))
         n_finite = np.empty(len(y0), dtype=np.int64)
 
-        def rows(i: slice, stop: np.ndarray) -> None:
-            rollout(*tables, y0[i], n_steps, save, out[i], n_finite[i], stop)
+        first, running = opened(carry, len(y0), y0.shape[1] * (1 + self._compensated))
 
-        run_rows(rows, len(y0), _stages(tables, n_steps, len(save)) * y0.shape[1] // 2, threads)
+        def rows(i: slice, stop: np.ndarray) -> None:
+            rollout(*tables, y0[i], n_steps, save, out[i], n_finite[i], stop, first, running[i])
+
+        run_rows(rows, len(y0), _stages(tables, n_steps - first, len(save)) * y0.shape[1] // 2, threads)
+        if carry is not None:
+            carry.advance(n_steps, running)
         return Run(out, n_finite)
 
     def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,); its numbers are polynomials in h."""
         h = np.asarray(h, dtype=np.float64)
         h = h.repeat(len(y)) if h.ndim == 0 else h
+        if self._step is not None:
+            return Steps(self._step(h, np.ascontiguousarray(y, dtype=np.float64)))
         if len(h) == 1 and h[0] != 0:
             back = bool(h[0] < 0)
             return Steps(self._stepped(-h if back else h, y, back))
@@ -148,7 +178,10 @@ class PrimedFlowKernel(Kernel):
 
     def _kernel(self, h: float) -> SplittingKernel:
         """K_h, or for h < 0 its inverse."""
-        return self._splitting.kernel(self._tables.scheme("primed kernel", abs(h), back=h < 0), self._compensated)
+        scheme = self._tables.scheme("primed kernel", abs(h), back=h < 0)
+        if (step := self._step) is not None:
+            return self._splitting.damped_kernel(scheme, lambda y, h: step(h, y))
+        return self._splitting.kernel(scheme, self._compensated)
 
     def _functions(self) -> LoopFunctions:
         """The compiled functions for the kicks of the flow."""
@@ -203,15 +236,23 @@ class SplitFlowKernel(Kernel):
         self._loops = parts_loops(parts)
         self._kernel = self._loops.kernel(lambda h: maps.maps(float(h)))
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` times ψ̄_h from one state: see `Kernel`."""
-        return self._kernel.run(h, y0, n_steps, save)
+        return self._kernel.run(h, y0, n_steps, save, carry)
 
-    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+    def run_batch(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        threads: int | None = None,
+        carry: Carry | None = None,
+    ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         if len(y0) == 1:
-            return _as_batch(self.run(h, y0[0], n_steps, save))
-        return self._kernel.run_batch(h, y0, n_steps, save, threads)
+            return _one_row(self.run, h, y0, n_steps, save, carry)
+        return self._kernel.run_batch(h, y0, n_steps, save, threads, carry)
 
     def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
@@ -226,9 +267,15 @@ class SplitFlowKernel(Kernel):
         return Steps(out)
 
 
-def _as_batch(run: Run) -> Run:
-    """A run of one state as that of a batch of one."""
-    return Run(run.states[None], np.array([run.n_finite]))
+def _one_row(
+    run: Callable[..., Run], h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None
+) -> Run:
+    """The run of a batch of one state, by that of one state."""
+    one = None if carry is None else Carry(carry.steps, None if carry.running is None else carry.running[0])
+    states, n_finite, _ = run(h, y0[0], n_steps, save, carry=one)
+    if carry is not None and one is not None and one.running is not None:
+        carry.advance(n_steps, one.running[None])
+    return Run(states[None], np.array([n_finite]))
 
 
 class ClockedFlowKernel(Kernel):
@@ -260,15 +307,23 @@ class ClockedFlowKernel(Kernel):
         self._scheme, self._kernel = scheme, splitting_loops(system).kernel(scheme)
         self._advance, self._numbers, self._time = advance, numbers, system.ndof - 1
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` times ψ̄_h from one state, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
-        Y, n_finite, _ = self._kernel.run(h, y0, n_steps, save)
+        Y, n_finite, _ = self._kernel.run(h, y0, n_steps, save, carry)
         Y[:, self._time] += np.asarray(save) * self._advance(float(h), float(y0[-1]))
         return Run(Y, n_finite)
 
-    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+    def run_batch(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        threads: int | None = None,
+        carry: Carry | None = None,
+    ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
-        Y, n_finite, _ = self._kernel.run_batch(h, y0, n_steps, save, threads)
+        Y, n_finite, _ = self._kernel.run_batch(h, y0, n_steps, save, threads, carry)
         Y[:, :, self._time] += np.asarray(save) * self._advance(h, y0[:, -1])[:, None]
         return Run(Y, n_finite)
 

@@ -15,7 +15,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels import terms
 from sympflow.kernels.codegen import statements
 from sympflow.kernels.modules import load_algebra, run_rows
-from sympflow.kernels.protocol import Kernel, Run, Steps
+from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, opened
 from sympflow.kernels.terms import is_large
 
 __all__ = ["ImplicitKernel", "implicit_kernel"]
@@ -67,23 +67,40 @@ class ImplicitKernel(Kernel):
         self.ndof, self._tableau, self._compensated = system.ndof, tableau, compensated
         self._algebra = gradient_and_hessian_source(system.symbols)
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` steps of length `h` from one state: see `Kernel`."""
-        Y, n_finite, iterations = self.run_batch(h, y0[None], n_steps, save)
+        Y, n_finite, iterations = self._rollout(h, y0[None], n_steps, save, None, carry)
         return Run(Y[0], n_finite[0], iterations)
 
-    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+    def run_batch(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        threads: int | None = None,
+        carry: Carry | None = None,
+    ) -> Run:
         """`run` for every row of `y0` (N, 2d), where it pays on several threads."""
+        return self._rollout(h, y0, n_steps, save, threads, carry)
+
+    def _rollout(
+        self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None, carry: Carry | None
+    ) -> Run:
         loops = _load(self._algebra, self._tableau, self._compensated)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(y0), len(save), 2 * self.ndof))
         n_finite, iterations = np.empty(len(y0), dtype=np.int64), np.empty(len(y0), dtype=np.int64)
 
+        first, running = opened(carry, len(y0), 2 * self.ndof * (1 + self._compensated))
+
         def rows(i: slice, stop: np.ndarray) -> None:
-            loops.rollout_each(h, y0[i], n_steps, save, out[i], n_finite[i], iterations[i], stop)
+            loops.rollout_each(h, y0[i], n_steps, save, out[i], n_finite[i], iterations[i], stop, first, running[i])
 
         size = 2 * self.ndof * len(self._tableau[1])
-        run_rows(rows, len(y0), n_steps * 4 * size**3, threads)
+        run_rows(rows, len(y0), (n_steps - first) * 4 * size**3, threads)
+        if carry is not None:
+            carry.advance(n_steps, running)
         return Run(out, n_finite, int(iterations.sum()))
 
     def step(self, h: ArrayLike, y: np.ndarray) -> Steps:

@@ -204,9 +204,7 @@ def _linearised(shape: Sequence[sp.Expr], symbols: Variations) -> dict[tuple[int
     return {place: printable(f) for place, f in entries.items() if f != 0}
 
 
-def _tried(
-    symbols: SymbolicHamiltonian | Variations, terms: int, prefix: str, monomials: Monomials
-) -> list[_Kick]:
+def _tried(symbols: SymbolicHamiltonian | Variations, terms: int, prefix: str, monomials: Monomials) -> list[_Kick]:
     own = symbols.symbols if isinstance(symbols, Variations) else symbols
     return [
         _scheduled(symbols, shape, prefix, common)

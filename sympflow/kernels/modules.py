@@ -9,8 +9,10 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache, partial
 from importlib.resources import files
 from itertools import pairwise
@@ -22,7 +24,17 @@ import numba
 import numpy as np
 from numba.core.registry import CPUDispatcher
 
-__all__ = ["NEVER", "OPTIONS", "cache_folder", "load_algebra", "load_module", "run_one", "run_rows", "template"]
+__all__ = [
+    "NEVER",
+    "OPTIONS",
+    "at_most",
+    "cache_folder",
+    "load_algebra",
+    "load_module",
+    "run_one",
+    "run_rows",
+    "template",
+]
 
 T = TypeVar("T")
 
@@ -132,6 +144,19 @@ def _write_once(folder: Path, name: str, source: str) -> Path:
     return path
 
 
+_most_threads: ContextVar[int | None] = ContextVar("most_threads", default=None)
+
+
+@contextmanager
+def at_most(threads: int) -> Iterator[None]:
+    """Run what is inside, in this thread, on at most so many threads: for callers that have workers of their own."""
+    token = _most_threads.set(threads)
+    try:
+        yield
+    finally:
+        _most_threads.reset(token)
+
+
 def run_one(call: Callable[[np.ndarray], T], work: int) -> T:
     """``call(stop)``, whose work takes about so many nanoseconds or more; it must end soon once ``stop[0]`` is set.
 
@@ -149,6 +174,7 @@ def run_rows(rows: Callable[[slice, np.ndarray], None], n_rows: int, work_per_ro
     `rows` releases the GIL; for `stop` see `run_one`.
     """
     n_blocks = -(-n_rows // _BLOCK)
+    threads = _most_threads.get() if threads is None else threads
     if threads is None:
         threads = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
         threads = min(threads, 1 + n_rows * work_per_row // _WORTH_A_THREAD)

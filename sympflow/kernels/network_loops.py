@@ -13,7 +13,7 @@ from numba.core.registry import CPUDispatcher
 from numpy.typing import ArrayLike
 
 from sympflow.kernels.modules import OPTIONS, load_module, run_rows, template
-from sympflow.kernels.protocol import Kernel, Run, Steps
+from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, opened
 
 __all__ = ["MLPFlowKernel", "NetworkLayer"]
 
@@ -114,14 +114,22 @@ class MLPFlowKernel(Kernel):
         is_kick = np.array([layer.is_kick for layer in layers])
         self._weights = is_kick, K, k, b, W, np.ascontiguousarray(W.swapaxes(-1, -2)), w
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` times ψ̄_h from one state: see `Kernel`."""
-        Y, n_finite, _ = self._rollout(h, y0[None], n_steps, save, threads=1)
+        Y, n_finite, _ = self._rollout(h, y0[None], n_steps, save, 1, carry)
         return Run(Y[0], int(n_finite[0]))
 
-    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+    def run_batch(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        threads: int | None = None,
+        carry: Carry | None = None,
+    ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
-        return self._rollout(h, y0, n_steps, save, threads)
+        return self._rollout(h, y0, n_steps, save, threads, carry)
 
     def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,), negative for the inverse."""
@@ -132,7 +140,15 @@ class MLPFlowKernel(Kernel):
                 out[rows] = self._rollout(steps[rows], y[rows], 1, np.array([1]), None).states[:, 0]
         return Steps(out)
 
-    def _rollout(self, h: ArrayLike, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None) -> Run:
+    def _rollout(
+        self,
+        h: ArrayLike,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        threads: int | None,
+        carry: Carry | None = None,
+    ) -> Run:
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         steps = np.full(len(y0), h, dtype=np.float64)
         backwards, t = bool((steps < 0).any()), np.abs(steps)
@@ -141,10 +157,14 @@ class MLPFlowKernel(Kernel):
         out = np.empty((len(y0), len(save), y0.shape[1]))
         n_finite = np.empty(len(y0), dtype=np.int64)
 
-        def rows(i: slice, stop: np.ndarray) -> None:
-            rollout(self._weights, backwards, t[i], y0[i], n_steps, save, out[i], n_finite[i], stop)
+        first, running = opened(carry, *y0.shape)
 
-        run_rows(rows, len(y0), 1000 * n_steps, threads)
+        def rows(i: slice, stop: np.ndarray) -> None:
+            rollout(self._weights, backwards, t[i], y0[i], n_steps, save, out[i], n_finite[i], stop, first, running[i])
+
+        run_rows(rows, len(y0), 1000 * (n_steps - first), threads)
+        if carry is not None:
+            carry.advance(n_steps, running)
         return Run(out, n_finite)
 
 

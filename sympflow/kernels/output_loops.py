@@ -9,7 +9,7 @@ import numpy as np
 
 from sympflow.kernels.modules import OPTIONS, load_module, template
 
-__all__ = ["all_between", "all_finite", "place"]
+__all__ = ["all_between", "all_finite", "place", "row_products"]
 
 
 @cache
@@ -27,6 +27,14 @@ def place(t: np.ndarray, t0: float, h: float, rounding: float) -> tuple[np.ndarr
     count, position, remainder = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64), np.empty(n)
     distinct = _loops().place(t, t0, h, rounding, count, remainder, position)
     return remainder, count[:distinct], position if distinct < n else None
+
+
+def row_products(A: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """A x of all vectors x (..., n), of which none depends on how many there are, as the products of a library do."""
+    rows = np.ascontiguousarray(x, dtype=np.float64).reshape(-1, x.shape[-1])
+    out = np.empty_like(rows)
+    _loops().row_products(np.ascontiguousarray(A), rows, out)
+    return out.reshape(x.shape)
 
 
 def all_finite(y: np.ndarray) -> bool:

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
 from sympflow.kernels.modules import NEVER, load_algebra, run_one, run_rows
+from sympflow.kernels.output_loops import row_products
 from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
-from sympflow.kernels.protocol import Kernel, Run, Steps
+from sympflow.kernels.protocol import NOTHING, Carry, Kernel, Run, Steps, opened
 from sympflow.kernels.terms import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_out
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
@@ -133,20 +134,25 @@ class PartsLoops:
         """The maps applied once to every row [X, Y] of `modes` (N, 2d), which stay modes."""
         functions = self.functions(sequence)
         out, n_finite = np.empty((len(modes), 1, modes.shape[1])), np.empty(len(modes), dtype=np.int64)
-        functions.rollout_batch(*self.run_table(sequence), modes, True, 1, ONE, out, n_finite, NEVER)
+        functions.rollout_batch(*self.run_table(sequence), modes, True, 1, ONE, out, n_finite, NEVER, 0, NOTHING[1])
         return out[:, 0]
 
     def modes(self, y: np.ndarray) -> np.ndarray:
         """The input of the loops: modes where these are mixed, else states."""
         y = np.ascontiguousarray(y, dtype=np.float64)
-        return np.ascontiguousarray(np.concatenate(self.parts.to_modes(y), axis=-1)) if self.mixed else y
+        if not self.mixed:
+            return y
+        parts, d = self.parts, self.parts.ndof
+        X = row_products(parts.inverse_C, y[..., :d] - parts.center)
+        return np.concatenate([X, row_products(parts.C.T, y[..., d:])], axis=-1)
 
     def states(self, out: np.ndarray, save: np.ndarray | None = None, y0: np.ndarray | None = None) -> np.ndarray:
         """The output of the loops as states."""
         if not self.mixed:
             return out
-        d = self.parts.ndof
-        states = self.parts.from_modes(out[..., :d], out[..., d:])
+        parts, d = self.parts, self.parts.ndof
+        X, Y = row_products(parts.C, out[..., :d]), row_products(parts.inverse_C.T, out[..., d:])
+        states = np.concatenate([parts.center + X, Y], axis=-1)
         if save is not None and len(save) and save[0] <= 0:
             states[..., : np.searchsorted(save, 0, "right"), :] = y0
         return states
@@ -220,20 +226,31 @@ class PartsKernel(Kernel):
     def __init__(self, loops: PartsLoops, maps: Maps) -> None:
         self.loops, self.maps = loops, maps
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` steps of length `h` from one state: see `Kernel`."""
         loops, sequence = self.loops, self.maps(np.asarray(h, dtype=float))
         functions, save = loops.functions(sequence), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((2 * loops.parts.ndof, len(save))).T  # each component in one piece, as a solution has them
         codes, table = loops.run_table(sequence)
         start, mixed = loops.modes(y0), loops.mixed
+        first, running = opened(carry, 2 * loops.parts.ndof)
         n_finite = run_one(
-            lambda stop: functions.rollout(codes, table, start, mixed, n_steps, save, out, stop),
-            n_steps * len(codes) * loops.parts.ndof,
+            lambda stop: functions.rollout(codes, table, start, mixed, n_steps, save, out, stop, first, running),
+            (n_steps - first) * len(codes) * loops.parts.ndof,
         )
+        if carry is not None:
+            carry.advance(n_steps, running)
         return Run(loops.states(out, save, y0), n_finite)
 
-    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+    def run_batch(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        threads: int | None = None,
+        carry: Carry | None = None,
+    ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         loops, sequence = self.loops, self.maps(np.asarray(h, dtype=float))
         functions, save = loops.functions(sequence), np.ascontiguousarray(save, dtype=np.int64)
@@ -241,11 +258,16 @@ class PartsKernel(Kernel):
         start, mixed = loops.modes(y0), loops.mixed
         out = np.empty((len(y0), len(save), 2 * loops.parts.ndof))
         n_finite = np.empty(len(y0), dtype=np.int64)
+        first, running = opened(carry, *start.shape)
 
         def rows(i: slice, stop: np.ndarray) -> None:
-            functions.rollout_batch(codes, table, start[i], mixed, n_steps, save, out[i], n_finite[i], stop)
+            functions.rollout_batch(
+                codes, table, start[i], mixed, n_steps, save, out[i], n_finite[i], stop, first, running[i]
+            )
 
-        run_rows(rows, len(y0), n_steps * len(codes) * loops.parts.ndof, threads)
+        run_rows(rows, len(y0), (n_steps - first) * len(codes) * loops.parts.ndof, threads)
+        if carry is not None:
+            carry.advance(n_steps, running)
         return Run(loops.states(out, save, y0[:, None]), n_finite)
 
     def step(self, h: ArrayLike, y: np.ndarray) -> Steps:

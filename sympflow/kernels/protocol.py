@@ -2,12 +2,47 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["Kernel", "Run", "Steps"]
+__all__ = ["Carry", "Kernel", "Run", "Steps"]
+
+NOTHING = np.empty(0), np.empty((0, 0))
+"""The running state of runs that are not cut, of one state and of a batch."""
+
+
+@dataclass
+class Carry:
+    """The place where a run is cut: with it, pieces of a run give the same bits as the run in one piece.
+
+    The states that a run saves are not enough for that: consecutive steps share a kick or a drift, so that the running
+    state is another one, and compensated sums have errors. A run that is given a carry goes on from it, and leaves in
+    it where it ends; one that is interrupted leaves it as it was.
+
+    Attributes
+    ----------
+    steps : int
+        The steps made so far; 0 before a run.
+    running : ndarray of shape (K,), or (N, K) of a batch; or None
+        The kernel's own; None before a run. NaN where a trajectory has ended.
+    """
+
+    steps: int = 0
+    running: np.ndarray | None = None
+
+    def advance(self, steps: int, running: np.ndarray) -> None:
+        """Take the place after so many steps."""
+        self.steps, self.running = steps, running
+
+
+def opened(carry: Carry | None, *shape: int) -> tuple[int, np.ndarray]:
+    """The steps made so far and the running state, of that shape, for the loops to change; empty without a carry."""
+    if carry is None:
+        return 0, NOTHING[len(shape) - 1]
+    return carry.steps, np.empty(shape) if carry.running is None else carry.running.copy()
 
 
 class Run(NamedTuple):
@@ -47,7 +82,7 @@ class Kernel(Protocol):
 
     saves_finite: bool
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` steps from one state.
 
         Parameters
@@ -58,10 +93,22 @@ class Kernel(Protocol):
         n_steps : int
         save : ndarray of int64, sorted, in 0 … n_steps
             The steps whose states are kept.
+        carry : Carry, optional
+            Where the run goes on, and leaves its end: of `n_steps` steps those after ``carry.steps`` are made. All
+            counts, those of `save` and of the result too, are from `y0`, which is the state that the first piece began
+            with; `save` begins after ``carry.steps``.
         """
         ...
 
-    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+    def run_batch(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        threads: int | None = None,
+        carry: Carry | None = None,
+    ) -> Run:
         """`run` for every row of `y0` (N, 2d); `threads` is the number of threads, by default as many as pay."""
         ...
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
-from sympflow.kernels.protocol import Kernel, Run, Steps
+from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, opened
 from sympflow.kernels.stages import (
     DampedDrift,
     StageTable,
@@ -143,7 +143,12 @@ class SplittingLoops:
         return self._variants[variant]
 
     def rows(self, table: StageTable) -> np.ndarray:
-        """What the loops read of a table; where they take the values of the system's parameters, with these."""
+        """What the loops read of a table; where they take the values of the system's parameters, with these.
+
+        With friction the maps of the drifts follow, of numbers for one h.
+        """
+        if self.friction is not None:
+            return _with_friction(table, self.friction)
         return table.rows(self.values if takes_values(table.level) else ())
 
     def step_rows(
@@ -176,35 +181,50 @@ class SplittingKernel(Kernel):
 
     def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool = False) -> None:
         self.loops, self.scheme, self.compensated = loops, scheme, compensated
+        self._width = 2 * loops.ndof * (1 + compensated)
 
     def table(self, h: float) -> np.ndarray:
         """The numbers of a run whose steps are h, as the loops read them."""
         return self.loops.rows(run_table(self.scheme, h))
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray) -> Run:
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` steps of length `h` from one state: see `Kernel`."""
         functions = self._functions()
         table = self.table(h)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(save), 2 * self.loops.ndof))
+        first, running = opened(carry, self._width)
         n_finite = run_one(
-            lambda stop: functions.rollout(table, y0, n_steps, save, out, stop),
-            n_steps * table.shape[1] * self.loops.ndof,
+            lambda stop: functions.rollout(table, y0, n_steps, save, out, stop, first, running),
+            (n_steps - first) * table.shape[1] * self.loops.ndof,
         )
+        if carry is not None:
+            carry.advance(n_steps, running)
         return Run(out, n_finite)
 
-    def run_batch(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None = None) -> Run:
+    def run_batch(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        threads: int | None = None,
+        carry: Carry | None = None,
+    ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         functions = self._functions()
         table = self.table(h)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(y0), len(save), 2 * self.loops.ndof))
         n_finite = np.empty(len(y0), dtype=np.int64)
+        first, running = opened(carry, len(y0), self._width)
 
         def rows(i: slice, stop: np.ndarray) -> None:
-            functions.rollout_batch(table, y0[i], n_steps, save, out[i], n_finite[i], stop)
+            functions.rollout_batch(table, y0[i], n_steps, save, out[i], n_finite[i], stop, first, running[i])
 
-        run_rows(rows, len(y0), n_steps * table.shape[1] * self.loops.ndof, threads)
+        run_rows(rows, len(y0), (n_steps - first) * table.shape[1] * self.loops.ndof, threads)
+        if carry is not None:
+            carry.advance(n_steps, running)
         return Run(out, n_finite)
 
     def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
@@ -239,8 +259,12 @@ class DampedKernel(SplittingKernel):
 
 @lru_cache(maxsize=256)
 def damped_table(scheme: Scheme, h: float, friction: Friction) -> np.ndarray:
-    """`run_table` with the rows of `DampedDrift`."""
-    table = run_table(scheme, h)
+    """The table of a run with the rows of `DampedDrift`."""
+    return _with_friction(run_table(scheme, h), friction)
+
+
+def _with_friction(table: StageTable, friction: Friction) -> np.ndarray:
+    """The rows of a table, then those of `DampedDrift`."""
     mean, decay = friction.factors(table.drifts)
     return np.ascontiguousarray(np.concatenate([table.packed, mean.T, decay.T]))
 

@@ -61,10 +61,14 @@ class TangentKernel:
                 f"`system` {system.name!r} has no compiled deviation vectors, which are made for symbolic systems of "
                 "few terms: use backend='auto'."
             )
+        if not system.autonomous:
+            raise ValueError(f"`system` {system.name!r} depends on t, for which vectors are moved by arrays.")
         loops = splitting_loops(system)
-        self.vectors, self.ndof, self._values = vectors, system.ndof, ()
+        self.vectors, self.ndof = vectors, system.ndof
+        self._values: tuple[float, ...] = ()
         self._scheme, self._friction = scheme, system.friction
-        damped = None if system.friction is None else replace(damped_drift(system, False), copies=1 + vectors)
+        drift = damped_drift(system, False)
+        damped = None if drift is None else replace(drift, copies=1 + vectors)
         if loops.values and takes_values(scheme.level):
             symbols, self._values = symbols.parametric, loops.values
         self._make = partial(_rollout, symbols, scheme.level, scheme.monomials, vectors, damped)
@@ -110,10 +114,10 @@ class TangentKernel:
             The default is as many as pay.
         """
         d, table, rollout = self.ndof, self._table(h), self._make(single)
-        x0 = np.empty((len(y0), 2, 1 + self.vectors, d))
-        x0[:, :, 0] = y0.reshape(-1, 2, d)
-        x0[:, :, 1:] = w0.reshape(-1, 2, d).swapaxes(0, 1)
-        x0 = x0.reshape(len(y0), -1)
+        parts = np.empty((len(y0), 2, 1 + self.vectors, d))
+        parts[:, :, 0] = y0.reshape(-1, 2, d)
+        parts[:, :, 1:] = w0.reshape(-1, 2, d).swapaxes(0, 1)
+        x0 = parts.reshape(len(y0), -1)
         growth = np.full((len(y0), self.vectors, len(save) + 1), np.nan)
         spread = np.full((len(y0), len(save) + 1), np.nan)
         reached = np.zeros(len(y0), dtype=np.int64)

@@ -15,7 +15,7 @@ __all__ = ["Variations"]
 
 @dataclass(frozen=True, eq=False)
 class Variations:
-    """An orbit of H = T(p) + V(q) and k deviation vectors w, w' = J∇²H w, as a state of (1 + k) d positions and momenta.
+    """An orbit of H = T(p) + V(q) and k deviation vectors, w' = J∇²H w, as a state of (1 + k) d positions and momenta.
 
     It has the names and the derivatives by which code of kicks and drifts is generated, as `SymbolicHamiltonian` has
     them: the orbit comes first, then vector after vector.

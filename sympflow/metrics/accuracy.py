@@ -10,7 +10,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.energy import failed
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
-from sympflow.solution import Solution, check_solution
+from sympflow.solution import Solution, check_solution, gathered
 from sympflow.solver import solve
 
 
@@ -32,7 +32,9 @@ def reference_error(sol: Solution, reference: Reference | Solution | ArrayLike |
         If the reference is not at the times of the solution, or is a solution of another problem.
     """
     check_solution(sol)
-    if reference is not None:
+    if sol.varied and reference is None:
+        return gathered(sol, reference_error)
+    if reference is not None and not sol.varied:
         check_problem(reference, sol.system, sol.t_span[0], to_numpy(sol.y0))
     y = to_numpy(sol.y).astype(float)
     if reference is None:
@@ -124,6 +126,8 @@ def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:
         If `sol` is not a Solution, or its method cannot run backwards.
     """
     check_solution(sol)
+    if sol.varied:
+        return gathered(sol, time_reversal_error)
     (t0, t1), y0 = sol.t_span, sol.y0
     there = _end(sol, (t0, t1), y0)
     finite = np.isfinite(to_numpy(there)).all(-1)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import as_float, check_counts, check_t_eval, floats
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import compiled_loops
-from sympflow.integrators.contract import FINISHED
+from sympflow.integrators.contract import FINISHED, differentiated, in_blocks
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
@@ -274,18 +274,28 @@ def _indicator(
 ) -> Indicator:
     integrator, system = orbits.integrator, orbits.system
     if integrator.keeps or integrator.tangent_holds:
-        what = f"keeps {integrator.keeps}" if integrator.keeps else f"is differentiated with {integrator.tangent_holds} held"
+        what = (
+            f"keeps {integrator.keeps}"
+            if integrator.keeps
+            else f"is differentiated with {integrator.tangent_holds} held"
+        )
         raise ValueError(
             f"`method` {integrator.name!r} {what}, so that deviation vectors of states are not known: use a splitting "
             "method such as 'kahan_li8', or an implicit one such as 'gauss_legendre6'."
+        )
+    if not (system.autonomous or integrator.on_grid) and orbits.batch:
+        raise ValueError(
+            f"`y0` is a batch, whose steps by method {integrator.name!r} begin at times of their own, and "
+            f"{system.name!r} depends on t: pass one state at a time, or use a method of fixed steps."
         )
     if not isinstance(backend, str) or backend not in BACKENDS:
         raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
     t0, t1 = orbits.t_span
     times = np.empty(0) if t_eval is None else check_t_eval(t_eval, t0, t1)
     w0 = _deviations(deviations, vectors, 2 * system.ndof, seed)
-    if integrator.on_grid:
-        grid = Grid(t0, t1, integrator.step_length(system))
+    length = integrator.step_length(system) if integrator.on_grid else None
+    if length is not None:
+        grid = Grid(t0, t1, length)
         if grid.n_steps == 0:
             raise ValueError(f"`t_span` is shorter than one step of {abs(grid.h):g}: end it later, or reduce `dt`.")
         orbits = orbits._replace(t_span=(t0, grid.time(grid.n_steps)))
@@ -320,9 +330,7 @@ def _compiled(
 ) -> _Run:
     counts = np.array([grid.place(t)[0] for t in times], dtype=np.int64)
     save, where = np.unique(counts[counts > 0], return_inverse=True)
-    found = kernel.run(
-        grid.h, orbits.rows, w0, grid.n_steps, save, EVERY, kind, below, single=not orbits.batch
-    )
+    found = kernel.run(grid.h, orbits.rows, w0, grid.n_steps, save, EVERY, kind, below, single=not orbits.batch)
     start, N = int((counts == 0).sum()), len(orbits.rows)
     growth, spread = np.zeros((N, len(w0), len(times) + 1)), np.empty((N, len(times) + 1))
     spread[:] = _spread(w0.T[None], kind)[0]
@@ -341,7 +349,8 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, times: np.ndarray, kind: int, bel
     sign = 1.0 if t1 >= t0 else -1.0
     W = np.broadcast_to(w0.T, (N, *w0.T.shape)).copy()
     exponents = np.zeros((N, len(w0)))
-    run = _Run(np.full((N, len(w0), n + 1), np.nan), np.full((N, n + 1), np.nan), np.zeros((N, n + 1)), np.zeros(N, int))
+    growth, spread = np.full((N, len(w0), n + 1), np.nan), np.full((N, n + 1), np.nan)
+    run = _Run(growth, spread, np.zeros((N, n + 1)), np.zeros(N, dtype=int))
     position = np.zeros(N, dtype=int)
     running = np.ones(N, dtype=bool)
     elapsed = np.zeros(N)
@@ -390,8 +399,19 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, times: np.ndarray, kind: int, bel
 
 def _each_step(orbits: Orbits) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Steps one by one: times and lengths (N,), Jacobians (N, 2d, 2d)."""
-    for t, h, A in orbits.integrator.executed(orbits.system, orbits.t_span, orbits.rows):
-        yield from zip(t, h, A, strict=True)
+    integrator, system = orbits.integrator, orbits.system
+    if system.autonomous:
+        for t, h, A in integrator.executed(system, orbits.t_span, orbits.rows):
+            yield from zip(t, h, A, strict=True)
+        return
+
+    def jacobian(t: float, y: np.ndarray, h: np.ndarray) -> np.ndarray:
+        return integrator.tangent(system, t, y, h)[1]
+
+    for chunk in in_blocks(integrator.steps(system, orbits.t_span, orbits.rows)):
+        for time, y, length in zip(*chunk, strict=True):  # each at its own time
+            t, h, A = differentiated(jacobian, np.atleast_1d(time), y[None], np.atleast_1d(length))
+            yield t[0], h[0], A[0]
 
 
 def _spread(W: np.ndarray, kind: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.energy import failed
-from sympflow.solution import Solution, check_solution
+from sympflow.solution import Solution, check_solution, gathered
 
 
 def step_tangents(sol: Solution) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -49,6 +49,8 @@ def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.nda
     """
     check_solution(sol)
     _check_kept(sol, "volume")
+    if sol.varied:
+        return gathered(sol, lambda part: volume_error(part, over_time))
     batch = sol.y.shape[:-2]
     lost = failed(sol)
     total = np.zeros(batch)
@@ -131,6 +133,8 @@ def symplecticity_defect(
     sol.system.check_conservative(
         "by which its flow is not symplectic", "use sympflow.conformal_defect(sol), which is 0 for the exact flow"
     )
+    if sol.varied:
+        return gathered(sol, lambda part: symplecticity_defect(part, relative, scale))
     return _form_defect(sol, 0.0, relative, scale)
 
 
@@ -160,12 +164,16 @@ def conformal_defect(sol: Solution, relative: bool = False, scale: ArrayLike | N
     .. [1] R. McLachlan, M. Perlmutter, "Conformal Hamiltonian systems", J. Geom. Phys. 39 (2001) 276–300.
     """
     check_solution(sol)
+    if sol.system.external_force is not None:
+        sol.system.check_conservative("by which its flow is not conformally symplectic", "")
     friction = sol.system.friction
     if friction is not None and not friction.isotropic:
         raise ValueError(
             f"`sol` is of {sol.system.name!r}, whose momenta have different rates of friction: its flow is not "
             "conformally symplectic. Use sympflow.reference_error(sol)."
         )
+    if sol.varied:
+        return gathered(sol, lambda part: conformal_defect(part, relative, scale))
     return _form_defect(sol, 0.0 if friction is None else friction.largest, relative, scale)
 
 
@@ -261,6 +269,8 @@ def loop_area_error(sol: Solution) -> np.ndarray:
     """
     check_solution(sol)
     _check_kept(sol, "area")
+    if sol.rows is not None and any((values != values[..., :1]).any() for values in sol.rows.values.values()):
+        raise ValueError("`sol` has other parameters at each point of a loop, whose area no flow keeps: give them one.")
     if sol.system.ndof != 1:
         raise ValueError(f"`sol` must have one degree of freedom for a loop in the plane; it has {sol.system.ndof}.")
     y0 = to_numpy(sol.y0).astype(float)

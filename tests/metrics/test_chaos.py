@@ -25,9 +25,7 @@ def both_ways(function, system, method, t_span, y0, **options):
 
 @pytest.mark.parametrize("method", ["verlet", "chin4c"])
 def test_compiled_vectors_are_those_of_the_differentiated_steps(wells, method):
-    compiled, arrays = both_ways(
-        sympflow.sali, wells, method, (0, 200.02), BOTH, t_eval=TIMES, dt=0.1, below=0
-    )
+    compiled, arrays = both_ways(sympflow.sali, wells, method, (0, 200.02), BOTH, t_eval=TIMES, dt=0.1, below=0)
     # rounding grows with the distance of neighbouring orbits, exp(0.05 · 200) on the chaotic one, and 1/SALI
     np.testing.assert_allclose(compiled.history, arrays.history, rtol=1e-6)
     np.testing.assert_allclose(compiled.value, arrays.value, rtol=1e-6)

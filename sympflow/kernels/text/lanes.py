@@ -9,6 +9,8 @@ a drift of all lanes.
 # ruff: noqa: F821
 # mypy: ignore-errors
 
+import math
+
 from numba import njit
 
 LANES = 64
@@ -31,7 +33,30 @@ def close_lane(Y, error, lane, table, work):
 
 
 @njit(**OPTIONS)
-def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop):
+def go_on(Y, start, error, running, block_start, count, width):
+    """Take up the running states of a block, where a run was cut."""
+    for lane in range(width):
+        row = running[block_start + min(lane, count - 1)]
+        for m in range(2 * NDOF):
+            Y[m, lane] = start[m, lane] = row[m]
+            if COMPENSATED:
+                error[m, lane] = row[2 * NDOF + m]
+
+
+@njit(**OPTIONS)
+def keep_lanes(Y, error, running, block_start, count, n_finite, n_steps):
+    """Write the running states of a block, NaN of those that have ended."""
+    for lane in range(count):
+        ended = n_finite[block_start + lane] < n_steps
+        row = running[block_start + lane]
+        for m in range(2 * NDOF):
+            row[m] = math.nan if ended else Y[m, lane]
+            if COMPENSATED:
+                row[2 * NDOF + m] = error[m, lane]
+
+
+@njit(**OPTIONS)
+def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running):
     """`rollout` of every row of `y0` (N, 2d), `MANY_LANES` at a time; outputs as in `rollout_each`."""
     link = table.shape[1] - 2
     work = prepared(table)
@@ -50,7 +75,10 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop):
                     break
                 pack(q, p, out[i, row])
         error[:] = 0.0
-        n = saved = first = 0
+        n, saved, begin = first, 0, 0
+        if first > 0:
+            begin = link
+            go_on(Y, start, error, running, block_start, count, width)
         while saved < len(save) and save[saved] <= 0:
             saved += 1
         n_alive = count
@@ -58,7 +86,7 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop):
             block = min(CHECK_EVERY, n_steps - n)
             if saved < len(save):
                 block = min(block, save[saved] - n)
-            numbers, a = numbers_of(table, first), drift_of(table, first)
+            numbers, a = numbers_of(table, begin), drift_of(table, begin)
             for _ in range(block):
                 stage_lanes(Y, error, width, numbers, a)
                 for j in range(1, link):
@@ -74,7 +102,7 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop):
                 q, p = close_lane(Y, error, lane, table, work)
                 if not is_finite(q, p):
                     q, p = unpack_lane(start, lane)
-                    before = first_non_finite(q, p, table, first, block, work) - 1
+                    before = first_non_finite(q, p, table, begin, block, work) - 1
                     n_finite[i] = n + before
                     n_alive -= 1
                     fill_with_nan(out[i], saved)
@@ -82,7 +110,9 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop):
                     for row in range(saved, next_saved):
                         pack(q, p, out[i, row])
             copy_lanes(Y, start)
-            n, saved, first = n + block, next_saved, link
+            n, saved, begin = n + block, next_saved, link
+        if running.shape[1] > 0:
+            keep_lanes(Y, error, running, block_start, count, n_finite, n_steps)
 
 
 # Rows of what a step of lanes needs beside the states: the variable of the polynomials, powers of the step length, the

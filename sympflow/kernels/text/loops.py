@@ -12,6 +12,9 @@ A table has a column for each stage; its first row holds the drifts, the others 
 friction those of the drifts (`stages.DampedDrift`). A run executes the columns [opening, inner …, link, closing]. A
 step is the link (the first step, the opening) and the inner stages; consecutive steps share their common kick or drift
 in the link, and an output is the closing stage applied to a copy, so that what is saved never changes the trajectory.
+A run may be cut: it then begins after `first` steps, from the `running` state (with the errors of compensated sums)
+that it left there, and counts on from `first`; where nobody asks for that, `running` is empty. It is left NaN where a
+run has ended in what is not finite.
 The constants `COMPENSATED` and `SCHEDULED` are known when it is compiled: Numba leaves dead branches out.
 """
 # ruff: noqa: F821
@@ -77,17 +80,37 @@ def fill_with_nan(rows, first):
 
 
 @njit(**OPTIONS)
-def rollout(table, y0, n_steps, save, out, stop):
-    """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
+def opened(y0, first, running):
+    """The running state after `first` steps, and its errors."""
+    q, p = unpack(y0)
+    q_error, p_error = no_error(q), no_error(p)
+    if first > 0:
+        q, p = unpack(running[: 2 * NDOF])
+        if COMPENSATED:
+            q_error, p_error = unpack(running[2 * NDOF :])
+    return q, p, q_error, p_error
+
+
+@njit(**OPTIONS)
+def keep(q, p, q_error, p_error, running):
+    """Write the running state, if it is asked for."""
+    if len(running) > 0:
+        pack(q, p, running[: 2 * NDOF])
+        if COMPENSATED:
+            pack(q_error, p_error, running[2 * NDOF :])
+
+
+@njit(**OPTIONS)
+def rollout(table, y0, n_steps, save, out, stop, first, running):
+    """The steps from `first` to `n_steps` from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
 
     Returns the index of the last step that ends in a finite state; rows of later steps are NaN. Ends early, with
     rows unset, when another thread sets ``stop[0]``.
     """
     link = table.shape[1] - 2
     work = prepared(table)
-    q, p = unpack(y0)
-    q_error, p_error = no_error(q), no_error(p)
-    n = saved = j = 0
+    q, p, q_error, p_error = opened(y0, first, running)
+    n, saved, j = first, 0, link if first > 0 else 0
     while saved < len(save) and save[saved] <= 0:
         pack(q, p, out[saved])
         saved += 1
@@ -102,19 +125,21 @@ def rollout(table, y0, n_steps, save, out, stop):
         end_q, end_p = close(q, p, q_error, p_error, table, work)
         if not is_finite(end_q, end_p):
             fill_with_nan(out, saved)
+            running[:] = math.nan
             return n - 1 + first_non_finite(start_q, start_p, table, begin, block, work)
         n += block
         while saved < len(save) and save[saved] == n:
             pack(end_q, end_p, out[saved])
             saved += 1
+    keep(q, p, q_error, p_error, running)
     return n_steps
 
 
 @njit(**OPTIONS)
-def rollout_each(table, y0, n_steps, save, out, n_finite, stop):
+def rollout_each(table, y0, n_steps, save, out, n_finite, stop, first, running):
     """`rollout` of every row of `y0` (N, 2d) by itself."""
     for i in range(y0.shape[0]):
-        n_finite[i] = rollout(table, y0[i], n_steps, save, out[i], stop)
+        n_finite[i] = rollout(table, y0[i], n_steps, save, out[i], stop, first, running[i])
 
 
 @njit(**OPTIONS)
@@ -182,26 +207,28 @@ def up_to_finite(out, save, n_finite):
 
 
 @njit(**OPTIONS)
-def rollout_processed(before, run, after, y0, n_steps, save, out, stop):
+def rollout_processed(before, run, after, y0, n_steps, save, out, stop, first, running):
     """`rollout` from `y0` (2d,) in other coordinates, `before` into them and `after` out of them."""
     start = np.empty((1, len(y0)))
-    map_rows(before, y0.reshape((1, len(y0))), start)
-    n_finite = rollout(run, start[0], n_steps, save, out, stop)
-    first = 0
-    while first < len(save) and save[first] <= 0:
+    if first == 0:
+        map_rows(before, y0.reshape((1, len(y0))), start)
+    n_finite = rollout(run, start[0], n_steps, save, out, stop, first, running)
+    at_start = 0
+    while at_start < len(save) and save[at_start] <= 0:
         q, p = unpack(y0)
-        pack(q, p, out[first])
-        first += 1
-    map_rows(after, out[first:], out[first:])
+        pack(q, p, out[at_start])
+        at_start += 1
+    map_rows(after, out[at_start:], out[at_start:])
     return up_to_finite(out, save, n_finite)
 
 
 @njit(**OPTIONS)
-def rollout_processed_rows(before, run, after, y0, n_steps, save, out, n_finite, stop):
+def rollout_processed_rows(before, run, after, y0, n_steps, save, out, n_finite, stop, first, running):
     """The same of every row of `y0` (N, 2d)."""
     start = np.empty(y0.shape)
-    map_rows(before, y0, start)
-    rollout_rows(run, start, n_steps, save, out, n_finite, stop)
+    if first == 0:
+        map_rows(before, y0, start)
+    rollout_rows(run, start, n_steps, save, out, n_finite, stop, first, running)
     outputs = out.reshape((-1, y0.shape[1]))
     map_rows(after, outputs, outputs)
     for i in range(len(y0)):

@@ -93,8 +93,11 @@ def store(q, p, s, row):
 
 
 @njit(**OPTIONS)
-def rollout(weights, backwards, t_steps, y0, n_steps, save, out, n_finite, stop):
+def rollout(weights, backwards, t_steps, y0, n_steps, save, out, n_finite, stop, begin, running):
     """`n_steps` steps of ``t_steps[i] ≥ 0`` from ``y0[i]``, the states after ``save[j]`` steps into ``out[i, j]``.
+
+    Where `begin` steps are made already, they go on from ``running[i]``, which is written at the end unless it is
+    empty.
 
     ``n_finite[i]`` is the last step that ends in a finite state; rows of later steps are NaN. Ends early when
     another thread sets ``stop[0]``.
@@ -106,13 +109,14 @@ def rollout(weights, backwards, t_steps, y0, n_steps, save, out, n_finite, stop)
         for s in range(STATES):
             i = first + min(s, count - 1)  # spare places repeat the last state
             t[s] = t_steps[i]
+            row = running[i] if begin > 0 else y0[i]
             for j in range(NDOF):
-                q[j * STATES + s], p[j * STATES + s] = y0[i, j], y0[i, NDOF + j]
+                q[j * STATES + s], p[j * STATES + s] = row[j], row[NDOF + j]
             n_finite[i] = n_steps
         n_alive = count
         saved = 0
-        for n in range(n_steps + 1):
-            if n > 0:
+        for n in range(begin, n_steps + 1):
+            if n > begin:
                 psi(q, p, t, backwards, weights, scratch)
                 for s in range(count):
                     if n_finite[first + s] == n_steps and not is_finite(q, p, s):
@@ -128,3 +132,9 @@ def rollout(weights, backwards, t_steps, y0, n_steps, save, out, n_finite, stop)
             if n_alive == 0 or stop[0] != 0:
                 break
         out[first : first + count, saved:] = np.nan
+        if running.shape[1] > 0:
+            for s in range(count):
+                if n_finite[first + s] == n_steps:
+                    store(q, p, s, running[first + s])
+                else:
+                    running[first + s] = np.nan

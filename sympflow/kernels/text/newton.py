@@ -129,37 +129,49 @@ def advance(y, error, K):
 
 
 @njit(**OPTIONS)
-def rollout(h, y0, n_steps, save, out, work, stop):
+def rollout(h, y0, n_steps, save, out, work, stop, first, running):
     """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``; later rows are NaN.
+
+    Where `first` steps are made already, it goes on from the `running` state (2d or, if `COMPENSATED`, 4d), which is
+    written at the end unless it is empty.
 
     Returns the index of the last step that was solved and ends in a finite state, and the iterations taken. Ends early,
     with rows unset, when another thread sets ``stop[0]``.
     """
     y, error = y0.copy(), np.zeros(SIZE)
+    if first > 0:
+        y[:] = running[:SIZE]
+        if COMPENSATED:
+            error[:] = running[SIZE:]
     saved = iterations = 0
     while saved < len(save) and save[saved] <= 0:
         out[saved] = y
         saved += 1
-    for n in range(1, n_steps + 1):
+    for n in range(first + 1, n_steps + 1):
         if stop[0] != 0:
             break
         taken = stages(y, h, work)
         iterations += abs(taken)
         if taken < 0 or not advance(y, error, work[0]):
             out[saved:] = np.nan
+            running[:] = np.nan
             return n - 1, iterations
         while saved < len(save) and save[saved] == n:
             out[saved] = y
             saved += 1
+    if len(running) > 0:
+        running[:SIZE] = y
+        if COMPENSATED:
+            running[SIZE:] = error
     return n_steps, iterations
 
 
 @njit(**OPTIONS)
-def rollout_each(h, y0, n_steps, save, out, n_finite, iterations, stop):
+def rollout_each(h, y0, n_steps, save, out, n_finite, iterations, stop, first, running):
     """`rollout` of every row of `y0` (N, 2d)."""
     work = workspace()
     for i in range(y0.shape[0]):
-        n_finite[i], iterations[i] = rollout(h, y0[i], n_steps, save, out[i], work, stop)
+        n_finite[i], iterations[i] = rollout(h, y0[i], n_steps, save, out[i], work, stop, first, running[i])
 
 
 @njit(**OPTIONS)

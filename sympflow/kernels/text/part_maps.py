@@ -4,7 +4,8 @@ The algebra that comes before defines tuples of normal modes x, y (``unpack``, `
 ``from_modes``, ``apply_map`` and ``apply_map_lanes``. Where a run is asked to be `in_modes`, it takes and gives modes
 instead of states. A step is a list of maps, a code and a row of coefficients each. A run executes the rows
 [opening, inner …, link, closing]: a step is the link (the first step, the opening) and the inner maps, so that
-consecutive steps share their common map; an output is the closing map applied to a copy.
+consecutive steps share their common map; an output is the closing map applied to a copy. A run may be cut: it then
+begins after `first` steps from the `running` modes that it left there; where nobody asks for them, `running` is empty.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -46,7 +47,7 @@ def first_non_finite(x, y, codes, table, first, n_steps, in_modes):
 
 
 @njit(**OPTIONS)
-def rollout(codes, table, y0, in_modes, n_steps, save, out, stop):
+def rollout(codes, table, y0, in_modes, n_steps, save, out, stop, first, running):
     """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
 
     Returns the index of the last step that ends in a finite state; rows of later steps are NaN. Ends early, with
@@ -54,28 +55,33 @@ def rollout(codes, table, y0, in_modes, n_steps, save, out, stop):
     """
     link = len(codes) - 2
     x, y = unpack(y0)
-    n = saved = first = 0
+    n, saved, begin = first, 0, link if first > 0 else 0
     while saved < len(save) and save[saved] <= 0:
         pack(x, y, out[saved])
         saved += 1
-    if not in_modes:
+    if first > 0:
+        x, y = unpack(running)
+    elif not in_modes:
         x, y = to_modes(x, y)
     while n < n_steps and stop[0] == 0:
         block = min(CHECK_EVERY, n_steps - n)
         if saved < len(save):
             block = min(block, save[saved] - n)
-        start_x, start_y, start = x, y, first
+        start_x, start_y, start = x, y, begin
         for _ in range(block):
-            x, y = one_step(x, y, codes, table, first, link)
-            first = link
+            x, y = one_step(x, y, codes, table, begin, link)
+            begin = link
         end_x, end_y = closed(x, y, codes, table, in_modes)
         if not is_finite(end_x, end_y):
             out[saved:] = np.nan
+            running[:] = np.nan
             return n - 1 + first_non_finite(start_x, start_y, codes, table, start, block, in_modes)
         n += block
         while saved < len(save) and save[saved] == n:
             pack(end_x, end_y, out[saved])
             saved += 1
+    if len(running) > 0:
+        pack(x, y, running)
     return n_steps
 
 
@@ -160,7 +166,7 @@ def step_lanes(codes, coefficients, dt, t, y, in_modes, out):
 
 
 @njit(**OPTIONS)
-def rollout_lanes(codes, table, y0, in_modes, n_steps, save, out, n_finite, stop):
+def rollout_lanes(codes, table, y0, in_modes, n_steps, save, out, n_finite, stop, first, running):
     """`rollout` of every row of `y0` (N, 2d), `LANES` at a time."""
     link = len(codes) - 2
     Z = aligned_zeros(2 * NDOF * LANES).reshape((2 * NDOF, LANES))
@@ -179,21 +185,27 @@ def rollout_lanes(codes, table, y0, in_modes, n_steps, save, out, n_finite, stop
             if not in_modes:
                 x, y = to_modes(x, y)
             pack_lane(x, y, Z, lane)
-        n = saved = first = 0
+        n, saved, j0 = first, 0, 0
+        if first > 0:
+            j0 = link
+            for lane in range(width):
+                row = running[block_start + min(lane, count - 1)]
+                for m in range(2 * NDOF):
+                    Z[m, lane] = row[m]
         while saved < len(save) and save[saved] <= 0:
             saved += 1
         n_alive = count
         while n < n_steps and n_alive > 0 and stop[0] == 0:
             copy_lanes(Z, start)
-            begin = first
+            begin = j0
             block = min(CHECK_EVERY, n_steps - n)
             if saved < len(save):
                 block = min(block, save[saved] - n)
             for _ in range(block):
                 for k in range(link):
-                    j = first if k == 0 else k
+                    j = j0 if k == 0 else k
                     apply_map_lanes(Z, width, codes[j], table, j)
-                first = link
+                j0 = link
             next_saved = saved
             while next_saved < len(save) and save[next_saved] == n + block:
                 next_saved += 1
@@ -212,3 +224,9 @@ def rollout_lanes(codes, table, y0, in_modes, n_steps, save, out, n_finite, stop
                     for row in range(saved, next_saved):
                         pack(x, y, out[i, row])
             n, saved = n + block, next_saved
+        if running.shape[1] > 0:
+            for lane in range(count):
+                ended = n_finite[block_start + lane] < n_steps
+                row = running[block_start + lane]
+                for m in range(2 * NDOF):
+                    row[m] = np.nan if ended else Z[m, lane]

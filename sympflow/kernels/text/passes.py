@@ -42,6 +42,17 @@ def place(t, t0, h, rounding, count, remainder, position):
 
 
 @njit(**OPTIONS)
+def row_products(A, x, out):
+    """A x of every row of x (N, n), each by the same sums in the same order, however many rows there are."""
+    for i in range(x.shape[0]):
+        for j in range(A.shape[0]):
+            total = 0.0
+            for k in range(A.shape[1]):
+                total += A[j, k] * x[i, k]
+            out[i, j] = total
+
+
+@njit(**OPTIONS)
 def all_finite(y):
     finite = True
     for i in range(len(y)):

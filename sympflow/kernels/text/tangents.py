@@ -1,8 +1,9 @@
 """Orbits with deviation vectors by the exact linearisation of each kick and drift, and what becomes of the vectors.
 
 Source text, pasted after the tuple algebra of an orbit and `VECTORS` vectors as one state of `NDOF` positions and
-momenta, its kicks, `loops`, `aligned` and `lanes`; where `SINGLE`, orbits run one by one in registers, not in lanes. What is known of an orbit does not depend on its neighbours: orbits
-stand in tiles of `LANES`, which are filled up with others once one of them is done.
+momenta, its kicks, `loops`, `aligned` and `lanes`. Where `SINGLE`, orbits run one by one in registers; else they stand
+in tiles of `LANES`, which are filled up with others once one of them is done. What is known of an orbit does not depend
+on its neighbours.
 
 Vectors are scaled by powers of two only, which rounds nothing: a run has the same bits however often that is done.
 """
@@ -236,9 +237,7 @@ def rollout_tangents(table, x0, n_steps, every, save, kind, limit, growth, sprea
                 place = done[n_done]
                 if place != alive:
                     copy_column(X[alive // LANES], X[place // LANES], alive % LANES, place % LANES)
-                    copy_column(
-                        exponents[alive // LANES], exponents[place // LANES], alive % LANES, place % LANES
-                    )
+                    copy_column(exponents[alive // LANES], exponents[place // LANES], alive % LANES, place % LANES)
                     index[place] = index[alive]
             n, first = n + block, link
             while saved < len(save) and save[saved] <= n:

@@ -1,0 +1,191 @@
+"""Chunks of an ensemble: some of its orbits, run together, each with its status and its message."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import FixedStep
+from sympflow.integrators.contract import Failure, Integrator, Problem
+from sympflow.integrators.grid import Grid
+from sympflow.solver import solve
+
+BLOCK = 64
+"""Rows that array operations take together: what they round depends on their number, and on a row's place in them."""
+MOST_VALUES = 1 << 21
+"""Values of states that are held at a time, of 16 MB."""
+FAILED = -1
+LONGEST_MESSAGE = 400
+
+
+@dataclass
+class Chunk:
+    """Some orbits of an ensemble, one after another in its order; a reduction makes its fields of them.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    integrator : Integrator
+    t_span : (float, float)
+    t_eval : ndarray of shape (m,) or None
+        Times of the states that a reduction sees; None for every step.
+    y0 : ndarray of shape (n, 2d)
+    params : mapping of str to ndarray of shape (n,)
+        Values of the parameters of each orbit, where they are others than the system's.
+    backend : str
+    first : int
+        Number of the first orbit within the ensemble.
+
+    Attributes
+    ----------
+    status : ndarray of shape (n,), of int8
+        0, or −1 for an orbit that failed.
+    messages : dict of int to str
+        Of the orbits that failed.
+    """
+
+    system: HamiltonianSystem
+    integrator: Integrator
+    t_span: tuple[float, float]
+    t_eval: np.ndarray | None
+    y0: np.ndarray
+    params: Mapping[str, np.ndarray] = field(default_factory=dict)
+    backend: str = "auto"
+    first: int = 0
+    status: np.ndarray = field(init=False)
+    messages: dict[int, str] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.status = np.zeros(len(self.y0), dtype=np.int8)
+
+    def __len__(self) -> int:
+        return len(self.y0)
+
+    def rows(self, start: int, stop: int) -> Chunk:
+        """A chunk of the rows start … stop alone."""
+        params = {name: values[start:stop] for name, values in self.params.items()}
+        return Chunk(
+            self.system,
+            self.integrator,
+            self.t_span,
+            self.t_eval,
+            self.y0[start:stop],
+            params,
+            self.backend,
+            self.first + start,
+        )
+
+    def take(self, part: Chunk) -> None:
+        """Take over what became of the orbits of `part`, some rows of this chunk."""
+        shift = part.first - self.first
+        self.status[shift : shift + len(part)] = part.status
+        self.messages |= {shift + i: text for i, text in part.messages.items()}
+
+    def fail(self, row: int, message: str) -> None:
+        """Note that the orbit of a row failed."""
+        self.status[row] = FAILED
+        self.messages[row] = message[:LONGEST_MESSAGE]
+
+    @cached_property
+    def compiled(self) -> bool:
+        """True if the steps run in compiled loops, in which no orbit depends on its neighbours."""
+        if not isinstance(self.integrator, FixedStep):
+            return False
+        t0, t1 = self.t_span
+        return self.integrator.stepper(Problem(self.system, t0, t1, self.y0[:1], backend=self.backend)).compiled
+
+    @cached_property
+    def times(self) -> np.ndarray:
+        """The times (m,) of the states that a reduction sees.
+
+        Raises
+        ------
+        ValueError
+            If they are the method's own, of each orbit others.
+        """
+        if self.t_eval is not None:
+            return self.t_eval
+        length = self.integrator.step_length(self.system) if self.integrator.on_grid else None
+        if length is None:
+            raise ValueError(
+                f"`t_eval` is needed: each orbit has steps of its own with method {self.integrator.name!r}. Give the "
+                "times to report."
+            )
+        return Grid(*self.t_span, length).outputs(None, 1)[0]
+
+    def windows(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """The states along the orbits, in bounded memory: times (m,) and states (n, 2d, m), one window after another.
+
+        States of an orbit from where it failed are NaN.
+        """
+        yield self.times, self.states(self.times)
+
+    def orbits(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Of each orbit its row, the times (m,), and its states (2d, m), NaN from where it failed."""
+        most = max(1, MOST_VALUES // (self.times.size * self.y0.shape[1] or 1))
+        for start in range(0, len(self), most):
+            part = self.rows(start, start + most)
+            y = part.states(self.times)
+            self.take(part)
+            for i in range(len(part)):
+                yield start + i, self.times, y[i]
+
+    def states(self, times: np.ndarray) -> np.ndarray:
+        """The states (n, 2d, m) at some times, NaN where an orbit has failed, which is noted."""
+        n, width = self.y0.shape
+        y = np.full((n, width, len(times)), np.nan)
+        if not self.integrator.on_grid:
+            for i in range(n):
+                self._run(y, times, np.array([i]))
+        elif self.compiled:
+            self._run(y, times, np.arange(n))
+        else:
+            shift = self.first % BLOCK
+            for start in range(-shift, n, BLOCK):  # each row has its place, and rows beside it, in any chunk
+                self._run(y, times, np.clip(np.arange(start, start + BLOCK), 0, n - 1))
+        return y
+
+    def _run(self, y: np.ndarray, times: np.ndarray, rows: np.ndarray) -> None:
+        """Fill the states of some rows, each of them perhaps more than once."""
+        try:
+            sol = solve(
+                self.system,
+                self.integrator,
+                self.t_span,
+                self.y0[rows],
+                t_eval=times,
+                backend=self.backend,
+                on_domain_exit="ignore",
+            )
+        except (KeyboardInterrupt, MemoryError):
+            raise
+        except Exception as error:  # of one orbit, most likely, which is then found
+            if len(set(rows.tolist())) > 1:
+                for row in sorted(set(rows.tolist())):
+                    self._run(y, times, np.full(len(rows), row))
+            else:
+                self.fail(int(rows[0]), f"{type(error).__name__}: {error}")
+            return
+        shape = y.shape[1:]
+        values = sol.y if sol.y.shape[1:] == shape else np.full((len(rows), *shape), np.nan)
+        if sol.y.shape[1:] != shape:  # the steps of one orbit ended before its outputs did
+            values[..., : sol.y.shape[-1]] = sol.y
+        y[rows] = values
+        failed = np.flatnonzero(np.asarray(sol.status) < 0)
+        if not failed.size:
+            return
+        when = np.broadcast_to(sol.stats.get("failed_at", math.nan), (len(rows),))
+        for i in failed.tolist():
+            self.fail(int(rows[i]), self._reason(float(when[i]), sol.message if len(rows) == 1 else ""))
+
+    def _reason(self, t: float, message: str) -> str:
+        """Why an orbit failed: after t in the words of the method, or in those of its run."""
+        if not isinstance(self.integrator, FixedStep) or math.isnan(t):
+            return message or Failure.NON_FINITE.value[0] + "."
+        what, remedy = self.integrator.breakdown.value
+        return f"{what} after t = {t:.17g}. {remedy}, or end `t_span` earlier."

@@ -1,0 +1,102 @@
+"""The initial states of an ensemble: given, or drawn where they are needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sympflow.arguments import check_counts
+from sympflow.arrays import is_tensor
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.solver import check_y0
+
+DRAWN = 4096
+"""States that a sampler draws at a time, from a seed and their number, so that no state depends on the chunks."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """Initial states (N, 2d) that were given."""
+
+    y0: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.y0)
+
+    def states(self, start: int, stop: int) -> np.ndarray:
+        return self.y0[start:stop]
+
+    def sent(self, start: int, stop: int) -> Given:
+        """What a worker needs for the states start … stop: these, numbered from 0."""
+        return Given(self.y0[start:stop])
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Initial states that a sampler draws, `DRAWN` at a time."""
+
+    sampler: Any
+    n: int
+    seed: int
+    width: int
+    start: int = 0
+
+    def __len__(self) -> int:
+        return self.n
+
+    def states(self, start: int, stop: int) -> np.ndarray:
+        start, stop = self.start + start, self.start + stop
+        out = np.empty((stop - start, self.width))
+        for block in range(start // DRAWN, -(-stop // DRAWN)):
+            low, high = max(start, block * DRAWN), min(stop, (block + 1) * DRAWN)
+            out[low - start : high - start] = self._block(block)[low - block * DRAWN : high - block * DRAWN]
+        return out
+
+    def _block(self, block: int) -> np.ndarray:
+        seeds = np.random.SeedSequence([self.seed, block])
+        if isinstance(self.sampler, Domain):
+            return self.sampler.sample(DRAWN, int(seeds.generate_state(1)[0]))
+        states = np.asarray(self.sampler(np.random.default_rng(seeds), DRAWN))
+        if states.shape != (DRAWN, self.width) or states.dtype.kind not in "fiu":
+            raise ValueError(
+                f"`y0` must draw real states of shape ({DRAWN}, {self.width}) when called with (rng, {DRAWN}); got "
+                f"{states.dtype} of shape {states.shape}."
+            )
+        if not np.isfinite(states).all():
+            raise ValueError("`y0` draws states that are not finite: mend the sampler.")
+        return states
+
+    def sent(self, start: int, stop: int) -> Drawn:
+        """What a worker needs for the states start … stop: the sampler, and where to begin."""
+        return Drawn(self.sampler, stop - start, self.seed, self.width, self.start + start)
+
+
+def initial_states(system: HamiltonianSystem, y0: Any, n: Any, seed: Any) -> Given | Drawn:
+    """The initial states that `y0`, `n` and `seed` mean.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If they are none.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
+    if isinstance(y0, Domain) or (callable(y0) and not isinstance(y0, type)):
+        if n is None:
+            raise ValueError("`n` is needed: the number of states to draw from `y0`.")
+        check_counts(n=n)
+        drawn = Drawn(y0, int(n), int(seed), 2 * system.ndof)
+        if isinstance(y0, Domain) and y0.sample(1).shape != (1, drawn.width):
+            raise ValueError(f"`y0` must be a domain of states of length {drawn.width} for {system.name!r}.")
+        return drawn
+    if n is not None:
+        raise ValueError("`n` is for drawing states: pass a domain or a sampler as `y0`, or leave it out.")
+    if is_tensor(y0):
+        raise TypeError("`y0` is a tensor, which an ensemble does not take: pass y0.numpy().")
+    given = check_y0(system, system.y0 if y0 is None else y0, None)
+    if given.ndim > 2:
+        raise ValueError(f"`y0` must have shape (N, {given.shape[-1]}); got {given.shape}: reshape it.")
+    return Given(np.atleast_2d(given))

@@ -1,0 +1,216 @@
+"""Reductions: what an ensemble keeps of each orbit instead of its states.
+
+A reduction is a row of `REDUCTIONS`, an instance of a `Reduction` with options, or a user's function of one orbit. It
+sees a `Chunk` of orbits, and walks along them by `chunk.windows()`, or runs loops of its own from `chunk.y0`.
+"""
+
+from __future__ import annotations
+
+import difflib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from importlib import import_module
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sympflow.ensembles.chunks import Chunk
+from sympflow.solution import SMALLEST_SCALE
+
+Fields = dict[str, tuple[tuple[int, ...], np.dtype]]
+"""Names of what is kept of each orbit, with the shape of one orbit and the dtype."""
+
+REDUCTIONS: dict[str, str] = {
+    "final": "ensembles.reductions:Final",
+    "energy_error": "ensembles.reductions:EnergyError",
+}
+"""The names that `reduce` takes: "module:Class" below sympflow, called without arguments."""
+
+MOST_TRIED = 64
+"""First orbits of which a user's function is tried on the first that does not fail."""
+
+
+class Reduction(ABC):
+    """What is kept of each orbit.
+
+    The result of an orbit must not depend on the others of its chunk, so that it is the same whatever the chunks.
+    """
+
+    in_python: ClassVar[bool] = False
+    """True if Python code runs for each orbit, so that threads would wait for each other."""
+    state: ClassVar[str] = ""
+    """The field that holds states [q, p] along its first axis, which a Dataset has as q and p."""
+    takes_params: ClassVar[bool] = False
+    """True if the orbits of a chunk may have different parameters, those of `chunk.params`."""
+
+    @abstractmethod
+    def fields(self, problem: Chunk) -> Fields:
+        """Return the fields of one orbit, for a problem that is given as a chunk of some first orbits."""
+
+    def settings(self) -> dict[str, Any]:
+        """Return what the reduction was made with: by that a store knows it again. Dataclasses tell their fields."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.compare} if is_dataclass(self) else vars(self)
+
+    @abstractmethod
+    def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
+        """Return the fields of all orbits of a chunk, (n, ...) each; NaN where an orbit failed.
+
+        Orbits that fail are noted by `chunk.fail`, as `chunk.windows()` does.
+        """
+
+
+@dataclass(frozen=True)
+class States(Reduction):
+    """The states at the times of `t_eval`, or after each step: `y`, (2d, m) of each orbit."""
+
+    state: ClassVar[str] = "y"
+
+    def fields(self, problem: Chunk) -> Fields:
+        return {"y": ((problem.y0.shape[1], problem.times.size), np.dtype(float))}
+
+    def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
+        return {"y": chunk.states(chunk.times)}
+
+
+@dataclass(frozen=True)
+class Final(Reduction):
+    """The state at the end of `t_span`: `final`, (2d,) of each orbit."""
+
+    state: ClassVar[str] = "final"
+
+    def fields(self, problem: Chunk) -> Fields:
+        return {"final": ((problem.y0.shape[1],), np.dtype(float))}
+
+    def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
+        return {"final": chunk.states(np.array(chunk.t_span[1:]))[..., 0]}
+
+
+@dataclass(frozen=True)
+class EnergyError(Reduction):
+    """The largest relative energy error |H(y(t)) − H(y0)| / |H(y0)| along each orbit: `energy_error`.
+
+    It is absolute where |H(y0)| is below 1e-12, and relative to the system's `energy_scale` if it has one.
+    """
+
+    def fields(self, problem: Chunk) -> Fields:
+        problem.system.check_conservative("so its energy is lost and no error", "use another `reduce`, such as 'final'")
+        return {"energy_error": ((), np.dtype(float))}
+
+    def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
+        system = chunk.system
+        with np.errstate(all="ignore"):
+            H0 = np.asarray(system.hamiltonian(chunk.y0))
+            scale = np.where(np.abs(H0) < SMALLEST_SCALE, 1.0, np.abs(H0))
+            scale = scale if system.energy_scale is None else np.full_like(H0, system.energy_scale)
+            worst = np.zeros(len(chunk))
+            for _, y in chunk.windows():
+                H = np.asarray(system.hamiltonian(y.swapaxes(1, 2)))
+                worst = np.maximum(worst, np.abs(H - H0[:, None]).max(axis=1, initial=0.0))
+        return {"energy_error": np.where(chunk.status < 0, np.nan, worst / scale)}
+
+
+@dataclass(frozen=True)
+class OfFunction(Reduction):
+    """A user's function of (t (m,), y (2d, m)) of one orbit, which returns a number, an array, or a dict of such.
+
+    The shapes are those of the first orbit. An orbit for which the function raises, or returns another shape, has
+    failed, with that message.
+    """
+
+    function: Callable[[np.ndarray, np.ndarray], Any]
+    found: Fields = field(default_factory=dict, compare=False)
+
+    in_python: ClassVar[bool] = True
+    takes_params: ClassVar[bool] = True
+
+    def fields(self, problem: Chunk) -> Fields:
+        """Find out the fields by the first orbit that does not fail.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If the function raises there, or what it returns is no array of numbers; or if all first orbits fail.
+        """
+        for i, t, y in problem.rows(0, MOST_TRIED).orbits():
+            if not np.isfinite(y).all():
+                continue
+            try:
+                value = self.function(t, y.copy())
+            except Exception as error:
+                raise ValueError(
+                    f"`reduce` raises {type(error).__name__}: {error}, for orbit {i}: it is called with the times "
+                    f"{t.shape} and the states {y.shape} of one orbit."
+                ) from error
+            self.found.update({name: (v.shape, v.dtype) for name, v in _arrays(value).items()})
+            return dict(self.found)
+        raise ValueError(
+            f"`reduce` cannot be tried: the first {len(problem)} orbits all fail. Reduce `dt`, or mend `y0`."
+        )
+
+    def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
+        out = {name: np.full((len(chunk), *shape), np.nan, dtype) for name, (shape, dtype) in self.found.items()}
+        for i, t, y in chunk.orbits():
+            if chunk.status[i] < 0:
+                continue
+            try:
+                values = _arrays(self.function(t, y))
+                shapes = {name: (v.shape, np.result_type(v, float)) for name, v in values.items()}
+                if {name: s for name, (s, _) in shapes.items()} != {name: s for name, (s, _) in self.found.items()}:
+                    raise ValueError(f"`reduce` returns {_described(values)}, but {_described(out, 1)} for the first")
+            except Exception as error:
+                chunk.fail(i, f"`reduce` failed: {type(error).__name__}: {error}.")
+                continue
+            for name, v in values.items():
+                out[name][i] = v
+        return out
+
+
+def _described(values: Mapping[str, np.ndarray], skip: int = 0) -> str:
+    return ", ".join(f"{name} of shape {v.shape[skip:]}" for name, v in values.items())
+
+
+def _arrays(value: Any) -> dict[str, np.ndarray]:
+    """What a user's function returned, as arrays of floats (or complex numbers) by name."""
+    named = value if isinstance(value, Mapping) else {"reduced": value}
+    arrays = {}
+    for name, v in named.items():
+        try:
+            array = np.asarray(v)
+        except ValueError:  # rows of different lengths
+            array = np.empty(0, dtype=object)
+        if array.dtype.kind not in "biufc" or not isinstance(name, str):
+            raise TypeError(
+                f"`reduce` must return numbers, an array of them, or a dict of such by name; got {type(v).__name__}."
+            )
+        arrays[name] = array.astype(complex if array.dtype.kind == "c" else float)
+    return arrays
+
+
+def reduction(reduce: Any) -> Reduction:
+    """Return the reduction that `reduce` means: None for the states, a name, a Reduction, or a function of (t, y).
+
+    Raises
+    ------
+    ValueError, TypeError
+        If it is none.
+    """
+    if reduce is None:
+        return States()
+    if isinstance(reduce, Reduction):
+        return reduce
+    if isinstance(reduce, str):
+        if reduce in REDUCTIONS:
+            module, _, name = REDUCTIONS[reduce].partition(":")
+            return getattr(import_module(f"sympflow.{module}"), name)()
+        close = difflib.get_close_matches(reduce.lower(), REDUCTIONS, n=1)
+        hint = f" Did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"`reduce` {reduce!r} is unknown.{hint} Choose one of {', '.join(REDUCTIONS)}.")
+    if isinstance(reduce, type) and issubclass(reduce, Reduction):
+        raise TypeError(f"`reduce` is the class {reduce.__name__}: pass an instance of it.")
+    if callable(reduce):
+        return OfFunction(reduce)
+    raise TypeError(
+        f"`reduce` must be a name ({', '.join(REDUCTIONS)}), a Reduction, or a function of (t, y); got "
+        f"{type(reduce).__name__}."
+    )

@@ -1,0 +1,317 @@
+"""The result of an ensemble: what was kept of each orbit, in memory or in a store, and its xarray Dataset."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from sympflow.ensembles.orbits import Drawn, Given
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.contract import Integrator
+from sympflow.storage.store import Field
+
+if TYPE_CHECKING:
+    import xarray
+
+    from sympflow.ensembles.reductions import Fields
+
+Index = tuple[int, ...]
+RESERVED = ("q", "p", "q0", "p0", "status", "orbit", "dof", "time")
+"""Names of the arrays and dimensions that each Dataset has, or may have."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of the grid of parameters and orbits: its ranges, one an axis; in C order its orbits are consecutive."""
+
+    ranges: tuple[tuple[int, int], ...]
+    first: int
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    @property
+    def index(self) -> tuple[slice, ...]:
+        return tuple(slice(*ends) for ends in self.ranges)
+
+    @property
+    def shape(self) -> Index:
+        return tuple(stop - start for start, stop in self.ranges)
+
+
+def chunk_shape(shape: Index, chunk: int) -> Index:
+    """The shape of a block of at most `chunk` orbits: whole axes at the end, a part of one before them."""
+    lengths, left = [], chunk
+    for length in reversed(shape):
+        lengths.append(min(length, max(1, left)))
+        left = left // length
+    return tuple(reversed(lengths))
+
+
+def blocks(shape: Index, sizes: Index) -> list[Block]:
+    """The blocks of a grid, in C order."""
+    axes = [[(i, min(i + k, n)) for i in range(0, n, k)] for n, k in zip(shape, sizes, strict=True)]
+    return [
+        Block(ranges, int(np.ravel_multi_index([start for start, _ in ranges], shape)))
+        for ranges in itertools.product(*axes)
+    ]
+
+
+@dataclass(frozen=True)
+class Done:
+    """The fields (n, ...) of the orbits of a block, their statuses (n,), and the messages of those that failed."""
+
+    fields: dict[str, np.ndarray]
+    status: np.ndarray
+    messages: dict[int, str]
+
+
+# variables -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Variable:
+    """An array of a Dataset or a store: a field of each orbit, or some rows of it."""
+
+    name: str
+    field: str
+    rows: slice | None
+    dims: tuple[str, ...]
+    shape: Index
+    dtype: np.dtype
+
+    def of(self, values: np.ndarray, leading: int) -> np.ndarray:
+        """Return its part of the values of its field, with so many axes before those of an orbit."""
+        return values if self.rows is None else values[(slice(None),) * leading + (self.rows,)]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The axes of an ensemble, and what is kept of each orbit.
+
+    Parameters
+    ----------
+    axes : dict of str to ndarray
+        The values of the parameters that are axes.
+    n : int
+        Orbits at each.
+    ndof : int
+    times : ndarray of shape (m,)
+    fields : dict
+        Names, shapes and dtypes of the fields of an orbit.
+    state : str
+        The field that holds states [q, p], along its first axis; "" if there is none.
+    """
+
+    axes: dict[str, np.ndarray]
+    n: int
+    ndof: int
+    times: np.ndarray | None
+    fields: Fields
+    state: str
+
+    def __post_init__(self) -> None:
+        taken = [name for name in self.fields if name in {*RESERVED, *self.axes}]
+        if taken:
+            raise ValueError(f"`reduce` returns {taken[0]!r}, a name that the result has already: take another one.")
+
+    @property
+    def shape(self) -> Index:
+        return (*(len(values) for values in self.axes.values()), self.n)
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        return (*map(axis_name, self.axes), "orbit")
+
+    def variables(self) -> list[Variable]:
+        """Return the arrays that hold the fields: states as q and p, with dimensions dof and time."""
+        found = []
+        for name, (shape, dtype) in self.fields.items():
+            if name == self.state:
+                more = ("time",) * (len(shape) - 1)
+                for letter, rows in ("q", slice(0, self.ndof)), ("p", slice(self.ndof, None)):
+                    inner = (self.ndof, *shape[1:])
+                    found.append(Variable(letter, name, rows, (*self.dims, "dof", *more), inner, dtype))
+            else:
+                inner_dims = tuple(f"{name}_{i}" for i in range(len(shape)))
+                found.append(Variable(name, name, None, (*self.dims, *inner_dims), shape, dtype))
+        return found
+
+    def coordinates(self) -> dict[str, np.ndarray]:
+        """Return the values along dimensions, by the names of these."""
+        found = {**{axis_name(name): values for name, values in self.axes.items()}, "dof": np.arange(1, self.ndof + 1)}
+        if self.state and len(self.fields[self.state][0]) == 2 and self.times is not None:
+            found["time"] = self.times
+        return found
+
+    def stored(self, sizes: Index) -> dict[str, Field]:
+        """Return the arrays of a store with chunks of such a shape along the axes."""
+        made = {v.name: Field(v.dims, (*self.shape, *v.shape), v.dtype, (*sizes, *v.shape)) for v in self.variables()}
+        for name in ("q0", "p0"):
+            made[name] = Field(("orbit", "dof"), (self.n, self.ndof), float, (sizes[-1], self.ndof))
+        made["status"] = Field(self.dims, self.shape, np.int8, sizes)
+        return made | {name: Field((name,), values.shape, values.dtype) for name, values in self.coordinates().items()}
+
+
+def axis_name(name: str) -> str:
+    """The dimension of a parameter: its name, unless that is one of the result's own."""
+    return f"param_{name}" if name in RESERVED else name
+
+
+class Keeper(Protocol):
+    """The place where the fields of an ensemble are kept."""
+
+    @property
+    def fields(self) -> Mapping[str, np.ndarray]: ...
+
+    @property
+    def status(self) -> np.ndarray: ...
+
+    @property
+    def messages(self) -> Mapping[Index, str]: ...
+
+    def place(self, block: Block, done: Done) -> None:
+        """Put the orbits of a block where they belong."""
+
+    def is_done(self, block: Block) -> bool:
+        """True if the orbits of a block are there already."""
+
+    def dataset(self) -> xarray.Dataset: ...
+
+
+class Memory:
+    """Fields in the memory of this process."""
+
+    def __init__(self, layout: Layout, orbits: Given | Drawn, attributes: Mapping[str, Any]) -> None:
+        self.layout, self.orbits, self.attributes = layout, orbits, attributes
+        self.fields = {name: np.empty((*layout.shape, *s), dtype) for name, (s, dtype) in layout.fields.items()}
+        self.status = np.zeros(layout.shape, dtype=np.int8)
+        self.messages: dict[Index, str] = {}
+
+    def is_done(self, block: Block) -> bool:
+        return False
+
+    def place(self, block: Block, done: Done) -> None:
+        for name, values in done.fields.items():
+            self.fields[name][block.index] = values.reshape(*block.shape, *values.shape[1:])
+        self.status[block.index] = done.status.reshape(block.shape)
+        for row, text in done.messages.items():
+            index = np.unravel_index(block.first + row, self.layout.shape)
+            self.messages[tuple(map(int, index))] = text
+
+    def dataset(self) -> xarray.Dataset:
+        xr, layout = imported("xarray", "to_xarray()"), self.layout
+        leading = len(layout.shape)
+        data = {v.name: (v.dims, v.of(self.fields[v.field], leading)) for v in layout.variables()}
+        data["status"] = (layout.dims, self.status)
+        y0 = self.orbits.states(0, layout.n)
+        data |= {"q0": (("orbit", "dof"), y0[:, : layout.ndof]), "p0": (("orbit", "dof"), y0[:, layout.ndof :])}
+        return xr.Dataset(data, coords=layout.coordinates(), attrs=dict(self.attributes))
+
+
+def imported(library: str, what: str) -> Any:
+    """Import a library of the extra "data".
+
+    Raises
+    ------
+    ImportError
+        If it is not installed, with what needs it.
+    """
+    from importlib import import_module
+
+    try:
+        return import_module(library)
+    except ImportError as error:
+        raise ImportError(f'{what} needs {library}: pip install "sympflow[data]".') from error
+
+
+@dataclass
+class Ensemble:
+    """The result of `ensemble`.
+
+    Every field that was kept of the orbits is an attribute: `y` where nothing was reduced, else what `reduce` says. An
+    axis stands in front of that of the orbits for each of `params` that is an array. From a `store` a field is read
+    whenever it is asked for.
+
+    Attributes
+    ----------
+    t : ndarray of shape (m,) or None
+        The times of `t_eval`, or of every step.
+    y : ndarray of shape (..., N, 2d, m)
+        The states, where nothing was reduced.
+    params : dict of str to ndarray
+        The axes of the grid of parameters.
+    system, integrator, t_span
+        The problem that was solved, and the method.
+    wall_time : float
+        Seconds of this call.
+    """
+
+    t: np.ndarray | None = field(repr=False)
+    params: dict[str, np.ndarray]
+    system: HamiltonianSystem
+    integrator: Integrator
+    t_span: tuple[float, float]
+    orbits: Given | Drawn = field(repr=False)
+    keeper: Keeper = field(repr=False)
+    wall_time: float = 0.0
+
+    @property
+    def fields(self) -> Mapping[str, np.ndarray]:
+        """What was kept of each orbit, by name: arrays (..., N, ...)."""
+        return self.keeper.fields
+
+    @property
+    def status(self) -> np.ndarray:
+        """0, or −1 for an orbit that failed, whose row is NaN: int8 of shape (..., N)."""
+        return self.keeper.status
+
+    @property
+    def messages(self) -> Mapping[Index, str]:
+        """Messages of the orbits that failed, by their indices."""
+        return self.keeper.messages
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        fields = {} if "keeper" not in self.__dict__ else self.keeper.fields
+        if name in fields:
+            return fields[name]
+        raise AttributeError(f"the ensemble has no {name!r}: of each orbit it has {', '.join(fields) or 'nothing'}.")
+
+    @property
+    def y0(self) -> np.ndarray:
+        """The initial states (N, 2d)."""
+        return self.orbits.states(0, len(self.orbits))
+
+    @property
+    def success(self) -> bool:
+        """True if no orbit failed."""
+        return not self.status.any()
+
+    @property
+    def message(self) -> str:
+        """What became of the orbits, in words."""
+        status = self.status
+        failed = int(np.count_nonzero(status))
+        if not failed:
+            return f"All {status.size:,} orbits reached the end."
+        index, text = min(self.messages.items())
+        return f"{failed:,} of {status.size:,} orbits failed, the first of them {list(index)}: {text}"
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The fields as an `xarray.Dataset`; of a store it reads what is used of it, when it is used.
+
+        States are `q` and `p` with the dimensions (..., orbit, dof, time), the initial ones `q0` and `p0`. The
+        attributes say by what the data were made.
+
+        Raises
+        ------
+        ImportError
+            If xarray is not installed.
+        """
+        return self.keeper.dataset()

@@ -1,0 +1,240 @@
+"""Stores of ensembles, which `xarray.open_zarr` reads; each chunk is written by the worker that runs it.
+
+A chunk of orbits is one chunk of every array, so that no two writers meet. The statuses are written last: a chunk whose
+statuses are there is done, and is not run again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sympflow.ensembles.orbits import Drawn, Given
+from sympflow.ensembles.results import Block, Done, Index, Layout, imported
+from sympflow.integrators.registry import name_of
+from sympflow.storage.store import Store
+
+if TYPE_CHECKING:
+    import xarray
+
+    from sympflow.ensembles.reductions import Reduction
+    from sympflow.hamiltonian.system import HamiltonianSystem
+    from sympflow.integrators.contract import Integrator
+
+MESSAGES = "messages"
+"""The folder of the messages of orbits that failed, a file for each chunk with some; readers of zarr pass over it."""
+KNOWN = "sympflow_ensemble"
+"""The attribute that says of which ensemble a store is."""
+TOLD = 90  # characters of what differs between two ensembles
+
+
+# what an ensemble is known by ----------------------------------------------------------------------------------------
+
+
+def identity(
+    system: HamiltonianSystem,
+    integrator: Integrator,
+    t_span: tuple[float, float],
+    t_eval: np.ndarray | None,
+    orbits: Given | Drawn,
+    axes: Mapping[str, np.ndarray],
+    reduction: Reduction,
+    backend: str,
+) -> dict[str, str]:
+    """What an ensemble is known by, each part as a text; two are the same if all parts are."""
+    states = orbits.y0 if isinstance(orbits, Given) else orbits.states(0, min(len(orbits), 64))
+    return {
+        "system": f"{system.name} {_digest([system.expression, dict(system.params), list(system.fingerprint)])}",
+        "method": f"{name_of(integrator)}, {_options(integrator, system)}",
+        "t_span": f"{t_span[0]!r} to {t_span[1]!r}",
+        "t_eval": "every step" if t_eval is None else f"{len(t_eval)} times {_digest(t_eval)}",
+        "y0": f"{len(orbits)} states{'' if isinstance(orbits, Given) else f' by seed {orbits.seed}'} {_digest(states)}",
+        "params": ", ".join(f"{len(v)} values of {name} {_digest(v)}" for name, v in axes.items()) or "none",
+        "reduce": _described(reduction),
+        "backend": backend,
+    }
+
+
+def _options(integrator: Integrator, system: HamiltonianSystem) -> str:
+    """The options of a method, and the checksum of the weights of its flow."""
+    options = {f.name: getattr(integrator, f.name) for f in fields(integrator) if f.name != "flow"}  # type: ignore[arg-type]
+    flow = integrator.flow_for(system)
+    if flow is not None:
+        from sympflow.flow.weights import checksum
+
+        options["flow"] = checksum(flow.state_dict())
+    return ", ".join(f"{name}={value!r}" for name, value in options.items())
+
+
+def _described(reduction: Reduction) -> str:
+    """A reduction with its options; a user's function by its name and a digest of its code."""
+    parts = []
+    for name, value in reduction.settings().items():
+        code = getattr(value, "__code__", None)
+        told = (
+            repr(value) if code is None else f"{value.__qualname__} {_digest([code.co_code.hex(), _constants(code)])}"
+        )
+        parts.append(f"{name}={told}")
+    return f"{type(reduction).__name__}({', '.join(parts)})"
+
+
+def _constants(code: Any) -> list[Any]:
+    """The names and constants of a function's code, those of functions within it too."""
+    inner = [_constants(c) if isinstance(c, type(code)) else repr(c) for c in code.co_consts]
+    return [list(code.co_names), inner]
+
+
+def _digest(value: Any) -> str:
+    data = value.tobytes() if isinstance(value, np.ndarray) else json.dumps(value, default=repr).encode()
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+# the store -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class EnsembleStore:
+    """The store of an ensemble: a path, which is small when it is sent to a worker.
+
+    Parameters
+    ----------
+    path : str
+    layout : Layout
+    sizes : tuple of int
+        Shape of a chunk, along the axes of the grid.
+    """
+
+    path: str
+    layout: Layout
+    sizes: Index
+
+    @classmethod
+    def at(cls, path: Any, layout: Layout, sizes: Index, attributes: dict[str, Any], resume: bool) -> EnsembleStore:
+        """Make the store of an ensemble, or, with `resume`, find the one that is there, with chunks of its own.
+
+        Raises
+        ------
+        ValueError
+            If there is one without `resume`, or one of something else.
+        StoreError
+            If it cannot be made.
+        """
+        if isinstance(path, bytes) or not isinstance(path, str | os.PathLike):
+            raise TypeError(f"`store` must be the path of a folder; got {type(path).__name__}.")
+        place = Path(os.path.abspath(os.fspath(path)))
+        made = layout.stored(sizes)
+        try:
+            store = Store.create(place, made, attributes | {"chunk_shape": list(sizes)})
+        except FileExistsError:
+            if not resume:
+                raise ValueError(
+                    f"`store` {str(path)!r} exists: pass resume=True to go on with it, or name another folder."
+                ) from None
+            return cls(str(place), layout, _same(Store.open(place), str(path), attributes))
+        for name, values in layout.coordinates().items():
+            store.write(name, (0,), values)
+        (place / MESSAGES).mkdir(exist_ok=True)
+        return cls(str(place), layout, sizes)
+
+    @cached_property
+    def _store(self) -> Store:
+        return Store.open(self.path)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ("path", "layout", "sizes")}
+
+    def _number(self, block: Block) -> Index:
+        """The number of the chunk of a block along each axis."""
+        return tuple(start // size for (start, _), size in zip(block.ranges, self.sizes, strict=True))
+
+    def write(self, block: Block, done: Done, y0: np.ndarray) -> None:
+        """Write the orbits of a block, their statuses last.
+
+        Raises
+        ------
+        StoreError
+            If it cannot be written.
+        """
+        store, number = self._store, self._number(block)
+        for v in self.layout.variables():
+            values = v.of(done.fields[v.field], 1).reshape(*block.shape, *v.shape)
+            store.write(v.name, (*number, *(0,) * len(v.shape)), values)
+        if not any(number[:-1]):  # each orbit belongs to many values of the parameters, and to one writer
+            d = self.layout.ndof
+            store.write("q0", (number[-1], 0), y0[:, :d])
+            store.write("p0", (number[-1], 0), y0[:, d:])
+        if done.messages:
+            store.write_text(f"{MESSAGES}/{block.first}.json", json.dumps(done.messages))
+        store.write("status", number, done.status.reshape(block.shape))
+
+    def place(self, block: Block, done: Done) -> None:
+        """Nothing: the worker has written it."""
+
+    def is_done(self, block: Block) -> bool:
+        """True if the orbits of a block have been run."""
+        return self._store.has("status", self._number(block))
+
+    @property
+    def status(self) -> np.ndarray:
+        return self._store.read("status")
+
+    @property
+    def fields(self) -> Mapping[str, np.ndarray]:
+        return _Read(self._store, self.layout)
+
+    @property
+    def messages(self) -> Mapping[Index, str]:
+        found = {}
+        for file in (Path(self.path) / MESSAGES).glob("*.json"):
+            for row, text in json.loads(file.read_text(encoding="utf-8")).items():
+                index = np.unravel_index(int(file.stem) + int(row), self.layout.shape)
+                found[tuple(map(int, index))] = text
+        return dict(sorted(found.items()))
+
+    def dataset(self) -> xarray.Dataset:
+        imported("zarr", "to_xarray()")
+        return imported("xarray", "to_xarray()").open_zarr(self.path, chunks=None)
+
+
+class _Read(Mapping[str, np.ndarray]):
+    """The fields of a store, read when they are asked for."""
+
+    def __init__(self, store: Store, layout: Layout) -> None:
+        self.store, self.layout = store, layout
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.layout.fields:
+            raise KeyError(name)
+        arrays = [self.store.read(v.name) for v in self.layout.variables() if v.field == name]
+        return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, axis=len(self.layout.shape))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.layout.fields
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.layout.fields)
+
+    def __len__(self) -> int:
+        return len(self.layout.fields)
+
+
+def _same(store: Store, path: str, attributes: Mapping[str, Any]) -> Index:
+    """Return the shape of the chunks of a store, if it is of the same ensemble."""
+    theirs, mine = (json.loads(a.get(KNOWN, "{}")) for a in (store.attributes, attributes))
+    if not theirs:
+        raise ValueError(f"`store` {path!r} is no store of an ensemble: name another folder.")
+    for name, text in mine.items():
+        if theirs.get(name) != text:
+            raise ValueError(
+                f"`store` {path!r} is of another ensemble: its `{name}` is {str(theirs.get(name))[:TOLD]}, not "
+                f"{text[:TOLD]}. Name another folder."
+            )
+    return tuple(store.attributes["chunk_shape"])

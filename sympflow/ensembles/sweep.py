@@ -1,0 +1,333 @@
+"""ensemble(): very many orbits of one system, over parameters too, on one machine or many."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow._version import __version__
+from sympflow.arguments import MAX_ASKED_VALUES, check_counts, check_flag, check_t_eval, check_t_span, floats
+from sympflow.ensembles.chunks import MOST_VALUES, Chunk
+from sympflow.ensembles.orbits import Drawn, Given, initial_states
+from sympflow.ensembles.reductions import Reduction, reduction
+from sympflow.ensembles.results import Block, Done, Ensemble, Keeper, Layout, Memory, blocks, chunk_shape
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.contract import Integrator
+from sympflow.integrators.registry import build, check_applies, name_of
+from sympflow.kernels.modules import at_most
+from sympflow.solver import BACKENDS
+from sympflow.workers import LostWorkers, Parcel, Unpicklable, checked_workers, mapped
+
+if TYPE_CHECKING:
+    import os
+
+    from sympflow.ensembles.stores import EnsembleStore
+
+MOST_WORK = 50_000_000
+"""Steps times degrees of freedom of a chunk, of about a quarter of a second."""
+LONGEST_CHUNK, SHORTEST_CHUNK = 65536, 64
+PIECES = 16  # chunks, or more, of which a large ensemble is made
+MOST_PIECES = 10_000_000
+
+
+def ensemble(
+    system: HamiltonianSystem,
+    method: Any = "sympflow",
+    t_span: tuple[float, float] | None = None,
+    y0: Any = None,
+    *,
+    n: int | None = None,
+    seed: int = 0,
+    params: Mapping[str, ArrayLike] | None = None,
+    t_eval: ArrayLike | None = None,
+    reduce: Any = None,
+    workers: Any = 1,
+    chunk: int | None = None,
+    store: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    progress: bool | Callable[[int, int], Any] = False,
+    backend: str = "auto",
+    **options: Any,
+) -> Ensemble:
+    """Solve for many initial states, and for many values of parameters.
+
+    The result of each orbit is the same to the last bit whatever the workers, the chunks and their order.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    method : str, Integrator, or trained flow
+        As for `solve`.
+    t_span : (float, float), optional
+        The default is the system's.
+    y0 : array_like of shape (N, 2d) or (2d,), Domain, or callable, optional
+        The initial states; or a domain from which `n` are drawn; or a sampler ``y0(rng, n)`` that returns n states
+        (n, 2d), drawn with a `numpy.random.Generator`. It is called for 4096 states at a time, each time with a
+        generator of its own. The default is the system's state.
+    n : int, optional
+        States to draw.
+    seed : int
+        For drawing.
+    params : mapping of str to array_like of shape (k,) or (), optional
+        Values of parameters of the system. Arrays span a grid, with an axis for each in front of that of the orbits; a
+        number replaces the system's value.
+    t_eval : array_like of shape (m,), optional
+        Times to report, or that `reduce` sees. The default is every step.
+    reduce : str, Reduction, or callable, optional
+        What is kept of each orbit instead of its states: a name of `sympflow.ensembles.reductions.REDUCTIONS`, such as
+        "final"; or a function of (t, y), the times (m,) and states (2d, m) of one orbit, that returns a number, an
+        array, or a dict of such.
+    workers : int, object with .map, or callable
+        A number of threads, or of processes where Python code has to run for each orbit or step, −1 for as many as
+        there are cores; a `concurrent.futures.Executor`, a `dask.distributed.Client`, or anything else with `.map`;
+        a function such as `map`; or a `joblib.Parallel`.
+    chunk : int, optional
+        Orbits that a worker is given at a time; a store that is there already keeps its own.
+    store : path, optional
+        A folder, in zarr's format, into which the workers write what is kept, each chunk when it is done, so that none
+        of it stays in memory. `xarray.open_zarr` reads it; workers on other machines must see it by the same path.
+    resume : bool
+        Go on with the store of the same ensemble, if there is one: what is there is not done again.
+    progress : bool or callable
+        True prints how far the ensemble is; a callable is called with the numbers of orbits done and in all.
+    backend : "auto", "compiled" or "array"
+        As for `solve`.
+    **options
+        Options of the method.
+
+    Returns
+    -------
+    Ensemble
+        An orbit that fails has status −1 and a message; the others go on.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For bad arguments, at once.
+    RuntimeError
+        If workers die again and again. What is in the store is kept.
+    OSError
+        If the store cannot be written, as on a full disk. What is in it is kept.
+
+    Examples
+    --------
+    >>> import sympflow
+    >>> system = sympflow.systems.henon_heiles()
+    >>> result = sympflow.ensemble(system, "verlet", (0, 10), system.domain, n=100, dt=0.1, reduce="final")
+    >>> result.final.shape
+    (100, 4)
+    """
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    integrator = build(method, options)
+    t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
+    times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
+    if not isinstance(backend, str) or backend not in BACKENDS:
+        raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
+    workers = checked_workers(workers)
+    check_flag("resume", resume)
+    if resume and store is None:
+        raise ValueError("`resume` goes on with a `store`: name one.")
+    kept = reduction(reduce)
+    orbits = initial_states(system, y0, n, seed)
+    fixed, axes = _axes(system, params)
+    if fixed:
+        changed: Any = system
+        system = changed.with_params(**fixed)
+    first = orbits.states(0, min(len(orbits), SHORTEST_CHUNK))
+    integrator = integrator.resolved(system, first, abs(t1 - t0))
+    check_applies(integrator, system, first)
+    task = Task(system, integrator, (t0, t1), times, axes, kept, backend)
+    problem = task.problem(first)
+    report = _reporter(progress, math.prod(map(len, axes.values())) * len(orbits))
+    start = time.perf_counter()
+    with at_most(1):
+        fields = kept.fields(problem)
+    layout = Layout(axes, len(orbits), system.ndof, problem.times if kept.state == "y" else times, fields, kept.state)
+    sizes = _chunk_shape(layout, problem, chunk, store is None)
+    attributes = {
+        "system": system.name,
+        "method": name_of(integrator),
+        "options": str(integrator),
+        "t_span": [t0, t1],
+        "params": json.dumps(dict(system.params)),
+        "sympflow_version": __version__,
+    }
+    keeper: Keeper = Memory(layout, orbits, attributes)
+    if store is not None:
+        from sympflow.ensembles.stores import KNOWN, EnsembleStore, identity
+
+        known = identity(system, integrator, (t0, t1), times, orbits, axes, kept, backend)
+        keeper = made = EnsembleStore.at(store, layout, sizes, attributes | {KNOWN: json.dumps(known)}, bool(resume))
+        sizes, task = made.sizes, replace(task, store=made)
+    pieces = blocks(layout.shape, sizes)
+    left = [piece for piece in pieces if not keeper.is_done(piece)]
+    report(sum(piece.size for piece in pieces) - sum(piece.size for piece in left))
+    items = ((piece, orbits.sent(*piece.ranges[-1])) for piece in left)
+    done = len(pieces) - len(left)
+    try:
+        for index, answer in mapped(run_piece, task, items, workers, processes=kept.in_python or not problem.compiled):
+            keeper.place(left[index], answer)
+            done += 1
+            report(left[index].size)
+    except Unpicklable as error:
+        raise _unpicklable(task, orbits, error) from error
+    except LostWorkers as error:
+        whatever = "Nothing is kept: name a `store`, which is."
+        if store is not None:
+            whatever = f"{done} of {len(pieces)} chunks are in `store` {str(store)!r}: call again with resume=True."
+        raise RuntimeError(f"{error} {whatever}") from error
+    seconds = time.perf_counter() - start
+    return Ensemble(layout.times, axes, system, integrator, (t0, t1), orbits, keeper, seconds)
+
+
+def _axes(
+    system: HamiltonianSystem, params: Mapping[str, ArrayLike] | None
+) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """The parameters that are numbers, and those that are axes."""
+    if params is None:
+        return {}, {}
+    if not isinstance(params, Mapping):
+        raise TypeError(f"`params` must map names of parameters to values; got {type(params).__name__}.")
+    fixed: dict[str, float] = {}
+    axes: dict[str, np.ndarray] = {}
+    for name, given in params.items():
+        if name not in system.params:
+            names = ", ".join(system.params) or "none"
+            raise ValueError(
+                f"`params` has {name!r}, which the system {system.name!r} has not: its parameters are {names}."
+            )
+        values = floats("params", given)
+        if values.ndim > 1 or values.size == 0 or not np.isfinite(values).all():
+            raise ValueError(
+                f"`params` must give {name!r} a finite number, or a list of them; got shape {values.shape}. For "
+                "parameters that vary together call `solve` with arrays of the length of the batch."
+            )
+        if values.ndim:
+            axes[name] = values
+        else:
+            fixed[name] = float(values)
+    return fixed, axes
+
+
+# chunks --------------------------------------------------------------------------------------------------------------
+
+
+def _chunk_shape(layout: Layout, problem: Chunk, chunk: int | None, in_memory: bool) -> tuple[int, ...]:
+    """The shape of a chunk; a ValueError says how large an ensemble is that does not fit."""
+    size = sum(math.prod(s) for s, _ in layout.fields.values())
+    total = math.prod(layout.shape)
+    grid = f"{' × '.join(f'{n:,}' for n in layout.shape)} orbits"
+    if in_memory and total * size > MAX_ASKED_VALUES:
+        raise ValueError(
+            f"`store` is needed: {size:,} numbers of each of {grid} are {total * size * 8 / 2**30:.3g} GiB, more than "
+            f"{MAX_ASKED_VALUES:.0e} numbers. Name one, or keep less by `t_eval` or `reduce`."
+        )
+    if chunk is None:
+        t0, t1 = problem.t_span
+        length = problem.integrator.step_length(problem.system) or problem.system.dt
+        work = max(1, int(abs(t1 - t0) / length)) * problem.system.ndof
+        most = min(MOST_WORK // work, MOST_VALUES // max(size, 2 * problem.system.ndof), LONGEST_CHUNK, total // PIECES)
+        chunk = SHORTEST_CHUNK * max(1, most // SHORTEST_CHUNK)
+    check_counts(chunk=chunk)
+    sizes = chunk_shape(layout.shape, int(chunk))
+    values = math.prod(sizes) * size
+    if values > MAX_ASKED_VALUES:
+        raise ValueError(
+            f"`chunk` of {math.prod(sizes):,} orbits with {size:,} numbers each is {values * 8 / 2**30:.3g} GiB, more "
+            f"than {MAX_ASKED_VALUES:.0e} numbers: choose at most {max(1, MAX_ASKED_VALUES // size):,}."
+        )
+    pieces = math.prod(-(-n // k) for n, k in zip(layout.shape, sizes, strict=True))
+    if pieces > MOST_PIECES:
+        raise ValueError(
+            f"`chunk` of {math.prod(sizes):,} cuts {grid} into {pieces:,} chunks, more than {MOST_PIECES:.0e}: choose "
+            "a larger one, or a smaller grid."
+        )
+    return sizes
+
+
+@dataclass(frozen=True)
+class Task:
+    """What all chunks of an ensemble have in common: a definition that is small when pickled."""
+
+    system: HamiltonianSystem
+    integrator: Integrator
+    t_span: tuple[float, float]
+    t_eval: np.ndarray | None
+    axes: dict[str, np.ndarray]
+    reduction: Reduction
+    backend: str
+    store: EnsembleStore | None = None
+
+    def problem(self, y0: np.ndarray) -> Chunk:
+        """The chunk of some first orbits, at the first values of the parameters."""
+        return self.chunk({name: values[0] for name, values in self.axes.items()}, y0, 0)
+
+    def chunk(self, values: Mapping[str, float], y0: np.ndarray, first: int) -> Chunk:
+        """A chunk of orbits with the same parameters."""
+        system: Any = self.system
+        system = system.with_params(**values) if values else system
+        return Chunk(system, self.integrator, self.t_span, self.t_eval, y0, backend=self.backend, first=first)
+
+
+def run_piece(task: Task, item: tuple[Block, Given | Drawn]) -> Done:
+    """Run the orbits of a block, on this thread alone, and write them into the store, if there is one."""
+    block, orbits = item
+    y0 = orbits.states(0, len(orbits))
+    grid = [values[slice(*ends)] for values, ends in zip(task.axes.values(), block.ranges[:-1], strict=True)]
+    parts: list[Done] = []
+    with at_most(1):
+        for i, values in enumerate(itertools.product(*grid)):
+            named = dict(zip(task.axes, map(float, values), strict=True))
+            chunk = task.chunk(named, y0, block.first + i * len(y0))
+            fields = task.reduction.reduce(chunk)
+            parts.append(Done(fields, chunk.status, {i * len(y0) + k: text for k, text in chunk.messages.items()}))
+    done = parts[0] if len(parts) == 1 else _joined(parts)
+    if task.store is None:
+        return done
+    task.store.write(block, done, y0)
+    return Done({}, done.status[:0], {})
+
+
+def _joined(parts: list[Done]) -> Done:
+    fields = {name: np.concatenate([part.fields[name] for part in parts]) for name in parts[0].fields}
+    messages = {row: text for part in parts for row, text in part.messages.items()}
+    return Done(fields, np.concatenate([part.status for part in parts]), messages)
+
+
+def _unpicklable(task: Task, orbits: Given | Drawn, error: Exception) -> TypeError:
+    """The error that names which argument cannot be sent to processes."""
+    parts = {"system": task.system, "method": task.integrator, "reduce": task.reduction, "y0": orbits.sent(0, 1)}
+    for name, part in parts.items():
+        try:
+            Parcel(part).pack()
+        except Unpicklable as why:
+            return TypeError(
+                f"`{name}` cannot be sent to the processes of `workers` ({why}): define its functions in a module, or "
+                "use workers=1."
+            )
+    return TypeError(f"`workers` cannot be sent their work ({error}): use workers=1.")
+
+
+def _reporter(progress: bool | Callable[[int, int], Any], total: int) -> Callable[[int], None]:
+    if not (isinstance(progress, bool) or callable(progress)):
+        raise TypeError(f"`progress` must be True, False, or a function of (done, total); got {progress!r}.")
+    done = 0
+
+    def report(more: int) -> None:
+        nonlocal done
+        done += more
+        if callable(progress):
+            progress(done, total)
+        elif progress:
+            print(f"\r{done:,} of {total:,} orbits", end="" if done < total else "\n", flush=True)
+
+    return report

@@ -1,0 +1,238 @@
+"""Any force, not only those of a Hamiltonian: Galley's doubling of the variables.
+
+The motion q' = ∂H/∂p, p' = −∂H/∂q + F(q, p) has no Hamiltonian in general, but two copies of the system have one. In
+the mean of the copies and their difference, q₊, p₊ and q₋, p₋, it is
+
+    A = p₋·∂H/∂p(q₊, p₊) + q₋·(∂H/∂q(q₊, p₊) − F(q₊, p₊)),
+
+with positions (q₊, q₋) and momenta (p₋, p₊), in this order: the partner of q₊ is p₋. These are H(1) − H(2) − K of the
+copies with K = q₋·F, to first order in the difference, which is all that the physical limit q₋ = p₋ = 0 keeps. There
+(q₊, p₊) moves as above, and the difference stays 0.
+
+References
+----------
+.. [1] C. R. Galley, "Classical mechanics of nonconservative systems", Phys. Rev. Lett. 110 (2013) 174301, eqs. (5)–(9).
+.. [2] D. Tsang, C. R. Galley, L. C. Stein, A. Turner, "'Slimplectic' integrators: variational integrators for general
+   nonconservative systems", Astrophys. J. Lett. 809 (2015) L9.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from sympflow.arrays import Array, concatenate, is_tensor
+from sympflow.hamiltonian.domain import Box, Domain
+from sympflow.hamiltonian.hamiltonian import ExternalForce
+from sympflow.hamiltonian.system import HamiltonianSystem
+
+Force = Callable[[Array, Array], Array]
+
+THIN = 0.1
+"""Width of the default domain in q₋ and p₋, over that in q and p."""
+_DRAWN = 1000  # states that find the extent of a domain
+
+
+class DoubledSystem(HamiltonianSystem):
+    """A Hamiltonian system in twice the variables whose physical limit has friction and any other force.
+
+    `doubled` makes it, and documents it.
+
+    Attributes
+    ----------
+    physical : HamiltonianSystem
+        The system of the physical limit, of d degrees of freedom: that which was doubled, with F as its
+        `external_force`. Runge–Kutta methods and `solve_ivp` integrate it as it is; all others take the doubled one.
+    """
+
+    physical: HamiltonianSystem
+
+    def as_doubled(self) -> DoubledSystem:
+        return self
+
+    def lift(self, y: Array) -> Array:
+        """[q, 0, 0, p], the state for a physical state y = [q, p]: (..., 2d) to (..., 4d).
+
+        Raises
+        ------
+        ValueError
+            If y has another width.
+        """
+        d = self.ndof // 2
+        if y.ndim == 0 or y.shape[-1] != 2 * d:
+            raise ValueError(
+                f"`y0` must have shape (..., {2 * d}) for {self.name!r}, a physical state [q, p] with {d} each, or "
+                f"(..., {4 * d}), [q₊, q₋, p₋, p₊]; got {tuple(y.shape)}."
+            )
+        return concatenate([y[..., :d], 0 * y[..., :d], 0 * y[..., d:], y[..., d:]])
+
+    def physical_limit(self, y: Array) -> Array:
+        """[q₊, p₊] of states [q₊, q₋, p₋, p₊]: (..., 4d) to (..., 2d)."""
+        d = self.ndof // 2
+        return concatenate([y[..., :d], y[..., 3 * d :]])
+
+    def difference(self, y: Array) -> Array:
+        """[q₋, p₋] of states [q₊, q₋, p₋, p₊], 0 in the physical limit: (..., 4d) to (..., 2d)."""
+        d = self.ndof // 2
+        return y[..., d : 3 * d]
+
+
+def doubled(
+    system: HamiltonianSystem,
+    force: Any = None,
+    *,
+    params: Mapping[str, float] | None = None,
+    domain: Domain | None = None,
+) -> DoubledSystem:
+    """The Hamiltonian system in twice the variables whose physical limit is q' = ∂H/∂p, p' = −∂H/∂q − Γp + F(q, p).
+
+    Its states are [q₊, q₋, p₋, p₊], of 4d numbers: the mean and the difference of two copies of the system, p₋ being
+    the momentum of q₊, and p₊ that of q₋. A physical state [q, p] is [q, 0, 0, p]; `solve` lifts a `y0` of 2d numbers
+    itself, and `Solution.physical()` is the way back. See `sympflow.hamiltonian.doubling` for H.
+
+    H is linear in q₋ and p₋. So where these are 0 they stay 0 exactly, with every Runge–Kutta, implicit and splitting
+    method, and whatever they are, (q₊, p₊) moves by the physical equations. It is separable, so that splitting methods
+    apply, if the system is and F depends on q alone.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        H of d degrees of freedom; its damping, −Γp, is taken over.
+    force : str, sympy.Expr, a list of d of these, or callable
+        F in q1 … qd, p1 … pd (or q and p), one expression for each momentum: "-c*p*abs(p)", or
+        ["-c*p1/(q1**2 + q2**2)", "-c*p2/(q1**2 + q2**2)"]; or F(q, p) written with torch functions, (..., d), each, to
+        (..., d), by which the system is not compiled. The default is 0, where the system has damping.
+    params : mapping of str to float, optional
+        Values of the other symbols of F; those of `system.params` are known.
+    domain : Domain, optional
+        Ω of states [q₊, q₋, p₋, p₊]. The default is a box about the domain of the system, a tenth as wide in q₋ and p₋.
+
+    Returns
+    -------
+    DoubledSystem
+        Of 2d degrees of freedom, with `lift`, `physical_limit`, `difference` and `physical`, the system of the limit.
+
+    Raises
+    ------
+    TypeError
+        If `system` is no HamiltonianSystem, or `force` is neither text, expression nor function.
+    ValueError
+        If `force` has another number of components, cannot be parsed, or holds symbols without values.
+
+    Warns
+    -----
+    UserWarning
+        If the force is one of a potential, which belongs into H.
+
+    References
+    ----------
+    .. [1] C. R. Galley, "Classical mechanics of nonconservative systems", Phys. Rev. Lett. 110 (2013) 174301.
+    .. [2] D. Tsang, C. R. Galley, L. C. Stein, A. Turner, Astrophys. J. Lett. 809 (2015) L9.
+
+    Examples
+    --------
+    >>> import sympflow
+    >>> fall = sympflow.HamiltonianSystem.from_sympy("p**2/2 + q", y0=[0.0, 0.0])
+    >>> sol = sympflow.solve(sympflow.doubled(fall, "-p*abs(p)"), "gauss_legendre6", (0, 10), dt=0.1)
+    >>> round(float(sol.physical().y[1, -1]), 6)
+    -1.0
+    """
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    if isinstance(system, DoubledSystem) or system.external_force is not None:
+        raise TypeError(f"`system` {system.name!r} is of a doubling: add the forces, and double what was doubled.")
+    if force is None and system.conservative:
+        raise TypeError("`force` is needed: a system without friction is Hamiltonian as it is.")
+    scene: dict[str, Any] = {"name": f"{system.name}_doubled", "t_span": system.t_span, "dt": system.dt}
+    scene["domain"] = _thin_box(system) if domain is None else domain
+    made: DoubledSystem
+    given = callable(force) and not hasattr(force, "free_symbols")  # SymPy's expressions may be called
+    if given and params is not None:
+        raise TypeError("`params` are for a `force` by symbols: write their values into the function.")
+    if given or system.symbols is None:
+        if not given and force is not None:
+            raise TypeError(
+                f"`force` is given by symbols, but `system` {system.name!r} by functions: give it as a function "
+                "F(q, p), written with torch."
+            )
+        F: ExternalForce = GivenForce(force if given else _no_force)
+        made = DoubledSystem(hamiltonian=_DoubledFunctions(system, F), ndof=2 * system.ndof, check=False, **scene)
+    else:
+        from sympflow.hamiltonian.forces import SymbolicForce, doubled_hamiltonian
+
+        F = SymbolicForce(system, [0] * system.ndof if force is None else force, params)
+        if system.conservative and F.has_potential:
+            warnings.warn(
+                "`force` is that of a potential, which keeps an energy: put it into H, and solve that system.",
+                UserWarning,
+                stacklevel=2,
+            )
+        made = DoubledSystem.from_sympy(doubled_hamiltonian(system, F), **scene)  # type: ignore[assignment]
+    made.physical = system if force is None else system.with_force(F)
+    made.y0 = None if system.y0 is None else made.lift(system.y0)
+    return made
+
+
+def _no_force(q: Array, p: Array) -> Array:
+    return 0 * p
+
+
+class GivenForce:
+    """F(q, p) of a user, written with torch functions: see `ExternalForce`."""
+
+    def __init__(self, force: Force) -> None:
+        self.force = force
+
+    def __call__(self, q: Array, p: Array) -> Array:
+        import torch
+
+        value = self.force(torch.as_tensor(q), torch.as_tensor(p))
+        if not is_tensor(value) or tuple(value.shape) != tuple(p.shape):
+            got = tuple(value.shape) if is_tensor(value) else type(value).__name__
+            raise ValueError(
+                f"`force` must return a tensor of the shape of p, {tuple(p.shape)}; got {got}: write it with torch "
+                "functions, for states on the last axis."
+            )
+        return value if is_tensor(p) else value.detach().numpy()
+
+    def jacobian(self, q: Array, p: Array) -> Array:
+        import torch
+
+        from sympflow.arrays import jvp
+
+        d, x = p.shape[-1], torch.as_tensor(concatenate([q, p]))
+        columns = []
+        for i in range(2 * d):
+            along = torch.zeros_like(x)
+            along[..., i] = 1
+            columns.append(jvp(lambda z: self(z[..., :d], z[..., d:]), x, along)[1])
+        found = torch.stack(columns, dim=-1)
+        return found if is_tensor(p) else found.numpy()
+
+
+class _DoubledFunctions:
+    """A of a system that is given by functions, or has a force that is."""
+
+    def __init__(self, system: HamiltonianSystem, force: ExternalForce) -> None:
+        self.system, self.force = system, force
+
+    def __call__(self, Q: Array, P: Array) -> Array:
+        d = self.system.ndof
+        q, p = Q[..., :d], P[..., d:]
+        field = self.system.vector_field(concatenate([q, p]))
+        slope = -field[..., d:] - self.force(q, p)
+        return (P[..., :d] * field[..., :d]).sum(-1) + (Q[..., d:] * slope).sum(-1)
+
+
+def _thin_box(system: HamiltonianSystem) -> Box | None:
+    """The box about the domain of a system, and about q₋ and p₋ of a tenth of its widths."""
+    if system.domain is None:
+        return None
+    d, x = system.ndof, system.domain.sample(_DRAWN, 0)
+    low, high = x.min(0), x.max(0)
+    thin = THIN * np.maximum((high - low) / 2, np.finfo(float).tiny)
+    low, high = (np.concatenate([b[:d], s * thin, b[d:]]) for b, s in ((low, -1), (high, 1)))
+    return Box(low, high)

@@ -1,0 +1,152 @@
+"""Forces by symbols, and the Hamiltonian in twice the variables that has them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import sympy as sp
+
+from sympflow.arrays import Array, assemble, is_tensor
+from sympflow.hamiltonian.expression import Unreadable, read
+from sympflow.hamiltonian.symbolic import checked_params, generate, printable
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.system import HamiltonianSystem
+
+_COORDINATE = re.compile(r"([qp])([1-9]\d*)?")
+
+
+class SymbolicForce:
+    """F(q, p) by expressions, one for each momentum: an `ExternalForce`.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        With symbols; its parameters are known by their names.
+    force : str, sympy.Expr or a list of d of these
+    params : mapping of str to float, optional
+        Values of further symbols.
+
+    Attributes
+    ----------
+    expressions : list of d sympy.Expr
+        In q1 … qd, p1 … pd and numbers.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `sympflow.doubled` says.
+    """
+
+    def __init__(self, system: HamiltonianSystem, force: Any, params: Mapping[str, float] | None) -> None:
+        symbols = system.symbols
+        assert symbols is not None
+        self.q, self.p = symbols.q, symbols.p
+        d = system.ndof
+        several = isinstance(force, Sequence | np.ndarray | sp.MatrixBase) and not isinstance(force, str)
+        written = list(force) if several else [force]
+        if len(written) != d:
+            raise ValueError(
+                f"`force` must have {d} components, one for each momentum of {system.name!r}; got {len(written)}."
+            )
+        values = {**system.params, **checked_params(params)}
+        read_ones = [_read(each, values) for each in written]
+        for name in params or {}:
+            if not any(sp.Symbol(name, real=True) in f.free_symbols for f in read_ones):
+                raise ValueError(f"`params` has {name!r}, which the force does not use: remove it.")
+        self.expressions = [self._valued(f, values) for f in read_ones]
+
+    def _valued(self, f: sp.Expr, values: Mapping[str, float]) -> sp.Expr:
+        """The expression in the system's coordinates, its parameters replaced by their values."""
+        d = len(self.q)
+        known: dict[sp.Symbol, sp.Expr] = {sp.Symbol(name, real=True): _number(value) for name, value in values.items()}
+        if d == 1:
+            known |= {sp.Symbol("q", real=True): self.q[0], sp.Symbol("p", real=True): self.p[0]}
+        f = f.xreplace(known)
+        unknown = sorted(s.name for s in f.free_symbols - {*self.q, *self.p})
+        beyond = [name for name in unknown if _COORDINATE.fullmatch(name)]
+        if beyond:
+            raise ValueError(
+                f"`force` holds {', '.join(beyond)}, but the system has the coordinates {self.q[0]} … {self.p[-1]}: "
+                "write it in these."
+            )
+        if "t" in unknown:
+            raise ValueError("`force` depends on the time t, but the system does not: leave t out.")
+        if unknown:
+            raise ValueError(f"`force` holds {', '.join(unknown)} without a value: give it in `params`.")
+        return f
+
+    def __call__(self, q: Array, p: Array) -> Array:
+        return self._evaluated(self.expressions, q, p)
+
+    def jacobian(self, q: Array, p: Array) -> Array:
+        x = (*self.q, *self.p)
+        flat = self._evaluated([sp.diff(f, s) for f in self.expressions for s in x], q, p)
+        return flat.reshape(*p.shape, len(x))
+
+    def _evaluated(self, expressions: list[sp.Expr], q: Array, p: Array) -> Array:
+        key = len(expressions), "torch" if is_tensor(p) else "numpy"
+        if key not in self._functions:
+            self._functions[key] = generate([printable(f) for f in expressions], (*self.q, *self.p), key[1])
+        columns = [each[..., i] for each in (q, p) for i in range(p.shape[-1])]
+        return assemble(self._functions[key](*columns), columns[0])
+
+    @cached_property
+    def _functions(self) -> dict[tuple[int, str], Any]:
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the generated functions, which cannot be pickled and are generated again."""
+        return {name: value for name, value in vars(self).items() if name != "_functions"}
+
+    @property
+    def has_potential(self) -> bool:
+        """True if F is −∇U(q)."""
+        F, q = self.expressions, self.q
+        if any(f.free_symbols & {*self.p} for f in F):
+            return False
+        return all(sp.expand(sp.diff(F[i], q[j]) - sp.diff(F[j], q[i])) == 0 for i in range(len(q)) for j in range(i))
+
+
+def doubled_hamiltonian(system: HamiltonianSystem, force: SymbolicForce) -> sp.Expr:
+    """p₋·∂H/∂p + q₋·(∂H/∂q + Γp − F) in q1 … q2d, p1 … p2d, which are q₊, q₋ and p₋, p₊."""
+    symbols = system.symbols
+    assert symbols is not None
+    d = system.ndof
+    q, p = (sp.symbols(f"{letter}1:{2 * d + 1}", real=True) for letter in "qp")
+    G = np.zeros((d, d)) if system.friction is None else system.friction.matrix(d)
+    mean = dict(zip((*symbols.q, *symbols.p), (*q[:d], *p[d:]), strict=True))
+    terms = []
+    for i, F in enumerate(force.expressions):
+        drag = sp.Add(*[_number(g) * s for g, s in zip(G[i], symbols.p, strict=True) if g])
+        terms.append(p[i] * sp.diff(symbols.H, symbols.p[i]).xreplace(mean))
+        terms.append(q[d + i] * (sp.diff(symbols.H, symbols.q[i]) + drag - F).xreplace(mean))
+    return printable(sp.Add(*terms))
+
+
+def _number(x: float) -> sp.Expr:
+    return sp.Integer(int(x)) if float(x).is_integer() else sp.Float(x)
+
+
+def _read(f: Any, names: Mapping[str, float]) -> sp.Expr:
+    """One component in real symbols."""
+    if isinstance(f, str):
+        try:
+            return read(f, {*names, *(w for w in re.findall(r"[A-Za-z_]\w*", f) if _COORDINATE.fullmatch(w))})
+        except Unreadable as error:
+            raise ValueError(
+                f"`force` cannot be parsed: {f[:200]!r} ({error}). Write it with these, or pass a SymPy expression."
+            ) from None
+    try:
+        value = sp.sympify(f, strict=True)
+    except sp.SympifyError:
+        value = None
+    if not isinstance(value, sp.Expr) or value.has(sp.I):
+        raise TypeError(
+            f"`force` must be real expressions, texts or SymPy's, or a function F(q, p); got {type(f).__name__}."
+        )
+    return value.xreplace({s: sp.Symbol(s.name, real=True) for s in value.free_symbols})

@@ -1,0 +1,259 @@
+"""Values of the parameters of a symbolic system for each trajectory of a batch."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import sympy as sp
+
+from sympflow.arrays import is_tensor
+from sympflow.hamiltonian.symbolic import exact, generate, printable
+from sympflow.hamiltonian.system import HamiltonianSystem
+
+MOST_SHOWN = 4  # values of a row, in messages
+
+
+class Rows(NamedTuple):
+    """Trajectories that one run takes together.
+
+    Attributes
+    ----------
+    places : ndarray of int, shape (n,)
+        Which of the batch, in the order of its flattened shape.
+    system : HamiltonianSystem
+        The system of the first of them.
+    letters : ndarray of shape (k, n) or None
+        For each the values of `system.symbols.parametric.parameters`; None where `system` is that of all.
+    """
+
+    places: np.ndarray
+    system: HamiltonianSystem
+    letters: np.ndarray | None = None
+
+
+class ParameterRows:
+    """The parameters of each trajectory of a batch.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        Symbolic; it has the parameters.
+    values : mapping of str to ndarray
+        Of some of its parameters, each of the shape of the batch.
+
+    Attributes
+    ----------
+    shape : tuple of int
+    """
+
+    def __init__(self, system: HamiltonianSystem, values: Mapping[str, np.ndarray]) -> None:
+        self.system, self.values = system, dict(values)
+        self.shape = next(iter(self.values.values())).shape
+
+    @cached_property
+    def _columns(self) -> dict[str, np.ndarray]:
+        return {name: np.ravel(value) for name, value in self.values.items()}
+
+    @property
+    def uniform(self) -> bool:
+        """True if all trajectories have the same values."""
+        return all(bool((column == column[0]).all()) for column in self._columns.values())
+
+    def system_of(self, row: int) -> HamiltonianSystem:
+        """The system of a trajectory, by its place in the flattened batch.
+
+        Raises
+        ------
+        ValueError
+            If it has none, with its values.
+        """
+        values = {name: float(column[row]) for name, column in self._columns.items()}
+        try:
+            return self.system.with_params(**values)
+        except (ValueError, TypeError) as error:
+            where = ", ".join(map(str, np.unravel_index(row, self.shape)))
+            shown = ", ".join(f"{name} = {value:.9g}" for name, value in [*values.items()][:MOST_SHOWN])
+            raise ValueError(
+                f"`params` has {shown} (trajectory {where}), for which there is no system: {error} Leave these values "
+                "out."
+            ) from error
+
+    def distinct(self) -> Iterator[Rows]:
+        """The trajectories by their values, each with its own system."""
+        for index in _groups([*self._columns.values()]):
+            yield Rows(index, self.system_of(int(index[0])))
+
+    def by_form(self) -> Iterator[Rows]:
+        """The trajectories by the `parametric` form of H; those whose values belong to the code, by their values.
+
+        A value that makes a part of H 0, 1 or −1 has a form of its own, as it has in a system that is made with it: so
+        a trajectory takes the same steps, bit by bit, alone and among others.
+        """
+        symbols = self.system.symbols
+        assert symbols is not None
+        try:
+            parts, replaced = symbols.parametric_parts
+        except (TypeError, OverflowError):
+            yield from self.distinct()
+            return
+        kinds = [_kind(self._part(part)) for part in parts if self._swept(part)]
+        kinds += [column for name, column in self._columns.items() if any(s.name == name for s in replaced)]
+        for index in _groups(kinds) if kinds else [np.arange(math.prod(self.shape))]:
+            rows = self.taken(index)
+            if rows.uniform:
+                yield Rows(index, self.system_of(int(index[0])))
+                continue
+            system = self.system_of(int(index[0]))
+            assert system.symbols is not None
+            form = system.symbols.parametric
+            letters = [rows._part(part) for part in form.meanings]
+            if form is system.symbols or not all(np.isfinite(letter).all() for letter in letters):
+                yield from (Rows(index[few], own) for few, own, _ in rows.distinct())
+                continue
+            yield Rows(index, system, np.stack([np.broadcast_to(x, index.shape) for x in letters]))
+
+    def taken(self, index: np.ndarray) -> ParameterRows:
+        """The rows of some trajectories, by their places in the flattened batch."""
+        if len(index) == math.prod(self.shape):
+            return self
+        return ParameterRows(self.system, {name: column[index] for name, column in self._columns.items()})
+
+    def _swept(self, part: sp.Expr) -> bool:
+        return any(s.name in self._columns for s in part.free_symbols)
+
+    def _part(self, part: sp.Expr) -> np.ndarray:
+        """The values of a part of H that depends on parameters alone, as SymPy has them; NaN where they are not real.
+
+        Of shape (N,), or (1,) where it depends on none of these parameters.
+        """
+        assert self.system.symbols is not None
+        fixed = self.system.symbols.written[1]
+        columns = {s: self._columns[s.name] for s in part.free_symbols if s.name in self._columns}
+        part = part.xreplace({s: value for s, value in fixed.items() if s not in columns})
+        if not columns:
+            return np.array([float(part)])
+        with np.errstate(all="ignore"):
+            if part.is_Symbol:
+                return columns[part]
+            if part.is_Pow and part.base.is_Symbol and part.exp in _ROUNDED_ONCE:
+                return _ROUNDED_ONCE[part.exp](columns[part.base])
+        values = np.empty(math.prod(self.shape))
+        for index in _groups([*columns.values()]):
+            try:
+                values[index] = float(part.xreplace({s: exact(float(c[index[0]])) for s, c in columns.items()}))
+            except (TypeError, OverflowError):
+                values[index] = math.nan
+        return values
+
+    def hamiltonian(self, y: np.ndarray) -> np.ndarray:
+        """H of each trajectory at its states y (*shape, ..., 2d): (*shape, ...)."""
+        more = (1,) * (y.ndim - 1 - len(self.shape))
+        columns = [value.reshape(*self.shape, *more) for value in self.values.values()]
+        d = self.system.ndof
+        (H,) = self._function(*(y[..., i] for i in range(2 * d)), *columns)
+        return np.broadcast_to(H, y.shape[:-1])
+
+    @cached_property
+    def _function(self) -> Any:
+        symbols = self.system.symbols
+        assert symbols is not None
+        H, values = symbols.written
+        H = H.xreplace({s: value for s, value in values.items() if s.name not in self.values})
+        letters = [sp.Symbol(name, real=True) for name in self.values]
+        return generate([printable(H)], [*symbols.q, *symbols.p, *letters], "numpy")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The definition alone: functions cannot be pickled."""
+        return {"system": self.system, "values": self.values, "shape": self.shape}
+
+
+_ROUNDED_ONCE: dict[Any, Callable[[np.ndarray], np.ndarray]] = {
+    sp.Integer(-1): lambda x: 1 / x,
+    sp.Integer(2): lambda x: x * x,
+    sp.Rational(1, 2): np.sqrt,
+}
+"""Powers that floats have exactly rounded, as SymPy has them."""
+
+
+def _kind(values: np.ndarray) -> np.ndarray:
+    """The values where they are 0, 1 or −1, else 2, or 3 of those that are not finite."""
+    kinds = np.where(np.isfinite(values), 2, 3)
+    for number in (0, 1, -1):
+        kinds[values == number] = number
+    return kinds
+
+
+def _groups(columns: list[np.ndarray]) -> list[np.ndarray]:
+    """The indices of equal rows of columns (N,), groups in the order of their first ones."""
+    key = np.zeros(len(columns[0]), dtype=np.int64)
+    for column in columns:
+        if (column == column[0]).all():
+            continue
+        _, own = np.unique(column, return_inverse=True)
+        _, key = np.unique(key * (int(own.max()) + 1) + own.reshape(-1), return_inverse=True)
+    order = np.argsort(key, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
+    return sorted(groups, key=lambda index: int(index[0]))
+
+
+def checked_rows(system: HamiltonianSystem, params: Any, batch: tuple[int, ...]) -> ParameterRows:
+    """The values of `params` for each trajectory of a batch of states, broadcast as NumPy does.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    params : mapping of str to array_like
+    batch : tuple of int
+        y0.shape[:-1].
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `params` is no mapping of parameters of the system to finite real numbers of shapes that fit.
+    """
+    if not isinstance(params, Mapping):
+        raise TypeError(f"`params` must be a mapping of names to numbers or arrays; got {type(params).__name__}.")
+    if not params:
+        raise ValueError("`params` is empty: give values for parameters of the system, or leave it out.")
+    system.check_parameters(params)
+    arrays = {name: _checked_values(name, value) for name, value in params.items()}
+    try:
+        shape = np.broadcast_shapes(batch, *(array.shape for array in arrays.values()))
+    except ValueError:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise ValueError(
+            f"`params` must have shapes that broadcast with the batch {batch} of `y0`, as numbers or arrays of one "
+            f"value for each trajectory; got {shapes}."
+        ) from None
+    return ParameterRows(system, {name: np.broadcast_to(array, shape) for name, array in arrays.items()})
+
+
+def _checked_values(name: str, given: Any) -> np.ndarray:
+    if is_tensor(given):
+        if given.requires_grad:
+            raise TypeError(f"`params` has {name} that requires a gradient, which does not flow to it: detach it.")
+        given = given.detach().cpu().numpy()
+    try:
+        array = np.asarray(given)
+        if array.dtype.kind not in "iuf":
+            raise TypeError
+        array = array.astype(float)
+    except (TypeError, ValueError, OverflowError):
+        raise TypeError(
+            f"`params` has {name} = {reprlib.repr(given)}: give finite real numbers, one or an array."
+        ) from None
+    if np.ma.is_masked(given):
+        raise ValueError(f"`params` has {name} with masked entries: fill them, or leave these trajectories out.")
+    if not array.size:
+        raise ValueError(f"`params` has no values of {name}: give one at least.")
+    if not np.isfinite(array).all():
+        where = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+        raise ValueError(
+            f"`params` has {name} = {array[where]} at {where}: give finite numbers, or leave these trajectories out."
+        )
+    return array

@@ -1,0 +1,61 @@
+"""Steps on a doubled system, each projected to the physical limit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from sympflow.arrays import Array
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import FixedStep
+from sympflow.integrators.contract import Integrator
+from sympflow.integrators.registry import build, check_applies
+
+
+@dataclass(frozen=True)
+class Projected(FixedStep):
+    """Another method on a doubled system, with q₋ = p₋ = 0 put back after every step.
+
+    A trained flow leaves the physical limit by its error, and the doubled flow then carries q₋, p₋ away as fast as
+    friction takes energy out: e^{γt}. With this projection the physical states (q₊, p₊) are mapped by themselves.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Step length; the default is that of the inner method.
+    of : str, Integrator or trained flow
+        The inner method, which makes steps by itself.
+    """
+
+    of: Any = field(default=None, repr=False)
+
+    name: ClassVar[str] = "projected"
+    order: ClassVar[int | None] = None
+    symplectic: ClassVar[bool] = False
+    source: ClassVar[str] = "another method, projected to the physical limit of a doubled system after every step"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.of is None:
+            raise TypeError("`of` is needed: the method, or trained flow, of which each step is projected.")
+        object.__setattr__(self, "of", build(self.of, {}))
+
+    @property
+    def inner(self) -> Integrator:
+        """The method of which each step is projected."""
+        return self.of
+
+    @property
+    def label(self) -> str:
+        return f"{self.inner.label}, projected"
+
+    def check(self, system: HamiltonianSystem) -> None:
+        system.as_doubled()
+        check_applies(self.inner, system)
+
+    def step_length(self, system: HamiltonianSystem) -> float:
+        return float(self.dt if self.dt is not None else self.inner.step_length(system) or system.dt)
+
+    def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+        doubled = system.as_doubled()
+        return doubled.lift(doubled.physical_limit(self.inner.step(system, t, y, h)))

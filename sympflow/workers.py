@@ -1,0 +1,371 @@
+"""A map over workers: this thread, threads, processes, or an engine that a user hands in.
+
+The conventions are SciPy's and gala's: a number; an object with `.map`, as an Executor, a dask Client, a pool of
+schwimmbad or mpi4py; or a function such as `map` itself. Of an engine only `.map` is used, and what it returns may be
+values or futures of them. What a worker that died had to do is done again.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from dataclasses import dataclass
+from functools import cache, lru_cache, partial
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from sympflow._version import __version__
+
+TRIES = 3
+"""Times in a row that workers may die before anything was done."""
+LOOK = 0.2  # seconds between two looks at the processes of a pool that does not tell when they die
+LOST = {"KilledWorker", "FutureCancelledError", "TerminatedWorkerError"}
+"""Names of the errors by which engines say that a worker died: of dask and joblib, which need not be installed."""
+SAME = ("numpy", "numba")
+"""Distributions whose versions may decide the last bits of a result."""
+
+
+class LostWorkers(RuntimeError):
+    """Workers died several times in a row, and nothing more was done."""
+
+
+class Unpicklable(TypeError):
+    """What workers are to be sent cannot be pickled."""
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def checked_workers(workers: Any) -> Any:
+    """Return the number of workers, −1 being as many as there are cores, or the engine as it is.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If it is neither.
+    """
+    if isinstance(workers, int) and not isinstance(workers, bool):
+        if workers == -1:
+            return available_cores()
+        if workers < 1:
+            raise ValueError(
+                f"`workers` must be a positive number, or −1 for as many as there are cores; got {workers}."
+            )
+        return workers
+    if workers is map:  # which is a class
+        return workers
+    if isinstance(workers, type) or not (callable(getattr(workers, "map", None)) or callable(workers)):
+        raise TypeError(
+            f"`workers` must be a number, an object with .map (an Executor, a dask Client, a pool), or a function such "
+            f"as map; got {workers!r}. Pass a number such as 2, or make an instance."
+        )
+    return workers
+
+
+# what is sent --------------------------------------------------------------------------------------------------------
+
+
+@cache
+def _versions() -> dict[str, str]:
+    found = {"sympflow": __version__, "Python": ".".join(map(str, sys.version_info[:2]))}
+    for name in SAME:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # frozen into a program
+            found[name] = "unknown"
+    return found
+
+
+class Parcel:
+    """What all calls have in common: pickled once, and unpacked once by each worker; in this process it is sent as is.
+
+    Parameters
+    ----------
+    value : object
+    """
+
+    def __init__(self, value: Any) -> None:
+        self._value, self._packed = value, b""
+        self._blob = b""
+
+    @property
+    def value(self) -> Any:
+        """The object; an error if it was packed with other versions than those that are installed here."""
+        return _unpacked(self._packed) if self._packed else self._value
+
+    def pack(self) -> bytes:
+        """The object as bytes, with the versions of the program that packs it.
+
+        Raises
+        ------
+        Unpicklable
+            If it cannot be pickled.
+        """
+        if not self._blob:
+            self._blob = pickle.dumps((_versions(), _pickled(self._value)))
+        return self._blob
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _sent, (self.pack(),)
+
+
+def _sent(packed: bytes) -> Parcel:
+    parcel = Parcel(None)
+    parcel._packed = parcel._blob = packed
+    return parcel
+
+
+def _pickled(value: Any) -> bytes:
+    """Return the pickle of an object; where Python's refuses functions that are in no module, cloudpickle's."""
+    try:
+        return pickle.dumps(value)
+    except Exception as error:
+        try:
+            import cloudpickle
+
+            return cloudpickle.dumps(value)
+        except Exception:
+            raise Unpicklable(f"{type(error).__name__}: {error}") from error
+
+
+@lru_cache(maxsize=4)
+def _unpacked(packed: bytes) -> Any:
+    theirs, value = pickle.loads(packed)
+    mine = _versions()
+    if theirs != mine:
+        other = [
+            f"{name} {mine.get(name)} instead of {theirs[name]}" for name in theirs if mine.get(name) != theirs[name]
+        ]
+        raise ValueError(
+            f"`workers` run other versions than this program: {', '.join(other)}, so that results might differ. "
+            "Install the same versions everywhere."
+        )
+    return pickle.loads(value)
+
+
+# the calls -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The result of a call, or what it raised."""
+
+    index: int
+    value: Any
+    error: Exception | None = None
+
+
+class _Call:
+    """A call of `function(common, item)` for a numbered item."""
+
+    def __init__(self, function: Callable[[Any, Any], Any], common: Parcel) -> None:
+        self.function, self.common = function, common
+
+    def __call__(self, numbered: tuple[int, int, Any]) -> Answer:
+        _, index, item = numbered
+        try:
+            return Answer(index, self.function(self.common.value, item))
+        except Exception as error:
+            try:
+                pickle.loads(pickle.dumps(error))
+            except Exception:
+                error = RuntimeError(f"{type(error).__name__}: {error}")
+            return Answer(index, None, error)
+
+
+Numbered = tuple[int, int, Any]
+
+
+def mapped(
+    function: Callable[[Any, Any], Any],
+    common: Any,
+    items: Iterable[Any],
+    workers: Any = 1,
+    *,
+    processes: bool = False,
+) -> Iterator[tuple[int, Any]]:
+    """Yield the index of each item and `function(common, item)`, in the order in which they are ready.
+
+    Parameters
+    ----------
+    function : callable
+        Of a module, so that its name is enough to find it.
+    common : object
+        The first argument of all calls: each worker is sent it, and unpacks it once.
+    items : iterable
+    workers : int, object with .map, or callable
+        See the module's docstring.
+    processes : bool
+        True if a number of workers is one of processes, because Python code runs for long; else they are threads.
+
+    Raises
+    ------
+    LostWorkers
+        If workers die again and again.
+    Unpicklable
+        If processes cannot be sent `common`.
+    Exception
+        What `function` raises, at the first item for which it does.
+    """
+    workers = checked_workers(workers)
+    call, left = _Call(function, Parcel(common)), dict(enumerate(items))
+    answers = _rounds(1 if isinstance(workers, int) and len(left) < 2 else workers, call, processes)
+    attempt = idle = 0
+    while left:
+        done = 0
+        try:
+            for answer in answers([(attempt, index, item) for index, item in left.items()]):
+                if answer.error is not None:
+                    raise answer.error
+                del left[answer.index]
+                done += 1
+                yield answer.index, answer.value
+        except _Lost as loss:
+            attempt, idle = attempt + 1, 0 if done else idle + 1
+            if idle >= TRIES:
+                raise LostWorkers(
+                    f"`workers` died {TRIES} times in a row ({loss}) with {len(left)} chunks to do. The system "
+                    "may have ended them for the memory that they took: take a smaller `chunk`, or fewer workers. "
+                    "A script that starts processes needs `if __name__ == '__main__':` around what it runs."
+                ) from loss.__cause__
+            if isinstance(workers, Executor) and not done:  # broken for good
+                n = getattr(workers, "_max_workers", None) or available_cores()
+                warnings.warn(
+                    f"`workers` is an executor of which a process died, so that it takes no more work: the rest is "
+                    f"done in {n} new processes.",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+                workers, answers = n, _rounds(n, call, processes=True)
+
+
+def _rounds(workers: Any, call: _Call, processes: bool) -> Callable[[list[Numbered]], Iterable[Answer]]:
+    """Return the function that gives the answers of numbered items, as they come, by such workers."""
+    if not isinstance(workers, int):
+        if isinstance(workers, ProcessPoolExecutor):
+            call.common.pack()
+        return partial(_by_map, workers, call)
+    if workers == 1:
+        return partial(map, call)
+    if not processes:
+        return partial(_in_pool, partial(ThreadPoolExecutor, workers), call, 2 * workers)
+    call.common.pack()
+    return partial(_in_pool, partial(ProcessPoolExecutor, workers, _context()), call, 2 * workers)
+
+
+class _Lost(Exception):
+    """A worker died, or its result was lost."""
+
+
+def _is_loss(error: BaseException) -> bool:
+    return isinstance(error, BrokenExecutor | CancelledError) or any(c.__name__ in LOST for c in type(error).__mro__)
+
+
+def _context() -> Any:
+    """Return the way to start processes: afresh, for a fork of a program with threads may wait forever."""
+    return multiprocessing.get_context("spawn")
+
+
+def _in_pool(make: Callable[[], Executor], call: _Call, most: int, todo: list[Numbered]) -> Iterator[Answer]:
+    """Answers as they come, from a pool that is closed afterwards; never more than `most` calls are under way."""
+    pool = make()
+    waiting = iter(todo)
+    under_way: set[Future[Answer]] = set()
+    try:
+        while True:
+            for numbered in waiting:
+                under_way.add(pool.submit(call, numbered))
+                if len(under_way) >= most:
+                    break
+            if not under_way:
+                break
+            ready, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+            lost = None
+            for future in ready:
+                try:
+                    answer = future.result()
+                except BrokenExecutor as error:
+                    lost = error
+                    continue
+                yield answer
+            if lost is not None:
+                raise _Lost(str(lost)) from lost
+    except BrokenExecutor as error:
+        raise _Lost(str(error)) from error
+    finally:
+        pool.shutdown(wait=isinstance(pool, ThreadPoolExecutor), cancel_futures=True)
+
+
+def _by_map(workers: Any, call: _Call, todo: list[Numbered]) -> Iterator[Answer]:
+    """Answers by the `.map` of an engine, in the order of the calls; of futures, of all that were not lost."""
+    lost: BaseException | None = None
+    try:
+        for given in _map_of(workers)(call, todo):
+            try:
+                answer = given if isinstance(given, Answer) else given.result()
+            except Exception as error:
+                if not _is_loss(error):
+                    raise
+                lost = error
+                continue
+            yield answer
+    except Exception as error:
+        if not _is_loss(error):
+            raise
+        lost = error
+    if lost is not None:
+        raise _Lost(f"{type(lost).__name__}: {lost}") from lost
+
+
+def _map_of(workers: Any) -> Callable[[_Call, list[Numbered]], Iterable[Any]]:
+    """Return the map of an engine."""
+    joblib = sys.modules.get("joblib")
+    if joblib is not None and isinstance(workers, joblib.Parallel):
+        return lambda call, todo: workers(joblib.delayed(call)(numbered) for numbered in todo)
+    pools = sys.modules.get("multiprocessing.pool")
+    if pools is not None and isinstance(workers, pools.Pool) and not isinstance(workers, pools.ThreadPool):
+        return lambda call, todo: _watched(workers, call, todo)
+    return getattr(workers, "map", workers)
+
+
+def _watched(pool: Any, call: _Call, todo: list[Numbered]) -> Iterator[Answer]:
+    """The map of a pool of `multiprocessing`, which waits forever for a process that died: they are looked at."""
+    size = max(1, len(todo) // 8)
+    for start in range(0, len(todo), size):
+        children = multiprocessing.active_children()
+        answers: list[Any] = []
+        part = todo[start : start + size]
+        thread = threading.Thread(target=lambda a=answers, p=part: a.append(_caught(pool.map, call, p)), daemon=True)
+        thread.start()
+        while thread.is_alive():
+            thread.join(LOOK)
+            dead = [child for child in children if child.exitcode not in (None, 0)]
+            if thread.is_alive() and dead:
+                raise _Lost(f"process {dead[0].pid} ended with exit code {dead[0].exitcode}")
+        if isinstance(answers[0], Exception):
+            raise answers[0]
+        yield from answers[0]
+
+
+def _caught(function: Callable[..., Any], *args: Any) -> Any:
+    try:
+        return list(function(*args))
+    except Exception as error:
+        return error

@@ -1,0 +1,76 @@
+"""Stores of ensembles: what is read is what is returned, runs go on where they ended, nothing is lost."""
+
+import errno
+import os
+
+import numpy as np
+import pytest
+
+import sympflow
+from sympflow.storage import store as storage
+
+SYSTEM = sympflow.systems.henon_heiles()
+STATES = SYSTEM.domain.sample(300, 1)
+STATES[5] = 60.0  # which fails
+TIMES = [0.0, 0.5, 1.0]
+
+
+def run(**how):
+    given = {"dt": 0.1, "t_eval": TIMES, "chunk": 64} | how
+    return sympflow.ensemble(SYSTEM, "verlet", (0, 1), STATES, **given)
+
+
+@pytest.mark.parametrize("reduce", [None, "final"])
+def test_a_store_holds_the_result(tmp_path, reduce):
+    xr = pytest.importorskip("xarray")
+    expected, result = run(reduce=reduce), run(reduce=reduce, store=tmp_path / "a.zarr", workers=2)
+    (name,) = result.fields
+    assert np.array_equal(result.fields[name], expected.fields[name], equal_nan=True)
+    assert np.array_equal(result.status, expected.status)
+    assert result.messages == expected.messages
+    assert result.message == expected.message
+    with xr.open_zarr(tmp_path / "a.zarr") as data:
+        assert data.equals(expected.to_xarray())
+        assert data.q.dims == ("orbit", "dof", "time")[: data.q.ndim]
+        assert np.array_equal(np.concatenate([data.q0, data.p0], axis=1), STATES)
+        assert data.attrs["method"] == "verlet"
+
+
+def test_a_run_goes_on_where_it_ended(tmp_path, monkeypatch):
+    path, written = tmp_path / "a.zarr", storage._replace
+    left = 2
+
+    def full(place, data, durable=True):
+        nonlocal left
+        left -= place.parent.name == "status" and place.name.isdigit()
+        if left < 1:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written(place, data, durable)
+
+    monkeypatch.setattr(storage, "_replace", full)
+    with pytest.raises(OSError, match=r"`store` .* cannot be written \(No space left on device\)"):
+        run(store=path)
+    monkeypatch.setattr(storage, "_replace", written)
+    done = {file.name: file.stat().st_mtime_ns for file in (path / "status").iterdir() if file.name[0] != "."}
+    assert len(done) == 1
+    assert np.array_equal(run(store=path, resume=True, chunk=7).y, run().y, equal_nan=True)
+    assert all((path / "status" / name).stat().st_mtime_ns == when for name, when in done.items())
+    assert len(os.listdir(path / "q")) > len(done)
+
+
+def test_a_store_that_is_there_or_of_another_ensemble(tmp_path):
+    path = tmp_path / "a.zarr"
+    run(store=path)
+    with pytest.raises(ValueError, match=r"`store` .* exists: pass resume=True"):
+        run(store=path)
+    for other, part in ({"dt": 0.2}, "method"), ({"t_eval": [1.0]}, "t_eval"), ({"reduce": "final"}, "reduce"):
+        with pytest.raises(ValueError, match=f"is of another ensemble: its `{part}` is"):
+            run(store=path, resume=True, **other)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="is no store of sympflow"):
+        run(store=tmp_path / "b", resume=True)
+    with pytest.raises(ValueError, match="`resume` goes on with a `store`"):
+        run(resume=True)
+    with pytest.raises(TypeError, match="`store` must be the path of a folder"):
+        run(store=3)

@@ -1,0 +1,158 @@
+"""Batches whose trajectories have parameters of their own: `solve(..., params=...)`."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+import sympflow
+from sympflow import HamiltonianSystem, solve
+
+LAM = np.array([0.3, 0.0, 0.7, 0.3])
+
+
+@pytest.fixture(scope="module")
+def system():
+    H = "(p1**2 + p2**2)/(2*m) + (q1**2 + q2**2)/2 + lam*(q1**2*q2 - q2**3/3) + 2"
+    return HamiltonianSystem.from_sympy(H, params={"lam": 0.9, "m": 1.3}, y0=[0.1, 0.2, 0.3, 0.1], name="hh")
+
+
+@pytest.fixture(scope="module")
+def y0():
+    return 0.2 * np.random.default_rng(0).normal(size=(len(LAM), 4))
+
+
+def own(system, method, y0, i, **options):
+    """The same trajectory on a system that is made with its values, as a batch of one."""
+    return solve(system.with_params(lam=LAM[i]), method, (0, 3), y0[i : i + 1], **options)
+
+
+class TestTrajectories:
+    @pytest.mark.parametrize("method", ["verlet", "chin4c", "gauss_legendre4", "linear_srkn11b", "dop853", "rk4"])
+    def test_each_is_that_of_its_own_system_bit_by_bit(self, system, y0, method):
+        options = {"t_eval": [0, 0.55, 3]} | ({} if method == "dop853" else {"dt": 0.25})
+        sol = solve(system, method, (0, 3), y0, params={"lam": LAM}, **options)
+        assert sol.success
+        assert sol.system is system
+        for i in range(len(LAM)):
+            np.testing.assert_array_equal(sol.y[i], own(system, method, y0, i, **options).y[0])
+
+    def test_arrays_compiled_or_not_agree(self, system, y0):
+        compiled, arrays = (
+            solve(system, "verlet", (0, 3), y0, params={"lam": LAM}, dt=0.25, backend=backend)
+            for backend in ("compiled", "array")
+        )
+        np.testing.assert_allclose(compiled.y, arrays.y, rtol=0, atol=1e-14)
+
+    def test_shapes_broadcast_with_those_of_the_states(self, system, y0):
+        grid = {"lam": LAM[:, None], "m": [1.0, 2.0]}
+        sol = solve(system, "verlet", (0, 1), params=grid, dt=0.25, dense_output=True)
+        assert sol.y.shape == (4, 2, 4, 5)
+        assert sol.params["m"].shape == (4, 2)
+        np.testing.assert_array_equal(sol.sol(1.0), sol.y[..., -1])
+        one = solve(
+            system.with_params(lam=LAM[3], m=2.0), "verlet", (0, 1), system.y0[None], dt=0.25, dense_output=True
+        )
+        np.testing.assert_array_equal(sol.sol([0.1, 0.6])[3, 1], one.sol([0.1, 0.6])[0])
+
+    def test_tensors_keep_their_gradient(self, system, y0):
+        import torch
+
+        start = torch.tensor(y0, requires_grad=True)
+        sol = solve(system, "verlet", (0, 1), start, params={"lam": LAM}, dt=0.25)
+        (gradient,) = torch.autograd.grad(sol.y[3, 0, -1], start)
+        assert gradient[3].abs().min() > 0
+        assert gradient[:3].abs().max() == 0
+        arrays = solve(system, "verlet", (0, 1), y0, params={"lam": LAM}, dt=0.25, backend="array")
+        np.testing.assert_array_equal(sol.y.detach().numpy(), arrays.y)
+
+    def test_numbers_are_another_system(self, system, y0):
+        sol = solve(system, "verlet", (0, 1), params={"lam": 0.5}, dt=0.25, events=lambda t, y: y[0])
+        alone = solve(system.with_params(lam=0.5), "verlet", (0, 1), dt=0.25)
+        np.testing.assert_array_equal(sol.y, alone.y)
+        assert sol.params == {"lam": 0.5, "m": 1.3}
+        assert sol.system.params == sol.params
+
+    def test_a_failure_is_of_its_trajectory_alone(self, system, y0):
+        y0 = y0.copy()
+        y0[2] = 1e3
+        sol = solve(system, "verlet", (0, 3), y0, params={"lam": LAM}, dt=0.25)
+        assert sol.status.tolist() == [0, 0, -1, 0]
+        assert "the first at 2 (lam = 0.7)" in sol.message
+        assert np.isfinite(sol.stats["failed_at"][2])
+        np.testing.assert_array_equal(sol.y[3], own(system, "verlet", y0, 3, dt=0.25).y[0])
+
+    def test_pickles(self, system, y0):
+        sol = solve(system, "verlet", (0, 1), y0, params={"lam": LAM}, dt=0.25)
+        again = pickle.loads(pickle.dumps(sol))
+        np.testing.assert_array_equal(again.energy_error(), sol.energy_error())
+
+
+class TestMetrics:
+    @pytest.mark.parametrize(
+        "metric",
+        [
+            sympflow.energy_error,
+            sympflow.max_energy_error,
+            sympflow.volume_error,
+            sympflow.symplecticity_defect,
+            sympflow.reference_error,
+            sympflow.time_reversal_error,
+        ],
+    )
+    def test_each_trajectory_is_judged_by_its_own_system(self, system, y0, metric):
+        sol = solve(system, "verlet", (0, 1), y0, params={"lam": LAM}, dt=0.25)
+        each = [
+            metric(solve(system.with_params(lam=x), "verlet", (0, 1), y, dt=0.25)) for x, y in zip(LAM, y0, strict=True)
+        ]
+        np.testing.assert_allclose(metric(sol), each, rtol=1e-9, atol=1e-14)
+
+    def test_a_loop_has_one_value(self):
+        oscillator = HamiltonianSystem.from_sympy("p**2/2 + k*q**2/2", params={"k": 1.5})
+        angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+        loop = np.stack([1 + 0.1 * np.cos(angle), 0.1 * np.sin(angle)], -1)
+        sol = solve(oscillator, "verlet", (0, 1), loop, params={"k": [[0.5], [2.0]]}, dt=0.25)
+        assert np.abs(sympflow.loop_area_error(sol)).max() < 1e-13
+        with pytest.raises(ValueError, match="`sol` has other parameters at each point"):
+            sympflow.loop_area_error(solve(oscillator, "verlet", (0, 1), loop, params={"k": angle + 1}, dt=0.25))
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("params", "error", "words"),
+        [
+            ({"x": 1.0}, ValueError, "no parameter of 'hh', which has lam, m"),
+            ({"lam": "a"}, TypeError, "finite real numbers"),
+            ({"lam": [True]}, TypeError, "finite real numbers"),
+            ({"lam": [1.0, np.nan]}, ValueError, r"lam = nan at \(1,\)"),
+            ({"lam": np.ones(3)}, ValueError, r"broadcast with the batch \(4,\)"),
+            ({"lam": []}, ValueError, "no values of lam"),
+            ({}, ValueError, "empty"),
+            (3, TypeError, "a mapping"),
+            ({"m": [1.0, 1.0, 1.0, 0.0]}, ValueError, r"m = 0 \(trajectory 3\)"),
+        ],
+    )
+    def test_bad_values(self, system, y0, params, error, words):
+        with pytest.raises(error, match=f"`params`.*{words}"):
+            solve(system, "verlet", (0, 1), y0, params=params, dt=0.25)
+
+    def test_systems_without_parameters(self, y0):
+        with pytest.raises(ValueError, match="which has none"):
+            solve(sympflow.systems.henon_heiles(), "verlet", params={"lam": 1.0})
+        functions = HamiltonianSystem(lambda q: (q**2).sum(-1), ndof=1, y0=[1.0, 0.0])
+        with pytest.raises(TypeError, match="given by functions"):
+            solve(functions, "verlet", params={"lam": 1.0})
+
+    def test_a_trained_flow_holds_for_its_own_parameters(self):
+        system = sympflow.systems.spring_pendulum()
+        name, value = next(iter(system.params.items()))
+        with pytest.raises(ValueError, match=f"`params` changes {name}, and a trained flow"):
+            solve(system, "sympflow", params={name: [value, 7.0]})
+
+
+def test_a_driven_system_keeps_its_period_with_its_driving():
+    H = "p**2/2 - k*cos(q)*(1 + cos(w*t)/3)"
+    driven = HamiltonianSystem.from_sympy(H, time="t", period=np.pi, params={"w": 2.0, "k": 1.5})
+    assert driven.with_params(w=3.0).period is None
+    still = HamiltonianSystem.from_sympy("p**2/2 - k*cos(q) + q*cos(2*t)", time="t", period=np.pi, params={"k": 1.5})
+    assert still.with_params(k=2.0).period == np.pi
