@@ -25,16 +25,22 @@ LONGEST_COMPARED = 2_000
 """Characters of two formulas that are compared as such, where their texts differ."""
 TOLERANCE = 1e-9
 """Share of the largest difference of energies among the states, and of the largest entry of Γ."""
+LATEST, GOLDEN = 20.0, (5**0.5 - 1) / 2
+"""Times at which a driven H is probed are multiples of the golden ratio, modulo 1, of the first."""
 PROBES = 8
 """Fixed states whose energies begin a fingerprint."""
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
-    """H at 8 fixed states less H at a ninth; the entries of Γ follow, of a system with friction."""
-    with np.errstate(all="ignore"):
-        H = to_numpy(system.hamiltonian(_fixed_states(system.ndof)))
+    """H at 8 fixed states less H at a ninth; the entries of Γ follow, of a system with friction.
+
+    Of a driven system each of the 8 has its own time, at which H at the ninth is taken too.
+    """
+    states = _fixed_states(system.ndof)
+    ninth = np.broadcast_to(states[0], states[1:].shape)
+    H = _energies(system, states[1:]) - _energies(system, ninth)
     friction = () if system.damping is None else system.damping.ravel().tolist()
-    return (*(H[1:] - H[0]).tolist(), *friction)
+    return (*H.tolist(), *friction)
 
 
 def _fixed_states(ndof: int) -> np.ndarray:
@@ -171,7 +177,7 @@ class Identity:
         if len(self.states):
             finite = np.flatnonzero(np.isfinite(self.energies))
             i = int(finite[0]) if finite.size else 0
-            return float(_energies(system, self.states[i : i + 1])[0]), float(self.energies[i])
+            return float(_energies(system, self.states[: i + 1])[i]), float(self.energies[i])
         read, state = _read(self.expression, system.ndof), _fixed_states(system.ndof)[:1]
         assert read is not None
         return float(_energies(system, state)[0]), float(_energies(read, state)[0])
@@ -242,9 +248,18 @@ def _floats(values: Any, ndim: int) -> np.ndarray:
         raise ValueError("its numbers are no array of floats") from None
 
 
+def _probed_times(system: Hamiltonian, n: int) -> np.ndarray:
+    """The times (n,) of states, within the samples of a function of t if there are some."""
+    span = None if system.symbols is None else system.symbols.span
+    low, high = (0.0, LATEST) if span is None else span
+    return low + (high - low) * (np.arange(1, n + 1) * GOLDEN % 1.0)
+
+
 def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
+    """H at the states (n, 2d), of a driven system each at a time that its number gives."""
+    times = None if system.autonomous else _probed_times(system, len(states))
     with np.errstate(all="ignore"):
-        return to_numpy(system.hamiltonian(states)).astype(float)
+        return to_numpy(system.hamiltonian(states, times)).astype(float)
 
 
 @lru_cache(maxsize=16)
@@ -255,9 +270,14 @@ def _read(expression: str | None, ndof: int) -> Hamiltonian | None:
 
     if expression is None:
         return None
-    try:
-        symbols = SymbolicHamiltonian(expression)
-    except (ValueError, TypeError):
+    symbols = None
+    for time in (None, "t"):
+        try:
+            symbols = SymbolicHamiltonian(expression, time=time)
+            break
+        except (ValueError, TypeError):
+            continue
+    if symbols is None:
         return None
     system = Hamiltonian("", symbols, None, False)
     system.symbols = symbols
