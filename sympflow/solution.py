@@ -150,13 +150,14 @@ class Solution:
         return physical_solution(self)
 
     def energy(self) -> Array:
-        """H along the solution: (..., n)."""
+        """H along the solution, of a driven system at the times of its states: (..., n)."""
         with np.errstate(all="ignore"):
-            if self.varied and not is_tensor(self.y):
-                return _energy(self, self.states)
+            if self.varied and not is_tensor(self.y) and self.system.autonomous:
+                return _energy(self, self.states, self.t)
             if self.varied:
                 return gathered(self, lambda part: part.energy())
-            return self.system.hamiltonian(self.states)
+            t = None if self.system.autonomous else np.broadcast_to(self.t, self.states.shape[:-1])
+            return self.system.hamiltonian(self.states, t)
 
     def energy_error(self) -> np.ndarray:
         """Relative energy error over time, (..., n), with its sign; inf where H is beyond floats.
@@ -167,8 +168,10 @@ class Solution:
 
     def energy_scale(self) -> np.ndarray:
         """The scale of the energy errors of each trajectory, (...); see `sympflow.metrics.energy.energy_scale`."""
+        if self.varied and not self.system.autonomous:
+            return gathered(self, lambda part: part.energy_scale())
         declared = self.system.energy_scale
-        H0 = np.abs(_energy(self, self.y0))
+        H0 = np.abs(_energy(self, self.y0, self.t_span[0]))
         if declared is not None:
             return np.full_like(H0, declared)
         return np.where(H0 < SMALLEST_SCALE, np.nan, H0)
@@ -263,9 +266,10 @@ def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> 
         "so its energy is lost and no error",
         "use sympflow.conformal_defect(sol), which is 0 for the exact flow, or sympflow.reference_error(sol)",
     )
+    sol.system.check_autonomous("so its energy is not kept and has no error", "use sympflow.energy_balance_error(sol)")
     with np.errstate(all="ignore"):
-        states = to_numpy(sol.states)
-        error = _energy(sol, states) - _energy(sol, sol.y0)[..., None]
+        states, t0 = to_numpy(sol.states), sol.t_span[0]
+        error = _energy(sol, states, t0) - _energy(sol, sol.y0, t0)[..., None]
         if np.isnan(error).any():
             error = np.where(np.isnan(error) & np.isfinite(states).all(-1), np.inf, error)
         if not relative:
@@ -281,12 +285,17 @@ def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> 
         return np.where(np.isinf(error), error, compared)  # H(y0) may be infinite itself: inf/inf
 
 
-def _energy(sol: Solution, y: Array) -> np.ndarray:
-    """H in float64, whatever the precision of the run, of each trajectory at its states (..., k, 2d) or (..., 2d)."""
+def _energy(sol: Solution, y: Array, t: Any) -> np.ndarray:
+    """H in float64, whatever the precision of the run, of each trajectory at its states (..., k, 2d) or (..., 2d).
+
+    `t` is the time of the states, of a driven system: a number, or (k,).
+    """
+    states = to_numpy(y).astype(float)
     with np.errstate(all="ignore"):
         if sol.rows is not None and not sol.rows.uniform and sol.system.autonomous:
-            return sol.rows.hamiltonian(to_numpy(y).astype(float))
-        return np.asarray(sol.system.hamiltonian(to_numpy(y).astype(float)))
+            return sol.rows.hamiltonian(states)
+        times = None if sol.system.autonomous else np.broadcast_to(t, states.shape[:-1])
+        return np.asarray(sol.system.hamiltonian(states, times))
 
 
 # trajectories with parameters of their own -----------------------------------------------------------------------

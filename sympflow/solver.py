@@ -132,6 +132,7 @@ def solve(
     search = check_events(events, event_step)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span, search is not None and search.may_end_run)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
+    system.check_times(t0, t1)
     rows = None
     if params is not None:
         rows, y_start = check_params(system, params, y_start, integrator)

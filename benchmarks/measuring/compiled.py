@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow import HamiltonianSystem
-from sympflow.kernels.splitting_loops import splitting_loops
-from sympflow.schemes import SCHEMES
+from sympflow import HamiltonianSystem, get
 
 Run = Callable[..., Any]
 
@@ -30,7 +28,7 @@ class Loops:
 
 def scheme_loops(system: HamiltonianSystem, name: str) -> Loops:
     """The loops of a splitting scheme of the package."""
-    kernel = splitting_loops(system).kernel(SCHEMES[name])
+    kernel = get(name)().composed(system).kernel(False)
     return Loops(kernel.run, partial(kernel.run_batch, threads=1))
 
 

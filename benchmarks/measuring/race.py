@@ -162,9 +162,18 @@ class Row:
 
 
 def race(
-    measure: Measure, target: float, flows: Sequence[PrimedFlow | ClockedFlow], taylor: Any, repeats: int, batch: int
+    measure: Measure,
+    target: float,
+    flows: Sequence[PrimedFlow | ClockedFlow],
+    taylor: Any,
+    repeats: int,
+    batch: int,
+    span: float = TIMED_SPAN,
 ) -> Row | None:
-    """All at the error `target`, on one thread: one trajectory, one with 1000 outputs, and a batch."""
+    """All at the error `target`, on one thread: one trajectory, one with 1000 outputs, and a batch.
+
+    One trajectory is timed over `span`: with friction a shorter one, for numbers that come to rest are denormal.
+    """
     system, T = measure.system, measure.t_end
     own = {Runner.of_flow(f, system): f for f in flows}
     steps: dict[Runner, int] = {}
@@ -186,8 +195,8 @@ def race(
     near = [r for side in sides for r in side if work[r] <= NEAR * min(work[s] for s in side)]
     tol = None if taylor is None else tolerance(measure, taylor, target)
     times = {
-        "one": _single(near, steps, measure, taylor, tol, repeats, outputs=False),
-        "outputs": _single(near, steps, measure, taylor, tol, repeats, outputs=True),
+        "one": _single(near, steps, measure, taylor, tol, repeats, span, outputs=False),
+        "outputs": _single(near, steps, measure, taylor, tol, repeats, span, outputs=True),
         "batch": _batch(near, steps, measure, taylor, tol, repeats, batch),
     }
     flow = min((r for r in near if r in own), key=lambda r: times["one"][r.name])
@@ -222,9 +231,9 @@ def tolerance(measure: Measure, taylor: Any, target: float) -> float:
     return low
 
 
-def _single(near, steps, measure, taylor, tol, repeats, outputs):  # type: ignore[no-untyped-def]
+def _single(near, steps, measure, taylor, tol, repeats, span, outputs):  # type: ignore[no-untyped-def]
     T, y0 = measure.t_end, measure.y0[:TIMED]
-    repeat = max(1, round(TIMED_SPAN / T))
+    repeat = max(1, round(span / T))
     times = np.linspace(0.0, repeat * T, repeat * INSTANTS + 1)
     calls: dict[str, Callable[[], Any]] = {}
     for runner in near:

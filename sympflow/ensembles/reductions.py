@@ -95,6 +95,7 @@ class EnergyError(Reduction):
 
     def fields(self, problem: Chunk) -> Fields:
         problem.system.check_conservative("so its energy is lost and no error", "use another `reduce`, such as 'final'")
+        problem.system.check_autonomous("so its energy is not kept", "use another `reduce`, such as 'final'")
         return {"energy_error": ((), np.dtype(float))}
 
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:

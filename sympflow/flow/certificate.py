@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 
@@ -225,7 +224,10 @@ def certify(
     seed: int,
 ) -> Certificate:
     """Find the certificate of a flow on a domain: `FlowMap.certificate`; `weights` is their checksum."""
-    check_for_flows(system)
+    system.check_conservative(
+        "which takes energy away, and a certificate bounds the error of an energy that is kept",
+        "see flow.figures, or sympflow.reference_error of a run",
+    )
     x, unseen = (domain.sample(n, _seed(seed, i)) for i, n in enumerate((states, held_out)))
     energy, relative, left = _energy_errors(flow, system, domain, unseen, t_end)
     return Certificate(

@@ -80,7 +80,8 @@ class FreeTable(nn.Module):
 class Coefficients(FreeTable):
     """c_i(τ) = Σ_k c_ik τ^(e_k), i = 1 … n: a column of a splitting table, and how it enters, as t^m c_i(t/Δt).
 
-    In a palindrome, c_i = c_{n+1−i}. With a `total`, Σ c_i(0) = total for every value of the parameters.
+    In a palindrome, c_i = c_{n+1−i}. With a `total`, Σ c_i(0) = total for every value of the parameters; if that holds
+    `always`, Σ c_i(τ) = total at every τ.
 
     Parameters
     ----------
@@ -93,7 +94,10 @@ class Coefficients(FreeTable):
         m.
     palindromic : bool
     total : float, optional
+    always : bool
     """
+
+    always = False  # of pickles of earlier versions, which did not have it
 
     def __init__(
         self,
@@ -105,9 +109,11 @@ class Coefficients(FreeTable):
         total: float | None = None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
+        always: bool = False,
     ) -> None:
-        super().__init__(n, len(exponents), palindromic, int(total is not None), total, dtype, device)
-        self.exponents, self.dt, self.power = exponents, dt, power
+        bound = len(exponents) if always else int(total is not None)
+        super().__init__(n, len(exponents), palindromic, bound, total, dtype, device)
+        self.exponents, self.dt, self.power, self.always = exponents, dt, power, always
 
     def set_constant(self, c: Sequence[Any]) -> None:
         """Let c_i(τ) be c_i at every τ."""

@@ -107,7 +107,7 @@ class Description:
         if not isinstance(record["version"], str):
             raise Refused("its version is not a string")
         system, fingerprint = record["system"], record["fingerprint"]
-        _check_system(system, fingerprint)
+        _check_system(system, fingerprint, ndof)
         _check_recipe(record["recipe"], ndof)
         if not isinstance(record["figures"], dict):
             raise Refused(f"its figures are not a table: {record['figures']!r}")
@@ -428,7 +428,7 @@ def _intervals(pairs: Any) -> tuple[tuple[float, float], ...]:
     return tuple((float(low), float(high)) for low, high in pairs)
 
 
-def _check_system(name: Any, fingerprint: Any) -> None:
+def _check_system(name: Any, fingerprint: Any, ndof: int) -> None:
     """Refuse all but a fingerprint, or, of a flow that never had a system, None as its system and fingerprint."""
     if not isinstance(name, str | None):
         raise Refused("its system is not a name")
@@ -436,8 +436,9 @@ def _check_system(name: Any, fingerprint: Any) -> None:
         if name is not None:
             raise Refused(f"its fingerprint of the system {name!r} is missing")
         return
-    if not isinstance(fingerprint, list) or len(fingerprint) != FINGERPRINT_LENGTH:
-        raise Refused(f"its fingerprint is not a list of {FINGERPRINT_LENGTH} numbers")
+    friction = 0, 1, ndof, ndof**2
+    if not isinstance(fingerprint, list) or len(fingerprint) - FINGERPRINT_LENGTH not in friction:
+        raise Refused(f"its fingerprint is not a list of {FINGERPRINT_LENGTH} numbers, and those of its friction")
     if not all(v is None or _is_number(v) for v in fingerprint):
         raise Refused("its fingerprint is not a list of numbers")
 

@@ -20,7 +20,7 @@ from sympflow.flow.certificate import Certificate, certify
 from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
-from sympflow.hamiltonian.fingerprint import Identity, check_for_flows, same_system
+from sympflow.hamiltonian.fingerprint import Identity, check_for_flows, same_system, without_friction
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 
@@ -44,13 +44,12 @@ class Origin:
 
 
 def check_system(system: Any) -> None:
-    """Raise TypeError unless `system` is a HamiltonianSystem; ValueError if it has friction, or wrong functions."""
+    """Raise TypeError unless `system` is a HamiltonianSystem; ValueError if its functions are wrong."""
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(
             f"`system` must be a HamiltonianSystem; got {type(system).__name__}: take a scene of sympflow.systems, or "
             "define one with HamiltonianSystem.from_sympy."
         )
-    check_for_flows(system)
     if system.functions_given:
         system.check_functions(torch.empty(0, dtype=torch.float64) if system.takes_tensors else None)
 
@@ -93,7 +92,9 @@ class FlowMap(nn.Module):
     kind: ClassVar[str]
     """The method of `solve` that runs it."""
     symplectic: ClassVar[bool] = False
-    """True if ψ_t is the flow of a Hamiltonian, with an exact inverse."""
+    """True if ψ_t is the flow of a Hamiltonian, with an exact inverse; with friction conformally symplectic."""
+    takes_friction: ClassVar[bool] = False
+    """True if the maps of the family hold the friction of a damped system that they are made for."""
     identity: Identity | None = None  # these two of flows in pickles of earlier versions, which did not have them
     unfitted: tuple[tuple[float, float], ...] = ()
 
@@ -400,8 +401,14 @@ class FlowMap(nn.Module):
         return self._origin[1]
 
     def identify(self, system: HamiltonianSystem, domain: Domain | None = None) -> None:
-        """Make this the flow of a system, which it will know again: by its fingerprint, and by its H over a domain."""
-        check_for_flows(system)
+        """Make this the flow of a system, which it will know again: by its fingerprint, and by its H over a domain.
+
+        Raises
+        ------
+        ValueError
+            If the system has friction, and the family of the flow has not.
+        """
+        check_for_flows(system, self.takes_friction)
         self.fingerprint, self.system_name = system.fingerprint, system.name
         self.identity = Identity.of(system, domain)
 
@@ -417,6 +424,7 @@ class FlowMap(nn.Module):
     def check_system(self, system: HamiltonianSystem) -> None:
         """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
         check_system(system)
+        check_for_flows(system, self.takes_friction)
         if self.fingerprint is not None and self.matches(system):
             return
         origin = self.origin
@@ -426,6 +434,13 @@ class FlowMap(nn.Module):
                 f"{origin.shift:g}) here; solve(system, 'sympflow', flow=flow) runs it in the physical time."
             )
         remedy = "pass the flow of this system, or train one with sympflow.train(system)."
+        if self.is_without_friction_of(system):
+            raise ValueError(
+                f"`system` {system.name!r} has friction, and the flow was trained without: its numbers cancel the "
+                "errors of the conservative field alone, and with friction it would be tens to hundreds of times less "
+                "accurate. Fit one to the damped system by sympflow.train(system), or from these numbers by "
+                "sympflow.train(system, flow=flow.transferred(system))."
+            )
         if system.ndof != self.ndof:
             raise ValueError(
                 f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: {remedy}"
@@ -435,6 +450,10 @@ class FlowMap(nn.Module):
                 f"`system` {system.name!r} is not the one that this flow was trained for ({self.system_name!r}, or its "
                 f"parameters differ): {remedy}"
             )
+
+    def is_without_friction_of(self, system: HamiltonianSystem) -> bool:
+        """Return True if the flow is that of a damped system without its friction."""
+        return self.fingerprint is not None and without_friction(self.fingerprint, self.identity, system)
 
     def bound(self, system: HamiltonianSystem) -> Self:
         """Return this flow, ready to be used on `system`: one that is made of the system's functions takes them."""

@@ -15,7 +15,7 @@ of Δt only K is executed, as the χ between two steps cancel.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
@@ -33,15 +33,16 @@ from sympflow.flow.potentials import Time
 from sympflow.flow.primed_potentials import (
     CURVATURE,
     FORCE_GRADIENT,
-    KINETIC,
     POTENTIAL,
     Binding,
     PolynomialTerm,
+    PrimedDrift,
     PrimedPotential,
     Term,
 )
 from sympflow.flow.sympflow import SympFlow
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
+from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.monomials import MOST_MONOMIALS, Monomials, monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE as CURVATURE_LEVEL
@@ -76,6 +77,8 @@ class PrimedShape:
         True if kicks with force gradients have curvature terms too, for symbolic systems.
     monomials : tuple of tuple of int
         The exponents m of polynomials that stand in place of both, for symbolic systems; none for none.
+    timed : bool
+        True if the drifts of the kernel add up to t at every t, as they must with friction: then its e^{−γt} is exact.
 
     Raises
     ------
@@ -91,6 +94,7 @@ class PrimedShape:
     processor: int = 0
     curvature: bool = False
     monomials: Monomials = ()
+    timed: bool = False
 
     def __post_init__(self) -> None:
         maps, degree, processor = self.maps, self.degree, self.processor
@@ -126,12 +130,12 @@ class PrimedShape:
             return Columns()
         powers, mirrored = range(0, self.degree, 2 if self.palindromic else 1), self.palindromic and total is not None
 
-        def column(kind: Kind, power: int, total: float | None = None) -> Coefficients:
-            return Coefficients(sequence.count(kind), tuple(powers), dt, power, mirrored, total, **like)
+        def column(kind: Kind, power: int, total: float | None = None, always: bool = False) -> Coefficients:
+            return Coefficients(sequence.count(kind), tuple(powers), dt, power, mirrored, total, always=always, **like)
 
         return Columns(
             column("kick", 1, total),
-            column("drift", 1, total),
+            column("drift", 1, total, self.timed and total is not None),
             column("kick", 3) if self.force_gradient else None,
             column("kick", 5) if self.curvature else None,
             nn.ModuleList(column("kick", 3) for _ in self.monomials) if self.monomials else None,
@@ -148,6 +152,7 @@ class PrimedShape:
             "processor": self.processor,
             "curvature": self.curvature,
             **({"monomials": [list(m) for m in self.monomials]} if self.monomials else {}),
+            **({"timed": True} if self.timed else {}),
         }
 
     @classmethod
@@ -161,7 +166,7 @@ class PrimedShape:
         if not isinstance(plan, dict) or plan.get("first") not in ("kick", "drift"):
             raise Refused("its plan of a primed flow is missing")
         flags: dict[str, Any] = {name: plan.get(name) for name in ("palindromic", "force_gradient")}
-        flags["curvature"] = plan.get("curvature", False)
+        flags |= {name: plan.get(name, False) for name in ("curvature", "timed")}
         for name, value in flags.items():
             if not isinstance(value, bool):
                 raise Refused(f"its {name} is neither true nor false")
@@ -406,6 +411,8 @@ class PrimedFlow(SympFlow):
         The maps in the order in which they are executed: χ⁻¹, K, χ.
     """
 
+    takes_friction = True
+
     def __init__(
         self,
         ndof: int,
@@ -457,12 +464,18 @@ class PrimedFlow(SympFlow):
         )
         processor, curvature, polynomial = map(plain, (processor, curvature, polynomial))
         check_system(system)
+        check_for_flows(system, cls.takes_friction)
         check_flag("palindromic", palindromic)
         check_flag("curvature", curvature)
         if force_gradient is not None:
             check_flag("force_gradient", force_gradient)
         if not system.separable:
             raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
+        if system.friction is not None and not system.quadratic_kinetic:
+            raise ValueError(
+                f"`system` {system.name!r} has friction, which drifts hold where the kinetic energy is ½ pᵀM⁻¹p: use a "
+                "Runge–Kutta method such as 'dop853'."
+            )
         exponents = _monomials_of(system, polynomial, force_gradient, curvature)
         force_gradient = _force_gradient_of(system, False if exponents else force_gradient, curvature)
         _check_counts(stages, processor)
@@ -485,6 +498,7 @@ class PrimedFlow(SympFlow):
             processor=processor,
             curvature=curvature,
             monomials=exponents,
+            timed=system.friction is not None,
         )
         flow = cls(system.ndof, shape, dt, system, dtype, device)
         kicks, drifts = ([s for s in substeps if s.kind == kind] for kind in ("kick", "drift"))
@@ -544,7 +558,7 @@ class PrimedFlow(SympFlow):
 
     def _layer(self, substep: Substep) -> Kick | Drift:
         if substep.kind == "drift":
-            return Drift(PrimedPotential(self.ndof, self._binding, [(KINETIC, substep.weight)]))
+            return PrimedDrift(self.ndof, self._binding, substep.weight)
         terms: list[tuple[Term, Entry]] = [(POTENTIAL, substep.weight)]
         if self.monomials:
             return Kick(PrimedPotential(self.ndof, self._binding, terms, PolynomialTerm(self.monomials, substep.more)))
@@ -599,8 +613,17 @@ class PrimedFlow(SympFlow):
             check_compilable(*placement)
         if compensated:
             return PrimedFlowKernel(tables, system, compensated=True)
-        tables.kernel = PrimedFlowKernel(tables, system)
+        tables.kernel = PrimedFlowKernel(tables, system, step=self._step_of_arrays)
         return tables.kernel
+
+    @torch.no_grad()
+    def _step_of_arrays(self, h: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """ψ̄_h of rows y (N, 2d), for h < 0 the inverse of ψ̄_|h|, each with its own h (N,)."""
+        out = np.array(y)
+        for rows, step in ((h > 0, self.psi), (h < 0, self.psi_inverse)):
+            if rows.any():
+                out[rows] = step(torch.from_numpy(np.abs(h[rows])), torch.from_numpy(y[rows])).numpy()
+        return out
 
     # kernel and processor as maps ---------------------------------------------------------------------------
 
@@ -639,6 +662,33 @@ class PrimedFlow(SympFlow):
         self.check_system(system)
         self._binding.bind(system)
         return self
+
+    def transferred(self, system: HamiltonianSystem) -> Self:
+        """Return an untrained flow of another system, with the numbers of this one.
+
+        They are a start for ``train(system, flow=flow.transferred(system))``. As they are they need not be near the
+        exact flow of that system, with friction for instance.
+
+        Raises
+        ------
+        ValueError
+            If the system has not as many degrees of freedom, or no such flow.
+        """
+        check_system(system)
+        check_for_flows(system, self.takes_friction)
+        if system.ndof != self.ndof:
+            raise ValueError(f"`system` has {system.ndof} degrees of freedom, the flow {self.ndof}: give one of those.")
+        if not system.separable or (self.terms and not (system.quadratic_kinetic and system.has_hessian_vector)):
+            raise ValueError(
+                f"`system` {system.name!r} has no kicks and drifts such as the flow's: it must be H = ½ pᵀM⁻¹p + V(q), "
+                "with `hessian_vector` where V is a function."
+            )
+        shape = replace(self.shape, timed=system.friction is not None)
+        other = type(self)(self.ndof, shape, self.dt, system, self.dtype, self.device)
+        mine = dict(self.columns())
+        for name, column in other.columns():
+            column.set(to_numpy(mine[name].table))
+        return other
 
     def bound(self, system: HamiltonianSystem) -> Self:
         return self if self._binding.known else self.bind(system)

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from sympflow.arrays import Array, jvp
+from sympflow.flow.layers import Drift
 from sympflow.flow.potentials import Potential, Time
-from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.hamiltonian import derivative, direction, length_of_change, step
 from sympflow.hamiltonian.monomials import Monomials, gradient, value
 
@@ -43,7 +43,6 @@ class Binding:
         return self._system
 
     def bind(self, system: HamiltonianSystem) -> None:
-        check_for_flows(system)
         self._system = system
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Binding:
@@ -176,6 +175,58 @@ class PolynomialTerm:
     @staticmethod
     def _stacked(values: Sequence[Time], x: Tensor) -> Tensor:
         return torch.stack([torch.as_tensor(v, dtype=x.dtype, device=x.device) for v in values], dim=-1)
+
+
+class PrimedDrift(Drift):
+    """The drift of a system over a time s = t a(t/Δt); with friction the exact flow of q' = M⁻¹p, p' = −Γp.
+
+    Parameters
+    ----------
+    ndof : int
+    binding : Binding
+    time : Factor
+        s.
+    """
+
+    def __init__(self, ndof: int, binding: Binding, time: Factor) -> None:
+        super().__init__(PrimedPotential(ndof, binding, [(KINETIC, time)]))
+        self._binding, self._time = binding, time
+
+    def _decayed(self, s: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        system = self._binding.system
+        assert system.friction is not None
+        mean, end = system.friction.drift(p.T, _each(s))
+        return q + system.velocity(mean).T, end.T
+
+    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        if self._binding.system.friction is None:
+            return super().forward(t, q, p)
+        return self._decayed(self._time.value(t), q, p)
+
+    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        if self._binding.system.friction is None:
+            return super().inverse(t, q, p)
+        return self._decayed(-self._time.value(t), q, p)
+
+    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        system = self._binding.system
+        if system.friction is None:
+            return super().tangent(t, q, p, dq, dp)
+        s, rate = self._time.value(t), self._time.rate(t)
+        q, p = self._decayed(s, q, p)
+        dq, dp = self._decayed(s, dq, dp)  # the drift is linear
+        return q, p, dq + rate * system.velocity(p.T).T, dp + rate * system.friction.force(p.T).T
+
+    def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        self._binding.system.check_conservative(
+            "with which a flow is that of no Hamiltonian", "ask for flow.velocity, or for system.hamiltonian"
+        )
+        return super().pull_back(t, q, p)
+
+
+def _each(s: Time) -> Time:
+    """A time, or one for each state (N,), against momenta (N, d)."""
+    return s[:, None] if isinstance(s, Tensor) and s.ndim else s
 
 
 class PrimedPotential(Potential):

@@ -17,7 +17,7 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sympflow.hamiltonian.fingerprint import Identity, check_for_flows, same_system
+from sympflow.hamiltonian.fingerprint import Identity, same_system, without_friction
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
@@ -112,6 +112,10 @@ class ShippedFlow:
         if not same_system(self.fingerprint, system.fingerprint):
             return False
         return self.identity is None or self.identity.agrees(system)
+
+    def is_without_friction_of(self, system: HamiltonianSystem) -> bool:
+        """Return True for a flow of a damped system without its friction."""
+        return without_friction(self.fingerprint, self.identity, system)
 
     def load(self, system: HamiltonianSystem | None = None) -> Any:
         """The flow itself; see `sympflow.load`."""
@@ -222,9 +226,15 @@ def choose(
         raise ValueError(
             f"`tol` must be a positive number, a relative energy error; got {tol!r}: take 1e-6, for instance."
         )
-    check_for_flows(system)
     own = ShippedFlows([f for f in shipped_flows(system, kind) if transformed or f.shift is None])
     if not own:
+        fits = [f for f in shipped_flows(kind=kind) if f.is_without_friction_of(system)]
+        if fits:
+            raise ValueError(
+                f"`system` {system.name!r} has friction, and no {kind} flow that ships was trained with it; the "
+                f"numbers of {fits[0].name} and others are for the system without. Train one with it by flow = "
+                "sympflow.train(system) and pass flow=flow, or use a splitting method such as 'verlet' or 'kahan_li8'."
+            )
         there = ", ".join(dict.fromkeys(f.system for f in shipped_flows(kind=kind)))
         raise ValueError(
             f"`system` {system.name!r} has no shipped {kind} flow (there are some of: {there or 'none'}): train one by "

@@ -28,6 +28,7 @@ from sympflow.flow.potentials import Time
 from sympflow.flow.sympflow import UNCOMPENSATED, SympFlow
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.expression import Unreadable, read
+from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, map_evaluations
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -268,6 +269,7 @@ class SplitFlow(SympFlow):
         """Return a flow of so many equal Strang steps: see `SympFlow.split`."""
         stages, terms = plain(stages), plain(terms)
         check_system(system)
+        check_for_flows(system)
         check_flag("filters", filters)
         check_flag("linear_outside", linear_outside)
         if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= 1000:

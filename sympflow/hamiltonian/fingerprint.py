@@ -24,15 +24,23 @@ LONGEST_EXPRESSION = 20_000
 LONGEST_COMPARED = 2_000
 """Characters of two formulas that are compared as such, where their texts differ."""
 TOLERANCE = 1e-9
-"""Share of the largest difference of energies among the states."""
+"""Share of the largest difference of energies among the states, and of the largest entry of Γ."""
+LATEST, GOLDEN = 20.0, (5**0.5 - 1) / 2
+"""Times at which a driven H is probed are multiples of the golden ratio, modulo 1, of the first."""
+PROBES = 8
+"""Fixed states whose energies begin a fingerprint."""
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
-    """H at 8 fixed states less H at a ninth; the entries of Γ follow, of a system with friction."""
-    with np.errstate(all="ignore"):
-        H = to_numpy(system.hamiltonian(_fixed_states(system.ndof)))
+    """H at 8 fixed states less H at a ninth; the entries of Γ follow, of a system with friction.
+
+    Of a driven system each of the 8 has its own time, at which H at the ninth is taken too.
+    """
+    states = _fixed_states(system.ndof)
+    ninth = np.broadcast_to(states[0], states[1:].shape)
+    H = _energies(system, states[1:]) - _energies(system, ninth)
     friction = () if system.damping is None else system.damping.ravel().tolist()
-    return (*(H[1:] - H[0]).tolist(), *friction)
+    return (*H.tolist(), *friction)
 
 
 def _fixed_states(ndof: int) -> np.ndarray:
@@ -40,35 +48,51 @@ def _fixed_states(ndof: int) -> np.ndarray:
 
 
 def same_system(a: Sequence[float], b: Sequence[float]) -> bool:
-    """Return True if two fingerprints agree to nine digits of the largest."""
+    """Return True if two fingerprints agree to nine digits of the largest, of the energies and of Γ each."""
     return a == b or _agree(tuple(a), tuple(b))
 
 
 @lru_cache(maxsize=256)
 def _agree(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
     u, v = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    if u.shape != v.shape:
-        return False
+    return u.shape == v.shape and all(_close(u[part], v[part]) for part in (slice(PROBES), slice(PROBES, None)))
+
+
+def _close(u: np.ndarray, v: np.ndarray) -> bool:
     finite = u[np.isfinite(u)]
     return np.allclose(u, v, rtol=0, atol=TOLERANCE * np.abs(finite).max(initial=0.0), equal_nan=True)
 
 
-def check_for_flows(system: Hamiltonian) -> None:
-    """Refuse a system with friction, or a driven one: trained flows, of H(q, p) alone, would leave that out.
+def check_for_flows(system: Hamiltonian, takes_friction: bool = False) -> None:
+    """Refuse a system of which a flow would leave something out: friction, a force that is none of H, or the time.
+
+    Parameters
+    ----------
+    system : Hamiltonian
+    takes_friction : bool
+        True for flows that hold the friction −Γp.
 
     Raises
     ------
     ValueError
         With the reason.
     """
-    system.check_conservative(
-        "which no trained flow has",
-        "train and use flows of the system without `damping`, and solve this one by a splitting method such as "
-        "'verlet' or 'kahan_li8'",
-    )
+    if system.external_force is not None or not takes_friction:
+        system.check_conservative(
+            "which trained flows have only where they are primed, with H = ½ pᵀM⁻¹p + V(q)",
+            "fit such a flow by sympflow.train(system), or use a splitting method such as 'verlet' or 'kahan_li8', or "
+            "a Runge–Kutta method such as 'dop853'",
+        )
     system.check_autonomous(
         "which no trained flow has", "solve it by a splitting method such as 'verlet' or 'kahan_li8'"
     )
+
+
+def without_friction(mine: Sequence[float], identity: Identity | None, system: Hamiltonian) -> bool:
+    """Return True if a fingerprint and an identity are those of a damped system without its friction."""
+    if system.friction is None or not same_system(mine, fingerprint(system)[:PROBES]):
+        return False
+    return identity is None or identity.agrees(system)
 
 
 Known = WeakKeyDictionary["Hamiltonian", bool]
@@ -76,7 +100,9 @@ Known = WeakKeyDictionary["Hamiltonian", bool]
 
 @dataclass(eq=False)
 class Identity:
-    """The H of a conservative system as a flow keeps it, to know it again all over its domain, and along a run.
+    """The H of a system as a flow keeps it, to know it again all over its domain, and along a run.
+
+    It tells nothing of friction, of which the fingerprint has Γ.
 
     A fingerprint probes H near the origin alone, and two systems may agree there and differ where the flow is used.
 
@@ -103,8 +129,7 @@ class Identity:
 
     @classmethod
     def of(cls, system: Hamiltonian, domain: Domain | None, seed: int = 20260103) -> Self:
-        """Return the identity of a system, by seeded states of a domain; of one without friction."""
-        check_for_flows(system)
+        """Return the identity of a system, by seeded states of a domain."""
         states = np.empty((0, 2 * system.ndof)) if domain is None else _spread_states(system, domain, seed)
         energies = _energies(system, states) if len(states) else np.empty(0)
         expression = system.expression
@@ -116,8 +141,6 @@ class Identity:
         """Return True if H of a system has these energies at these states, up to a constant; found out once."""
         if self._last is not None and self._last() is system:  # in nearly all calls
             return True
-        if not system.conservative:
-            return False
         found = self._agreed.get(system)
         if found is None:
             found = self._agreed[system] = self.is_proved(system) or self.first_difference(system) is None
@@ -154,7 +177,7 @@ class Identity:
         if len(self.states):
             finite = np.flatnonzero(np.isfinite(self.energies))
             i = int(finite[0]) if finite.size else 0
-            return float(_energies(system, self.states[i : i + 1])[0]), float(self.energies[i])
+            return float(_energies(system, self.states[: i + 1])[i]), float(self.energies[i])
         read, state = _read(self.expression, system.ndof), _fixed_states(system.ndof)[:1]
         assert read is not None
         return float(_energies(system, state)[0]), float(_energies(read, state)[0])
@@ -163,8 +186,6 @@ class Identity:
         """Return True if the formula of a system is this one, up to a constant; found out once."""
         if self._last is not None and self._last() is system:
             return True
-        if not system.conservative:
-            return False
         found = self._proved.get(system)
         if found is None:
             found = self._proved[system] = self._prove(system)
@@ -227,9 +248,18 @@ def _floats(values: Any, ndim: int) -> np.ndarray:
         raise ValueError("its numbers are no array of floats") from None
 
 
+def _probed_times(system: Hamiltonian, n: int) -> np.ndarray:
+    """The times (n,) of states, within the samples of a function of t if there are some."""
+    span = None if system.symbols is None else system.symbols.span
+    low, high = (0.0, LATEST) if span is None else span
+    return low + (high - low) * (np.arange(1, n + 1) * GOLDEN % 1.0)
+
+
 def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
+    """H at the states (n, 2d), of a driven system each at a time that its number gives."""
+    times = None if system.autonomous else _probed_times(system, len(states))
     with np.errstate(all="ignore"):
-        return to_numpy(system.hamiltonian(states)).astype(float)
+        return to_numpy(system.hamiltonian(states, times)).astype(float)
 
 
 @lru_cache(maxsize=16)
@@ -240,9 +270,14 @@ def _read(expression: str | None, ndof: int) -> Hamiltonian | None:
 
     if expression is None:
         return None
-    try:
-        symbols = SymbolicHamiltonian(expression)
-    except (ValueError, TypeError):
+    symbols = None
+    for time in (None, "t"):
+        try:
+            symbols = SymbolicHamiltonian(expression, time=time)
+            break
+        except (ValueError, TypeError):
+            continue
+    if symbols is None:
         return None
     system = Hamiltonian("", symbols, None, False)
     system.symbols = symbols

@@ -239,6 +239,17 @@ class Hamiltonian:
         if not self.autonomous:
             raise ValueError(f"`system` {self.name!r} is driven, H depends on t, {what}: {remedy}.")
 
+    def check_times(self, t0: float, t1: float) -> None:
+        """Refuse an interval that leaves the times of sampled parameters.
+
+        Raises
+        ------
+        ValueError
+            With the times of the samples.
+        """
+        if self.symbols is not None and self.symbols.samples:
+            self.symbols.check_times(t0, t1)
+
     def _time(self, t: Any, x: Array) -> tuple[Any, ...]:
         """The time that functions of a driven system take after the states x (..., k), checked; () of another."""
         if self.autonomous:
@@ -407,8 +418,8 @@ class Hamiltonian:
 
     @cached_property
     def expression(self) -> str | None:
-        """H as a text, in q1 … qd, p1 … pd, the time and numbers, of a symbolic system; else None."""
-        return None if self.symbols is None else str(self.symbols.H)
+        """H as a text, in q1 … qd, p1 … pd, the time t and numbers, of a symbolic system; else None."""
+        return None if self.symbols is None else self.symbols.text
 
     @property
     def has_hessian_vector(self) -> bool:

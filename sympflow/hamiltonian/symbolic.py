@@ -21,7 +21,16 @@ from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympflow.arguments import plain
 from sympflow.arrays import Array, assemble, concatenate, is_tensor
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.driving import DURATION, Samples, drift, is_spline, sampled, sampled_parameter, with_letters
+from sympflow.hamiltonian.driving import (
+    DURATION,
+    Samples,
+    check_span,
+    drift,
+    is_spline,
+    sampled,
+    sampled_parameter,
+    with_letters,
+)
 from sympflow.hamiltonian.expression import FUNCTIONS, Unreadable, read
 
 LARGEST = sys.float_info.max
@@ -261,6 +270,21 @@ class SymbolicHamiltonian(Definition):
     def drift_jacobian(self, p: Array, t: Array, s: Array) -> Array:
         """The derivatives of `drift` in p: (..., d) to (..., d, d)."""
         return self._function("drift'", lambda: list(sp.Matrix(self.drift).jacobian(self.p)), _square)(p, t, s)
+
+    @property
+    def text(self) -> str:
+        """H, whatever the name of the time in t."""
+        return str(self.H if self.time is None else self.H.xreplace({self.time: sp.Symbol("t", real=True)}))
+
+    @property
+    def span(self) -> tuple[float, float] | None:
+        """The times that all samples cover; None without samples, or where all are periodic."""
+        spans = [samples.span for samples in self.samples.values() if not samples.periodic]
+        return (max(a for a, _ in spans), min(b for _, b in spans)) if spans else None
+
+    def check_times(self, t0: float, t1: float) -> None:
+        """Raise a ValueError where an interval leaves the times of samples."""
+        check_span({name.rpartition("_")[0]: samples for name, samples in self.samples.items()}, t0, t1)
 
     # generation -----------------------------------------------------------------------------------
 

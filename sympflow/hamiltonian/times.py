@@ -13,7 +13,10 @@ from sympflow.arrays import Array, is_tensor, to_numpy
 def stage_time(t: Any, c: float, h: Any) -> Any:
     """t + c·h in double precision, of t and h a number or (...): states may be of less, times never are."""
     if is_tensor(h):
+        import torch
+
         h = h.double()
+        t = torch.as_tensor(t, dtype=torch.float64, device=h.device) if isinstance(t, np.ndarray) else t
     elif isinstance(h, np.ndarray):
         h = h.astype(float, copy=False)
     return t + c * h

@@ -3,7 +3,7 @@
 An integrator is a frozen dataclass whose fields are its options (`dt`, `rtol`, …): the immutable choice of a method.
 Its duties:
 
-1. `step(system, t, y, h)` maps states y (..., 2d) over a step h, negative or not, of shape () or y.shape[:-1].
+1. `step(system, t, y, h)` maps states y (..., 2d) over a step h, negative or not, of shape () or y.shape[:-1]; so is t.
 2. `order` (None if trained), `symplectic`, `trained` and `source` are class attributes that tell the truth.
 3. `check(system)` raises a ValueError with the reason where the method does not apply.
 4. `run(problem)` produces the states that were asked for, and no others, as an `Outcome`.
@@ -254,7 +254,7 @@ class Integrator:
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """The steps of the run, differentiated where they were made: times and lengths (n, ...), Jacobians as above."""
         for times, states, lengths in in_blocks(self.steps(system, t_span, y0)):
-            yield differentiated(lambda t, y, h: self.tangent(system, t, y, h)[1], times, states, lengths)
+            yield differentiated(lambda t, y, h: self.tangent(system, t, y, h)[1], times, states, lengths, system)
 
     def run(self, problem: Problem) -> Outcome:
         """Solve the problem."""
@@ -295,21 +295,24 @@ def forward_tangent(step: Callable[[Any, Any], Any], y: Array, h: Array) -> tupl
 
 
 def differentiated(
-    jacobian: Callable[[float, np.ndarray, np.ndarray], np.ndarray],
+    jacobian: Callable[[Any, np.ndarray, np.ndarray], np.ndarray],
     times: np.ndarray,
     states: Array,
     lengths: np.ndarray,
+    system: HamiltonianSystem | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A chunk of `steps` as times and lengths (n, ...) and Jacobians (n, ..., k, k).
 
-    Each step is differentiated in the precision in which it was executed, so its Jacobian holds the rounding of that
+    `jacobian` is given the times (n, ...) of a driven system, else the first; the states and the lengths. Each step is
+    differentiated in the precision in which it was executed, so its Jacobian holds the rounding of that
     precision; it is returned as float64, in which everything that follows is computed.
     """
     y = to_numpy(states)
     batch = y.shape[:-1]
     t, h = (np.broadcast_to(x.reshape(*x.shape, *[1] * (len(batch) - x.ndim)), batch) for x in (times, lengths))
+    start = float(t.flat[0]) if system is None or system.autonomous else t
     with np.errstate(all="ignore"):
-        return t, h, jacobian(float(t.flat[0]), y, h.astype(y.dtype)).astype(float)
+        return t, h, jacobian(start, y, h.astype(y.dtype)).astype(float)
 
 
 @cache

@@ -29,12 +29,12 @@ def note_singularities(outcome: Outcome, integrator: Integrator, problem: Proble
     order 8 that are adapted to a tolerance, from y0; where the end is not reached in `MOST_TRIED` of them, from a state
     some hundred steps before it, if that still has the energy of y0. The solution is singular where the steps become
     too short to move t while the state grows without bound. Nothing is said where that is not settled, or the functions
-    of the system do not take NumPy arrays, or it has friction, with which energy tells nothing.
+    of the system do not take NumPy arrays, or it has friction or is driven, with which energy tells nothing.
 
     `blow_up_time` is an estimate. In a batch it is an array, NaN for
     the trajectories that have none; without any it is left out.
     """
-    if not problem.system.conservative:  # a state of the solution is told by its energy
+    if not (problem.system.conservative and problem.system.autonomous):  # a state of the solution is told by its energy
         return
     y0 = to_numpy(problem.y0)
     failed = (np.atleast_1d(np.asarray(outcome.status)) < 0).reshape(-1)

@@ -289,6 +289,11 @@ class SympFlowIntegrator(FlowIntegrator):
                 raise ValueError(f"`tol` chooses the flow and its Δt, but `{name}` is given: leave out one of them.")
 
     @property
+    def takes_friction(self) -> bool:
+        """True: a flow holds the friction of the system that it was made for, and refuses every other."""
+        return True
+
+    @property
     def tolerance(self) -> float | None:
         return self.tol
 

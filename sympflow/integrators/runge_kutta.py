@@ -11,6 +11,7 @@ import numpy as np
 from sympflow.arguments import as_float
 from sympflow.arrays import Array, per_state, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.contract import Integrator
 from sympflow.integrators.grid import no_event
 
@@ -30,28 +31,39 @@ class ExplicitStep(Integrator):
     def takes_forces(self) -> bool:
         return True
 
-    def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
+    @property
+    def takes_driving(self) -> bool:
+        return True
+
+    def step(self, system: HamiltonianSystem, t: Any, y: Array, h: float | Array) -> Array:
         """One step without error control."""
-        h = per_state(h, y)
+        times, h = self._stage_times(system, t, h), per_state(h, y)
         K: list[Array] = []
-        for row in self.A[: len(self.B)]:
-            K.append(system.vector_field(y + h * weighted(row, K) if K else y))
+        for row, at in zip(self.A, times, strict=False):
+            K.append(system.vector_field(y + h * weighted(row, K) if K else y, at))
         return y + h * weighted(self.B, K)
 
-    def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
+    def _stage_times(self, system: HamiltonianSystem, t: Any, h: Any) -> list[Any]:
+        """The times t + c_i h of the stages, of a driven system; None for each of another."""
+        rows = self.A[: len(self.B)]
+        if system.autonomous:
+            return [None] * len(rows)
+        return [stage_time(t, math.fsum(map(float, row)), h) for row in rows]
+
+    def tangent(self, system: HamiltonianSystem, t: Any, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         """The step and its Jacobian, the step length held fixed: each stage differentiated as it is executed."""
         y = to_numpy(y)
-        h = np.asarray(h, dtype=y.dtype)[..., None]
+        times, h = self._stage_times(system, t, np.asarray(h)), np.asarray(h, dtype=y.dtype)[..., None]
         if not system.has_hessian_vector:
-            system.hessian(y)  # which says so, before anything large is made
+            system.hessian(y, times[0])  # which says so, before anything large is made
         identity = np.eye(y.shape[-1], dtype=y.dtype)
         K: list[np.ndarray] = []
         dK: list[np.ndarray] = []
-        for row in self.A[: len(self.B)]:
+        for row, at in zip(self.A, times, strict=False):
             Y = y + h * weighted(row, K) if K else y
             dY = identity + h[..., None] * weighted(row, dK) if K else identity
-            K.append(system.vector_field(Y))
-            dK.append(system.field_jacobian(Y) @ dY)
+            K.append(system.vector_field(Y, at))
+            dK.append(system.field_jacobian(Y, at) @ dY)
         return y + h * weighted(self.B, K), identity + h[..., None] * weighted(self.B, dK)
 
 

@@ -87,7 +87,7 @@ class _Scipy(RungeKutta):
     def _no_start(self, system: HamiltonianSystem, t0: float, y0: np.ndarray) -> str:
         """The message of a trajectory that has no first step."""
         with np.errstate(all="ignore"):
-            finite = bool(np.isfinite(system.vector_field(y0.astype(float))).all())
+            finite = bool(np.isfinite(system.vector_field(y0.astype(float), t0)).all())
         if finite and self.atol == 0 and (y0 == 0).any():
             return (
                 f"There is no first step from t = {t0:.17g}: `atol` is 0, and `y0` has components that are 0, of which "

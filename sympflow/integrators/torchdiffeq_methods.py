@@ -60,9 +60,13 @@ class Trace:
 
     def __call__(self, s: Any, y: Any) -> Any:
         self.evaluations += 1
-        f = self.system.vector_field(y)
+        f = self.system.vector_field(y, None if self.system.autonomous else self.time(s))
         self.evaluated(y, f)
         return f if self.direction > 0 else -f
+
+    def time(self, s: Any) -> Any:
+        """The time at which a time has elapsed."""
+        return self.t_span[0] + self.direction * s.double()
 
     def evaluated(self, y: Any, f: Any) -> None:
         """Called with the slope f at each state y where torchdiffeq asks for it."""
@@ -99,6 +103,10 @@ class Watched(Integrator):
 
     @property
     def takes_forces(self) -> bool:
+        return True
+
+    @property
+    def takes_driving(self) -> bool:
         return True
 
     def outputs(self, problem: Problem) -> tuple[np.ndarray, dict[str, Any]]:
@@ -277,7 +285,7 @@ def _divided(problem: Problem, part: np.ndarray, trace: Trace) -> list[np.ndarra
     rates = np.zeros(len(part))
     if y is not None:
         with np.errstate(all="ignore"):
-            f = to_numpy(problem.system.vector_field(y)).reshape(len(part), -1)
+            f = to_numpy(problem.system.vector_field(y, trace.reached)).reshape(len(part), -1)
             rates = np.nan_to_num(np.abs(f).max(-1) / np.abs(to_numpy(y)).reshape(f.shape).max(-1), nan=np.inf)
     order = np.argsort(rates, kind="stable")
     with np.errstate(all="ignore"):
@@ -485,7 +493,7 @@ class Adams(Watched):
             else:
                 warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
         trace.callback_step(None, None, None)
-        trace(None, states[-1])
+        trace(nodes[-1], states[-1])
 
 
 class _Nodes(Trace):
@@ -582,7 +590,8 @@ class FixedGrid(ExplicitStep, FixedStep):
         finite = np.full(y.shape[:-1], n_steps)
 
         def scaled(s: Any, y: Any) -> Any:
-            return h * problem.system.vector_field(y)
+            time = None if problem.system.autonomous else problem.t0 + (k + s.double()) * h
+            return h * problem.system.vector_field(y, time)
 
         with torch.set_grad_enabled(tensor and torch.is_grad_enabled()):
             while k < last:

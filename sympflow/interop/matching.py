@@ -217,12 +217,13 @@ class Comparison:
             return
         self.states_compared += len(states)
         with np.errstate(all="ignore"):
-            velocity = self.system.vector_field(states.astype(float))
+            velocity = self.system.vector_field(states.astype(float), times[: len(states)].astype(float))
         agree = _agree(slope, velocity)
         if agree.all():
             return
         i = int(np.argmin(agree))
-        before = _quietly(fun, t0, y) if t0 is not None and t0 != times[i] else None
+        looked = t0 is not None and t0 != times[i] and self.system.autonomous
+        before = _quietly(fun, t0, y) if looked and t0 is not None else None
         if before is not None:
             before = before.reshape(-1, width)[:MOST_ROWS]
             if _agree(before, velocity)[i]:

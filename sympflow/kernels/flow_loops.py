@@ -28,6 +28,9 @@ __all__ = [
 ]
 
 
+ArrayStep = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
 class TableSource(Protocol):
     """The numbers of a primed flow ψ̄ = χ ∘ K ∘ χ⁻¹, which do not change.
 
@@ -79,11 +82,20 @@ class PrimedFlowKernel(Kernel):
         The flow's, one that can be compiled.
     compensated : bool
         Sum with Kahan's compensation in runs.
+    step : callable, optional
+        ψ̄_h of rows y (N, 2d) by array operations, ``step(h, y)`` with h (N,): of a system with friction, where the
+        numbers of a step are no polynomials in h.
     """
 
     saves_finite = True
 
-    def __init__(self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False) -> None:
+    def __init__(
+        self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False, step: ArrayStep | None = None
+    ) -> None:
+        if system.friction is not None and compensated:
+            raise ValueError(
+                "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
+            )
         if tables.level >= CURVATURE and system.symbols is None:
             raise ValueError(
                 f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled: "
@@ -91,6 +103,7 @@ class PrimedFlowKernel(Kernel):
             )
         self.system = system
         self._tables, self._splitting, self._compensated = tables, splitting_loops(system), compensated
+        self._step = None if system.friction is None else step
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         """Count those of the numbers that the kernel has: see `Kernel`."""
@@ -143,6 +156,8 @@ class PrimedFlowKernel(Kernel):
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,); its numbers are polynomials in h."""
         h = np.asarray(h, dtype=np.float64)
         h = h.repeat(len(y)) if h.ndim == 0 else h
+        if self._step is not None:
+            return Steps(self._step(h, np.ascontiguousarray(y, dtype=np.float64)))
         if len(h) == 1 and h[0] != 0:
             back = bool(h[0] < 0)
             return Steps(self._stepped(-h if back else h, y, back))
@@ -163,7 +178,10 @@ class PrimedFlowKernel(Kernel):
 
     def _kernel(self, h: float) -> SplittingKernel:
         """K_h, or for h < 0 its inverse."""
-        return self._splitting.kernel(self._tables.scheme("primed kernel", abs(h), back=h < 0), self._compensated)
+        scheme = self._tables.scheme("primed kernel", abs(h), back=h < 0)
+        if (step := self._step) is not None:
+            return self._splitting.damped_kernel(scheme, lambda y, h: step(h, y))
+        return self._splitting.kernel(scheme, self._compensated)
 
     def _functions(self) -> LoopFunctions:
         """The compiled functions for the kicks of the flow."""

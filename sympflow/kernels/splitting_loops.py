@@ -142,7 +142,12 @@ class SplittingLoops:
         return self._variants[variant]
 
     def rows(self, table: StageTable) -> np.ndarray:
-        """What the loops read of a table; where they take the values of the system's parameters, with these."""
+        """What the loops read of a table; where they take the values of the system's parameters, with these.
+
+        With friction the maps of the drifts follow, of numbers for one h.
+        """
+        if self.friction is not None:
+            return _with_friction(table, self.friction)
         return table.rows(self.values if _takes_values(table.level) else ())
 
     def step_rows(
@@ -296,8 +301,11 @@ class DampedKernel(SplittingKernel):
 
 @lru_cache(maxsize=256)
 def _damped_table(scheme: Scheme, h: float, friction: Friction) -> np.ndarray:
-    """`run_table` with the rows of `DampedDrift`."""
-    table = run_table(scheme, h)
+    return _with_friction(run_table(scheme, h), friction)
+
+
+def _with_friction(table: StageTable, friction: Friction) -> np.ndarray:
+    """The rows of a table, then those of `DampedDrift`."""
     mean, decay = friction.factors(table.drifts)
     return np.ascontiguousarray(np.concatenate([table.packed, mean.T, decay.T]))
 

@@ -72,7 +72,7 @@ def check_problem(reference: object, system: HamiltonianSystem, t0: float, y0: n
             raise ValueError("`reference` is a solution from another `y0`: solve from the one that is compared.")
         return
     states = states_of(reference.y if isinstance(reference, Reference) else reference)
-    if states.shape[:-1] != y0.shape or not system.conservative:
+    if states.shape[:-1] != y0.shape or not (system.conservative and system.autonomous):
         return  # the shape is refused where it is needed
     with np.errstate(all="ignore"):
         H0 = to_numpy(system.hamiltonian(y0))
@@ -89,9 +89,11 @@ def _same_field(sol: Solution, system: HamiltonianSystem) -> bool:
         return False
     y = to_numpy(sol.y).astype(float)
     states = np.moveaxis(y, -2, -1).reshape(-1, y.shape[-2])
-    states = states[:: max(1, len(states) // SAMPLED)]
+    every = max(1, len(states) // SAMPLED)
+    t = np.broadcast_to(sol.t, (*y.shape[:-2], len(sol.t))).reshape(-1)[::every]
+    states = states[::every]
     with np.errstate(all="ignore"):
-        mine, other = (to_numpy(s.vector_field(states)) for s in (system, sol.system))
+        mine, other = (to_numpy(s.vector_field(states, t)) for s in (system, sol.system))
     size = np.abs(other[np.isfinite(other)]).max(initial=0.0)
     return np.allclose(mine, other, rtol=0, atol=1e-9 * size, equal_nan=True)
 

@@ -52,7 +52,7 @@ def reference(
 
     A quadratic H is solved exactly. A separable one by Kahan–Li 8 with a step that is halved until the last two runs
     agree to `target`, or to rounding, or no better than the two before; their difference is the accuracy. Any other by
-    DOP853 at rtol 1e-13, whose accuracy is the difference from a run at 1e-12; so is one with friction.
+    DOP853 at rtol 1e-13, whose accuracy is the difference from a run at 1e-12; so is one with friction, or driven.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def reference(
         Accuracy that is enough.
     """
     y0 = to_numpy(y0).astype(float)
-    if not system.conservative:
+    if not (system.conservative and system.autonomous):
         return _dop853(system, t_span, y0, t, target)
     exact = _linear_flow(system, t - t_span[0], y0)
     if exact is not None:

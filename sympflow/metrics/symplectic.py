@@ -217,12 +217,12 @@ def natural_scale(system: HamiltonianSystem) -> np.ndarray:
     """Factors s (d,) such that (s q, p/s) are balanced near q = p = 0: s_i⁴ = ∂²H/∂q_i² / ∂²H/∂p_i², or 1.
 
     For an oscillator of frequency ω and unit mass s = √ω. Where the two second derivatives at the origin are not both
-    positive and finite, there is no natural scale and s_i = 1.
+    positive and finite, there is no natural scale and s_i = 1. Of a driven system they are those at `t_span[0]`.
     """
     d = system.ndof
     try:
         with np.errstate(all="ignore"):
-            diagonal = np.diagonal(np.asarray(system.hessian(np.zeros(2 * d))))
+            diagonal = np.diagonal(np.asarray(system.hessian(np.zeros(2 * d), system.t_span[0])))
             s = (diagonal[:d] / diagonal[d:]) ** 0.25
     except (ZeroDivisionError, OverflowError):  # a Hamiltonian that is singular at the origin
         return np.ones(d)

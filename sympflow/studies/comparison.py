@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_counts, check_t_span
-from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.system import HamiltonianSystem, parameters_text
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.accuracy import check_problem, states_of
 from sympflow.metrics.energy import max_energy_error
@@ -120,6 +120,10 @@ def compare(
     if unkept or match == "energy_error":
         what = f"which `metrics` {', '.join(map(repr, unkept))}" if unkept else "which `match` 'energy_error'"
         system.check_conservative(f"{what} presume is not there", "pass metrics=['error'], and match by 'time'")
+        if match == "energy_error" or not {"energy", "drift"}.isdisjoint(unkept):
+            system.check_autonomous(
+                "so that its energy is not kept", "pass metrics=['error'], match by 'time', or use energy_balance_error"
+            )
     if match is not None and match not in MATCHES:
         raise ValueError(f"`match` must be one of {', '.join(map(repr, MATCHES))}, or None; got {match!r}.")
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
@@ -159,7 +163,7 @@ def compare(
 
 
 def _identify(system: HamiltonianSystem) -> str:
-    params = ", ".join(f"{k}={v:g}" for k, v in system.params.items())
+    params = parameters_text(system.params)
     return f"{system.name}({params})" if params else system.name
 
 

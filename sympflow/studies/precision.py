@@ -97,6 +97,9 @@ def work_precision(
     system.check_conservative(
         "so there is no energy error to draw", "use sympflow.compare(system, methods, metrics=['error'])"
     )
+    system.check_autonomous(
+        "so there is no energy error to draw", "use sympflow.compare(system, methods, metrics=['error'])"
+    )
     tolerances = positive_numbers("tolerances", tolerances)
     if steps is not None:
         steps = positive_numbers("steps", steps)

@@ -21,7 +21,7 @@ from sympflow.arguments import naming_path, writable
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from sympflow.hamiltonian.system import HamiltonianSystem
+    from sympflow.hamiltonian.system import HamiltonianSystem, parameters_text
 
 _GREEK = {"omega": "ω", "mu": "μ", "epsilon": "ε", "alpha": "α", "beta": "β"}
 _NAMES = {"henon_heiles": "Hénon–Heiles"}
@@ -66,13 +66,16 @@ class Report(ABC):
 
 def title(system: HamiltonianSystem) -> str:
     """The name and parameters of a system, as they are printed."""
-    params = ", ".join(f"{_GREEK.get(k, k)} = {v:g}" for k, v in system.params.items())
+    params = parameters_text(system.params, _GREEK, " = ")
     return _NAMES.get(system.name, system.name.replace("_", " ")) + (f", {params}" if params else "")
 
 
 def described(system: HamiltonianSystem) -> dict[str, Any]:
     """A system in the settings of a report."""
-    return {"name": system.name, "params": system.params}
+    return {
+        "name": system.name,
+        "params": {k: v if isinstance(v, int | float) else str(v) for k, v in system.params.items()},
+    }
 
 
 # text -------------------------------------------------------------------------------------------------------------

@@ -128,6 +128,7 @@ def stability(
             "so its energy error says nothing of stability",
             "study the system without `damping`, or use sympflow.compare",
         )
+        one.check_autonomous("so its energy error says nothing of stability", "use sympflow.compare(metrics=['error'])")
     unknown = [m for m in metrics if m not in METRICS]
     if isinstance(metrics, str) or unknown:
         raise ValueError(f"`metrics` must be a list of names from {', '.join(METRICS)}; got {metrics!r}.")

@@ -110,6 +110,9 @@ def check_integrator(factory: Factory, system: HamiltonianSystem | None = None) 
         system.check_conservative(
             "and most laws are those of conservative ones", "leave `system` out: one check has friction of its own"
         )
+        system.check_autonomous(
+            "and most laws are those of autonomous ones", "leave `system` out: one check has a drive of its own"
+        )
     integrator.check(default_system() if system is None else system)
     passed, skipped = [], {}
     for check in CHECKS:

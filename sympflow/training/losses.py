@@ -44,6 +44,13 @@ class Loss:
     matching_weight: float = 1.0
     label_weight: float = 0.0
 
+    def __post_init__(self) -> None:
+        if self.matching_weight:
+            self.system.check_conservative(
+                "with which a flow is that of no Hamiltonian, so there is none to match",
+                "pass matching_weight=0, or fit by the labels",
+            )
+
     def residual(self, flow: FlowMap, t: Tensor, x: Tensor) -> Tensor:
         """(d/dt ψ̄_t(x) − J∇H(ψ̄_t(x))) Δt/s: (..., 2d)."""
         y, velocity = flow.psi_and_velocity(t, x)

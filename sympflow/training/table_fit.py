@@ -261,7 +261,7 @@ class TableRun(SearchRun):
 
     def _continued(self, minimum: Minimum) -> np.ndarray:
         """The parameters that a minimum of the search gives."""
-        return minimum.x if self.frozen is None else self.table.continued(self.frozen.design[0] @ minimum.x)
+        return minimum.x if self.frozen is None else self.table.continued(self.frozen.coefficients(minimum.x)[:, 0])
 
     def differences(self) -> np.ndarray:
         """The differences from the exact flow, at the held-out states and times."""
@@ -478,7 +478,7 @@ class Table:
         return self._assembled(self.columns, t)
 
     def frozen(self, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """The same for a table at one time that is bound by nothing but the palindrome."""
+        """The same for a table at one time that is bound by nothing but the palindrome, and friction's total time."""
         return self._assembled(self._unbound(), np.array([t]))
 
     def frozen_parameters(self, coefficients: np.ndarray) -> np.ndarray:
@@ -489,7 +489,9 @@ class Table:
         return np.concatenate(
             [
                 np.linalg.lstsq(
-                    _array(c.basis)[:, 0], self._column(coefficients, place) / self.dt**c.power, rcond=None
+                    _array(c.basis)[:, 0],
+                    self._column(coefficients, place) / self.dt**c.power - _array(c.offset)[:, 0],
+                    rcond=None,
                 )[0]
                 for c, place in zip(self._unbound(), self._places, strict=True)
             ]
@@ -498,7 +500,15 @@ class Table:
     def _unbound(self) -> list[Coefficients]:
         """The columns of `frozen`."""
         return [
-            Coefficients(c.offset.shape[0], (0,), self.dt, c.power, self.flow.palindromic and j < self._kernel)
+            Coefficients(
+                c.offset.shape[0],
+                (0,),
+                self.dt,
+                c.power,
+                self.flow.palindromic and j < self._kernel,
+                1.0 if c.always else None,
+                always=c.always,
+            )
             for j, c in enumerate(self.columns)
         ]
 

@@ -53,7 +53,7 @@ class TableStep:
             )
         self.ndof, self.sequence = system.ndof, tuple(sequence)
         self._inverse_mass = system.kinetic_hessian(np.zeros(system.ndof))
-        self._times_inverse_mass = system.velocity
+        self._times_inverse_mass, self._friction = system.velocity, system.friction
         self._forces = forces_of(system, level, monomials)
         n, terms = len(sequence), len(monomials) or level
         kicks = [i for i in range(n) if sequence[i] == "kick"]
@@ -71,12 +71,24 @@ class TableStep:
         q, p = y[: self.ndof], y[self.ndof :]
         for i, kind in enumerate(self.sequence):
             if kind == "drift":
-                q = q + c[i] * (self._inverse_mass @ p)
+                change, p = self._drifted(p, c[i], self._inverse_mass.__matmul__)
+                q = q + change
             else:
                 check()
                 for place, F in zip(self._places[i], self._forces.values(q), strict=True):
                     p = p + c[place] * F
         return np.concatenate([q, p])
+
+    def _drifted(self, p: np.ndarray, s: np.ndarray, velocity: Callable[[np.ndarray], np.ndarray]) -> Any:
+        """The change of q and the p after drifts of times s (P,) or (1,), of momenta (..., d, P)."""
+        if self._friction is None:
+            return s * velocity(p), p
+        mean, end = self._friction.drift(p.swapaxes(-1, -2), s[:, None])
+        return velocity(mean.swapaxes(-1, -2)), end.swapaxes(-1, -2)
+
+    def _slowing(self, p: np.ndarray) -> np.ndarray:
+        """−Γp of momenta (d, P), their rate in a drift."""
+        return np.zeros_like(p) if self._friction is None else self._friction.force(p.T).T
 
     def with_jacobian(self, c: np.ndarray, y: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
         """The step, and its derivatives by each coefficient: (n, 2d, P); `check` as in the step."""
@@ -92,10 +104,12 @@ class TableStep:
         for i, kind in enumerate(self.sequence):
             check()
             if kind == "drift":
-                by_q[moved] += c[i] * self._velocity(by_p[moved])
-                velocity = self._velocity(p)
-                by_q[i] += velocity
-                q = q + c[i] * velocity
+                change, by_p[moved] = self._drifted(by_p[moved], c[i], self._velocity)
+                by_q[moved] += change
+                change, p = self._drifted(p, c[i], self._velocity)
+                q = q + change
+                by_q[i] += self._velocity(p)
+                by_p[i] += self._slowing(p)
                 moved.append(i)
             else:
                 forces, changes = self._forces.along(q, by_q[moved])
@@ -120,9 +134,9 @@ class TableStep:
         passed: list[tuple[np.ndarray, ...]] = []
         for i, kind in enumerate(self.sequence):
             if kind == "drift":
-                velocity = self._inverse_mass @ p
-                passed.append((velocity,))
-                q = q + c[i] * velocity
+                change, p = self._drifted(p, c[i], self._inverse_mass.__matmul__)
+                q = q + change
+                passed.append((self._inverse_mass @ p, self._slowing(p)))
             else:
                 check()
                 forces, jacobians = self._forces.all(q)
@@ -135,9 +149,15 @@ class TableStep:
         after_p[np.arange(d, 2 * d), np.arange(d)] = 1.0
         for i in reversed(range(len(self.sequence))):
             if self.sequence[i] == "drift":
-                (velocity,) = passed[i]
+                velocity, slowing = passed[i]
                 J[i] = _apply(after_q, velocity)
-                after_p += c[i] * np.einsum("rkP,kj->rjP", after_q, self._inverse_mass)
+                by_velocity = np.einsum("rkP,kj->rjP", after_q, self._inverse_mass)
+                if self._friction is None:
+                    after_p += c[i] * by_velocity
+                    continue
+                J[i] += _apply(after_p, slowing)
+                # the maps of a drift are symmetric, as Γ is
+                after_p = self._drifted(after_p, c[i], _same)[1] + self._drifted(by_velocity, c[i], _same)[0]
             else:
                 slope, *forces = passed[i]
                 for place, F in zip(self._places[i], forces, strict=True):
@@ -145,6 +165,10 @@ class TableStep:
                 for k in range(d):
                     after_q += after_p[:, k, None] * slope[k]
         return np.concatenate([q, p]), J
+
+
+def _same(v: np.ndarray) -> np.ndarray:
+    return v
 
 
 def _apply(A: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
+from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
@@ -234,6 +235,7 @@ def fit_flow(
     domain = _domain_for(system, domain)
     untold = flow is None and asked.restarts is None and asked.steps is None
     kind = _kind_of(system, flow, new, asked)
+    check_for_flows(system, takes_friction=kind == "primed")
     hurried = untold and session.time_budget is None and session.resume is None and kind == "primed" and asked.searches
     if hurried:
         session.time_budget = BUDGET

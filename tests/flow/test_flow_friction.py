@@ -1,0 +1,136 @@
+"""Primed flows of damped systems: fitted with their friction, conformally symplectic, refused for any other."""
+
+import numpy as np
+import pytest
+import torch
+
+import sympflow
+from sympflow import HamiltonianSystem, SympFlow, solve
+from sympflow.systems import damped_pendulum, henon_heiles, pendulum
+from sympflow.training.table_step import TableStep
+
+DT = 0.8
+MATRIX = [[0.3, 0.1], [0.1, 0.2]]
+
+
+@pytest.fixture(scope="module")
+def system():
+    return damped_pendulum(0.3)
+
+
+@pytest.fixture(scope="module")
+def conservative():
+    """The flow that ships for the system without friction, with this Δt."""
+    return next(f for f in sympflow.shipped_flows(pendulum()) if f.name == "pendulum-primed-3-0.8").load(pendulum())
+
+
+@pytest.fixture(scope="module")
+def flow(system):
+    start = SympFlow.primed(system, 2, processor=3, dt=DT)
+    return sympflow.train(
+        system, flow=start, restarts=3, steps=40, points=60, label_times=3, reference_states=20, progress=False
+    )
+
+
+def end(system, method, x, **options):
+    return solve(system, method, (0, 8.0), x, t_eval=[8.0], **options).y[..., -1]
+
+
+def test_a_flow_is_fitted_to_the_damped_system(system, flow, conservative):
+    x = system.domain.sample(10, seed=1)
+    truth = end(system, "dop853", x, rtol=1e-12, atol=1e-12)
+    error, start, taken = (
+        np.abs(end(system, each, x) - truth).max()
+        for each in (flow, SympFlow.primed(system, 2, dt=DT), conservative.transferred(system))
+    )
+    assert error < start / 30
+    assert taken > 20 * np.abs(end(pendulum(), conservative, x) - end(pendulum(), "kahan_li8", x, dt=0.1)).max()
+
+
+def test_its_steps_shrink_the_form_and_go_back(system, flow):
+    sol = solve(system, flow, (0, 8.0))
+    assert sol.stats["backend"] == "compiled"
+    assert sympflow.conformal_defect(sol) < 1e-14
+    assert sympflow.conformal_defect(solve(system, flow, (0, 3 * 0.7), dt=0.7)) < 1e-14  # e^{−γt} at every t
+    back = solve(system, flow, (8.0, 0.0), sol.y[:, -1])
+    np.testing.assert_allclose(back.y[:, -1], system.y0, atol=1e-13)
+
+
+@pytest.mark.parametrize("damping", [None, [0.3, 0.1], MATRIX], ids=["trained", "diagonal", "matrix"])
+def test_loops_arrays_and_outputs_between_steps_agree(system, flow, damping):
+    if damping is not None:
+        plain = henon_heiles()
+        system = HamiltonianSystem.from_sympy(plain.symbols.H, damping=damping, y0=plain.y0, domain=plain.domain)
+        flow = SympFlow.primed(system, 2, dt=DT)
+    x = system.domain.sample(3, seed=2)
+    compiled, arrays = (
+        solve(system, "sympflow", (0, 2.1), x, flow=flow, t_eval=[0.3, 1.7, 2.1], backend=backend)
+        for backend in ("compiled", "array")
+    )
+    np.testing.assert_allclose(compiled.y, arrays.y, atol=1e-14)
+    y, t = torch.tensor(x), torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64)
+    h = 1e-5
+    slope = (flow.psi(t + h, y) - flow.psi(t - h, y)) / (2 * h)
+    torch.testing.assert_close(flow.velocity(t, y), slope, atol=1e-9, rtol=0)
+    torch.testing.assert_close(flow.psi_inverse(t, flow.psi(t, y)), y, atol=1e-14, rtol=0)
+
+
+@pytest.mark.parametrize("damping", [0.3, [0.1, 0.4], MATRIX])
+def test_the_derivatives_of_a_step_by_its_numbers(damping):
+    system = HamiltonianSystem.from_sympy(henon_heiles().symbols.H, damping=damping)
+    step = TableStep(system, ("drift", "kick", "drift", "kick", "drift"), 1)
+    rng = np.random.default_rng(0)
+    c, y = 0.4 * rng.normal(size=(step.n_coefficients, 4)), 0.3 * rng.normal(size=(4, 4))
+    for derivatives in (step._forward, step._backward):
+        at, J = derivatives(c, y, lambda: None)
+        np.testing.assert_allclose(at, step(c, y), atol=1e-14)
+        for k in range(len(c)):
+            e = np.zeros_like(c)
+            e[k] = 1e-6
+            np.testing.assert_allclose(J[k], (step(c + e, y) - step(c - e, y)) / 2e-6, atol=1e-8)
+
+
+def test_a_file_knows_the_friction(system, flow, tmp_path):
+    flow.save(tmp_path / "flow.safetensors")
+    again = sympflow.load(tmp_path / "flow.safetensors", system=system)
+    x = torch.tensor(system.domain.sample(3, seed=0))
+    assert torch.equal(again(2.0, x), flow(2.0, x))
+    for other in (damped_pendulum(0.31), pendulum()):
+        with pytest.raises(ValueError, match="is not the one that this flow was trained for"):
+            sympflow.load(tmp_path / "flow.safetensors", system=other)
+
+
+def test_flows_without_the_friction_are_refused(system, flow, conservative):
+    for use in (
+        lambda: solve(system, conservative),
+        lambda: conservative.check_system(system),
+        lambda: sympflow.train(system, flow=conservative),
+    ):
+        with pytest.raises(
+            ValueError, match=r"^`system` 'damped_pendulum' has friction, .*flow\.transferred\(system\)"
+        ):
+            use()
+    with pytest.raises(ValueError, match="no sympflow flow that ships was trained with it"):
+        solve(system, "sympflow", tol=1e-6)
+    for use in (
+        lambda: flow.hamiltonian(0.1, torch.zeros(2, dtype=torch.float64)),
+        lambda: flow.certificate(system),
+        lambda: sympflow.train(system, flow=flow, loss="labels+matching"),
+        lambda: sympflow.train(system, kind="sympflow"),
+        lambda: solve(system, SympFlow(1)),
+        lambda: SympFlow.primed(HamiltonianSystem.from_sympy("sqrt(1 + p**2) - cos(q)", damping=0.1)),
+    ):
+        with pytest.raises(ValueError, match="has friction"):
+            use()
+    with pytest.raises(ValueError, match=r"^`compensated`"):
+        solve(system, "sympflow", flow=flow, compensated=True)
+
+
+def test_a_driven_system_is_none_of_a_flow(conservative):
+    driven = HamiltonianSystem.from_sympy("p**2/2 - cos(q)*(1 + 0.3*cos(1.7*t))", time="t", y0=[1.0, 0.0])
+    same = HamiltonianSystem.from_sympy("p**2/2 - cos(q)*(1 + 0.3*cos(1.7*t))", time="t", y0=[1.0, 0.0])
+    other = HamiltonianSystem.from_sympy("p**2/2 - cos(q)*(1 + 0.3*cos(1.8*t))", time="t", y0=[1.0, 0.0])
+    assert driven.fingerprint == same.fingerprint
+    assert not sympflow.hamiltonian.fingerprint.same_system(driven.fingerprint, other.fingerprint)
+    assert not conservative.matches(driven)
+    assert len(sympflow.shipped_flows(driven)) == 0
