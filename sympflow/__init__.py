@@ -39,11 +39,15 @@ _HOME = {
     "max_energy_error": "metrics.energy",
     "energy_drift": "metrics.energy",
     "energy_growth": "metrics.energy",
+    "energy_balance_error": "metrics.energy_balance",
     "volume_error": "metrics.symplectic",
     "symplecticity_defect": "metrics.symplectic",
     "conformal_defect": "metrics.symplectic",
     "loop_area_error": "metrics.symplectic",
     "linear_stability": "metrics.linear_stability",
+    "lyapunov": "metrics.chaos",
+    "sali": "metrics.chaos",
+    "gali": "metrics.chaos",
     "reference_error": "metrics.accuracy",
     "time_reversal_error": "metrics.accuracy",
 }
@@ -72,10 +76,14 @@ if TYPE_CHECKING:
     from sympflow.integrators.splitting import splitting_method as splitting_method
     from sympflow.metrics.accuracy import reference_error as reference_error
     from sympflow.metrics.accuracy import time_reversal_error as time_reversal_error
+    from sympflow.metrics.chaos import gali as gali
+    from sympflow.metrics.chaos import lyapunov as lyapunov
+    from sympflow.metrics.chaos import sali as sali
     from sympflow.metrics.energy import energy_drift as energy_drift
     from sympflow.metrics.energy import energy_error as energy_error
     from sympflow.metrics.energy import energy_growth as energy_growth
     from sympflow.metrics.energy import max_energy_error as max_energy_error
+    from sympflow.metrics.energy_balance import energy_balance_error as energy_balance_error
     from sympflow.metrics.linear_stability import linear_stability as linear_stability
     from sympflow.metrics.symplectic import conformal_defect as conformal_defect
     from sympflow.metrics.symplectic import loop_area_error as loop_area_error

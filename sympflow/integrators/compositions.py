@@ -54,6 +54,8 @@ class Composition(ABC):
     """Name of what a run keeps from step to step beside the state, where steps are made on an extended phase space."""
     counts_as_scheme: ClassVar[bool] = True
     """True if a step evaluates as many forces as the scheme says, whatever the system."""
+    takes_values: ClassVar[bool] = False
+    """True if compiled loops may take the values of parameters as numbers, other ones for each trajectory."""
     takes_friction: ClassVar[bool] = False
     """True if one of the parts holds the friction of a damped system."""
     takes_driving: ClassVar[bool] = False
@@ -130,6 +132,7 @@ class KineticPotential(Composition):
     """
 
     compensates: ClassVar[bool] = True
+    takes_values: ClassVar[bool] = True
     takes_friction: ClassVar[bool] = True
     takes_driving: ClassVar[bool] = True
 

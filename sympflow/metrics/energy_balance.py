@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -95,7 +95,7 @@ def _balanced(sol: Solution) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _extended(sol: Solution) -> HamiltonianSystem | None:
-    """H(t + s, q, p) in [q, s, p, E], in which s stays 0 and E' = −∂H/∂t; None where the method does not apply to it."""
+    """H(t + s, q, p) in [q, s, p, E], in which s stays 0 and E' = −∂H/∂t; None where it is not for the method."""
     system = sol.system
     symbols = system.symbols
     if symbols is None or sol.integrator.trained or symbols.samples or system.kinetic_timed:
@@ -143,7 +143,7 @@ def _quadrature(sol: Solution) -> np.ndarray:
     return np.moveaxis(work, 0, -1)
 
 
-def _along(sol: Solution, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:
+def _along(sol: Solution, t: Any, y: np.ndarray, h: np.ndarray) -> np.ndarray:
     """∫ ∂H/∂t over steps of lengths h (n, ...) from the states y (n, ..., 2d)."""
     total = np.zeros(h.shape)
     for c, weight in zip((1 + NODES) / 2, WEIGHTS / 2, strict=True):
