@@ -27,7 +27,10 @@ ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("kernels",), "compiled loops behind one protocol"),
     (("systems",), "the built-in scenes"),
     (("hamiltonian",), "H, its structure and derivatives; domains"),
-    (("schemes", "events", "workers"), "tables of numbers; zeros along a run; a map over workers"),
+    (
+        ("schemes", "events", "workers", "storage"),
+        "tables of numbers; zeros along a run; a map over workers; arrays on disk",
+    ),
     (("arguments",), "checks of what users give"),
     (("arrays",), "operations that NumPy and torch spell differently"),
 )

@@ -44,6 +44,9 @@ _HOME = {
     "conformal_defect": "metrics.symplectic",
     "loop_area_error": "metrics.symplectic",
     "linear_stability": "metrics.linear_stability",
+    "lyapunov": "metrics.chaos",
+    "sali": "metrics.chaos",
+    "gali": "metrics.chaos",
     "reference_error": "metrics.accuracy",
     "time_reversal_error": "metrics.accuracy",
 }
@@ -72,6 +75,9 @@ if TYPE_CHECKING:
     from sympflow.integrators.splitting import splitting_method as splitting_method
     from sympflow.metrics.accuracy import reference_error as reference_error
     from sympflow.metrics.accuracy import time_reversal_error as time_reversal_error
+    from sympflow.metrics.chaos import gali as gali
+    from sympflow.metrics.chaos import lyapunov as lyapunov
+    from sympflow.metrics.chaos import sali as sali
     from sympflow.metrics.energy import energy_drift as energy_drift
     from sympflow.metrics.energy import energy_error as energy_error
     from sympflow.metrics.energy import energy_growth as energy_growth

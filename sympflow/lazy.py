@@ -34,6 +34,7 @@ FORMER = {
     "numba_functions": "hamiltonian.callables",
     "parts": "hamiltonian.parts",
     "studies.comparison_report": "studies.comparison",
+    "studies.crossings": "metrics.crossings",
     "studies.measurements": "studies.attempts",
     "studies.stability_report": "studies.step_stability",
     "symbolic": "hamiltonian.symbolic",

@@ -177,6 +177,7 @@ class _Call:
 
     def __init__(self, function: Callable[[Any, Any], Any], common: Parcel) -> None:
         self.function, self.common = function, common
+        self.__name__ = function.__name__  # by which engines call it
 
     def __call__(self, numbered: tuple[int, int, Any]) -> Answer:
         _, index, item = numbered

@@ -143,7 +143,7 @@ class Chunk:
             for i in range(n):
                 self._run(y, times, np.array([i]))
         elif self.compiled:
-            self._run(y, times, np.arange(n))
+            self._run(y, times, np.arange(n) if n > 1 else np.zeros(2, dtype=int))  # loops of one row round otherwise
         else:
             shift = self.first % BLOCK
             for start in range(-shift, n, BLOCK):  # each row has its place, and rows beside it, in any chunk
@@ -158,6 +158,7 @@ class Chunk:
                 self.integrator,
                 self.t_span,
                 self.y0[rows],
+                params={name: values[rows] for name, values in self.params.items()} or None,
                 t_eval=times,
                 backend=self.backend,
                 on_domain_exit="ignore",
@@ -165,9 +166,10 @@ class Chunk:
         except (KeyboardInterrupt, MemoryError):
             raise
         except Exception as error:  # of one orbit, most likely, which is then found
-            if len(set(rows.tolist())) > 1:
-                for row in sorted(set(rows.tolist())):
-                    self._run(y, times, np.full(len(rows), row))
+            several = sorted(set(rows.tolist()))
+            if len(several) > 1:
+                for row in several:
+                    self._run(y, times, np.full(max(2, len(rows)), row))
             else:
                 self.fail(int(rows[0]), f"{type(error).__name__}: {error}")
             return

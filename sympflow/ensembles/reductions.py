@@ -65,6 +65,7 @@ class States(Reduction):
     """The states at the times of `t_eval`, or after each step: `y`, (2d, m) of each orbit."""
 
     state: ClassVar[str] = "y"
+    takes_params: ClassVar[bool] = True
 
     def fields(self, problem: Chunk) -> Fields:
         return {"y": ((problem.y0.shape[1], problem.times.size), np.dtype(float))}
@@ -78,6 +79,7 @@ class Final(Reduction):
     """The state at the end of `t_span`: `final`, (2d,) of each orbit."""
 
     state: ClassVar[str] = "final"
+    takes_params: ClassVar[bool] = True
 
     def fields(self, problem: Chunk) -> Fields:
         return {"final": ((problem.y0.shape[1],), np.dtype(float))}

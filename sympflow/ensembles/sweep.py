@@ -140,8 +140,7 @@ def ensemble(
     orbits = initial_states(system, y0, n, seed)
     fixed, axes = _axes(system, params)
     if fixed:
-        changed: Any = system
-        system = changed.with_params(**fixed)
+        system = system.with_params(**fixed)
     first = orbits.states(0, min(len(orbits), SHORTEST_CHUNK))
     integrator = integrator.resolved(system, first, abs(t1 - t0))
     check_applies(integrator, system, first)
@@ -271,10 +270,17 @@ class Task:
         """The chunk of some first orbits, at the first values of the parameters."""
         return self.chunk({name: values[0] for name, values in self.axes.items()}, y0, 0)
 
+    def whole(self, block: Block, y0: np.ndarray) -> Chunk:
+        """The chunk of a block, each orbit with its own parameters."""
+        grid = np.meshgrid(*(np.arange(*ends) for ends in block.ranges), indexing="ij")
+        where = [index.ravel() for index in grid]
+        params = {name: values[i] for (name, values), i in zip(self.axes.items(), where, strict=False)}
+        states = y0[where[-1] - block.ranges[-1][0]]
+        return Chunk(self.system, self.integrator, self.t_span, self.t_eval, states, params, self.backend, block.first)
+
     def chunk(self, values: Mapping[str, float], y0: np.ndarray, first: int) -> Chunk:
-        """A chunk of orbits with the same parameters."""
-        system: Any = self.system
-        system = system.with_params(**values) if values else system
+        """A chunk of orbits with the same parameters, which are its system's."""
+        system = self.system.with_params(**values) if values else self.system
         return Chunk(system, self.integrator, self.t_span, self.t_eval, y0, backend=self.backend, first=first)
 
 
@@ -282,12 +288,15 @@ def run_piece(task: Task, item: tuple[Block, Given | Drawn]) -> Done:
     """Run the orbits of a block, on this thread alone, and write them into the store, if there is one."""
     block, orbits = item
     y0 = orbits.states(0, len(orbits))
-    grid = [values[slice(*ends)] for values, ends in zip(task.axes.values(), block.ranges[:-1], strict=True)]
+    if task.axes and task.reduction.takes_params:
+        chunks = [task.whole(block, y0)]
+    else:
+        grid = [values[slice(*ends)] for values, ends in zip(task.axes.values(), block.ranges[:-1], strict=True)]
+        named = [dict(zip(task.axes, map(float, values), strict=True)) for values in itertools.product(*grid)]
+        chunks = [task.chunk(values, y0, block.first + i * len(y0)) for i, values in enumerate(named)]
     parts: list[Done] = []
     with at_most(1):
-        for i, values in enumerate(itertools.product(*grid)):
-            named = dict(zip(task.axes, map(float, values), strict=True))
-            chunk = task.chunk(named, y0, block.first + i * len(y0))
+        for i, chunk in enumerate(chunks):
             fields = task.reduction.reduce(chunk)
             parts.append(Done(fields, chunk.status, {i * len(y0) + k: text for k, text in chunk.messages.items()}))
     done = parts[0] if len(parts) == 1 else _joined(parts)

@@ -45,6 +45,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
     from sympflow.hamiltonian.fingerprint import Identity
+    from sympflow.kernels.tangent_loops import TangentKernel
     from sympflow.schemes import Scheme
 
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
@@ -244,6 +245,10 @@ class Integrator:
                 "functions of sympflow.arrays, or define tangent()."
             )
         return forward_tangent(lambda x, lengths: self.step(system, t, x, lengths), y, h)
+
+    def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
+        """The compiled loops of steps with so many deviation vectors; a ValueError says why there are none."""
+        raise ValueError(f"`method` {self.name!r} has no compiled deviation vectors: use backend='auto'.")
 
     def jacobian(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> np.ndarray:
         """The Jacobian (..., n, n) of a step from y in the phase space where steps are made; n = 2d but if extended."""

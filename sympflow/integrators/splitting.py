@@ -24,6 +24,7 @@ from sympflow.schemes import SCHEMES, Scheme, checked_scheme, scheme_evaluations
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
+    from sympflow.kernels.tangent_loops import TangentKernel
 
 
 @dataclass(frozen=True)
@@ -270,6 +271,16 @@ class Splitting(OwnStepper):
     def takes_friction(self) -> bool:
         return SPLITTINGS[self.splitting].takes_friction and self.clock == "physical"
 
+    def takes_letters(self, problem: Problem) -> bool:
+        system, composition = problem.system, self.composed(problem.system)
+        asked = any(map(self.overrides, ("step", "rollout", "substep", "evaluations")))
+        if self.clock != "physical" or asked or not composition.takes_values or system.friction is not None:
+            return False
+        kernel = compiled_loops(
+            lambda: composition.kernel(bool(self.compensated)), problem.y0, problem.backend, self.compensated
+        )
+        return kernel is not None and kernel.loops.takes_values(self.scheme.level)
+
     def check(self, system: HamiltonianSystem) -> None:
         if self.clock != "physical":
             self.on_clock(system)
@@ -298,6 +309,17 @@ class Splitting(OwnStepper):
         known = None if self.keeps else (self.on_clock(system) or self.composed(system)).tangent(y, h)
         return super().tangent(system, t, y, h) if known is None else known
 
+    def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
+        scheme = self.kicks_and_drifts
+        if scheme is None or self.compensated:
+            raise ValueError(
+                f"`method` {self.name!r} has compiled deviation vectors on the splitting 'kinetic' and the clock "
+                "'physical' only, without compensated sums: use backend='auto'."
+            )
+        from sympflow.kernels.tangent_loops import tangent_kernel
+
+        return tangent_kernel(system, scheme, vectors)
+
     def jacobian(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> np.ndarray:
         if not self.keeps:
             return super().jacobian(system, t, y, h)
@@ -321,6 +343,8 @@ class Splitting(OwnStepper):
         )
         if kernel is None:
             return ArrayComposition(self, problem, composition)
+        if problem.letters is not None:
+            kernel = kernel.varied(problem.letters)
         return CompiledComposition(self, problem, composition, kernel)
 
     def run(self, problem: Problem) -> Outcome:

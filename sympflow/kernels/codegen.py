@@ -11,6 +11,7 @@ from sympy.printing.pycode import PythonCodePrinter
 
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
+from sympflow.kernels.variations import Variations
 
 __all__ = [
     "algebra_source",
@@ -23,6 +24,7 @@ __all__ = [
     "printed",
     "statements",
     "tuple_algebra",
+    "variations_source",
 ]
 
 _MAX_POWER = 16  # integer powers up to this are written as products
@@ -119,14 +121,32 @@ def algebra_source(symbols: SymbolicHamiltonian) -> str:
     q, p, d = symbols.q, symbols.p, symbols.ndof
     velocity = [sp.diff(symbols.T, s) for s in p]
     slope = [sp.diff(symbols.V, s) for s in q]
-    numbers = "numbers, " if symbols.parameters else ""
     parts = [
         f"NDOF = {d}",
         tuple_algebra(d),
         _function(symbols, "kick", "q, numbers, work", [-s for s in slope], [f"b*{{{i}}}" for i in range(d)], "b"),
-        _function(symbols, "drift", f"p, a, {numbers}work", velocity, [f"a*{{{i}}}" for i in range(d)]),
+        _drift(symbols, velocity),
     ]
     return "\n\n\n".join(parts) + "\n"
+
+
+def variations_source(variations: Variations) -> str:
+    """`algebra_source` of an orbit and its deviation vectors, without the kick, which is scheduled.
+
+    Raises
+    ------
+    ValueError
+        As `algebra_source`.
+    """
+    n = variations.ndof
+    parts = [f"NDOF = {n}", tuple_algebra(n), _drift(variations, list(variations.velocity))]
+    return "\n\n\n".join(parts) + "\n"
+
+
+def _drift(symbols: SymbolicHamiltonian | Variations, velocity: list[sp.Expr]) -> str:
+    numbers = "numbers, " if symbols.parameters else ""
+    results = [f"a*{{{i}}}" for i in range(symbols.ndof)]
+    return _function(symbols, "drift", f"p, a, {numbers}work", velocity, results)
 
 
 def gradient_kick_source(symbols: SymbolicHamiltonian) -> str:
@@ -224,14 +244,14 @@ def as_factor(number: sp.Expr) -> str:
     return f"({printed(number)})" if number.free_symbols else repr(float(number))
 
 
-def parameter_lines(symbols: SymbolicHamiltonian, lines: Sequence[str]) -> list[str]:
+def parameter_lines(symbols: SymbolicHamiltonian | Variations, lines: Sequence[str]) -> list[str]:
     """Assignments of the parameters that occur in lines of code; their values are the last ones of `numbers`."""
     words, n = set(re.findall(r"\w+", " ".join(lines))), len(symbols.parameters)
     return [f"{s} = numbers[-{n - i}]" for i, s in enumerate(symbols.parameters) if s.name in words]
 
 
 def _function(
-    symbols: SymbolicHamiltonian,
+    symbols: SymbolicHamiltonian | Variations,
     name: str,
     arguments: str,
     expressions: list[sp.Expr],

@@ -15,6 +15,7 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
 from sympflow.kernels.codegen import as_factor, parameter_lines, printed
 from sympflow.kernels.scheduling import FUSED, PRODUCTS, Schedule, nested
 from sympflow.kernels.stages import kicks_of
+from sympflow.kernels.variations import Variations
 
 __all__ = ["kick_cycles", "kicks_source", "shapes"]
 
@@ -45,7 +46,7 @@ class _Kick:
     operations: float
 
 
-def kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials = ()) -> str:
+def kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials = (), vectors: int = 0) -> str:
     """The new p after each kind of kick of a level, each in two shapes, equal but for rounding: see `Kick`.
 
     It is p − b∇V + g∇²V v − c∇(½ v·∇²V v), v = M⁻¹∇V, or p − b∇V − Σ_m e_m ∇q^m. ``kicked(q, p, table, j)`` is the
@@ -54,16 +55,19 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials 
     trajectories at once. ``drifted(q, p, a)`` is the drift of a single one. Where H has parameters, `numbers` end with
     their values, and ``drifted(q, p, numbers, a)`` takes them too.
 
+    With deviation vectors q and p hold these after those of the orbit (`Variations`), and a kick moves them by its
+    exact linearisation, of which the entries are computed once for all of them, together with the kick of the orbit.
+
     Raises
     ------
     ValueError
         If a function in H has no counterpart in compiled code.
     """
-    key = symbols.H, level, monomials
+    key = symbols.H, level, monomials, vectors
     if key not in _SOURCES:
         if len(_SOURCES) >= MOST_KEPT:
             del _SOURCES[next(iter(_SOURCES))]
-        _SOURCES[key] = _source(symbols, level, monomials)
+        _SOURCES[key] = _source(Variations(symbols, vectors) if vectors else symbols, level, monomials)
     return _SOURCES[key]
 
 
@@ -88,11 +92,11 @@ def kick_cycles(symbols: SymbolicHamiltonian, level: int) -> float:
     return min(_scheduled(symbols, shape, "kick_", common).cycles for common in (True, False))
 
 
-_SOURCES: dict[tuple[sp.Expr, int, Monomials], str] = {}
+_SOURCES: dict[tuple[sp.Expr, int, Monomials, int], str] = {}
 """Sources by H: systems are often made again, and the search takes a tenth of a second or more."""
 
 
-def _source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> str:
+def _source(symbols: SymbolicHamiltonian | Variations, level: int, monomials: Monomials) -> str:
     functions: list[str] = []
     fill: list[str] = []
     stored: list[str] = []
@@ -121,7 +125,7 @@ def _source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> s
     return "\n\n\n".join([f"N_COEFFICIENTS = {len(stored) + len(kept)}", filled, *functions, drifts]) + "\n"
 
 
-def _drift_source(symbols: SymbolicHamiltonian) -> str:
+def _drift_source(symbols: SymbolicHamiltonian | Variations) -> str:
     """``drifted(q, p, a)``, q + a M⁻¹p or q + a∇T, the products with a, for which no state waits, made first."""
     M, d = symbols.inverse_mass, symbols.ndof
     numbers = "numbers, " if symbols.parameters else ""
@@ -150,14 +154,16 @@ def _mentions(code: str, name: str) -> bool:
 
 
 def _function(
-    symbols: SymbolicHamiltonian, name: str, arguments: str, lines: Sequence[str], results: Sequence[str]
+    symbols: SymbolicHamiltonian | Variations, name: str, arguments: str, lines: Sequence[str], results: Sequence[str]
 ) -> str:
     unpacked = [f"{', '.join(s.name for s in v)}, = {x}" for v, x in ((symbols.q, "q"), (symbols.p, "p"))]
     returned = f"return ({''.join(f'{value}, ' for value in results)})"
     return "\n    ".join([f"@njit(**OPTIONS, forceinline=True)\ndef {name}({arguments}):", *unpacked, *lines, returned])
 
 
-def _scheduled(symbols: SymbolicHamiltonian, shape: Sequence[sp.Expr], prefix: str, common: bool = True) -> _Kick:
+def _scheduled(
+    symbols: SymbolicHamiltonian | Variations, shape: Sequence[sp.Expr], prefix: str, common: bool = True
+) -> _Kick:
     """The shape as code. Momenta are known before positions, whose drift waited for them.
 
     Without `common` only whole factors and terms are shared, not products within products, which may be known later.
@@ -166,23 +172,43 @@ def _scheduled(symbols: SymbolicHamiltonian, shape: Sequence[sp.Expr], prefix: s
     schedule = Schedule(known, printed, prefix, PRODUCT)
     numbers: dict[sp.Expr, sp.Symbol] = {}
     states = {*symbols.q, *symbols.p}
-    shape = [_numbered(f, states, numbers) for f in shape]
+    d = len(shape)
+    slopes = _linearised(shape, symbols) if isinstance(symbols, Variations) else {}
+    shape = [_numbered(f, states, numbers) for f in (*shape, *slopes.values())]
     for coefficient, symbol in numbers.items():  # as one: what is common to several would else be taken out of them
         schedule.define(symbol, coefficient)
     if common:
         shared, shape = sp.cse(shape, symbols=sp.numbered_symbols("common_", real=True), list=True, order="none")
         for symbol, expression in shared:
             schedule.define(symbol, expression)
-    results = [schedule.value(f)[1] for f in shape]
+    results = [schedule.value(f)[1] for f in shape[:d]]
+    if isinstance(symbols, Variations):
+        entries = dict(zip(slopes, shape[d:], strict=True))
+        for w_q, w_p in symbols.pairs():
+            for i, s in enumerate(w_p):
+                terms = [
+                    sp.Mul(entries[min(i, j), max(i, j)], w_q[j], evaluate=False)
+                    for j in range(d)
+                    if (min(i, j), max(i, j)) in entries
+                ]
+                results.append(schedule.value(sp.Add(s, *terms, evaluate=False))[1])
     schedule.busy[PRODUCTS] += sum(sp.diff(symbols.T, p).has(s) or s == p for p in symbols.p for s in symbols.p)
     cycles = schedule.cycles(results) + FUSED  # the drift waits for the kick
     return _Kick(schedule.early, schedule.lines, results, cycles, schedule.operations)
 
 
-def _tried(symbols: SymbolicHamiltonian, terms: int, prefix: str, monomials: Monomials) -> list[_Kick]:
+def _linearised(shape: Sequence[sp.Expr], symbols: Variations) -> dict[tuple[int, int], sp.Expr]:
+    """The entries of the upper triangle of ∂p/∂q after a kick that are not zero: a kick is a gradient."""
+    q = symbols.symbols.q
+    entries = {(i, j): sp.diff(f, q[j]) for i, f in enumerate(shape) for j in range(i, len(q))}
+    return {place: printable(f) for place, f in entries.items() if f != 0}
+
+
+def _tried(symbols: SymbolicHamiltonian | Variations, terms: int, prefix: str, monomials: Monomials) -> list[_Kick]:
+    own = symbols.symbols if isinstance(symbols, Variations) else symbols
     return [
         _scheduled(symbols, shape, prefix, common)
-        for shape in shapes(symbols, terms, monomials)
+        for shape in shapes(own, terms, monomials)
         for common in (True, False)
     ]
 

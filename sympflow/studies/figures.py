@@ -13,10 +13,10 @@ import numpy as np
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
+from sympflow.metrics.crossings import Plane, crossings
 from sympflow.solution import Solution
 from sympflow.solver import solve
 from sympflow.studies.attempts import Attempt, Row
-from sympflow.studies.crossings import Plane, crossings
 from sympflow.studies.figure_style import (
     TEXT,
     dress,

@@ -12,13 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_t_span
-from sympflow.arrays import is_tensor
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator
-from sympflow.integrators.registry import build, check_applies, name_of
-from sympflow.solver import check_y0
-from sympflow.studies.crossings import Plane, crossings
+from sympflow.integrators.registry import name_of
+from sympflow.metrics.crossings import Plane, crossings
+from sympflow.metrics.orbits import checked_orbits
 from sympflow.studies.figure_style import saved
 from sympflow.studies.reports import Column, Report, described, text_table, title
 
@@ -81,15 +79,7 @@ def poincare_section(
     >>> section.states.shape[1]
     4
     """
-    if not isinstance(system, HamiltonianSystem):
-        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
-    integrator = build(method, options)
-    span = check_t_span(system.t_span if t_span is None else t_span)
-    if is_tensor(y0):
-        raise TypeError("`y0` is a tensor, but crossings are located on NumPy arrays: pass y0.numpy().")
-    start = check_y0(system, system.y0 if y0 is None else y0, None)
-    integrator = integrator.resolved(system, start, abs(span[1] - span[0]))
-    check_applies(integrator, system, start)
+    orbits = checked_orbits(system, method, t_span, y0, options, "crossings are located on")
     index = _check_coordinate(coordinate, system.ndof)
     if direction not in (-1, 0, 1):
         raise ValueError(f"`direction` must be 1 (upwards), -1 (downwards) or 0 (both); got {direction!r}.")
@@ -98,21 +88,20 @@ def poincare_section(
     sample = system.dt if sample is None else sample
     if not (_is_number(sample) and sample > 0):
         raise ValueError(f"`sample` must be a positive number, a time; got {sample!r}.")
-    rows = start.reshape(-1, start.shape[-1])
     plane = Plane(index, float(level), direction)
-    found = crossings(integrator, system, span, rows, plane, float(sample))
+    found = crossings(orbits.integrator, system, orbits.t_span, orbits.rows, plane, float(sample))
     return PoincareSection(
         system,
-        integrator,
-        span,
-        rows,
+        orbits.integrator,
+        orbits.t_span,
+        orbits.rows,
         index,
         float(level),
         direction,
         found.trajectory,
         found.t,
         found.states,
-        status=int(found.status[0]) if start.ndim == 1 else found.status,
+        status=found.status if orbits.batch else int(found.status[0]),
         message=found.message,
     )
 

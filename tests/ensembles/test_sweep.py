@@ -1,9 +1,13 @@
 """ensemble(): the same bits whatever the workers and chunks; a failed orbit is a row; what is kept of each."""
 
+import threading
+
 import numpy as np
 import pytest
 
 import sympflow
+from sympflow import workers
+from sympflow.ensembles import reductions, sweep
 
 SYSTEM = sympflow.systems.henon_heiles()
 STATES = SYSTEM.domain.sample(200, 1)
@@ -24,10 +28,10 @@ def test_states_are_those_of_solve():
 
 
 @pytest.mark.parametrize("chunk", [1, 37, 64, 1000])
-@pytest.mark.parametrize("workers", [1, 2, map])
-def test_the_same_bits_whatever_the_workers_and_chunks(workers, chunk):
+@pytest.mark.parametrize("engine", [1, 2, map])
+def test_the_same_bits_whatever_the_workers_and_chunks(engine, chunk):
     reference = sympflow.solve(SYSTEM, "verlet", SPAN, STATES, dt=DT, t_eval=[SPAN[1]]).y[..., 0]
-    assert np.array_equal(kept(reduce="final", workers=workers, chunk=chunk).final, reference)
+    assert np.array_equal(kept(reduce="final", workers=engine, chunk=chunk).final, reference)
 
 
 @pytest.mark.parametrize(("method", "options"), [("verlet", {"backend": "array"}), ("dop853", {})])
@@ -38,6 +42,14 @@ def test_the_same_bits_where_python_runs(method, options):
     reference = final(80)
     for chunk in (1, 7, 64):
         assert np.array_equal(final(chunk), reference)
+
+
+def test_a_chunk_of_one_orbit_of_a_flow():
+    def final(chunk):
+        return sympflow.ensemble(SYSTEM, "sympflow", (0, 1), STATES[:9], reduce="final", chunk=chunk).final
+
+    reference = final(9)
+    assert all(np.array_equal(final(chunk), reference) for chunk in (1, 4))
 
 
 def test_a_failed_orbit_is_a_row():
@@ -68,3 +80,91 @@ def test_a_users_function():
     errors = kept(reduce="energy_error").energy_error
     H = SYSTEM.hamiltonian(states.swapaxes(1, 2))
     assert np.allclose(errors, np.abs(H / H[:, :1] - 1).max(1), rtol=1e-9)
+
+
+def test_a_grid_of_parameters():
+    system = sympflow.HamiltonianSystem.from_sympy("p**2/2 + k*q**2/2 + a*q**4/4", params={"k": 1.0, "a": 0.1})
+    k, states = [1.0, 2.0, 4.0], np.array([[1.0, 0.0], [0.5, 0.2]])
+
+    def swept(**how):
+        return sympflow.ensemble(system, "verlet", (0, 2), states, dt=0.1, params={"k": k, "a": [0.0, 0.3]}, **how)
+
+    result = swept(reduce="final")
+    assert result.final.shape == (3, 2, 2, 2)
+    assert list(result.params) == ["k", "a"]
+    assert result.to_xarray().q.dims == ("k", "a", "orbit", "dof")
+    for chunk in (1, 5):
+        assert np.array_equal(swept(reduce="final", chunk=chunk, workers=2).final, result.final)
+    for i, value in enumerate(k):
+        changed = system.with_params(k=value, a=0.3)
+        expected = sympflow.solve(changed, "verlet", (0, 2), states, dt=0.1)
+        assert np.allclose(result.final[i, 1], expected.y[..., -1], rtol=0, atol=1e-13)
+        H = changed.hamiltonian(expected.states)
+        worst = np.abs(H / H[:, :1] - 1).max(1)
+        assert np.allclose(swept(reduce="energy_error").energy_error[i, 1], worst, atol=1e-13)
+    fixed = sympflow.ensemble(system, "verlet", (0, 2), states, dt=0.1, params={"k": 2.0}, reduce="final")
+    assert fixed.final.shape == (2, 2)
+
+
+@pytest.mark.parametrize(
+    ("how", "error", "message"),
+    [
+        ({"params": {"lam": [1.0]}}, ValueError, "`params` has 'lam', which the system 'henon_heiles' has not"),
+        ({"params": 3}, TypeError, "`params` must map names"),
+        ({"reduce": "finall"}, ValueError, "Did you mean 'final'"),
+        ({"reduce": 3}, TypeError, "`reduce` must be a name"),
+        (
+            {"reduce": lambda t, y: 1 / 0},
+            ValueError,
+            "`reduce` raises ZeroDivisionError: division by zero",
+        ),
+        ({"reduce": lambda t, y: "text"}, TypeError, "`reduce` must return numbers"),
+        ({"reduce": lambda t, y: {"status": 1.0}}, ValueError, "`reduce` returns 'status', a name that"),
+        ({"workers": "two"}, TypeError, "`workers` must be a number"),
+        ({"chunk": 0}, ValueError, "`chunk` must be a positive integer"),
+        ({"n": 3}, ValueError, "`n` is for drawing states"),
+        ({"seed": -1}, ValueError, "`seed` must be an integer"),
+        ({"progress": 3}, TypeError, "`progress` must be True, False"),
+        ({"y0": SYSTEM.domain}, ValueError, "`n` is needed"),
+        (
+            {"y0": SYSTEM.domain, "n": 10**8},
+            ValueError,
+            r"`store` is needed: 204 numbers of each of 100,000,000",
+        ),
+        ({"y0": SYSTEM.domain, "n": 10**8, "chunk": 1, "reduce": "final"}, ValueError, "`chunk` of 1 cuts"),
+        ({"method": "dop853"}, ValueError, "`t_eval` is needed: each orbit has steps of its own"),
+    ],
+)
+def test_bad_input(how, error, message):
+    given = {"method": "verlet", "y0": STATES, "t_span": SPAN, "dt": DT} | how
+    if given["method"] != "verlet":
+        del given["dt"]
+    with pytest.raises(error, match=message):
+        sympflow.ensemble(SYSTEM, **given)
+
+
+def test_a_function_that_fails_later_fails_a_row():
+    def strict(t, y):
+        if y[0, 0] == STATES[7, 0]:
+            raise RuntimeError("not this one")
+        return np.zeros(3 if y[0, 0] == STATES[9, 0] else 2)
+
+    result = kept(reduce=strict, chunk=20)
+    assert np.flatnonzero(result.status).tolist() == [7, 9]
+    assert "RuntimeError: not this one" in result.messages[7,]
+    assert "returns reduced of shape (3,), but reduced of shape (2,) for the first" in result.messages[9,]
+    assert np.isnan(result.reduced[7]).all()
+
+
+def test_what_is_sent_to_processes_is_small_and_can_be_sent():
+    task = sweep.Task(SYSTEM, sympflow.get("verlet")(dt=DT), SPAN, None, {}, reductions.States(), "auto")
+    assert len(workers.Parcel(task).pack()) < 20_000
+    lock = threading.Lock()
+    with pytest.raises(TypeError, match="`reduce` cannot be sent to the processes of `workers`"):
+        kept(reduce=lambda t, y: float(lock.locked()), workers=2)
+
+
+def test_progress():
+    told = []
+    kept(reduce="final", chunk=50, progress=lambda done, total: told.append((done, total)))
+    assert told == [(0, 200), (50, 200), (100, 200), (150, 200), (200, 200)]

@@ -1,0 +1,456 @@
+"""Chaos of orbits by deviation vectors: the largest Lyapunov exponent, SALI and GALI.
+
+A deviation vector w is moved by the exact linearisation of each step that is made, the tangent map of the method, not
+by an integration of the variational equations with errors of its own [1]_.
+
+References
+----------
+.. [1] C. Skokos, E. Gerlach, "Numerical integration of variational equations", Phys. Rev. E 82 (2010) 036704.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.arguments import as_float, check_counts, check_t_eval, floats
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import compiled_loops
+from sympflow.integrators.contract import FINISHED, differentiated, in_blocks
+from sympflow.integrators.grid import Grid
+from sympflow.integrators.registry import naming_plugin
+from sympflow.metrics.orbits import Orbits, checked_orbits
+
+EVERY = 64  # steps between two looks at an orbit, of compiled loops
+ALIGNED = 1e-12
+"""Below this SALI and GALI an orbit is chaotic for sure, and ends: what is left is rounding."""
+NONE, ALIGNMENT, VOLUME = 0, 1, 2  # as `kernels.tangent_loops`
+BACKENDS = ("auto", "compiled", "array")
+LOG_2 = float(np.log(2.0))
+
+
+@dataclass(frozen=True)
+class Indicator:
+    """A chaos indicator of each orbit, at its end and at the times that were asked for.
+
+    Attributes
+    ----------
+    value : float, or ndarray of shape (...) of a batch
+        At `t_end`; NaN of an orbit that failed.
+    t_end : float or ndarray of shape (...)
+        The end of the orbit: the last whole step of `t_span`, or where the indicator fell below its threshold.
+    status : int or ndarray of shape (...)
+        0 where the end of `t_span` was reached, 1 where the indicator fell below its threshold before, and −1 where
+        the orbit or its deviation vectors ceased to be finite; `t_end` is then the last time at which all was known
+        to be.
+    message : str
+        In words, with the remedy.
+    t : ndarray of shape (n,)
+        The times of `t_eval`.
+    history : ndarray of shape (..., n)
+        The indicator after the last step that ends at or before each of them; NaN after the end of an orbit.
+    """
+
+    value: Any
+    t_end: Any
+    status: Any
+    message: str
+    t: np.ndarray = field(repr=False)
+    history: np.ndarray = field(repr=False)
+
+    @property
+    def success(self) -> bool:
+        """True if no orbit failed."""
+        return bool(np.all(np.asarray(self.status) >= 0))
+
+
+def lyapunov(
+    system: HamiltonianSystem,
+    method: Any = "sympflow",
+    t_span: tuple[float, float] | None = None,
+    y0: ArrayLike | None = None,
+    *,
+    t_eval: ArrayLike | None = None,
+    deviations: ArrayLike | None = None,
+    seed: int = 0,
+    backend: str = "auto",
+    **options: Any,
+) -> Indicator:
+    """The largest Lyapunov exponent of each orbit: ln(|w(t)|/|w(0)|)/|t − t0|, of a deviation vector w.
+
+    As t grows it tends to the exponent of the orbit, for almost all initial vectors [1]_ [2]_: to a positive number on
+    a chaotic one, and like ln(t)/t to 0 on a regular one, so that a value of that size at the end of the run does not
+    tell the two apart (`sali` does). With friction the exponent of an orbit that comes to rest is negative.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    method : str, Integrator or trained flow
+        Splitting methods run compiled on symbolic systems; of others each step is differentiated, which takes longer.
+    t_span : (float, float), optional
+        The default is the system's. With fixed steps the run ends with the last whole one.
+    y0 : array_like of shape (..., 2d), optional
+        One state, or a batch of them. The default is the system's.
+    t_eval : array_like of shape (n,), optional
+        Times at which to report the average so far too: `history`.
+    deviations : array_like of shape (2d,), optional
+        w(0). The default is a random direction, the same for all orbits.
+    seed : int
+        Of this direction.
+    backend : "auto", "compiled" or "array"
+        As for `solve`.
+    **options
+        Options of the method, such as `dt`.
+
+    Returns
+    -------
+    Indicator
+
+    Raises
+    ------
+    ValueError, TypeError
+        For bad arguments, at once; and if the steps of the method are not differentiated in y at a fixed t.
+
+    References
+    ----------
+    .. [1] G. Benettin, L. Galgani, A. Giorgilli, J.-M. Strelcyn, Meccanica 15 (1980) 9–30.
+    .. [2] V. I. Oseledec, Trans. Moscow Math. Soc. 19 (1968) 197–231.
+
+    Examples
+    --------
+    >>> import sympflow
+    >>> system = sympflow.systems.henon_heiles()
+    >>> exponent = lyapunov(system, "verlet", (0, 1000), [0.0, -0.25, 0.42081, 0.0], dt=0.05)
+    >>> bool(0.03 < exponent.value < 0.06)
+    True
+    """
+    orbits = checked_orbits(system, method, t_span, y0, options, "deviation vectors are followed on")
+    return _indicator(orbits, 1, NONE, 0.0, t_eval, deviations, seed, backend)
+
+
+def sali(
+    system: HamiltonianSystem,
+    method: Any = "sympflow",
+    t_span: tuple[float, float] | None = None,
+    y0: ArrayLike | None = None,
+    *,
+    below: float = ALIGNED,
+    t_eval: ArrayLike | None = None,
+    deviations: ArrayLike | None = None,
+    seed: int = 0,
+    backend: str = "auto",
+    **options: Any,
+) -> Indicator:
+    """The smaller alignment index of each orbit: min(|u + v|, |u − v|) of two deviation vectors made unit vectors.
+
+    On a chaotic orbit it falls like exp(−(λ₁ − λ₂)t), λ the two largest Lyapunov exponents, to the last bit; on a
+    regular one in two or more degrees of freedom it stays between constants [1]_. In one degree of freedom, where all
+    vectors turn into the direction of the flow, it falls like 1/t².
+
+    Parameters
+    ----------
+    system, method, t_span, y0, t_eval, seed, backend, **options
+        As for `lyapunov`.
+    below : float
+        An orbit ends where the index falls below this number, and is chaotic; 0 to go on to the end.
+    deviations : array_like of shape (2, 2d), optional
+        The vectors at the start. The default is two random directions at right angles.
+
+    Returns
+    -------
+    Indicator
+
+    Raises
+    ------
+    ValueError, TypeError
+        As `lyapunov`.
+
+    References
+    ----------
+    .. [1] C. Skokos, J. Phys. A: Math. Gen. 34 (2001) 10029–10043.
+
+    Examples
+    --------
+    >>> import sympflow
+    >>> system = sympflow.systems.henon_heiles()
+    >>> index = sali(system, "verlet", (0, 2000), [[0.0, -0.25, 0.42081, 0.0], [0.0, 0.55, 0.2417, 0.0]], dt=0.05)
+    >>> index.value < 1e-8
+    array([ True, False])
+    """
+    orbits = checked_orbits(system, method, t_span, y0, options, "deviation vectors are followed on")
+    return _indicator(orbits, 2, ALIGNMENT, _threshold(below), t_eval, deviations, seed, backend)
+
+
+def gali(
+    system: HamiltonianSystem,
+    method: Any = "sympflow",
+    t_span: tuple[float, float] | None = None,
+    y0: ArrayLike | None = None,
+    *,
+    k: int = 2,
+    below: float = ALIGNED,
+    t_eval: ArrayLike | None = None,
+    deviations: ArrayLike | None = None,
+    seed: int = 0,
+    backend: str = "auto",
+    **options: Any,
+) -> Indicator:
+    """The generalised alignment index of order k: the volume that k deviation vectors, made unit vectors, span.
+
+    On a chaotic orbit it falls like exp(−Σ_{j=2..k} (λ₁ − λ_j) t); on a regular one it stays near a constant for k up
+    to the dimension of its torus, d as a rule, and falls like t^{−2(k − d)} for more vectors [1]_.
+
+    Parameters
+    ----------
+    system, method, t_span, y0, t_eval, seed, backend, **options
+        As for `lyapunov`.
+    k : int
+        From 2 to 2d.
+    below : float
+        An orbit ends where the index falls below this number; 0 to go on to the end.
+    deviations : array_like of shape (k, 2d), optional
+        The vectors at the start. The default is random directions at right angles, for which the index is 1.
+
+    Returns
+    -------
+    Indicator
+
+    Raises
+    ------
+    ValueError, TypeError
+        As `lyapunov`.
+
+    Notes
+    -----
+    The volume |w₁ ∧ … ∧ w_k| is the product of the singular values of the matrix of the vectors, computed by making
+    them orthogonal one after the other.
+
+    References
+    ----------
+    .. [1] C. Skokos, T. Bountis, C. Antonopoulos, Physica D 231 (2007) 30–54.
+    """
+    orbits = checked_orbits(system, method, t_span, y0, options, "deviation vectors are followed on")
+    check_counts(k=k)
+    if not 2 <= k <= 2 * system.ndof:
+        raise ValueError(
+            f"`k` must be from 2 to {2 * system.ndof}, the dimension of the phase space of {system.name!r}; got {k}."
+        )
+    return _indicator(orbits, int(k), VOLUME, _threshold(below), t_eval, deviations, seed, backend)
+
+
+def _threshold(below: float) -> float:
+    value = as_float(below)
+    if not 0 <= value < 1:
+        raise ValueError(f"`below` must be a number from 0, to go on to the end, up to 1; got {below!r}.")
+    return value
+
+
+# runs with deviation vectors ----------------------------------------------------------------------
+
+
+@dataclass
+class _Run:
+    """Logarithms of lengths (N, k, n + 1), spreads and times (N, n + 1), the last at the end; and the status (N,)."""
+
+    growth: np.ndarray
+    spread: np.ndarray
+    elapsed: np.ndarray
+    status: np.ndarray
+
+
+def _indicator(
+    orbits: Orbits,
+    vectors: int,
+    kind: int,
+    below: float,
+    t_eval: ArrayLike | None,
+    deviations: ArrayLike | None,
+    seed: int,
+    backend: str,
+) -> Indicator:
+    integrator, system = orbits.integrator, orbits.system
+    if integrator.keeps or integrator.tangent_holds:
+        what = (
+            f"keeps {integrator.keeps}"
+            if integrator.keeps
+            else f"is differentiated with {integrator.tangent_holds} held"
+        )
+        raise ValueError(
+            f"`method` {integrator.name!r} {what}, so that deviation vectors of states are not known: use a splitting "
+            "method such as 'kahan_li8', or an implicit one such as 'gauss_legendre6'."
+        )
+    if not (system.autonomous or integrator.on_grid) and orbits.batch:
+        raise ValueError(
+            f"`y0` is a batch, whose steps by method {integrator.name!r} begin at times of their own, and "
+            f"{system.name!r} depends on t: pass one state at a time, or use a method of fixed steps."
+        )
+    if not isinstance(backend, str) or backend not in BACKENDS:
+        raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
+    t0, t1 = orbits.t_span
+    times = np.empty(0) if t_eval is None else check_t_eval(t_eval, t0, t1)
+    w0 = _deviations(deviations, vectors, 2 * system.ndof, seed)
+    length = integrator.step_length(system) if integrator.on_grid else None
+    if length is not None:
+        grid = Grid(t0, t1, length)
+        if grid.n_steps == 0:
+            raise ValueError(f"`t_span` is shorter than one step of {abs(grid.h):g}: end it later, or reduce `dt`.")
+        orbits = orbits._replace(t_span=(t0, grid.time(grid.n_steps)))
+        kernel = compiled_loops(lambda: integrator.tangent_kernel(system, vectors), orbits.y0, backend)
+        if kernel is not None:
+            run = _compiled(kernel, grid, orbits, w0, times, kind, below)
+            return _reported(run, orbits, times, kind, below)
+    elif backend == "compiled":
+        raise ValueError(f"`backend` 'compiled' does not apply to method {integrator.name!r}: use 'auto'.")
+    with naming_plugin(integrator):
+        run = _by_arrays(orbits, w0, times, kind, below)
+    return _reported(run, orbits, times, kind, below)
+
+
+def _deviations(given: ArrayLike | None, vectors: int, width: int, seed: int) -> np.ndarray:
+    """The vectors at the start, (k, 2d)."""
+    if given is None:
+        random = np.random.default_rng(seed).standard_normal((width, vectors))
+        return np.ascontiguousarray(np.linalg.qr(random)[0].T)
+    shape = (width,) if vectors == 1 else (vectors, width)
+    w0 = floats("deviations", given)
+    if w0.shape != shape:
+        raise ValueError(f"`deviations` must have shape {shape}; got {w0.shape}.")
+    lengths = np.linalg.norm(w0.reshape(vectors, width), axis=-1)
+    if not (np.isfinite(lengths) & (lengths > 0)).all():
+        raise ValueError("`deviations` must be finite and not 0: remove NaN and infinity.")
+    return w0.reshape(vectors, width) / lengths[:, None]
+
+
+def _compiled(
+    kernel: Any, grid: Grid, orbits: Orbits, w0: np.ndarray, times: np.ndarray, kind: int, below: float
+) -> _Run:
+    counts = np.array([grid.place(t)[0] for t in times], dtype=np.int64)
+    save, where = np.unique(counts[counts > 0], return_inverse=True)
+    found = kernel.run(grid.h, orbits.rows, w0, grid.n_steps, save, EVERY, kind, below, single=not orbits.batch)
+    start, N = int((counts == 0).sum()), len(orbits.rows)
+    growth, spread = np.zeros((N, len(w0), len(times) + 1)), np.empty((N, len(times) + 1))
+    spread[:] = _spread(w0.T[None], kind)[0]
+    growth[..., start:-1], growth[..., -1] = found.growth[..., where], found.growth[..., -1]
+    spread[..., start:-1], spread[..., -1] = found.spread[..., where], found.spread[..., -1]
+    elapsed = np.empty((N, len(times) + 1))
+    elapsed[:, :-1], elapsed[:, -1] = counts * grid.h, found.n_steps * grid.h
+    status = np.where(found.whole, np.where(found.n_steps < grid.n_steps, 1, 0), -1)
+    return _Run(growth, spread, elapsed, status)
+
+
+def _by_arrays(orbits: Orbits, w0: np.ndarray, times: np.ndarray, kind: int, below: float) -> _Run:
+    """The same by the differentiated steps of the run, executed as a stream."""
+    t0, t1 = orbits.t_span
+    N, n = len(orbits.rows), len(times)
+    sign = 1.0 if t1 >= t0 else -1.0
+    W = np.broadcast_to(w0.T, (N, *w0.T.shape)).copy()
+    exponents = np.zeros((N, len(w0)))
+    growth, spread = np.full((N, len(w0), n + 1), np.nan), np.full((N, n + 1), np.nan)
+    run = _Run(growth, spread, np.zeros((N, n + 1)), np.zeros(N, dtype=int))
+    position = np.zeros(N, dtype=int)
+    running = np.ones(N, dtype=bool)
+    elapsed = np.zeros(N)
+
+    def note(rows: np.ndarray, column: np.ndarray) -> None:
+        run.growth[rows, :, column] = LOG_2 * exponents[rows] + np.log(np.linalg.norm(W[rows], axis=1))
+        run.spread[rows, column] = _spread(W[rows], kind)
+        run.elapsed[rows, column] = elapsed[rows]
+
+    for t, h, A in _each_step(orbits):
+        ends = t + h - t0
+        if n:
+            due = running & (position < n)
+            while due.any():
+                due &= sign * ends > sign * (times[np.minimum(position, n - 1)] - t0) + 1e-12 * np.abs(ends)
+                note(np.flatnonzero(due), position[due])
+                position[due] += 1
+                due &= position < n
+        with np.errstate(all="ignore"):
+            moved = A @ W
+            finite = np.isfinite(np.square(moved).sum(axis=1)).all(axis=-1)
+        run.status[running & ~finite] = -1
+        running &= finite
+        W = np.where(running[:, None, None], moved, W)
+        elapsed = np.where(running, ends, elapsed)
+        lengths = np.linalg.norm(W, axis=1)
+        powers = np.where(running[:, None] & (lengths > 0), np.frexp(lengths)[1], 0)
+        W, exponents = np.ldexp(W, -powers[:, None, :]), exponents + powers
+        if below > 0:
+            aligned = running & (_spread(W, kind) < below)
+            run.status[aligned] = 1
+            running &= ~aligned
+        if not running.any():
+            break
+    run.status[running & (np.abs(elapsed) < (1 - 1e-9) * abs(t1 - t0))] = -1  # the stream of steps ended before
+    running &= run.status == 0
+    run.elapsed[:, -1] = elapsed
+    done = np.flatnonzero(run.status >= 0)
+    note(done, np.full(len(done), n))
+    reached = np.flatnonzero(running)
+    for column in range(n):
+        late = reached[position[reached] <= column]
+        note(late, np.full(len(late), column))
+    return run
+
+
+def _each_step(orbits: Orbits) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Steps one by one: times and lengths (N,), Jacobians (N, 2d, 2d)."""
+    integrator, system = orbits.integrator, orbits.system
+    if system.autonomous:
+        for t, h, A in integrator.executed(system, orbits.t_span, orbits.rows):
+            yield from zip(t, h, A, strict=True)
+        return
+
+    def jacobian(t: float, y: np.ndarray, h: np.ndarray) -> np.ndarray:
+        return integrator.tangent(system, t, y, h)[1]
+
+    for chunk in in_blocks(integrator.steps(system, orbits.t_span, orbits.rows)):
+        for time, y, length in zip(*chunk, strict=True):  # each at its own time
+            t, h, A = differentiated(jacobian, np.atleast_1d(time), y[None], np.atleast_1d(length))
+            yield t[0], h[0], A[0]
+
+
+def _spread(W: np.ndarray, kind: int) -> np.ndarray:
+    """Spread (N,) of vectors (N, 2d, k), of a kind."""
+    if kind == NONE:
+        return np.full(len(W), np.nan)
+    unit = W / np.linalg.norm(W, axis=1, keepdims=True)
+    if kind == VOLUME:
+        return np.asarray(np.prod(np.linalg.svd(unit, compute_uv=False), axis=-1))
+    u, v = unit[..., 0], unit[..., 1]
+    return np.minimum(np.linalg.norm(u + v, axis=-1), np.linalg.norm(u - v, axis=-1))
+
+
+def _reported(run: _Run, orbits: Orbits, times: np.ndarray, kind: int, below: float) -> Indicator:
+    values = run.spread
+    if kind == NONE:
+        with np.errstate(all="ignore"):
+            values = run.growth[:, 0] / np.abs(run.elapsed)
+        values = np.where(np.isfinite(values), values, np.nan)
+    n_failed, n_aligned = int((run.status < 0).sum()), int((run.status == 1).sum())
+    message = FINISHED
+    if n_failed:
+        first = int(np.argmax(run.status < 0))
+        message = (
+            f"{n_failed} of {len(values)} orbits ceased to be finite, the first of them (index {first}) after t = "
+            f"{orbits.t_span[0] + run.elapsed[first, -1]:.17g}. Reduce `dt`, or end `t_span` earlier."
+        )
+    elif n_aligned:
+        message = f"{n_aligned} of {len(values)} orbits ended early: the index fell below {below:g}."
+
+    def shaped(x: np.ndarray) -> Any:
+        return x.reshape(orbits.batch + x.shape[1:])[()]
+
+    t_end = orbits.t_span[0] + run.elapsed[:, -1]
+    return Indicator(
+        shaped(values[:, -1]),
+        shaped(t_end),
+        shaped(run.status),
+        message,
+        times,
+        np.asarray(shaped(values[:, :-1])),
+    )

@@ -1,0 +1,62 @@
+"""Arguments of functions that follow orbits, states as NumPy arrays: checked as `solve` checks them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.arguments import check_t_span
+from sympflow.arrays import is_tensor
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.contract import Integrator
+from sympflow.integrators.registry import build, check_applies
+from sympflow.solver import check_y0
+
+
+class Orbits(NamedTuple):
+    """A method on a system, the interval, and the initial states (..., 2d)."""
+
+    system: HamiltonianSystem
+    integrator: Integrator
+    t_span: tuple[float, float]
+    y0: np.ndarray
+
+    @property
+    def rows(self) -> np.ndarray:
+        """The initial states as (N, 2d)."""
+        return self.y0.reshape(-1, self.y0.shape[-1])
+
+    @property
+    def batch(self) -> tuple[int, ...]:
+        """The shape of the batch, () of one orbit."""
+        return self.y0.shape[:-1]
+
+
+def checked_orbits(
+    system: HamiltonianSystem,
+    method: Any,
+    t_span: tuple[float, float] | None,
+    y0: ArrayLike | None,
+    options: Mapping[str, Any],
+    purpose: str,
+) -> Orbits:
+    """Orbits, the arguments as those of `solve`; `purpose` is what NumPy arrays are needed for, as a clause.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For bad arguments, and where the method does not apply to the system.
+    """
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    integrator = build(method, dict(options))
+    span = check_t_span(system.t_span if t_span is None else t_span)
+    if is_tensor(y0):
+        raise TypeError(f"`y0` is a tensor, but {purpose} NumPy arrays: pass y0.numpy().")
+    start = check_y0(system, system.y0 if y0 is None else y0, None)
+    integrator = integrator.resolved(system, start, abs(span[1] - span[0]))
+    check_applies(integrator, system, start)
+    return Orbits(system, integrator, span, start)

@@ -1,0 +1,139 @@
+"""Lyapunov exponents, SALI and GALI: compiled and by arrays, against what is known of orbits."""
+
+import numpy as np
+import pytest
+
+import sympflow
+from sympflow import HamiltonianSystem
+from sympflow.systems import henon_heiles, henon_heiles_escape
+
+CHAOTIC, REGULAR = [0.0, -0.25, 0.42081, 0.0], [0.0, 0.55, 0.2417, 0.0]  # E = 1/8, of Skokos (2001), figure 1
+BOTH = [CHAOTIC, REGULAR]
+TIMES = [0.0, 10.0, 100.02, 200.0]
+
+
+@pytest.fixture(scope="module")
+def wells():
+    return henon_heiles()
+
+
+def both_ways(function, system, method, t_span, y0, **options):
+    found = [function(system, method, t_span, y0, backend=b, **options) for b in ("compiled", "array")]
+    np.testing.assert_array_equal(found[0].status, found[1].status)
+    return found
+
+
+@pytest.mark.parametrize("method", ["verlet", "chin4c"])
+def test_compiled_vectors_are_those_of_the_differentiated_steps(wells, method):
+    compiled, arrays = both_ways(sympflow.sali, wells, method, (0, 200.02), BOTH, t_eval=TIMES, dt=0.1, below=0)
+    # rounding grows with the distance of neighbouring orbits, exp(0.05 · 200) on the chaotic one, and 1/SALI
+    np.testing.assert_allclose(compiled.history, arrays.history, rtol=1e-6)
+    np.testing.assert_allclose(compiled.value, arrays.value, rtol=1e-6)
+    assert compiled.t_end == pytest.approx(200.0)
+
+
+def test_orbits_do_not_depend_on_their_neighbours_nor_on_how_often_they_are_looked_at(wells, monkeypatch):
+    y0 = np.random.default_rng(0).uniform(-0.2, 0.2, (70, 4))
+    whole = sympflow.sali(wells, "verlet", (0, 300), y0, dt=0.1, below=1e-2)
+    assert 0 < (whole.status == 1).sum() < 70
+    parts = [sympflow.sali(wells, "verlet", (0, 300), part, dt=0.1, below=1e-2) for part in (y0[:3], y0[3:])]
+    np.testing.assert_array_equal(whole.value, np.concatenate([part.value for part in parts]))
+    np.testing.assert_array_equal(whole.t_end, np.concatenate([part.t_end for part in parts]))
+    full = sympflow.sali(wells, "verlet", (0, 300), y0, dt=0.1, below=0)
+    monkeypatch.setattr("sympflow.metrics.chaos.EVERY", 17)
+    again = sympflow.sali(wells, "verlet", (0, 300), y0, dt=0.1, below=0)
+    np.testing.assert_array_equal(full.value, again.value)
+
+
+def test_a_chaotic_orbit_is_told_from_a_regular_one(wells):
+    index = sympflow.sali(wells, "verlet", (0, 3000), BOTH, dt=0.1)
+    assert index.status.tolist() == [1, 0]
+    assert index.success
+    assert index.value[0] < 1e-12
+    assert 300 < index.t_end[0] < 1500  # exp(−λt) = 1e-12, λ about 0.04
+    assert index.value[1] > 0.1
+    assert "1 of 2 orbits ended early" in index.message
+
+
+def test_the_exponents_of_henon_heiles(wells):
+    exponents = sympflow.lyapunov(wells, "verlet", (0, 2e5), BOTH, dt=0.1, t_eval=[2e3, 2e4])
+    assert 0.035 < exponents.value[0] < 0.055  # 0.047 by Skokos (2001)
+    # the vectors of a regular orbit grow like t
+    assert (exponents.history[1] < 2 * np.log(exponents.t) / exponents.t).all()
+
+
+@pytest.mark.parametrize(("k", "power"), [(2, 0), (3, -2), pytest.param(4, -4, marks=pytest.mark.slow)])
+def test_gali_on_a_torus_falls_by_its_power(wells, k, power):
+    index = sympflow.gali(wells, "verlet", (0, 4000), REGULAR, k=k, dt=0.1, below=0, t_eval=np.geomspace(40, 4000, 60))
+    slope = np.polyfit(np.log(index.t), np.log(index.history), 1)[0]
+    assert slope == pytest.approx(power, abs=0.3)
+
+
+def test_gali_of_two_vectors_is_sali_times_the_other_diagonal(wells):
+    s = sympflow.sali(wells, "verlet", (0, 50), BOTH, dt=0.1, below=0).value
+    g = sympflow.gali(wells, "verlet", (0, 50), BOTH, dt=0.1, below=0).value
+    np.testing.assert_allclose(g, s * np.sqrt(4 - s**2) / 2, rtol=1e-12)
+
+
+def test_the_exponent_of_a_ridge_with_friction():
+    """λ of q'' = q − γq' is (−γ + √(γ² + 4))/2; the verlet step has this rate up to O(h²)."""
+    y0 = [[1e-3, 0.0], [0.0, 1e-3]]
+    gamma = 0.4
+    system = HamiltonianSystem.from_sympy("p**2/2 - q**2/2", damping=gamma, name="ridge")
+    compiled, arrays = both_ways(sympflow.lyapunov, system, "verlet", (0, 40), y0, dt=0.02, deviations=[1.0, 0.5])
+    np.testing.assert_allclose(compiled.value, arrays.value, rtol=1e-10)
+    np.testing.assert_allclose(compiled.value, (-gamma + np.sqrt(gamma**2 + 4)) / 2, atol=0.02)
+
+
+def test_parameters_and_coupled_masses_are_those_of_the_system():
+    for stiffness in (1.0, 2.5):  # one code for both values
+        system = HamiltonianSystem.from_sympy(
+            "p1**2/2 + p1*p2/4 + p2**2 - k*cos(q1)*cos(q2)", params={"k": stiffness}, name="coupled"
+        )
+        compiled, arrays = both_ways(sympflow.sali, system, "verlet", (0, 20), [0.7, 0.5, 0.1, 0.3], dt=0.1)
+        assert compiled.value == pytest.approx(arrays.value, rel=1e-9)
+
+
+def test_other_methods_and_directions(wells):
+    exact = sympflow.lyapunov(wells, "kahan_li8", (0, 10), BOTH, dt=0.1)
+    for method, options in (("gauss_legendre6", {"dt": 0.1}), ("dop853", {"rtol": 1e-10, "atol": 1e-12})):
+        found = sympflow.lyapunov(wells, method, (0, 10), BOTH, **options)
+        np.testing.assert_allclose(found.value, exact.value, rtol=1e-6)
+    back = both_ways(sympflow.lyapunov, wells, "verlet", (0, -10), BOTH, dt=0.1, t_eval=[-3, -5])
+    np.testing.assert_allclose(back[0].history, back[1].history, rtol=1e-9)
+
+
+def test_orbits_that_fail_have_a_status_and_leave_the_others_alone():
+    system = henon_heiles_escape()
+    for found in both_ways(sympflow.sali, system, "verlet", (0, 50), [system.y0, [0, 0.1, 0, 0]], dt=0.05):
+        assert found.status.tolist() == [-1, 0]
+        assert not found.success
+        assert np.isnan(found.value[0])
+        assert np.isfinite(found.value[1])
+        assert 3 < found.t_end[0] < 7
+        assert "(index 0)" in found.message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"below": 2}, "`below` must be a number"),
+        ({"deviations": [[1, 0], [0, 1]]}, "`deviations` must have shape"),
+        ({"deviations": np.zeros((2, 4))}, "`deviations` must be finite and not 0"),
+        ({"backend": "gpu"}, "`backend` must be one of"),
+        ({"dt": 300.0}, "`t_span` is shorter than one step"),
+        ({"t_eval": [300]}, "`t_eval` must lie within"),
+        ({"method": "gauss_legendre6", "backend": "compiled"}, "`backend` 'compiled' does not apply"),
+        ({"method": "tao4"}, "keeps the second copy of phase space"),
+        ({"method": "log_kahan_li8"}, "is differentiated with"),
+    ],
+)
+def test_bad_arguments(wells, arguments, message):
+    arguments = {"method": "verlet", **arguments}
+    with pytest.raises(ValueError, match=message):
+        sympflow.sali(wells, t_span=(0, 200), y0=REGULAR, **arguments)
+
+
+def test_more_vectors_than_dimensions(wells):
+    with pytest.raises(ValueError, match="`k` must be from 2 to 4"):
+        sympflow.gali(wells, "verlet", k=5)
