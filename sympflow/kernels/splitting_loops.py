@@ -123,7 +123,7 @@ class SplittingLoops:
 
     def takes_values(self, level: int) -> bool:
         """True if the values of the system's parameters are numbers of the kicks of a level, not of their code."""
-        return bool(self.values) and _takes_values(level)
+        return bool(self.values) and takes_values(level)
 
     def functions(
         self, level: int, compensated: bool, monomials: Monomials = (), varied: bool = False
