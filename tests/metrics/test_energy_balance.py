@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 import sympflow
 from sympflow import HamiltonianSystem, energy_balance_error, solve
 
@@ -17,9 +18,7 @@ Y0 = np.array([[0.5, 0.1], [0.2, 0.4]])
 @pytest.mark.parametrize(("method", "order"), [("verlet", 2), ("chin4c", 4), ("gauss_legendre4", 4), ("rk4", 4)])
 def test_the_balance_is_kept_to_the_order_of_the_method(method, order):
     times = np.linspace(0.3, 8.3, 11)
-    errors = [
-        energy_balance_error(solve(PENDULUM, method, (0.3, 8.3), Y0, dt=dt, t_eval=times)) for dt in (0.1, 0.05)
-    ]
+    errors = [energy_balance_error(solve(PENDULUM, method, (0.3, 8.3), Y0, dt=dt, t_eval=times)) for dt in (0.1, 0.05)]
     assert errors[0].shape == (2, 11)
     assert (errors[0][:, 0] == 0).all()
     assert math.log2(errors[0].max() / errors[1].max()) > order - 0.4
@@ -41,5 +40,5 @@ def test_kinetic_energies_that_depend_on_the_time_and_autonomous_systems():
 
 def test_friction_is_refused():
     system = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 - q*cos(t)", time="t", damping=0.1)
-    with pytest.raises(ValueError, match="`system`.*friction"):
+    with pytest.raises(ValueError, match=r"`system`.*friction"):
         energy_balance_error(solve(system, "verlet", (0, 1), [1.0, 0.0], dt=0.1))
