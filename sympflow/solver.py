@@ -72,9 +72,10 @@ def solve(
     params : mapping of str to array_like, optional
         Values of parameters of the system for each trajectory: numbers, or arrays that broadcast with the batch of y0;
         of one state y0 they make a batch. The others keep the system's values. Splitting methods on the splitting
-        "kinetic" take them as numbers of one compiled run; elsewhere trajectories of equal values run together, one
-        set of values after the other. Either way each trajectory is, bit by bit, that of a batch on
-        ``system.with_params(...)``. A trained flow holds for its own parameters alone.
+        "kinetic", but for those with force gradients and with friction, take them as numbers of one compiled run, and
+        each trajectory is that on ``system.with_params(...)`` up to rounding. Elsewhere trajectories of equal values
+        run together, one set of values after the other, and are so bit by bit. A trained flow holds for its own
+        parameters alone.
     t_eval : array_like of shape (n,), optional
         Times to report, ordered from start to end. The default is every step. No other state is stored.
     dense_output : bool

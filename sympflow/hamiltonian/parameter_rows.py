@@ -91,8 +91,7 @@ class ParameterRows:
     def by_form(self) -> Iterator[Rows]:
         """The trajectories by the `parametric` form of H; those whose values belong to the code, by their values.
 
-        A value that makes a part of H 0, 1 or −1 has a form of its own, as it has in a system that is made with it: so
-        a trajectory takes the same steps, bit by bit, alone and among others.
+        A value that makes a part of H 0, 1 or −1 has a form of its own, as it has in a system that is made with it.
         """
         symbols = self.system.symbols
         assert symbols is not None

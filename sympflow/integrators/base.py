@@ -652,12 +652,13 @@ class GridSolution:
             "grid": self.grid,
             "states": self.states,
             "backend": stepper.backend,
+            "letters": stepper.problem.letters,
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         integrator, grid, states = state["integrator"], state["grid"], state["states"]
         backend = "auto" if state["backend"] == "compiled" else "array"
-        problem = Problem(state["system"], grid.t0, grid.t1, states[0], backend=backend)
+        problem = Problem(state["system"], grid.t0, grid.t1, states[0], backend=backend, letters=state.get("letters"))
         GridSolution.__init__(self, integrator.stepper(problem), grid, states)
 
     def __call__(self, t: float | np.ndarray) -> Array:

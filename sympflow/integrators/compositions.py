@@ -53,6 +53,8 @@ class Composition(ABC):
     """Name of what a run keeps from step to step beside the state, where steps are made on an extended phase space."""
     counts_as_scheme: ClassVar[bool] = True
     """True if a step evaluates as many forces as the scheme says, whatever the system."""
+    takes_values: ClassVar[bool] = False
+    """True if compiled loops may take the values of parameters as numbers, other ones for each trajectory."""
     takes_friction: ClassVar[bool] = False
     """True if one of the parts holds the friction of a damped system."""
 
@@ -116,6 +118,7 @@ class KineticPotential(Composition):
     """
 
     compensates: ClassVar[bool] = True
+    takes_values: ClassVar[bool] = True
     takes_friction: ClassVar[bool] = True
 
     def __init__(

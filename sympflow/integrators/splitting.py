@@ -271,6 +271,16 @@ class Splitting(OwnStepper):
     def takes_friction(self) -> bool:
         return SPLITTINGS[self.splitting].takes_friction and self.clock == "physical"
 
+    def takes_letters(self, problem: Problem) -> bool:
+        system, composition = problem.system, self.composed(problem.system)
+        asked = any(map(self.overrides, ("step", "rollout", "substep", "evaluations")))
+        if self.clock != "physical" or asked or not composition.takes_values or system.friction is not None:
+            return False
+        kernel = compiled_loops(
+            lambda: composition.kernel(bool(self.compensated)), problem.y0, problem.backend, self.compensated
+        )
+        return kernel is not None and kernel.loops.takes_values(self.scheme.level)
+
     def check(self, system: HamiltonianSystem) -> None:
         if self.clock != "physical":
             self.on_clock(system)
@@ -333,6 +343,8 @@ class Splitting(OwnStepper):
         )
         if kernel is None:
             return ArrayComposition(self, problem, composition)
+        if problem.letters is not None:
+            kernel = kernel.varied(problem.letters)
         return CompiledComposition(self, problem, composition, kernel)
 
     def run(self, problem: Problem) -> Outcome:

@@ -104,7 +104,7 @@ class SplittingLoops:
                 "HamiltonianSystem.from_sympy or by Numba functions, or use backend='array'."
             )
         self._has_curvature = system.symbols is not None
-        self._variants: dict[tuple[int, bool, Monomials], LoopFunctions] = {}
+        self._variants: dict[tuple[int, bool, Monomials, bool], LoopFunctions] = {}
 
     def kernel(self, scheme: Scheme, compensated: bool = False) -> SplittingKernel:
         """The loops of one scheme.
@@ -121,15 +121,21 @@ class SplittingLoops:
         """The loops of one scheme on a system with friction; single steps are made by `step(y, h)` on arrays."""
         return DampedKernel(self, scheme, step)
 
-    def functions(self, level: int, compensated: bool, monomials: Monomials = ()) -> LoopFunctions:
-        """The compiled functions for kicks of a level, see `Scheme`.
+    def takes_values(self, level: int) -> bool:
+        """True if the values of the system's parameters are numbers of the kicks of a level, not of their code."""
+        return bool(self.values) and takes_values(level)
+
+    def functions(
+        self, level: int, compensated: bool, monomials: Monomials = (), varied: bool = False
+    ) -> LoopFunctions:
+        """The compiled functions for kicks of a level, see `Scheme`; `varied` for `VariedKernel`.
 
         Raises
         ------
         ValueError
             If the system has no such kicks.
         """
-        variant = (level, compensated, monomials)
+        variant = (level, compensated, monomials, varied)
         if variant not in self._variants:
             if level in (FORCE_GRADIENT, CURVATURE) and not self._has_force_gradient:
                 raise ValueError(
@@ -139,7 +145,8 @@ class SplittingLoops:
             if level > FORCE_GRADIENT and not self._has_curvature:
                 what = "curvature terms" if level == CURVATURE else "polynomials"
                 raise ValueError(f"`scheme` has {what}, which need a symbolic system: take one without them.")
-            self._variants[variant] = self._compile(*variant)
+            more = {"varied": True} if varied else {}
+            self._variants[variant] = self._compile(level, compensated, monomials, **more)
         return self._variants[variant]
 
     def rows(self, table: StageTable) -> np.ndarray:
@@ -152,7 +159,13 @@ class SplittingLoops:
         return table.rows(self.values if takes_values(table.level) else ())
 
     def step_rows(
-        self, table: StageTable, x: np.ndarray, h: np.ndarray, y: np.ndarray, monomials: Monomials = ()
+        self,
+        table: StageTable,
+        x: np.ndarray,
+        h: np.ndarray,
+        y: np.ndarray,
+        monomials: Monomials = (),
+        varied: bool = False,
     ) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
 
@@ -166,11 +179,13 @@ class SplittingLoops:
         y : ndarray of shape (N, 2d)
         monomials
             Of the polynomials, where kicks have them.
+        varied : bool
+            True if the values of its parameters follow each state in its row.
         """
         y = np.ascontiguousarray(y, dtype=np.float64)
-        out = np.empty(y.shape)
+        out = np.empty((len(y), 2 * self.ndof))
         x, h = np.ascontiguousarray(x), np.ascontiguousarray(h)
-        self.functions(table.level, False, monomials).step_rows(self.rows(table), x, h, y, out)
+        self.functions(table.level, False, monomials, varied).step_rows(self.rows(table), x, h, y, out)
         return out
 
 
@@ -214,7 +229,7 @@ class SplittingKernel(Kernel):
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         functions = self._functions()
         table = self.table(h)
-        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+        y0, save = self._rows(y0), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(y0), len(save), 2 * self.loops.ndof))
         n_finite = np.empty(len(y0), dtype=np.int64)
         first, running = opened(carry, len(y0), self._width)
@@ -233,8 +248,43 @@ class SplittingKernel(Kernel):
         h = h.repeat(len(y)) if h.ndim == 0 else h
         return Steps(self.loops.step_rows(step_table(self.scheme), h, h, y, self.scheme.monomials))
 
+    def varied(self, values: np.ndarray) -> VariedKernel:
+        """The loops of batches whose trajectories have these values (k, N) of `SplittingLoops.values`."""
+        return VariedKernel(self.loops, self.scheme, self.compensated, values)
+
+    def _rows(self, y: np.ndarray) -> np.ndarray:
+        """The states of a batch (N, 2d) as the loops read them."""
+        return np.ascontiguousarray(y, dtype=np.float64)
+
     def _functions(self) -> LoopFunctions:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials)
+
+
+class VariedKernel(SplittingKernel):
+    """The loops of batches of N trajectories that have their own values (k, N) of `SplittingLoops.values`.
+
+    Each takes the steps of `SplittingKernel` on a system with its values up to rounding: what the compiler takes out of
+    loops there, products of values, it may fuse with sums here. A batch may be several of such ones, one after the
+    other.
+    """
+
+    def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool, values: np.ndarray) -> None:
+        super().__init__(loops, scheme, compensated)
+        self._values = np.ascontiguousarray(values.T, dtype=np.float64)
+
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
+        raise TypeError("`y0` must be a batch (N, 2d): trajectories have their own parameters.")
+
+    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+        lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), len(y))
+        scheme, rows = self.scheme, self._rows(y)
+        return Steps(self.loops.step_rows(step_table(scheme), lengths, lengths, rows, scheme.monomials, varied=True))
+
+    def _rows(self, y: np.ndarray) -> np.ndarray:
+        return np.concatenate([y, np.tile(self._values, (len(y) // len(self._values), 1))], axis=1)
+
+    def _functions(self) -> LoopFunctions:
+        return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, varied=True)
 
 
 class DampedKernel(SplittingKernel):
@@ -296,10 +346,10 @@ class LoopFunctions:
     step_rows: Callable[..., None]
 
 
-def _header(compensated: bool, cache: bool, scheduled: bool) -> str:
+def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0) -> str:
     return (
         f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': cache}}\n"
-        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}"
+        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}\nN_VALUES = {n_values}"
     )
 
 
@@ -318,6 +368,7 @@ def _symbolic_loops(
     level: int,
     compensated: bool,
     monomials: Monomials,
+    varied: bool = False,
 ) -> LoopFunctions:
     if friction is None and takes_values(level) and symbols.parametric is not symbols:
         from sympflow.kernels.codegen import algebra_source
@@ -325,7 +376,7 @@ def _symbolic_loops(
         symbols = symbols.parametric
         algebra = algebra_source(symbols)
     after = ("loops", "aligned", "lanes")
-    loops = symbolic_module(symbols, algebra, level, compensated, after, monomials, friction)
+    loops = symbolic_module(symbols, algebra, level, compensated, after, monomials, friction, varied)
     processed = loops.rollout_processed, loops.rollout_processed_rows
     return LoopFunctions(loops.rollout, loops.rollout_lanes, *processed, loops.step_lanes)
 
@@ -338,14 +389,19 @@ def symbolic_module(
     after: Sequence[str],
     monomials: Monomials = (),
     friction: DampedDrift | None = None,
+    varied: bool = False,
 ) -> ModuleType:
-    """The algebra of a symbolic system, its kicks and the texts of loops `after` them, as a module."""
+    """The algebra of a symbolic system, its kicks and the texts of loops `after` them, as a module.
+
+    In `varied` ones each lane has its own values of the parameters.
+    """
     from sympflow.kernels.codegen import curvature_kick_source, gradient_kick_source, polynomial_kick_source
     from sympflow.kernels.kicks import kicks_source
 
     kinds, scheduled = kicks_of(level, len(monomials)), not compensated
     n = len(symbols.parameters)
-    sources = [algebra, stages_source(kinds, scheduled, friction, n), lanes_source(kinds, scheduled, friction, n)]
+    lanes = lanes_source(kinds, scheduled, friction, n, varied)
+    sources = [algebra, stages_source(kinds, scheduled, friction, n), lanes]
     if scheduled:
         sources.append(kicks_source(symbols, level, monomials))
     elif level == POLYNOMIAL:
@@ -356,7 +412,7 @@ def symbolic_module(
         sources.append(curvature_kick_source(symbols))
     algebra = "\n\n\n".join(sources)
     before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
-    header = _header(compensated, cache=True, scheduled=scheduled)
+    header = _header(compensated, cache=True, scheduled=scheduled, n_values=n if varied else 0)
     return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
 
 

@@ -361,43 +361,52 @@ def stage(q, p, q_error, p_error, numbers, a, j, work):
 
 
 def lanes_source(
-    kinds: Sequence[Kick], scheduled: bool, friction: DampedDrift | None = None, n_parameters: int = 0
+    kinds: Sequence[Kick],
+    scheduled: bool,
+    friction: DampedDrift | None = None,
+    n_parameters: int = 0,
+    varied: bool = False,
 ) -> str:
     """The functions of the text `lanes` that depend on the kinds of kick; not scheduled, sums are compensated.
 
     ``stage_lanes`` is a kick and a drift of all lanes by the same numbers, ``stage_each`` of each lane by its own, by
-    column j of a table.
+    column j of a table. `varied` lanes have their own values of the parameters in both.
     """
 
     given = "numbers, " if n_parameters else ""
+    n_numbers, values = len(kinds[0].numbers), range(n_parameters)
 
     def together(kick: Kick) -> list[str]:
-        kicked = kick.application(scheduled, lane=True)
+        own = [f"common[{i}], " for i in range(n_numbers)] + [f"Y[2 * NDOF + {i}, lane], " for i in values]
+        taken = [f"numbers = ({''.join(own)})"] if varied else []
+        kicked = [*taken, *kick.application(scheduled, lane=True)]
         if scheduled:
             move = f"q, _ = move(q, None, drift({{p}}, {{a}}, {given}None))"
             moved = [move.format(p="p", a="a")] if friction is None else friction.drifted(move)
             return _over_lanes([*kicked, *moved])
         drifted = f"q, q_error = move(q, q_error, drift(p, a, {given}None))"
-        taken, stored = "q_error, p_error = unpack_lane(error, lane)", "pack_lane(q_error, p_error, error, lane)"
-        return _over_lanes([taken, *kicked, drifted, stored])
+        errors, stored = "q_error, p_error = unpack_lane(error, lane)", "pack_lane(q_error, p_error, error, lane)"
+        return _over_lanes([errors, *kicked, drifted, stored])
 
     def each(kick: Kick) -> list[str]:
         steps, places = {1: "H", 3: "H3", 5: "H5"}, range(len(kick.numbers))
         filled = [f"fill_lanes(Y, width, NUMBERS + {i}, table[{i + 1}, j], {steps[kick.powers[i]]})" for i in places]
-        constant = range(n_parameters)
-        filled += [f"value_{i} = table[{1 + len(kinds[0].numbers) + i}, j, 0]" for i in constant]
-        numbers = "".join([f"Y[NUMBERS + {i}, lane], " for i in places] + [f"value_{i}, " for i in constant])
+        if not varied:
+            filled += [f"value_{i} = table[{1 + n_numbers + i}, j, 0]" for i in values]
+        value = "Y[NUMBERS + N_NUMBERS + {0}, lane], " if varied else "value_{0}, "
+        numbers = "".join([f"Y[NUMBERS + {i}, lane], " for i in places] + [value.format(i) for i in values])
         drifted = f"q, _ = move(q, None, drift(p, Y[A, lane], {given}None))"
         return [*filled, *_over_lanes([f"numbers = ({numbers})", *kick.application(True, lane=True), drifted])]
 
     # Kinds are told apart outside the loops: a loop with a branch in it, once it is long, is no longer made of vector
     # instructions.
+    passed = "common" if varied else "numbers"
     source = f"""@njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
-def stage_lanes(Y, error, width, numbers, a):
-    {_cases(kinds, "numbers[{0}] != 0.0", [together(kick) for kick in kinds])}"""
+def stage_lanes(Y, error, width, {passed}, a):
+    {_cases(kinds, passed + "[{0}] != 0.0", [together(kick) for kick in kinds])}"""
     if not scheduled:
         return source
-    return f"""N_NUMBERS = {len(kinds[0].numbers)}
+    return f"""N_NUMBERS = {n_numbers}
 
 
 {source}

@@ -5,6 +5,9 @@ Source text, pasted after the tuple algebra of a symbolic system, its kicks, `lo
 cache; the compiler turns the loop over the lanes of a stage into vector instructions. Lanes never mix: one that
 overflows leaves the others as they are. `sympflow.kernels.stages` writes ``stage_lanes`` and ``stage_each``, a kick and
 a drift of all lanes.
+
+Where `N_VALUES` is not 0, trajectories have parameters of their own: so many values of each stand after its state, in
+the rows of y0 (N, 2d + `N_VALUES`) as in those of the blocks.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -20,7 +23,18 @@ VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
 
 @njit(**OPTIONS)
 def empty_lanes():
-    return aligned_zeros(2 * NDOF * MANY_LANES).reshape((2 * NDOF, MANY_LANES))
+    return aligned_zeros((2 * NDOF + N_VALUES) * MANY_LANES).reshape((2 * NDOF + N_VALUES, MANY_LANES))
+
+
+@njit(**OPTIONS)
+def take_values(table, work, Y, lane, first):
+    """Let the columns of a table from `first` on, and their coefficients, have the values of a lane."""
+    if N_VALUES > 0:
+        for j in range(first, table.shape[1]):
+            for k in range(N_VALUES):
+                table[table.shape[0] - N_VALUES + k, j] = Y[2 * NDOF + k, lane]
+            if SCHEDULED:
+                fill_coefficients(numbers_of(table, j), work[j])
 
 
 @njit(**OPTIONS)
@@ -58,6 +72,8 @@ def keep_lanes(Y, error, running, block_start, count, n_finite, n_steps):
 @njit(**OPTIONS)
 def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running):
     """`rollout` of every row of `y0` (N, 2d), `MANY_LANES` at a time; outputs as in `rollout_each`."""
+    if N_VALUES > 0:
+        table = table.copy()  # of this thread
     link = table.shape[1] - 2
     work = prepared(table)
     Y, start, error = empty_lanes(), empty_lanes(), empty_lanes()
@@ -69,6 +85,8 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running)
             q, p = unpack(y0[i])
             pack_lane(q, p, Y, lane)
             pack_lane(q, p, start, lane)
+            for k in range(2 * NDOF, 2 * NDOF + N_VALUES):
+                Y[k, lane] = y0[i, k]
             n_finite[i] = n_steps
             for row in range(len(save)):
                 if save[row] > 0:
@@ -99,8 +117,10 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running)
                 i = block_start + lane
                 if n_finite[i] < n_steps:
                     continue
+                take_values(table, work, Y, lane, link + 1)
                 q, p = close_lane(Y, error, lane, table, work)
                 if not is_finite(q, p):
+                    take_values(table, work, Y, lane, 0)
                     q, p = unpack_lane(start, lane)
                     before = first_non_finite(q, p, table, begin, block, work) - 1
                     n_finite[i] = n + before
@@ -148,7 +168,7 @@ def step_lanes(table, x, h, y, out):
 
     All numbers lie in one array: of several the compiler would have to find out that they do not overlap.
     """
-    rows = NUMBERS + N_NUMBERS
+    rows = NUMBERS + N_NUMBERS + N_VALUES
     Y = aligned_zeros(rows * LANES).reshape((rows, LANES))
     for block_start in range(0, y.shape[0], LANES):
         count = min(LANES, y.shape[0] - block_start)
@@ -158,6 +178,8 @@ def step_lanes(table, x, h, y, out):
             q, p = unpack(y[i])
             pack_lane(q, p, Y, lane)
             Y[X, lane], Y[H, lane], Y[H3, lane], Y[H5, lane] = x[i], h[i], h[i] ** 3, h[i] ** 5
+            for k in range(N_VALUES):
+                Y[NUMBERS + N_NUMBERS + k, lane] = y[i, 2 * NDOF + k]
         for j in range(table.shape[1]):
             fill_lanes(Y, width, A, table[0, j], H)
             stage_each(Y, width, table, j)
