@@ -97,7 +97,7 @@ def escape_times(
     >>> system = sympflow.systems.henon_heiles_escape()
     >>> found = escape_times(system, "kahan_li8", (0, 20), outside=10.0, dt=0.01)
     >>> round(float(found.time), 3), int(found.status)
-    (4.719, 1)
+    (4.656, 1)
     """
     orbits = checked_orbits(system, method, t_span, y0, options, "escapes are located on")
     region = region_of(outside, system)

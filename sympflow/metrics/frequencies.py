@@ -71,7 +71,7 @@ def frequencies(
 
     A line starts at the maximum of the Fourier transform of the signal, times a Hann window; there the frequency is
     refined until |⟨z, exp(iωt)⟩| is largest. The lines are made orthogonal one after another as by Gram and Schmidt,
-    and each is refined once more with the others taken off. Over a time T the error falls like T⁻⁴, where that of the
+    and each is refined again with the others taken off. Over a time T the error falls like T⁻⁴, where that of the
     Fourier transform falls like T⁻¹. The difference of the frequencies of two halves of an orbit measures its
     diffusion: on a torus it is 0 [2]_.
 
@@ -124,7 +124,7 @@ def frequencies(
     orbits = checked_orbits(system, method, t_span, y0, options, "frequencies are found on")
     check_counts(n=n)
     times = _sample_times(orbits, samples)
-    taken = _rotations if signal is None else signal
+    taken = rotations if signal is None else signal
     if not callable(taken):
         raise TypeError(f"`signal` must be a function of states (..., 2d, m); got {type(signal).__name__}.")
     rows, parts, status, message = orbits.rows, [], [], ""
@@ -174,7 +174,7 @@ def _sample_times(orbits: Orbits, samples: int | None) -> np.ndarray:
     return times
 
 
-def _rotations(y: np.ndarray) -> np.ndarray:
+def rotations(y: np.ndarray) -> np.ndarray:
     """q − ip: (..., 2d, m) to (..., d, m)."""
     d = y.shape[-2] // 2
     return y[..., :d, :] - 1j * y[..., d:, :]
@@ -234,7 +234,7 @@ def _lines_of(z: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     known = len(basis)
     if known > 1:
         a = _projected(basis, window, z)
-        for k in range(known):  # once more, each with the others taken off
+        for k in 2 * [*range(known)]:  # each with the others taken off
             others = z - np.delete(a, k) @ np.delete(basis, k, axis=0)
             angles[k] = _refined(others, window, s, angles[k])
             basis[k] = np.exp(1j * angles[k] * s)
