@@ -17,7 +17,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem, Stepper
 from sympflow.integrators.grid import Grid, no_event, open_end
 from sympflow.integrators.registry import check_applies, naming_plugin
-from sympflow.interop.matching import Comparison, fixed_step
+from sympflow.interop.matching import Comparison, check_not_driven, fixed_step
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
@@ -64,6 +64,7 @@ def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: An
         )
     integrator = fixed_step(method, options, "SciPy")
     if system is not None:
+        check_not_driven(system, "SciPy")
         check_applies(integrator, system)
     return _solver_class(integrator, system)
 
@@ -165,6 +166,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
         if not np.isfinite(self.y).all():
             raise ValueError("`y0` must be finite; it holds NaN or infinity.")
         if self._solved is not None and self._solved is not self.system:
+            check_not_driven(self._solved, "SciPy")
             check_applies(integrator, self._solved)
         self.y = self.y.astype(float)
         self._comparison = Comparison("fun", integrator, self._solved, REMEDY)

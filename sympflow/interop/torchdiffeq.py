@@ -25,7 +25,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import available, check_applies
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED
-from sympflow.interop.matching import Comparison, fixed_step
+from sympflow.interop.matching import Comparison, check_not_driven, fixed_step
 from sympflow.interop.path import AdjointPath, BeforeStep, DensePath, Path, leaves, numbers
 
 State = Tensor | tuple[Tensor, ...]
@@ -376,6 +376,7 @@ def _build(func: Any, method: Any, options: dict[str, Any] | None) -> tuple[Fixe
             "or options={'system': system}; sympflow.interop.systems converts a module."
         )
     if system is not None:
+        check_not_driven(system, "torchdiffeq")
         check_applies(integrator, system)
     return integrator, system
 

@@ -28,7 +28,7 @@ from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.registry import check_applies, naming_plugin
-from sympflow.interop.matching import Comparison, fixed_step
+from sympflow.interop.matching import Comparison, check_not_driven, fixed_step
 
 _REMEDY = "Register the system of the term: register(name, system), and solve_ivp(system, ...)."
 
@@ -65,6 +65,7 @@ def step_method(method: Any, system: HamiltonianSystem, **options: Any) -> Sympl
     if "dt" in options:
         raise TypeError("`dt` is not an option here: the step length is torchode's `dt0`, one for each sample.")
     integrator = fixed_step(method, options, "torchode")
+    check_not_driven(system, "torchode")
     check_applies(integrator, system)
     return SymplecticStep(integrator, system)
 

@@ -27,6 +27,8 @@ DOMAINS: dict[str, tuple[str, ...]] = {
 KEYS = {
     "hamiltonian": (str, "a formula in quotes, such as 'p**2/2 - cos(q)'"),
     "params": (dict, "a table of numbers, such as { omega = 2.0 }"),
+    "time": (str, "the name of the time in the formula, such as 't'"),
+    "period": (float, "a number"),
     "name": (str, "a text in quotes"),
     "y0": (list, "a list of numbers, [q…, p…]"),
     "t_span": (list, "two numbers, such as [0, 100]"),
@@ -44,8 +46,8 @@ def from_toml(path: str | os.PathLike[str], **params: float) -> HamiltonianSyste
     ----------
     path : str or path
         The keys of the file are the arguments of `HamiltonianSystem.from_sympy`: `hamiltonian`, the formula, is needed;
-        `params`, `name`, `y0`, `t_span`, `dt`, `energy_scale` and `domain` are optional. A domain has a `kind`, "Box",
-        "Ball", "EnergySublevel" or "Tube", and the arguments of that class.
+        `params`, `time`, `period`, `name`, `y0`, `t_span`, `dt`, `energy_scale` and `domain` are optional. A domain has
+        a `kind`, "Box", "Ball", "EnergySublevel" or "Tube", and the arguments of that class.
     **params
         Values of parameters of the file, instead of those in it.
 

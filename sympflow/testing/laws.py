@@ -533,6 +533,42 @@ def friction_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem) 
     )
 
 
+DRIVEN_FROM = 0.7  # where the drive is neither 0 nor at its largest
+
+
+@cache
+def _driven() -> tuple[HamiltonianSystem, np.ndarray, float]:
+    """The default system with a drive, its state T_END after `DRIVEN_FROM`, and how much that moves it."""
+    system = default_system()
+    assert system.symbols is not None
+    scene: dict[str, Any] = {"y0": system.y0, "dt": system.dt, "name": "driven"}
+    H = f"{system.symbols.H} + q1*cos(2*t)/5"
+    driven = HamiltonianSystem.from_sympy(H, time="t", **scene)
+    t0 = DRIVEN_FROM
+    end = solve(driven, "dop853", (t0, t0 + T_END), t_eval=[t0 + T_END], rtol=1e-13, atol=1e-15).y[..., 0]
+    frozen = [HamiltonianSystem.from_sympy(H.replace("2*t", repr(2 * t)), **scene) for t in (0.0, t0)]
+    others = [exact(other) for other in (system, *frozen)]
+    return driven, end, float(min(np.abs(end - other).max() for other in others))
+
+
+def the_drive_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem) -> None:
+    """A method that says `takes_driving` solves a driven system: nearer to it than to one with H held fixed."""
+    if not integrator.takes_driving:
+        raise NotApplicable("it does not say that it takes H at its times, so driven systems are refused for it")
+    driven, end, effect = _driven()
+    try:
+        integrator.check(driven)
+    except ValueError as reason:
+        raise NotApplicable(f"it does not apply to the default system with a drive ({reason})") from None
+    t1 = DRIVEN_FROM + T_END
+    sol = run(integrator, driven, (DRIVEN_FROM, t1), t_eval=[t1], backend="array")
+    error = float(np.abs(sol.y[..., 0] - end).max())
+    assert error < effect / 4, (
+        f"the end of a driven system is wrong by {error:.1e}, and that the drive moves matters by {effect:.1e}: take H "
+        "at t + c·h in every stage, as system.vector_field(y, t + c * h) does, or do not say `takes_driving`"
+    )
+
+
 def the_start_time_does_not_matter(integrator: Integrator, system: HamiltonianSystem) -> None:
     """The system is autonomous: a run from t0 = 5.25 is that from 0, and so is a step."""
     t0, times = 5.25, np.array([0.5, 1.111, T_END])
@@ -636,6 +672,7 @@ OF_CONSISTENCY: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (
     states_within_a_step_belong_to_it,
     the_start_time_does_not_matter,
     friction_is_in_the_steps,
+    the_drive_is_in_the_steps,
     every_event_is_found,
     save_every_thins_the_outputs,
     a_batch_reports_its_failures,

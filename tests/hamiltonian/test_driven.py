@@ -5,13 +5,18 @@ import pickle
 import numpy as np
 import pytest
 import torch
+import torchdiffeq
 from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline, make_interp_spline
 
 import sympflow
+import sympflow.interop.scipy
+import sympflow.interop.torchdiffeq
 from sympflow import HamiltonianSystem, solve
 from sympflow.hamiltonian.fingerprint import same_system
+from sympflow.systems.user_files import from_toml
+from sympflow.testing.checks import CHECKS
 
 W = 1.7
 PERIOD = 2 * np.pi / W
@@ -244,6 +249,7 @@ HERE = "^`system` 'driven_pendulum' is driven"
             "^`system` has a kinetic energy .* not elementary",
         ),
         (lambda: DRIVEN.linear_part, ValueError, HERE),
+        (lambda: sympflow.doubled(DRIVEN, "-p*abs(p)"), ValueError, HERE),
         (lambda: sympflow.time_transformed(DRIVEN), ValueError, HERE),
         (lambda: solve(DRIVEN, "log_kahan_li8"), ValueError, HERE),
         (lambda: solve(DRIVEN, "linear_srkn6b"), ValueError, HERE),
@@ -280,6 +286,49 @@ class FirstOrder(sympflow.integrators.base.FixedStep):
         return y + h * system.vector_field(y)
 
 
-def test_a_method_that_says_nothing_of_the_time_is_refused():
+class Pretender(FirstOrder):
+    """One that says that it takes the time, and leaves it out."""
+
+    takes_driving = True
+
+    def step(self, system, t, y, h):
+        return y + h * system.vector_field(y, 0.0)
+
+
+class RightOne(Pretender):
+    """Euler's method, with the time of its stage."""
+
+    takes_driving = True
+
+    def step(self, system, t, y, h):
+        h = sympflow.arrays.per_state(h, y)
+        return y + h * system.vector_field(y, t)
+
+
+def test_a_method_that_says_nothing_of_the_time_is_refused_and_one_that_lies_is_caught():
     with pytest.raises(ValueError, match="'forgets_t' does not take the time into account"):
         solve(DRIVEN, FirstOrder)
+    check = {check.name: check for check in CHECKS}["the_drive_is_in_the_steps"]
+    with pytest.raises(AssertionError, match="do not say `takes_driving`"):
+        check(Pretender(dt=0.001))
+    check(RightOne(dt=0.001))
+    check(sympflow.get("rk4")())
+
+
+def test_peers_solve_system_of_t_and_y_and_do_not_drive_our_steps():
+    y0 = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    peer = torchdiffeq.odeint(DRIVEN, y0, torch.tensor([1.0, 4.0]), method="dopri5", rtol=1e-10, atol=1e-10)[-1]
+    ours = solve(DRIVEN, "dop853", (1, 4), t_eval=[4], rtol=1e-10, atol=1e-10).y[:, -1]
+    np.testing.assert_allclose(peer, ours, atol=1e-8)
+    with pytest.raises(ValueError, match="SciPy does not tell our methods the time"):
+        sympflow.interop.scipy.as_scipy("rk4", DRIVEN)
+    with pytest.raises(ValueError, match="torchdiffeq does not tell our"):
+        sympflow.interop.torchdiffeq.odeint(DRIVEN, y0, torch.tensor([0.0, 1.0]), method="verlet")
+
+
+def test_a_file_may_hold_a_drive(tmp_path):
+    path = tmp_path / "driven.toml"
+    path.write_text(f'hamiltonian = "{TEXT}"\ntime = "t"\nperiod = {PERIOD!r}\nparams = {{ a = 0.3, w = 1.7 }}\n')
+    system = from_toml(path)
+    assert system.period == PERIOD
+    assert same_system(system.fingerprint, DRIVEN.fingerprint)
