@@ -48,6 +48,8 @@ _HOME = {
     "lyapunov": "metrics.chaos",
     "sali": "metrics.chaos",
     "gali": "metrics.chaos",
+    "frequencies": "metrics.frequencies",
+    "escape_times": "metrics.escapes",
     "reference_error": "metrics.accuracy",
     "time_reversal_error": "metrics.accuracy",
 }
@@ -84,6 +86,8 @@ if TYPE_CHECKING:
     from sympflow.metrics.energy import energy_growth as energy_growth
     from sympflow.metrics.energy import max_energy_error as max_energy_error
     from sympflow.metrics.energy_balance import energy_balance_error as energy_balance_error
+    from sympflow.metrics.escapes import escape_times as escape_times
+    from sympflow.metrics.frequencies import frequencies as frequencies
     from sympflow.metrics.linear_stability import linear_stability as linear_stability
     from sympflow.metrics.symplectic import conformal_defect as conformal_defect
     from sympflow.metrics.symplectic import loop_area_error as loop_area_error

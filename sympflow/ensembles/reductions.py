@@ -24,6 +24,12 @@ Fields = dict[str, tuple[tuple[int, ...], np.dtype]]
 REDUCTIONS: dict[str, str] = {
     "final": "ensembles.reductions:Final",
     "energy_error": "ensembles.reductions:EnergyError",
+    "lyapunov": "ensembles.dynamics:Lyapunov",
+    "sali": "ensembles.dynamics:Sali",
+    "gali": "ensembles.dynamics:Gali",
+    "frequencies": "ensembles.dynamics:Lines",
+    "escape": "ensembles.dynamics:Escape",
+    "crossings": "ensembles.dynamics:PlaneCrossings",
 }
 """The names that `reduce` takes: "module:Class" below sympflow, called without arguments."""
 

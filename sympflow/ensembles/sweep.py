@@ -151,7 +151,7 @@ def ensemble(
     with at_most(1):
         fields = kept.fields(problem)
     layout = Layout(axes, len(orbits), system.ndof, problem.times if kept.state == "y" else times, fields, kept.state)
-    sizes = _chunk_shape(layout, problem, chunk, store is None)
+    sizes = _chunk_shape(layout, problem, chunk, store is None, orbits.together)
     attributes = {
         "system": system.name,
         "method": name_of(integrator),
@@ -220,7 +220,7 @@ def _axes(
 # chunks --------------------------------------------------------------------------------------------------------------
 
 
-def _chunk_shape(layout: Layout, problem: Chunk, chunk: int | None, in_memory: bool) -> tuple[int, ...]:
+def _chunk_shape(layout: Layout, problem: Chunk, chunk: int | None, in_memory: bool, multiple: int) -> tuple[int, ...]:
     """The shape of a chunk; a ValueError says how large an ensemble is that does not fit."""
     size = sum(math.prod(s) for s, _ in layout.fields.values())
     total = math.prod(layout.shape)
@@ -235,7 +235,8 @@ def _chunk_shape(layout: Layout, problem: Chunk, chunk: int | None, in_memory: b
         length = problem.integrator.step_length(problem.system) or problem.system.dt
         work = max(1, int(abs(t1 - t0) / length)) * problem.system.ndof
         most = min(MOST_WORK // work, MOST_VALUES // max(size, 2 * problem.system.ndof), LONGEST_CHUNK, total // PIECES)
-        chunk = SHORTEST_CHUNK * max(1, most // SHORTEST_CHUNK)
+        multiple = multiple if most >= multiple else SHORTEST_CHUNK
+        chunk = multiple * max(1, most // multiple)
     check_counts(chunk=chunk)
     sizes = chunk_shape(layout.shape, int(chunk))
     values = math.prod(sizes) * size

@@ -278,7 +278,8 @@ class Splitting(OwnStepper):
     def takes_letters(self, problem: Problem) -> bool:
         system, composition = problem.system, self.composed(problem.system)
         asked = any(map(self.overrides, ("step", "rollout", "substep", "evaluations")))
-        if self.clock != "physical" or asked or not composition.takes_values or system.friction is not None:
+        plain = system.friction is None and system.autonomous
+        if self.clock != "physical" or asked or not composition.takes_values or not plain:
             return False
         kernel = compiled_loops(
             lambda: composition.kernel(bool(self.compensated)), problem.y0, problem.backend, self.compensated

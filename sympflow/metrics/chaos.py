@@ -129,7 +129,7 @@ def lyapunov(
     True
     """
     orbits = checked_orbits(system, method, t_span, y0, options, "deviation vectors are followed on")
-    return _indicator(orbits, 1, NONE, 0.0, t_eval, deviations, seed, backend)
+    return indicator(orbits, 1, NONE, 0.0, t_eval, deviations, seed, backend)
 
 
 def sali(
@@ -182,7 +182,7 @@ def sali(
     array([ True, False])
     """
     orbits = checked_orbits(system, method, t_span, y0, options, "deviation vectors are followed on")
-    return _indicator(orbits, 2, ALIGNMENT, _threshold(below), t_eval, deviations, seed, backend)
+    return indicator(orbits, 2, ALIGNMENT, checked_threshold(below), t_eval, deviations, seed, backend)
 
 
 def gali(
@@ -239,10 +239,11 @@ def gali(
         raise ValueError(
             f"`k` must be from 2 to {2 * system.ndof}, the dimension of the phase space of {system.name!r}; got {k}."
         )
-    return _indicator(orbits, int(k), VOLUME, _threshold(below), t_eval, deviations, seed, backend)
+    return indicator(orbits, int(k), VOLUME, checked_threshold(below), t_eval, deviations, seed, backend)
 
 
-def _threshold(below: float) -> float:
+def checked_threshold(below: float) -> float:
+    """`below` as a float; a ValueError if it is no threshold."""
     value = as_float(below)
     if not 0 <= value < 1:
         raise ValueError(f"`below` must be a number from 0, to go on to the end, up to 1; got {below!r}.")
@@ -262,16 +263,8 @@ class _Run:
     status: np.ndarray
 
 
-def _indicator(
-    orbits: Orbits,
-    vectors: int,
-    kind: int,
-    below: float,
-    t_eval: ArrayLike | None,
-    deviations: ArrayLike | None,
-    seed: int,
-    backend: str,
-) -> Indicator:
+def check_followed(orbits: Orbits) -> None:
+    """Raise a ValueError with the reason where deviation vectors of states are not known."""
     integrator, system = orbits.integrator, orbits.system
     if integrator.keeps or integrator.tangent_holds:
         what = (
@@ -288,6 +281,21 @@ def _indicator(
             f"`y0` is a batch, whose steps by method {integrator.name!r} begin at times of their own, and "
             f"{system.name!r} depends on t: pass one state at a time, or use a method of fixed steps."
         )
+
+
+def indicator(
+    orbits: Orbits,
+    vectors: int,
+    kind: int,
+    below: float,
+    t_eval: ArrayLike | None = None,
+    deviations: ArrayLike | None = None,
+    seed: int = 0,
+    backend: str = "auto",
+) -> Indicator:
+    """An indicator of checked orbits, by so many vectors and a kind of their spread; that of growth is 0."""
+    integrator, system = orbits.integrator, orbits.system
+    check_followed(orbits)
     if not isinstance(backend, str) or backend not in BACKENDS:
         raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
     t0, t1 = orbits.t_span

@@ -1,0 +1,253 @@
+"""escape_times(): when orbits leave a region of phase space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.arguments import real_number
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import FixedStep
+from sympflow.integrators.contract import FINISHED, Problem
+from sympflow.integrators.grid import Grid
+from sympflow.integrators.registry import naming_plugin
+from sympflow.metrics.orbits import Orbits, checked_orbits
+
+WINDOW = 256  # steps between which orbits that have left are put aside
+MOST_VALUES = 1 << 21  # numbers of states that are held at a time
+HALVINGS = 48
+
+Outside = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Escapes:
+    """When and where orbits left a region.
+
+    Attributes
+    ----------
+    time : float or ndarray of shape (...)
+        The time of the escape; inf of an orbit that stayed, NaN of one that failed.
+    state : ndarray of shape (..., 2d)
+        The state then; NaN of an orbit that did not escape.
+    status : int or ndarray of shape (...)
+        1 where the orbit escaped, 0 where it stayed to the end, −1 where it ceased to be finite before it was seen
+        outside.
+    message : str
+    """
+
+    time: Any
+    state: np.ndarray = field(repr=False)
+    status: Any
+    message: str
+
+    @property
+    def success(self) -> bool:
+        """True if no orbit failed."""
+        return bool(np.all(np.asarray(self.status) >= 0))
+
+
+def escape_times(
+    system: HamiltonianSystem,
+    method: Any = "sympflow",
+    t_span: tuple[float, float] | None = None,
+    y0: ArrayLike | None = None,
+    *,
+    outside: Any = None,
+    backend: str = "auto",
+    **options: Any,
+) -> Escapes:
+    """The times at which orbits leave a region of phase space.
+
+    The states after the steps are looked at; between the last one inside and the first one outside the time is found
+    by halving, on shorter steps. An orbit that is outside only between two steps is not seen. The run streams, and
+    ends for orbits that have left.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    method : str, Integrator or trained flow
+        Of fixed steps.
+    t_span, y0
+        As for `solve`; y0 may be a batch of shape (..., 2d).
+    outside : float, domain or callable, optional
+        A radius, outside of which |q| is larger; a domain such as `sympflow.Box`, outside of which a state does not lie
+        in it; or a function of states (..., 2d) that returns booleans (...). The default is the system's domain.
+    backend : "auto", "compiled" or "array"
+        As for `solve`.
+    **options
+        Options of the method, such as `dt`.
+
+    Returns
+    -------
+    Escapes
+
+    Raises
+    ------
+    ValueError, TypeError
+        For bad arguments, at once.
+
+    Examples
+    --------
+    >>> import sympflow
+    >>> system = sympflow.systems.henon_heiles_escape()
+    >>> found = escape_times(system, "kahan_li8", (0, 20), outside=10.0, dt=0.01)
+    >>> round(float(found.time), 3), int(found.status)
+    (4.656, 1)
+    """
+    orbits = checked_orbits(system, method, t_span, y0, options, "escapes are located on")
+    region = region_of(outside, system)
+    rows = orbits.rows
+    _inside(region, rows[:1])
+    found = escapes(orbits, region, backend)
+    time, state, status = found
+    message = FINISHED
+    if (status < 0).any():
+        message = (
+            f"{int((status < 0).sum())} of {len(rows)} orbits ceased to be finite before they were seen outside, the "
+            f"first of them of index {int(np.argmax(status < 0))}: reduce `dt`."
+        )
+    batch = orbits.batch
+    return Escapes(time.reshape(batch)[()], state.reshape((*batch, -1)), status.reshape(batch)[()], message)
+
+
+def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
+    """The function of states that `outside` means.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If it is none.
+    """
+    if outside is None:
+        if system.domain is None:
+            raise ValueError(
+                f"`outside` is needed, as {system.name!r} has no domain: pass a radius, a domain or a function."
+            )
+        outside = system.domain
+    if real_number(outside):
+        if not 0 < outside < np.inf:
+            raise ValueError(f"`outside` must be a positive radius; got {outside!r}.")
+        return _Beyond(float(outside), system.ndof)
+    contains = getattr(outside, "contains", None)
+    if contains is not None:
+        return _NotIn(contains)
+    if not callable(outside):
+        raise TypeError(
+            f"`outside` must be a radius, a domain, or a function of states (..., 2d); got {type(outside).__name__}."
+        )
+    return outside
+
+
+@dataclass(frozen=True)
+class _Beyond:
+    """|q| > radius."""
+
+    radius: float
+    ndof: int
+
+    def __call__(self, y: np.ndarray) -> np.ndarray:
+        return np.square(y[..., : self.ndof]).sum(-1) > self.radius**2
+
+
+@dataclass(frozen=True)
+class _NotIn:
+    """Not in a domain."""
+
+    contains: Callable[[np.ndarray], np.ndarray]
+
+    def __call__(self, y: np.ndarray) -> np.ndarray:
+        return ~self.contains(y)
+
+
+def _inside(region: Outside, y: np.ndarray) -> np.ndarray:
+    with np.errstate(all="ignore"):
+        out = np.asarray(region(y))
+    if out.shape != y.shape[:-1] or out.dtype != bool:
+        raise ValueError(
+            f"`outside` must return booleans of shape {y.shape[:-1]} for states of shape {y.shape}; got {out.dtype} of "
+            f"shape {out.shape}."
+        )
+    return ~out
+
+
+def escapes(orbits: Orbits, region: Outside, backend: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The times (N,), states (N, 2d) and statuses (N,), some rows after others.
+
+    Raises
+    ------
+    ValueError
+        If the method has no fixed steps.
+    """
+    integrator = orbits.integrator
+    if not (isinstance(integrator, FixedStep) and integrator.on_grid):
+        raise ValueError(
+            f"`method` {integrator.name!r} has no fixed steps of the states, after which escapes are looked for: use "
+            "a splitting method such as 'kahan_li8', or 'gauss_legendre6'."
+        )
+    rows = orbits.rows
+    most = max(1, MOST_VALUES // (WINDOW * rows.shape[1]))
+    with naming_plugin(integrator):
+        parts = [_escapes(integrator, orbits, rows[i : i + most], region, backend) for i in range(0, len(rows), most)]
+    time, state, status = (np.concatenate(found) for found in zip(*parts, strict=True))
+    return time, state, status
+
+
+def _escapes(
+    integrator: FixedStep, orbits: Orbits, rows: np.ndarray, region: Outside, backend: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    system, (t0, t1) = orbits.system, orbits.t_span
+    grid = Grid(t0, t1, integrator.step_length(system))
+    time, state = np.full(len(rows), np.inf), np.full(rows.shape, np.nan)
+    status = np.zeros(len(rows), dtype=np.int64)
+    began = ~_inside(region, rows)
+    time[began], state[began], status[began] = t0, rows[began], 1
+    where = np.flatnonzero(~began)
+    y, k = rows[where], 0
+    total = grid.n_steps + bool(grid.remainder)
+    while k < total and where.size:
+        n = min(WINDOW, grid.n_steps - k)
+        stepper = integrator.stepper(Problem(system, grid.time(k), t1, y, backend=backend))
+        with np.errstate(all="ignore"):
+            if n:
+                h = grid.h
+                states, _ = stepper.rollout(y, h, n, np.arange(n + 1), grid.time(k))
+            else:
+                n, h = 1, grid.remainder
+                states = np.stack([y, integrator.step(system, grid.time(k), y, h)])
+        finite = np.isfinite(states).all(-1)
+        left = ~finite
+        left[finite] = ~_inside(region, states[finite])
+        gone = left.any(0)
+        first = np.argmax(left, axis=0)
+        lanes = np.flatnonzero(gone)
+        before = states[first[lanes] - 1, lanes]
+        escaped = finite[first[lanes], lanes]
+        status[where[lanes]] = np.where(escaped, 1, -1)
+        time[where[lanes]] = np.nan
+        found = where[lanes[escaped]]
+        begin = grid.t0 + (k + first[lanes[escaped]] - 1) * grid.h
+        groups = [slice(None)] if system.autonomous else [slice(i, i + 1) for i in range(len(found))]
+        for i in groups:  # together, or each at its own time
+            if len(found[i]):
+                part, state[found[i]] = _located(integrator, system, begin[i][0], before[escaped][i], h, region)
+                time[found[i]] = begin[i] + part
+        y, where = states[-1, ~gone], where[~gone]
+        k += n
+    return time, state, status
+
+
+def _located(
+    integrator: FixedStep, system: HamiltonianSystem, t: float, y: np.ndarray, h: float, region: Outside
+) -> tuple[np.ndarray, np.ndarray]:
+    """The parts (n,) of steps from y (n, 2d) after which states are outside, and these states."""
+    inside, out = np.zeros(len(y)), np.ones(len(y))
+    for _ in range(HALVINGS):
+        middle = (inside + out) / 2
+        kept = _inside(region, integrator.step(system, t, y, middle * h))
+        inside, out = np.where(kept, middle, inside), np.where(kept, out, middle)
+    return out * h, np.asarray(integrator.step(system, t, y, out * h))
