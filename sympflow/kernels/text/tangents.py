@@ -26,12 +26,14 @@ LOG_2 = 0.6931471805599453
 def advance_tile(Y, error, width, table, first, n_steps):
     """Steps of all lanes, the first of them begun with column `first` of the table."""
     link = table.shape[1] - 2
-    numbers, a = numbers_of(table, first), drift_of(table, first)
-    for _ in range(n_steps):
-        stage_lanes(Y, error, width, numbers, a)
-        for j in range(1, link):
-            stage_lanes(Y, error, width, numbers_of(table, j), drift_of(table, j))
-        numbers, a = numbers_of(table, link), drift_of(table, link)
+    j = first
+    for _ in range(n_steps * link // 2):  # two at a time: what is loaded and stored takes as long as half of a stage
+        k = j + 1 if j < link else 1
+        numbers, after = numbers_of(table, j), numbers_of(table, k)
+        two_stages_lanes(Y, error, width, numbers, drift_of(table, j), after, drift_of(table, k))
+        j = k + 1 if k < link else 1
+    if n_steps * link % 2:
+        stage_lanes(Y, error, width, numbers_of(table, j), drift_of(table, j))
 
 
 @njit(**OPTIONS)
