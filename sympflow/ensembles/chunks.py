@@ -10,9 +10,10 @@ from functools import cached_property
 import numpy as np
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep
+from sympflow.integrators.base import FixedStep, KernelStepper, Stepper
 from sympflow.integrators.contract import Failure, Integrator, Problem
 from sympflow.integrators.grid import Grid
+from sympflow.kernels.protocol import Carry
 from sympflow.solver import solve
 
 BLOCK = 64
@@ -94,10 +95,14 @@ class Chunk:
     @cached_property
     def compiled(self) -> bool:
         """True if the steps run in compiled loops, in which no orbit depends on its neighbours."""
+        return self._stepper is not None and self._stepper.compiled
+
+    @cached_property
+    def _stepper(self) -> Stepper | None:
+        """A run with fixed steps; None with a method that chooses them."""
         if not isinstance(self.integrator, FixedStep):
-            return False
-        t0, t1 = self.t_span
-        return self.integrator.stepper(Problem(self.system, t0, t1, self.y0[:1], backend=self.backend)).compiled
+            return None
+        return self.integrator.stepper(Problem(self.system, *self.t_span, self.y0[:1], backend=self.backend))
 
     @cached_property
     def times(self) -> np.ndarray:
@@ -123,7 +128,25 @@ class Chunk:
 
         States of an orbit from where it failed are NaN.
         """
-        yield self.times, self.states(self.times)
+        times = self.times
+        stepper = self._stepper
+        most = max(1, MOST_VALUES // self.y0.size)
+        alike = self.t_eval is None and not self.params and self.system.autonomous
+        if len(times) <= most or not alike or not isinstance(stepper, KernelStepper) or len(self) == 1:
+            yield times, self.states(times)
+            return
+        grid = Grid(*self.t_span, stepper.integrator.step_length(self.system))
+        carry, last = Carry(), np.full(len(self), grid.n_steps)
+        for start in range(0, grid.n_steps + 1, most):
+            save = np.arange(start, min(start + most, grid.n_steps + 1))
+            y, last, _ = stepper.kernel.run_batch(grid.h, self.y0, int(save[-1]), save, carry=carry)
+            ran_out = np.flatnonzero((last < save[-1]) & (self.status == 0))
+            for row in ran_out.tolist():
+                self.fail(row, self._reason(grid.time(int(last[row])), ""))
+            yield times[save], y.swapaxes(1, 2)
+        if grid.remainder:
+            with np.errstate(all="ignore"):
+                yield times[-1:], stepper.shorter(y[:, -1], np.full(len(self), grid.remainder))[..., None]
 
     def orbits(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Of each orbit its row, the times (m,), and its states (2d, m), NaN from where it failed."""

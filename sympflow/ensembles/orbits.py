@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,6 +22,9 @@ class Given:
     """Initial states (N, 2d) that were given."""
 
     y0: np.ndarray
+
+    together: ClassVar[int] = 1
+    """States of which a chunk should be a multiple."""
 
     def __len__(self) -> int:
         return len(self.y0)
@@ -43,6 +46,12 @@ class Drawn:
     seed: int
     width: int
     start: int = 0
+    _last: dict[int, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
+
+    together: ClassVar[int] = DRAWN
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_last": {}}
 
     def __len__(self) -> int:
         return self.n
@@ -56,6 +65,15 @@ class Drawn:
         return out
 
     def _block(self, block: int) -> np.ndarray:
+        """The states of a block; the last one that was drawn is kept, for small chunks share it."""
+        states = self._last.get(block)
+        if states is None:
+            states = self._drawn(block)
+            self._last.clear()
+            self._last[block] = states
+        return states
+
+    def _drawn(self, block: int) -> np.ndarray:
         seeds = np.random.SeedSequence([self.seed, block])
         if isinstance(self.sampler, Domain):
             return self.sampler.sample(DRAWN, int(seeds.generate_state(1)[0]))
@@ -71,7 +89,7 @@ class Drawn:
 
     def sent(self, start: int, stop: int) -> Drawn:
         """What a worker needs for the states start … stop: the sampler, and where to begin."""
-        return Drawn(self.sampler, stop - start, self.seed, self.width, self.start + start)
+        return Drawn(self.sampler, stop - start, self.seed, self.width, self.start + start, self._last)
 
 
 def initial_states(system: HamiltonianSystem, y0: Any, n: Any, seed: Any) -> Given | Drawn:

@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import naming_path, writable
+from sympflow.hamiltonian.system import parameters_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from sympflow.hamiltonian.system import HamiltonianSystem, parameters_text
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
 _GREEK = {"omega": "ω", "mu": "μ", "epsilon": "ε", "alpha": "α", "beta": "β"}
 _NAMES = {"henon_heiles": "Hénon–Heiles"}

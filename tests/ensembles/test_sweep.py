@@ -7,7 +7,7 @@ import pytest
 
 import sympflow
 from sympflow import workers
-from sympflow.ensembles import reductions, sweep
+from sympflow.ensembles import chunks, reductions, sweep
 
 SYSTEM = sympflow.systems.henon_heiles()
 STATES = SYSTEM.domain.sample(200, 1)
@@ -168,3 +168,23 @@ def test_progress():
     told = []
     kept(reduce="final", chunk=50, progress=lambda done, total: told.append((done, total)))
     assert told == [(0, 200), (50, 200), (100, 200), (150, 200), (200, 200)]
+
+
+@pytest.mark.parametrize("method", ["verlet", "implicit_midpoint"])
+def test_windows_are_pieces_of_the_run(method, monkeypatch):
+    states = STATES[:10].copy()
+    states[3] = 60.0
+
+    def chunk():
+        return chunks.Chunk(SYSTEM, sympflow.get(method)(dt=DT), (0, 5.03), None, states)
+
+    whole = chunk()
+    expected = whole.states(whole.times)
+    monkeypatch.setattr(chunks, "MOST_VALUES", 20 * states.size)
+    cut = chunk()
+    windows = list(cut.windows())
+    assert [len(t) for t, _ in windows] == [20, 20, 11, 1]
+    assert np.array_equal(np.concatenate([t for t, _ in windows]), whole.times)
+    assert np.array_equal(np.concatenate([y for _, y in windows], axis=-1), expected, equal_nan=True)
+    assert cut.messages == whole.messages
+    assert cut.status.tolist() == whole.status.tolist()

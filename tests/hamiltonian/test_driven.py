@@ -15,6 +15,7 @@ import sympflow.interop.scipy
 import sympflow.interop.torchdiffeq
 from sympflow import HamiltonianSystem, solve
 from sympflow.hamiltonian.fingerprint import same_system
+from sympflow.studies.reports import described, title
 from sympflow.systems.user_files import from_toml
 from sympflow.testing.checks import CHECKS
 
@@ -275,6 +276,15 @@ def test_a_gradient_that_is_right_at_its_first_time_alone_is_found():
     )
     with pytest.raises(ValueError, match=r"^`gradient` is not that of `potential`: at t = 1\.327, q = "):
         solve(wrong, "rk45", (0, 1))
+
+
+def test_reports_name_a_drive_and_its_samples():
+    report = sympflow.compare(DRIVEN, ["rk45"], ["error"], t_span=(0, 2), repeats=1)
+    assert report.rows[0].status == "ok"
+    assert report.to_dict()["system"]["params"] == {"a": 0.3, "w": W}
+    sampled = made("p**2/2 - a*cos(q)", params=SAMPLED, t_span=(0, 9))
+    assert "81 samples" in title(sampled)
+    assert "samples" in described(sampled)["params"]["a"]
 
 
 class FirstOrder(sympflow.integrators.base.FixedStep):
