@@ -127,7 +127,7 @@ def ours(system: HamiltonianSystem, exact: np.ndarray, t_end: float) -> list[tup
             n = round(n)
             return kernel.run(t_end / n, system.y0, n, np.array([n])).states[-1]
 
-        n = cheapest(lambda n: float(np.abs(end(n) - exact).max()), PERIODS * 4.0, 1.1)  # noqa: B023
+        n = cheapest(lambda n: float(np.abs(end(n) - exact).max()), PERIODS * 4.0, 1.1)
         if n is not None:
             found.append((f"{name}, {n / PERIODS:.0f} steps a period", partial(end, n)))
     return found
