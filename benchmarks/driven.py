@@ -69,7 +69,8 @@ def least(calls: Sequence[Callable[[], Any]], rounds: int) -> list[float]:
 
 def cost(rounds: int) -> list[tuple[str, ...]]:
     """A step of the driven pendulum against one of the pendulum plus the cosines of its kicks."""
-    header = "import math\n\nimport numpy as np\nfrom numba import njit\n\nOPTIONS = {'error_model': 'numpy', 'fastmath': {'contract'}}"
+    options = {"error_model": "numpy", "fastmath": {"contract"}}
+    header = f"import math\n\nimport numpy as np\nfrom numba import njit\n\nOPTIONS = {options}"
     cosines = load_module("\n\n\n".join([header, template("elementary"), COSINES])).cosines
     rows: list[tuple[str, ...]] = [("method", "pendulum, ns a step", "cosines", "driven pendulum", "ratio")]
     n, h, save = 200_000, 0.05, np.array([200_000])
