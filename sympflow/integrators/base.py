@@ -414,7 +414,7 @@ def shorter_steps(stepper: Stepper, grid: Grid, y: Array, count: np.ndarray, rem
         lengths = np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy()
     if not stepper.system.autonomous:
         start = grid.t0 + count[extra] * grid.h
-        t = np.broadcast_to(start.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1])
+        t = np.broadcast_to(start.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy()
     if not is_tensor(y):
         with np.errstate(all="ignore"):
             y[rows] = checked_state(stepper.shorter_from(t, states, lengths.astype(y.dtype)), states)
@@ -570,7 +570,7 @@ class GridRun:
         lengths = h * np.arange(1, parts) / parts * np.ones((len(states), 1))
         if parts == 1 or not len(states):
             return states[:, None][:, :0]
-        t = np.broadcast_to((self.grid.t0 + (k + np.arange(len(states))) * self.grid.h)[:, None], lengths.shape)
+        t = (self.grid.t0 + (k + np.arange(len(states))) * self.grid.h)[:, None] * np.ones_like(lengths)
         if is_tensor(states):
             import torch
 
