@@ -201,7 +201,7 @@ class Store:
             chunk = np.full(known.chunks, np.nan if known.dtype.kind == "f" else 0, dtype=known.dtype)
             chunk[tuple(map(slice, values.shape))] = values
         with _told(self.path):
-            _replace(self._file(name, index), zlib.compress(memoryview(chunk), 0))
+            _replace(self._file(name, index), zlib.compress(chunk.data, 0))
 
     def read(self, name: str, index: tuple[int, ...] | None = None) -> np.ndarray:
         """Return a chunk, or the whole array; NaN, or 0 of other numbers, where nothing has been written.
