@@ -39,6 +39,7 @@ _HOME = {
     "max_energy_error": "metrics.energy",
     "energy_drift": "metrics.energy",
     "energy_growth": "metrics.energy",
+    "energy_balance_error": "metrics.energy_balance",
     "volume_error": "metrics.symplectic",
     "symplecticity_defect": "metrics.symplectic",
     "conformal_defect": "metrics.symplectic",
@@ -86,6 +87,7 @@ if TYPE_CHECKING:
     from sympflow.metrics.energy import max_energy_error as max_energy_error
     from sympflow.metrics.escapes import escape_times as escape_times
     from sympflow.metrics.frequencies import frequencies as frequencies
+    from sympflow.metrics.energy_balance import energy_balance_error as energy_balance_error
     from sympflow.metrics.linear_stability import linear_stability as linear_stability
     from sympflow.metrics.symplectic import conformal_defect as conformal_defect
     from sympflow.metrics.symplectic import loop_area_error as loop_area_error

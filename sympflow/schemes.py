@@ -174,6 +174,15 @@ class Scheme:
         return tuple(merged)
 
     @cached_property
+    def substep_times(self) -> tuple[float, ...]:
+        """When each of the substeps begins, in steps: time moves with the drifts."""
+        times, t = [], 0.0
+        for substep in self.substeps:
+            times.append(t)
+            t += substep.one if substep.kind == "drift" else 0.0
+        return tuple(times)
+
+    @cached_property
     def symmetric(self) -> bool:
         """True if the step is its own adjoint, Φ(−h) = Φ(h)⁻¹ (the coefficients read the same backwards)."""
         forwards, backwards = self.substeps, self.substeps[::-1]

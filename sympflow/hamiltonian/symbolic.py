@@ -119,6 +119,13 @@ class SymbolicHamiltonian(Definition):
         self.V, self.T = _split(self.H, self.q, self.p)
         self.separable = self.V is not None
 
+    def like(self, H: sp.Expr) -> SymbolicHamiltonian:
+        """Another H in the same coordinates and time, and with the same samples."""
+        form = SymbolicHamiltonian.__new__(SymbolicHamiltonian)
+        form.ndof, form.q, form.p, form.time, form.samples = self.ndof, self.q, self.p, self.time, self.samples
+        form._set(H)
+        return form
+
     @cached_property
     def parametric(self) -> SymbolicHamiltonian:
         """H with symbols for what depends on parameters alone: one for all values that leave its structure as it is.
@@ -126,18 +133,18 @@ class SymbolicHamiltonian(Definition):
         What is 0, 1 or −1 stays a number, and so do exponents. H itself, where nothing is left to replace, or where
         symbols would change what is separable or quadratic.
         """
-        if self._written is None or self.timed:
+        if self._written is None:
             return self
-        letters = _Letters(self._written[1])
+        written, values = self._written
+        samples = {s: value for s, value in values.items() if isinstance(value, sampled)}
+        letters = _Letters({s: value for s, value in values.items() if s not in samples})
         try:
-            H = letters.put_into(self._written[0])
+            H = letters.put_into(written.xreplace(samples))
         except (TypeError, OverflowError):  # a value that is no real number
             return self
-        form = SymbolicHamiltonian.__new__(SymbolicHamiltonian)
-        form.ndof, form.q, form.p = self.ndof, self.q, self.p
         states = {*self.q, *self.p}
-        form._set(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
-        used = form.H.free_symbols - states
+        form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
+        used = form.H.free_symbols - states - {self.time}
         kept = [(part, *letter) for part, letter in letters.found.items() if letter[0] in used]
         form.meanings, form.parameters, form.values = (tuple(row[i] for row in kept) for i in range(3))
         alike = (

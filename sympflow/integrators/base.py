@@ -88,7 +88,7 @@ class FixedStep(Integrator):
         """
         return {"force_evaluations": 0, "hessian_evaluations": 0}
 
-    def checked_step(self, system: HamiltonianSystem, t: float, y: Array, h: Any) -> Array:
+    def checked_step(self, system: HamiltonianSystem, t: Any, y: Array, h: Any) -> Array:
         """`step`, whose failure on tensors is told from one on arrays."""
         try:
             return self.step(system, t, y, h)
@@ -110,9 +110,9 @@ class FixedStep(Integrator):
         )
         return states, finite, "torch" if is_tensor(problem.y0) else "numpy"
 
-    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
-        """`step` on the backend of the run that it belongs to."""
-        return self.checked_step(system, 0.0, y, h)
+    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str, t: Any = 0.0) -> Array:
+        """`step` on the backend of the run that it belongs to; t, a number or one for each state, of driven systems."""
+        return self.checked_step(system, t, y, h)
 
     def run(self, problem: Problem) -> Outcome:
         return GridRun(self, problem).outcome()
@@ -158,11 +158,11 @@ class OwnStepper(FixedStep):
         states, finite = stepper.rollout(problem.y0, h, n_steps, save, problem.t0)
         return states, finite, stepper.backend
 
-    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str) -> Array:
+    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str, t: Any = 0.0) -> Array:
         if self.overrides("step"):
-            return super().substep(system, y, h, backend)
+            return super().substep(system, y, h, backend, t)
         asked = "auto" if backend == "compiled" else "array"
-        return self.own_stepper(Problem(system, 0.0, 0.0, y, backend=asked)).shorter(y, h)
+        return self.own_stepper(Problem(system, 0.0, 0.0, y, backend=asked)).shorter_from(t, y, h)
 
 
 @cache
@@ -221,9 +221,18 @@ class Stepper:
         states, finite, self.backend = self.integrator.rollout(piece, h, n_steps, save)
         return states, finite
 
-    def shorter(self, y: Array, h: Any) -> Array:
-        """Return the states a step of length h, a number or one for each state, after y (..., 2d)."""
-        return self.integrator.substep(self.problem.system, y, h, self.backend)
+    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        """Return the states a step of length h, a number or one for each state, after y (..., 2d).
+
+        `t` is the time of y, a number or one for each state, which the functions of a driven system take.
+        """
+        system = self.problem.system
+        times = () if system.autonomous else (t,)
+        return self.integrator.substep(system, y, h, self.backend, *times)
+
+    def shorter_from(self, t: Any, y: Array, h: Any) -> Array:
+        """`shorter`, by one of a class that may not know the time, which is then not needed."""
+        return self.shorter(y, h) if self.system.autonomous else self.shorter(y, h, t)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         """Evaluations of the force and its derivatives so far, if it made so many steps, saves and shorter steps."""
@@ -263,21 +272,23 @@ class KernelStepper(Stepper):
         self.iterations = 0
 
     def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
+        start: dict[str, Any] = {} if self.system.autonomous else {"t0": t0}
         if y0.ndim == 1:
-            states, last, iterations = self.kernel.run(h, y0, n_steps, save)
+            states, last, iterations = self.kernel.run(h, y0, n_steps, save, **start)
             self.iterations += iterations
             return states, np.asarray(last)
         rows = y0.reshape(-1, y0.shape[-1])
-        states, finite, iterations = self.kernel.run_batch(h, rows, n_steps, save)
+        states, finite, iterations = self.kernel.run_batch(h, rows, n_steps, save, **start)
         self.iterations += iterations
         return states.swapaxes(0, 1).reshape(len(save), *y0.shape), np.asarray(finite).reshape(y0.shape[:-1])
 
-    def shorter(self, y: Array, h: Any) -> Array:
+    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        start = () if self.system.autonomous else (np.broadcast_to(t, y.shape[:-1]).reshape(-1),)
         if y.ndim == 2 and np.shape(h) == (len(y),):
-            states, iterations = self.kernel.step(h, y)
+            states, iterations = self.kernel.step(h, y, *start)
         else:
             rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
-            states, iterations = self.kernel.step(np.broadcast_to(h, y.shape[:-1]).reshape(-1), rows)
+            states, iterations = self.kernel.step(np.broadcast_to(h, y.shape[:-1]).reshape(-1), rows, *start)
         self.iterations += iterations
         return states.reshape(y.shape)
 
@@ -388,21 +399,30 @@ def _gradients_are_on() -> bool:
     return torch.is_grad_enabled()
 
 
-def shorter_steps(stepper: Stepper, y: Array, extra: np.ndarray, h: np.ndarray) -> Array:
-    """Replace the states y[extra] by those a step h later."""
+def shorter_steps(stepper: Stepper, grid: Grid, y: Array, count: np.ndarray, remainder: np.ndarray) -> Array:
+    """Replace the states y, those at grid points `count`, by those a step later where the remainder h is not 0."""
+    extra = remainder.nonzero()[0]
+    if not extra.size:
+        return y
+    h = remainder[extra]
     first, last = int(extra[0]), int(extra[-1])
     together = last - first == len(extra) - 1  # nearly always, and a slice is copied ten times sooner
     rows: Any = slice(first, last + 1) if together and not is_tensor(y) else extra
     states = y[rows]
-    lengths = h if y.ndim == 2 else np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy()
+    lengths, t = h, np.zeros(())
+    if y.ndim != 2:
+        lengths = np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy()
+    if not stepper.system.autonomous:
+        start = grid.t0 + count[extra] * grid.h
+        t = np.broadcast_to(start.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1])
     if not is_tensor(y):
         with np.errstate(all="ignore"):
-            y[rows] = checked_state(stepper.shorter(states, lengths.astype(y.dtype)), states)
+            y[rows] = checked_state(stepper.shorter_from(t, states, lengths.astype(y.dtype)), states)
         return y
     import torch
 
     h_extra = torch.as_tensor(lengths, dtype=y.dtype, device=y.device)
-    advanced = checked_state(stepper.shorter(states, h_extra), states)
+    advanced = checked_state(stepper.shorter_from(t, states, h_extra), states)
     return y.index_copy(0, torch.as_tensor(extra, device=y.device), advanced)
 
 
@@ -431,7 +451,7 @@ class GridRun:
         y = saved if place is None else saved[place]
         extra = remainder.nonzero()[0]
         if extra.size:
-            y = shorter_steps(stepper, y, extra, remainder[extra])
+            y = shorter_steps(stepper, grid, y, save if place is None else save[place], remainder)
         n_steps = min(last, int(finite.max() if finite.ndim else finite) + 1)
         end = len(save) if n_steps == last else int(save.searchsorted(n_steps, "right"))
         n_saved = end - int(save.searchsorted(0, "right") if end and save[0] <= 0 else 0)
@@ -495,10 +515,8 @@ class GridRun:
             # outputs before the end of this chunk; a state at its end belongs to the next, unless there is none
             due = delivered + int(np.searchsorted(count[delivered:], k + good, "right" if last else "left"))
             chosen = slice(delivered, due)
-            y_due, extra = states[count[chosen] - k], np.flatnonzero(remainder[chosen])
-            if extra.size:
-                y_due = shorter_steps(stepper, y_due, extra, remainder[chosen][extra])
-            outputs.append(y_due)
+            y_due = states[count[chosen] - k]
+            outputs.append(shorter_steps(stepper, grid, y_due, count[chosen], remainder[chosen]))
             delivered = due
             if problem.dense_output:
                 kept.append(states[: good + 1] if last or ended else states[:good])
@@ -531,33 +549,37 @@ class GridRun:
     def _search(self, search: EventSearch, k: int, states: Array) -> tuple[int, bool]:
         """Search the steps between `states`, which begin at grid point k: the number searched; does the run end?"""
         grid, stepper = self.grid, self.stepper
-        inner = self._samples(search, states[:-1], grid.h)
+        inner = self._samples(search, k, states[:-1], grid.h)
         for j in range(len(states) - 1):
             t, y = grid.time(k + j), states[j]
 
             def dense(s: float, t: float = t, y: Array = y) -> Array:
-                return stepper.shorter(y, s - t)
+                return stepper.shorter_from(t, y, s - t)
 
             if search.step(t, y, grid.time(k + j + 1), states[j + 1], dense, inner[j]):
                 return j + 1, True
         return len(states) - 1, False
 
-    def _samples(self, search: EventSearch, states: Array, h: float) -> Array:
-        """States (n, parts − 1, 2d) that divide the steps of length h from `states` (n, 2d), all computed at once."""
+    def _samples(self, search: EventSearch, k: int, states: Array, h: float) -> Array:
+        """States (n, parts − 1, 2d) that divide steps of length h, all computed at once.
+
+        They are those from `states` (n, 2d), the first of which is at grid point k.
+        """
         parts = search.parts(h, self.problem.system.dt)
         search.n_dense += len(states) * (parts - 1)
         lengths = h * np.arange(1, parts) / parts * np.ones((len(states), 1))
         if parts == 1 or not len(states):
             return states[:, None][:, :0]
+        t = np.broadcast_to((self.grid.t0 + (k + np.arange(len(states))) * self.grid.h)[:, None], lengths.shape)
         if is_tensor(states):
             import torch
 
             with torch.no_grad():
                 repeated = states[:, None].expand(-1, parts - 1, -1)
-                return self.stepper.shorter(repeated, torch.as_tensor(lengths).to(repeated))
+                return self.stepper.shorter_from(t, repeated, torch.as_tensor(lengths).to(repeated))
         with np.errstate(all="ignore"):
             repeated = np.repeat(states[:, None], parts - 1, axis=1)
-            return self.stepper.shorter(repeated, lengths.astype(states.dtype))
+            return self.stepper.shorter_from(t, repeated, lengths.astype(states.dtype))
 
     def _search_remainder(self, search: EventSearch, y: Array) -> bool:
         """Search the last, shorter step of an interval that dt does not divide."""
@@ -565,13 +587,13 @@ class GridRun:
         t = grid.time(grid.n_steps)
 
         def dense(s: float) -> Array:
-            return self.stepper.shorter(y, s - t)
+            return self.stepper.shorter_from(t, y, s - t)
 
         y_end = dense(grid.t1)
         search.n_dense += 1
         if not finite_states(y_end):
             return False
-        inner = self._samples(search, y[None], grid.remainder)
+        inner = self._samples(search, grid.n_steps, y[None], grid.remainder)
         return bool(search.step(t, y, grid.t1, y_end, dense, inner[0]))
 
     # failures -----------------------------------------------------------------------------------------------------
@@ -665,10 +687,7 @@ class GridSolution:
         check_not_followed("t", t)
         times = np.atleast_1d(np.asarray(t, dtype=float))
         count, remainder = self.grid.locate(times)
-        y = self.states[count]
-        extra = np.flatnonzero(remainder)
-        if extra.size:
-            y = shorter_steps(self.stepper, y, extra, remainder[extra])
+        y = shorter_steps(self.stepper, self.grid, self.states[count], count, remainder)
         y = y.movedim(0, -1) if is_tensor(y) else np.moveaxis(y, 0, -1)
         return y[..., 0] if np.ndim(t) == 0 else y
 

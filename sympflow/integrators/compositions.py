@@ -19,6 +19,7 @@ from sympflow.hamiltonian.copies import both, coupling_strength, distance, mean,
 from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, like, linear_and_rest, map_evaluations
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.base import rollout
 from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, scheme_evaluations
 
@@ -57,6 +58,8 @@ class Composition(ABC):
     """True if compiled loops may take the values of parameters as numbers, other ones for each trajectory."""
     takes_friction: ClassVar[bool] = False
     """True if one of the parts holds the friction of a damped system."""
+    takes_driving: ClassVar[bool] = False
+    """True if the time moves with one of the parts, of a system that depends on it."""
 
     def __init__(
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
@@ -66,6 +69,10 @@ class Composition(ABC):
     def check_friction(self, dt: float) -> None:
         """Raise a ValueError where the friction of the system asks for shorter steps than dt."""
         raise ValueError(f"`method` {self.method!r} does not take friction: use the splitting 'kinetic'.")
+
+    def check_driving(self) -> None:
+        """Raise a ValueError where the parts of a driven system have no exact flows."""
+        raise ValueError(f"`method` {self.method!r} does not take a driven system: use the splitting 'kinetic'.")
 
     def lift(self, y: Array) -> Array:
         """The states on which steps are made, of states y (..., 2d); y itself where the phase space is not extended."""
@@ -80,20 +87,23 @@ class Composition(ABC):
         return 0 * x[..., 0]
 
     @abstractmethod
-    def step(self, y: Array, h: Any) -> Array:
-        """One step of length h, a number or one for each state, from y (..., 2d)."""
+    def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        """One step of length h, a number or one for each state, from y (..., 2d).
+
+        `t` is the time at its beginning, of a driven system: a number or one for each state.
+        """
 
     @abstractmethod
-    def inverse(self, y: Array, h: Any) -> Array:
-        """The states from which `step` leads to y."""
+    def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        """The states from which `step`, with the same h and t, leads to y."""
 
-    def tangent(self, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray] | None:
+    def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
         """The step and its Jacobian (..., 2d, 2d); None where `step` itself is to be differentiated."""
         return None
 
-    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray]:
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
         """Many steps by array operations, as `base.rollout`."""
-        return rollout(lambda k, y: self.step(y, h), y0, n_steps, save)
+        return rollout(lambda k, y: self.step(y, h, t0 + k * h), y0, n_steps, save)
 
     @abstractmethod
     def kernel(self, compensated: bool) -> Kernel:
@@ -115,11 +125,16 @@ class KineticPotential(Composition):
     that are polynomials in p, kicks have the degree −1, and of drifts the friction lowers the degree: brackets of kicks
     and drifts that vanish without friction by their degree vanish with it, those of Nyström and force-gradient schemes
     among them, and brackets of degree −1, such as force gradients, are the same. So every scheme keeps its order.
+
+    Where H depends on t, the drift is the flow of T(p, t) + E, with which the time moves, E its momentum, and a kick is
+    at a time that stands still, force gradients too. A drift raises the degree by at most 1 if E counts 2, a kick
+    lowers it by 1 as before, and so every scheme keeps its order once more.
     """
 
     compensates: ClassVar[bool] = True
     takes_values: ClassVar[bool] = True
     takes_friction: ClassVar[bool] = True
+    takes_driving: ClassVar[bool] = True
 
     def __init__(
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
@@ -155,49 +170,64 @@ class KineticPotential(Composition):
                 "'chin4c'."
             )
 
-    def step(self, y: Array, h: Any) -> Array:
+    def check_driving(self) -> None:
+        if self.system.kinetic_timed:
+            self.system.drift(np.zeros(self.system.ndof), 0.0, 0.0)
+
+    def _times(self, t: Any, h: Any) -> list[Any]:
+        """The time at which each substep begins; that of a system that does not depend on it is left out."""
+        if self.system.autonomous:
+            return [None] * len(self.scheme.substeps)
+        return [stage_time(t, c, h) for c in self.scheme.substep_times]
+
+    def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         system = self.system
         q, p = y[..., : system.ndof], y[..., system.ndof :]
-        h = per_state(h, y)
-        for substep in self.scheme.substeps:
+        times, h = self._times(t, h), per_state(h, y)
+        for substep, at in zip(self.scheme.substeps, times, strict=True):
             if substep.kind == "drift":
-                q, p = _drift(system, q, p, substep.one * h)
+                q, p = _drift(system, q, p, substep.one * h, at)
             else:
-                p = p + _kick(system, q, substep, h, self.scheme.monomials)
+                p = p + _kick(system, q, substep, h, self.scheme.monomials, at)
         return concatenate([q, p])
 
-    def inverse(self, y: Array, h: Any) -> Array:
+    def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         system = self.system
         q, p = y[..., : system.ndof], y[..., system.ndof :]
-        h = per_state(h, y)
-        for substep in reversed(self.scheme.substeps):
-            if substep.kind == "drift":
+        times, h = self._times(t, h), per_state(h, y)
+        for substep, at in zip(reversed(self.scheme.substeps), reversed(times), strict=True):
+            if substep.kind == "kick":
+                p = p - _kick(system, q, substep, h, self.scheme.monomials, at)
+            elif system.friction is None:
+                q, p = _drift(system, q, p, substep.one * h, at, -1.0)
+            else:
                 q, p = _drift(system, q, p, -(substep.one * h))
-            else:
-                p = p - _kick(system, q, substep, h, self.scheme.monomials)
         return concatenate([q, p])
 
-    def tangent(self, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray] | None:
+    def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
         if self.scheme.level:  # would need third derivatives of V: differentiate the step itself
             return None
         system, d = self.system, self.system.ndof
         y = to_numpy(y)
+        times = self._times(t, np.broadcast_to(h, y.shape[:-1]))
         q, p, h = y[..., :d], y[..., d:], np.asarray(h, dtype=y.dtype)[..., None]
         if not system.has_hessian_vector:
-            system.potential_hessian(q)  # which says so, before anything large is made
+            system.potential_hessian(q, t)  # which says so, before anything large is made
         A = np.broadcast_to(np.eye(2 * d, dtype=y.dtype), (*y.shape, 2 * d)).copy()
-        for kind, c, *_ in self.scheme.substeps:
+        for (kind, c, *_), at in zip(self.scheme.substeps, times, strict=True):
             if kind == "drift":
-                if system.friction is None:
-                    A[..., :d, :] += c * h[..., None] * (system.kinetic_hessian(p) @ A[..., d:, :])
-                else:
+                if system.friction is not None:
                     mean, end = system.friction.drift(A[..., d:, :].swapaxes(-1, -2), c * h[..., None])
                     A[..., :d, :] += system.kinetic_hessian(p) @ mean.swapaxes(-1, -2)
                     A[..., d:, :] = end.swapaxes(-1, -2)
-                q, p = _drift(system, q, p, c * h)
+                elif system.kinetic_timed:
+                    A[..., :d, :] += system.drift_jacobian(p, at, c * h[..., 0]) @ A[..., d:, :]
+                else:
+                    A[..., :d, :] += c * h[..., None] * (system.kinetic_hessian(p) @ A[..., d:, :])
+                q, p = _drift(system, q, p, c * h, at)
             else:
-                A[..., d:, :] -= c * h[..., None] * (system.potential_hessian(q) @ A[..., :d, :])
-                p = p + c * h * system.force(q)
+                A[..., d:, :] -= c * h[..., None] * (system.potential_hessian(q, at) @ A[..., :d, :])
+                p = p + c * h * system.force(q, at)
         return np.concatenate([q, p], axis=-1), A
 
     def kernel(self, compensated: bool) -> Kernel:
@@ -218,22 +248,26 @@ def _splitting_loops() -> Callable[[HamiltonianSystem], SplittingLoops]:
     return splitting_loops
 
 
-def _drift(system: HamiltonianSystem, q: Array, p: Array, s: Any) -> tuple[Array, Array]:
-    """The states after a drift over s, of which friction is a part."""
-    if system.friction is None:
-        return q + s * system.velocity(p), p
-    mean, end = system.friction.drift(p, s)
-    return q + system.velocity(mean), end
+def _drift(
+    system: HamiltonianSystem, q: Array, p: Array, s: Any, t: Any = None, sign: float = 1.0
+) -> tuple[Array, Array]:
+    """The states after a drift over s from the time t on, of which friction is a part; `sign` −1 undoes one without."""
+    if system.friction is not None:
+        mean, end = system.friction.drift(p, s)
+        return q + system.velocity(mean), end
+    if system.kinetic_timed:
+        return q + sign * system.drift(p, t, s[..., 0] if getattr(s, "ndim", 0) else s), p
+    return q + (sign * s) * system.velocity(p), p
 
 
-def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials: Monomials) -> Array:
+def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials: Monomials, t: Any = None) -> Array:
     """The change of p by a kick, where the scheme has it the force gradient, the curvature or the polynomial too."""
-    force = system.force(q)
+    force = system.force(q, t)
     change = (kick.one * h) * force
     if kick.three:
-        change = change - (kick.three * h**3) * system.hessian_vector(q, system.velocity(force))
+        change = change - (kick.three * h**3) * system.hessian_vector(q, system.velocity(force), t)
     if kick.five:
-        change = change - (kick.five * h**5) * system.curvature_gradient(q)
+        change = change - (kick.five * h**5) * system.curvature_gradient(q, t)
     if kick.polynomial:
         change = change - h**3 * gradient(monomials, kick.polynomial, q)
     return change
@@ -260,16 +294,16 @@ class ExactMaps(Composition):
     def maps(self, h: Any) -> list[Map]:
         """The maps of a step of length h, a number or an array (...)."""
 
-    def step(self, y: Array, h: Any) -> Array:
+    def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         parts = self.parts
         return parts.from_modes(*parts.apply(self.maps(h), *parts.to_modes(y)))
 
-    def inverse(self, y: Array, h: Any) -> Array:
+    def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         parts = self.parts
         back = [m.inverse() for m in reversed(self.maps(h))]
         return parts.from_modes(*parts.apply(back, *parts.to_modes(y)))
 
-    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray]:
+    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
         return rollout_in_modes(self.parts, self.maps(h), y0, n_steps, save)
 
     def kernel(self, compensated: bool) -> Kernel:

@@ -212,7 +212,7 @@ class FlowStepper(Stepper):
         start = int(np.count_nonzero(save == 0))  # `save` is sorted
         return torch.cat([y0.expand(start, *y0.shape), states[start:]]), finite
 
-    def shorter(self, y: Array, h: Any) -> Array:
+    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         return _apply(self.flow, y, h)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
@@ -226,9 +226,9 @@ class CompiledFlowStepper(KernelStepper):
         super().__init__(integrator, problem, kernel)
         self.flow = flow
 
-    def shorter(self, y: Array, h: Any) -> Array:
+    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         self.flow.warn_of_times(h)
-        return super().shorter(y, h)
+        return super().shorter(y, h, t)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         counted = self.kernel.evaluations(n_steps, n_saved, n_extra)

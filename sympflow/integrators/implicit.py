@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, concatenate, is_tensor, library, per_state, to_numpy, values
+from sympflow.arrays import Array, concatenate, is_tensor, library, per_state, stack, to_numpy, values
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.base import KernelStepper, OwnStepper, Problem, Stepper, compiled_loops, rollout
 from sympflow.integrators.contract import Failure
 
@@ -68,27 +69,43 @@ class Gauss(OwnStepper):
         check_flag("compensated", self.compensated)
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        return self.counted_step(system, y, h)[0]
+        return self.counted_step(system, t, y, h)[0]
 
-    def counted_step(self, system: HamiltonianSystem, y: Array, h: float | Array) -> tuple[Array, int]:
+    def counted_step(self, system: HamiltonianSystem, t: Any, y: Array, h: float | Array) -> tuple[Array, int]:
         """The step, and the iterations that it took, in sum over the states."""
-        K, iterations = self._stages(system, y, per_state(h, y))
+        K, iterations = self._stages(system, y, per_state(h, y), self.stage_times(system, t, y, h))
         return self._advanced(y, K), iterations
 
+    def stage_times(self, system: HamiltonianSystem, t: Any, y: Array, h: Any) -> Any:
+        """The times t + c_i h of the stages, (..., s), of a driven system; None of another."""
+        if system.autonomous:
+            return None
+        nodes, batch = stage_nodes(self.tableau), y.shape[:-1]
+        times = [stage_time(t, c, h) for c in nodes]
+        if is_tensor(y):
+            import torch
+
+            times = [torch.as_tensor(s, dtype=torch.float64, device=y.device).expand(batch) for s in times]
+        return stack(times if is_tensor(y) else [np.broadcast_to(s, batch) for s in times], axis=-1)
+
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        return self.step(system, t, y, -h)  # the methods are symmetric
+        return self.step(system, stage_time(t, 1.0, h), y, -h)  # the methods are symmetric
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         """The step and its Jacobian, by differentiating the equations that the K of the step solve."""
         y = to_numpy(y)
-        h = np.asarray(h, dtype=y.dtype)[..., None]
-        K, _ = self._stages(system, y, h)
+        times, h = self.stage_times(system, t, y, h), np.asarray(h, dtype=y.dtype)[..., None]
+        K, _ = self._stages(system, y, h, times)
         A, b, scale = (np.array(c, dtype=y.dtype) for c in self.tableau)
-        M, D = _newton_matrix(system, y[..., None, :] + A @ K, h, A, scale)
+        M, D = _newton_matrix(system, y[..., None, :] + A @ K, h, times, A, scale)
         s, n = K.shape[-2:]
         slopes = (h[..., None, None] * scale[:, None, None] * D).reshape(*y.shape[:-1], s * n, n)
         dK = _solved(M, slopes).reshape(*y.shape[:-1], s, n, n)
         return self._advanced(y, K), np.eye(n, dtype=y.dtype) + np.einsum("i,...ijk->...jk", b, dK)
+
+    @property
+    def takes_driving(self) -> bool:
+        return True
 
     def own_stepper(self, problem: Problem) -> CompiledGauss | ArrayGauss:
         from sympflow.kernels.implicit_loops import implicit_kernel
@@ -104,10 +121,10 @@ class Gauss(OwnStepper):
     def _advanced(self, y: Array, K: Array) -> Array:
         return y + sum(b * K[..., i, :] for i, b in enumerate(self.tableau[1]))
 
-    def _stages(self, system: HamiltonianSystem, y: Array, h: Any) -> tuple[Array, int]:
+    def _stages(self, system: HamiltonianSystem, y: Array, h: Any, times: Any) -> tuple[Array, int]:
         """The K (..., s, 2d) of a step, NaN where the step was not solved; and the iterations, over all states."""
         if is_tensor(y):
-            return self._tensor_stages(system, y, h)
+            return self._tensor_stages(system, y, h, times)
         A, _, scale = (np.array(c, dtype=y.dtype) for c in self.tableau)
         eps = float(np.finfo(y.dtype).eps)
         K = np.zeros((*y.shape[:-1], len(A), y.shape[-1]), dtype=y.dtype)
@@ -117,7 +134,7 @@ class Gauss(OwnStepper):
         with np.errstate(all="ignore"):
             while not done.all() and iteration < MOST_ITERATIONS:
                 iteration += 1
-                M, residual = _equations(system, y, K, h, A, scale)
+                M, residual = _equations(system, y, K, h, times, A, scale)
                 change = _solved(M, residual[..., None])[..., 0].reshape(K.shape)
                 K = np.where(done[..., None, None], K, K - change)
                 size = _relative_size(change, y, K, system.ndof)
@@ -128,7 +145,7 @@ class Gauss(OwnStepper):
         K[~done] = np.nan
         return K, iteration * done.size
 
-    def _tensor_stages(self, system: HamiltonianSystem, y: Array, h: Any) -> tuple[Array, int]:
+    def _tensor_stages(self, system: HamiltonianSystem, y: Array, h: Any, times: Any) -> tuple[Array, int]:
         """`_stages` of tensors: solved without a graph, then three more iterations in it, which give it derivatives.
 
         They are Newton's with the matrix of the solution held fixed: each makes derivatives of one more order right.
@@ -138,15 +155,15 @@ class Gauss(OwnStepper):
         A, _, scale = (torch.as_tensor(c, dtype=y.dtype, device=y.device) for c in self.tableau)
         with torch.no_grad():
             start, length = y.detach(), h.detach() if is_tensor(h) else h
-            K, iterations = _solved_tensors(system, start, length, A, scale)
-            M, _ = _newton_matrix(system, start[..., None, :] + A @ K, length, A, scale)
+            K, iterations = _solved_tensors(system, start, length, times, A, scale)
+            M, _ = _newton_matrix(system, start[..., None, :] + A @ K, length, times, A, scale)
             inverse = torch.linalg.inv_ex(M)[0]
         for _ in range(DIFFERENTIATED):
-            K = K - (inverse @ _residual(system, y, K, h, A, scale)[..., None])[..., 0].reshape(K.shape)
+            K = K - (inverse @ _residual(system, y, K, h, times, A, scale)[..., None])[..., 0].reshape(K.shape)
         return K, iterations
 
 
-def _solved_tensors(system: HamiltonianSystem, y: Any, h: Any, A: Any, scale: Any) -> tuple[Any, int]:
+def _solved_tensors(system: HamiltonianSystem, y: Any, h: Any, times: Any, A: Any, scale: Any) -> tuple[Any, int]:
     """The K of `Gauss._stages` for tensors, by the same iteration, and its count over all states.
 
     Under `torch.func.vmap` it runs until the last lane has converged; where a graph is traced, which cannot depend on
@@ -159,7 +176,7 @@ def _solved_tensors(system: HamiltonianSystem, y: Any, h: Any, A: Any, scale: An
     before = y[..., 0] * 0 + torch.inf
     done = before < 0
     for iteration in range(1, MOST_ITERATIONS + 1):
-        M, residual = _equations(system, y, K, h, A, scale)
+        M, residual = _equations(system, y, K, h, times, A, scale)
         change = torch.linalg.solve_ex(M, residual[..., None])[0][..., 0].reshape(K.shape)
         K = torch.where(done[..., None, None], K, K - change)
         size = _relative_size(change, y, K, system.ndof)
@@ -204,31 +221,41 @@ class ArrayGauss(_Counts, Stepper):
         self.gauss, self.iterations = gauss, 0
 
     def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
-        return rollout(lambda k, y: self.shorter(y, h), y0, n_steps, save)
+        return rollout(lambda k, y: self.shorter(y, h, t0 + k * h), y0, n_steps, save)
 
-    def shorter(self, y: Array, h: Any) -> Array:
-        y_next, iterations = self.gauss.counted_step(self.system, y, h)
+    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        y_next, iterations = self.gauss.counted_step(self.system, t, y, h)
         self.iterations += iterations
         return y_next
 
 
-def _equations(system: HamiltonianSystem, y: Array, K: Array, h: Any, A: Array, scale: Array) -> tuple[Array, Array]:
+def stage_nodes(tableau: Tableau) -> tuple[float, ...]:
+    """The nodes c_i of the stages, in steps."""
+    A, _, scale = tableau
+    return tuple(float(np.dot(row, scale)) for row in A)
+
+
+def _equations(
+    system: HamiltonianSystem, y: Array, K: Array, h: Any, times: Any, A: Array, scale: Array
+) -> tuple[Array, Array]:
     """Newton's matrix (..., s·2d, s·2d) and the residuals of `_residual`."""
-    M, _ = _newton_matrix(system, y[..., None, :] + A @ K, h, A, scale)
-    return M, _residual(system, y, K, h, A, scale)
+    M, _ = _newton_matrix(system, y[..., None, :] + A @ K, h, times, A, scale)
+    return M, _residual(system, y, K, h, times, A, scale)
 
 
-def _residual(system: HamiltonianSystem, y: Array, K: Array, h: Any, A: Array, scale: Array) -> Array:
+def _residual(system: HamiltonianSystem, y: Array, K: Array, h: Any, times: Any, A: Array, scale: Array) -> Array:
     """K_i − h scale_i f(Y_i), (..., s·2d)."""
     outer = h[..., None] if getattr(h, "ndim", 0) else h
-    residual = K - outer * scale[:, None] * system.vector_field(y[..., None, :] + A @ K)
+    residual = K - outer * scale[:, None] * system.vector_field(y[..., None, :] + A @ K, times)
     return residual.reshape(*residual.shape[:-2], -1)
 
 
-def _newton_matrix(system: HamiltonianSystem, Y: Array, h: Any, A: Array, scale: Array) -> tuple[Array, Array]:
+def _newton_matrix(
+    system: HamiltonianSystem, Y: Array, h: Any, times: Any, A: Array, scale: Array
+) -> tuple[Array, Array]:
     """M = I − h (scale_i A_ij f'(Y_i)), (..., s·2d, s·2d), and f'(Y), (..., s, 2d, 2d)."""
     d, (s, n) = system.ndof, Y.shape[-2:]
-    S = system.hessian(Y)
+    S = system.hessian(Y, times)
     D = concatenate([S[..., d:, :].swapaxes(-1, -2), -S[..., :d, :].swapaxes(-1, -2)]).swapaxes(-1, -2)
     outer = h[..., None, None, None] if getattr(h, "ndim", 0) else h
     blocks = outer * (scale[:, None] * A)[:, None, :, None] * D[..., :, :, None, :]

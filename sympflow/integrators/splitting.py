@@ -271,6 +271,10 @@ class Splitting(OwnStepper):
     def takes_friction(self) -> bool:
         return SPLITTINGS[self.splitting].takes_friction and self.clock == "physical"
 
+    @property
+    def takes_driving(self) -> bool:
+        return SPLITTINGS[self.splitting].takes_driving and self.clock == "physical"
+
     def takes_letters(self, problem: Problem) -> bool:
         system, composition = problem.system, self.composed(problem.system)
         asked = any(map(self.overrides, ("step", "rollout", "substep", "evaluations")))
@@ -287,6 +291,8 @@ class Splitting(OwnStepper):
             self.on_clock(system)
             return
         composition = self.composed(system)
+        if not system.autonomous:
+            composition.check_driving()
         if system.friction is not None:
             composition.check_friction(self.step_length(system))
             if self.compensated:
@@ -299,15 +305,19 @@ class Splitting(OwnStepper):
         if clock is not None:
             return clock.step(y, h)
         composition = self.composed(system)
-        return composition.project(composition.step(composition.lift(y), h))
+        return composition.project(composition.step(composition.lift(y), h, t))
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         if self.keeps:
             raise TypeError(f"`method` {self.name!r} keeps {self.keeps}, without which a step cannot be undone.")
-        return (self.on_clock(system) or self.composed(system)).inverse(y, h)
+        clock = self.on_clock(system)
+        return self.composed(system).inverse(y, h, t) if clock is None else clock.inverse(y, h)
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
-        known = None if self.keeps else (self.on_clock(system) or self.composed(system)).tangent(y, h)
+        clock = self.on_clock(system)
+        if clock is not None:
+            return clock.tangent(y, h)
+        known = None if self.keeps else self.composed(system).tangent(y, h, t)
         return super().tangent(system, t, y, h) if known is None else known
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
@@ -372,10 +382,10 @@ class ArrayComposition(Stepper):
         self.composition = composition
 
     def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
-        return self.composition.rollout(y0, h, n_steps, save)
+        return self.composition.rollout(y0, h, n_steps, save, t0)
 
-    def shorter(self, y: Array, h: Any) -> Array:
-        return self.composition.step(y, h)
+    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        return self.composition.step(y, h, t)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         return self.composition.evaluations(n_steps, n_saved, n_extra, self.backend)

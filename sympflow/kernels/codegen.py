@@ -9,6 +9,7 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympy.printing.pycode import PythonCodePrinter
 
+from sympflow.hamiltonian.driving import sampled
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
 from sympflow.kernels.variations import Variations
@@ -22,6 +23,7 @@ __all__ = [
     "polynomial_kick_source",
     "polynomial_slope_source",
     "printed",
+    "sampled_name",
     "statements",
     "tuple_algebra",
     "variations_source",
@@ -54,6 +56,9 @@ class _KernelPrinter(PythonCodePrinter):
     def _print_tanh(self, expr: sp.tanh) -> str:
         return f"fast_tanh({self._print(expr.args[0])})"
 
+    def _print_sampled(self, expr: sampled) -> str:
+        return f"{sampled_name(expr.name_of_samples, expr.order)}({self._print(expr.at)})"
+
     def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
         base, exponent = expr.as_base_exp()
         if exponent.is_negative is True and exponent.is_number:
@@ -66,6 +71,11 @@ class _KernelPrinter(PythonCodePrinter):
             whole = int(exponent.p) // 2
             return f"({_product(factor, whole)}*{root})" if whole else root
         return f"{factor}**{self.parenthesize(exponent, 100)}"
+
+
+def sampled_name(name: str, order: int) -> str:
+    """The compiled function of samples of that name, or of a derivative of it; −1 is the antiderivative."""
+    return f"sampled_{name}_{order}".replace("-", "m")
 
 
 _PRINTER = _KernelPrinter({"fully_qualified_modules": True, "human": True})

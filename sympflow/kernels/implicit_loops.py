@@ -67,9 +67,17 @@ class ImplicitKernel(Kernel):
         self.ndof, self._tableau, self._compensated = system.ndof, tableau, compensated
         self._algebra = gradient_and_hessian_source(system.symbols)
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
+    def run(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        carry: Carry | None = None,
+        t0: float = 0.0,
+    ) -> Run:
         """`n_steps` steps of length `h` from one state: see `Kernel`."""
-        Y, n_finite, iterations = self._rollout(h, y0[None], n_steps, save, None, carry)
+        Y, n_finite, iterations = self._rollout(h, t0, y0[None], n_steps, save, None, carry)
         return Run(Y[0], n_finite[0], iterations)
 
     def run_batch(
@@ -80,12 +88,20 @@ class ImplicitKernel(Kernel):
         save: np.ndarray,
         threads: int | None = None,
         carry: Carry | None = None,
+        t0: float = 0.0,
     ) -> Run:
         """`run` for every row of `y0` (N, 2d), where it pays on several threads."""
-        return self._rollout(h, y0, n_steps, save, threads, carry)
+        return self._rollout(h, t0, y0, n_steps, save, threads, carry)
 
     def _rollout(
-        self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, threads: int | None, carry: Carry | None
+        self,
+        h: float,
+        t0: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        threads: int | None,
+        carry: Carry | None,
     ) -> Run:
         loops = _load(self._algebra, self._tableau, self._compensated)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
@@ -95,7 +111,7 @@ class ImplicitKernel(Kernel):
         first, running = opened(carry, len(y0), 2 * self.ndof * (1 + self._compensated))
 
         def rows(i: slice, stop: np.ndarray) -> None:
-            loops.rollout_each(h, y0[i], n_steps, save, out[i], n_finite[i], iterations[i], stop, first, running[i])
+            loops.rollout_each(h, t0, y0[i], n_steps, save, out[i], n_finite[i], iterations[i], stop, first, running[i])
 
         size = 2 * self.ndof * len(self._tableau[1])
         run_rows(rows, len(y0), (n_steps - first) * 4 * size**3, threads)
@@ -103,41 +119,45 @@ class ImplicitKernel(Kernel):
             carry.advance(n_steps, running)
         return Run(out, n_finite, int(iterations.sum()))
 
-    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
-        """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
+        """One step from each row of `y` (N, 2d), each of its own length `h` (N,): see `Kernel`."""
         y = np.ascontiguousarray(y, dtype=np.float64)
-        h = np.ascontiguousarray(np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1]))
+        h, t = (np.ascontiguousarray(np.broadcast_to(np.asarray(x, dtype=np.float64), y.shape[:1])) for x in (h, t))
         out, iterations = np.empty_like(y), np.empty(len(y), dtype=np.int64)
-        _load(self._algebra, self._tableau, False).step_each(h, y, out, iterations)
+        _load(self._algebra, self._tableau, False).step_each(h, t, y, out, iterations)
         return Steps(out, int(iterations.sum()))
 
 
 @lru_cache(maxsize=256)
 def _load(algebra: str, tableau: Tableau, compensated: bool) -> ModuleType:
     A, B, scale = tableau
-    return load_algebra(algebra, ["newton"], COMPENSATED=compensated, STAGES=len(B), A=A, B=B, SCALE=scale)
+    C = tuple(float(np.dot(row, scale)) for row in A)
+    return load_algebra(algebra, ["newton"], COMPENSATED=compensated, STAGES=len(B), A=A, B=B, C=C, SCALE=scale)
 
 
 def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:
-    """``gradient_and_hessian(y, g, S)``: ∇H into g and ∇²H into S, as statements; zeros of S are not written.
+    """``gradient_and_hessian(y, g, S, t)``: ∇H into g and ∇²H into S, as statements; zeros of S are not written.
 
     Raises
     ------
     ValueError
         If a function in H has no counterpart in compiled code.
     """
-    variables = symbols.q + symbols.p
+    variables, H, before = symbols.q + symbols.p, symbols.H, f"NDOF = {symbols.ndof}\n\n\n"
+    if symbols.time is not None:
+        from sympflow.kernels.stage_times import in_code, sampled_sources
+
+        before = "\n\n\n".join([*sampled_sources([H], symbols.samples), before])
+        H = in_code(H, symbols.time, "t")
     if is_large(symbols):
-        return f"NDOF = {symbols.ndof}\n\n\n" + terms.gradient_and_hessian_source(
-            symbols.H, variables, "gradient_and_hessian"
-        )
-    slopes = [sp.diff(symbols.H, s) for s in variables]
+        return before + terms.gradient_and_hessian_source(H, variables, "gradient_and_hessian", time="t")
+    slopes = [sp.diff(H, s) for s in variables]
     triangle = [(i, j) for i in range(len(variables)) for j in range(i, len(variables))]
     entries = {ij: sp.diff(slopes[ij[0]], variables[ij[1]]) for ij in triangle}
     entries = {ij: entry for ij, entry in entries.items() if entry != 0}
     targets = [f"g[{i}]" for i in range(len(variables))]
     targets += [f"S[{i}, {j}] = S[{j}, {i}]" if i != j else f"S[{i}, {i}]" for i, j in entries]
-    lines = [f"NDOF = {symbols.ndof}\n\n", "@njit(**OPTIONS)", "def gradient_and_hessian(y, g, S):"]
+    lines = [f"{before}@njit(**OPTIONS)", "def gradient_and_hessian(y, g, S, t):"]
     lines += [f"    {s.name} = y[{i}]" for i, s in enumerate(variables)]
     lines += [f"    {statement}" for statement in statements(targets, [*slopes, *entries.values()])]
     return "\n".join(lines) + "\n"

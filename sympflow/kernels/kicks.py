@@ -63,7 +63,7 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials 
     ValueError
         If a function in H has no counterpart in compiled code.
     """
-    key = symbols.H, level, monomials, vectors
+    key = symbols.H, symbols.parameters, level, monomials, vectors
     if key not in _SOURCES:
         if len(_SOURCES) >= MOST_KEPT:
             del _SOURCES[next(iter(_SOURCES))]
@@ -92,7 +92,7 @@ def kick_cycles(symbols: SymbolicHamiltonian, level: int) -> float:
     return min(_scheduled(symbols, shape, "kick_", common).cycles for common in (True, False))
 
 
-_SOURCES: dict[tuple[sp.Expr, int, Monomials, int], str] = {}
+_SOURCES: dict[tuple[sp.Expr, tuple[sp.Symbol, ...], int, Monomials, int], str] = {}
 """Sources by H: systems are often made again, and the search takes a tenth of a second or more."""
 
 

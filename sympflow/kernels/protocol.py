@@ -74,6 +74,9 @@ class Steps(NamedTuple):
 class Kernel(Protocol):
     """Compiled loops of a method on one system; states are [q, p], float64.
 
+    For a driven system, and for no other, `run` and `run_batch` are given ``t0=``, the time of the states `y0`, and
+    `step` has a third argument t (N,), the times of its states.
+
     Attributes
     ----------
     saves_finite : bool

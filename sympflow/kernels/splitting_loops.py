@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, opened
 from sympflow.kernels.stages import (
     DampedDrift,
     StageTable,
+    TimeAlone,
     kicks_of,
     lanes_source,
     run_table,
@@ -30,6 +31,7 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    from sympflow.kernels.stage_times import Driving
 
 __all__ = [
     "SplittingKernel",
@@ -74,12 +76,15 @@ class SplittingLoops:
     ----------
     values : tuple of float
         Of what depends on parameters of H alone: arguments of the loops, so that systems which differ in them share
-        these. With friction, and in kicks with force gradients, the values are part of the code.
+        these. With friction, and in kicks with force gradients, the values are part of the code, unless H depends on t.
+    driven : bool
+        True if H depends on t.
     """
 
     def __init__(self, system: HamiltonianSystem) -> None:
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
+        self.driven = not system.autonomous
         if not system.separable:
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
         if system.symbols is not None:
@@ -89,6 +94,12 @@ class SplittingLoops:
             self._has_force_gradient = system.quadratic_kinetic
             if is_large(system.symbols):
                 self._compile = partial(_family_loops, system, damped_drift(system, True))
+            elif self.driven:
+                from sympflow.kernels.stage_times import driven_form
+
+                driving = driven_form(system.symbols.parametric)
+                self.values = driving.form.values
+                self._compile = partial(_driven_loops, driving, damped_drift(system, False))
             else:
                 damped = damped_drift(system, False)
                 self.values = () if damped else system.symbols.parametric.values
@@ -97,7 +108,9 @@ class SplittingLoops:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
             damped = damped_drift(system, True)
-            self._compile = partial(_array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, damped)
+            self._compile = partial(
+                _array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, self.driven, damped
+            )
         else:
             raise ValueError(
                 "`system` cannot be compiled: it is given by plain functions. Define it with "
@@ -123,7 +136,7 @@ class SplittingLoops:
 
     def takes_values(self, level: int) -> bool:
         """True if the values of the system's parameters are numbers of the kicks of a level, not of their code."""
-        return bool(self.values) and takes_values(level)
+        return bool(self.values) and not self.driven and takes_values(level)
 
     def functions(
         self, level: int, compensated: bool, monomials: Monomials = (), varied: bool = False
@@ -149,13 +162,18 @@ class SplittingLoops:
             self._variants[variant] = self._compile(level, compensated, monomials, **more)
         return self._variants[variant]
 
-    def rows(self, table: StageTable) -> np.ndarray:
+    def rows(self, table: StageTable, h: float = 1.0, t0: float = 0.0) -> np.ndarray:
         """What the loops read of a table; where they take the values of the system's parameters, with these.
 
-        With friction the maps of the drifts follow, of numbers for one h.
+        With friction the maps of the drifts are among them, of numbers for one h. Those of a driven system read the
+        time too, that of a step h that begins at t0.
         """
         if self.friction is not None:
-            return _with_friction(table, self.friction)
+            table = _with_friction(table, self.friction)
+        if self.driven:
+            return table.timed_rows(self.values, h, t0)
+        if self.friction is not None:
+            return table.packed
         return table.rows(self.values if takes_values(table.level) else ())
 
     def step_rows(
@@ -165,6 +183,7 @@ class SplittingLoops:
         h: np.ndarray,
         y: np.ndarray,
         monomials: Monomials = (),
+        t: ArrayLike = 0.0,
         varied: bool = False,
     ) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
@@ -179,13 +198,16 @@ class SplittingLoops:
         y : ndarray of shape (N, 2d)
         monomials
             Of the polynomials, where kicks have them.
+        t : float or ndarray of shape (N,)
+            When the steps of a driven system begin.
         varied : bool
             True if the values of its parameters follow each state in its row.
         """
         y = np.ascontiguousarray(y, dtype=np.float64)
         out = np.empty((len(y), 2 * self.ndof))
         x, h = np.ascontiguousarray(x), np.ascontiguousarray(h)
-        self.functions(table.level, False, monomials, varied).step_rows(self.rows(table), x, h, y, out)
+        t = np.ascontiguousarray(np.broadcast_to(np.asarray(t, dtype=np.float64), h.shape)) if self.driven else h
+        self.functions(table.level, False, monomials, varied).step_rows(self.rows(table), x, h, t, y, out)
         return out
 
 
@@ -198,14 +220,22 @@ class SplittingKernel(Kernel):
         self.loops, self.scheme, self.compensated = loops, scheme, compensated
         self._width = 2 * loops.ndof * (1 + compensated)
 
-    def table(self, h: float) -> np.ndarray:
-        """The numbers of a run whose steps are h, as the loops read them."""
-        return self.loops.rows(run_table(self.scheme, h))
+    def table(self, h: float, t0: float = 0.0) -> np.ndarray:
+        """The numbers of a run whose steps are h, as the loops read them; of a driven system from a time t0 on."""
+        return self.loops.rows(run_table(self.scheme, h), h, t0)
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
+    def run(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        carry: Carry | None = None,
+        t0: float = 0.0,
+    ) -> Run:
         """`n_steps` steps of length `h` from one state: see `Kernel`."""
         functions = self._functions()
-        table = self.table(h)
+        table = self.table(h, t0)
         y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(save), 2 * self.loops.ndof))
         first, running = opened(carry, self._width)
@@ -225,10 +255,11 @@ class SplittingKernel(Kernel):
         save: np.ndarray,
         threads: int | None = None,
         carry: Carry | None = None,
+        t0: float = 0.0,
     ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         functions = self._functions()
-        table = self.table(h)
+        table = self.table(h, t0)
         y0, save = self._rows(y0), np.ascontiguousarray(save, dtype=np.int64)
         out = np.empty((len(y0), len(save), 2 * self.loops.ndof))
         n_finite = np.empty(len(y0), dtype=np.int64)
@@ -242,11 +273,11 @@ class SplittingKernel(Kernel):
             carry.advance(n_steps, running)
         return Run(out, n_finite)
 
-    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
-        """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
+        """One step from each row of `y` (N, 2d), each of its own length `h` (N,): see `Kernel`."""
         h = np.asarray(h, dtype=np.float64)
         h = h.repeat(len(y)) if h.ndim == 0 else h
-        return Steps(self.loops.step_rows(step_table(self.scheme), h, h, y, self.scheme.monomials))
+        return Steps(self.loops.step_rows(step_table(self.scheme), h, h, y, self.scheme.monomials, t))
 
     def varied(self, values: np.ndarray) -> VariedKernel:
         """The loops of batches whose trajectories have these values (k, N) of `SplittingLoops.values`."""
@@ -272,10 +303,18 @@ class VariedKernel(SplittingKernel):
         super().__init__(loops, scheme, compensated)
         self._values = np.ascontiguousarray(values.T, dtype=np.float64)
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
+    def run(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        carry: Carry | None = None,
+        t0: float = 0.0,
+    ) -> Run:
         raise TypeError("`y0` must be a batch (N, 2d): trajectories have their own parameters.")
 
-    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), len(y))
         scheme, rows = self.scheme, self._rows(y)
         return Steps(self.loops.step_rows(step_table(scheme), lengths, lengths, rows, scheme.monomials, varied=True))
@@ -293,30 +332,34 @@ class DampedKernel(SplittingKernel):
     A step by itself, of a length of its own for each state, is made by array operations.
     """
 
-    def __init__(
-        self, loops: SplittingLoops, scheme: Scheme, step: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    ) -> None:
+    def __init__(self, loops: SplittingLoops, scheme: Scheme, step: Callable[..., np.ndarray]) -> None:
         super().__init__(loops, scheme)
         self._step = step
 
-    def table(self, h: float) -> np.ndarray:
+    def table(self, h: float, t0: float = 0.0) -> np.ndarray:
         assert self.loops.friction is not None
-        return damped_table(self.scheme, h, self.loops.friction)
+        table = _damped_stages(self.scheme, h, self.loops.friction)
+        return table.timed_rows(self.loops.values, h, t0) if self.loops.driven else table.packed
 
-    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
-        return Steps(self._step(np.asarray(y, dtype=np.float64), np.asarray(h, dtype=np.float64)))
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
+        y, h = np.asarray(y, dtype=np.float64), np.asarray(h, dtype=np.float64)
+        return Steps(self._step(y, h, t) if self.loops.driven else self._step(y, h))
 
 
 @lru_cache(maxsize=256)
-def damped_table(scheme: Scheme, h: float, friction: Friction) -> np.ndarray:
-    """The table of a run with the rows of `DampedDrift`."""
+def _damped_stages(scheme: Scheme, h: float, friction: Friction) -> StageTable:
     return _with_friction(run_table(scheme, h), friction)
 
 
-def _with_friction(table: StageTable, friction: Friction) -> np.ndarray:
-    """The rows of a table, then those of `DampedDrift`."""
+def damped_table(scheme: Scheme, h: float, friction: Friction) -> np.ndarray:
+    """The table of a run with the rows of `DampedDrift`."""
+    return _damped_stages(scheme, h, friction).packed
+
+
+def _with_friction(table: StageTable, friction: Friction) -> StageTable:
+    """A table with the rows of `DampedDrift`."""
     mean, decay = friction.factors(table.drifts)
-    return np.ascontiguousarray(np.concatenate([table.packed, mean.T, decay.T]))
+    return replace(table, more=np.concatenate([mean.T, decay.T]))
 
 
 MOST_COUPLED = 6
@@ -376,9 +419,22 @@ def _symbolic_loops(
         symbols = symbols.parametric
         algebra = algebra_source(symbols)
     after = ("loops", "aligned", "lanes")
-    loops = symbolic_module(symbols, algebra, level, compensated, after, monomials, friction, varied)
+    loops = symbolic_module(symbols, algebra, level, compensated, after, monomials, friction, varied=varied)
     processed = loops.rollout_processed, loops.rollout_processed_rows
     return LoopFunctions(loops.rollout, loops.rollout_lanes, *processed, loops.step_lanes)
+
+
+def _driven_loops(
+    driving: Driving, friction: DampedDrift | None, level: int, compensated: bool, monomials: Monomials
+) -> LoopFunctions:
+    """The loops of a symbolic system whose H depends on t; single steps, each at a time of its own, without lanes."""
+    from sympflow.kernels.codegen import algebra_source
+
+    form, after = driving.form, ("loops", "aligned", "lanes")
+    algebra = algebra_source(form)
+    loops = symbolic_module(form, algebra, level, compensated, after, monomials, friction, driving)
+    processed = loops.rollout_processed, loops.rollout_processed_rows
+    return LoopFunctions(loops.rollout, loops.rollout_lanes, *processed, loops.step_each)
 
 
 def symbolic_module(
@@ -389,6 +445,7 @@ def symbolic_module(
     after: Sequence[str],
     monomials: Monomials = (),
     friction: DampedDrift | None = None,
+    driving: Driving | None = None,
     varied: bool = False,
 ) -> ModuleType:
     """The algebra of a symbolic system, its kicks and the texts of loops `after` them, as a module.
@@ -401,7 +458,7 @@ def symbolic_module(
     kinds, scheduled = kicks_of(level, len(monomials)), not compensated
     n = len(symbols.parameters)
     lanes = lanes_source(kinds, scheduled, friction, n, varied)
-    sources = [algebra, stages_source(kinds, scheduled, friction, n), lanes]
+    sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
     if scheduled:
         sources.append(kicks_source(symbols, level, monomials))
     elif level == POLYNOMIAL:
@@ -423,14 +480,23 @@ def _family_loops(
     from sympflow.kernels.codegen import polynomial_slope_source
     from sympflow.kernels.terms import bend_source, gradient_source, product_source, warn_if_long
 
-    symbols = system.symbols
+    symbols, driving = system.symbols, None
     assert symbols is not None
+    if symbols.time is not None:
+        from sympflow.kernels.stage_times import driven_form
+
+        driving = driven_form(symbols)
+        if driving.means:
+            raise ValueError("`system` has many terms and a kinetic energy that depends on t: use backend='array'.")
+        symbols = driving.form
+    letters = symbols.parameters
     warn_if_long(symbols.V, symbols.q, system.name)
-    sources = [f"import numpy as np\n\nNDOF = {symbols.ndof}", gradient_source(symbols.V, symbols.q, "gradient")]
+    sources = [f"import numpy as np\n\nNDOF = {symbols.ndof}", _given_functions(level, bool(letters))]
+    sources.append(gradient_source(symbols.V, symbols.q, "gradient", letters))
     if level in (FORCE_GRADIENT, CURVATURE):
-        sources.append(product_source(symbols.V, symbols.q, "hessian_vector"))
+        sources.append(product_source(symbols.V, symbols.q, "hessian_vector", letters))
     if level == CURVATURE:
-        sources.append(bend_source(symbols.V, symbols.q, "bend"))
+        sources.append(bend_source(symbols.V, symbols.q, "bend", letters))
     if level == POLYNOMIAL:
         sources.append(polynomial_slope_source(symbols, monomials))
     M = system.inverse_mass
@@ -439,7 +505,7 @@ def _family_loops(
         sources.append("" if M is None else f"INVERSE_MASS = np.array({M.tolist()})")
     else:
         sources.append(gradient_source(symbols.T, symbols.p, "apply_inverse_mass"))
-    sources.append(stages_source(kicks_of(level, len(monomials)), False, friction))
+    sources.append(stages_source(kicks_of(level, len(monomials)), False, friction, 0, driving))
     code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
     before = ["elementary"] if "fast_" in code else []
     header = _header(compensated, cache=True, scheduled=False)
@@ -458,6 +524,27 @@ def _inverse_mass_source(inverse_mass: np.ndarray | None) -> str:
     return f"@njit(**OPTIONS)\ndef apply_inverse_mass(v, out):\n    for i in range(NDOF):\n        {rows}"
 
 
+def _given_functions(level: int, driven: bool, time_first: bool = False) -> str:
+    """``gradient_at(q, numbers, out)`` and the others that the text `array_states` calls, by functions of a system.
+
+    Those of a driven one take the letters of `numbers` after their arguments, or the time before them.
+    """
+    functions = ["gradient(q, out)", "hessian_vector(q, v, out)", "bend(q, v, out)"]
+    if level not in (FORCE_GRADIENT, CURVATURE):
+        functions = functions[:1]
+    elif level == FORCE_GRADIENT:
+        functions = functions[:2]
+    sources = []
+    for function in functions:
+        name, _, arguments = function.rstrip(")").partition("(")
+        call = function
+        if driven:
+            call = f"{name}(numbers[-1], {arguments})" if time_first else f"{name}({arguments}, numbers)"
+        given = arguments.removesuffix("out") + "numbers, out"
+        sources.append(f"@njit(**OPTIONS)\ndef {name}_at({given}):\n    {call}")
+    return "\n\n\n".join(sources)
+
+
 def _array_functions(module: dict[str, Any]) -> LoopFunctions:
     names = ("rollout", "rollout_each", "rollout_processed", "rollout_processed_rows", "step_each")
     return LoopFunctions(*(module[name] for name in names))
@@ -468,6 +555,7 @@ def _array_loops(
     gradient: Any,
     hessian_vector: Any | None,
     inverse_mass: np.ndarray | None,
+    driven: bool,
     friction: DampedDrift | None,
     level: int,
     compensated: bool,
@@ -476,7 +564,8 @@ def _array_loops(
     """The loops around the user's Numba functions; compiled for this process only."""
     mass = _inverse_mass_source(inverse_mass)
     header = _header(compensated, cache=False, scheduled=False)
-    stages = stages_source(kicks_of(level), False, friction)
+    stages = stages_source(kicks_of(level), False, friction, 0, TimeAlone() if driven else None)
+    given = _given_functions(level, driven, time_first=True)
     functions: dict[str, Any] = {
         "NDOF": ndof,
         "INVERSE_MASS": inverse_mass,
@@ -484,5 +573,5 @@ def _array_loops(
         "hessian_vector": hessian_vector,
     }
     texts = map(template, ("array_states", "loops"))
-    exec("\n\n\n".join([header, mass, stages, *texts]), functions)
+    exec("\n\n\n".join([header, mass, given, stages, *texts]), functions)
     return _array_functions(functions)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Protocol
 
 import numpy as np
 
@@ -14,12 +15,16 @@ __all__ = [
     "DampedDrift",
     "Kick",
     "StageTable",
+    "TimeAlone",
+    "TimedNumbers",
     "kicks_of",
     "lanes_source",
+    "numbers_of_kicks",
     "run_table",
     "single_table",
     "stages_source",
     "step_table",
+    "time_lines",
 ]
 
 
@@ -35,6 +40,12 @@ class StageTable:
         b, a, g and c.
     polynomials : ndarray of shape (m, M) or (m, M, K)
         e of the M monomials, none for other kicks.
+    times : ndarray of shape (m,) or (m, K), optional
+        When each kick is, counted from the beginning of the step; the default is the sum of the drifts before it.
+    direction : float
+        Steps by which the time moves on with a step of the table: −1 of an inverse.
+    more : ndarray of shape (n, m), optional
+        Further rows: those of friction.
     """
 
     level: int
@@ -43,6 +54,9 @@ class StageTable:
     gradients: np.ndarray
     curvatures: np.ndarray
     polynomials: np.ndarray
+    times: np.ndarray | None = None
+    direction: float = 1.0
+    more: np.ndarray | None = None
 
     @cached_property
     def packed(self) -> np.ndarray:
@@ -50,7 +64,7 @@ class StageTable:
         of_kicks = [self.kicks, *self.polynomials.swapaxes(0, 1)]
         if self.level != POLYNOMIAL:
             of_kicks = [self.kicks, self.gradients, self.curvatures][: 1 + self.level]
-        return np.ascontiguousarray(np.stack([self.drifts, *of_kicks]))
+        return np.ascontiguousarray(np.stack([self.drifts, *of_kicks, *(() if self.more is None else self.more)]))
 
     def rows(self, values: tuple[float, ...]) -> np.ndarray:
         """`packed`, and for each of the values of a system's parameters a row, the same for all stages."""
@@ -65,6 +79,13 @@ class StageTable:
             self._with_values[values] = rows
         return rows
 
+    def timed_rows(self, values: tuple[float, ...], h: float, t0: float) -> np.ndarray:
+        """`rows`, then the times of the kicks, that of step 0 and the step of the time, of a driven system."""
+        of_kicks = np.cumsum(self.drifts, axis=0) - self.drifts if self.times is None else self.times
+        clock = np.zeros((2, *of_kicks.shape))
+        (clock if clock.ndim == 2 else clock[..., 0])[:] = np.array([t0, self.direction * h])[:, None]
+        return np.concatenate([self.rows(values), of_kicks[None], clock])
+
     @cached_property
     def _with_values(self) -> dict[tuple[float, ...], np.ndarray]:
         return {}
@@ -78,6 +99,8 @@ class StageTable:
             _times_power(self.gradients, h, 3),
             _times_power(self.curvatures, h, 5),
             _times_power(self.polynomials, h, 3),
+            None if self.times is None else h * self.times,
+            self.direction,
         )
 
 
@@ -127,11 +150,14 @@ def _stages(scheme: Scheme) -> list[_Stage]:
     return stages or [none]
 
 
-def _table(scheme: Scheme, stages: Sequence[_Stage]) -> StageTable:
+def _table(
+    scheme: Scheme, stages: Sequence[_Stage], times: Sequence[float] | None = None, direction: float = 1.0
+) -> StageTable:
     columns = zip(*((s.kick, s.drift, s.gradient, s.curvature) for s in stages), strict=True)
     kicks, drifts, gradients, curvatures = (np.array(column, dtype=float) for column in columns)
     polynomials = np.array([s.polynomial for s in stages], dtype=float)
-    return StageTable(scheme.level, kicks, drifts, gradients, curvatures, polynomials)
+    known = None if times is None else np.array(times)
+    return StageTable(scheme.level, kicks, drifts, gradients, curvatures, polynomials, known, direction)
 
 
 @lru_cache(maxsize=256)
@@ -160,7 +186,11 @@ def run_table(scheme: Scheme, h: float) -> StageTable:
         opening, inner, link = first, stages[1:-1], replace(last.kicked_by(first), drift=first.drift)
     elif len(stages) > 1 and not first.kicks:  # drift … drift
         opening, inner, link = first, stages[1:-1], replace(last, drift=last.drift + first.drift)
-    return _table(scheme, [opening, *inner, link, last]).scaled(h)
+    before_inner = opening.drift + np.cumsum([0.0, *(s.drift for s in inner)])
+    # The link begins with the last kick of the step before; an output is closed after so many whole steps.
+    times = [0.0, *before_inner[: len(inner)].tolist(), -last.drift, -last.drift]
+    direction = float(round(sum(s.drift for s in stages)))
+    return _table(scheme, [opening, *inner, link, last], times, direction).scaled(h)
 
 
 # kinds of kick as code --------------------------------------------------------------------------------------------
@@ -315,21 +345,81 @@ def drift_of(table, j):
     return table[0, j]"""
 
 
-def stages_source(
-    kinds: Sequence[Kick], scheduled: bool, friction: DampedDrift | None = None, n_parameters: int = 0
-) -> str:
-    """The functions of the text `loops` that depend on the kinds of kick, and on friction.
+class TimedNumbers(Protocol):
+    """The numbers of kicks and drifts as code, where they depend on the time."""
 
-    ``numbers_of(table, j)`` are the numbers of kick j, ``numbers_at(table, j, x, h)`` those of a step h by polynomials
-    in x; the values of the parameters of H, which are taken where there is no friction, come after them.
-    ``drift_of(table, j)`` are those of a drift. ``stage`` is a kick and a drift of one trajectory.
-    """
+    def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
+        """``numbers_of`` and ``numbers_at`` of `stages_source`, of tables as `StageTable.timed_rows` makes them.
+
+        `n_rows` are the rows of a table before those of the values of parameters and of the time.
+        """
+        ...
+
+
+class TimeAlone:
+    """The numbers of kicks, and after them the time, of a system whose functions take that."""
+
+    def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
+        numbers, values = numbers_of_kicks(kinds)
+        run, one = time_lines(n_rows)
+        return f"""@njit(**OPTIONS)
+def numbers_of(table, j, k=0):
+    {run}
+    return ({", ".join([*numbers, "time"])})
+
+
+@njit(**OPTIONS)
+def numbers_at(table, j, x, h, t):
+    {one}
+    return ({", ".join([*values, "time"])})"""
+
+
+def time_lines(row: int) -> tuple[str, str]:
+    """The time of kick j of step k of a run, and in a step h from t on; `row` is the first of those of the time."""
+    return (
+        f"time = table[{row + 1}, j] + (k * table[{row + 2}, j] + table[{row}, j])",
+        f"time = t + h * polynomial(table[{row}, j], x)",
+    )
+
+
+def numbers_of_kicks(kinds: Sequence[Kick]) -> tuple[list[str], list[str]]:
+    """The numbers of kicks as code: those of a run, and those of a step h by polynomials in x."""
     rows = range(1, 1 + len(kinds[0].numbers))
-    constant = range(rows.stop, rows.stop + n_parameters)
-    numbers = "".join(f"table[{i}, j], " for i in (*rows, *constant))
     steps = {1: "h", 3: "h ** 3", 5: "h ** 5"}
-    values = [f"{steps[n]} * polynomial(table[{i}, j], x), " for i, n in zip(rows, kinds[0].powers, strict=True)]
-    values += [f"table[{i}, j, 0], " for i in constant]
+    values = [f"{steps[n]} * polynomial(table[{i}, j], x)" for i, n in zip(rows, kinds[0].powers, strict=True)]
+    return [f"table[{i}, j]" for i in rows], values
+
+
+def _numbers_source(kinds: Sequence[Kick], n_parameters: int) -> str:
+    """``numbers_of`` and ``numbers_at`` of `stages_source`, of a system that does not depend on the time."""
+    numbers, values = numbers_of_kicks(kinds)
+    constant = range(1 + len(numbers), 1 + len(numbers) + n_parameters)
+    numbers += [f"table[{i}, j]" for i in constant]
+    values += [f"table[{i}, j, 0]" for i in constant]
+    return f"""@njit(**OPTIONS)
+def numbers_of(table, j, k=0):
+    return ({", ".join(numbers)}, )
+
+
+@njit(**OPTIONS)
+def numbers_at(table, j, x, h, t):
+    return ({", ".join(values)}, )"""
+
+
+def stages_source(
+    kinds: Sequence[Kick],
+    scheduled: bool,
+    friction: DampedDrift | None = None,
+    n_parameters: int = 0,
+    driving: TimedNumbers | None = None,
+) -> str:
+    """The functions of the text `loops` that depend on the kinds of kick, on friction and on the time.
+
+    ``numbers_of(table, j, k)`` are the numbers of kick j of step k, ``numbers_at(table, j, x, h, t)`` those of a step h
+    by polynomials in x that begins at the time t; the values of the parameters of H, which are taken where there is no
+    friction, come after them. ``drift_of(table, j)`` are those of a drift. ``stage`` is a kick and a drift of one
+    trajectory.
+    """
     given = "numbers, " if n_parameters else ""
     drifted = f"return move(q, q_error, drift(p, a, {given}work))"
     if scheduled:
@@ -337,17 +427,13 @@ def stages_source(
     move = f"q, q_error = drift_by(q, {{p}}, q_error, {given}{{a}}, work)"
     moved = [move.format(p="p", a="a")] if friction is None else friction.drifted(move)
     end = [*moved, "return q, p, q_error, p_error"]
-    return f"""@njit(**OPTIONS)
-def numbers_of(table, j):
-    return ({numbers})
+    begin = ["fill_coefficients(numbers, work[j])"] if driving is not None and scheduled else []
+    first = 1 + len(kinds[0].numbers)
+    n_rows = first + (0 if friction is None else 2 * friction.size)
+    return f"""{_numbers_source(kinds, n_parameters) if driving is None else driving.source(kinds, n_rows)}
 
 
-{_DRIFT_OF if friction is None else friction.source(1 + len(kinds[0].numbers))}
-
-
-@njit(**OPTIONS)
-def numbers_at(table, j, x, h):
-    return ({"".join(values)})
+{_DRIFT_OF if friction is None else friction.source(first)}
 
 
 @njit(**OPTIONS, forceinline=True)
@@ -357,7 +443,7 @@ def drift_by(q, p, q_error, {given}a, work):
 
 @njit(**OPTIONS, forceinline=True)
 def stage(q, p, q_error, p_error, numbers, a, j, work):
-    {_cases(kinds, "numbers[{0}] != 0.0", [[*kick.application(scheduled, lane=False), *end] for kick in kinds])}"""
+    {_cases(kinds, "numbers[{0}] != 0.0", [[*begin, *kick.application(scheduled, False), *end] for kick in kinds])}"""
 
 
 def lanes_source(

@@ -192,31 +192,35 @@ def energy_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> str:
     return _source(f, variables, name, "q", before, lambda family: {"total": family.f}, after)
 
 
-def gradient_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> str:
-    """``name(q, out)``: ∇f into out."""
-    return _source(f, variables, name, "q, out", "out[:] = 0.0", lambda family: _each(_slopes(family.f, family.x)))
+def gradient_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()) -> str:
+    """``name(q, out)``: ∇f into out; with letters in f ``name(q, out, numbers)``, of which the last are theirs."""
+
+    def slopes(family: Family) -> dict[str, sp.Expr]:
+        return _each(_slopes(family.f, family.x))
+
+    return _source(f, variables, name, "q, out", "out[:] = 0.0", slopes, letters=letters)
 
 
-def product_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> str:
+def product_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()) -> str:
     """``name(q, v, out)``: ∇²f v into out."""
 
     def product(family: Family) -> dict[str, sp.Expr]:
         return _each(_slopes(_along(family.f, family.x), family.x))
 
-    return _source(f, variables, name, "q, v, out", "out[:] = 0.0", product)
+    return _source(f, variables, name, "q, v, out", "out[:] = 0.0", product, letters=letters)
 
 
-def bend_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> str:
+def bend_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()) -> str:
     """``name(q, v, out)``: ½ ∇³f(v, v) into out."""
 
     def bend(family: Family) -> dict[str, sp.Expr]:
         return _each(_slopes(_along(_along(family.f, family.x), family.x) / 2, family.x))
 
-    return _source(f, variables, name, "q, v, out", "out[:] = 0.0", bend)
+    return _source(f, variables, name, "q, v, out", "out[:] = 0.0", bend, letters=letters)
 
 
-def gradient_and_hessian_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> str:
-    """``name(q, out, S)``: ∇f into out and ∇²f into S."""
+def gradient_and_hessian_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, time: str) -> str:
+    """``name(q, out, S, time)``: ∇f into out and ∇²f into S, of f that may hold the symbol of that time."""
 
     def both(family: Family) -> dict[str, sp.Expr]:
         slopes = _slopes(family.f, family.x)
@@ -226,7 +230,7 @@ def gradient_and_hessian_source(f: sp.Expr, variables: Sequence[sp.Symbol], name
                 targets[f"S[i_{j}, i_{k}]"] = entry
         return targets
 
-    return _source(f, variables, name, "q, out, S", "out[:] = 0.0\n    S[:] = 0.0", both)
+    return _source(f, variables, name, f"q, out, S, {time}", "out[:] = 0.0\n    S[:] = 0.0", both)
 
 
 def _slopes(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[sp.Expr]:
@@ -250,9 +254,11 @@ def _source(
     before: str,
     values: Callable[[Family], dict[str, sp.Expr]],
     after: str = "",
+    letters: Sequence[sp.Symbol] = (),
 ) -> str:
     """A function that adds up the values of all terms, and one that it calls for each family."""
     parts, calls = [], []
+    arguments += ", numbers" if letters else ""
     for k, family in enumerate(families(f, variables)):
         wanted = {target: value for target, value in values(family).items() if value != 0}
         if not wanted:
@@ -260,6 +266,7 @@ def _source(
         one = f"{name}_{k}"
         n_terms, used = len(family.coordinates), set().union(*(value.free_symbols for value in wanted.values()))
         lines = [f"i_{j} = COORDINATES_{one.upper()}[n, {j}]" for j in range(len(family.x))]
+        drawn = "".join(f"    {s} = numbers[{i - len(letters)}]\n" for i, s in enumerate(letters) if s in used)
         lines += [f"{s} = q[i_{j}]" for j, s in enumerate(family.x) if s in used]
         lines += [f"v_{j} = v[i_{j}]" for j in range(len(family.x)) if sp.Symbol(f"v_{j}", real=True) in used]
         lines += [f"{s} = CONSTANTS_{one.upper()}[n, {j}]" for j, s in enumerate(family.c) if s in used]
@@ -272,6 +279,7 @@ def _source(
         body = "\n        ".join(lines)
         parts.append(
             f"@njit(**OPTIONS)\ndef {one}({arguments}):\n"
+            + drawn
             + ("    total = 0.0\n" if returns else "")
             + f"    for n in range({n_terms}):\n        {body}"
             + ("\n    return total" if returns else "")

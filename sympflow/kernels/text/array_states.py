@@ -1,8 +1,8 @@
 """The algebra of a system given by Numba functions, or of many terms: q and p are arrays, changed in place.
 
-Source text for `loops`. What comes before defines `NDOF`, the constants of `loops`, the system's ``gradient(q, out)``
-and ``hessian_vector(q, v, out)``, and ``apply_inverse_mass(v, out)``; where kicks have curvature terms or polynomials,
-``bend(q, v, out)`` and ``polynomial_slope(q, numbers, out)`` too.
+Source text for `loops`. What comes before defines `NDOF`, the constants of `loops`, the system's ``gradient_at(q,
+numbers, out)`` and ``hessian_vector_at(q, v, numbers, out)``, and ``apply_inverse_mass(v, out)``; where kicks have
+curvature terms or polynomials, ``bend_at(q, v, numbers, out)`` and ``polynomial_slope(q, numbers, out)`` too.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -79,7 +79,7 @@ COUPLED = True
 def kick(q, numbers, work):
     slope = work[0]
     forget(slope)
-    gradient(q, slope)
+    gradient_at(q, numbers, slope)
     for i in range(NDOF):
         slope[i] *= -numbers[0]
     return slope
@@ -87,13 +87,13 @@ def kick(q, numbers, work):
 
 @njit(**OPTIONS)
 def gradient_kick(q, numbers, work):
-    b, g = numbers
+    b, g = numbers[0], numbers[1]
     slope, velocity, product, _ = work
     forget(slope)
-    gradient(q, slope)
+    gradient_at(q, numbers, slope)
     apply_inverse_mass(slope, velocity)
     forget(product)
-    hessian_vector(q, velocity, product)
+    hessian_vector_at(q, velocity, numbers, product)
     for i in range(NDOF):
         slope[i] *= -b
         product[i] *= g
@@ -103,16 +103,16 @@ def gradient_kick(q, numbers, work):
 @njit(**OPTIONS)
 def curvature_kick(q, numbers, work):
     """−b∇V + g ∇²V v − c (∇²V M⁻¹∇²V v + ½ ∇³V(v, v)), v = M⁻¹∇V."""
-    b, g, c = numbers
+    b, g, c = numbers[0], numbers[1], numbers[2]
     change, velocity, product, bent = work
-    gradient(q, change)
+    gradient_at(q, numbers, change)
     apply_inverse_mass(change, velocity)
-    hessian_vector(q, velocity, product)
-    bend(q, velocity, bent)
+    hessian_vector_at(q, velocity, numbers, product)
+    bend_at(q, velocity, numbers, bent)
     for i in range(NDOF):
         change[i] = g * product[i] - b * change[i] - c * bent[i]
     apply_inverse_mass(product, velocity)
-    hessian_vector(q, velocity, product)
+    hessian_vector_at(q, velocity, numbers, product)
     for i in range(NDOF):
         change[i] -= c * product[i]
     return change

@@ -89,7 +89,7 @@ def deliver(q, p, first, n, block, end, table, work, step, h, advance, clock, ta
     q_error, p_error = no_error(q), no_error(p)
     before_q, before_p = q, p
     if n > 0:
-        before_q, before_p = close(q, p, q_error, p_error, table, work)
+        before_q, before_p = close(q, p, q_error, p_error, table, 0, work)
     for k in range(1, block + 1):
         for j in range(link):
             row = first if j == 0 else j
@@ -97,7 +97,7 @@ def deliver(q, p, first, n, block, end, table, work, step, h, advance, clock, ta
                 q, p, q_error, p_error, numbers_of(table, row), table[0, row], row, work
             )
         first = link
-        after_q, after_p = close(q, p, q_error, p_error, table, work)
+        after_q, after_p = close(q, p, q_error, p_error, table, 0, work)
         before = sign * (before_q[NDOF - 1] + (n + k - 1) * advance)
         after = sign * (after_q[NDOF - 1] + (n + k) * advance)
         while saved < len(targets) and targets[saved] <= end and (targets[saved] <= after or k == block):
@@ -140,7 +140,7 @@ def reach_times(table, step, h, clock, y0, targets, stride, most_steps, out, cou
         for _ in range(block * link):
             q, p, q_error, p_error = stage(q, p, q_error, p_error, numbers_of(table, j), table[0, j], j, work)
             j = j + 1 if j < link else 1
-        end_q, end_p = close(q, p, q_error, p_error, table, work)
+        end_q, end_p = close(q, p, q_error, p_error, table, 0, work)
         then = sign * (end_q[NDOF - 1] + (n + block) * advance)
         if block <= 0 or not is_finite(end_q, end_p) or not then >= now:
             return False
@@ -179,7 +179,7 @@ def reach_times_lanes(table, step, h, clock, y0, begin, end, targets, stride, mo
         while count < LANES and following < end:  # their first step: the opening stage is not that of the others
             enter(Y, count, y0[following], table, work)
             row[count], n[count], saved[count], now[count] = following, 1, 0, 0.0
-            q, p = close_lane(Y, error, count, table, work)
+            q, p = close_lane(Y, error, count, table, 0, work)
             advance[count] = clock_advance(clock, h, p[NDOF - 1])
             now[count] = sign * (q[NDOF - 1] + advance[count])
             regular &= is_finite(q, p) and now[count] >= 0.0
@@ -207,7 +207,7 @@ def reach_times_lanes(table, step, h, clock, y0, begin, end, targets, stride, mo
         lane = 0
         while lane < count:
             i = row[lane]
-            q, p = close_lane(Y, error, lane, table, work)
+            q, p = close_lane(Y, error, lane, table, 0, work)
             then = sign * (q[NDOF - 1] + (n[lane] + stride) * advance[lane])
             if not is_finite(q, p) or not then >= now[lane] or n[lane] > most_steps:
                 return False

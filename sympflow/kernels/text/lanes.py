@@ -38,12 +38,12 @@ def take_values(table, work, Y, lane, first):
 
 
 @njit(**OPTIONS)
-def close_lane(Y, error, lane, table, work):
+def close_lane(Y, error, lane, table, k, work):
     q, p = unpack_lane(Y, lane)
     q_error, p_error = no_error(q), no_error(p)
     if COMPENSATED:
         q_error, p_error = unpack_lane(error, lane)
-    return close(q, p, q_error, p_error, table, work)
+    return close(q, p, q_error, p_error, table, k, work)
 
 
 @njit(**OPTIONS)
@@ -104,12 +104,12 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running)
             block = min(CHECK_EVERY, n_steps - n)
             if saved < len(save):
                 block = min(block, save[saved] - n)
-            numbers, a = numbers_of(table, begin), drift_of(table, begin)
-            for _ in range(block):
+            numbers, a = numbers_of(table, begin, n), drift_of(table, begin)
+            for k in range(n, n + block):
                 stage_lanes(Y, error, width, numbers, a)
                 for j in range(1, link):
-                    stage_lanes(Y, error, width, numbers_of(table, j), drift_of(table, j))
-                numbers, a = numbers_of(table, link), drift_of(table, link)
+                    stage_lanes(Y, error, width, numbers_of(table, j, k), drift_of(table, j))
+                numbers, a = numbers_of(table, link, k + 1), drift_of(table, link)
             next_saved = saved
             while next_saved < len(save) and save[next_saved] == n + block:
                 next_saved += 1
@@ -118,11 +118,11 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running)
                 if n_finite[i] < n_steps:
                     continue
                 take_values(table, work, Y, lane, link + 1)
-                q, p = close_lane(Y, error, lane, table, work)
+                q, p = close_lane(Y, error, lane, table, n + block, work)
                 if not is_finite(q, p):
                     take_values(table, work, Y, lane, 0)
                     q, p = unpack_lane(start, lane)
-                    before = first_non_finite(q, p, table, begin, block, work) - 1
+                    before = first_non_finite(q, p, table, begin, n, block, work) - 1
                     n_finite[i] = n + before
                     n_alive -= 1
                     fill_with_nan(out[i], saved)
@@ -163,8 +163,8 @@ def fill_lanes(Y, width, row, coefficients, factor):
 
 
 @njit(**OPTIONS)
-def step_lanes(table, x, h, y, out):
-    """`step_each`, `LANES` rows at a time.
+def step_lanes(table, x, h, t, y, out):
+    """`step_each`, `LANES` rows at a time, of systems that do not depend on the time.
 
     All numbers lie in one array: of several the compiler would have to find out that they do not overlap.
     """

@@ -3,8 +3,8 @@
 The algebra says what a state is: q and p are tuples held in registers (a symbolic system) or arrays changed in place
 (Numba functions). It defines ``unpack``, ``pack``, ``copy``, ``is_finite``, ``move``, ``no_error``, ``drift``,
 ``workspace``, and functions for each kind of kick. `sympflow.kernels.stages` writes what depends on the kinds of kick:
-``numbers_of`` and ``numbers_at``, which read the numbers of a kick from a table, ``drift_of``, which reads those of a
-drift, and ``stage``, a kick and a drift.
+``numbers_of`` and ``numbers_at``, which read the numbers of a kick from a table and, where H depends on t, compute what
+depends on that, ``drift_of``, which reads those of a drift, and ``stage``, a kick and a drift.
 Where `SCHEDULED`, kicks and ``drifted`` run in an order of operations that is fast, and ``fill_coefficients`` prepares
 their coefficients.
 
@@ -46,27 +46,28 @@ def called_stage(q, p, q_error, p_error, numbers, a, j, work):
 
 
 @njit(**OPTIONS)
-def close(q, p, q_error, p_error, table, work):
-    """The end of a step, from the running state before its last stage, which is left as it is."""
+def close(q, p, q_error, p_error, table, k, work):
+    """The end of step k, from the running state before its last stage, which is left as it is."""
     q, p, q_error, p_error = copy(q), copy(p), copy(q_error), copy(p_error)
     last = table.shape[1] - 1
-    q, p, _, _ = called_stage(q, p, q_error, p_error, numbers_of(table, last), drift_of(table, last), last, work)
+    q, p, _, _ = called_stage(q, p, q_error, p_error, numbers_of(table, last, k), drift_of(table, last), last, work)
     return q, p
 
 
 @njit(**OPTIONS)
-def first_non_finite(q, p, table, first, n_steps, work):
-    """The first of `n_steps` steps from a running state whose end is not finite; `n_steps` if none is."""
+def first_non_finite(q, p, table, first, k, n_steps, work):
+    """The first of `n_steps` steps from a running state, that of step k, whose end is not finite, or `n_steps`."""
     link = table.shape[1] - 2
     q_error, p_error = no_error(q), no_error(p)
     j = first
     for n in range(1, n_steps):
         for _ in range(link):
             q, p, q_error, p_error = called_stage(
-                q, p, q_error, p_error, numbers_of(table, j), drift_of(table, j), j, work
+                q, p, q_error, p_error, numbers_of(table, j, k), drift_of(table, j), j, work
             )
             j = j + 1 if j < link else 1
-        end_q, end_p = close(q, p, q_error, p_error, table, work)
+            k = k + 1 if j == link else k
+        end_q, end_p = close(q, p, q_error, p_error, table, k, work)
         if not is_finite(end_q, end_p):
             return n
     return n_steps
@@ -119,14 +120,16 @@ def rollout(table, y0, n_steps, save, out, stop, first, running):
         if saved < len(save):
             block = min(block, save[saved] - n)
         start_q, start_p, begin = copy(q), copy(p), j
+        k = n
         for _ in range(block * link):
-            q, p, q_error, p_error = stage(q, p, q_error, p_error, numbers_of(table, j), drift_of(table, j), j, work)
+            q, p, q_error, p_error = stage(q, p, q_error, p_error, numbers_of(table, j, k), drift_of(table, j), j, work)
             j = j + 1 if j < link else 1
-        end_q, end_p = close(q, p, q_error, p_error, table, work)
+            k = k + 1 if j == link else k
+        end_q, end_p = close(q, p, q_error, p_error, table, k, work)
         if not is_finite(end_q, end_p):
             fill_with_nan(out, saved)
             running[:] = math.nan
-            return n - 1 + first_non_finite(start_q, start_p, table, begin, block, work)
+            return n - 1 + first_non_finite(start_q, start_p, table, begin, n, block, work)
         n += block
         while saved < len(save) and save[saved] == n:
             pack(end_q, end_p, out[saved])
@@ -151,8 +154,8 @@ def polynomial(coefficients, x):
 
 
 @njit(**OPTIONS)
-def step_each(table, x, h, y, out):
-    """One step of length ``h[i]`` from every row of `y` (N, 2d).
+def step_each(table, x, h, t, y, out):
+    """One step of length ``h[i]`` from every row of `y` (N, 2d), which is at the time ``t[i]``.
 
     The numbers (1 + n, m, K) of stage j are those for h = 1, polynomials Σ_k table[:, j, k] x^k of ``x[i]``.
     """
@@ -161,7 +164,7 @@ def step_each(table, x, h, y, out):
         q, p = unpack(y[i])
         q_error, p_error = no_error(q), no_error(p)
         for j in range(table.shape[1]):
-            numbers, a = numbers_at(table, j, x[i], h[i]), h[i] * polynomial(table[0, j], x[i])
+            numbers, a = numbers_at(table, j, x[i], h[i], t[i]), h[i] * polynomial(table[0, j], x[i])
             q, p, q_error, p_error = called_stage(q, p, q_error, p_error, numbers, a, j, work)
         pack(q, p, out[i])
 

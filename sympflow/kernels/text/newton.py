@@ -1,7 +1,7 @@
 """The loops of an implicit Gauss method: Newton's iteration, a step, a run. Source text for `implicit`.
 
-What comes before defines `NDOF`, `COMPENSATED`, the tableau `A`, `B` and `SCALE` of `STAGES` stages as tuples, and the
-system's ``gradient_and_hessian(y, g, S)``, which leaves the entries of S that are always zero as they are.
+What comes before defines `NDOF`, `COMPENSATED`, the tableau `A`, `B`, `C` and `SCALE` of `STAGES` stages as tuples, and
+the system's ``gradient_and_hessian(y, g, S, t)``, which leaves the entries of S that are always zero as they are.
 
 The unknowns are K_i = h SCALE_i f(y + Σ_j A_ij K_j), in which the coefficients are exact where it matters for the long
 run, and y + Σ B_i K_i needs no further evaluation of f.
@@ -74,8 +74,11 @@ def relative_size(change, y, K):
 
 
 @njit(**OPTIONS)
-def stages(y, h, work):
-    """The K of a step of length h from y, by Newton's iteration from 0: the iterations taken, negative if in vain."""
+def stages(y, h, t, work):
+    """The K of a step of length h from y, at the time t, by Newton's iteration from 0.
+
+    Returns the iterations taken, negative if in vain.
+    """
     K, change, M, Y, g, S = work
     K[:] = 0.0
     before = np.inf
@@ -86,7 +89,7 @@ def stages(y, h, work):
                 Y[m] = y[m]
                 for j in range(STAGES):
                     Y[m] += A[i][j] * K[j * SIZE + m]
-            gradient_and_hessian(Y, g, S)
+            gradient_and_hessian(Y, g, S, t + C[i] * h)
             for m in range(SIZE):
                 sign = 1.0 if m < NDOF else -1.0  # J∇H = (∂H/∂p, −∂H/∂q)
                 other = m + NDOF if m < NDOF else m - NDOF
@@ -129,7 +132,7 @@ def advance(y, error, K):
 
 
 @njit(**OPTIONS)
-def rollout(h, y0, n_steps, save, out, work, stop, first, running):
+def rollout(h, t0, y0, n_steps, save, out, work, stop, first, running):
     """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``; later rows are NaN.
 
     Where `first` steps are made already, it goes on from the `running` state (2d or, if `COMPENSATED`, 4d), which is
@@ -150,7 +153,7 @@ def rollout(h, y0, n_steps, save, out, work, stop, first, running):
     for n in range(first + 1, n_steps + 1):
         if stop[0] != 0:
             break
-        taken = stages(y, h, work)
+        taken = stages(y, h, t0 + (n - 1) * h, work)
         iterations += abs(taken)
         if taken < 0 or not advance(y, error, work[0]):
             out[saved:] = np.nan
@@ -167,20 +170,20 @@ def rollout(h, y0, n_steps, save, out, work, stop, first, running):
 
 
 @njit(**OPTIONS)
-def rollout_each(h, y0, n_steps, save, out, n_finite, iterations, stop, first, running):
+def rollout_each(h, t0, y0, n_steps, save, out, n_finite, iterations, stop, first, running):
     """`rollout` of every row of `y0` (N, 2d)."""
     work = workspace()
     for i in range(y0.shape[0]):
-        n_finite[i], iterations[i] = rollout(h, y0[i], n_steps, save, out[i], work, stop, first, running[i])
+        n_finite[i], iterations[i] = rollout(h, t0, y0[i], n_steps, save, out[i], work, stop, first, running[i])
 
 
 @njit(**OPTIONS)
-def step_each(h, y, out, iterations):
-    """One step of length ``h[i]`` from every row of `y` (N, 2d); NaN where it has no solution."""
+def step_each(h, t, y, out, iterations):
+    """One step of length ``h[i]`` from every row of `y` (N, 2d), at the time ``t[i]``; NaN where it has no solution."""
     work, error = workspace(), np.zeros(SIZE)
     for i in range(y.shape[0]):
         out[i] = y[i]
-        taken = stages(y[i], h[i], work)
+        taken = stages(y[i], h[i], t[i], work)
         iterations[i] = abs(taken)
         error[:] = 0.0
         if taken < 0 or not advance(out[i], error, work[0]):

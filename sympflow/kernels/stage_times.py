@@ -1,0 +1,206 @@
+"""Systems whose H depends on t as code: what depends on t alone is computed once a stage, outside loops over states.
+
+The extended Hamiltonian T(p, t) + E + V(q, t) is split into a drift, which moves q and t, and a kick at a fixed time.
+Let the degree of E be 2 and that of p be 1: the drift raises the degree of a polynomial in p by at most 1, a kick
+lowers it by 1. So all brackets that vanish by their degree where H does not depend on t vanish here, those of Nyström
+and force-gradient schemes among them, and the kicks of these are taken at a fixed time as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import sympy as sp
+
+from sympflow.hamiltonian.driving import DURATION, Samples, drift, sampled
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.kernels.codegen import printed, sampled_name, statements
+from sympflow.kernels.stages import Kick, numbers_of_kicks, time_lines
+
+__all__ = ["Driving", "driven_form"]
+
+MOST_SAMPLED = 200_000
+"""Numbers of samples that compiled code holds."""
+UNIFORM = 1e-9
+"""Relative deviation of equal intervals."""
+
+
+@dataclass(frozen=True)
+class Driving:
+    """A system whose H depends on t, written with parameters that change from stage to stage.
+
+    Attributes
+    ----------
+    form : SymbolicHamiltonian
+        H with letters for what depends on t alone. Its `parameters` are those that stay as they are, then the letters.
+    time : Symbol
+    letters : mapping of Symbol to Expr
+        Those of V, as functions of t and of the parameters that stay.
+    means : mapping of Symbol to (Expr, Expr)
+        Those of T, means over the time of a drift: a function of t, and its integral over a `DURATION` from t on.
+    samples : mapping of str to Samples
+        Of the sampled functions, by their names in expressions.
+    """
+
+    form: SymbolicHamiltonian
+    time: sp.Symbol
+    letters: Mapping[sp.Symbol, sp.Expr]
+    means: Mapping[sp.Symbol, tuple[sp.Expr, sp.Expr]]
+    samples: Mapping[str, Samples]
+
+    def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
+        """``numbers_of(table, j, k)`` and ``numbers_at(table, j, x, h, t)``: see `stages.TimedNumbers`."""
+        numbers, scaled = numbers_of_kicks(kinds)
+        fixed = self.form.parameters[: len(self.form.values)]
+        rows = range(n_rows, n_rows + len(fixed))
+        run, one = ([line] for line in time_lines(rows.stop))
+        run += ["length = table[0, j]", *(f"{s} = table[{i}, j]" for s, i in zip(fixed, rows, strict=True))]
+        one += [
+            "length = h * polynomial(table[0, j], x)",
+            *(f"{s} = table[{i}, j, 0]" for s, i in zip(fixed, rows, strict=True)),
+        ]
+        letters = [s.name for s in (*self.letters, *self.means)]
+        given = ", ".join(["time", "length", *map(str, fixed)])
+        drawn = f"{', '.join(letters)}, = letters_at({given})"
+        names = [s.name for s in self.form.parameters]
+        sources = [
+            *self._sampled_sources,
+            _function(f"letters_at({given})", self._letter_lines, letters),
+            _function("numbers_of(table, j, k=0)", [*run, drawn], [*numbers, *names]),
+            _function("numbers_at(table, j, x, h, t)", [*one, drawn], [*scaled, *names]),
+        ]
+        return "\n\n\n".join(sources)
+
+    @cached_property
+    def _letter_lines(self) -> list[str]:
+        """The letters at `time`, and their means over the `length` from there."""
+        names = [s.name for s in self.letters]
+        integrals = [f"integral_{i}" for i in range(len(self.means))]
+        wanted = [*self.letters.values(), *(integral for _, integral in self.means.values())]
+        lines = statements([*names, *integrals], [in_code(f, self.time, "time") for f in wanted])
+        for (mean, (f, _)), integral in zip(self.means.items(), integrals, strict=True):
+            now = printed(in_code(f, self.time, "time"))
+            lines.append(f"{mean} = {integral} / length if length != 0.0 else {now}")
+        return lines
+
+    @property
+    def _sampled_sources(self) -> list[str]:
+        return sampled_sources(
+            [*self.letters.values(), *(f for pair in self.means.values() for f in pair)], self.samples
+        )
+
+
+def driven_form(symbols: SymbolicHamiltonian) -> Driving:
+    """The driven form of a separable H that depends on t, with the parameters that it has.
+
+    Raises
+    ------
+    ValueError
+        If T is no sum of products of functions of t and of p, of which those of t have elementary integrals.
+    """
+    t = symbols.time
+    assert t is not None
+    assert symbols.T is not None
+    values = dict(zip(symbols.parameters, map(sp.Float, symbols.values), strict=True))
+    of_V: dict[sp.Expr, sp.Symbol] = {}
+    V = _with_letters(symbols.V, t, {*symbols.parameters}, of_V, "letter")
+    T, of_T = _kinetic(symbols, symbols.T.xreplace(values) if symbols.T.has(t) else symbols.T)
+    letters = {s: f for f, s in of_V.items()}
+    means = {s: (f, drift((f,), t)[0]) for f, s in of_T.items()}
+    form = symbols.like(T + V)
+    form.parameters, form.values = (*symbols.parameters, *letters, *means), symbols.values
+    return Driving(form, t, letters, means, symbols.samples)
+
+
+def _kinetic(symbols: SymbolicHamiltonian, T: sp.Expr) -> tuple[sp.Expr, dict[sp.Expr, sp.Symbol]]:
+    """T with letters for functions of t, in which it is linear; these letters."""
+    for expression in (T, sp.expand(T)):
+        found: dict[sp.Expr, sp.Symbol] = {}
+        moving = [term for term in sp.Add.make_args(expression) if term.free_symbols & {*symbols.p}]
+        lettered = _with_letters(sp.Add(*moving), symbols.time, set(), found, "mean")
+        letters = {*found.values()}
+        if not any(sp.diff(lettered, s).free_symbols & letters for s in letters):
+            return lettered, found
+    raise ValueError(
+        f"`system` has the kinetic energy {symbols.T}, which is no sum of products of functions of {symbols.time} and "
+        "of p: use an implicit method such as 'gauss_legendre6'."
+    )
+
+
+def _with_letters(
+    f: sp.Expr, t: sp.Symbol, fixed: set[sp.Symbol], found: dict[sp.Expr, sp.Symbol], prefix: str
+) -> sp.Expr:
+    """The expression with symbols for its parts that depend on t and on fixed symbols alone; these in `found`."""
+    if t not in f.free_symbols:
+        return f
+    known = {t, *fixed}
+    if f.free_symbols <= known and isinstance(f, sp.Expr):
+        number, part = f.as_coeff_Mul()
+        return number * found.setdefault(part, sp.Symbol(f"{prefix}_{len(found)}", real=True))
+    if f.is_Add or f.is_Mul:
+        alone = [a for a in f.args if a.free_symbols <= known]
+        others = [_with_letters(a, t, fixed, found, prefix) for a in f.args if not a.free_symbols <= known]
+        return f.func(_with_letters(f.func(*alone), t, fixed, found, prefix), *others)
+    return f.func(*[_with_letters(a, t, fixed, found, prefix) if isinstance(a, sp.Basic) else a for a in f.args])
+
+
+# functions of samples ---------------------------------------------------------------------------------------------
+
+
+def in_code(f: sp.Expr, time: sp.Symbol, name: str) -> sp.Expr:
+    """The expression with the variable `name` for the time, and `length` for a duration."""
+    return f.xreplace({time: sp.Symbol(name, real=True), DURATION: sp.Symbol("length", real=True)})
+
+
+def sampled_sources(expressions: Sequence[sp.Expr], samples: Mapping[str, Samples]) -> list[str]:
+    """The functions of samples that the expressions hold.
+
+    Raises
+    ------
+    ValueError
+        As `_sampled_source`.
+    """
+    functions = {(a.name_of_samples, a.order) for f in expressions for a in f.atoms(sampled)}
+    return [_sampled_source(name, order, samples[name]) for name, order in sorted(functions)]
+
+
+def _sampled_source(name: str, order: int, samples: Samples) -> str:
+    """A derivative of samples: the polynomial of the interval of t.
+
+    The interval is found at once where all are equal, else by bisection.
+
+    Raises
+    ------
+    ValueError
+        If there are more than compiled code holds.
+    """
+    c, x = samples.polynomials(order), samples.x
+    if c.size > MOST_SAMPLED:
+        raise ValueError(
+            f"`params` has samples of {len(x)} times, more than compiled code holds: give fewer than "
+            f"{MOST_SAMPLED // len(c)}, or use backend='array'."
+        )
+    called, n, first, last = sampled_name(name, order), len(x) - 1, float(x[0]), float(x[-1])
+    width = (last - first) / n
+    lines, rest = [], ""
+    if samples.periodic:
+        lines += [f"turns = math.floor((t - {first!r}) / {last - first!r})", f"t = t - turns * {last - first!r}"]
+        rest = f" + turns * {float(np.polyval(c[:, -1], last - float(x[-2])))!r}" if order < 0 else ""
+    if np.all(np.abs(np.diff(x) - width) <= UNIFORM * width):
+        lines.append(f"i = int(math.floor((t - {first!r}) * {1 / width!r}))")
+    else:
+        lines.append(f"i = np.searchsorted(TIMES_{called}, t, side='right') - 1")
+    lines += [f"i = max(0, min(i, {n - 1}))", f"s = t - TIMES_{called}[i]", f"total = OF_{called}[i, 0]"]
+    lines += [f"total = total * s + OF_{called}[i, {k}]" for k in range(1, len(c))]
+    constants = f"TIMES_{called} = np.array({x.tolist()})\nOF_{called} = np.array({c.T.tolist()})"
+    return "\n    ".join(
+        [f"import numpy as np\n\n{constants}\n\n\n@njit(**OPTIONS)\ndef {called}(t):", *lines, f"return total{rest}"]
+    )
+
+
+def _function(head: str, lines: Sequence[str], results: Sequence[str]) -> str:
+    returned = f"return ({''.join(f'{result}, ' for result in results)})"
+    return "\n    ".join([f"@njit(**OPTIONS)\ndef {head}:", *lines, returned])

@@ -1,0 +1,155 @@
+"""Compiled loops of driven systems, H(t, q, p): orders, the times of the stages, samples, friction."""
+
+import math
+
+import numba
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from sympflow import HamiltonianSystem, get, solve
+from sympflow.kernels.splitting_loops import splitting_loops
+from sympflow.schemes import SCHEMES
+
+W = 1.7
+PENDULUM = HamiltonianSystem.from_sympy(
+    "p**2/2 - cos(q)*(1 + a*cos(w*t))", time="t", params={"a": 0.3, "w": W}, period=2 * math.pi / W
+)
+START, T0 = np.array([1.0, 0.3]), 0.4
+EXACT = solve(PENDULUM, "gauss_legendre8", t_span=(T0, T0 + 4), y0=START, dt=0.02).y[:, -1]
+IN_DRIFT = HamiltonianSystem.from_sympy(
+    "(p - A*sin(w*t))**2/2*exp(-t/3) + cos(q)*(2 + cos(t))", time="t", params={"A": 0.5, "w": 2.0}
+)
+EXACT_IN_DRIFT = solve(IN_DRIFT, "gauss_legendre8", t_span=(T0, T0 + 4), y0=START, dt=0.02).y[:, -1]
+
+
+def slope(system, scheme, exact):
+    """The order by the errors of two runs of 4 units of time."""
+    kernel, n = splitting_loops(system).kernel(scheme), 10 if scheme.order >= 6 else 20
+    errors = [np.abs(kernel.run(4 / m, START, m, np.array([m]), t0=T0).states[-1] - exact).max() for m in (n, 2 * n)]
+    return math.log2(errors[0] / errors[1])
+
+
+@pytest.mark.parametrize("name", SCHEMES)
+def test_every_scheme_keeps_its_order(name):
+    assert slope(PENDULUM, SCHEMES[name], EXACT) > SCHEMES[name].order - 0.25
+
+
+@pytest.mark.parametrize("name", [n for n, s in SCHEMES.items() if not (s.nystrom or s.level)])
+def test_schemes_keep_their_order_where_the_kinetic_energy_depends_on_the_time(name):
+    assert slope(IN_DRIFT, SCHEMES[name], EXACT_IN_DRIFT) > SCHEMES[name].order - 0.35
+
+
+@pytest.mark.parametrize("method", ["verlet", "leapfrog", "omelyan6", "gauss_legendre4"])
+def test_compiled_runs_are_those_of_arrays(method):
+    times = np.append(np.linspace(T0 + 0.03, T0 + 1.9, 17), T0 + 2.0)
+    span = (T0, T0 + 2.0)
+    found, batch, arrays, pieces = (
+        solve(PENDULUM, method, t_span=s, y0=y, dt=0.1, **options)
+        for s, y, options in (
+            (span, START, {"t_eval": times}),
+            (span, np.stack([START] * 3), {"t_eval": times}),
+            (span, START, {"t_eval": times, "backend": "array"}),
+            ((T0, T0 + 1), START, {}),
+        )
+    )
+    assert found.stats["backend"] == "compiled"
+    assert np.abs(found.y - arrays.y).max() < 1e-13
+    assert np.abs(batch.y - found.y).max() < 1e-13
+    rest = solve(PENDULUM, method, t_span=(T0 + 1, T0 + 2), y0=pieces.y[:, -1], dt=0.1)
+    assert np.abs(rest.y[:, -1] - found.y[:, -1]).max() < 1e-13
+    back = solve(PENDULUM, method, t_span=span[::-1], y0=found.y[:, -1], dt=0.1)
+    assert np.abs(back.y[:, -1] - START).max() < 1e-13
+
+
+@pytest.mark.parametrize("method", ["kahan_li8", "chin4c", "gauss_legendre6"])
+def test_a_step_has_its_inverse_and_its_jacobian_at_its_time(method):
+    integrator, t, h = get(method)(dt=0.1), 1.3, 0.1
+    y = np.stack([START, START + 0.1])
+    end = integrator.step(PENDULUM, t, y, h)
+    assert np.abs(integrator.inverse(PENDULUM, t, end, h) - y).max() < 1e-14
+    found, A = integrator.tangent(PENDULUM, t, y, np.full(2, h))
+    apart = [1e-6 * e for e in np.eye(2)]
+    slopes = [(integrator.step(PENDULUM, t, y + e, h) - integrator.step(PENDULUM, t, y - e, h)) / 2e-6 for e in apart]
+    assert np.abs(A - np.stack(slopes, -1)).max() < 1e-8
+    assert np.abs(found - end).max() < 1e-14
+    assert np.abs(np.linalg.det(A) - 1).max() < 1e-13
+
+
+def test_events_and_dense_output_are_at_their_times():
+    sol = solve(
+        PENDULUM, "kahan_li8", t_span=(T0, T0 + 6), y0=START, dt=0.1, events=lambda t, y: y[0], dense_output=True
+    )
+    assert len(sol.t_events[0]) > 1
+    for t, y in zip(sol.t_events[0], sol.y_events[0], strict=True):
+        exact = solve(PENDULUM, "gauss_legendre8", t_span=(T0, t), y0=START, dt=0.05).y[:, -1]
+        assert np.abs(y - exact).max() < 1e-9
+        assert np.abs(sol.sol(t) - y).max() < 1e-13
+
+
+def test_parameters_of_the_drive_are_no_part_of_the_code():
+    other = HamiltonianSystem.from_sympy("p**2/2 - cos(q)*(1 + a*cos(w*t))", time="t", params={"a": 0.7, "w": 1.1})
+    one, two = (splitting_loops(s).functions(0, False) for s in (PENDULUM, other))
+    assert one.rollout is two.rollout
+    found, arrays = (solve(other, "verlet", t_span=(0, 2), y0=START, dt=0.1, backend=b) for b in ("compiled", "array"))
+    assert np.abs(found.y - arrays.y).max() < 1e-13
+
+
+@pytest.mark.parametrize("uniform", [True, False])
+def test_samples_are_compiled(uniform):
+    times = np.linspace(0, 5, 40)
+    times = times if uniform else 5 * (times / 5) ** 1.3
+    system = HamiltonianSystem.from_sympy(
+        "p**2/2 + a*q**2/2", time="t", params={"a": CubicSpline(times, 1 + 0.3 * np.sin(times))}
+    )
+    found, arrays = (
+        solve(system, "kahan_li8", t_span=(0.1, 4.9), y0=START, dt=0.2, backend=b) for b in ("compiled", "array")
+    )
+    assert np.abs(found.y - arrays.y).max() < 1e-13
+
+
+def test_periodic_samples_go_on():
+    times = np.linspace(0, 2 * math.pi, 30)
+    spline = CubicSpline(
+        times, np.append(1 + 0.3 * np.sin(times[:-1]), 1.0), bc_type="periodic", extrapolate="periodic"
+    )
+    system = HamiltonianSystem.from_sympy("a*p**2/2 + q**2/2", time="t", params={"a": spline})
+    found, arrays = (
+        solve(system, "verlet", t_span=(-9, 9), y0=START, dt=0.1, backend=b) for b in ("compiled", "array")
+    )
+    assert np.abs(found.y - arrays.y).max() < 1e-12
+
+
+@pytest.mark.parametrize("method", ["verlet", "chin4c"])
+def test_drive_and_friction_are_compiled(method):
+    duffing = HamiltonianSystem.from_sympy(
+        "p**2/2 - q**2/2 + q**4/4 - F*q*cos(w*t)", time="t", params={"F": 0.3, "w": 1.2}, damping=0.2
+    )
+    y0, times = np.stack([START, START + 0.1]), np.linspace(0.03, 2, 9)
+    found, arrays = (
+        solve(duffing, method, t_span=(0, 2), y0=y0, dt=0.1, t_eval=times, backend=b) for b in ("compiled", "array")
+    )
+    assert np.abs(found.y - arrays.y).max() < 1e-13
+
+
+def test_numba_functions_with_the_time_first():
+    @numba.njit
+    def potential(t, q):
+        return -np.cos(q[0]) * (1 + 0.3 * np.cos(W * t))
+
+    @numba.njit
+    def gradient(t, q, out):
+        out[0] = np.sin(q[0]) * (1 + 0.3 * np.cos(W * t))
+
+    system = HamiltonianSystem(potential, ndof=1, gradient=gradient, time=True)
+    found = solve(system, "kahan_li8", t_span=(T0, T0 + 4), y0=START, dt=0.1, backend="compiled")
+    assert np.abs(found.y[:, -1] - EXACT).max() < 1e-11
+
+
+def test_many_terms():
+    d = 18
+    terms = [f"p{i}**2/2 + (1 + a*cos(t))*q{i}**4/4 + q{i}*sin({i}*t)" for i in range(1, d + 1)]
+    system = HamiltonianSystem.from_sympy(" + ".join(terms), time="t", params={"a": 0.4})
+    y0 = np.linspace(-0.5, 0.5, 2 * d)
+    found, arrays = (solve(system, "chin4c", t_span=(0, 1), y0=y0, dt=0.1, backend=b) for b in ("compiled", "array"))
+    assert np.abs(found.y - arrays.y).max() < 1e-13
