@@ -86,6 +86,7 @@ def doubled(
     *,
     params: Mapping[str, float] | None = None,
     domain: Domain | None = None,
+    name: str | None = None,
 ) -> DoubledSystem:
     """The Hamiltonian system in twice the variables whose physical limit is q' = ∂H/∂p, p' = −∂H/∂q − Γp + F(q, p).
 
@@ -109,6 +110,7 @@ def doubled(
         Values of the other symbols of F; those of `system.params` are known.
     domain : Domain, optional
         Ω of states [q₊, q₋, p₋, p₊]. The default is a box about the domain of the system, a tenth as wide in q₋ and p₋.
+    name : str, optional
 
     Returns
     -------
@@ -146,8 +148,10 @@ def doubled(
         raise TypeError(f"`system` {system.name!r} is of a doubling: add the forces, and double what was doubled.")
     if force is None and system.conservative:
         raise TypeError("`force` is needed: a system without friction is Hamiltonian as it is.")
-    scene: dict[str, Any] = {"name": f"{system.name}_doubled", "t_span": system.t_span, "dt": system.dt}
+    named = f"{system.name}_doubled" if name is None else name
+    scene: dict[str, Any] = {"name": named, "t_span": system.t_span, "dt": system.dt}
     scene["domain"] = _thin_box(system) if domain is None else domain
+    scene["energy_scale"] = _energy_scale(system)
     made: DoubledSystem
     given = callable(force) and not hasattr(force, "free_symbols")  # SymPy's expressions may be called
     if given and params is not None:
@@ -225,6 +229,15 @@ class _DoubledFunctions:
         field = self.system.vector_field(concatenate([q, p]))
         slope = -field[..., d:] - self.force(q, p)
         return (P[..., :d] * field[..., :d]).sum(-1) + (Q[..., d:] * slope).sum(-1)
+
+
+def _energy_scale(system: HamiltonianSystem) -> float | None:
+    """The energy of the physical system, for that of the doubled one is 0."""
+    if system.energy_scale is not None or system.y0 is None:
+        return system.energy_scale
+    with np.errstate(all="ignore"):
+        size = float(abs(system.hamiltonian(system.y0)))
+    return size if np.finfo(float).tiny < size < np.inf else None
 
 
 def _thin_box(system: HamiltonianSystem) -> Box | None:
