@@ -1,0 +1,417 @@
+"""Stores: named arrays with dimensions and attributes in a folder, in the format of zarr, version 2.
+
+A store is written here and not by the zarr library because of three guarantees:
+
+- A chunk is a file of its own, written beside its place and moved there: it is whole or it is not there, and different
+  processes write different chunks. Each has a checksum (zlib's, of data that it stores as they are).
+- Arrays grow, and attributes change, by the replacement of one file, ``.zmetadata``, the consolidated metadata that
+  readers take: `Store.commit`. A program that is killed at any moment leaves the store of the last commit.
+- Nothing is imported for it: a worker that writes chunks needs neither zarr nor xarray.
+
+`xarray.open_zarr(path)` and `zarr.open_group(path)` read a store.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import tempfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from itertools import product
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Appender", "Field", "Store", "StoreError"]
+
+METADATA, ATTRIBUTES, ARRAY = ".zmetadata", ".zattrs", ".zarray"
+KEPT = "sympflow_state"
+"""The attribute that names the file of the state which was kept at the last commit."""
+LARGEST_CHUNK = 2**20
+"""Numbers in a chunk of an array that grows."""
+
+
+class StoreError(OSError):
+    """A store that cannot be read or written, as where the disk is full; what was committed before is kept."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """An array of a store.
+
+    Attributes
+    ----------
+    dims : tuple of str
+        A name for each dimension. Fields that share one have the same length along it.
+    shape : tuple of int
+    dtype : dtype
+        Of numbers or truth values.
+    chunks : tuple of int, optional
+        The default is the whole array.
+    attributes : mapping
+        As JSON has them.
+    """
+
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: Any = float
+    chunks: tuple[int, ...] | None = None
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not len(self.dims) == len(self.shape) == len(self.chunks or self.shape):
+            raise ValueError(f"`dims` {self.dims}, `shape` {self.shape} and `chunks` {self.chunks} must agree.")
+        chunks = self.shape if self.chunks is None else self.chunks
+        object.__setattr__(self, "dtype", np.dtype(self.dtype).newbyteorder("<"))
+        object.__setattr__(self, "chunks", tuple(max(1, int(n)) for n in chunks))
+
+    @property
+    def grid(self) -> tuple[int, ...]:
+        """The number of chunks along each dimension."""
+        assert self.chunks is not None
+        return tuple(-(-n // size) for n, size in zip(self.shape, self.chunks, strict=True))
+
+    def region(self, index: tuple[int, ...]) -> tuple[slice, ...]:
+        """Return where in the array a chunk lies."""
+        assert self.chunks is not None
+        ends = zip(index, self.chunks, self.shape, strict=True)
+        return tuple(slice(i * size, min((i + 1) * size, n)) for i, size, n in ends)
+
+    def resized(self, lengths: Mapping[str, int]) -> Field:
+        """Return the field with other lengths of some dimensions."""
+        shape = tuple(lengths.get(dim, n) for dim, n in zip(self.dims, self.shape, strict=True))
+        return replace(self, shape=shape)
+
+    def metadata(self) -> dict[str, Any]:
+        """Return the array as zarr describes it."""
+        return {
+            "zarr_format": 2,
+            "shape": list(self.shape),
+            "chunks": list(self.chunks or ()),
+            "dtype": self.dtype.str,
+            "compressor": {"id": "zlib", "level": 0},
+            "fill_value": "NaN" if self.dtype.kind == "f" else None,
+            "order": "C",
+            "filters": None,
+        }
+
+    @classmethod
+    def read(cls, metadata: Mapping[str, Any], attributes: Mapping[str, Any]) -> Field:
+        """Return the field that zarr describes so."""
+        own = {name: value for name, value in attributes.items() if name != "_ARRAY_DIMENSIONS"}
+        shape, chunks = tuple(metadata["shape"]), tuple(metadata["chunks"])
+        return cls(tuple(attributes["_ARRAY_DIMENSIONS"]), shape, np.dtype(metadata["dtype"]), chunks, own)
+
+
+class Store:
+    """A store that exists: make one by `create`, or `open` it.
+
+    Attributes
+    ----------
+    path : Path
+    fields : dict of str to Field
+    attributes : dict
+        Those of the whole, as JSON has them, of the last commit.
+    """
+
+    def __init__(self, path: Path, fields: dict[str, Field], attributes: dict[str, Any]) -> None:
+        self.path, self.fields, self.attributes = path, fields, attributes
+
+    @classmethod
+    def create(cls, path: str | os.PathLike[str], fields: Mapping[str, Field], attributes: Mapping[str, Any]) -> Store:
+        """Make a store of arrays without values.
+
+        Raises
+        ------
+        FileExistsError
+            If there is something in this place.
+        StoreError
+            If it cannot be made there.
+        """
+        place = Path(path)
+        if place.exists() and (not place.is_dir() or any(place.iterdir())):
+            raise FileExistsError(f"`store` {str(place)!r} exists.")
+        store = cls(place, dict(fields), {})
+        with _told(place):
+            place.mkdir(parents=True, exist_ok=True)
+            for name in fields:
+                (place / name).mkdir(exist_ok=True)
+            _replace(place / ".zgroup", b'{"zarr_format": 2}')
+        store.commit(attributes=attributes)
+        return store
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str]) -> Store:
+        """Open a store as its last commit left it.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is none.
+        ValueError
+            If what is there is no such store.
+        """
+        place = Path(path)
+        try:
+            found = json.loads((place / METADATA).read_text(encoding="utf-8"))["metadata"]
+            names = [key.removesuffix(f"/{ARRAY}") for key in found if key.endswith(f"/{ARRAY}")]
+            fields = {name: Field.read(found[f"{name}/{ARRAY}"], found[f"{name}/{ATTRIBUTES}"]) for name in names}
+            return cls(place, fields, found[ATTRIBUTES])
+        except FileNotFoundError:
+            if place.exists():
+                raise ValueError(f"`store` {str(place)!r} is no store of sympflow: give another place.") from None
+            raise FileNotFoundError(f"`store` {str(place)!r} does not exist.") from None
+        except (ValueError, KeyError, TypeError, AttributeError, NotADirectoryError):
+            raise ValueError(f"`store` {str(place)!r} is no store of sympflow: give another place.") from None
+
+    # chunks ---------------------------------------------------------------------------------------
+
+    def _file(self, name: str, index: tuple[int, ...]) -> Path:
+        return self.path / name / (".".join(map(str, index)) or "0")
+
+    def has(self, name: str, index: tuple[int, ...]) -> bool:
+        """Return True if a chunk has been written."""
+        return self._file(name, index).exists()
+
+    def write(self, name: str, index: tuple[int, ...], values: np.ndarray) -> None:
+        """Write one chunk; at the edge of the array, or of one that is to grow, `values` may be smaller than a chunk.
+
+        Raises
+        ------
+        ValueError
+            If the values do not fit into the chunk.
+        StoreError
+            If they cannot be written, as on a full disk.
+        """
+        known = self.fields[name]
+        assert known.chunks is not None
+        values = np.asarray(values)
+        if values.ndim != len(known.chunks) or (np.array(values.shape) > known.chunks).any():
+            raise ValueError(f"`values` of shape {values.shape} are no chunk of {name!r}, of shape {known.chunks}.")
+        if values.shape == known.chunks:
+            chunk = np.ascontiguousarray(values, dtype=known.dtype)
+        else:
+            chunk = np.full(known.chunks, np.nan if known.dtype.kind == "f" else 0, dtype=known.dtype)
+            chunk[tuple(map(slice, values.shape))] = values
+        with _told(self.path):
+            _replace(self._file(name, index), zlib.compress(memoryview(chunk), 0))
+
+    def read(self, name: str, index: tuple[int, ...] | None = None) -> np.ndarray:
+        """Return a chunk, or the whole array; NaN, or 0 of other numbers, where nothing has been written.
+
+        Raises
+        ------
+        StoreError
+            If a chunk is damaged.
+        """
+        known = self.fields[name]
+        if index is None:
+            whole = np.empty(known.shape, known.dtype)
+            for i in product(*map(range, known.grid)):
+                whole[known.region(i)] = self.read(name, i)
+            return whole
+        assert known.chunks is not None
+        shape = tuple(part.stop - part.start for part in known.region(index))
+        try:
+            data = zlib.decompress(self._file(name, index).read_bytes())
+            if len(data) != prod(known.chunks) * known.dtype.itemsize:
+                raise zlib.error("another length")
+        except FileNotFoundError:
+            return np.full(shape, np.nan if known.dtype.kind == "f" else 0, dtype=known.dtype)
+        except zlib.error as error:
+            file = self._file(name, index)
+            raise StoreError(f"`store` {str(self.path)!r} is damaged: {file.name} of {name!r} ({error}).") from None
+        return np.frombuffer(data, known.dtype).reshape(known.chunks)[tuple(map(slice, shape))]
+
+    # commits --------------------------------------------------------------------------------------
+
+    def commit(
+        self,
+        lengths: Mapping[str, int] | None = None,
+        attributes: Mapping[str, Any] | None = None,
+        state: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """Set the lengths of dimensions, attributes, and the state to go on from, all at once or not at all.
+
+        Parameters
+        ----------
+        lengths : mapping of str to int
+            Of the dimensions that have grown.
+        attributes : mapping
+            Those that change, as JSON has them.
+        state : mapping of str to ndarray
+            Arrays that stand for what a run goes on from; see `state`.
+
+        Raises
+        ------
+        StoreError
+            If it cannot be written: the store is as it was.
+        """
+        fields = {name: known.resized(lengths or {}) for name, known in self.fields.items()}
+        changed = self.attributes | dict(attributes or {})
+        before = self.attributes.get(KEPT)
+        with _told(self.path):
+            if state is not None:
+                number = 1 + int(before.split("-")[1].removesuffix(".npz")) if before else 1
+                changed[KEPT] = f".state-{number}.npz"
+                buffer = io.BytesIO()
+                np.savez(buffer, **dict(state))  # type: ignore[arg-type]
+                _replace(self.path / changed[KEPT], buffer.getvalue())
+            described: dict[str, Any] = {".zgroup": {"zarr_format": 2}, ATTRIBUTES: changed}
+            for name, known in fields.items():
+                described[f"{name}/{ARRAY}"] = known.metadata()
+                described[f"{name}/{ATTRIBUTES}"] = {"_ARRAY_DIMENSIONS": list(known.dims), **known.attributes}
+            _replace(self.path / METADATA, _json({"metadata": described, "zarr_consolidated_format": 1}))
+            self.fields, self.attributes = fields, changed
+            for key, value in described.items():  # for readers that do not take consolidated metadata
+                _replace(self.path / key, _json(value), durable=False)
+            if state is not None and before:
+                (self.path / before).unlink(missing_ok=True)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return the arrays that the last commit kept; {} if it kept none."""
+        name = self.attributes.get(KEPT)
+        if name is None:
+            return {}
+        try:
+            with np.load(self.path / name, allow_pickle=False) as kept:
+                return dict(kept)
+        except (OSError, ValueError, zlib.error) as error:
+            raise StoreError(f"`store` {str(self.path)!r} is damaged: its state cannot be read ({error}).") from None
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from writing a store that grows; the system takes the lock of one that is killed.
+
+        Raises
+        ------
+        StoreError
+            If another one writes it.
+        """
+        try:
+            import fcntl
+        except ImportError:  # Windows, where an open file is not replaced anyway
+            yield
+            return
+        with open(self.path / ".lock", "w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise StoreError(
+                    f"`store` {str(self.path)!r} is being written by another process: wait for it, or give another "
+                    "place."
+                ) from None
+            except OSError:  # a file system without locks
+                pass
+            yield
+
+    def remove(self) -> None:
+        """Delete the store."""
+        shutil.rmtree(self.path)
+
+
+class Appender:
+    """Records that are appended to a store along one dimension; a chunk that is not full yet is kept in memory.
+
+    Parameters
+    ----------
+    store : Store
+    dim : str
+        The dimension that grows, along which the fields that have it share their chunks.
+    """
+
+    def __init__(self, store: Store, dim: str) -> None:
+        self.store, self.dim = store, dim
+        self.axes = {name: known.dims.index(dim) for name, known in store.fields.items() if dim in known.dims}
+        name, axis = next(iter(self.axes.items()))
+        known = store.fields[name]
+        assert known.chunks is not None
+        self.size, self.length = known.chunks[axis], known.shape[axis]
+        self.tails: dict[str, list[np.ndarray]] = {name: [] for name in self.axes}
+        self.held = self.length % self.size
+        if self.held:  # the last chunk, up to what was committed
+            for name in self.axes:
+                index = self._index(name, self.length // self.size)
+                self.tails[name].append(store.read(name, index))
+
+    def _index(self, name: str, k: int) -> tuple[int, ...]:
+        """The chunk k along the dimension; along the others there is one."""
+        axis = self.axes[name]
+        return tuple(k if i == axis else 0 for i in range(len(self.store.fields[name].dims)))
+
+    def append(self, records: Mapping[str, np.ndarray]) -> None:
+        """Append arrays, one for each field that grows, of one length along the dimension."""
+        n = next(records[name].shape[axis] for name, axis in self.axes.items())
+        for name in self.axes:
+            self.tails[name].append(np.asarray(records[name]))
+        self.held += n
+        self.length += n
+        if self.held >= self.size:
+            self._write(self.held // self.size)
+
+    def _write(self, n_chunks: int) -> None:
+        """Write full chunks, and keep what is left."""
+        first = (self.length - self.held) // self.size
+        for name, axis in self.axes.items():
+            tail = np.concatenate(self.tails[name], axis=axis)
+            for k in range(n_chunks):
+                part = [slice(None)] * tail.ndim
+                part[axis] = slice(k * self.size, (k + 1) * self.size)
+                self.store.write(name, self._index(name, first + k), tail[tuple(part)])
+            part = [slice(None)] * tail.ndim
+            part[axis] = slice(n_chunks * self.size, None)
+            self.tails[name] = [tail[tuple(part)].copy()]
+        self.held -= n_chunks * self.size
+
+    def commit(
+        self, attributes: Mapping[str, Any] | None = None, state: Mapping[str, np.ndarray] | None = None
+    ) -> None:
+        """Write what is in memory, and commit the store with its new length: see `Store.commit`."""
+        if self.held:
+            k = self.length // self.size
+            for name, axis in self.axes.items():
+                tail = np.concatenate(self.tails[name], axis=axis)
+                self.tails[name] = [tail]
+                self.store.write(name, self._index(name, k), tail)
+        self.store.commit({self.dim: self.length}, attributes, state)
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, allow_nan=False, indent=1).encode()
+
+
+def _replace(path: Path, data: bytes, durable: bool = True) -> None:
+    """Write a file beside its place and move it there; `durable` once the disk has it."""
+    handle, unfinished = tempfile.mkstemp(dir=path.parent, prefix=".new-")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            if durable:
+                os.fsync(file.fileno())
+        os.chmod(unfinished, 0o644)
+        os.replace(unfinished, path)
+    except BaseException:
+        Path(unfinished).unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Say which store could not be written."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, StoreError):
+            raise
+        raise StoreError(
+            f"`store` {str(path)!r} cannot be written ({error.strerror or error}): what was committed is kept. Make "
+            "room, or mend that, and resume."
+        ) from error
