@@ -32,7 +32,9 @@ NETWORK = {"pairs": 4, "hidden": (10,)}
 STATES = Ball([0.0, 0.0], 1.0)
 
 
-def trained(rate: float, labels: int, steps: int) -> tuple[sympflow.hamiltonian.doubling.DoubledSystem, sympflow.SympFlow]:
+def trained(
+    rate: float, labels: int, steps: int
+) -> tuple[sympflow.hamiltonian.doubling.DoubledSystem, sympflow.SympFlow]:
     """The doubled oscillator and a flow of it on [0, Δt], whose labels are all at Δt."""
     domain = Box([-1.5, -0.5, -0.5, -1.5], [1.5, 0.5, 0.5, 1.5])
     system = doubled(systems.harmonic_oscillator(), "-rate*p", params={"rate": rate}, domain=domain)
