@@ -11,13 +11,16 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, differentiable, is_tensor, stack, to_numpy, unfollowed
+from sympflow.arrays import Array, differentiable, is_tensor, library, stack, to_numpy, unfollowed, values
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.function_checks import Tested, check_writes, test
 
 
 class CallableHamiltonian(Definition):
     """The functions of a system given by V(q) or H(q, p). See `HamiltonianSystem` for the arguments."""
+
+    time: float | None = None
+    """The time at which those of a driven system are taken, for messages."""
 
     def __init__(
         self,
@@ -31,27 +34,25 @@ class CallableHamiltonian(Definition):
         check_flag("check", check)
         if (potential is None) == (hamiltonian is None):
             raise TypeError("`potential` or `hamiltonian` must be given, and not both.")
-        for name, function in (
-            ("potential", potential),
-            ("hamiltonian", hamiltonian),
-            ("gradient", gradient),
-        ):
-            if function is not None and not callable(function):
-                raise TypeError(f"`{name}` must be callable; got {type(function).__name__}.")
+        _check_callable(potential=potential, hamiltonian=hamiltonian, gradient=gradient)
         if potential is None and (gradient is not None or hessian_vector is not None):
             raise TypeError("`gradient` and `hessian_vector` only go with `potential`: leave them out.")
         self.ndof, self.given = ndof, bool(check)
         self.separable = potential is not None
         self.has_hessian_vector = gradient is None or hessian_vector is not None
-        if gradient is not None and hasattr(gradient, "py_func"):
-            _check_numba(potential, gradient, hessian_vector)
-            self.numba_functions = (potential, gradient, hessian_vector)
-            arrays = NumbaFunctions(potential, gradient, hessian_vector)
-            potential, gradient = arrays.potential, arrays.gradient
-            hessian_vector = None if hessian_vector is None else arrays.hessian_vector
         self._potential, self._hamiltonian = potential, hamiltonian
         self._gradient, self._hessian_vector = gradient, hessian_vector
         self.differentiates_itself = gradient is None and hessian_vector is None
+        if gradient is not None and hasattr(gradient, "py_func"):
+            _check_numba(potential, gradient, hessian_vector)
+            self.take_numba(potential, gradient, hessian_vector)
+
+    def take_numba(self, potential: Any, gradient: Any, hessian_vector: Any | None) -> None:
+        """Take Numba functions of single states."""
+        self.numba_functions = (potential, gradient, hessian_vector)
+        arrays = NumbaFunctions(potential, gradient, hessian_vector)
+        self._potential, self._gradient = arrays.potential, arrays.gradient
+        self._hessian_vector = None if hessian_vector is None else arrays.hessian_vector
 
     def learns(self, y: Array) -> bool:
         if self.numba_functions is not None:
@@ -71,7 +72,7 @@ class CallableHamiltonian(Definition):
             like = torch.from_numpy(np.empty(0, like.dtype))
         if not self.separable:
             names = "hamiltonian", "gradient", "[q, p]"
-            functions = Tested(names, self.hamiltonian, self.gradient, None, True, 2, self._result_types)
+            functions = Tested(names, self.hamiltonian, self.gradient, None, True, 2, self._result_types, self.time)
             test(functions, states, like, n_given)
             return
         if self.numba_functions is not None:
@@ -84,7 +85,9 @@ class CallableHamiltonian(Definition):
         names = "potential", "gradient", "q"
         product = None if self._hessian_vector is None else self.hessian_vector
         automatic = self._gradient is None
-        functions = Tested(names, self.potential, self.potential_gradient, product, automatic, 1, self._result_types)
+        functions = Tested(
+            names, self.potential, self.potential_gradient, product, automatic, 1, self._result_types, self.time
+        )
         test(functions, states[:, : self.ndof], like, n_given)
 
     def _result_types(self, x: Array) -> list[tuple[str, Any]]:
@@ -176,12 +179,18 @@ class CallableHamiltonian(Definition):
         return _with_torch(_hessian_of(self._potential, "potential"), q, "potential", (self.ndof, self.ndof))
 
 
-def _check_numba(potential: Any, gradient: Any, hessian_vector: Any) -> None:
+def _check_callable(**functions: Any) -> None:
+    for name, function in functions.items():
+        if function is not None and not callable(function):
+            raise TypeError(f"`{name}` must be callable; got {type(function).__name__}.")
+
+
+def _check_numba(potential: Any, gradient: Any, hessian_vector: Any, first: str = "") -> None:
     """Raise unless the functions given with a Numba `gradient` are Numba functions of the right arguments."""
     for name, function, arguments in (
-        ("potential", potential, "q"),
-        ("gradient", gradient, "q, out"),
-        ("hessian_vector", hessian_vector, "q, v, out"),
+        ("potential", potential, f"{first}q"),
+        ("gradient", gradient, f"{first}q, out"),
+        ("hessian_vector", hessian_vector, f"{first}q, v, out"),
     ):
         if function is None:
             continue
@@ -269,6 +278,167 @@ def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
     if value.dtype.kind not in "fiub":
         raise TypeError(f"`{name}` must return real numbers; got {value.dtype}. Take the real part.")
     return value.astype(x.dtype, copy=False)
+
+
+class DrivenCallables(Definition):
+    """The functions of a driven system, H(t, q, p), each with the time as its first argument.
+
+    A user's function is called with one time, a number: as a float beside arrays, and as a tensor of one double beside
+    tensors. States of several times are taken apart.
+    """
+
+    timed = True
+
+    def __init__(
+        self,
+        ndof: int,
+        potential: Callable[..., Array] | None,
+        hamiltonian: Callable[..., Array] | None,
+        gradient: Callable[..., Any] | None,
+        hessian_vector: Callable[..., Any] | None,
+        check: bool = True,
+    ) -> None:
+        _check_callable(potential=potential, hamiltonian=hamiltonian, gradient=gradient, hessian_vector=hessian_vector)
+        self._functions = potential, hamiltonian, gradient, hessian_vector
+        for (name, arguments), function in zip(_ARGUMENTS.items(), self._functions, strict=True):
+            if function is not None and not hasattr(function, "py_func"):
+                _check_arguments(name, function, arguments)
+        if gradient is not None and hasattr(gradient, "py_func"):
+            _check_numba(potential, gradient, hessian_vector, "t, ")
+            self.numba_functions = (potential, gradient, hessian_vector)
+        self.ndof, self.check_given = ndof, check
+        now = self._at(0.0)
+        self.given, self.separable = now.given, now.separable
+        self.has_hessian_vector, self.differentiates_itself = now.has_hessian_vector, now.differentiates_itself
+
+    def _at(self, t: Any) -> CallableHamiltonian:
+        """The functions at one time."""
+        V, H, slope, product = (None if f is None else _AtTime(f, t) for f in self._functions)
+        now = CallableHamiltonian(self.ndof, V, H, slope, product, bool(self.check_given))
+        if self.numba_functions is not None:
+            now.take_numba(*(None if f is None else _AtTime(f, float(t)) for f in self.numba_functions))
+        return now
+
+    def _over_times(self, name: str, t: Any, *states: Array) -> Array:
+        """A function of `CallableHamiltonian` of states (..., k), each at its time."""
+        if not getattr(t, "ndim", 0):
+            return getattr(self._at(t), name)(*states)
+        flat = [x.reshape(-1, x.shape[-1]) for x in states]
+        times = t.reshape(-1)
+        if is_tensor(times) and (found := values(times)) is not None and (found == found[..., :1]).all():
+            return getattr(self._at(times[0]), name)(*states)
+        if is_tensor(times):
+            rows = [getattr(self._at(s), name)(*(x[i] for x in flat)) for i, s in enumerate(times)]
+            return stack(rows, axis=0).reshape(*t.shape, *rows[0].shape)
+        distinct, which = np.unique(times, return_inverse=True)
+        result: Any = None
+        for k, s in enumerate(distinct.tolist()):
+            rows = which == k
+            each = getattr(self._at(s), name)(*(x[rows] for x in flat))
+            if result is None:
+                result = np.empty((len(times), *each.shape[1:]), dtype=each.dtype)
+            result[rows] = each
+        return result.reshape(*t.shape, *result.shape[1:])
+
+    def learns(self, y: Array) -> bool:
+        return self._at(0.0).learns(y)
+
+    def check(self, states: np.ndarray, like: Array, n_given: int, times: np.ndarray | None = None) -> None:
+        """Test them at each of the times (n,)."""
+        for t in (0.0,) if times is None else times.tolist():
+            now = self._at(t)
+            now.time = t
+            now.check(states, like, n_given)
+
+    @cached_property
+    def takes_tensors(self) -> bool:  # type: ignore[override]
+        return self._at(0.0).takes_tensors
+
+    def hamiltonian(self, y: Array, t: Any) -> Array:
+        return self._over_times("hamiltonian", t, y)
+
+    def gradient(self, y: Array, t: Any) -> Array:
+        return self._over_times("gradient", t, y)
+
+    def hessian(self, y: Array, t: Any) -> Array:
+        return self._over_times("hessian", t, y)
+
+    def potential(self, q: Array, t: Any) -> Array:
+        return self._over_times("potential", t, q)
+
+    def potential_gradient(self, q: Array, t: Any) -> Array:
+        return self._over_times("potential_gradient", t, q)
+
+    def potential_hessian(self, q: Array, *t: Any) -> Array:
+        return self._over_times("potential_hessian", *t, q)
+
+    def hessian_vector(self, q: Array, v: Array, *t: Any) -> Array:
+        return self._over_times("hessian_vector", *t, q, v)
+
+    def time_derivative(self, y: Array, t: Any) -> Array:
+        """∂H/∂t (...): of functions that torch differentiates by that, of others by differences of order 6."""
+        states, name = (y[..., : self.ndof], "potential") if self.separable else (y, "hamiltonian")
+
+        def value(s: Any) -> Array:
+            return self._over_times(name, s, states)
+
+        if self.differentiates_itself:
+            import torch
+
+            from sympflow.arrays import jvp
+
+            s = torch.as_tensor(t, dtype=torch.float64)
+            tensor = torch.as_tensor(states)
+            found = jvp(lambda u: self._over_times(name, u, tensor), s, torch.ones_like(s))[1]
+            return found.to(states.dtype) if is_tensor(y) else to_numpy(found).astype(y.dtype)
+        return _time_difference(value, t)
+
+
+_ARGUMENTS = {"potential": "t, q", "hamiltonian": "t, q, p", "gradient": "t, q", "hessian_vector": "t, q, v"}
+
+
+class _AtTime:
+    """A function of a user at a time, which is its first argument."""
+
+    def __init__(self, function: Callable[..., Any], t: Any) -> None:
+        self.function, self.t = function, t
+
+    def __call__(self, *states: Any) -> Any:
+        t, x = self.t, states[0]
+        if is_tensor(x):
+            import torch
+
+            t = torch.as_tensor(t, dtype=torch.float64, device=x.device)
+        elif is_tensor(t):
+            t = float(t)
+        return self.function(t, *states)
+
+
+def _check_arguments(name: str, function: Callable[..., Any], arguments: str) -> None:
+    """Raise a TypeError if it is known that a function does not take these arguments."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return
+    try:
+        signature.bind(*arguments.split(","))
+    except TypeError as error:
+        raise TypeError(f"`{name}` of a driven system is called with ({arguments}), the time first: {error}.") from None
+
+
+def _time_difference(value: Callable[[Any], Array], t: Any) -> Array:
+    """The derivative of a function of t, by central differences of order 6 with the step of ten at which it settles."""
+    found, best, before = None, None, None
+    for h in (0.1 * 0.4**k for k in range(10)):
+        near, middle, far = (value(t + k * h) - value(t - k * h) for k in (1, 2, 3))
+        slope = (45 * near - 9 * middle + far) / (60 * h)
+        if before is not None:
+            change = abs(slope - before)
+            where = library(change).where
+            found = slope if best is None else where(change < best, slope, found)
+            best = change if best is None else where(change < best, change, best)
+        before = slope
+    return found
 
 
 class NumbaFunctions:

@@ -29,6 +29,11 @@ class Definition:
         False if the functions take NumPy arrays alone.
     given : bool
         True if the functions are a user's own, whose derivatives may be wrong: `check` tests them.
+    timed : bool
+        True if H depends on the time: then each function takes t, a number or (...), after the states, and there is
+        `time_derivative(y, t)`.
+    kinetic_timed : bool
+        True if T depends on it: then there are `drifted(p, t, s)` and `drift_jacobian(p, t, s)`.
     """
 
     ndof: int
@@ -38,6 +43,8 @@ class Definition:
     has_hessian_vector: bool = True
     takes_tensors: bool = True
     given: bool = False
+    timed: bool = False
+    kinetic_timed: bool = False
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""
@@ -49,10 +56,10 @@ class Definition:
         """
         return False
 
-    def potential_hessian(self, q: Array) -> Array:
+    def potential_hessian(self, q: Array, *t: Array) -> Array:
         """∇²V(q): (..., d) to (..., d, d)."""
         raise NotImplementedError(f"{type(self).__name__} must define potential_hessian().")
 
-    def hessian_vector(self, q: Array, v: Array) -> Array:
+    def hessian_vector(self, q: Array, v: Array, *t: Array) -> Array:
         """∇²V(q)·v: (..., d), each, to (..., d)."""
-        return (self.potential_hessian(q) @ v[..., None])[..., 0]
+        return (self.potential_hessian(q, *t) @ v[..., None])[..., 0]

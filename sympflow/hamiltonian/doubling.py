@@ -154,6 +154,12 @@ def doubled(
     scene["energy_scale"] = _energy_scale(system)
     made: DoubledSystem
     given = callable(force) and not hasattr(force, "free_symbols")  # SymPy's expressions may be called
+    samples = system.symbols is not None and system.symbols.samples
+    if samples or (not system.autonomous and (given or system.symbols is None)):
+        system.check_autonomous(
+            "by functions of t, or samples, or with a force by a function, which are not doubled",
+            "give H and the force by symbols, with the time named, or solve system.vector_field by 'dop853'",
+        )
     if given and params is not None:
         raise TypeError("`params` are for a `force` by symbols: write their values into the function.")
     if given or system.symbols is None:
@@ -174,7 +180,8 @@ def doubled(
                 UserWarning,
                 stacklevel=2,
             )
-        made = DoubledSystem.from_sympy(doubled_hamiltonian(system, F), **scene)  # type: ignore[assignment]
+        time = None if system.symbols.time is None else {"time": system.symbols.time, "period": system.period}
+        made = DoubledSystem.from_sympy(doubled_hamiltonian(system, F), **scene, **(time or {}))  # type: ignore[assignment]
     made.physical = system if force is None else system.with_force(F)
     made.y0 = None if system.y0 is None else made.lift(system.y0)
     return made
@@ -190,7 +197,7 @@ class GivenForce:
     def __init__(self, force: Force) -> None:
         self.force = force
 
-    def __call__(self, q: Array, p: Array) -> Array:
+    def __call__(self, q: Array, p: Array, *t: Any) -> Array:
         import torch
 
         value = self.force(torch.as_tensor(q), torch.as_tensor(p))
@@ -202,7 +209,7 @@ class GivenForce:
             )
         return value if is_tensor(p) else value.detach().numpy()
 
-    def jacobian(self, q: Array, p: Array) -> Array:
+    def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
         import torch
 
         from sympflow.arrays import jvp
@@ -236,7 +243,7 @@ def _energy_scale(system: HamiltonianSystem) -> float | None:
     if system.energy_scale is not None or system.y0 is None:
         return system.energy_scale
     with np.errstate(all="ignore"):
-        size = float(abs(system.hamiltonian(system.y0)))
+        size = float(abs(system.hamiltonian(system.y0, system.t_span[0])))
     return size if np.finfo(float).tiny < size < np.inf else None
 
 

@@ -54,7 +54,7 @@ def _agree(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
 
 
 def check_for_flows(system: Hamiltonian) -> None:
-    """Refuse a system with friction, which trained flows, of conservative systems, would leave out.
+    """Refuse a system with friction, or a driven one: trained flows, of H(q, p) alone, would leave that out.
 
     Raises
     ------
@@ -65,6 +65,9 @@ def check_for_flows(system: Hamiltonian) -> None:
         "which no trained flow has",
         "train and use flows of the system without `damping`, and solve this one by a splitting method such as "
         "'verlet' or 'kahan_li8'",
+    )
+    system.check_autonomous(
+        "which no trained flow has", "solve it by a splitting method such as 'verlet' or 'kahan_li8'"
     )
 
 

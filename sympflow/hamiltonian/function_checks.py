@@ -91,6 +91,8 @@ class Tested:
         2 if x is [q, p], two halves of sizes of their own, else 1.
     result_types : callable, optional
         The types in which the user's own functions answer.
+    time : float, optional
+        The time of the functions, of a driven system.
     """
 
     names: tuple[str, str, str]
@@ -100,6 +102,7 @@ class Tested:
     automatic: bool = False
     parts: int = 1
     result_types: Callable[[Array], list[tuple[str, Any]]] | None = None
+    time: float | None = None
 
 
 def test(functions: Tested, states: np.ndarray, like: Array, n_given: int) -> None:
@@ -379,7 +382,8 @@ def check_writes(name: str, function: Callable[..., Any], *states: np.ndarray) -
 
 
 def _shown(functions: Tested, state: Array) -> str:
-    return f"{functions.names[2]} = {_short(_numbers(state))}"
+    at = "" if functions.time is None else f"t = {functions.time:g}, "
+    return f"{at}{functions.names[2]} = {_short(_numbers(state))}"
 
 
 def _short(v: np.ndarray) -> str:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor
+from sympflow.arrays import Array, concatenate, is_tensor, per_state
+from sympflow.hamiltonian.times import checked_time
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
@@ -17,13 +18,13 @@ if TYPE_CHECKING:
 
 
 class ExternalForce(Protocol):
-    """F(q, p) in p' = −∂H/∂q + F, that no H has."""
+    """F(q, p) in p' = −∂H/∂q + F, that no H has; of a driven system t, a number or (...), follows p."""
 
-    def __call__(self, q: Array, p: Array) -> Array:
+    def __call__(self, q: Array, p: Array, *t: Any) -> Array:
         """F: (..., d), each, to (..., d)."""
         ...
 
-    def jacobian(self, q: Array, p: Array) -> Array:
+    def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
         """∂F/∂(q, p): (..., d), each, to (..., d, 2d)."""
         ...
 
@@ -47,7 +48,7 @@ class Doubled(Protocol):
 
 
 class Hamiltonian:
-    """H(q, p), of d degrees of freedom, by a definition of it.
+    """H(q, p), or H(t, q, p), of d degrees of freedom, by a definition of it.
 
     Parameters
     ----------
@@ -72,11 +73,18 @@ class Hamiltonian:
         True if H is given by functions of a user, which are to be checked.
     friction : Friction or None
         What −Γp does, of a damped system. Whatever leaves it out must refuse the system: see `check_conservative`.
+    autonomous : bool
+        False if H depends on t: then every function takes the time after the states, a number or one for each state,
+        and whatever leaves it out must refuse the system: see `check_autonomous`.
+    period : float or None
+        The period of H in t, where one was named.
     """
 
     friction: Friction | None = None
     external_force: ExternalForce | None = None
     """F of the physical limit of a doubled system, p' = −∂H/∂q + F; it is part of `vector_field`."""
+    autonomous: bool = True
+    period: float | None = None
 
     def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
         self.name = name
@@ -90,51 +98,64 @@ class Hamiltonian:
         self.quadratic_kinetic = quadratic_kinetic
         self.stiffness_matrix: np.ndarray | None = None
         self.functions_given: bool = definition.given
+        if definition.timed:
+            self.autonomous = False
         self._tested: dict[tuple[type, Any], np.ndarray] = {}  # how far, by the kind of states
 
-    def hamiltonian(self, y: Array) -> Array:
-        """H(y): (..., 2d) to (...)."""
+    def hamiltonian(self, y: Array, t: Any = None) -> Array:
+        """H(y), or H(t, y): (..., 2d) to (...).
+
+        Raises
+        ------
+        TypeError
+            As every function of a driven system, if t is left out.
+        """
         self._check_width(y)
         if self.separable:
             q, p = y[..., : self.ndof], y[..., self.ndof :]
-            return self.kinetic(p) + self.potential(q)
-        return self._definition.hamiltonian(y)
+            return self.kinetic(p, t) + self.potential(q, t)
+        return self._definition.hamiltonian(y, *self._time(t, y))
 
-    def gradient(self, y: Array) -> Array:
+    def gradient(self, y: Array, t: Any = None) -> Array:
         """∇H(y): (..., 2d) to (..., 2d)."""
         self._check_width(y)
         if self.separable:
-            return concatenate([-self.force(y[..., : self.ndof]), self.velocity(y[..., self.ndof :])])
-        return self._definition.gradient(y)
+            return concatenate([-self.force(y[..., : self.ndof], t), self.velocity(y[..., self.ndof :], t)])
+        return self._definition.gradient(y, *self._time(t, y))
 
-    def hessian(self, y: Array) -> Array:
+    def hessian(self, y: Array, t: Any = None) -> Array:
         """∇²H(y): (..., 2d) to (..., 2d, 2d)."""
         self._check_width(y)
         if not self.separable:
-            return self._definition.hessian(y)
+            return self._definition.hessian(y, *self._time(t, y))
         d = self.ndof
-        A, B = self.potential_hessian(y[..., :d]), self.kinetic_hessian(y[..., d:])
+        A, B = self.potential_hessian(y[..., :d], t), self.kinetic_hessian(y[..., d:], t)
         B = B + 0 * A
         return concatenate([_rows(A, 0 * A), _rows(0 * B, B)]).swapaxes(-1, -2)
 
-    def vector_field(self, y: Array) -> Array:
+    def time_derivative(self, y: Array, t: Any = None) -> Array:
+        """∂H/∂t of a driven system, 0 of another: (..., 2d) to (...)."""
+        self._check_width(y)
+        return 0 * y[..., 0] if self.autonomous else self._definition.time_derivative(y, *self._time(t, y))
+
+    def vector_field(self, y: Array, t: Any = None) -> Array:
         """J∇H(y) = [∇_pH, −∇_qH], with friction [∇_pH, −∇_qH − Γp]: (..., 2d) to (..., 2d)."""
         self._check_width(y)
         d = self.ndof
         if self.separable:
-            velocity, force = self.velocity(y[..., d:]), self.force(y[..., :d])
+            velocity, force = self.velocity(y[..., d:], t), self.force(y[..., :d], t)
         else:
-            g = self._definition.gradient(y)
+            g = self._definition.gradient(y, *self._time(t, y))
             velocity, force = g[..., d:], -g[..., :d]
         if self.friction is not None:
             force = force + self.friction.force(y[..., d:])
         if self.external_force is not None:
-            force = force + self.external_force(y[..., :d], y[..., d:])
+            force = force + self.external_force(y[..., :d], y[..., d:], *self._time(t, y))
         return concatenate([velocity, force])
 
-    def field_jacobian(self, y: Array) -> Array:
+    def field_jacobian(self, y: Array, t: Any = None) -> Array:
         """The Jacobian of `vector_field`, J∇²H(y), with friction less Γ in the rows and columns of p: (..., 2d, 2d)."""
-        d, S = self.ndof, self.hessian(y)
+        d, S = self.ndof, self.hessian(y, t)
         rows = [S[..., d:, :], -S[..., :d, :]]
         A = _library(S).cat(rows, dim=-2) if is_tensor(S) else np.concatenate(rows, axis=-2)
         if self.friction is not None:
@@ -142,7 +163,7 @@ class Hamiltonian:
             G[d:, d:] = self.friction.matrix(d)
             A = A - _like(G, A)
         if self.external_force is not None:
-            F = self.external_force.jacobian(y[..., :d], y[..., d:])
+            F = self.external_force.jacobian(y[..., :d], y[..., d:], *self._time(t, y))
             A = A + _rows_below(F)
         return A
 
@@ -207,13 +228,35 @@ class Hamiltonian:
         if self.friction is not None:
             raise ValueError(f"`system` {self.name!r} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
 
+    def check_autonomous(self, what: str, remedy: str) -> None:
+        """Refuse a driven system, H(t, q, p), where the time would be left out, or what is asked does not hold with it.
+
+        Raises
+        ------
+        ValueError
+            With `what` is asked, as a clause that follows the reason, and the remedy.
+        """
+        if not self.autonomous:
+            raise ValueError(f"`system` {self.name!r} is driven, H depends on t, {what}: {remedy}.")
+
+    def _time(self, t: Any, x: Array) -> tuple[Any, ...]:
+        """The time that functions of a driven system take after the states x (..., k), checked; () of another."""
+        if self.autonomous:
+            return ()
+        if t is None:
+            raise TypeError(
+                f"`t` is missing, the time: `system` {self.name!r} is driven, H depends on t. Give it after the state, "
+                "as in system.hamiltonian(y, t)."
+            )
+        return (checked_time(t, x, x.shape[:-1]),)
+
     def learns(self, y: Array) -> bool:
         """Return True if torch follows numbers of H other than y (..., 2d), a tensor: such as a network's weights."""
         return self._definition.learns(y)
 
     def __call__(self, t: float, y: Array) -> Array:
         """The right-hand side fun(t, y) of `scipy.integrate.solve_ivp` and `torchdiffeq.odeint`."""
-        return self.vector_field(y)
+        return self.vector_field(y, t)
 
     def _check_width(self, y: Array) -> None:
         if y.shape[-1:] != (2 * self.ndof,):
@@ -224,23 +267,23 @@ class Hamiltonian:
 
     # separable systems: V(q) and T(p) -------------------------------------------------------------
 
-    def potential(self, q: Array) -> Array:
+    def potential(self, q: Array, t: Any = None) -> Array:
         """V(q): (..., d) to (...)."""
-        return self._separable()._definition.potential(self._positions(q))
+        return self._separable()._definition.potential(self._positions(q), *self._time(t, q))
 
-    def force(self, q: Array) -> Array:
+    def force(self, q: Array, t: Any = None) -> Array:
         """−∇V(q): (..., d) to (..., d)."""
-        return -self._separable()._definition.potential_gradient(self._positions(q))
+        return -self._separable()._definition.potential_gradient(self._positions(q), *self._time(t, q))
 
-    def potential_hessian(self, q: Array) -> Array:
+    def potential_hessian(self, q: Array, t: Any = None) -> Array:
         """∇²V(q): (..., d) to (..., d, d)."""
-        return self._separable()._definition.potential_hessian(self._positions(q))
+        return self._separable()._definition.potential_hessian(self._positions(q), *self._time(t, q))
 
-    def hessian_vector(self, q: Array, v: Array) -> Array:
+    def hessian_vector(self, q: Array, v: Array, t: Any = None) -> Array:
         """∇²V(q)·v, by the function given for it if there is one: (..., d), (..., d) to (..., d)."""
-        return self._separable()._definition.hessian_vector(self._positions(q), v)
+        return self._separable()._definition.hessian_vector(self._positions(q), v, *self._time(t, q))
 
-    def curvature(self, q: Array) -> Array:
+    def curvature(self, q: Array, t: Any = None) -> Array:
         """½ v·∇²V(q) v, the curvature of V along the acceleration v = M⁻¹∇V(q): (..., d) to (...).
 
         Raises
@@ -250,11 +293,11 @@ class Hamiltonian:
         """
         symbols = self._with_acceleration().symbols
         if symbols is not None:
-            return symbols.curvature(self._positions(q))
-        v = self.velocity(self.force(q))
-        return (v * self.hessian_vector(q, v)).sum(-1) / 2
+            return symbols.curvature(self._positions(q), *self._time(t, q))
+        v = self.velocity(self.force(q, t))
+        return (v * self.hessian_vector(q, v, t)).sum(-1) / 2
 
-    def curvature_gradient(self, q: Array) -> Array:
+    def curvature_gradient(self, q: Array, t: Any = None) -> Array:
         """The gradient of `curvature`, ∇²V M⁻¹∇²V v + ½ ∇³V(v, v): (..., d) to (..., d).
 
         Without symbols the third derivative is that of ∇²V v along v: by automatic differentiation of tensors, and of
@@ -262,11 +305,12 @@ class Hamiltonian:
         """
         symbols = self._with_acceleration().symbols
         if symbols is not None:
-            return symbols.curvature_gradient(self._positions(q))
-        v = -self.velocity(self.force(q))
-        return self.hessian_vector(q, self.velocity(self.hessian_vector(q, v))) + self.third_derivative(q, v, v) / 2
+            return symbols.curvature_gradient(self._positions(q), *self._time(t, q))
+        v = -self.velocity(self.force(q, t))
+        turn = self.hessian_vector(q, self.velocity(self.hessian_vector(q, v, t)), t)
+        return turn + self.third_derivative(q, v, v, t) / 2
 
-    def third_derivative(self, q: Array, v: Array, w: Array) -> Array:
+    def third_derivative(self, q: Array, v: Array, w: Array, t: Any = None) -> Array:
         """∇³V(q)(v, w), for a system without symbols: (..., d), each, to (..., d)."""
         if self.numba_functions is None and (self._definition.differentiates_itself or is_tensor(q)):
             import torch
@@ -274,10 +318,10 @@ class Hamiltonian:
             from sympflow.arrays import jvp
 
             x, along, other = (torch.as_tensor(each) for each in (q, v, w))
-            found = jvp(lambda z: self.hessian_vector(z, other), x, along)[1]
+            found = jvp(lambda z: self.hessian_vector(z, other, t), x, along)[1]
             return found if is_tensor(q) else found.numpy()
 
-        return third_derivative(self, q, v, w)
+        return third_derivative(self, q, v, w, t)
 
     def _with_acceleration(self) -> Hamiltonian:
         if not self._separable().quadratic_kinetic:
@@ -295,27 +339,63 @@ class Hamiltonian:
             )
         return q
 
-    def kinetic(self, p: Array) -> Array:
-        """T(p): (..., d) to (...)."""
+    def kinetic(self, p: Array, t: Any = None) -> Array:
+        """T(p): (..., d) to (...). Like its derivatives it needs no t if T does not depend on it."""
         if self._separable().quadratic_kinetic:
             return (p * self.velocity(p)).sum(-1) / 2
-        return self._definition.kinetic(p)
+        return self._definition.kinetic(p, *self._kinetic_time(t, p))
 
-    def velocity(self, p: Array) -> Array:
+    def velocity(self, p: Array, t: Any = None) -> Array:
         """∇T(p): (..., d) to (..., d)."""
         if not self._separable().quadratic_kinetic:
-            return self._definition.kinetic_gradient(p)
+            return self._definition.kinetic_gradient(p, *self._kinetic_time(t, p))
         if self.inverse_mass is None:
             return p
         M = _like(self.inverse_mass, p)
         return p * M if M.ndim == 1 else p @ M
 
-    def kinetic_hessian(self, p: Array) -> Array:
+    def kinetic_hessian(self, p: Array, t: Any = None) -> Array:
         """∇²T(p): (..., d) to (..., d, d); M⁻¹ of shape (d, d) when T is quadratic."""
         if not self._separable().quadratic_kinetic:
-            return self._definition.kinetic_hessian(p)
+            return self._definition.kinetic_hessian(p, *self._kinetic_time(t, p))
         M = np.ones(self.ndof) if self.inverse_mass is None else self.inverse_mass
         return _like(np.diag(M) if M.ndim == 1 else M, p)
+
+    def drift(self, p: Array, t: Any, s: Any) -> Array:
+        """∫_t^{t+s} ∇T(p, u) du, by which a drift moves q; s·∇T(p) if T does not depend on t.
+
+        Parameters
+        ----------
+        p : (..., d)
+        t, s : number or (...)
+            The time at the beginning of the drift and how long it lasts, with its sign.
+
+        Returns
+        -------
+        (..., d)
+
+        Raises
+        ------
+        ValueError
+            If T depends on t and the integral is not elementary.
+        """
+        if not self.kinetic_timed:
+            return per_state(s, p) * self.velocity(p)
+        return self._definition.drifted(p, *self._time(t, p), checked_time(s, p, p.shape[:-1]))
+
+    def drift_jacobian(self, p: Array, t: Any, s: Any) -> Array:
+        """The derivatives of `drift` in p: (..., d) to (..., d, d)."""
+        if not self.kinetic_timed:
+            return (s[..., None, None] if getattr(s, "ndim", 0) else s) * self.kinetic_hessian(p)
+        return self._definition.drift_jacobian(p, *self._time(t, p), checked_time(s, p, p.shape[:-1]))
+
+    @property
+    def kinetic_timed(self) -> bool:
+        """True if T depends on t: then a drift is an integral over t."""
+        return not self.autonomous and self._definition.kinetic_timed
+
+    def _kinetic_time(self, t: Any, p: Array) -> tuple[Any, ...]:
+        return self._time(t, p) if self.kinetic_timed else ()
 
     def _separable(self) -> Hamiltonian:
         if not self.separable:
@@ -327,7 +407,7 @@ class Hamiltonian:
 
     @cached_property
     def expression(self) -> str | None:
-        """H as a text, in q1 … qd, p1 … pd and numbers, of a symbolic system; else None."""
+        """H as a text, in q1 … qd, p1 … pd, the time and numbers, of a symbolic system; else None."""
         return None if self.symbols is None else str(self.symbols.H)
 
     @property
@@ -365,7 +445,7 @@ def _like(constant: np.ndarray, x: Array) -> Array:
     return constant.astype(x.dtype, copy=False)
 
 
-def third_derivative(system: Hamiltonian, q: Array, v: Array, w: Array) -> Array:
+def third_derivative(system: Hamiltonian, q: Array, v: Array, w: Array, t: Any = None) -> Array:
     """∇³V(q)(v, w), the derivative of ∇²V·w along v: (..., d), each, to (..., d).
 
     Good to ε^⅘ of ∇³V, 1e-12 of it in float64, where the force changes on lengths ℓ like |q|; where ℓ is far below |q|
@@ -373,8 +453,8 @@ def third_derivative(system: Hamiltonian, q: Array, v: Array, w: Array) -> Array
     """
     along, other = direction(v), direction(w)
     with np.errstate(all="ignore"):
-        h = step(q, length_of_change(system, q, along, other))
-        change = derivative(lambda x: system.hessian_vector(x, other), q, along, h)
+        h = step(q, length_of_change(system, q, along, other, t))
+        change = derivative(lambda x: system.hessian_vector(x, other, t), q, along, h)
     return _largest(v) * _largest(w) * change
 
 
@@ -391,17 +471,17 @@ def direction(v: Array) -> Array:
     return v / (size + (size == 0))
 
 
-def length_of_change(system: Hamiltonian, q: Array, along: Array, other: Array) -> Array:
+def length_of_change(system: Hamiltonian, q: Array, along: Array, other: Array, t: Any = None) -> Array:
     """ℓ = ‖∇V‖ / ‖∇²V v̂‖, on which the force changes along unit vectors v̂: (..., d) to (..., 1).
 
     It does not depend on where the origin lies, as |q| does. Where ∇²V v̂ nearly vanishes it says nothing: then it is
     (‖∇V‖ / ‖∇³V(v̂, ŵ)‖)^½, which is less. It is kept between √ε|q| and |q|, or 1 where that is more.
     """
     xp = _library(q)
-    force, change = _largest(system.force(q)), _largest(system.hessian_vector(q, along))
+    force, change = _largest(system.force(q, t)), _largest(system.hessian_vector(q, along, t))
     first = _bounded(xp.where(change > 0, force / (change + (change == 0)), np.inf), q)
     h = xp.finfo(q.dtype).eps ** (1 / 3) * first
-    twice = system.hessian_vector(q + h * along, other) - system.hessian_vector(q - h * along, other)
+    twice = system.hessian_vector(q + h * along, other, t) - system.hessian_vector(q - h * along, other, t)
     bend = _largest(twice) / (2 * h)
     second = xp.sqrt(force / (bend + (bend == 0)))
     return _bounded(xp.where((bend > 0) & (second < first), second, first), q)

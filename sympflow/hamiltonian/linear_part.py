@@ -41,6 +41,7 @@ class Scene(Protocol):
     def kinetic_hessian(self, p: Any) -> Any: ...
 
     def check_conservative(self, what: str, remedy: str) -> None: ...
+    def check_autonomous(self, what: str, remedy: str) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -162,8 +163,10 @@ class LinearPart:
 
 
 def check_parts_conservative(system: Scene) -> None:
-    """Refuse a system with friction, which the exact flows of parts of H do not have."""
-    system.check_conservative("which exact flows of parts of H omit", "use the splitting 'kinetic', as of 'verlet'")
+    """Refuse a system with friction, or a driven one, which the exact flows of parts of H leave out."""
+    remedy = "use the splitting 'kinetic', as of 'verlet'"
+    system.check_conservative("which exact flows of parts of H omit", remedy)
+    system.check_autonomous("and parts of H that move with t have no exact flows here", remedy)
 
 
 def linear_part(system: Scene) -> LinearPart:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, reduce
 from itertools import islice
 from operator import add
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,8 @@ from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympflow.arguments import plain
 from sympflow.arrays import Array, assemble, concatenate, is_tensor
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.expression import Unreadable, read
+from sympflow.hamiltonian.driving import DURATION, Samples, drift, is_spline, sampled, sampled_parameter, with_letters
+from sympflow.hamiltonian.expression import FUNCTIONS, Unreadable, read
 
 LARGEST = sys.float_info.max
 
@@ -32,20 +34,26 @@ class SymbolicHamiltonian(Definition):
     ----------
     expression : str or sympy.Expr
         In the symbols q1 … qd, p1 … pd (or q, p when d = 1).
-    params : mapping of str to float, optional
-        Values of the remaining symbols.
+    params : mapping of str to float or spline, optional
+        Values of the remaining symbols; a spline is one of t.
+    time : str or sympy.Symbol, optional
+        The time, of a Hamiltonian that depends on it.
 
     Raises
     ------
     ValueError
-        If the expression cannot be parsed, or holds a symbol without a value.
+        If the expression cannot be parsed, holds a symbol without a value, or does not use the time that is named.
     TypeError
-        If H depends on the time t.
+        If H depends on a time t that is not named.
 
     Attributes
     ----------
     H, V, T : sympy.Expr
-        V and T are None unless H = T(p) + V(q).
+        V and T are None unless H = T(p) + V(q), each of t too.
+    time : sympy.Symbol or None
+        t, which H, V and T may hold; None of an autonomous H.
+    samples : dict of str to Samples
+        The functions of t that are given by samples, by the names that `driving.sampled` has in H.
     q, p : tuple of sympy.Symbol, length d
     parameters : tuple of sympy.Symbol
         Symbols of H beside q and p: only a `parametric` form has some.
@@ -58,9 +66,27 @@ class SymbolicHamiltonian(Definition):
     _written: tuple[sp.Expr, dict[sp.Symbol, sp.Expr]] | None = None
     """H as it was written, and the values of its parameters; None without any."""
 
-    def __init__(self, expression: str | sp.Expr, params: Mapping[str, float] | None = None) -> None:
-        written, values = _read(expression, checked_params(params))
-        H = _valued(written, values)
+    time: sp.Symbol | None = None
+    samples: Mapping[str, Samples] = MappingProxyType({})
+
+    def __init__(
+        self,
+        expression: str | sp.Expr,
+        params: Mapping[str, Any] | None = None,
+        time: str | sp.Symbol | None = None,
+    ) -> None:
+        params = checked_params(params)
+        self.time = named_time(time, params)
+        written, values = _read(expression, params, self.time)
+        H = _valued(written, values, self.time)
+        if self.time is not None:
+            if self.time not in H.free_symbols:
+                raise ValueError(f"`time` is {self.time.name!r}, which H does not depend on: leave it out.")
+            self.samples = {
+                found.name_of_samples: params[symbol.name]
+                for symbol, found in values.items()
+                if isinstance(found, sampled)
+            }
         ndof = max((_index(s) for s in H.free_symbols if _index(s)), default=0)
         if ndof == 0:
             raise ValueError("`expression` must depend on q1 … qd and p1 … pd (or q and p).")
@@ -87,7 +113,7 @@ class SymbolicHamiltonian(Definition):
         What is 0, 1 or −1 stays a number, and so do exponents. H itself, where nothing is left to replace, or where
         symbols would change what is separable or quadratic.
         """
-        if self._written is None:
+        if self._written is None or self.timed:
             return self
         found: dict[sp.Expr, tuple[sp.Symbol, float]] = {}
         try:
@@ -108,6 +134,31 @@ class SymbolicHamiltonian(Definition):
         )
         return form if kept and alike and all(map(math.isfinite, form.values)) else self
 
+    @property
+    def timed(self) -> bool:  # type: ignore[override]
+        return self.time is not None
+
+    @property
+    def kinetic_timed(self) -> bool:  # type: ignore[override]
+        """True if T depends on the time."""
+        return self.T is not None and self.time in self.T.free_symbols
+
+    @cached_property
+    def Ht(self) -> sp.Expr:
+        """∂H/∂t."""
+        return sp.diff(self.H, self.time)
+
+    @cached_property
+    def drift(self) -> tuple[sp.Expr, ...]:
+        """∫_t^{t+s} ∇T(p, u) du in p, t and s, which is `driving.DURATION`.
+
+        Raises
+        ------
+        ValueError
+            If the integral is not elementary.
+        """
+        return drift(tuple(gradient(self.T, self.p)), self.time)
+
     @cached_property
     def inverse_mass(self) -> sp.Matrix | None:
         """M⁻¹ if T = ½ pᵀM⁻¹p exactly, else None."""
@@ -115,7 +166,7 @@ class SymbolicHamiltonian(Definition):
             return None
         M = hessian(self.T, self.p)
         p = sp.Matrix(self.p)
-        if M.free_symbols & {*self.p} or sp.expand(self.T - (p.T * M * p)[0] / 2) != 0:
+        if M.free_symbols & {*self.p, self.time} or sp.expand(self.T - (p.T * M * p)[0] / 2) != 0:
             return None
         return M
 
@@ -141,94 +192,111 @@ class SymbolicHamiltonian(Definition):
 
     # array functions, state y = [q, p] on the last axis -------------------------------------------
 
-    def hamiltonian(self, y: Array) -> Array:
-        return self._scalar("H")(y)
+    def hamiltonian(self, y: Array, *t: Array) -> Array:
+        return self._scalar("H")(y, *t)
 
-    def gradient(self, y: Array) -> Array:
+    def gradient(self, y: Array, *t: Array) -> Array:
         if self.separable:
             q, p = y[..., : self.ndof], y[..., self.ndof :]
-            return concatenate([self.potential_gradient(q), self.kinetic_gradient(p)])
-        return self._vector("H")(y)
+            return concatenate([self.potential_gradient(q, *t), self.kinetic_gradient(p, *t)])
+        return self._vector("H")(y, *t)
 
-    def hessian(self, y: Array) -> Array:
-        return self._matrix("H")(y)
+    def hessian(self, y: Array, *t: Array) -> Array:
+        return self._matrix("H")(y, *t)
 
-    def potential(self, q: Array) -> Array:
-        return self._scalar("V")(q)
+    def time_derivative(self, y: Array, t: Array) -> Array:
+        """∂H/∂t: (..., 2d) to (...)."""
+        return self._scalar("Ht")(y, t)
 
-    def potential_gradient(self, q: Array) -> Array:
-        return self._vector("V")(q)
+    def potential(self, q: Array, *t: Array) -> Array:
+        return self._scalar("V")(q, *t)
 
-    def potential_hessian(self, q: Array) -> Array:
-        return self._matrix("V")(q)
+    def potential_gradient(self, q: Array, *t: Array) -> Array:
+        return self._vector("V")(q, *t)
 
-    def curvature(self, q: Array) -> Array:
-        return self._scalar("W")(q)
+    def potential_hessian(self, q: Array, *t: Array) -> Array:
+        return self._matrix("V")(q, *t)
 
-    def curvature_gradient(self, q: Array) -> Array:
-        return self._vector("W")(q)
+    def curvature(self, q: Array, *t: Array) -> Array:
+        return self._scalar("W")(q, *t)
 
-    def kinetic(self, p: Array) -> Array:
-        return self._scalar("T")(p)
+    def curvature_gradient(self, q: Array, *t: Array) -> Array:
+        return self._vector("W")(q, *t)
 
-    def kinetic_gradient(self, p: Array) -> Array:
-        return self._vector("T")(p)
+    def kinetic(self, p: Array, *t: Array) -> Array:
+        return self._scalar("T")(p, *t)
 
-    def kinetic_hessian(self, p: Array) -> Array:
-        return self._matrix("T")(p)
+    def kinetic_gradient(self, p: Array, *t: Array) -> Array:
+        return self._vector("T")(p, *t)
+
+    def kinetic_hessian(self, p: Array, *t: Array) -> Array:
+        return self._matrix("T")(p, *t)
+
+    def drifted(self, p: Array, t: Array, s: Array) -> Array:
+        """`drift` for times t and durations s, numbers or (...): (..., d) to (..., d)."""
+        return self._function("drift", lambda: list(self.drift), assemble)(p, t, s)
+
+    def drift_jacobian(self, p: Array, t: Array, s: Array) -> Array:
+        """The derivatives of `drift` in p: (..., d) to (..., d, d)."""
+        return self._function("drift'", lambda: list(sp.Matrix(self.drift).jacobian(self.p)), _square)(p, t, s)
 
     # generation -----------------------------------------------------------------------------------
 
     def _variables(self, name: str) -> tuple[sp.Symbol, ...]:
-        return {"H": self.q + self.p, "V": self.q, "T": self.p, "W": self.q}[name]
+        return {"V": self.q, "T": self.p, "W": self.q, "drift": self.p}.get(name, self.q + self.p)
 
-    def _scalar(self, name: str) -> Callable[[Array], Array]:
-        return self._function(name + "", lambda f, x: [f], lambda values, like, n: assemble(values, like)[..., 0])
+    def _scalar(self, name: str) -> Callable[..., Array]:
+        return self._function(name, lambda: [getattr(self, name)], lambda values, like: assemble(values, like)[..., 0])
 
-    def _vector(self, name: str) -> Callable[[Array], Array]:
-        return self._function(
-            name + "'",
-            gradient,
-            lambda values, like, n: assemble(values, like),
-        )
+    def _vector(self, name: str) -> Callable[..., Array]:
+        return self._function(name + "'", lambda: gradient(getattr(self, name), self._variables(name)), assemble)
 
-    def _matrix(self, name: str) -> Callable[[Array], Array]:
-        def reshape(values: Sequence[Array], like: Array, n: int) -> Array:
-            flat = assemble(values, like)
-            return flat.reshape(*flat.shape[:-1], n, n)
-
-        return self._function(name + "''", lambda f, x: list(hessian(f, x)), reshape)
+    def _matrix(self, name: str) -> Callable[..., Array]:
+        return self._function(name + "''", lambda: list(hessian(getattr(self, name), self._variables(name))), _square)
 
     def _function(
         self,
         key: str,
-        expressions: Callable[[sp.Expr, tuple[sp.Symbol, ...]], list[sp.Expr]],
-        collect: Callable[[Sequence[Array], Array, int], Array],
-    ) -> Callable[[Array], Array]:
-        """A function of an array (..., n), generated for NumPy or torch when first called with one."""
+        expressions: Callable[[], list[sp.Expr]],
+        collect: Callable[[Sequence[Array], Array], Array],
+    ) -> Callable[..., Array]:
+        """A function of an array (..., n), and of the time, generated for NumPy or torch when first called with one."""
         if key in self._functions:
             return self._functions[key]
-        variables = self._variables(key[0])
+        name = key.rstrip("'")
+        variables = self._variables(name)
         n = len(variables)
+        moving = self._moving(name)
         generated: dict[str, Callable[..., list[Any]]] = {}
+        values_of_samples: list[tuple[sampled, Callable[..., Any]]] = []
 
-        def function(x: Array) -> Array:
+        def function(x: Array, *times: Array) -> Array:
             library = "torch" if is_tensor(x) else "numpy"
             if library not in generated:
-                wanted = expressions(getattr(self, key[0]), variables)
-                generated[library] = generate([printable(f) for f in wanted], variables, library)
+                wanted, letters = with_letters([printable(f) for f in expressions()])
+                values_of_samples[:] = [(a, sp.lambdify(moving, a.at, modules=[])) for a in letters]
+                generated[library] = generate(wanted, (*variables, *moving, *letters.values()), library)
             columns = [x[..., i] for i in range(n)]
+            times = times[: len(moving)]
+            if library == "torch" and moving:
+                times = _doubles(times, x)
+            sampled_values = [self.samples[a.name_of_samples](at(*times), a.order) for a, at in values_of_samples]
             try:
-                values = generated[library](*columns)
+                values = generated[library](*columns, *times, *sampled_values)
             except (NameError, AttributeError, TypeError) as error:
                 raise TypeError(
                     f"`expression` cannot be evaluated with {library} ({error}): write it with functions that "
                     f"{library} has."
                 ) from error
-            return collect(values, columns[0], n)
+            return collect(values, columns[0])
 
         self._functions[key] = function
         return function
+
+    def _moving(self, name: str) -> tuple[sp.Symbol, ...]:
+        """The times that a function takes after the states."""
+        timed = self.kinetic_timed if name in ("T", "drift") else self.timed
+        return (self.time,) * timed + (DURATION,) * (name == "drift")
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the generated functions, which cannot be pickled and are generated again."""
@@ -237,6 +305,40 @@ class SymbolicHamiltonian(Definition):
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:
         return {}
+
+
+def _square(values: Sequence[Array], like: Array) -> Array:
+    """Entries of a square matrix, row by row, as arrays: (..., n, n)."""
+    flat, n = assemble(values, like), math.isqrt(len(values))
+    return flat.reshape(*flat.shape[:-1], n, n)
+
+
+def _doubles(times: Sequence[Any], x: Any) -> tuple[Any, ...]:
+    """Times as tensors of doubles, on the device of x."""
+    import torch
+
+    return tuple(torch.as_tensor(t, dtype=torch.float64, device=x.device) for t in times)
+
+
+def named_time(time: str | sp.Symbol | None, params: Mapping[str, Any]) -> sp.Symbol | None:
+    """The symbol of the time, "t" where a parameter is sampled and none is named; None without.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is no name, or the name of something else.
+    """
+    if time is None:
+        if not any(isinstance(value, Samples) for value in params.values()):
+            return None
+        time = "t"
+    name = time.name if isinstance(time, sp.Symbol) else time
+    if not isinstance(name, str):
+        raise TypeError(f"`time` must be the name of the time in H, such as 't'; got {time!r}.")
+    if not name.isidentifier() or _is_coordinate(name) or name in params or name in FUNCTIONS or name == "pi":
+        what = "a parameter" if name in params else "a coordinate" if _is_coordinate(name) else "no name of a symbol"
+        raise ValueError(f"`time` {name!r} is {what}: name the time otherwise, as time='t'.")
+    return sp.Symbol(name, real=True)
 
 
 def gradient(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[sp.Expr]:
@@ -259,16 +361,18 @@ def hessian(f: sp.Expr, x: Sequence[sp.Symbol]) -> sp.Matrix:
 
 def parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
     """The expression in real symbols, its parameters replaced by their values."""
-    return _valued(*_read(expression, checked_params(params)))
+    return _valued(*_read(expression, checked_params(params), None), None)
 
 
-def _read(expression: str | sp.Expr, params: Mapping[str, float]) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
-    """The expression in real symbols, and the numbers for those that are parameters."""
+def _read(
+    expression: str | sp.Expr, params: Mapping[str, Any], time: sp.Symbol | None
+) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
+    """The expression in real symbols, and the numbers, or functions of t, for those that are parameters."""
     names = {name: sp.Symbol(name, real=True) for name in params}
     if isinstance(expression, str):
         try:
             coordinates = (w for w in re.findall(r"[A-Za-z_]\w*", expression) if _is_coordinate(w))
-            H = read(expression, {*params, *_AMBIGUOUS, *coordinates})
+            H = read(expression, {*params, *_AMBIGUOUS, *coordinates, *(() if time is None else (time.name,))})
         except Unreadable as error:
             shown = expression if len(expression) <= 200 else expression[:200] + "..."
             raise ValueError(
@@ -290,20 +394,23 @@ def _read(expression: str | sp.Expr, params: Mapping[str, float]) -> tuple[sp.Ex
     for name in params:
         if names[name] not in H.free_symbols:
             raise ValueError(f"`params` has {name!r}, which the expression does not use: remove it.")
-    values = {
-        names[name]: sp.nsimplify(value) if float(value).is_integer() else sp.Float(value)
-        for name, value in params.items()
-    }
-    return H, values
+    return H, {names[name]: _symbolic(name, value, time) for name, value in params.items()}
 
 
-def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
+def _symbolic(name: str, value: Any, time: sp.Symbol | None) -> sp.Expr:
+    if isinstance(value, Samples):
+        assert time is not None
+        return sampled_parameter(name, value, time)
+    return sp.nsimplify(value) if float(value).is_integer() else sp.Float(value)
+
+
+def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | None) -> sp.Expr:
     """The expression, its parameters replaced by their values."""
     for symbol, value in values.items():
         H = H.xreplace({symbol: value})
-    unknown = sorted(s.name for s in H.free_symbols if not _is_coordinate(s.name))
+    unknown = sorted(s.name for s in H.free_symbols if not _is_coordinate(s.name) and s != time)
     if "t" in unknown:
-        raise TypeError("`expression` depends on the time t: only autonomous Hamiltonians are supported.")
+        raise TypeError('`expression` depends on the time t: name it by time="t", for a system that is driven.')
     if unknown:
         meant = "".join(f" {_AMBIGUOUS[name]}." for name in unknown if name in _AMBIGUOUS)
         raise ValueError(f"`expression` holds {', '.join(unknown)} without a value: give it in `params`.{meant}")
@@ -360,8 +467,8 @@ _AMBIGUOUS = {
 """Names that are constants for SymPy, but in the text of a Hamiltonian more likely an energy, a moment of inertia."""
 
 
-def checked_params(params: Mapping[str, float] | None) -> dict[str, float]:
-    """Return the parameters as numbers of Python.
+def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the parameters as numbers of Python, or samples of a function of t.
 
     Raises
     ------
@@ -370,10 +477,13 @@ def checked_params(params: Mapping[str, float] | None) -> dict[str, float]:
     """
     if not isinstance(params, Mapping | None):
         raise TypeError(f"`params` must be a mapping of names to numbers; got {type(params).__name__}: pass a dict.")
-    checked = {}
+    checked: dict[str, Any] = {}
     for name, given in (params or {}).items():
         if not isinstance(name, str) or _is_coordinate(name) or name == "t":
             raise ValueError(f"`params` gives a value to {name!r}, which is a coordinate: rename the parameter.")
+        if is_spline(given):
+            checked[name] = Samples.of(name, given)
+            continue
         value = plain(given)
         if isinstance(value, numbers.Rational | sp.Expr) and not isinstance(value, int):
             try:

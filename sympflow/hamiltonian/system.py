@@ -8,18 +8,20 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from functools import cached_property, lru_cache
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import floats, real_number
+from sympflow.arguments import check_flag, floats, real_number
 from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
+from sympflow.hamiltonian.times import check_period, probe_times
 
 if TYPE_CHECKING:
     import sympy
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
 MOST_DEGREES = 1_000_000
 
 
-class Parameters(dict[str, float]):
+class Parameters(dict[str, Any]):
     """The parameters of a system: a dictionary that cannot be changed, for the code of H holds their values."""
 
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
@@ -46,7 +48,7 @@ class Parameters(dict[str, float]):
 
 
 class HamiltonianSystem(Hamiltonian):
-    """A Hamiltonian system x' = J∇H(x), x = [q, p], with H autonomous; with `damping` p' = −∂H/∂q − Γp.
+    """A Hamiltonian system x' = J∇H(x), x = [q, p]; with `time` H(t, x); with `damping` p' = −∂H/∂q − Γp.
 
     Parameters
     ----------
@@ -68,6 +70,13 @@ class HamiltonianSystem(Hamiltonian):
     stiffness_matrix : array_like of shape (d, d), optional
         A symmetric K, part ½ qᵀKq of the potential, that methods with an exact linear flow take as their `linear_part`.
         Only with `potential`; of a symbolic system it is read off.
+    time : bool
+        True for a driven system: every function has the time t, a number, as its first argument, before q: V(t, q),
+        gradient(t, q), hessian_vector(t, q, v), H(t, q, p); as Numba functions gradient(t, q, out) and
+        hessian_vector(t, q, v, out). Functions of the system then take the time after the states.
+    period : float, optional
+        The period in t of H, of a driven system; other values than its own are a ValueError. Sections and multipliers
+        take it.
     damping : float or array_like of shape (d,) or (d, d), optional
         Γ: one rate, one for each p, or a symmetric positive semi-definite matrix; 0 is none. The splitting methods on
         the splitting "kinetic" and the Runge–Kutta methods solve it; all else refuses it, with the reason.
@@ -95,6 +104,8 @@ class HamiltonianSystem(Hamiltonian):
         M⁻¹, None when it is the identity or T is not quadratic.
     symbols : SymbolicHamiltonian or None
         The symbolic definition, if there is one.
+    autonomous : bool
+        False if H depends on t.
 
     Examples
     --------
@@ -113,6 +124,8 @@ class HamiltonianSystem(Hamiltonian):
         gradient: Callable[..., Any] | None = None,
         hessian_vector: Callable[..., Any] | None = None,
         stiffness_matrix: ArrayLike | None = None,
+        time: bool = False,
+        period: float | None = None,
         damping: float | ArrayLike | None = None,
         name: str = "custom",
         domain: Domain | None = None,
@@ -122,14 +135,18 @@ class HamiltonianSystem(Hamiltonian):
         energy_scale: float | None = None,
         check: bool = True,
     ) -> None:
-        from sympflow.hamiltonian.callables import CallableHamiltonian
+        from sympflow.hamiltonian.callables import CallableHamiltonian, DrivenCallables
 
         number = isinstance(ndof, int | float | np.number) and not isinstance(ndof, bool) and 1 <= ndof <= MOST_DEGREES
         if ndof is None or not number or int(ndof) != ndof:
             raise ValueError(
                 f"`ndof` must be a positive integer, at most {MOST_DEGREES:,}, the degrees of freedom; got {ndof!r}."
             )
-        definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector, check)
+        if isinstance(time, str):
+            raise TypeError(f"`time` must be True for functions with t first; got {time!r}: names are for from_sympy.")
+        check_flag("time", time)
+        kind = DrivenCallables if time else CallableHamiltonian
+        definition = kind(int(ndof), potential, hamiltonian, gradient, hessian_vector, check)
         if definition.separable:
             super().__init__(name, definition, matrices.inverse_mass(mass, int(ndof)), True)
         elif mass is not None:
@@ -143,13 +160,16 @@ class HamiltonianSystem(Hamiltonian):
             self.stiffness_matrix.setflags(write=False)
         self._set_friction(damping)
         self._set_scene({}, domain, y0, t_span, dt, energy_scale)
+        self._set_period(period)
 
     @classmethod
     def from_sympy(
         cls,
         expression: str | sympy.Expr,
         *,
-        params: Mapping[str, float] | None = None,
+        params: Mapping[str, Any] | None = None,
+        time: str | sympy.Symbol | None = None,
+        period: float | None = None,
         damping: float | ArrayLike | None = None,
         name: str = "custom",
         domain: Domain | None = None,
@@ -169,20 +189,27 @@ class HamiltonianSystem(Hamiltonian):
             Euler's number is exp(1).
         params : mapping of str to float, optional
             Values of the other symbols: finite real numbers. A name that is given here is a symbol whatever it means
-            otherwise. `system.params` holds them, to be read only.
+            otherwise. `system.params` holds them, to be read only. A spline of SciPy, such as `CubicSpline(t, a)` or
+            `make_interp_spline(t, a)`, is a function of t by its samples; runs beyond them are refused, unless it is
+            periodic.
+        time : str or sympy.Symbol, optional
+            The symbol that is the time, "t", of a driven system H(t, q, p).
+        period : float, optional
+            The period of H in t; other values than its own are a ValueError.
         damping, name, domain, y0, t_span, dt, energy_scale
             As for the class.
 
         Raises
         ------
         ValueError, TypeError
-            If the expression cannot be parsed, has symbols without a value, or depends on t; if `damping` is not
-            symmetric, has negative rates, or another shape.
+            If the expression cannot be parsed, has symbols without a value, or a time that `time` does not name; if
+            H does not depend on that, or has another period; if `damping` is not symmetric, has negative rates, or
+            another shape.
         """
         from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, checked_params
 
         params = checked_params(params)
-        symbols = SymbolicHamiltonian(expression, params)
+        symbols = SymbolicHamiltonian(expression, params, time)
         self = cls.__new__(cls)
         M = symbols.inverse_mass
         inverse_mass = None if M is None else matrices.simplest(np.array(M.tolist(), dtype=float))
@@ -190,11 +217,22 @@ class HamiltonianSystem(Hamiltonian):
         self.symbols = symbols
         self._set_friction(damping)
         self._set_scene(params, domain, y0, t_span, dt, energy_scale)
+        self._set_period(period)
         return self
 
     def _set_friction(self, damping: float | ArrayLike | None) -> None:
         G = matrices.damping(damping, self.ndof)
         self.friction = None if G is None else Friction(G)
+
+    def _set_period(self, period: float | None) -> None:
+        if period is None:
+            return
+        if self.autonomous:
+            raise TypeError("`period` only goes with `time`, for H that depends on t: leave it out.")
+        if not real_number(period) or not 0 < period < 1e100:
+            raise ValueError(f"`period` must be positive and finite; got {period!r}.")
+        self.period = float(period)
+        check_period(self.hamiltonian, self.ndof, self.y0, self.period)
 
     def _set_scene(
         self,
@@ -221,7 +259,10 @@ class HamiltonianSystem(Hamiltonian):
         self.y0 = None if y0 is None else self._checked_y0(y0)
         if domain is not None and not isinstance(domain, Domain):
             raise TypeError(f"`domain` must be a domain such as sympflow.Box(low, high); got {type(domain).__name__}.")
-        self.domain = domain.attach(self.hamiltonian) if isinstance(domain, EnergySublevel) else domain
+        if isinstance(domain, EnergySublevel):
+            self.check_autonomous("so that no energy bounds a set of states", "take a Box or a Ball as `domain`")
+            domain = domain.attach(self.hamiltonian)
+        self.domain = domain
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
 
@@ -277,7 +318,7 @@ class HamiltonianSystem(Hamiltonian):
         given = one_lane(like) if math.prod(like.shape) else self.y0
         probes = probe_states(given, self.domain, 2 * self.ndof)
         n_given = min(FEW, math.prod(like.shape) // (2 * self.ndof))
-        self._definition.check(probes, like, n_given)
+        self._definition.check(probes, like, n_given, *self._probed_times())
         self._tested = self._tested | {kind: reach(probes[:, : self._arguments])}
 
     def check_functions_along(self, y: Array) -> None:
@@ -299,11 +340,15 @@ class HamiltonianSystem(Hamiltonian):
         if not len(far):
             return
         try:
-            self._definition.check(far, y, 0)
+            self._definition.check(far, y, 0, *self._probed_times())
         except (ValueError, TypeError) as error:
             warnings.warn(f"On this run, far from its start: {error}", RuntimeWarning, stacklevel=3)
             return
         self._tested = self._tested | {kind: reach(np.concatenate([reached, far[:, : self._arguments]]))}
+
+    def _probed_times(self) -> tuple[np.ndarray, ...]:
+        """The times at which functions of a driven system are tested."""
+        return () if self.autonomous else (probe_times(*self.t_span),)
 
     @property
     def _arguments(self) -> int:
@@ -333,11 +378,21 @@ class HamiltonianSystem(Hamiltonian):
         return fingerprint(self)
 
     def __repr__(self) -> str:
-        params = ", ".join(f"{k}={v:g}" for k, v in self.params.items())
+        params = parameters_text(self.params)
         kind = "separable" if self.separable else "not separable"
         if self.damping is not None:
             kind += f", damping {np.array2string(self.damping, threshold=9, precision=6).replace(chr(10), '')}"
+        if not self.autonomous:
+            kind += ", driven" if self.period is None else f", driven with period {self.period:g}"
         return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
+
+
+def parameters_text(
+    params: Mapping[str, Any], names: Mapping[str, str] = MappingProxyType({}), equals: str = "="
+) -> str:
+    """Parameters in a row, name=value, by other names where there are some; samples by their description."""
+    shown = {k: f"{v:g}" if isinstance(v, int | float) else str(v) for k, v in params.items()}
+    return ", ".join(f"{names.get(k, k)}{equals}{v}" for k, v in shown.items())
 
 
 # a view that counts -------------------------------------------------------------------------------
@@ -379,13 +434,13 @@ def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]
 @lru_cache(maxsize=64)
 def _counting_class(cls: type[HamiltonianSystem]) -> type[HamiltonianSystem]:
     def counted(name: str) -> Callable[..., Array]:
-        def evaluate(self: Any, x: Array, *more: Array) -> Array:
+        def evaluate(self: Any, x: Array, *more: Array, **named: Array) -> Array:
             function = getattr(super(view, self), name)
             if self._inside:  # one of them may call another
-                return function(x, *more)
+                return function(x, *more, **named)
             self._inside = True
             try:
-                value = function(x, *more)
+                value = function(x, *more, **named)
             finally:
                 self._inside = False
             self._count(COUNTED[name], x)

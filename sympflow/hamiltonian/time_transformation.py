@@ -71,6 +71,10 @@ def time_transformed(
     system.check_conservative(
         "and no Hamiltonian in another time", "solve it in the physical time, by 'verlet' or 'dop853' for instance"
     )
+    system.check_autonomous(
+        "so that there is no energy E that a time transformation could hold",
+        "solve it in the physical time, by 'kahan_li8' or 'dop853' for instance",
+    )
     if not system.separable:
         raise ValueError(
             f"`system` {system.name!r} is not separable, so its logarithmic Hamiltonian is not either: use an implicit "

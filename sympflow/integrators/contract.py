@@ -19,6 +19,9 @@ Its duties:
    friction −Γp into account, as one that steps by `system.vector_field` does. `takes_forces` says the same of a force
    that is none of H, which only `vector_field` holds.
 
+11. `takes_driving` is False, and a driven system, H(t, q, p), is refused before the integrator sees it; or the method
+   takes H and its derivatives at the times of its stages, t + c·h, as `system.vector_field(y, t + c * h)` does.
+
 `FixedStep`, in `sympflow.integrators.base`, does 4, 5, 6 and 8 for any integrator that has a step: a new one needs
 duties 1 to 3 only, and its forces are counted. Whatever a run changes, such as its kernel and its counts, belongs to a
 `Stepper`.
@@ -174,6 +177,11 @@ class Integrator:
     @property
     def takes_forces(self) -> bool:
         """True if every step holds any force beside −∂H/∂q, as one by `system.vector_field` does."""
+        return False
+
+    @property
+    def takes_driving(self) -> bool:
+        """True if every step takes H at its times, of a driven system H(t, q, p); where not, the system is refused."""
         return False
 
     def check(self, system: HamiltonianSystem) -> None:

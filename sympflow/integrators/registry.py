@@ -237,18 +237,25 @@ class naming_plugin:
 def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array | None = None) -> None:
     """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named.
 
-    The functions of a user's system are tested too, for states such as y0. Friction, and forces that are none of H, are
-    refused here for every method that does not say that it takes them.
+    The functions of a user's system are tested too, for states such as y0. Friction, forces that are none of H, and H
+    that depends on t, are refused here for every method that does not say that it takes them.
     """
-    own_words = system.conservative or _speaks_for_itself(type(integrator).__mro__)
-    if system.external_force is not None and not (integrator.takes_forces and own_words):
+    mro = type(integrator).__mro__
+    if system.external_force is not None and not (integrator.takes_forces and _speaks_for_itself(mro, "takes_forces")):
         system.check_conservative(f"which method {integrator.name!r} does not take", "")
-    if system.friction is not None and not (integrator.takes_friction and own_words):
+    if system.friction is not None and not (integrator.takes_friction and _speaks_for_itself(mro, "takes_friction")):
         what = "was trained without it" if integrator.trained else "does not take it"
         system.check_conservative(
             f"and method {integrator.name!r} {what}",
             "use a splitting method on the splitting 'kinetic', such as 'verlet' or 'kahan_li8', or a Runge–Kutta "
             "method such as 'dop853' or 'dopri5'",
+        )
+    if not system.autonomous and not (integrator.takes_driving and _speaks_for_itself(mro, "takes_driving")):
+        what = "was trained for a system without t" if integrator.trained else "does not take the time into account"
+        system.check_autonomous(
+            f"and method {integrator.name!r} {what}",
+            "use a splitting method on the splitting 'kinetic', such as 'verlet' or 'kahan_li8', an implicit method "
+            "such as 'gauss_legendre6', or a Runge–Kutta method such as 'dop853' or 'dopri5'",
         )
     system.check_functions(y0)
     if type(integrator) not in _loaded:
@@ -259,9 +266,9 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
 
 
 @cache
-def _speaks_for_itself(bases: tuple[type, ...]) -> bool:
+def _speaks_for_itself(bases: tuple[type, ...], what: str) -> bool:
     """False for a class outside of the package that changes what a built-in class does, and inherits what that says."""
-    says = next(i for i, base in enumerate(bases) if "takes_friction" in vars(base))
+    says = next(i for i, base in enumerate(bases) if what in vars(base))
     others = (base for base in bases[:says] if not base.__module__.startswith("sympflow."))
     return not any(_DUTIES & vars(base).keys() for base in others)
 

@@ -1,0 +1,293 @@
+"""Driven systems, H(t, q, p): parameters that are samples of a function of t, and drifts of T(p, t).
+
+The flow of H(t, q, p) is that of the autonomous E + H(t, q, p) in [q, t, p, E], with t' = 1 and E' = −∂H/∂t. A
+splitting cuts it into T(p, t) + E, a drift with which the time moves, and V(q, t), a kick at a time that stands still.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import sympy as sp
+from sympy.core.symbol import Str
+
+from sympflow.arrays import Array, is_tensor
+from sympflow.hamiltonian.expression import ELEMENTARY
+
+# samples -------------------------------------------------------------------------------------------
+
+
+class Samples:
+    """A function of t by the polynomials of a SciPy spline, a parameter of H.
+
+    Parameters
+    ----------
+    spline : PPoly, BPoly or BSpline of scipy.interpolate
+        Of one variable and real values, as `CubicSpline(t, a)` or `make_interp_spline(t, a)` makes them.
+
+    Attributes
+    ----------
+    c : ndarray of shape (k, n)
+        The coefficients of the n polynomials, the highest powers of t − x[i] first.
+    x : ndarray of shape (n + 1,)
+        The ends of their intervals, which increase.
+    periodic : bool
+        True if the spline goes on beyond its ends periodically; if not, a run beyond them is refused.
+    """
+
+    def __init__(self, c: np.ndarray, x: np.ndarray, periodic: bool) -> None:
+        self.c, self.x, self.periodic = c, x, periodic
+        for each in (c, x):
+            each.setflags(write=False)
+
+    @classmethod
+    def of(cls, name: str, spline: Any) -> Samples:
+        """Return the samples of a SciPy spline that is given as a parameter.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If it is none, or not one of real values of one variable.
+        """
+        if isinstance(spline, Samples):
+            return spline
+        from scipy.interpolate import BPoly, BSpline, PPoly
+
+        low, high = -np.inf, np.inf
+        if isinstance(spline, BSpline):
+            low, high = spline.t[spline.k], spline.t[len(spline.t) - 1 - spline.k]
+        if np.ndim(spline.c) != (1 if isinstance(spline, BSpline) else 2) or np.iscomplexobj(spline.c):
+            raise ValueError(f"`params` has {name}, a spline that is not of real numbers: give one for each parameter.")
+        if isinstance(spline, BSpline):
+            spline = PPoly.from_spline(spline)
+        elif isinstance(spline, BPoly):
+            spline = PPoly.from_bernstein_basis(spline)
+        c, x = np.array(spline.c, dtype=float), np.array(spline.x, dtype=float)
+        if len(x) > 1 and x[0] > x[-1]:
+            raise ValueError(f"`params` has {name}, a spline of times that decrease: reverse them.")
+        kept = (x[1:] > x[:-1]) & (x[:-1] >= low) & (x[1:] <= high)
+        ends = np.append(x[:-1][kept], x[1:][kept][-1:])
+        if not (len(ends) > 1 and np.isfinite(c).all() and np.isfinite(ends).all()):
+            raise ValueError(
+                f"`params` has {name}, a spline that is not finite: give finite samples at two times at least."
+            )
+        return cls(np.ascontiguousarray(c[:, kept]), ends, spline.extrapolate == "periodic")
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The first and the last time of the samples."""
+        return float(self.x[0]), float(self.x[-1])
+
+    @cached_property
+    def digest(self) -> str:
+        """A name of the content, by which H of other samples is another expression."""
+        content = b"".join((self.c.tobytes(), self.x.tobytes(), bytes([self.periodic])))
+        return hashlib.sha256(content).hexdigest()[:12]
+
+    def polynomials(self, order: int) -> np.ndarray:
+        """The coefficients (k, n) of a derivative, or for −1 of the antiderivative, on the same intervals."""
+        return self._function(order).c
+
+    def __call__(self, t: Array, order: int = 0) -> Array:
+        """The derivative of an order, −1 for the antiderivative, at times: numbers or arrays; tensors by NumPy."""
+        if is_tensor(t):
+            return _on_tensors(self, t, order)
+        return self._values(np.asarray(t, dtype=float), order)
+
+    def _values(self, t: np.ndarray, order: int) -> np.ndarray:
+        function, (low, high) = self._function(order), self.span
+        if not self.periodic:
+            return function(t)
+        turns = np.floor((t - low) / (high - low))
+        value = function(np.clip(t - turns * (high - low), low, high))
+        return value if order >= 0 else value + turns * function(high)
+
+    def _function(self, order: int) -> Any:
+        if order not in self._functions:
+            from scipy.interpolate import PPoly
+
+            function = PPoly.construct_fast(np.array(self.c), np.array(self.x), True)
+            self._functions[order] = function.derivative(order) if order >= 0 else function.antiderivative(-order)
+        return self._functions[order]
+
+    @cached_property
+    def _functions(self) -> dict[int, Any]:
+        return {}
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Samples) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Samples, (np.array(self.c), np.array(self.x), self.periodic)
+
+    def __repr__(self) -> str:
+        low, high = self.span
+        return f"<{len(self.x)} samples, t in [{low:g}, {high:g}]{', periodic' if self.periodic else ''}>"
+
+
+def is_spline(value: object) -> bool:
+    """Return True for samples, or a spline of SciPy, decided without importing that."""
+    import sys
+
+    if isinstance(value, Samples):
+        return True
+    module = sys.modules.get("scipy.interpolate")
+    return module is not None and isinstance(value, module.PPoly | module.BPoly | module.BSpline)
+
+
+def _on_tensors(samples: Samples, t: Any, order: int) -> Any:
+    import torch
+
+    class Values(torch.autograd.Function):
+        generate_vmap_rule = False
+
+        @staticmethod
+        def forward(s: torch.Tensor) -> torch.Tensor:
+            found = samples(s.detach().cpu().numpy(), order)
+            return torch.as_tensor(found, dtype=s.dtype, device=s.device)
+
+        @staticmethod
+        def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+            ctx.save_for_backward(*inputs)
+            ctx.save_for_forward(*inputs)
+
+        @staticmethod
+        def backward(ctx: Any, v: torch.Tensor) -> torch.Tensor:
+            return v * _on_tensors(samples, ctx.saved_tensors[0], order + 1)
+
+        @staticmethod
+        def jvp(ctx: Any, v: torch.Tensor) -> torch.Tensor:
+            return v * _on_tensors(samples, ctx.saved_tensors[0], order + 1)
+
+        @staticmethod
+        def vmap(info: Any, in_dims: tuple[Any, ...], s: torch.Tensor) -> tuple[torch.Tensor, int | None]:
+            return Values.apply(s), in_dims[0]
+
+    return Values.apply(t)
+
+
+class sampled(sp.Function):
+    """A derivative of samples in an expression: sampled(name, order, t), of order −1 the antiderivative.
+
+    The name is that of the parameter with the digest of its samples.
+    """
+
+    nargs = 3
+    is_real = True
+
+    @property
+    def name_of_samples(self) -> str:
+        return str(self.args[0])
+
+    @property
+    def order(self) -> int:
+        return int(self.args[1])
+
+    @property
+    def at(self) -> sp.Expr:
+        """The time, an expression."""
+        return self.args[2]
+
+    def _eval_derivative(self, s: sp.Symbol) -> sp.Expr:
+        name, order, at = self.args
+        return sampled(name, order + 1, at) * sp.diff(at, s)
+
+    def _sympystr(self, printer: Any) -> str:
+        order = "" if self.order == 0 else f"_{self.order}".replace("-", "m")
+        return f"{self.name_of_samples}{order}({printer._print(self.at)})"
+
+
+def sampled_parameter(name: str, samples: Samples, time: sp.Symbol) -> sampled:
+    """The expression that stands for a sampled parameter."""
+    return sampled(Str(f"{name}_{samples.digest}"), sp.S.Zero, time)
+
+
+def with_letters(f: list[sp.Expr]) -> tuple[list[sp.Expr], dict[sampled, sp.Symbol]]:
+    """Expressions with a letter for each value of samples in them, and these letters."""
+    found = sorted({a for each in f for a in each.atoms(sampled)}, key=str)
+    letters = {a: sp.Symbol(f"sample_{i}", real=True) for i, a in enumerate(found)}
+    return ([each.xreplace(letters) for each in f] if letters else f), letters
+
+
+# drifts of T(p, t) ---------------------------------------------------------------------------------
+
+DURATION = sp.Symbol("duration", real=True)
+"""s, how long a drift lasts, in expressions of it."""
+
+
+def drift(slope: tuple[sp.Expr, ...], time: sp.Symbol | None) -> tuple[sp.Expr, ...]:
+    """∫_t^{t+s} ∇T(p, u) du, an expression in p, t and s, which is `DURATION`, for each entry of the slope ∇T(p, t).
+
+    Raises
+    ------
+    ValueError
+        If a term of ∇T is no product of a function of p and one of t of which the integral is elementary.
+    """
+    return tuple(sp.Add(*[_integrated(term, time) for term in sp.Add.make_args(_sum_of(f, time))]) for f in slope)
+
+
+def _sum_of(f: sp.Expr, time: sp.Symbol | None) -> sp.Expr:
+    return f if time is None or not f.has(time) else sp.expand(f)
+
+
+def _integrated(term: sp.Expr, time: sp.Symbol | None) -> sp.Expr:
+    if time is None or not term.has(time):
+        return DURATION * term
+    fixed, moving = term.as_independent(time, as_Add=False)
+    if moving.free_symbols != {time}:
+        raise _not_elementary(term, time)
+    if isinstance(moving, sampled) and moving.at == time:
+        antiderivative = moving.func(moving.args[0], moving.args[1] - 1, time)
+    else:
+        antiderivative = _antiderivative(moving, time)
+        if antiderivative is None:
+            raise _not_elementary(term, time)
+    if antiderivative.is_polynomial(time):  # the difference without cancellation
+        return fixed * sp.expand(antiderivative.xreplace({time: time + DURATION}) - antiderivative)
+    return fixed * (antiderivative.xreplace({time: time + DURATION}) - antiderivative)
+
+
+def _antiderivative(f: sp.Expr, time: sp.Symbol) -> sp.Expr | None:
+    from sympy.integrals.manualintegrate import manualintegrate
+
+    if f.atoms(sampled):
+        return None
+    found = manualintegrate(f, time)
+    kinds = {type(a) for a in found.atoms(sp.Function)}
+    if found.atoms(sp.Integral) or any(kind.__name__ not in _ELEMENTARY for kind in kinds):
+        return None
+    return found
+
+
+_ELEMENTARY = frozenset((*ELEMENTARY, "Abs", "Max", "Min"))
+
+
+def _not_elementary(term: sp.Expr, time: sp.Symbol) -> ValueError:
+    return ValueError(
+        f"`system` has a kinetic energy T(p, {time}) whose drift needs the integral over {time} of {term}, which is "
+        "not elementary: use an implicit method such as 'gauss_legendre6', or a Runge–Kutta method."
+    )
+
+
+def check_span(samples: Mapping[str, Samples], t0: float, t1: float) -> None:
+    """Refuse a run that leaves the times of samples, beyond which a spline is no more than its last polynomial.
+
+    Raises
+    ------
+    ValueError
+        With the samples' times.
+    """
+    for name, each in samples.items():
+        low, high = each.span
+        if not each.periodic and not (low <= min(t0, t1) and max(t0, t1) <= high):
+            raise ValueError(
+                f"`t_span` ({t0:g}, {t1:g}) leaves the samples of the parameter {name!r}, which are for t from {low:g} "
+                f"to {high:g}: end it there, or give samples of all of it, or a periodic spline."
+            )
