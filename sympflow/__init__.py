@@ -43,6 +43,7 @@ _HOME = {
     "symplecticity_defect": "metrics.symplectic",
     "conformal_defect": "metrics.symplectic",
     "loop_area_error": "metrics.symplectic",
+    "floquet_multipliers": "metrics.floquet",
     "linear_stability": "metrics.linear_stability",
     "reference_error": "metrics.accuracy",
     "time_reversal_error": "metrics.accuracy",
@@ -76,6 +77,7 @@ if TYPE_CHECKING:
     from sympflow.metrics.energy import energy_error as energy_error
     from sympflow.metrics.energy import energy_growth as energy_growth
     from sympflow.metrics.energy import max_energy_error as max_energy_error
+    from sympflow.metrics.floquet import floquet_multipliers as floquet_multipliers
     from sympflow.metrics.linear_stability import linear_stability as linear_stability
     from sympflow.metrics.symplectic import conformal_defect as conformal_defect
     from sympflow.metrics.symplectic import loop_area_error as loop_area_error
