@@ -45,8 +45,8 @@ class FloquetMultipliers:
     mismatch : float
         |y(t0 + T) − y0|: 0 of an orbit that is periodic.
     pairing : float
-        ‖MᵀJM − e^{−γT}J‖₂/‖M‖₂², 0 where the multipliers are in pairs λ, e^{−γT}/λ; NaN where friction is no single rate,
-        or there is a force that is none of H.
+        ‖MᵀJM − e^{−γT}J‖₂/‖M‖₂², 0 where the multipliers are in pairs λ, e^{−γT}/λ; NaN where friction is no single
+        rate, or there is a force that is none of H.
     """
 
     multipliers: np.ndarray
