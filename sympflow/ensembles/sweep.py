@@ -5,9 +5,11 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import os
+import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,13 +24,11 @@ from sympflow.ensembles.results import Block, Done, Ensemble, Keeper, Layout, Me
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
 from sympflow.integrators.registry import build, check_applies, name_of
-from sympflow.kernels.modules import at_most
+from sympflow.kernels.modules import at_most, compiling_alone
 from sympflow.solver import BACKENDS
 from sympflow.workers import LostWorkers, Parcel, Unpicklable, checked_workers, mapped
 
 if TYPE_CHECKING:
-    import os
-
     from sympflow.ensembles.stores import EnsembleStore
 
 MOST_WORK = 50_000_000
@@ -36,6 +36,7 @@ MOST_WORK = 50_000_000
 LONGEST_CHUNK, SHORTEST_CHUNK = 65536, 64
 PIECES = 16  # chunks, or more, of which a large ensemble is made
 MOST_PIECES = 10_000_000
+_preparing = threading.Lock()
 
 
 def ensemble(
@@ -170,6 +171,8 @@ def ensemble(
     pieces = blocks(layout.shape, sizes)
     left = [piece for piece in pieces if not keeper.is_done(piece)]
     report(sum(piece.size for piece in pieces) - sum(piece.size for piece in left))
+    if left and workers != 1:  # what is compiled here is loaded by workers on this machine
+        task.prepare(first)
     items = ((piece, orbits.sent(*piece.ranges[-1])) for piece in left)
     done = len(pieces) - len(left)
     try:
@@ -266,6 +269,28 @@ class Task:
     reduction: Reduction
     backend: str
     store: EnsembleStore | None = None
+    ready: set[int] = field(default_factory=set)
+    """Processes in which the method is compiled."""
+
+    def prepare(self, y0: np.ndarray) -> None:
+        """Compile the method, or load it, once in each process, by a few steps from some first orbits (n, 2d)."""
+        if os.getpid() in self.ready:
+            return
+        with _preparing, compiling_alone():
+            if os.getpid() not in self.ready:
+                self._few_steps(self.problem(y0[:2]))
+                if self.axes and self.reduction.takes_params:
+                    ends = {name: values[[0, -1]] for name, values in self.axes.items()}
+                    self._few_steps(replace(self.problem(y0[[0, 0]]), system=self.system, params=ends))
+                self.ready.add(os.getpid())
+
+    def _few_steps(self, problem: Chunk) -> None:
+        length = problem.integrator.step_length(problem.system)
+        if not problem.compiled or length is None:
+            return
+        t0, t1 = self.t_span
+        end = t0 + math.copysign(min(abs(t1 - t0), 2.5 * length), t1 - t0)
+        replace(problem, t_span=(t0, end)).states(np.linspace(t0, end, 12))
 
     def problem(self, y0: np.ndarray) -> Chunk:
         """The chunk of some first orbits, at the first values of the parameters."""
@@ -297,6 +322,7 @@ def run_piece(task: Task, item: tuple[Block, Given | Drawn]) -> Done:
         chunks = [task.chunk(values, y0, block.first + i * len(y0)) for i, values in enumerate(named)]
     parts: list[Done] = []
     with at_most(1):
+        task.prepare(y0)
         for i, chunk in enumerate(chunks):
             fields = task.reduction.reduce(chunk)
             parts.append(Done(fields, chunk.status, {i * len(y0) + k: text for k, text in chunk.messages.items()}))

@@ -122,7 +122,9 @@ class SymbolicHamiltonian(Definition):
     def like(self, H: sp.Expr) -> SymbolicHamiltonian:
         """Another H in the same coordinates and time, and with the same samples."""
         form = SymbolicHamiltonian.__new__(SymbolicHamiltonian)
-        form.ndof, form.q, form.p, form.time, form.samples = self.ndof, self.q, self.p, self.time, self.samples
+        form.ndof, form.q, form.p, form.time = self.ndof, self.q, self.p, self.time
+        if self.samples:
+            form.samples = self.samples
         form._set(H)
         return form
 

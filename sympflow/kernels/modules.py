@@ -11,7 +11,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import cache, partial
 from importlib.resources import files
@@ -29,6 +29,7 @@ __all__ = [
     "OPTIONS",
     "at_most",
     "cache_folder",
+    "compiling_alone",
     "load_algebra",
     "load_module",
     "run_one",
@@ -117,6 +118,27 @@ def _callable_part(module: ModuleType) -> ModuleType:
         else:
             setattr(part, name, f)
     return part
+
+
+@contextmanager
+def compiling_alone() -> Iterator[None]:
+    """Keep other processes that say so from compiling what is inside: the next one finds it in the cache on disk.
+
+    Numba's index of that cache would lose what two processes add to it at once.
+    """
+    try:
+        import fcntl
+
+        folder = cache_folder()
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        file = open(folder / ".lock", "w")  # noqa: SIM115
+    except (ImportError, OSError, RuntimeError):  # Windows; no folder that can be written
+        yield
+        return
+    with file:
+        with suppress(OSError):  # of a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 @cache

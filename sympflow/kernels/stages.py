@@ -25,6 +25,7 @@ __all__ = [
     "stages_source",
     "step_table",
     "time_lines",
+    "two_stages_source",
 ]
 
 
@@ -446,6 +447,26 @@ def stage(q, p, q_error, p_error, numbers, a, j, work):
     {_cases(kinds, "numbers[{0}] != 0.0", [[*begin, *kick.application(scheduled, False), *end] for kick in kinds])}"""
 
 
+def two_stages_source(kinds: Sequence[Kick], friction: DampedDrift | None = None, n_parameters: int = 0) -> str:
+    """``two_stages_lanes``, as ``stage_lanes`` twice; of one kind of kick in one pass, where kicks are scheduled."""
+    head = """@njit(**OPTIONS, inline="always")
+def two_stages_lanes(Y, error, width, numbers_1, a_1, numbers_2, a_2):
+    """
+    if len(kinds) > 1:
+        return head + "\n    ".join(f"stage_lanes(Y, error, width, numbers_{i}, a_{i})" for i in (1, 2))
+    lines = []
+    for i in (1, 2):
+        kicked = kinds[0].application(True, lane=True)
+        lines += [f"numbers, a = numbers_{i}, a_{i}", *kicked, *_drifted_lane(friction, n_parameters)]
+    return head + "\n    ".join(_over_lanes(lines))
+
+
+def _drifted_lane(friction: DampedDrift | None, n_parameters: int) -> list[str]:
+    """The drift of a lane without compensated sums."""
+    move = f"q, _ = move(q, None, drift({{p}}, {{a}}, {'numbers, ' if n_parameters else ''}None))"
+    return [move.format(p="p", a="a")] if friction is None else friction.drifted(move)
+
+
 def lanes_source(
     kinds: Sequence[Kick],
     scheduled: bool,
@@ -467,9 +488,7 @@ def lanes_source(
         taken = [f"numbers = ({''.join(own)})"] if varied else []
         kicked = [*taken, *kick.application(scheduled, lane=True)]
         if scheduled:
-            move = f"q, _ = move(q, None, drift({{p}}, {{a}}, {given}None))"
-            moved = [move.format(p="p", a="a")] if friction is None else friction.drifted(move)
-            return _over_lanes([*kicked, *moved])
+            return _over_lanes([*kicked, *_drifted_lane(friction, n_parameters)])
         drifted = f"q, q_error = move(q, q_error, drift(p, a, {given}None))"
         errors, stored = "q_error, p_error = unpack_lane(error, lane)", "pack_lane(q_error, p_error, error, lane)"
         return _over_lanes([errors, *kicked, drifted, stored])

@@ -13,7 +13,7 @@ import numpy as np
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import load_algebra, run_rows, template
 from sympflow.kernels.splitting_loops import damped_drift, damped_table, splitting_loops, takes_values
-from sympflow.kernels.stages import DampedDrift, kicks_of, lanes_source, run_table, stages_source
+from sympflow.kernels.stages import DampedDrift, kicks_of, lanes_source, run_table, stages_source, two_stages_source
 from sympflow.schemes import Scheme
 
 if TYPE_CHECKING:
@@ -167,8 +167,9 @@ def _rollout(
         variations_source(Variations(symbols, vectors)),
         stages_source(kinds, True, friction, n),
         lanes_source(kinds, True, friction, n),
+        two_stages_source(kinds, friction, n),
         kicks_source(symbols, level, monomials, vectors),
     ]
-    constants = {"COMPENSATED": False, "SCHEDULED": True, "VECTORS": vectors, "SINGLE": single}
+    constants = {"COMPENSATED": False, "SCHEDULED": True, "N_VALUES": 0, "VECTORS": vectors, "SINGLE": single}
     texts = ("loops", "aligned", "lanes", "tangents")
     return load_algebra("\n\n\n".join([template("elementary"), *sources]), texts, **constants).rollout_tangents

@@ -25,7 +25,7 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
 
-EVERY = 64  # steps between two looks at an orbit, of compiled loops
+EVERY = 256  # steps between two looks at an orbit, of compiled loops
 ALIGNED = 1e-12
 """Below this SALI and GALI an orbit is chaotic for sure, and ends: what is left is rounding."""
 NONE, ALIGNMENT, VOLUME = 0, 1, 2  # as `kernels.tangent_loops`
