@@ -146,9 +146,6 @@ def doubled(
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     if isinstance(system, DoubledSystem) or system.external_force is not None:
         raise TypeError(f"`system` {system.name!r} is of a doubling: add the forces, and double what was doubled.")
-    system.check_autonomous(
-        "and a doubling holds no time", "double the system without the drive, or give the drive up for `damping`"
-    )
     if force is None and system.conservative:
         raise TypeError("`force` is needed: a system without friction is Hamiltonian as it is.")
     named = f"{system.name}_doubled" if name is None else name
