@@ -44,6 +44,7 @@ _HOME = {
     "symplecticity_defect": "metrics.symplectic",
     "conformal_defect": "metrics.symplectic",
     "loop_area_error": "metrics.symplectic",
+    "floquet_multipliers": "metrics.floquet",
     "linear_stability": "metrics.linear_stability",
     "lyapunov": "metrics.chaos",
     "sali": "metrics.chaos",
@@ -87,6 +88,7 @@ if TYPE_CHECKING:
     from sympflow.metrics.energy import max_energy_error as max_energy_error
     from sympflow.metrics.energy_balance import energy_balance_error as energy_balance_error
     from sympflow.metrics.escapes import escape_times as escape_times
+    from sympflow.metrics.floquet import floquet_multipliers as floquet_multipliers
     from sympflow.metrics.frequencies import frequencies as frequencies
     from sympflow.metrics.linear_stability import linear_stability as linear_stability
     from sympflow.metrics.symplectic import conformal_defect as conformal_defect

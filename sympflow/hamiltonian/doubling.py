@@ -86,6 +86,7 @@ def doubled(
     *,
     params: Mapping[str, float] | None = None,
     domain: Domain | None = None,
+    name: str | None = None,
 ) -> DoubledSystem:
     """The Hamiltonian system in twice the variables whose physical limit is q' = ∂H/∂p, p' = −∂H/∂q − Γp + F(q, p).
 
@@ -109,6 +110,7 @@ def doubled(
         Values of the other symbols of F; those of `system.params` are known.
     domain : Domain, optional
         Ω of states [q₊, q₋, p₋, p₊]. The default is a box about the domain of the system, a tenth as wide in q₋ and p₋.
+    name : str, optional
 
     Returns
     -------
@@ -144,15 +146,20 @@ def doubled(
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     if isinstance(system, DoubledSystem) or system.external_force is not None:
         raise TypeError(f"`system` {system.name!r} is of a doubling: add the forces, and double what was doubled.")
-    system.check_autonomous(
-        "and a doubling holds no time", "double the system without the drive, or give the drive up for `damping`"
-    )
     if force is None and system.conservative:
         raise TypeError("`force` is needed: a system without friction is Hamiltonian as it is.")
-    scene: dict[str, Any] = {"name": f"{system.name}_doubled", "t_span": system.t_span, "dt": system.dt}
+    named = f"{system.name}_doubled" if name is None else name
+    scene: dict[str, Any] = {"name": named, "t_span": system.t_span, "dt": system.dt}
     scene["domain"] = _thin_box(system) if domain is None else domain
+    scene["energy_scale"] = _energy_scale(system)
     made: DoubledSystem
     given = callable(force) and not hasattr(force, "free_symbols")  # SymPy's expressions may be called
+    samples = system.symbols is not None and system.symbols.samples
+    if samples or (not system.autonomous and (given or system.symbols is None)):
+        system.check_autonomous(
+            "by functions of t, or samples, or with a force by a function, which are not doubled",
+            "give H and the force by symbols, with the time named, or solve system.vector_field by 'dop853'",
+        )
     if given and params is not None:
         raise TypeError("`params` are for a `force` by symbols: write their values into the function.")
     if given or system.symbols is None:
@@ -173,7 +180,8 @@ def doubled(
                 UserWarning,
                 stacklevel=2,
             )
-        made = DoubledSystem.from_sympy(doubled_hamiltonian(system, F), **scene)  # type: ignore[assignment]
+        time = None if system.symbols.time is None else {"time": system.symbols.time, "period": system.period}
+        made = DoubledSystem.from_sympy(doubled_hamiltonian(system, F), **scene, **(time or {}))  # type: ignore[assignment]
     made.physical = system if force is None else system.with_force(F)
     made.y0 = None if system.y0 is None else made.lift(system.y0)
     return made
@@ -189,7 +197,7 @@ class GivenForce:
     def __init__(self, force: Force) -> None:
         self.force = force
 
-    def __call__(self, q: Array, p: Array) -> Array:
+    def __call__(self, q: Array, p: Array, *t: Any) -> Array:
         import torch
 
         value = self.force(torch.as_tensor(q), torch.as_tensor(p))
@@ -201,7 +209,7 @@ class GivenForce:
             )
         return value if is_tensor(p) else value.detach().numpy()
 
-    def jacobian(self, q: Array, p: Array) -> Array:
+    def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
         import torch
 
         from sympflow.arrays import jvp
@@ -228,6 +236,15 @@ class _DoubledFunctions:
         field = self.system.vector_field(concatenate([q, p]))
         slope = -field[..., d:] - self.force(q, p)
         return (P[..., :d] * field[..., :d]).sum(-1) + (Q[..., d:] * slope).sum(-1)
+
+
+def _energy_scale(system: HamiltonianSystem) -> float | None:
+    """The energy of the physical system, for that of the doubled one is 0."""
+    if system.energy_scale is not None or system.y0 is None:
+        return system.energy_scale
+    with np.errstate(all="ignore"):
+        size = float(abs(system.hamiltonian(system.y0, system.t_span[0])))
+    return size if np.finfo(float).tiny < size < np.inf else None
 
 
 def _thin_box(system: HamiltonianSystem) -> Box | None:

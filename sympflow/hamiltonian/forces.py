@@ -45,7 +45,7 @@ class SymbolicForce:
     def __init__(self, system: HamiltonianSystem, force: Any, params: Mapping[str, float] | None) -> None:
         symbols = system.symbols
         assert symbols is not None
-        self.q, self.p = symbols.q, symbols.p
+        self.q, self.p, self.time = symbols.q, symbols.p, symbols.time
         d = system.ndof
         several = isinstance(force, Sequence | np.ndarray | sp.MatrixBase) and not isinstance(force, str)
         written = list(force) if several else [force]
@@ -67,7 +67,7 @@ class SymbolicForce:
         if d == 1:
             known |= {sp.Symbol("q", real=True): self.q[0], sp.Symbol("p", real=True): self.p[0]}
         f = f.xreplace(known)
-        unknown = sorted(s.name for s in f.free_symbols - {*self.q, *self.p})
+        unknown = sorted(s.name for s in f.free_symbols - {*self.q, *self.p, self.time})
         beyond = [name for name in unknown if _COORDINATE.fullmatch(name)]
         if beyond:
             raise ValueError(
@@ -75,25 +75,28 @@ class SymbolicForce:
                 "write it in these."
             )
         if "t" in unknown:
-            raise ValueError("`force` depends on the time t, but the system does not: leave t out.")
+            raise ValueError(
+                "`force` depends on the time t, but the system does not: leave t out, or name the time of the system."
+            )
         if unknown:
             raise ValueError(f"`force` holds {', '.join(unknown)} without a value: give it in `params`.")
         return f
 
-    def __call__(self, q: Array, p: Array) -> Array:
-        return self._evaluated(self.expressions, q, p)
+    def __call__(self, q: Array, p: Array, *t: Any) -> Array:
+        return self._evaluated(self.expressions, q, p, *t)
 
-    def jacobian(self, q: Array, p: Array) -> Array:
+    def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
         x = (*self.q, *self.p)
-        flat = self._evaluated([sp.diff(f, s) for f in self.expressions for s in x], q, p)
+        flat = self._evaluated([sp.diff(f, s) for f in self.expressions for s in x], q, p, *t)
         return flat.reshape(*p.shape, len(x))
 
-    def _evaluated(self, expressions: list[sp.Expr], q: Array, p: Array) -> Array:
+    def _evaluated(self, expressions: list[sp.Expr], q: Array, p: Array, *t: Any) -> Array:
         key = len(expressions), "torch" if is_tensor(p) else "numpy"
+        times = () if self.time is None else (self.time,)
         if key not in self._functions:
-            self._functions[key] = generate([printable(f) for f in expressions], (*self.q, *self.p), key[1])
+            self._functions[key] = generate([printable(f) for f in expressions], (*self.q, *self.p, *times), key[1])
         columns = [each[..., i] for each in (q, p) for i in range(p.shape[-1])]
-        return assemble(self._functions[key](*columns), columns[0])
+        return assemble(self._functions[key](*columns, *t), columns[0])
 
     @cached_property
     def _functions(self) -> dict[tuple[int, str], Any]:

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 
 class ExternalForce(Protocol):
-    """F(q, p) in p' = −∂H/∂q + F, that no H has."""
+    """F(q, p) in p' = −∂H/∂q + F, that no H has; of a driven system t, a number or (...), follows p."""
 
-    def __call__(self, q: Array, p: Array) -> Array:
+    def __call__(self, q: Array, p: Array, *t: Any) -> Array:
         """F: (..., d), each, to (..., d)."""
         ...
 
-    def jacobian(self, q: Array, p: Array) -> Array:
+    def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
         """∂F/∂(q, p): (..., d), each, to (..., d, 2d)."""
         ...
 
@@ -150,7 +150,7 @@ class Hamiltonian:
         if self.friction is not None:
             force = force + self.friction.force(y[..., d:])
         if self.external_force is not None:
-            force = force + self.external_force(y[..., :d], y[..., d:])
+            force = force + self.external_force(y[..., :d], y[..., d:], *self._time(t, y))
         return concatenate([velocity, force])
 
     def field_jacobian(self, y: Array, t: Any = None) -> Array:
@@ -163,7 +163,7 @@ class Hamiltonian:
             G[d:, d:] = self.friction.matrix(d)
             A = A - _like(G, A)
         if self.external_force is not None:
-            F = self.external_force.jacobian(y[..., :d], y[..., d:])
+            F = self.external_force.jacobian(y[..., :d], y[..., d:], *self._time(t, y))
             A = A + _rows_below(F)
         return A
 

@@ -269,10 +269,11 @@ class KernelStepper(Stepper):
     def __init__(self, integrator: FixedStep, problem: Problem, kernel: Kernel) -> None:
         self.integrator, self.system, self.problem = integrator, problem.system, problem
         self.kernel, self.backend, self.saves_finite = kernel, "compiled", kernel.saves_finite
+        self.driven = self.system is not None and not self.system.autonomous  # a flow alone steps without a system
         self.iterations = 0
 
     def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
-        start: dict[str, Any] = {} if self.system.autonomous else {"t0": t0}
+        start: dict[str, Any] = {"t0": t0} if self.driven else {}
         if y0.ndim == 1:
             states, last, iterations = self.kernel.run(h, y0, n_steps, save, **start)
             self.iterations += iterations
@@ -283,7 +284,7 @@ class KernelStepper(Stepper):
         return states.swapaxes(0, 1).reshape(len(save), *y0.shape), np.asarray(finite).reshape(y0.shape[:-1])
 
     def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        start = () if self.system.autonomous else (np.broadcast_to(t, y.shape[:-1]).reshape(-1),)
+        start = (np.broadcast_to(t, y.shape[:-1]).reshape(-1),) if self.driven else ()
         if y.ndim == 2 and np.shape(h) == (len(y),):
             states, iterations = self.kernel.step(h, y, *start)
         else:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.lazy import announced, distribution, load_announced
 from sympflow.systems.celestial import (
+    decaying_orbit,
     kepler,
     kepler_ellipse,
     outer_solar_system,
@@ -62,6 +63,7 @@ SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {
     "charged-particle": charged_particle,
     "damped-oscillator": damped_oscillator,
     "damped-pendulum": damped_pendulum,
+    "decaying-orbit": decaying_orbit,
 }
 """The built-in scenes by the name that the command line uses."""
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
+from sympflow.hamiltonian.doubling import DoubledSystem, doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.systems.pairs import OPTIONS, pair_functions
 
@@ -55,6 +56,54 @@ def kepler_ellipse(e: float, anomaly: np.ndarray) -> np.ndarray:
     c, s, b = np.cos(anomaly), np.sin(anomaly), math.sqrt(1 - e * e)
     r = 1 - e * c
     return np.stack([c - e, b * s, -s / r, b * c / r], axis=-1)
+
+
+def decaying_orbit(drag: float = 0.002, e: float = 0.3) -> DoubledSystem:
+    """H = (p₁² + p₂²)/2 − 1/√(q₁² + q₂²) with the drag −k p/(q₁² + q₂²), doubled: an orbit that falls inwards.
+
+    Drag of this form, through dust whose density falls with 1/r², has an exact solution.
+
+    Parameters
+    ----------
+    drag : float
+        k, 0 < k ≤ 0.003.
+    e : float
+        Eccentricity, 0 ≤ e ≤ 0.6, of the ellipse without drag that starts as this orbit does, at q = (1 − e, 0).
+
+    Notes
+    -----
+    Known truth: with the polar angle φ the angular momentum is L = √(1 − e²) − kφ, and u = 1/r solves
+    u'' + u = 1/L(φ)², a linear equation; so L = 0 would be reached after √(1 − e²)/(2πk) turns. The default interval is
+    five turns of the ellipse without drag, the default step 1/500 of one.
+
+    The states are [q₁, q₂, q₁₋, q₂₋, p₁₋, p₂₋, p₁, p₂], see `sympflow.doubled`; `y0` may be a physical one. The domain
+    is a box about the orbits, which the physical part of the default run does not leave.
+
+    References
+    ----------
+    .. [1] D. Mittleman, D. Jezewski, "An analytic solution to the classical two-body problem with drag", Celest. Mech.
+       28 (1982) 401–413.
+    """
+    if not (isinstance(drag, int | float) and 0 < drag <= 0.003):
+        raise ValueError(f"`drag` must be positive, at most 0.003; got {drag!r}.")
+    if not (isinstance(e, int | float) and 0 <= e <= 0.6):
+        raise ValueError(f"`e` must be an eccentricity, 0 ≤ e ≤ 0.6; got {e!r}.")
+    orbit = kepler(e)
+    p = 1.25 * math.sqrt((1 + e) / (1 - e))
+    high = np.array([1.2 * (1 + e), 1.2 * (1 + e), 0.1, 0.1, 0.1, 0.1, p, p])
+    return doubled(
+        HamiltonianSystem.from_sympy(
+            orbit.symbols.H,  # type: ignore[union-attr]
+            name="kepler",
+            y0=orbit.y0,
+            t_span=(0.0, 10 * math.pi),
+            dt=2 * math.pi / 500,
+        ),
+        ["-k*p1/(q1**2 + q2**2)", "-k*p2/(q1**2 + q2**2)"],
+        params={"k": drag},
+        domain=Box(-high, high),
+        name="decaying_orbit",
+    )
 
 
 def _shell(e: float) -> Domain:

@@ -202,3 +202,17 @@ def test_bad_systems_and_forces_of_potentials(oscillator):
         doubled(HamiltonianSystem(lambda q: (q**2).sum(-1), ndof=1), "-p")
     with pytest.warns(UserWarning, match="that of a potential"):
         doubled(systems.pendulum(), "-q**3")
+
+
+def test_a_driven_system_with_a_force_that_depends_on_t():
+    period = 2 * np.pi / 1.7
+    base = HamiltonianSystem.from_sympy(
+        "p**2/2 - cos(q)*(1 + a*cos(w*t))", time="t", params={"a": 0.3, "w": 1.7}, period=period, y0=[1.0, 0.0]
+    )
+    system = doubled(base, "-0.1*p*abs(p)*(1 + cos(w*t)/2)")
+    assert system.period == period
+    y, t = np.array([[1.0, 0.3], [0.2, -0.4]]), np.array([0.7, 1.1])
+    field = system.physical.vector_field(y, t)
+    force = -0.1 * y[:, 1] * abs(y[:, 1]) * (1 + np.cos(1.7 * t) / 2)
+    np.testing.assert_allclose(field - base.vector_field(y, t), np.stack([0 * t, force], axis=-1), atol=1e-15)
+    np.testing.assert_array_equal(system.physical_limit(system.vector_field(system.lift(y), t)), field)

@@ -250,7 +250,6 @@ HERE = "^`system` 'driven_pendulum' is driven"
             "^`system` has a kinetic energy .* not elementary",
         ),
         (lambda: DRIVEN.linear_part, ValueError, HERE),
-        (lambda: sympflow.doubled(DRIVEN, "-p*abs(p)"), ValueError, HERE),
         (lambda: sympflow.time_transformed(DRIVEN), ValueError, HERE),
         (lambda: solve(DRIVEN, "log_kahan_li8"), ValueError, HERE),
         (lambda: solve(DRIVEN, "linear_srkn6b"), ValueError, HERE),

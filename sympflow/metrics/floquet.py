@@ -1,0 +1,159 @@
+"""Floquet multipliers: how small deviations from a periodic orbit grow in a period.
+
+The Jacobian M of the flow over one period, along a periodic orbit, is the *monodromy matrix*; its eigenvalues are the
+multipliers. Here M is the product of the Jacobians of the steps that a method really makes, so that it is exact for
+that method. For a symplectic step the multipliers come in pairs λ, 1/λ; with the friction −γp in pairs λ, e^{−γT}/λ.
+
+References
+----------
+.. [1] V. A. Yakubovich, V. M. Starzhinskii, *Linear Differential Equations with Periodic Coefficients*, Wiley 1975.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.arguments import real_number
+from sympflow.arrays import is_tensor, to_numpy
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.registry import build, check_applies
+from sympflow.solver import check_y0, solve
+
+GROWS = 1e-5
+"""Excess of a multiplier over 1 that is more than the rounding of a double eigenvalue, √ε."""
+CLOSED = 1e-6
+"""Distance of the end of a period from its start, over 1 + |y0|, up to which an orbit is periodic."""
+
+
+@dataclass(frozen=True)
+class FloquetMultipliers:
+    """The multipliers of a periodic orbit.
+
+    Attributes
+    ----------
+    multipliers : ndarray (2d,), complex
+        The largest magnitudes first.
+    monodromy : ndarray (2d, 2d)
+        M, of which they are the eigenvalues.
+    period : float
+    mismatch : float
+        |y(t0 + T) − y0|: 0 of an orbit that is periodic.
+    pairing : float
+        ‖MᵀJM − e^{−γT}J‖₂/‖M‖₂², 0 where the multipliers are in pairs λ, e^{−γT}/λ; NaN where friction is no single
+        rate, or there is a force that is none of H.
+    """
+
+    multipliers: np.ndarray
+    monodromy: np.ndarray = field(repr=False)
+    period: float
+    mismatch: float
+    pairing: float
+
+    @property
+    def stable(self) -> bool:
+        """True if no multiplier is larger than 1."""
+        return bool(np.abs(self.multipliers[0]) <= 1 + GROWS)
+
+    @property
+    def exponents(self) -> np.ndarray:
+        """The Floquet exponents log(λ)/T, (2d,), their imaginary parts within ±π/T."""
+        return np.log(self.multipliers) / self.period
+
+
+def floquet_multipliers(
+    system: HamiltonianSystem,
+    y0: ArrayLike | None = None,
+    *,
+    period: float | None = None,
+    method: Any = "kahan_li8",
+    t0: float = 0.0,
+    **options: Any,
+) -> FloquetMultipliers:
+    """The Floquet multipliers of the orbit from y0 that is periodic, by the Jacobians of the steps of a method.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    y0 : array_like of shape (2d,), optional
+        A state of the orbit at the time t0; the default is the system's. An equilibrium is periodic too.
+    period : float, optional
+        T; the default is that of a driven system. The step of a method with fixed steps, `dt`, need not divide it.
+    method : str, Integrator or trained flow
+    t0 : float
+        Where the period begins, for a driven system; the multipliers do not depend on it.
+    **options
+        Options of the method, such as `dt`; by default the largest below `system.dt` that divides the period.
+
+    Returns
+    -------
+    FloquetMultipliers
+
+    Raises
+    ------
+    ValueError, TypeError
+        For bad arguments; if no period is known; if y0 is a batch; if the run of a period fails.
+
+    Warns
+    -----
+    RuntimeWarning
+        If the orbit is not periodic: its end is farther than 1e-6 from y0. The eigenvalues then mean little.
+
+    Examples
+    --------
+    >>> import math, sympflow
+    >>> found = floquet_multipliers(sympflow.systems.harmonic_oscillator(), period=math.pi, y0=[0.0, 0.0], dt=0.1)
+    >>> bool(abs(found.multipliers + 1).max() < 1e-6)
+    True
+    """
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    T = system.period if period is None else period
+    if T is None:
+        raise ValueError(f"`period` is needed: the system {system.name!r} has none of its own.")
+    if not real_number(T) or not 0 < T < math.inf:
+        raise ValueError(f"`period` must be positive and finite; got {period!r}.")
+    if not real_number(t0) or not math.isfinite(t0):
+        raise ValueError(f"`t0` must be a finite number; got {t0!r}.")
+    if is_tensor(y0):
+        raise TypeError("`y0` is a tensor, but multipliers are of NumPy arrays: pass y0.numpy().")
+    start = check_y0(system, system.y0 if y0 is None else y0, None)
+    if start.ndim != 1:
+        raise ValueError(f"`y0` must be one state, of shape ({2 * system.ndof},); got {start.shape}.")
+    integrator = build(method, options)
+    if "dt" in integrator.options() and integrator.step_length(system) == system.dt and "dt" not in options:
+        integrator = build(method, {**options, "dt": T / math.ceil(T / system.dt)})
+    integrator = integrator.resolved(system, start, float(T))
+    check_applies(integrator, system, start)
+    t_span = (float(t0), float(t0 + T))
+    end = solve(system, integrator, t_span, start, t_eval=[t_span[1]]).raise_for_status().y[:, -1]
+    mismatch = float(np.linalg.norm(to_numpy(end) - start))
+    if not mismatch <= CLOSED * (1 + float(np.abs(start).max())):
+        warnings.warn(
+            f"The orbit is not periodic: after {T:g} it is {mismatch:.3g} from `y0`. Take a state of a periodic orbit, "
+            "its period, or a smaller `dt`.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    M = np.eye(len(start))
+    for _, _, jacobians in integrator.executed(system, t_span, start):
+        for A in jacobians:
+            M = A @ M
+    found = np.linalg.eigvals(M)
+    found = found[np.argsort(-np.abs(found), kind="stable")].astype(complex)
+    return FloquetMultipliers(found, M, float(T), mismatch, _pairing(system, M, float(T)))
+
+
+def _pairing(system: HamiltonianSystem, M: np.ndarray, T: float) -> float:
+    """The defect of the form that M keeps, or shrinks: see `FloquetMultipliers`."""
+    friction = system.friction
+    if system.external_force is not None or (friction is not None and not friction.isotropic):
+        return math.nan
+    rate, d = 0.0 if friction is None else friction.largest, system.ndof
+    J = np.block([[np.zeros((d, d)), np.eye(d)], [-np.eye(d), np.zeros((d, d))]])
+    return float(np.linalg.norm(M.T @ J @ M - math.exp(-rate * T) * J, 2) / np.linalg.norm(M, 2) ** 2)
