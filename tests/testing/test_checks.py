@@ -337,7 +337,7 @@ def test_what_is_wrong_in_one_place_only_is_caught(lie, message):
 
 
 def test_the_sound_method_passes():
-    assert len(check_integrator(SoundVerlet).passed) == len(CHECKS) - 3  # it says nothing of friction and drive, for two
+    assert len(check_integrator(SoundVerlet).passed) == len(CHECKS) - 3  # it says nothing of friction and drive
 
 
 def test_a_start_time_that_matters_is_seen_by_its_own_check():
