@@ -244,12 +244,12 @@ def test_a_fragment_says_where_it_is_from(tmp_path, monkeypatch):
 
 
 def test_every_fragment_has_a_command_that_writes_it():
-    """The names in the sources; stability and the ideas put a prefix before the names of their sections."""
+    """The names in the sources; stability, the ideas and driven systems put a prefix before the names of their sections."""
     sources = "".join(path.read_text(encoding="utf-8") for path in BENCHMARKS.rglob("*.py"))
     for path in (BENCHMARKS.parent / "docs" / "measured").glob("*.md"):
         if path.stem == "flows":  # the table of `sympflow flows`
             continue
-        section = path.stem.removeprefix("stability-").removeprefix("ideas-")
+        section = path.stem.removeprefix("stability-").removeprefix("ideas-").removeprefix("driven-")
         section = re.sub(r"^stiff-fput-\d+", "stiff-fput-", section)
         section = re.sub(r"^peers-(one|batch)", "peers-", section)
         stem = section.removesuffix("-against").removesuffix("-flow").removesuffix("-work")
