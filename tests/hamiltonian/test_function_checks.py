@@ -169,7 +169,9 @@ def test_right_functions_pass(functions, y0):
 
 def test_a_wrong_slope_among_scales_far_apart_is_found():
     wrong = MIXED | {"gradient": lambda q: np.stack([q[..., 0] / 1e12, 1.01e7 / (1e7 * q[..., 1]) ** 2], -1)}
-    assert_refused(r"its component 1 is 1\.01e\+07, but `potential` grows by 1e\+07", np.array([1e6, 1e-7, 0.1, 0.2]), **wrong)
+    assert_refused(
+        r"its component 1 is 1\.01e\+07, but `potential` grows by 1e\+07", np.array([1e6, 1e-7, 0.1, 0.2]), **wrong
+    )
 
 
 def within(q):
@@ -205,7 +207,9 @@ def test_halves_of_other_sizes_are_tested_by_their_own():
     def hamiltonian(q, p):
         return (p.detach() ** 2).sum(-1) / 2e-26 + 1e-2 * (q**2).sum(-1)
 
-    assert_refused(r"^`hamiltonian` is cut off .* component 1", np.array([1e-10, 1e-23]), hamiltonian=hamiltonian, ndof=1)
+    assert_refused(
+        r"^`hamiltonian` is cut off .* component 1", np.array([1e-10, 1e-23]), hamiltonian=hamiltonian, ndof=1
+    )
 
 
 FAR = QUARTIC | {"gradient": lambda q: np.where(abs(q) > 2, 0, q**3), "y0": np.array([0.3, 0.2, 3.0, 3.0])}
