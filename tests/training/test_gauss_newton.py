@@ -115,7 +115,7 @@ FEW = TableOptions(points=5, label_times=3, frozen_weight=1.0, energy_weight=7.0
 
 
 def errors_of(run, psi):
-    """The fit's residuals by definition, of coordinates and of the energy, for ψ̄ at labels (3, 5, 2) of the pendulum."""
+    """The residuals by definition, of coordinates and of the energy, for ψ̄ at labels (3, 5, 2) of the pendulum."""
     y = run.whole._y.T.reshape(3, 5, 2)
     spread = np.std(PENDULUM.hamiltonian(run.whole._x[:, :5].T))
     energy = math.sqrt(7.0) / spread * (PENDULUM.gradient(y) * (psi - y)).sum(-1)
