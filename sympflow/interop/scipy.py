@@ -79,7 +79,7 @@ class _SolverType(type):
 
 
 def _made_of(cls: type[FlowSolver]) -> Any:
-    """What pickle makes the class of again: its name, if it is the base class or a user's."""
+    """The recipe by which pickle makes the class again: its name, if it is the base class or a user's."""
     made = {"integrator", "system"} <= set(vars(cls))
     return (_solver_class, (cls.integrator, cls.system)) if made else cls.__qualname__
 
