@@ -258,7 +258,7 @@ class Ensemble:
 
     @property
     def fields(self) -> Mapping[str, np.ndarray]:
-        """What was kept of each orbit, by name: arrays (..., N, ...)."""
+        """The kept part of each orbit, by name: arrays (..., N, ...)."""
         return self.keeper.fields
 
     @property
@@ -289,7 +289,7 @@ class Ensemble:
 
     @property
     def message(self) -> str:
-        """What became of the orbits, in words."""
+        """The outcome of the orbits, in words."""
         status = self.status
         failed = int(np.count_nonzero(status))
         if not failed:

@@ -51,7 +51,7 @@ def identity(
     reduction: Reduction,
     backend: str,
 ) -> dict[str, str]:
-    """What an ensemble is known by, each part as a text; two are the same if all parts are."""
+    """The identity of an ensemble, each part as a text; two are the same if all parts are."""
     states = orbits.y0 if isinstance(orbits, Given) else orbits.states(0, min(len(orbits), 64))
     return {
         "system": f"{system.name} {_digest([system.expression, dict(system.params), list(system.fingerprint)])}",

@@ -253,7 +253,7 @@ def _chunk_shape(layout: Layout, problem: Chunk, chunk: int | None, in_memory: b
 
 @dataclass(frozen=True)
 class Task:
-    """What all chunks of an ensemble have in common: a definition that is small when pickled."""
+    """The common part of all chunks of an ensemble: a definition that is small when pickled."""
 
     system: HamiltonianSystem
     integrator: Integrator

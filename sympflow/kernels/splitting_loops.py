@@ -163,7 +163,7 @@ class SplittingLoops:
         return self._variants[variant]
 
     def rows(self, table: StageTable, h: float = 1.0, t0: float = 0.0) -> np.ndarray:
-        """What the loops read of a table; where they take the values of the system's parameters, with these.
+        """The numbers of a table that the loops read, with the values of the system's parameters where they take these.
 
         With friction the maps of the drifts are among them, of numbers for one h. Those of a driven system read the
         time too, that of a step h that begins at t0.
