@@ -111,12 +111,20 @@ class SplittingLoops:
             self._compile = partial(
                 _array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, self.driven, damped
             )
+        elif system.local is not None:
+            if system.damping is not None and system.damping.ndim:
+                raise ValueError(
+                    f"`system` {system.name!r} has a rate of friction for each momentum, and its compiled loops have one "
+                    "for all: use backend='array'."
+                )
+            self._has_force_gradient = system.quadratic_kinetic
+            self._compile = partial(_LOCAL[system.local.loops], system)
         else:
             raise ValueError(
                 "`system` cannot be compiled: it is given by plain functions. Define it with "
                 "HamiltonianSystem.from_sympy or by Numba functions, or use backend='array'."
             )
-        self._has_curvature = system.symbols is not None
+        self._has_curvature = system.symbols is not None or system.local is not None
         self._variants: dict[tuple[int, bool, Monomials, bool], LoopFunctions] = {}
 
     def kernel(self, scheme: Scheme, compensated: bool = False) -> SplittingKernel:
@@ -559,3 +567,18 @@ def _array_loops(
     texts = map(template, ("array_states", "loops"))
     exec("\n\n\n".join([header, mass, given, stages, *texts]), functions)
     return _array_functions(functions)
+
+
+def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
+    """The loops of a lattice, of which only the structure, and not the size, is part of the code."""
+    from sympflow.hamiltonian.lattice import LatticeHamiltonian
+    from sympflow.kernels.lattice_loops import LatticeLoops
+
+    assert isinstance(system.local, LatticeHamiltonian)
+    loops = LatticeLoops(system.local, level, compensated, system.friction is not None)
+    processed = loops.rollout_processed, loops.rollout_processed_batch
+    return LoopFunctions(loops.rollout, loops.rollout_batch, *processed, loops.step_rows)
+
+
+_LOCAL: dict[str, Callable[..., LoopFunctions]] = {"lattice": _lattice_loops}
+"""The loops of systems that are symbolic in one piece, by the name that their definition gives."""
