@@ -266,6 +266,13 @@ class FlowMap(nn.Module):
         """The states [q, p] of those that the maps take."""
         return torch.cat([z[..., : self.ndof], z[..., self.ndof + 1 :]], dim=-1) if self.driven else z
 
+    def on_extended(self, extended: HamiltonianSystem) -> Self | None:
+        """Return the same maps of a driven system with a coordinate more, of which the momentum is −∫ ∂H/∂t dt.
+
+        None where the functions of a system are no part of the maps.
+        """
+        return None
+
     def at_time(self, z: Tensor, time: Any) -> Tensor:
         """Such states of a driven system with another time, a number or (...)."""
         d = self.ndof
@@ -497,9 +504,9 @@ class FlowMap(nn.Module):
             )
         if not (system.autonomous or self.matches(system)):
             raise ValueError(
-                f"`system` {system.name!r} is driven, H depends on t, and the flow was trained for {self.system_name!r} "
-                "with another drive or none: its amplitude, its frequency or another parameter differs. Pass the flow "
-                "of this system, or train one with sympflow.train(system), from these numbers by "
+                f"`system` {system.name!r} is driven, H depends on t, and the flow was trained with another drive or "
+                f"none, for {self.system_name!r}: its amplitude, its frequency or another parameter differs. Pass the "
+                "flow of this system, or train one with sympflow.train(system), from these numbers by "
                 "sympflow.train(system, flow=flow.transferred(system))."
             )
         if not self.matches(system):
@@ -684,13 +691,13 @@ def start_time(t0: Any, x: Tensor, period: float | None) -> Tensor:
     if t0 is None:
         raise TypeError("`t0` is missing, the time of `x`: the system of the flow is driven, as in flow(t, x, t0=0.0).")
     try:
-        time = t0 if isinstance(t0, Tensor) else torch.as_tensor(np.asarray(t0))
+        time = t0 if isinstance(t0, Tensor) else torch.as_tensor(np.array(t0))
         time = time.to(x.device)
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"`t0` must be a number or a tensor of times; got {t0!r}: pass seconds.") from None
     if time.dtype == torch.bool or time.is_complex():
         raise TypeError(f"`t0` must be real times; got {time.dtype}: use a floating-point tensor.")
-    if time.ndim and torch.broadcast_shapes(time.shape, x.shape[:-1]) != x.shape[:-1]:
+    if time.ndim and not _fits(time.shape, x.shape[:-1]):
         raise ValueError(
             f"`t0` of shape {tuple(time.shape)} does not fit the batch shape {tuple(x.shape[:-1])} of `x`: give one "
             "time, or one for each state."
@@ -705,6 +712,11 @@ def start_time(t0: Any, x: Tensor, period: float | None) -> Tensor:
             f"`x` is {x.dtype}, in which times are rounded too much: use float64, or give the system its `period`."
         )
     return time % period
+
+
+def _fits(shape: torch.Size, batch: torch.Size) -> bool:
+    """Return True if an array broadcasts to a batch."""
+    return len(shape) <= len(batch) and all(n in (1, m) for n, m in zip(shape[::-1], batch[::-1], strict=False))
 
 
 def to_values(t: Tensor) -> np.ndarray:

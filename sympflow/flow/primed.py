@@ -79,7 +79,7 @@ class PrimedShape:
     monomials : tuple of tuple of int
         The exponents m of polynomials that stand in place of both, for symbolic systems; none for none.
     timed : bool
-        True if the drifts of the kernel add up to t at every t, as they must with friction, for its e^{−γt} to be exact,
+        True if the drifts of the kernel add up to t at every t, as they must with friction, with an exact e^{−γt},
         and in a driven system, in which the time moves with them.
 
     Raises
@@ -692,8 +692,15 @@ class PrimedFlow(SympFlow):
                 f"`system` {system.name!r} has no kicks and drifts such as the flow's: it must be H = ½ pᵀM⁻¹p + V(q), "
                 "with `hessian_vector` where V is a function."
             )
-        shape = replace(self.shape, timed=_is_timed(system))
-        other = type(self)(self.ndof, shape, self.dt, system, self.dtype, self.device)
+        return self._of(system, replace(self.shape, timed=_is_timed(system)))
+
+    def on_extended(self, extended: HamiltonianSystem) -> Self:
+        monomials = tuple((*m, *[0] * (extended.ndof - self.ndof)) for m in self.monomials)
+        return self._of(extended, replace(self.shape, monomials=monomials)).requires_grad_(False)
+
+    def _of(self, system: HamiltonianSystem, shape: PrimedShape) -> Self:
+        """A flow of a system with the numbers of this one."""
+        other = type(self)(system.ndof, shape, self.dt, system, self.dtype, self.device)
         mine = dict(self.columns())
         for name, column in other.columns():
             column.set(to_numpy(mine[name].table))

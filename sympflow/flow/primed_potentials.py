@@ -72,10 +72,8 @@ class Sum:
         return sum((f.rate(t) for f in self.factors), 0 * t)
 
 
-class Function(Protocol):
-    """A function of x (N, d) and, of a driven system, of the times (N,), that a system defines."""
-
-    def __call__(self, system: HamiltonianSystem, x: Tensor, t: Tensor | None = None) -> Tensor: ...
+Function = Callable[..., Tensor]
+"""Function of a system, x (N, d) and, where the system is driven, the times (N,)."""
 
 
 @dataclass(frozen=True)

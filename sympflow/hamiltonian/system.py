@@ -417,7 +417,7 @@ class HamiltonianSystem(Hamiltonian):
 
     @property
     def _arguments(self) -> int:
-        """How many components of a state the given functions depend on: V is one of q alone."""
+        """The number of components of a state that the given functions depend on: V is one of q alone."""
         return self.ndof if self.separable else 2 * self.ndof
 
     # structure --------------------------------------------------------------------------------------

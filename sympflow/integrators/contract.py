@@ -211,6 +211,10 @@ class Integrator:
         """Return the trained flow that is used for a system, one in the system's own time; None if there is none."""
         return None
 
+    def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> Integrator | None:
+        """Return the same method on a driven system with the time and its momentum E; None where it is none there."""
+        return None if self.trained else self
+
     def identity_for(self, system: HamiltonianSystem) -> Identity | None:
         """Return the H that the trained flow for a system was made for; None without a flow, or where it is unknown."""
         flow = self.flow_for(system)
@@ -268,6 +272,22 @@ class Integrator:
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         """Execute the run again as a stream of its steps."""
         raise NotImplementedError(f"{type(self).__name__} must define steps().")
+
+
+class ByVectorField(Integrator):
+    """An integrator whose steps evaluate `system.vector_field` at its times, and take all that this holds."""
+
+    @property
+    def takes_friction(self) -> bool:
+        return True
+
+    @property
+    def takes_forces(self) -> bool:
+        return True
+
+    @property
+    def takes_driving(self) -> bool:
+        return True
 
 
 def in_blocks(steps: Steps) -> Steps:

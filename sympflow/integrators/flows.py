@@ -123,6 +123,10 @@ class FlowIntegrator(OwnStepper):
             flows[asked] = known((name, kind_of(system), tolerance), lambda: shipped(system, name, tolerance))
         return flows[asked]
 
+    def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> FlowIntegrator | None:
+        flow = self.flow_for(system).on_extended(extended)
+        return None if flow is None else type(self)(flow=flow, dt=self.dt)
+
     def check(self, system: HamiltonianSystem) -> None:
         if self.flow is not None:
             self.flow.check_system(system)

@@ -290,6 +290,7 @@ def _share(error: Any, of: Any) -> float:
 
 def handed_in(data: Any, system: HamiltonianSystem, dt: float) -> Labelled:
     """The labels that were handed in, as float64 arrays."""
+    system.check_autonomous("and `data` tell no time at which a step begins", "leave them out")
     if not isinstance(data, tuple | list) or len(data) != 3:
         raise TypeError(
             "`data` must be three arrays, times (n,), states (n, 2d) and where they go (n, 2d): pass a tuple."

@@ -160,7 +160,7 @@ def _with_times(q: np.ndarray, t: np.ndarray | None) -> np.ndarray:
 
 
 def _largest_eigenvalues(system: HamiltonianSystem, q: np.ndarray, t: np.ndarray | None = None) -> np.ndarray:
-    """Of M⁻¹∇²V the one of largest size, by the power method: (n, d) to (n,)."""
+    """The eigenvalue of M⁻¹∇²V of largest size, by the power method: (n, d) to (n,)."""
     forces, d = forces_of(system, 0), system.ndof
     v = np.random.default_rng(SEED).standard_normal(q.shape)
     size, still = np.ones(len(q)), None if t is None else 0 * t

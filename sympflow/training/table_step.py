@@ -368,7 +368,6 @@ class ArrayForces:
         basis = np.broadcast_to(np.eye(rows.shape[1])[:, None], (rows.shape[1], *rows.shape))
         return np.moveaxis(self._product(rows, basis), 0, -1)
 
-
     def _ends(self, rows: np.ndarray, v: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
         """The states on both sides of each row along v (P, D), and their distance from it over that of v (P, 1)."""
         largest = np.abs(v).max(-1, keepdims=True)

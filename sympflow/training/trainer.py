@@ -252,7 +252,9 @@ def fit_flow(
                 TableOptions.of(asked)  # raises before trials
             flow, tried = _new_primed(system, domain, dt, new, asked, session)
             session.cut = session.interruption.asked  # what trials were left out does not end the run
-        system.vector_field(domain.sample(1, 0), start_times(system, 0.0, 1, 0, Stream.LABELS))  # what is compiled for it counts, but not as labels
+        system.vector_field(
+            domain.sample(1, 0), start_times(system, 0.0, 1, 0, Stream.LABELS)
+        )  # what is compiled for it counts, but not as labels
         run = _run_of(system, domain, kind, flow, tried, dt, new, asked, session.deadline)
         if session.resume is not None:
             run.load(session.resume)

@@ -22,7 +22,10 @@ from sympflow.training.table_fit import TableRun
 PHASES = (PHASE, 1.25, 1.5)  # ω Δt of the flows that are tried
 STARTS, STEPS, FINAL_STEPS, POINTS = 6, 40, 160, 80  # of a trial's search, and what follows the best start
 ORBITS, LENGTH = 20, 256  # held-out orbits of a trial, and their steps
-FEWER, REFERENCE = 32, 1e-10  # steps of orbits of which the energy changes, and the tolerance of the exact ones beside them
+FEWER, REFERENCE = (
+    32,
+    1e-10,
+)  # steps of orbits of which the energy changes, and the tolerance of the exact ones beside them
 ORDER = 8  # with which the errors of classical schemes fall where these flows are used
 MOST_NDOF = 3  # beyond which trials take too long
 SHARE = 0.5  # of a time budget
