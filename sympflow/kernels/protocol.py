@@ -27,13 +27,14 @@ class Carry:
     steps : int
         The steps made so far; 0 before a run.
     running : ndarray of shape (K,), or (N, K) of a batch; or None
-        The kernel's own; None before a run. NaN where a trajectory has ended.
+        The kernel's own; None before a run. NaN where a trajectory has ended. Of array operations the states (..., K),
+        an array or a tensor.
     """
 
     steps: int = 0
-    running: np.ndarray | None = None
+    running: Any = None
 
-    def advance(self, steps: int, running: np.ndarray) -> None:
+    def advance(self, steps: int, running: Any) -> None:
         """Take the place after so many steps."""
         self.steps, self.running = steps, running
 
