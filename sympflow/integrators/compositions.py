@@ -83,7 +83,7 @@ class Composition(ABC):
         return x
 
     def distance(self, x: Array) -> Array:
-        """How far those states are from ones that `lift` gives: (...)."""
+        """Distance of those states from ones that `lift` gives: (...)."""
         return 0 * x[..., 0]
 
     @abstractmethod

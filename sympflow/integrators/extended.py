@@ -31,7 +31,7 @@ class Extension(Protocol):
         ...
 
     def distance(self, x: Array) -> Array:
-        """How far states of the extended space are from those that `lift` gives: (...)."""
+        """Distance of states of the extended space from those that `lift` gives: (...)."""
         ...
 
 

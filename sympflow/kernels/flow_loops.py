@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,9 +12,8 @@ from numpy.typing import ArrayLike
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.parts import ExactParts, Map
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.modules import run_one, run_rows
 from sympflow.kernels.parts_loops import parts_loops
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, opened
+from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
 from sympflow.kernels.splitting_loops import LoopFunctions, SplittingKernel, splitting_loops
 from sympflow.kernels.stages import StageTable, run_table, single_table
 from sympflow.kernels.timed_loops import reach_times
@@ -113,15 +113,10 @@ class PrimedFlowKernel(Kernel):
         """`n_steps` times ψ̄_h from one state: see `Kernel`."""
         if not self._tables.processed:
             return self._kernel(h).run(abs(h), y0, n_steps, save, carry)
-        tables, rollout = self._processed(h), self._functions().rollout_processed
-        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
-        out = np.empty((len(save), len(y0)))
-        first, running = opened(carry, len(y0) * (1 + self._compensated))
-        work = _stages(tables, n_steps - first, len(save)) * len(y0) // 2
-        n_finite = run_one(lambda stop: rollout(*tables, y0, n_steps, save, out, stop, first, running), work)
-        if carry is not None:
-            carry.advance(n_steps, running)
-        return Run(out, n_finite)
+        tables = self._processed(h)
+        rollout = partial(self._functions().rollout_processed, *tables)
+        width, work = len(y0) * (1 + self._compensated), _stages(tables, n_steps, save) * len(y0) // 2
+        return run_state(rollout, y0, n_steps, save, carry, width, work)
 
     def run_batch(
         self,
@@ -138,19 +133,13 @@ class PrimedFlowKernel(Kernel):
         if not self._tables.processed:
             return self._kernel(h).run_batch(abs(h), y0, n_steps, save, threads, carry)
         tables, rollout = self._processed(h), self._functions().rollout_processed_batch
-        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
-        out = np.empty((len(y0), len(save), y0.shape[1]))
-        n_finite = np.empty(len(y0), dtype=np.int64)
 
-        first, running = opened(carry, len(y0), y0.shape[1] * (1 + self._compensated))
+        def rows(_: slice, *rest: Any) -> None:
+            rollout(*tables, *rest)
 
-        def rows(i: slice, stop: np.ndarray) -> None:
-            rollout(*tables, y0[i], n_steps, save, out[i], n_finite[i], stop, first, running[i])
-
-        run_rows(rows, len(y0), _stages(tables, n_steps - first, len(save)) * y0.shape[1] // 2, threads)
-        if carry is not None:
-            carry.advance(n_steps, running)
-        return Run(out, n_finite)
+        size = y0.shape[1]
+        width, work = size * (1 + self._compensated), _stages(tables, n_steps, save) * size // 2
+        return run_states(rows, y0, n_steps, save, threads, carry, width, work)
 
     def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,); its numbers are polynomials in h."""
@@ -200,9 +189,9 @@ class PrimedFlowKernel(Kernel):
         return self._tables.kept(("processed", h, self._splitting.values), make)
 
 
-def _stages(tables: Sequence[np.ndarray], n_steps: int, n_saved: int) -> int:
-    """Stages of a run with a processor."""
-    return n_steps * tables[1].shape[1] + n_saved * tables[2].shape[1]
+def _stages(tables: Sequence[np.ndarray], n_steps: int, save: np.ndarray) -> int:
+    """Stages of a step of a run with a processor, with its share of those of the outputs."""
+    return tables[1].shape[1] + tables[2].shape[1] * -(-len(save) // max(n_steps, 1))
 
 
 class MapSource(Protocol):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["energy_balance_error"]
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(6)
-"""Of the integral over a step, where the method cannot run on the extended system."""
+"""Gauss–Legendre quadrature of the integral over a step, where the method cannot run on the extended system."""
 
 _EXTENDED: WeakKeyDictionary[HamiltonianSystem, HamiltonianSystem] = WeakKeyDictionary()
 

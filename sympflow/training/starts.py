@@ -148,7 +148,7 @@ def potential_hessian(system: HamiltonianSystem, q: np.ndarray) -> np.ndarray:
 
 
 def _largest_eigenvalues(system: HamiltonianSystem, q: np.ndarray) -> np.ndarray:
-    """Of M⁻¹∇²V the one of largest size, by the power method: (n, d) to (n,)."""
+    """The eigenvalue of M⁻¹∇²V of largest size, by the power method: (n, d) to (n,)."""
     forces = forces_of(system, 0)
     v = np.random.default_rng(SEED).standard_normal(q.shape)
     size = np.ones(len(q))
