@@ -31,7 +31,7 @@ from sympflow.integrators.contract import (
 )
 from sympflow.integrators.grid import EPS, Grid
 from sympflow.integrators.windows import MOST_SAVED, Pace, Pieces, Saved, first_window
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.carry import Carry
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel

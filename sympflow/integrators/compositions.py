@@ -24,7 +24,8 @@ from sympflow.integrators.base import rollout
 from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, scheme_evaluations
 
 if TYPE_CHECKING:
-    from sympflow.kernels.protocol import Carry, Kernel
+    from sympflow.kernels.carry import Carry
+    from sympflow.kernels.protocol import Kernel
     from sympflow.kernels.splitting_loops import SplittingLoops
 
 _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, ExactParts]] = WeakKeyDictionary()

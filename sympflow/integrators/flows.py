@@ -30,7 +30,7 @@ from sympflow.integrators.clocks import (
 )
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.carry import Carry
 
 T = TypeVar("T")
 

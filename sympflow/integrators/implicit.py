@@ -16,8 +16,8 @@ from sympflow.integrators.base import KernelStepper, OwnStepper, Problem, Steppe
 from sympflow.integrators.contract import Failure
 
 if TYPE_CHECKING:
+    from sympflow.kernels.carry import Carry
     from sympflow.kernels.implicit_loops import ImplicitKernel, Tableau
-    from sympflow.kernels.protocol import Carry
 
 MOST_ITERATIONS = 50
 DIFFERENTIATED = 3

@@ -23,7 +23,8 @@ from sympflow.integrators.methods import NAMES, TRIPLES
 from sympflow.schemes import SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
-    from sympflow.kernels.protocol import Carry, Kernel
+    from sympflow.kernels.carry import Carry
+    from sympflow.kernels.protocol import Kernel
     from sympflow.kernels.tangent_loops import TangentKernel
 
 
