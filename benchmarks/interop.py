@@ -1,4 +1,4 @@
-"""What our methods cost inside SciPy and torchdiffeq, against the methods that are at home there.
+"""Cost of our methods inside SciPy and torchdiffeq, against the methods that are at home there.
 
     python benchmarks/interop.py                 # a table; about a minute on two cores
     python benchmarks/interop.py --json out.json # the same as JSON

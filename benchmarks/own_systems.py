@@ -1,4 +1,4 @@
-"""What `train(system)` with nothing else gives on systems that are not built in, beside splitting schemes.
+"""Flows that `train(system)` with nothing else gives on systems that are not built in, beside splitting schemes.
 
     python benchmarks/own_systems.py              all of them, each a minute of training and half a minute of comparison
     python benchmarks/own_systems.py mass         one of them

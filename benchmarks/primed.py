@@ -162,7 +162,7 @@ ABLATION = (
 
 
 def ablation(system: HamiltonianSystem, dt: float, variants: tuple[Variant, ...], **options: Any) -> str:
-    """How near each variant comes with the same Δt, and how many forces it saves at its own energy error."""
+    """The error of each variant with the same Δt, and the forces that it saves at its own energy error."""
     lines = [
         "| variant | numbers | fit | error at Δt / at fractional t | energy error, T = 1000 | forces saved |",
         "|---|---|---|---|---|---|",

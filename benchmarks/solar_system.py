@@ -64,7 +64,7 @@ class Racer:
 
 
 def flows(system: HamiltonianSystem) -> list[Racer]:
-    """Those that ship."""
+    """The flows that ship."""
     racers = []
     for entry in sympflow.shipped_flows(system):
         flow = sympflow.load(entry.path, system=system)

@@ -72,7 +72,7 @@ def cpu_seconds(calls: list[Callable[[], Any]], repeats: int) -> list[float]:
 
 
 def errors(system: HamiltonianSystem, y: np.ndarray) -> tuple[float, float]:
-    """Of states (n, 2d): the largest relative energy error, and |I − 1|."""
+    """The largest relative energy error of states (n, 2d), and |I − 1|."""
     with np.errstate(all="ignore"):
         H = system.hamiltonian(y)
         I = oscillatory_energies(system, y).sum(-1)  # noqa: E741
@@ -123,7 +123,7 @@ def candidates(system: HamiltonianSystem) -> list[Run]:
 
 
 def cheapest(runs: list[Run], goal: float) -> Run | None:
-    """Of the runs that reach the goal the one that runs fastest: the few with least evaluations are timed."""
+    """The fastest of the runs that reach the goal: the few with least evaluations are timed."""
     good = sorted((r for r in runs if r.energy_error <= goal), key=lambda r: r.forces + r.hessians)[:6]
     if not good:
         return None

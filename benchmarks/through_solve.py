@@ -1,4 +1,4 @@
-"""What a user of `solve` pays: shipped flows beside untrained schemes at about the same energy error.
+"""The cost of `solve` to a user: shipped flows beside untrained schemes at about the same energy error.
 
     python benchmarks/through_solve.py
     python benchmarks/through_solve.py --quick      every case once, on short intervals: does it run?
@@ -66,7 +66,7 @@ def fastest(calls: tuple[Callable[[], Any], ...], quick: bool) -> list[float]:
 
 
 def median_energy_error(system: HamiltonianSystem, run: Callable[..., Solution], t_end: float) -> float:
-    """Of the largest relative error of each of 200 states."""
+    """Median of the largest relative error of each of 200 states."""
     y0 = system.domain.sample(200, 3)  # type: ignore[union-attr]
     sol = run((0, t_end), y0, t_eval=np.linspace(0, t_end, 500))
     H0 = system.hamiltonian(y0)[:, None]

@@ -9,9 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sympflow.arguments import check_flag
 from sympflow.arrays import Array, is_tensor, to_numpy
 
 if TYPE_CHECKING:
+    import os
+
+    import pandas
+    import xarray
     from scipy.optimize import OptimizeResult
 
     from sympflow.hamiltonian.parameter_rows import ParameterRows
@@ -204,11 +209,100 @@ class Solution:
             success=self.success,
         )
 
+    def to_xarray(self, energy: bool = True) -> xarray.Dataset:
+        """The solution as an `xarray.Dataset`, from which `to_netcdf` and `to_zarr` of xarray write files.
+
+        Variables are `q` and `p` with the dimensions (..., dof, time), `energy` (..., time), the initial states `q0`
+        and `p0` (..., dof), `status` (...), and of each event i its times `t_event_i` and states. A batch has the
+        dimension `orbit`, or of more axes orbit_0, orbit_1, ...; parameters that were given for each trajectory are
+        coordinates along it. The attributes say by what the data were made: the version of sympflow, the system, its
+        H and params, the method, its options, the checksum of its flow, counts of the run, and the message.
+
+        Parameters
+        ----------
+        energy : bool
+            False leaves `energy` out, which is an evaluation of H at each state.
+
+        Raises
+        ------
+        ImportError
+            If xarray is not installed.
+        """
+        return dataset(self, energy)
+
+    def to_dataframe(self, energy: bool = True) -> pandas.DataFrame:
+        """The solution as a `pandas.DataFrame` with a row for each time of each trajectory.
+
+        Columns are the place in the batch (`orbit`), `time`, q1 … qd, p1 … pd, `energy`, and for a batch `status` and
+        the parameters that were given for each trajectory. `attrs` has the attributes of `to_xarray`.
+
+        Parameters
+        ----------
+        energy : bool
+            False leaves `energy` out.
+
+        Raises
+        ------
+        ImportError
+            If pandas or xarray is not installed.
+        """
+        from sympflow.storage.layout import TIME, batch_dims, imported, table
+
+        imported("pandas", "to_dataframe()")
+        return table(dataset(self, energy, "to_dataframe()"), (*batch_dims(self.y0.shape[:-1]), TIME))
+
+    def to_netcdf(self, path: str | os.PathLike[str], energy: bool = True) -> None:
+        """Write `to_xarray(energy)` as a NetCDF file, which `xarray.open_dataset(path)` reads.
+
+        Raises
+        ------
+        ImportError
+            If xarray is not installed.
+        """
+        dataset(self, energy, "to_netcdf()").to_netcdf(path)
+
     def raise_for_status(self) -> Solution:
         """Raise a RuntimeError with the message unless the run succeeded; else return the solution."""
         if not self.success:
             raise RuntimeError(self.message)
         return self
+
+
+COUNTS = ("backend", "dt", "n_steps", "force_evaluations", "hessian_evaluations", "newton_iterations", "difference")
+"""Statistics of a run that are attributes of its Dataset: all that do not differ from run to run."""
+
+
+def dataset(sol: Solution, energy: bool = True, asked: str = "to_xarray()") -> xarray.Dataset:
+    """The Dataset of a solution: see `Solution.to_xarray`; `asked` is the call that needs it."""
+    from sympflow.integrators.provenance import provenance
+    from sympflow.storage.layout import DOF, TIME, axis_name, batch_dims, described, dofs, halves, imported
+
+    check_flag("energy", energy)
+    xr = imported("xarray", asked)
+    y, y0, d = to_numpy(sol.y), to_numpy(sol.y0), sol.system.ndof
+    batch = batch_dims(y0.shape[:-1])
+    arrays: dict[str, tuple[Any, ...]] = {}
+    for letter, rows in halves(d):
+        arrays[letter] = ((*batch, DOF, TIME), y[..., rows, :])
+        arrays[f"{letter}0"] = ((*batch, DOF), y0[..., rows])
+    if energy:
+        arrays["energy"] = ((*batch, TIME), to_numpy(sol.energy()))
+    arrays["status"] = (batch, np.broadcast_to(np.asarray(sol.status, dtype=np.int8), y0.shape[:-1]))
+    for i, (times, states) in enumerate(zip(sol.t_events or (), sol.y_events or (), strict=True)):
+        arrays[f"t_event_{i}"] = ((f"event_{i}",), to_numpy(times))
+        for letter, rows in halves(d):
+            arrays[f"{letter}_event_{i}"] = (
+                (DOF, f"event_{i}"),
+                to_numpy(states).reshape(len(times), 2 * d)[:, rows].T,
+            )
+    coords: dict[str, tuple[Any, ...]] = {DOF: (DOF, dofs(d)), TIME: (TIME, to_numpy(sol.t))}
+    if sol.rows is not None:
+        coords |= {axis_name(name): (batch, values) for name, values in sol.rows.values.items()}
+    counts = {
+        name: value for name, value in sol.stats.items() if name in COUNTS and isinstance(value, int | float | str)
+    }
+    attributes = provenance(sol.system, sol.integrator, sol.t_span) | counts | {"message": sol.message}
+    return xr.Dataset(described(arrays), coords=described(coords), attrs=attributes)
 
 
 LARGEST_DIFFERENCE = 1e-6

@@ -45,7 +45,7 @@ class LostWorkers(RuntimeError):
 
 
 class Unpicklable(TypeError):
-    """What workers are to be sent cannot be pickled."""
+    """The call that workers are to be sent cannot be pickled."""
 
 
 def available_cores() -> int:
@@ -94,7 +94,7 @@ def _versions() -> dict[str, str]:
 
 
 class Parcel:
-    """What all calls have in common: pickled once, and unpacked once by each worker; in this process it is sent as is.
+    """The common part of all calls: pickled once, and unpacked once by each worker; in this process it is sent as is.
 
     Parameters
     ----------

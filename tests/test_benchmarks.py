@@ -244,7 +244,7 @@ def test_a_fragment_says_where_it_is_from(tmp_path, monkeypatch):
 
 
 def test_every_fragment_has_a_command_that_writes_it():
-    """The names in the sources; stability, the ideas and driven systems put a prefix before the names of their sections."""
+    """The names in the sources; stability, the ideas and driven systems put a prefix before those of their sections."""
     sources = "".join(path.read_text(encoding="utf-8") for path in BENCHMARKS.rglob("*.py"))
     for path in (BENCHMARKS.parent / "docs" / "measured").glob("*.md"):
         if path.stem == "flows":  # the table of `sympflow flows`

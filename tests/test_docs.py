@@ -1,4 +1,4 @@
-"""What the documentation shows is run: every Python block of README and docs, page by page, in order."""
+"""The code of the documentation is run: every Python block of README and docs, page by page, in order."""
 
 import importlib.util
 import os

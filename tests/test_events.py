@@ -29,7 +29,7 @@ def options(method):
 
 
 def tolerance(method):
-    """Of event times up to t = 12, from the order."""
+    """Tolerance of event times up to t = 12, from the order."""
     return {1: 0.2, 2: 1e-2, 3: 1e-2}.get(get(method).order, 1e-5)
 
 

@@ -368,7 +368,7 @@ def caught(call):
 
 
 def assert_each(outcomes, error, message):
-    """That every method raised `error` with a message that begins as `message` and ends with a sentence."""
+    """Assert that every method raised `error` with a message that begins as `message` and ends with a sentence."""
     wrong = {}
     for method, own, got in outcomes:
         expected, begins = own[0] or error, own[1] or message

@@ -1,4 +1,4 @@
-"""What a call does not need is not imported. Each case runs in a fresh interpreter."""
+"""A call imports nothing that it does not need. Each case runs in a fresh interpreter."""
 
 import subprocess
 import sys

@@ -1,1 +1,1 @@
-"""What `peers.py` compares: sympflow's methods, hand-written loops, and other packages, on one scene."""
+"""The contenders of `peers.py`: sympflow's methods, hand-written loops, and other packages, on one scene."""

@@ -14,7 +14,7 @@ from sympflow.metrics.reference import reference
 from sympflow.systems import henon_heiles
 
 SAMPLE = 64
-"""How many trajectories of a batch its step or tolerance is calibrated on."""
+"""The number of trajectories of a batch that its step or tolerance is calibrated on."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def whole_steps(t_end: float, dt: float) -> int:
 
 @dataclass(frozen=True)
 class Work:
-    """What one trajectory costs, whatever the machine. None where the method has no such thing."""
+    """The cost of one trajectory, whatever the machine. None where the method has no such thing."""
 
     steps: int
     force_evaluations: int | None

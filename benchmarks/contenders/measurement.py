@@ -254,7 +254,7 @@ def measure(
 
 
 def check_agreement(scene: Scene, contender: Contender, leader: Contender, dt: float) -> None:
-    """Whether a loop takes the very steps of the method that it is compared with."""
+    """True of a loop that takes the very steps of the method that it is compared with."""
     t_end = PROBE * scene.t_end
     difference = np.abs(np.asarray(contender.run(dt, t_end)) - np.asarray(leader.run(dt, t_end))).max()
     if not difference < AGREEMENT:

@@ -32,7 +32,7 @@ def fragments(results: Results) -> dict[str, str]:
 
 
 def run_table(results: Results) -> str:
-    """How the run was made."""
+    """The conditions of the run."""
     e = results.environment
     spreads = sorted(row.spread / row.seconds for row in results.rows)
     middle, most = spreads[len(spreads) // 2], spreads[-1]
@@ -167,7 +167,7 @@ def leapfrog_ratio(results: Results, n: int, target: float) -> float | None:
 
 
 def order_table(results: Results) -> str:
-    """How many times faster than our Verlet our fastest scheme is, one trajectory."""
+    """Ratio of the times of our Verlet and our fastest scheme, one trajectory."""
     rows = []
     for target in LISTED:
         verlet, best = pick(results, "sympflow", "verlet", 1, target), fastest(results, 1, target, ["sympflow"])

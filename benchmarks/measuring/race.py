@@ -112,7 +112,7 @@ class Measure:
             return self.of_states(Y)
 
     def of_states(self, Y: np.ndarray) -> float:
-        """Of states (N, n, 2d), the first of which are the initial ones."""
+        """Errors of states (N, n, 2d), the first of which are the initial ones."""
         if self.name == "energy":
             H = self.system.hamiltonian(Y)
             error = np.abs(H - H[:, :1]).max(1) / np.abs(H[:, 0])

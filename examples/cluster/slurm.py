@@ -27,7 +27,7 @@ JOB: dict[str, Any] = {
     # compiled loops are kept in a folder that the workers of a node share
     "job_script_prologue": ["export SYMPFLOW_CACHE_DIR=${TMPDIR:-/tmp}/sympflow-$USER"],
 }
-"""What SLURM is asked for; put in the queue and the limits of your cluster."""
+"""The request to SLURM; put in the queue and the limits of your cluster."""
 
 
 def slurm_cluster() -> Any:

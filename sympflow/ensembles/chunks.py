@@ -149,7 +149,7 @@ class Chunk:
                 yield times[-1:], stepper.shorter(y[:, -1], np.full(len(self), grid.remainder))[..., None]
 
     def orbits(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        """Of each orbit its row, the times (m,), and its states (2d, m), NaN from where it failed."""
+        """Yield the row of each orbit, the times (m,), and its states (2d, m), NaN from where it failed."""
         most = max(1, MOST_VALUES // (self.times.size * self.y0.shape[1] or 1))
         for start in range(0, len(self), most):
             part = self.rows(start, start + most)

@@ -33,7 +33,7 @@ class Given:
         return self.y0[start:stop]
 
     def sent(self, start: int, stop: int) -> Given:
-        """What a worker needs for the states start … stop: these, numbered from 0."""
+        """The part that a worker needs for the states start … stop: these, numbered from 0."""
         return Given(self.y0[start:stop])
 
 
@@ -88,7 +88,7 @@ class Drawn:
         return states
 
     def sent(self, start: int, stop: int) -> Drawn:
-        """What a worker needs for the states start … stop: the sampler, and where to begin."""
+        """The part that a worker needs for the states start … stop: the sampler, and where to begin."""
         return Drawn(self.sampler, stop - start, self.seed, self.width, self.start + start, self._last)
 
 

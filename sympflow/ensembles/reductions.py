@@ -38,7 +38,7 @@ MOST_TRIED = 64
 
 
 class Reduction(ABC):
-    """What is kept of each orbit.
+    """The part of each orbit that is kept.
 
     The result of an orbit must not depend on the others of its chunk, so that it is the same whatever the chunks.
     """
@@ -180,7 +180,7 @@ def _described(values: Mapping[str, np.ndarray], skip: int = 0) -> str:
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
-    """What a user's function returned, as arrays of floats (or complex numbers) by name."""
+    """The value of a user's function as arrays of floats (or complex numbers) by name."""
     named = value if isinstance(value, Mapping) else {"reduced": value}
     arrays = {}
     for name, v in named.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -13,16 +13,28 @@ import numpy as np
 from sympflow.ensembles.orbits import Drawn, Given
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
+from sympflow.storage.layout import (
+    DOF,
+    NAMED,
+    ORBIT,
+    RESERVED,
+    TIME,
+    axis_name,
+    described,
+    dofs,
+    halves,
+    imported,
+    table,
+)
 from sympflow.storage.store import Field
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
 
     from sympflow.ensembles.reductions import Fields
 
 Index = tuple[int, ...]
-RESERVED = ("q", "p", "q0", "p0", "status", "orbit", "dof", "time")
-"""Names of the arrays and dimensions that each Dataset has, or may have."""
 
 
 @dataclass(frozen=True)
@@ -127,17 +139,17 @@ class Layout:
 
     @property
     def dims(self) -> tuple[str, ...]:
-        return (*map(axis_name, self.axes), "orbit")
+        return (*map(axis_name, self.axes), ORBIT)
 
     def variables(self) -> list[Variable]:
         """Return the arrays that hold the fields: states as q and p, with dimensions dof and time."""
         found = []
         for name, (shape, dtype) in self.fields.items():
             if name == self.state:
-                more = ("time",) * (len(shape) - 1)
-                for letter, rows in ("q", slice(0, self.ndof)), ("p", slice(self.ndof, None)):
+                more = (TIME,) * (len(shape) - 1)
+                for letter, rows in halves(self.ndof):
                     inner = (self.ndof, *shape[1:])
-                    found.append(Variable(letter, name, rows, (*self.dims, "dof", *more), inner, dtype))
+                    found.append(Variable(letter, name, rows, (*self.dims, DOF, *more), inner, dtype))
             else:
                 inner_dims = tuple(f"{name}_{i}" for i in range(len(shape)))
                 found.append(Variable(name, name, None, (*self.dims, *inner_dims), shape, dtype))
@@ -145,23 +157,20 @@ class Layout:
 
     def coordinates(self) -> dict[str, np.ndarray]:
         """Return the values along dimensions, by the names of these."""
-        found = {**{axis_name(name): values for name, values in self.axes.items()}, "dof": np.arange(1, self.ndof + 1)}
+        found = {**{axis_name(name): values for name, values in self.axes.items()}, DOF: dofs(self.ndof)}
         if self.state and len(self.fields[self.state][0]) == 2 and self.times is not None:
-            found["time"] = self.times
+            found[TIME] = self.times
         return found
 
     def stored(self, sizes: Index) -> dict[str, Field]:
         """Return the arrays of a store with chunks of such a shape along the axes."""
-        made = {v.name: Field(v.dims, (*self.shape, *v.shape), v.dtype, (*sizes, *v.shape)) for v in self.variables()}
+        made = {v.name: (v.dims, (*self.shape, *v.shape), v.dtype, (*sizes, *v.shape)) for v in self.variables()}
         for name in ("q0", "p0"):
-            made[name] = Field(("orbit", "dof"), (self.n, self.ndof), float, (sizes[-1], self.ndof))
-        made["status"] = Field(self.dims, self.shape, np.int8, sizes)
-        return made | {name: Field((name,), values.shape, values.dtype) for name, values in self.coordinates().items()}
-
-
-def axis_name(name: str) -> str:
-    """The dimension of a parameter: its name, unless that is one of the result's own."""
-    return f"param_{name}" if name in RESERVED else name
+            made[name] = ((ORBIT, DOF), (self.n, self.ndof), np.dtype(float), (sizes[-1], self.ndof))
+        made["status"] = (self.dims, self.shape, np.dtype(np.int8), sizes)
+        for name, values in self.coordinates().items():
+            made[name] = ((name,), values.shape, values.dtype, values.shape)
+        return {name: Field(*array, attributes=NAMED.get(name, {})) for name, array in made.items()}
 
 
 class Keeper(Protocol):
@@ -188,7 +197,7 @@ class Keeper(Protocol):
 class Memory:
     """Fields in the memory of this process."""
 
-    def __init__(self, layout: Layout, orbits: Given | Drawn, attributes: Mapping[str, Any]) -> None:
+    def __init__(self, layout: Layout, orbits: Given | Drawn, attributes: Callable[[], Mapping[str, Any]]) -> None:
         self.layout, self.orbits, self.attributes = layout, orbits, attributes
         self.fields = {name: np.empty((*layout.shape, *s), dtype) for name, (s, dtype) in layout.fields.items()}
         self.status = np.zeros(layout.shape, dtype=np.int8)
@@ -211,24 +220,9 @@ class Memory:
         data = {v.name: (v.dims, v.of(self.fields[v.field], leading)) for v in layout.variables()}
         data["status"] = (layout.dims, self.status)
         y0 = self.orbits.states(0, layout.n)
-        data |= {"q0": (("orbit", "dof"), y0[:, : layout.ndof]), "p0": (("orbit", "dof"), y0[:, layout.ndof :])}
-        return xr.Dataset(data, coords=layout.coordinates(), attrs=dict(self.attributes))
-
-
-def imported(library: str, what: str) -> Any:
-    """Import a library of the extra "data".
-
-    Raises
-    ------
-    ImportError
-        If it is not installed, with what needs it.
-    """
-    from importlib import import_module
-
-    try:
-        return import_module(library)
-    except ImportError as error:
-        raise ImportError(f'{what} needs {library}: pip install "sympflow[data]".') from error
+        data |= {f"{letter}0": ((ORBIT, DOF), y0[:, rows]) for letter, rows in halves(layout.ndof)}
+        coords = {name: (name, values) for name, values in layout.coordinates().items()}
+        return xr.Dataset(described(data), coords=described(coords), attrs=dict(self.attributes()))
 
 
 @dataclass
@@ -264,7 +258,7 @@ class Ensemble:
 
     @property
     def fields(self) -> Mapping[str, np.ndarray]:
-        """What was kept of each orbit, by name: arrays (..., N, ...)."""
+        """The kept part of each orbit, by name: arrays (..., N, ...)."""
         return self.keeper.fields
 
     @property
@@ -295,7 +289,7 @@ class Ensemble:
 
     @property
     def message(self) -> str:
-        """What became of the orbits, in words."""
+        """The outcome of the orbits, in words."""
         status = self.status
         failed = int(np.count_nonzero(status))
         if not failed:
@@ -315,3 +309,18 @@ class Ensemble:
             If xarray is not installed.
         """
         return self.keeper.dataset()
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """The fields as a `pandas.DataFrame`, with a row for each orbit, and each time where states are kept in time.
+
+        Columns are the parameters that are axes, the orbit, the time, then the fields: of states q1 … qd and p1 … pd;
+        of arrays name_0, name_1. `status` is that of the orbit. Without times q1_0 … pd_0 are its initial state.
+
+        Raises
+        ------
+        ImportError
+            If pandas or xarray is not installed.
+        """
+        imported("pandas", "to_dataframe()")
+        data = self.to_xarray()
+        return table(data, (*map(axis_name, self.params), ORBIT, TIME))

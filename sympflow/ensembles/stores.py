@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.ensembles.orbits import Drawn, Given
-from sympflow.ensembles.results import Block, Done, Index, Layout, imported
+from sympflow.ensembles.results import Block, Done, Index, Layout
+from sympflow.integrators.provenance import flow_checksum, option_text
 from sympflow.integrators.registry import name_of
+from sympflow.storage.layout import halves, imported
 from sympflow.storage.store import Store
 
 if TYPE_CHECKING:
@@ -49,11 +51,11 @@ def identity(
     reduction: Reduction,
     backend: str,
 ) -> dict[str, str]:
-    """What an ensemble is known by, each part as a text; two are the same if all parts are."""
+    """The identity of an ensemble, each part as a text; two are the same if all parts are."""
     states = orbits.y0 if isinstance(orbits, Given) else orbits.states(0, min(len(orbits), 64))
     return {
         "system": f"{system.name} {_digest([system.expression, dict(system.params), list(system.fingerprint)])}",
-        "method": f"{name_of(integrator)}, {_options(integrator, system)}",
+        "method": f"{name_of(integrator)}, {option_text(integrator)}, flow={flow_checksum(integrator, system)}",
         "t_span": f"{t_span[0]!r} to {t_span[1]!r}",
         "t_eval": "every step" if t_eval is None else f"{len(t_eval)} times {_digest(t_eval)}",
         "y0": f"{len(orbits)} states{'' if isinstance(orbits, Given) else f' by seed {orbits.seed}'} {_digest(states)}",
@@ -61,17 +63,6 @@ def identity(
         "reduce": _described(reduction),
         "backend": backend,
     }
-
-
-def _options(integrator: Integrator, system: HamiltonianSystem) -> str:
-    """The options of a method, and the checksum of the weights of its flow."""
-    options = {f.name: getattr(integrator, f.name) for f in fields(integrator) if f.name != "flow"}  # type: ignore[arg-type]
-    flow = integrator.flow_for(system)
-    if flow is not None:
-        from sympflow.flow.weights import checksum
-
-        options["flow"] = checksum(flow.state_dict())
-    return ", ".join(f"{name}={value!r}" for name, value in options.items())
 
 
 def _described(reduction: Reduction) -> str:
@@ -168,9 +159,8 @@ class EnsembleStore:
             values = v.of(done.fields[v.field], 1).reshape(*block.shape, *v.shape)
             store.write(v.name, (*number, *(0,) * len(v.shape)), values)
         if not any(number[:-1]):  # each orbit belongs to many values of the parameters, and to one writer
-            d = self.layout.ndof
-            store.write("q0", (number[-1], 0), y0[:, :d])
-            store.write("p0", (number[-1], 0), y0[:, d:])
+            for letter, rows in halves(self.layout.ndof):
+                store.write(f"{letter}0", (number[-1], 0), y0[:, rows])
         if done.messages:
             store.write_text(f"{MESSAGES}/{block.first}.json", json.dumps(done.messages))
         store.write("status", number, done.status.reshape(block.shape))

@@ -10,12 +10,12 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow._version import __version__
 from sympflow.arguments import MAX_ASKED_VALUES, check_counts, check_flag, check_t_eval, check_t_span, floats
 from sympflow.ensembles.chunks import FAILED, LONGEST_MESSAGE, MOST_VALUES, Chunk
 from sympflow.ensembles.orbits import Drawn, Given, initial_states
@@ -23,7 +23,8 @@ from sympflow.ensembles.reductions import Fields, Reduction, reduction
 from sympflow.ensembles.results import Block, Done, Ensemble, Keeper, Layout, Memory, blocks, chunk_shape
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Problem
-from sympflow.integrators.registry import build, check_applies, name_of
+from sympflow.integrators.provenance import provenance
+from sympflow.integrators.registry import build, check_applies
 from sympflow.kernels.modules import at_most, compiling_alone
 from sympflow.solver import BACKENDS
 from sympflow.workers import LostWorkers, Parcel, Unpicklable, checked_workers, mapped
@@ -155,20 +156,13 @@ def ensemble(
     task = replace(task, fields=fields)
     layout = Layout(axes, len(orbits), system.ndof, problem.times if kept.state == "y" else times, fields, kept.state)
     sizes = _chunk_shape(layout, problem, chunk, store is None, orbits.together)
-    attributes = {
-        "system": system.name,
-        "method": name_of(integrator),
-        "options": str(integrator),
-        "t_span": [t0, t1],
-        "params": json.dumps(dict(system.params)),
-        "sympflow_version": __version__,
-    }
+    attributes = partial(provenance, system, integrator, (t0, t1))
     keeper: Keeper = Memory(layout, orbits, attributes)
     if store is not None:
         from sympflow.ensembles.stores import KNOWN, EnsembleStore, identity
 
         known = identity(system, integrator, (t0, t1), times, orbits, axes, kept, backend)
-        keeper = made = EnsembleStore.at(store, layout, sizes, attributes | {KNOWN: json.dumps(known)}, bool(resume))
+        keeper = made = EnsembleStore.at(store, layout, sizes, attributes() | {KNOWN: json.dumps(known)}, bool(resume))
         sizes, task = made.sizes, replace(task, store=made)
     pieces = blocks(layout.shape, sizes)
     left = [piece for piece in pieces if not keeper.is_done(piece)]
@@ -287,7 +281,7 @@ def _chunk_shape(layout: Layout, problem: Chunk, chunk: int | None, in_memory: b
 
 @dataclass(frozen=True)
 class Task:
-    """What all chunks of an ensemble have in common: a definition that is small when pickled."""
+    """The common part of all chunks of an ensemble: a definition that is small when pickled."""
 
     system: HamiltonianSystem
     integrator: Integrator

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import sys
 import warnings
 from collections.abc import Callable
 from functools import cached_property
@@ -43,7 +44,7 @@ class CallableHamiltonian(Definition):
         self._potential, self._hamiltonian = potential, hamiltonian
         self._gradient, self._hessian_vector = gradient, hessian_vector
         self.differentiates_itself = gradient is None and hessian_vector is None
-        if gradient is not None and hasattr(gradient, "py_func"):
+        if _is_numba(gradient):
             _check_numba(potential, gradient, hessian_vector)
             self.take_numba(potential, gradient, hessian_vector)
 
@@ -185,6 +186,12 @@ def _check_callable(**functions: Any) -> None:
             raise TypeError(f"`{name}` must be callable; got {type(function).__name__}.")
 
 
+def _is_numba(function: Any) -> bool:
+    """True of a function compiled by Numba, which is asked only where it has been imported already."""
+    numba = sys.modules.get("numba.core.dispatcher")
+    return numba is not None and isinstance(function, numba.Dispatcher)
+
+
 def _check_numba(potential: Any, gradient: Any, hessian_vector: Any, first: str = "") -> None:
     """Raise unless the functions given with a Numba `gradient` are Numba functions of the right arguments."""
     for name, function, arguments in (
@@ -194,7 +201,7 @@ def _check_numba(potential: Any, gradient: Any, hessian_vector: Any, first: str 
     ):
         if function is None:
             continue
-        if not hasattr(function, "py_func"):
+        if not _is_numba(function):
             raise TypeError(f"`{name}` must be a Numba function, as `gradient` is: decorate it with numba.njit.")
         count = len(inspect.signature(function.py_func).parameters)
         if count != len(arguments.split(",")):
@@ -301,9 +308,9 @@ class DrivenCallables(Definition):
         _check_callable(potential=potential, hamiltonian=hamiltonian, gradient=gradient, hessian_vector=hessian_vector)
         self._functions = potential, hamiltonian, gradient, hessian_vector
         for (name, arguments), function in zip(_ARGUMENTS.items(), self._functions, strict=True):
-            if function is not None and not hasattr(function, "py_func"):
+            if function is not None and not _is_numba(function):
                 _check_arguments(name, function, arguments)
-        if gradient is not None and hasattr(gradient, "py_func"):
+        if _is_numba(gradient):
             _check_numba(potential, gradient, hessian_vector, "t, ")
             self.numba_functions = (potential, gradient, hessian_vector)
         self.ndof, self.check_given = ndof, check

@@ -18,6 +18,7 @@ References
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -153,7 +154,8 @@ def doubled(
     scene["domain"] = _thin_box(system) if domain is None else domain
     scene["energy_scale"] = _energy_scale(system)
     made: DoubledSystem
-    given = callable(force) and not hasattr(force, "free_symbols")  # SymPy's expressions may be called
+    sympy = sys.modules.get("sympy")
+    given = callable(force) and not (sympy is not None and isinstance(force, sympy.Basic))  # a Symbol is callable
     samples = system.symbols is not None and system.symbols.samples
     if samples or (not system.autonomous and (given or system.symbols is None)):
         system.check_autonomous(

@@ -220,11 +220,17 @@ def _check_batches(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) ->
             )
 
 
-def _directions(x: np.ndarray, chosen: Sequence[int] | None, parts: int) -> np.ndarray:
-    """Directions (N, m, n) at states (N, n), of the size of these: those of chosen components, or random ones."""
+def _directions(x: np.ndarray, chosen: Sequence[int] | None, parts: int, own: bool = False) -> np.ndarray:
+    """Directions (N, m, n) at states (N, n), of the size of these: those of chosen components, or random ones.
+
+    A small component is moved by a tenth of the largest, or, if it is not 0, by its `own` size.
+    """
     groups = np.abs(x).reshape(len(x), parts, -1)
     largest = groups.max(-1, keepdims=True)
-    size = np.maximum(groups, 0.1 * np.where(largest > 0, largest, 1.0)).reshape(x.shape)
+    size = np.maximum(groups, 0.1 * np.where(largest > 0, largest, 1.0))
+    if own:
+        size = np.where(groups > 0, groups, size)
+    size = size.reshape(x.shape)
     if chosen is not None:
         return size[:, None, :] * np.eye(x.shape[-1])[list(chosen)]
     rng = np.random.Generator(np.random.PCG64(20260103))
@@ -298,12 +304,23 @@ def _check_gradient(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -
         x, at, g = x[worst : worst + 1], at[worst : worst + 1], g[worst : worst + 1]
     for start in range(0, n, EVERY_COMPONENT):
         chosen = range(start, min(start + EVERY_COMPONENT, n))
-        w = _directions(at, chosen, functions.parts)
-        size = w.sum(-1)
-        wrong, found = _certainly_wrong(functions.value, x, w, size * g[:, list(chosen)])
+        wrong, found = _wrong_slopes(functions, x, g, chosen, own=False)
+        if wrong.any():  # a small component may have a scale of its own
+            again, found = _wrong_slopes(functions, x, g, chosen, own=True)
+            wrong &= again
         if wrong.any():
             i, k = np.argwhere(wrong)[0].tolist()
-            _refuse(functions, x[i], chosen[k], g[i, chosen[k]], found[i, k] / size[i, k], g)
+            _refuse(functions, x[i], chosen[k], g[i, chosen[k]], found[i, k], g)
+
+
+def _wrong_slopes(
+    functions: Tested, x: Array, g: np.ndarray, chosen: Sequence[int], own: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """True where chosen components of the gradient are certainly wrong, (N, m), and the differences there."""
+    w = _directions(_numbers(x), chosen, functions.parts, own)
+    size = w.sum(-1)
+    wrong, found = _certainly_wrong(functions.value, x, w, size * g[:, list(chosen)])
+    return wrong, found / size
 
 
 def _refuse(functions: Tested, state: Array, k: int, given: float, found: float, g: np.ndarray) -> None:
@@ -323,10 +340,9 @@ def _refuse(functions: Tested, state: Array, k: int, given: float, found: float,
 
 def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
     assert functions.hessian_vector is not None
-    w = _directions(_numbers(x), None, 1)[:, :1]
-    v = as_like(w[:, 0], x)
-    claimed = np.stack([_numbers(functions.hessian_vector(x[i], v[i])) for i in range(len(x))])
-    batch = _numbers(functions.hessian_vector(x, v))
+    v = _vectors(x)
+    claimed = _products(functions, x, v)
+    batch = _numbers(functions.hessian_vector(x, as_like(v, x)))
     name = "hessian_vector"
     if claimed.shape != g.shape or batch.shape != g.shape:
         got = claimed.shape[1:] if claimed.shape != g.shape else batch.shape
@@ -335,12 +351,17 @@ def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
             f"`{name}` must return shape {expected}, that of its arguments; got {got}. Write it for states on the last "
             f"axis; {REMEDY}"
         )
-    wrong, found = _certainly_wrong(functions.gradient, x, w, claimed[:, None])
+    wrong, found = _certainly_wrong(functions.gradient, x, v[:, None], claimed[:, None])
+    if wrong.any():  # a small component may have a scale of its own
+        v = _vectors(x, own=True)
+        again = _products(functions, x, v)
+        still, found = _certainly_wrong(functions.gradient, x, v[:, None], again[:, None])
+        wrong &= still
     if wrong.any():
         i, _, k = np.argwhere(wrong)[0].tolist()
         raise ValueError(
             f"`{name}` is not the derivative of `{functions.names[1]}`: at {_shown(functions, x[i])}, along v = "
-            f"{_short(w[i, 0])}, its component {k} is {claimed[i, k]:g}, but the gradient grows by "
+            f"{_short(v[i])}, its component {k} is {again[i, k]:g}, but the gradient grows by "
             f"{found[i, 0, k]:g}, by differences. Correct one of them; {REMEDY}"
         )
     size = np.abs(claimed).max(-1, keepdims=True)
@@ -353,6 +374,18 @@ def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
             f"{_shown(functions, x[i])} is {claimed[i, k]:g} alone, {batch[i, k]:g} in a batch of shape "
             f"{tuple(x.shape)}. Write it for states on the last axis, q[..., 0] in place of q[0]; {REMEDY}"
         )
+
+
+def _vectors(x: Array, own: bool = False) -> np.ndarray:
+    """One random direction (N, n) at each state."""
+    return _directions(_numbers(x), None, 1, own)[:, 0]
+
+
+def _products(functions: Tested, x: Array, v: np.ndarray) -> np.ndarray:
+    """The given products of the Hessian at single states with v, (N, n)."""
+    assert functions.hessian_vector is not None
+    vectors = as_like(v, x)
+    return np.stack([_numbers(functions.hessian_vector(x[i], vectors[i])) for i in range(len(x))])
 
 
 def check_writes(name: str, function: Callable[..., Any], *states: np.ndarray) -> None:

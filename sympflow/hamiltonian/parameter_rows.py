@@ -25,11 +25,11 @@ class Rows(NamedTuple):
     Attributes
     ----------
     places : ndarray of int, shape (n,)
-        Which of the batch, in the order of its flattened shape.
+        The trajectories' places in the batch, in the order of its flattened shape.
     system : HamiltonianSystem
         The system of the first of them.
     letters : ndarray of shape (k, n) or None
-        For each the values of `system.symbols.parametric.parameters`; None where `system` is that of all.
+        The values, for each, of `system.symbols.parametric.parameters`; None where `system` is that of all.
     """
 
     places: np.ndarray

@@ -351,7 +351,7 @@ class PhysicalRun:
             n = self._chunk(1.02 * left / pace + 2 if pace > 0 else np.inf, 4 * n * self.stride)
 
     def _chunk(self, steps: float, most: int) -> int:
-        """How many states of a chunk so many steps are, or the most that there may be."""
+        """The number of states of a chunk of so many steps, or the most that there may be."""
         kept = max(16, LARGEST_CHUNK // self.start.size)
         return int(min(max(16, steps if steps < most else most) / self.stride + 1, kept))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from types import ModuleType
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -14,8 +15,8 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels import terms
 from sympflow.kernels.codegen import statements
-from sympflow.kernels.modules import load_algebra, run_rows
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, opened
+from sympflow.kernels.modules import load_algebra
+from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
 from sympflow.kernels.terms import is_large
 
 __all__ = ["ImplicitKernel", "implicit_kernel"]
@@ -104,20 +105,15 @@ class ImplicitKernel(Kernel):
         carry: Carry | None,
     ) -> Run:
         loops = _load(self._algebra, self._tableau, self._compensated)
-        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
-        out = np.empty((len(y0), len(save), 2 * self.ndof))
-        n_finite, iterations = np.empty(len(y0), dtype=np.int64), np.empty(len(y0), dtype=np.int64)
+        iterations = np.empty(len(y0), dtype=np.int64)
 
-        first, running = opened(carry, len(y0), 2 * self.ndof * (1 + self._compensated))
+        def rows(i: slice, *rest: Any) -> None:
+            *states, stop, first, running = rest
+            loops.rollout_each(h, t0, *states, iterations[i], stop, first, running)
 
-        def rows(i: slice, stop: np.ndarray) -> None:
-            loops.rollout_each(h, t0, y0[i], n_steps, save, out[i], n_finite[i], iterations[i], stop, first, running[i])
-
-        size = 2 * self.ndof * len(self._tableau[1])
-        run_rows(rows, len(y0), (n_steps - first) * 4 * size**3, threads)
-        if carry is not None:
-            carry.advance(n_steps, running)
-        return Run(out, n_finite, int(iterations.sum()))
+        width, size = 2 * self.ndof * (1 + self._compensated), 2 * self.ndof * len(self._tableau[1])
+        Y, n_finite, _ = run_states(rows, y0, n_steps, save, threads, carry, width, 4 * size**3)
+        return Run(Y, n_finite, int(iterations.sum()))
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,): see `Kernel`."""

@@ -40,7 +40,7 @@ __all__ = [
 T = TypeVar("T")
 
 OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
-"""How kernels are compiled: 1/0 is inf, a·b + c may be fused; nothing else about rounding or NaN is relaxed."""
+"""Options of the compiler: 1/0 is inf, a·b + c may be fused; nothing else about rounding or NaN is relaxed."""
 
 _INNER = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # options of functions that only others call
 _CALLED = {"rollout", "rollout_rows"}  # functions that others call, and Python as well

@@ -12,8 +12,8 @@ from numba import njit
 from numba.core.registry import CPUDispatcher
 from numpy.typing import ArrayLike
 
-from sympflow.kernels.modules import OPTIONS, load_module, run_rows, template
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, opened
+from sympflow.kernels.modules import OPTIONS, load_module, template
+from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
 
 __all__ = ["MLPFlowKernel", "NetworkLayer"]
 
@@ -149,23 +149,15 @@ class MLPFlowKernel(Kernel):
         threads: int | None,
         carry: Carry | None = None,
     ) -> Run:
-        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
         steps = np.full(len(y0), h, dtype=np.float64)
         backwards, t = bool((steps < 0).any()), np.abs(steps)
         lanes = _LANES if len(y0) >= _LANES // 4 else 1
         rollout = self._architecture.rollout(lanes)
-        out = np.empty((len(y0), len(save), y0.shape[1]))
-        n_finite = np.empty(len(y0), dtype=np.int64)
 
-        first, running = opened(carry, *y0.shape)
+        def rows(i: slice, *rest: Any) -> None:
+            rollout(self._weights, backwards, t[i], *rest)
 
-        def rows(i: slice, stop: np.ndarray) -> None:
-            rollout(self._weights, backwards, t[i], y0[i], n_steps, save, out[i], n_finite[i], stop, first, running[i])
-
-        run_rows(rows, len(y0), 1000 * (n_steps - first), threads)
-        if carry is not None:
-            carry.advance(n_steps, running)
-        return Run(out, n_finite)
+        return run_states(rows, y0, n_steps, save, threads, carry, y0.shape[1], 1000)
 
 
 def _padded(layer: NetworkLayer, architecture: _Architecture) -> tuple[np.ndarray, ...]:

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
-from sympflow.kernels.modules import NEVER, load_algebra, run_one, run_rows
+from sympflow.kernels.modules import NEVER, load_algebra
 from sympflow.kernels.output_loops import row_products
 from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
-from sympflow.kernels.protocol import NOTHING, Carry, Kernel, Run, Steps, opened
+from sympflow.kernels.protocol import NOTHING, Carry, Kernel, Run, Steps, run_state, run_states
 from sympflow.kernels.terms import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_out
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
@@ -229,18 +229,15 @@ class PartsKernel(Kernel):
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` steps of length `h` from one state: see `Kernel`."""
         loops, sequence = self.loops, self.maps(np.asarray(h, dtype=float))
-        functions, save = loops.functions(sequence), np.ascontiguousarray(save, dtype=np.int64)
-        out = np.empty((2 * loops.parts.ndof, len(save))).T  # each component in one piece, as a solution has them
-        codes, table = loops.run_table(sequence)
-        start, mixed = loops.modes(y0), loops.mixed
-        first, running = opened(carry, 2 * loops.parts.ndof)
-        n_finite = run_one(
-            lambda stop: functions.rollout(codes, table, start, mixed, n_steps, save, out, stop, first, running),
-            (n_steps - first) * len(codes) * loops.parts.ndof,
-        )
-        if carry is not None:
-            carry.advance(n_steps, running)
-        return Run(loops.states(out, save, y0), n_finite)
+        rollout, (codes, table), mixed = loops.functions(sequence).rollout, loops.run_table(sequence), loops.mixed
+
+        def steps(start: np.ndarray, *rest: Any) -> int:
+            return rollout(codes, table, start, mixed, *rest)
+
+        out = np.empty((len(y0), len(save))).T  # each component in one piece, as a solution has them
+        start, work = loops.modes(y0), len(codes) * loops.parts.ndof
+        Y, n_finite, _ = run_state(steps, start, n_steps, save, carry, len(start), work, out)
+        return Run(loops.states(Y, save, y0), n_finite)
 
     def run_batch(
         self,
@@ -253,22 +250,14 @@ class PartsKernel(Kernel):
     ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         loops, sequence = self.loops, self.maps(np.asarray(h, dtype=float))
-        functions, save = loops.functions(sequence), np.ascontiguousarray(save, dtype=np.int64)
-        codes, table = loops.run_table(sequence)
-        start, mixed = loops.modes(y0), loops.mixed
-        out = np.empty((len(y0), len(save), 2 * loops.parts.ndof))
-        n_finite = np.empty(len(y0), dtype=np.int64)
-        first, running = opened(carry, *start.shape)
+        rollout, (codes, table), mixed = loops.functions(sequence).rollout_batch, loops.run_table(sequence), loops.mixed
 
-        def rows(i: slice, stop: np.ndarray) -> None:
-            functions.rollout_batch(
-                codes, table, start[i], mixed, n_steps, save, out[i], n_finite[i], stop, first, running[i]
-            )
+        def rows(_: slice, start: np.ndarray, *rest: Any) -> None:
+            rollout(codes, table, start, mixed, *rest)
 
-        run_rows(rows, len(y0), (n_steps - first) * len(codes) * loops.parts.ndof, threads)
-        if carry is not None:
-            carry.advance(n_steps, running)
-        return Run(loops.states(out, save, y0[:, None]), n_finite)
+        start, work = loops.modes(y0), len(codes) * loops.parts.ndof
+        Y, n_finite, _ = run_states(rows, start, n_steps, save, threads, carry, start.shape[1], work)
+        return Run(loops.states(Y, save, y0[:, None]), n_finite)
 
     def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""

@@ -2,47 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["Carry", "Kernel", "Run", "Steps"]
+from sympflow.kernels.carry import Carry
+from sympflow.kernels.modules import run_one, run_rows
+
+__all__ = ["Carry", "Kernel", "Run", "Steps", "run_state", "run_states"]
 
 NOTHING = np.empty(0), np.empty((0, 0))
 """The running state of runs that are not cut, of one state and of a batch."""
-
-
-@dataclass
-class Carry:
-    """The place where a run is cut: with it, pieces of a run give the same bits as the run in one piece.
-
-    The states that a run saves are not enough for that: consecutive steps share a kick or a drift, so that the running
-    state is another one, and compensated sums have errors. A run that is given a carry goes on from it, and leaves in
-    it where it ends; one that is interrupted leaves it as it was.
-
-    Attributes
-    ----------
-    steps : int
-        The steps made so far; 0 before a run.
-    running : ndarray of shape (K,), or (N, K) of a batch; or None
-        The kernel's own; None before a run. NaN where a trajectory has ended.
-    """
-
-    steps: int = 0
-    running: np.ndarray | None = None
-
-    def advance(self, steps: int, running: np.ndarray) -> None:
-        """Take the place after so many steps."""
-        self.steps, self.running = steps, running
-
-
-def opened(carry: Carry | None, *shape: int) -> tuple[int, np.ndarray]:
-    """The steps made so far and the running state, of that shape, for the loops to change; empty without a carry."""
-    if carry is None:
-        return 0, NOTHING[len(shape) - 1]
-    return carry.steps, np.empty(shape) if carry.running is None else carry.running.copy()
 
 
 class Run(NamedTuple):
@@ -62,6 +34,74 @@ class Run(NamedTuple):
     states: np.ndarray
     n_finite: Any
     iterations: int = 0
+
+
+def run_state(
+    rollout: Callable[..., int],
+    y0: np.ndarray,
+    n_steps: int,
+    save: np.ndarray,
+    carry: Carry | None,
+    width: int,
+    work: int,
+    out: np.ndarray | None = None,
+) -> Run:
+    """The run of one state by ``rollout(y0, n_steps, save, out, stop, first, running)``, which is compiled.
+
+    Parameters
+    ----------
+    rollout : callable
+        Returns the index of the last step that ends in a finite state.
+    y0 : ndarray of shape (2d,)
+    n_steps, save, carry
+        See `Kernel.run`.
+    width : int
+        K, the size of the running state.
+    work : int
+        About how many nanoseconds a step takes.
+    out : ndarray of shape (n, 2d), optional
+        Where the states go.
+    """
+    y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+    if out is None:
+        out = np.empty((len(save), len(y0)))
+    first, running = (0, NOTHING[0]) if carry is None else _opened(carry, width)
+    n_finite = run_one(lambda stop: rollout(y0, n_steps, save, out, stop, first, running), (n_steps - first) * work)
+    if carry is not None:
+        carry.advance(n_steps, running)
+    return Run(out, n_finite)
+
+
+def run_states(
+    rollout: Callable[..., None],
+    y0: np.ndarray,
+    n_steps: int,
+    save: np.ndarray,
+    threads: int | None,
+    carry: Carry | None,
+    width: int,
+    work: int,
+) -> Run:
+    """`run_state` of every row of `y0` (N, 2d), as many threads as pay.
+
+    `rollout` is called with the rows that it is to run before everything else, and with their `n_finite` after `out`.
+    """
+    y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+    out, n_finite = np.empty((len(y0), len(save), y0.shape[1])), np.empty(len(y0), dtype=np.int64)
+    first, running = (0, NOTHING[1]) if carry is None else _opened(carry, len(y0), width)
+
+    def rows(i: slice, stop: np.ndarray) -> None:
+        rollout(i, y0[i], n_steps, save, out[i], n_finite[i], stop, first, running[i])
+
+    run_rows(rows, len(y0), (n_steps - first) * work, threads)
+    if carry is not None:
+        carry.advance(n_steps, running)
+    return Run(out, n_finite)
+
+
+def _opened(carry: Carry, *shape: int) -> tuple[int, np.ndarray]:
+    """The steps made so far and the running state, of that shape, for the loops to change."""
+    return carry.steps, np.empty(shape) if carry.running is None else carry.running.copy()
 
 
 class Steps(NamedTuple):

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.modules import OPTIONS, load_module, run_one, run_rows, template
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, opened
+from sympflow.kernels.modules import OPTIONS, load_module, template
+from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
 from sympflow.kernels.stages import (
     DampedDrift,
     StageTable,
@@ -163,7 +163,7 @@ class SplittingLoops:
         return self._variants[variant]
 
     def rows(self, table: StageTable, h: float = 1.0, t0: float = 0.0) -> np.ndarray:
-        """What the loops read of a table; where they take the values of the system's parameters, with these.
+        """The numbers of a table that the loops read, with the values of the system's parameters where they take these.
 
         With friction the maps of the drifts are among them, of numbers for one h. Those of a driven system read the
         time too, that of a step h that begins at t0.
@@ -234,18 +234,9 @@ class SplittingKernel(Kernel):
         t0: float = 0.0,
     ) -> Run:
         """`n_steps` steps of length `h` from one state: see `Kernel`."""
-        functions = self._functions()
         table = self.table(h, t0)
-        y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
-        out = np.empty((len(save), 2 * self.loops.ndof))
-        first, running = opened(carry, self._width)
-        n_finite = run_one(
-            lambda stop: functions.rollout(table, y0, n_steps, save, out, stop, first, running),
-            (n_steps - first) * table.shape[1] * self.loops.ndof,
-        )
-        if carry is not None:
-            carry.advance(n_steps, running)
-        return Run(out, n_finite)
+        work = table.shape[1] * self.loops.ndof
+        return run_state(partial(self._functions().rollout, table), y0, n_steps, save, carry, self._width, work)
 
     def run_batch(
         self,
@@ -258,20 +249,13 @@ class SplittingKernel(Kernel):
         t0: float = 0.0,
     ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
-        functions = self._functions()
-        table = self.table(h, t0)
-        y0, save = self._rows(y0), np.ascontiguousarray(save, dtype=np.int64)
-        out = np.empty((len(y0), len(save), 2 * self.loops.ndof))
-        n_finite = np.empty(len(y0), dtype=np.int64)
-        first, running = opened(carry, len(y0), self._width)
+        rollout, table, start = self._functions().rollout_batch, self.table(h, t0), self._rows(y0)
 
-        def rows(i: slice, stop: np.ndarray) -> None:
-            functions.rollout_batch(table, y0[i], n_steps, save, out[i], n_finite[i], stop, first, running[i])
+        def rows(i: slice, _: np.ndarray, *rest: Any) -> None:
+            rollout(table, start[i], *rest)
 
-        run_rows(rows, len(y0), (n_steps - first) * table.shape[1] * self.loops.ndof, threads)
-        if carry is not None:
-            carry.advance(n_steps, running)
-        return Run(out, n_finite)
+        work = table.shape[1] * self.loops.ndof
+        return run_states(rows, y0, n_steps, save, threads, carry, self._width, work)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,): see `Kernel`."""
@@ -389,10 +373,10 @@ class LoopFunctions:
     step_rows: Callable[..., None]
 
 
-def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0) -> str:
+def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0, driven: bool = False) -> str:
     return (
         f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': cache}}\n"
-        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}\nN_VALUES = {n_values}"
+        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}\nN_VALUES = {n_values}\nDRIVEN = {driven}"
     )
 
 
@@ -469,7 +453,8 @@ def symbolic_module(
         sources.append(curvature_kick_source(symbols))
     algebra = "\n\n\n".join(sources)
     before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
-    header = _header(compensated, cache=True, scheduled=scheduled, n_values=n if varied else 0)
+    n_values = n if varied else 0
+    header = _header(compensated, cache=True, scheduled=scheduled, n_values=n_values, driven=driving is not None)
     return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
 
 

@@ -102,7 +102,7 @@ class Run(ABC):
 
     @property
     def remedy(self) -> str:
-        """What to do about a flow that is far from the exact one."""
+        """The advice for a flow that is far from the exact one."""
         return "Take a shorter `dt`, a smaller `domain`, or another `flow`, with more kicks."
 
     @abstractmethod

@@ -17,6 +17,13 @@ SQUARE = {"potential": lambda q: (q**2).sum(-1) / 2, "ndof": 1}
 QUARTIC = {"potential": lambda q: (q**4).sum(-1) / 4, "ndof": 2}
 PLANE = {"potential": lambda q: q[..., 0] ** 2 / 2 + 2 * q[..., 1] ** 2, "ndof": 2}
 
+MIXED = {
+    "potential": lambda q: q[..., 0] ** 2 / 2e12 - 1e-7 / q[..., 1],
+    "gradient": lambda q: np.stack([q[..., 0] / 1e12, 1e7 / (1e7 * q[..., 1]) ** 2], -1),
+    "hessian_vector": lambda q, v: v * np.stack([0 * q[..., 0] + 1e-12, -2e-7 / q[..., 1] ** 3], -1),
+    "ndof": 2,
+}
+
 
 def counting():
     """A potential that differs at each call."""
@@ -29,11 +36,29 @@ def counting():
     return potential
 
 
-def refused(message, y0, **functions):
+def assert_refused(message, y0, **functions):
     with pytest.raises((ValueError, TypeError), match=message) as error:
         HamiltonianSystem(**functions).check_functions(y0)
     assert "check=False" in str(error.value)
     HamiltonianSystem(**functions, check=False).check_functions(y0)
+
+
+def assert_accepted(y0, **functions):
+    """Assert that the functions are called for a test, pass it without a warning, and are not tested again."""
+    name = "hamiltonian" if "hamiltonian" in functions else "potential"
+    calls = []
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return functions[name](*arguments)
+
+    system = HamiltonianSystem(**functions | {name: counted})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        system.check_functions(y0)
+        n = len(calls)
+        system.check_functions(y0)
+    assert len(calls) == n > 4
 
 
 @pytest.mark.parametrize(
@@ -95,7 +120,7 @@ def refused(message, y0, **functions):
     ],
 )
 def test_contradictions_are_named_with_the_component_the_state_and_both_values(functions, y0, message):
-    refused(message, y0, **functions)
+    assert_refused(message, y0, **functions)
 
 
 @pytest.mark.parametrize(
@@ -131,16 +156,22 @@ def test_contradictions_are_named_with_the_component_the_state_and_both_values(f
         ),
         (QUARTIC | {"ndof": 300, "gradient": lambda q: q**3}, np.linspace(-1, 1, 600)),
         ({"potential": lambda q: (1 / torch.clamp(q, min=0.0)).sum(-1), "ndof": 1}, np.array([-1.0, 0.0])),
+        (MIXED, np.array([1e6, 1e-7, 0.1, 0.2])),
     ],
     ids=[
         *("free", "kink", "relu at its kink", "sign at its kink", "a slope of a kink", "stiff", "far from 0", "noisy"),
-        *("singular", "other units", "next to the end of its domain", "many", "infinite"),
+        *("singular", "other units", "next to the end of its domain", "many", "infinite", "scales far apart"),
     ],
 )
 def test_right_functions_pass(functions, y0):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        HamiltonianSystem(**functions).check_functions(y0)
+    assert_accepted(y0, **functions)
+
+
+def test_a_wrong_slope_among_scales_far_apart_is_found():
+    wrong = MIXED | {"gradient": lambda q: np.stack([q[..., 0] / 1e12, 1.01e7 / (1e7 * q[..., 1]) ** 2], -1)}
+    assert_refused(
+        r"its component 1 is 1\.01e\+07, but `potential` grows by 1e\+07", np.array([1e6, 1e-7, 0.1, 0.2]), **wrong
+    )
 
 
 def within(q):
@@ -169,14 +200,16 @@ def edge(q):
     ids=["a period shorter than a difference", "an angle and a large momentum", "raises beyond its domain"],
 )
 def test_what_differences_cannot_resolve_is_not_refused(functions, y0):
-    HamiltonianSystem(**functions).check_functions(y0)
+    assert_accepted(y0, **functions)
 
 
 def test_halves_of_other_sizes_are_tested_by_their_own():
     def hamiltonian(q, p):
         return (p.detach() ** 2).sum(-1) / 2e-26 + 1e-2 * (q**2).sum(-1)
 
-    refused(r"^`hamiltonian` is cut off .* component 1", np.array([1e-10, 1e-23]), hamiltonian=hamiltonian, ndof=1)
+    assert_refused(
+        r"^`hamiltonian` is cut off .* component 1", np.array([1e-10, 1e-23]), hamiltonian=hamiltonian, ndof=1
+    )
 
 
 FAR = QUARTIC | {"gradient": lambda q: np.where(abs(q) > 2, 0, q**3), "y0": np.array([0.3, 0.2, 3.0, 3.0])}
@@ -212,19 +245,19 @@ def test_one_wrong_component_of_many_is_found():
     def gradient(q):
         return q**3 * (1 + (np.arange(300) == 177))
 
-    refused(r"its component 177 is ", np.linspace(-1, 1, 600), **QUARTIC | {"ndof": 300, "gradient": gradient})
+    assert_refused(r"its component 177 is ", np.linspace(-1, 1, 600), **QUARTIC | {"ndof": 300, "gradient": gradient})
 
 
 def test_a_contradiction_elsewhere_in_the_domain_is_found():
     wrong = SQUARE | {"gradient": lambda q: np.where(q > 2, 2 * q, q), "domain": Ball([3.0, 0.0], 1.0)}
-    refused("^`gradient` is not that of `potential`", Y1, **wrong)
+    assert_refused("^`gradient` is not that of `potential`", Y1, **wrong)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_tensors_are_tested_in_their_precision(dtype):
     y0 = torch.tensor(Y2, dtype=dtype)
-    HamiltonianSystem(**QUARTIC, gradient=lambda q: q**3, hessian_vector=lambda q, v: 3 * q**2 * v).check_functions(y0)
-    refused("^`gradient` is not that of", y0, **QUARTIC, gradient=lambda q: 1.2 * q**3)
+    assert_accepted(y0, **QUARTIC, gradient=lambda q: q**3, hessian_vector=lambda q, v: 3 * q**2 * v)
+    assert_refused("^`gradient` is not that of", y0, **QUARTIC, gradient=lambda q: 1.2 * q**3)
 
 
 def test_every_door_tests():
@@ -242,6 +275,14 @@ def test_every_door_tests():
             door(HamiltonianSystem(**wrong))
 
 
+CALLS = []
+
+
+def recorded(q):
+    CALLS.append(q)
+    return -torch.cos(q).sum(-1)
+
+
 def test_once_and_again_in_another_copy():
     calls = []
 
@@ -254,9 +295,11 @@ def test_once_and_again_in_another_copy():
     n = len(calls)
     system.check_functions(2 * Y1)
     assert len(calls) == n < 100
-    plain = HamiltonianSystem(potential=systems.pendulum().potential, ndof=1)
+    plain = HamiltonianSystem(potential=recorded, ndof=1)
     for again in (copy.copy(plain), copy.deepcopy(plain), pickle.loads(pickle.dumps(plain))):
+        CALLS.clear()
         again.check_functions(Y1)
+        assert CALLS
 
 
 @njit
@@ -309,10 +352,12 @@ class TestNumbaFunctions:
         ],
     )
     def test_that_are_wrong_are_named(self, functions, message):
-        refused(message, Y2, potential=potential, ndof=2, **functions)
+        assert_refused(message, Y2, potential=potential, ndof=2, **functions)
 
     def test_that_are_right_pass(self):
-        HamiltonianSystem(potential, gradient=gradient, ndof=2).check_functions(Y2)
+        system = HamiltonianSystem(potential, gradient=gradient, ndof=2)
+        system.check_functions(Y2)
+        np.testing.assert_allclose(system.force(Y2[:2]), [-0.3, -2.4])
 
     def test_what_is_not_written_is_not_finite(self):
         """Untested, it ends the run rather than take what memory holds."""
@@ -328,7 +373,10 @@ def test_the_scenes_that_ship_are_right(scene):
     names = ("potential", "gradient", "hessian_vector")
     given = dict(zip(names, system.numba_functions, strict=True))
     again = HamiltonianSystem(**given, ndof=system.ndof, domain=system.domain, y0=system.y0)
+    assert again.functions_given
     again.check_functions()
+    q = system.y0[: system.ndof]
+    assert again.potential(q) == system.potential(q)
 
 
 def test_symbolic_systems_are_not_tested():

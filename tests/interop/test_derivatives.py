@@ -152,7 +152,7 @@ class TestFlows:
         torch.testing.assert_close(vmap(jacfwd(psi, 1))(t, Y), J, **CLOSE)
 
     def test_derivatives_in_one_time(self, kind):
-        """Of a time () beyond Δt, and of one that is a whole number of steps."""
+        """A time () beyond Δt, and one that is a whole number of steps."""
         psi = FLOWS[kind]()
         for t in (0.7, 2 * psi.dt):
             time = torch.tensor(t, dtype=torch.float64)
@@ -333,7 +333,7 @@ class TestCompiled:
 
 
 class TestRefusals:
-    """What cannot be right is an error that names the remedy."""
+    """Calls that cannot be right raise an error that names the remedy."""
 
     @pytest.mark.parametrize("argument", ["t_span", "t_eval", "t"])
     def test_times_of_solve_that_are_followed(self, argument):
@@ -424,7 +424,7 @@ class TestBatchesUnderVmap:
 
 
 def test_a_flow_that_ships_is_read_outside_of_a_transform(monkeypatch):
-    """What is kept from call to call must not be a tensor of a transform that has ended."""
+    """Tables kept from call to call must not be tensors of a transform that has ended."""
     monkeypatch.setattr("sympflow.integrators.flows._KNOWN", {})
     monkeypatch.setattr("sympflow.integrators.flows._FLOWS_OF", WeakKeyDictionary())
     end = problem("sympflow")[1]

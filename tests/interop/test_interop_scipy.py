@@ -244,7 +244,7 @@ class TestAnotherSystem:
         assert solve_ivp(fun, (0, 0.01), [1.0, 0.0], method=as_scipy("verlet", PENDULUM)).success
 
     def test_of_a_flow(self, rotation):
-        """Of a bare flow, of a network that knows its own error, and of a primed flow, which knows its system."""
+        """A bare flow, a network that knows its own error, and a primed flow, which knows its system."""
         with pytest.raises(ValueError, match=r"^`fun` is not the system that method 'sympflow' solves"):
             solve_ivp(systems.harmonic_oscillator(3.0), (0, 1), [1.0, 0.5], method=as_scipy(rotation))
         solve_ivp(lambda t, y: [y[1], -y[0]], (0, 1), [1.0, 0.5], method=as_scipy(rotation))

@@ -27,7 +27,7 @@ def torch_steps(flow, h, y0, n_steps):
 
 
 def step_errors(flow, h, Y):
-    """How far each state of a run (n, ..., 2d) is from torch's step from the one before."""
+    """Distance of each state of a run (n, ..., 2d) from torch's step from the one before."""
     with torch.no_grad():
         return np.abs(Y[1:] - flow(h, torch.as_tensor(Y[:-1])).numpy())
 

@@ -105,7 +105,7 @@ def test_the_force_gradient_of_a_polynomial_is_one():
 
 @pytest.mark.parametrize("each", [False, True], ids=["one polynomial", "one for each state"])
 def test_values_and_gradients(each):
-    """Those of torch by its own differentiation; of NumPy the same."""
+    """Derivatives of torch by its own differentiation; NumPy gives the same."""
     rng = np.random.default_rng(1)
     q, c = rng.normal(size=(6, 2)), rng.normal(size=(6, 4) if each else 4)
     x, t = torch.tensor(q, requires_grad=True), torch.tensor(c)

@@ -1,4 +1,4 @@
-"""What a training may take: a time budget that every piece of it keeps, memory, and a Δt that can be learnt."""
+"""Limits of a training: a time budget that every piece of it keeps, memory, and a Δt that can be learnt."""
 
 import math
 import warnings
@@ -160,7 +160,7 @@ def test_a_run_without_time_for_labels_goes_on_from_its_checkpoint(clock, tmp_pa
 
 
 def test_trials_take_at_most_half_of_the_time(clock, monkeypatch):
-    """What they tried so far chooses; without any it is the shortest Δt."""
+    """The trials made so far choose; without any it is the shortest Δt."""
     taken = []
 
     def trial(start, system, domain, deadline):

@@ -115,7 +115,7 @@ FEW = TableOptions(points=5, label_times=3, frozen_weight=1.0, energy_weight=7.0
 
 
 def errors_of(run, psi):
-    """What the fit's residuals are, of each coordinate and of the energy, for ψ̄ at labels (3, 5, 2) of the pendulum."""
+    """The residuals by definition, of coordinates and of the energy, for ψ̄ at labels (3, 5, 2) of the pendulum."""
     y = run.whole._y.T.reshape(3, 5, 2)
     spread = np.std(PENDULUM.hamiltonian(run.whole._x[:, :5].T))
     energy = math.sqrt(7.0) / spread * (PENDULUM.gradient(y) * (psi - y)).sum(-1)
@@ -336,7 +336,7 @@ def test_other_losses_train_too(loss):
 
 
 def test_residuals_of_a_loss_are_those_of_the_flow():
-    """Of the whole fit, against Loss: the sum of squares is the loss, and the Jacobian its derivative."""
+    """The whole fit against Loss: the sum of squares is the loss, and the Jacobian its derivative."""
     flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=1)
     config = TableOptions(label_weight=0.0, residual_weight=2.0, matching_weight=3.0, loss_points=20)
     run = TableRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), config)

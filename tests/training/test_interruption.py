@@ -1,4 +1,4 @@
-"""How a search for a primed flow ends early: Ctrl-C, at any moment, and a time budget, which counts all of it."""
+"""Early ends of a search for a primed flow: Ctrl-C, at any moment, and a time budget, which counts all of it."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""What a fit says of how far its flow is from the exact one at held-out states."""
+"""Errors that a fit reports of its flow at held-out states."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""What `train` and its flows say of arguments that they cannot take: the argument, and the remedy."""
+"""Messages of `train` and its flows on arguments that they cannot take: the argument, and the remedy."""
 
 import inspect
 
@@ -116,7 +116,7 @@ class Started(Exception):
 
 
 def test_a_run_of_trials_is_resumed_whatever_else_is_said_now(monkeypatch, tmp_path):
-    """That its budget is short, and what its fit is by default, say nothing of its flow."""
+    """A short budget, and the default of its fit, say nothing of its flow."""
     path, start = tmp_path / "run.ckpt", trials.tried_starts(HH, HH.domain)[-1]
 
     def kill(*_):

@@ -210,7 +210,7 @@ def labelled_at_dt():
 
 
 class TestLabelsAtFewTimes:
-    """What was compared with nothing is given with a warning, wherever it is asked for."""
+    """A flow that was compared with nothing is given with a warning, wherever it is asked for."""
 
     def test_the_flow_knows_its_times_and_so_does_its_file(self, labelled_at_dt, tmp_path):
         assert labelled_at_dt.unfitted == ((0.0, 1.0),)

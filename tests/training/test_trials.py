@@ -1,4 +1,4 @@
-"""Which flow `train` fits to a system of which nothing else is said: what its kicks cost, and short trials."""
+"""The flow that `train` fits to a system of which nothing else is said: the cost of kicks, and short trials."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def test_a_long_step_that_misses_the_goal_is_not_taken(monkeypatch):
 
 
 def test_where_all_miss_the_goal_the_least_error_is_taken(monkeypatch):
-    """Of errors that are alike the longest step's; curvature terms where they alone meet the goal."""
+    """The longest step wins among errors that are alike; curvature terms where they alone meet the goal."""
     first, *_, last = trials.tried_starts(HH, HH.domain, curvature=False)
     assert law(monkeypatch, lambda x, c: 1e-3 if x == 1.0 else 2.1e-3) == first
     assert law(monkeypatch, lambda x, c: 1e-3 if x == 1.0 else 1.9e-3) == last

@@ -1,0 +1,63 @@
+"""The provenance of a result: flat attributes that say by what it was made."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from sympflow._version import __version__
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.contract import Integrator
+from sympflow.integrators.registry import name_of
+from sympflow.storage.layout import UNITS
+
+LONGEST_EXPRESSION = 10_000
+"""Characters of H beyond which its text is left out."""
+
+
+def option_text(integrator: Integrator) -> str:
+    """Return the options of a method, but for its flow, as a text."""
+    own = [f.name for f in fields(integrator) if f.name != "flow"]  # type: ignore[arg-type]
+    return ", ".join(f"{name}={getattr(integrator, name)!r}" for name in own)
+
+
+def flow_checksum(integrator: Integrator, system: HamiltonianSystem) -> str | None:
+    """Return the checksum of the weights of the flow that a method uses for a system; None if it uses none."""
+    flow = integrator.flow_for(system)
+    if flow is None:
+        return None
+    from sympflow.flow.weights import checksum
+
+    return checksum(flow.state_dict())
+
+
+def provenance(
+    system: HamiltonianSystem, integrator: Integrator, t_span: tuple[float, float]
+) -> dict[str, str | float | list[float]]:
+    """Return the attributes of what a method computed of a system: texts, numbers and lists, as JSON and NetCDF have.
+
+    Returns
+    -------
+    dict
+        `sympflow_version`, `system` (its name), `hamiltonian` (H as it was written, of a symbolic system), `params`
+        (JSON), `damping` (JSON, of a damped system), `method`, `options`, `t_span`, `flow_checksum` (of a trained
+        flow), and `units`, which are those of the system.
+    """
+    told: dict[str, Any] = {"sympflow_version": __version__, "system": system.name}
+    if system.symbols is not None and len(system.symbols.text) <= LONGEST_EXPRESSION:
+        told["hamiltonian"] = str(system.symbols.written[0])
+    told["params"] = json.dumps(_plain(system.params))
+    if system.friction is not None:
+        told["damping"] = json.dumps(system.friction.damping.tolist())
+    told |= {"method": name_of(integrator), "options": option_text(integrator), "t_span": list(t_span)}
+    checksum = flow_checksum(integrator, system)
+    if checksum is not None:
+        told["flow_checksum"] = checksum
+    return told | {"units": UNITS}
+
+
+def _plain(params: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters as JSON has them: samples of functions of t by their text."""
+    return {name: value if isinstance(value, int | float) else str(value) for name, value in params.items()}
