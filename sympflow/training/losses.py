@@ -45,6 +45,9 @@ class Loss:
     label_weight: float = 0.0
 
     def __post_init__(self) -> None:
+        self.system.check_autonomous(
+            "and the losses compare at no time of it", "fit a primed flow to its labels, optimizer='gauss-newton'"
+        )
         if self.matching_weight:
             self.system.check_conservative(
                 "with which a flow is that of no Hamiltonian, so there is none to match",

@@ -37,6 +37,7 @@ from sympflow.training.points import (
     PointSource,
     Stream,
     shares_missed,
+    start_times,
     states,
     step_errors,
     stream_seed,
@@ -124,6 +125,10 @@ class TableRun(SearchRun):
         fractions = FRACTIONAL_TIMES
         step, table = TableStep(system, flow.sequence, flow.tables.level, flow.monomials), Table(flow)
         unit = np.array(scaling.x)
+        if options.residual_weight or options.matching_weight or data is not None:
+            system.check_autonomous(
+                "and what is not its own labels tells no time at which a step begins", "leave out `loss` and `data`"
+            )
         parts: list[tuple[float, Fit]] = []
         frozen = weighted = None
         if options.label_weight and data is None:
@@ -134,7 +139,8 @@ class TableRun(SearchRun):
             x = states(domain, points, options.seed, Stream.RESIDUAL)
             t = flow.dt * np.arange(1, options.label_times + 1) / options.label_times
             began = deadline.session.passed
-            labels = Labels.needed(system, x, t, deadline.part(LABEL_SHARE))
+            t0 = start_times(system, flow.dt, points, options.seed, Stream.RESIDUAL)
+            labels = Labels.needed(system, x, t, deadline.part(LABEL_SHARE), t0)
             if (deadline.session.passed - began) / len(t) * fractions > HELD_OUT_SHARE * deadline.left:
                 fractions = min(fractions, len(t))
             slope = energy_slope(system, labels, options.energy_weight)
@@ -163,7 +169,8 @@ class TableRun(SearchRun):
             parts.append((1.0, LossFit(table, Objective(loss, flow, points_at))))
         x = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
         t = flow.dt * (np.arange(fractions) + 0.5) / fractions
-        held_out = Labels.of(system, x, np.append(t, flow.dt), deadline.part(LABEL_SHARE))
+        t0 = start_times(system, flow.dt, len(x), options.seed, Stream.REFERENCE)
+        held_out = Labels.of(system, x, np.append(t, flow.dt), deadline.part(LABEL_SHARE), t0)
         whole = parts[0][1] if len(parts) == 1 else StackedFit(*parts)  # one weight changes nothing
         run = cls(flow, system, domain, scaling, options, step, frozen, weighted, whole, held_out, tried)
         began = deadline.session.passed
@@ -291,10 +298,10 @@ def _check_memory(points: int, options: TableOptions, numbers: int, ndof: int) -
 
 def energy_slope(system: HamiltonianSystem, labels: Labels, weight: float) -> np.ndarray | None:
     """∇H at the labels (J, N, 2d), divided by the spread of H over Ω: `TableFit`; None if it is to count nothing."""
-    spread = float(np.std(system.hamiltonian(labels.x)))
+    spread = float(np.std(system.hamiltonian(labels.x, labels.t0)))
     if not (weight > 0 and 0 < spread < math.inf):
         return None
-    return math.sqrt(weight) / spread * system.gradient(labels.y)
+    return math.sqrt(weight) / spread * system.gradient(labels.y, labels.times)
 
 
 def _with_and_without(
@@ -408,6 +415,7 @@ class TableFit(Fit):
         self.step, self.offset, self.design = step, offset, design
         self.times, self.count = len(labels.t), len(labels.x)
         self._x = np.tile(labels.x.T, (1, self.times))
+        self._t0 = None if labels.t0 is None else np.tile(labels.t0, self.times)
         self._y = np.ascontiguousarray(labels.y.reshape(-1, labels.x.shape[1]).T)
         # The sum of squares is a mean over states and times.
         each = np.repeat(weight, self.count) / math.sqrt(self.times * self.count)
@@ -420,12 +428,12 @@ class TableFit(Fit):
 
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
         with np.errstate(all="ignore"):
-            y = self.step(self.coefficients(theta), self._x, check)
+            y = self.step(self.coefficients(theta), self._x, check, self._t0)
             return self._rows(self._errors(y - self._y)).ravel()
 
     @np.errstate(all="ignore")  # as in the residuals: what is not finite is rejected
     def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
-        y, J = self.step.with_jacobian(self.coefficients(theta), self._x, check)
+        y, J = self.step.with_jacobian(self.coefficients(theta), self._x, check, self._t0)
         by_table = self._rows(self._errors(J))  # (J, (2d + 1) N, n)
         J = (by_table @ self.design).reshape(-1, self.design.shape[-1])
         return self._rows(self._errors(y - self._y)).ravel(), J
@@ -609,7 +617,7 @@ def differences(flow: PrimedFlow, step: TableStep, labels: Labels) -> np.ndarray
     table = Table(flow)
     offset, design = table.polynomial(labels.t)
     coefficients = offset + design @ table.parameters()
-    return np.stack([step(c[:, None], labels.x.T).T for c in coefficients]) - labels.y
+    return np.stack([step(c[:, None], labels.x.T, t0=labels.t0).T for c in coefficients]) - labels.y
 
 
 @np.errstate(all="ignore")

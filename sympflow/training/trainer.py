@@ -37,7 +37,7 @@ from sympflow.training.options import (
     is_number,
     plain_numbers,
 )
-from sympflow.training.points import digest, handed_in, unlabelled, warn_of_another_system
+from sympflow.training.points import Stream, digest, handed_in, start_times, unlabelled, warn_of_another_system
 from sympflow.training.runs import Run, Unstarted
 from sympflow.training.session import Deadline, OutOfTime, Path, Session
 from sympflow.training.split_fit import SplitRun
@@ -235,7 +235,7 @@ def fit_flow(
     domain = _domain_for(system, domain)
     untold = flow is None and asked.restarts is None and asked.steps is None
     kind = _kind_of(system, flow, new, asked)
-    check_for_flows(system, takes_friction=kind == "primed")
+    check_for_flows(system, takes_friction=kind == "primed", takes_driving=kind == "primed")
     hurried = untold and session.time_budget is None and session.resume is None and kind == "primed" and asked.searches
     if hurried:
         session.time_budget = BUDGET
@@ -252,7 +252,9 @@ def fit_flow(
                 TableOptions.of(asked)  # raises before trials
             flow, tried = _new_primed(system, domain, dt, new, asked, session)
             session.cut = session.interruption.asked  # what trials were left out does not end the run
-        system.vector_field(domain.sample(1, 0))  # what is compiled for it counts, but not as labels
+        system.vector_field(
+            domain.sample(1, 0), start_times(system, 0.0, 1, 0, Stream.LABELS)
+        )  # what is compiled for it counts, but not as labels
         run = _run_of(system, domain, kind, flow, tried, dt, new, asked, session.deadline)
         if session.resume is not None:
             run.load(session.resume)
