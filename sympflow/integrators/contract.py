@@ -41,6 +41,7 @@ from sympflow.arguments import MAX_ASKED_VALUES
 from sympflow.arrays import Array, is_tensor, jvp, to_numpy
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.progress import Progress
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
@@ -56,6 +57,16 @@ MOST_ENTRIES = 20_000_000
 
 FINISHED = "The solver successfully reached the end of the integration interval."
 ENDED = "A termination event occurred."
+
+
+INTERRUPTED = "The run was interrupted after t = {t:.17g}; what was computed until then is kept."
+
+
+def interrupted(outcome: Outcome, t: float) -> Interrupted:
+    """Return the error of a run that Ctrl-C ended after time t, with its outcome, which is marked as failed."""
+    outcome.status = np.full(outcome.y.shape[1:-1], -1) if outcome.y.ndim > 2 else -1
+    outcome.message, outcome.stats["interrupted_at"] = INTERRUPTED.format(t=t), t
+    return Interrupted(outcome)
 
 
 def finished(problem: Problem) -> str:
@@ -86,6 +97,20 @@ class Failure(Enum):
     )
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a long run, with what was computed until then.
+
+    Attributes
+    ----------
+    solution : Solution
+        The outputs up to where the run was, with status −1, the time in the message and in `stats["interrupted_at"]`.
+    """
+
+    def __init__(self, outcome: Outcome, solution: Any = None) -> None:
+        super().__init__(outcome.message)
+        self.outcome, self.solution = outcome, solution
+
+
 @dataclass(frozen=True)
 class Problem:
     """A validated initial value problem, and the outputs that `solve` asks an integrator for."""
@@ -101,6 +126,8 @@ class Problem:
     events: EventSearch | None = None
     letters: np.ndarray | None = None
     """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
+    progress: Progress | None = None
+    """What is told how much of the time from t0 to t1 is done."""
 
 
 @dataclass
@@ -268,6 +295,22 @@ class Integrator:
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         """Execute the run again as a stream of its steps."""
         raise NotImplementedError(f"{type(self).__name__} must define steps().")
+
+
+class ByVectorField(Integrator):
+    """An integrator whose steps evaluate `system.vector_field` at its times, and take all that this holds."""
+
+    @property
+    def takes_friction(self) -> bool:
+        return True
+
+    @property
+    def takes_forces(self) -> bool:
+        return True
+
+    @property
+    def takes_driving(self) -> bool:
+        return True
 
 
 def in_blocks(steps: Steps) -> Steps:

@@ -30,6 +30,7 @@ from sympflow.integrators.clocks import (
 )
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
+from sympflow.kernels.carry import Carry
 
 T = TypeVar("T")
 
@@ -199,15 +200,26 @@ class FlowStepper(Stepper):
         super().__init__(integrator, problem)
         self.flow, self.backend = flow, "torch"
 
-    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
+    @property
+    def takes_carry(self) -> bool:
+        return True
+
+    def rollout(
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+    ) -> tuple[Array, np.ndarray]:
         if not is_tensor(y0):
+            inner = _as_tensors(carry)
             with torch.no_grad():
-                states, finite = self.rollout(torch.from_numpy(np.ascontiguousarray(y0)), h, n_steps, save)
+                states, finite = self.rollout(torch.from_numpy(np.ascontiguousarray(y0)), h, n_steps, save, carry=inner)
+            if carry is not None and inner is not None:
+                carry.advance(n_steps, to_numpy(inner.running))
             return to_numpy(states), finite
         flow, t = self.flow, abs(h)
         if not flow.symplectic:  # without an inverse: the call says so where h < 0
-            return rollout(lambda k, y: flow(h, y), y0, n_steps, save)
-        states, finite = rollout(lambda k, y: flow.kernel_step(t, y, h < 0), flow.prepare(t, y0), n_steps, save)
+            return rollout(lambda k, y: flow(h, y), y0, n_steps, save, carry=carry)
+        states, finite = rollout(
+            lambda k, y: flow.kernel_step(t, y, h < 0), flow.prepare(t, y0), n_steps, save, carry=carry
+        )
         states = flow.finish(t, states)
         start = int(np.count_nonzero(save == 0))  # `save` is sorted
         return torch.cat([y0.expand(start, *y0.shape), states[start:]]), finite
@@ -217,6 +229,13 @@ class FlowStepper(Stepper):
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         return self.flow.evaluations(n_steps, n_saved, n_extra, self.backend)
+
+
+def _as_tensors(carry: Carry | None) -> Carry | None:
+    """A carry of arrays as one of tensors."""
+    if carry is None or carry.running is None:
+        return None if carry is None else Carry()
+    return Carry(carry.steps, torch.from_numpy(carry.running))
 
 
 class CompiledFlowStepper(KernelStepper):
