@@ -186,6 +186,11 @@ class Integrator:
         return False
 
     @property
+    def takes_extended(self) -> bool:
+        """True if a driven system with E, the momentum of the time, as another momentum is solved by the same steps."""
+        return not self.trained
+
+    @property
     def takes_forces(self) -> bool:
         """True if every step holds any force beside −∂H/∂q, as one by `system.vector_field` does."""
         return False

@@ -33,8 +33,8 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     with E as one more momentum; memory is that of the outputs. Methods that choose their steps then control the error
     of E too.
 
-    For systems without symbols, T(p, t) in splitting methods, and trained flows, it is the integral of ∂H/∂t along the
-    steps as executed, by Gauss–Legendre quadrature of 6 nodes within each.
+    For systems without symbols, T(p, t) in splitting methods, splittings other than "kinetic", and trained flows, it is
+    the integral of ∂H/∂t along the steps as executed, by Gauss–Legendre quadrature of 6 nodes within each.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def _extended(sol: Solution) -> HamiltonianSystem | None:
     """H(t + s, q, p) in [q, s, p, E], in which s stays 0 and E' = −∂H/∂t; None where it is not for the method."""
     system = sol.system
     symbols = system.symbols
-    if symbols is None or sol.integrator.trained or symbols.samples or system.kinetic_timed:
+    if symbols is None or not sol.integrator.takes_extended or symbols.samples or system.kinetic_timed:
         return None
     if system not in _EXTENDED:
         d, time = system.ndof, symbols.time
