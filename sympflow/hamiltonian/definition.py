@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,13 @@ class Definition:
         `time_derivative(y, t)`.
     kinetic_timed : bool
         True if T depends on it: then there are `drifted(p, t, s)` and `drift_jacobian(p, t, s)`.
+    shortest_piece : float
+        The shortest time between two jumps of H in t that are known, inf if there are none.
+    has_third_derivative : bool
+        True if there is `third_derivative(q, v, w)` of all arrays; else it is found by differences.
+    loops : str
+        Name of the compiled loops that are generated for it, of a definition by one piece: see
+        `sympflow.hamiltonian.local`.
     """
 
     ndof: int
@@ -45,6 +53,9 @@ class Definition:
     given: bool = False
     timed: bool = False
     kinetic_timed: bool = False
+    shortest_piece: float = inf
+    has_third_derivative: bool = False
+    loops: str = ""
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""
@@ -63,3 +74,7 @@ class Definition:
     def hessian_vector(self, q: Array, v: Array, *t: Array) -> Array:
         """∇²V(q)·v: (..., d), each, to (..., d)."""
         return (self.potential_hessian(q, *t) @ v[..., None])[..., 0]
+
+    def third_derivative(self, q: Array, v: Array, w: Array, *t: Array) -> Array:
+        """∇³V(q)(v, w): (..., d), each, to (..., d)."""
+        raise NotImplementedError(f"{type(self).__name__} must define third_derivative().")

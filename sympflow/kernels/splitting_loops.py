@@ -373,10 +373,10 @@ class LoopFunctions:
     step_rows: Callable[..., None]
 
 
-def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0) -> str:
+def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0, driven: bool = False) -> str:
     return (
         f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': cache}}\n"
-        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}\nN_VALUES = {n_values}"
+        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}\nN_VALUES = {n_values}\nDRIVEN = {driven}"
     )
 
 
@@ -453,7 +453,8 @@ def symbolic_module(
         sources.append(curvature_kick_source(symbols))
     algebra = "\n\n\n".join(sources)
     before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
-    header = _header(compensated, cache=True, scheduled=scheduled, n_values=n if varied else 0)
+    n_values = n if varied else 0
+    header = _header(compensated, cache=True, scheduled=scheduled, n_values=n_values, driven=driving is not None)
     return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
 
 

@@ -189,8 +189,8 @@ def step_lanes(table, x, h, t, y, out):
 
 
 @njit(**OPTIONS)
-def map_lanes(table, y, out):
-    """`map_each`, `MANY_LANES` rows at a time."""
+def map_lanes(table, steps, y, out):
+    """`map_each`, `MANY_LANES` rows at a time, of systems that do not depend on the time."""
     Y, error = empty_lanes(), empty_lanes()
     for block_start in range(0, y.shape[0], MANY_LANES):
         count = min(MANY_LANES, y.shape[0] - block_start)
@@ -206,4 +206,4 @@ def map_lanes(table, y, out):
             pack(q, p, out[block_start + lane])
 
 
-map_rows, rollout_rows = map_lanes, rollout_lanes
+map_rows, rollout_rows = map_each if DRIVEN else map_lanes, rollout_lanes
