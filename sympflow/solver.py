@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Mapping
@@ -24,9 +25,10 @@ from sympflow.arrays import Array, finite_states, is_tensor, lanes, readable
 from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import report_lanes, run_and_search
-from sympflow.integrators.contract import Failure, Integrator, Outcome, Problem
+from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
 from sympflow.integrators.domain_exit import check_domain, check_system_along
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
+from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, naming_plugin
 from sympflow.solution import Solution, joined
 
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 
 BACKENDS = ("auto", "compiled", "array")
 MAX_EVENT_SAMPLES = 100_000_000
+MOST_DIAGNOSED = 16  # sets of values of parameters
 FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite end
 _FLOAT64 = np.dtype(np.float64)
 
@@ -54,6 +57,7 @@ def solve(
     event_step: float | None = None,
     backend: str = "auto",
     on_domain_exit: str | None = None,
+    progress: Asked = False,
     **options: Any,
 ) -> Solution:
     """Solve x' = J∇H(x), x(t0) = y0.
@@ -73,9 +77,9 @@ def solve(
         Values of parameters of the system for each trajectory: numbers, or arrays that broadcast with the batch of y0;
         of one state y0 they make a batch. The others keep the system's values. Splitting methods on the splitting
         "kinetic", but for those with force gradients and with friction, take them as numbers of one compiled run, and
-        each trajectory is that on ``system.with_params(...)`` up to rounding. Elsewhere trajectories of equal values
-        run together, one set of values after the other, and are so bit by bit. A trained flow holds for its own
-        parameters alone.
+        each trajectory is that of a batch on ``system.with_params(...)``, with compensated sums up to rounding.
+        Elsewhere trajectories of equal values run together, one set of values after the other. A trained flow holds for
+        its own parameters alone.
     t_eval : array_like of shape (n,), optional
         Times to report, ordered from start to end. The default is every step. No other state is stored.
     dense_output : bool
@@ -100,6 +104,9 @@ def solve(
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
         statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The
         default is "warn" for trained flows, whose figures hold in Ω, and "ignore" for classical methods.
+    progress : bool or callable
+        True for a bar on stderr; or a function of the time that is done and the whole one, called a few times a second.
+        A method that is not run in pieces, such as one of a library, tells its end only.
     **options
         Options of the method: `dt` for fixed steps (default `system.dt`, or the flow's Δt), `rtol` and `atol` for
         adaptive ones, `flow` for "sympflow" and "mlp".
@@ -116,6 +123,8 @@ def solve(
         For bad arguments, at once: the message names the argument and the remedy.
     RuntimeError
         If the method is that of a plug-in and fails: the message names the plug-in.
+    Interrupted
+        A KeyboardInterrupt, by Ctrl-C in a run of a second or more: its `solution` is what was computed until then.
 
     Examples
     --------
@@ -157,6 +166,21 @@ def solve(
     if search is not None:
         check_event_search(search, y_start, abs(t1 - t0))
     problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend, search)
+    if progress is False:
+        return _answered(integrator, problem, action, rows)
+    sign = math.copysign(1.0, t1 - t0)
+    bar = Progress(progress, abs(t1 - t0), lambda done: f"t = {t0 + sign * done:.6g} of {t1:.6g}")
+    try:
+        sol = _answered(integrator, replace(problem, progress=bar), action, rows)
+        if sol.success and not bar.complete:
+            bar(bar.total)
+    finally:
+        bar.end()
+    return sol
+
+
+def _answered(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None) -> Solution:
+    """The solution of a validated problem, where trajectories may have parameters of their own."""
     if rows is None or rows.uniform:
         sol = _solved(integrator, problem, action)
         sol.rows = rows
@@ -176,13 +200,16 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     else:
         check_memory(integrator, problem)
 
-    start = time.perf_counter()
+    start, stopped = time.perf_counter(), None
     with naming_plugin(integrator):
-        outcome, problem = run(integrator, problem)
+        try:
+            outcome, problem = run(integrator, problem)
+        except Interrupted as stop:
+            outcome, stopped = stop.outcome, stop
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
     failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
-    if failed and problem.letters is None and readable(y_start):
+    if failed and stopped is None and problem.letters is None and readable(y_start):
         from sympflow.integrators.diagnosis import note_singularities
 
         note_singularities(outcome, integrator, problem)
@@ -193,7 +220,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     if action != "ignore" and readable(outcome.y):
         check_domain(outcome, integrator, system, action)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
-    return Solution(
+    sol = Solution(
         t=outcome.t,
         y=y,
         status=outcome.status,
@@ -207,6 +234,9 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
         t_events=None if problem.events is None else problem.events.times(),
         y_events=None if problem.events is None else problem.events.states(y_start),
     )
+    if stopped is not None:
+        raise Interrupted(outcome, sol) from None
+    return sol
 
 
 def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows) -> Solution:
@@ -220,13 +250,34 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
     for group in rows.by_form() if action == "ignore" else rows.distinct():
         together = replace(problem, system=group.system, y0=states[group.places], letters=group.letters)
         if group.letters is None or integrator.takes_letters(together):
-            pieces.append((group.places, _solved(integrator, together, action)))
+            sol = _solved(integrator, together, action)
+            pieces.append((group.places, sol))
+            if group.letters is not None and not sol.success:
+                _note_singularities(sol, integrator, together, rows.taken(group.places))
             continue
         for few, system, _ in rows.taken(group.places).distinct():
             index = group.places[few]
             alone = replace(problem, system=system, y0=states[index])
             pieces.append((index, _solved(integrator, alone, action)))
     return joined(pieces, problem.system, problem.y0, rows)
+
+
+def _note_singularities(sol: Solution, integrator: Integrator, problem: Problem, rows: ParameterRows) -> None:
+    """Note when solutions with parameters of their own become infinite, of the first `MOST_DIAGNOSED` that fail."""
+    from sympflow.integrators.diagnosis import note_singularities
+
+    status = np.asarray(sol.status)
+    failed, times = np.flatnonzero(status < 0), np.full(len(status), np.nan)
+    for few, system, _ in itertools.islice(rows.taken(failed).distinct(), MOST_DIAGNOSED):
+        i = failed[few]
+        stats = {name: value[i] if isinstance(value, np.ndarray) else value for name, value in sol.stats.items()}
+        outcome = Outcome(sol.t, np.moveaxis(sol.y[i], -1, 0), status[i], "", stats)
+        note_singularities(outcome, integrator, replace(problem, system=system, y0=problem.y0[i], letters=None))
+        times[i] = outcome.stats.get("blow_up_time", np.nan)
+    if np.isfinite(times).any():
+        sol.stats["blow_up_time"] = times
+        first = int(np.argmax(np.isfinite(times)))
+        sol.message += f" A solution itself becomes infinite, at about t = {times[first]:.10g}: end `t_span` before."
 
 
 def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
@@ -380,16 +431,22 @@ def check_params(
     from sympflow.hamiltonian.parameter_rows import checked_rows
 
     rows = checked_rows(system, params, tuple(y0.shape[:-1]))
-    if integrator.trained:
-        other = [name for name, values in rows.values.items() if (values != system.params[name]).any()]
-        if other:
-            own = ", ".join(f"{name} = {system.params[name]:.9g}" for name in other)
-            raise ValueError(
-                f"`params` changes {', '.join(other)}, and a trained flow, as of method {integrator.name!r}, holds for "
-                f"its own parameters ({own}): train one for each value, or use a classical method such as 'kahan_li8'."
-            )
+    check_own_parameters(system, rows.values, integrator)
     shape = (*rows.shape, y0.shape[-1])
     return rows, (y0.expand(shape) if is_tensor(y0) else np.broadcast_to(y0, shape).copy())
+
+
+def check_own_parameters(system: HamiltonianSystem, values: Mapping[str, ArrayLike], integrator: Integrator) -> None:
+    """Refuse a trained flow for other parameters than those of its system."""
+    if not integrator.trained:
+        return
+    other = [name for name, value in values.items() if np.any(np.asarray(value) != system.params[name])]
+    if other:
+        own = ", ".join(f"{name} = {system.params[name]:.9g}" for name in other)
+        raise ValueError(
+            f"`params` changes {', '.join(other)}, and a trained flow, as of method {integrator.name!r}, holds for "
+            f"its own parameters ({own}): train one for each value, or use a classical method such as 'kahan_li8'."
+        )
 
 
 def check_events(events: Any, event_step: Any) -> EventSearch | None:

@@ -23,6 +23,7 @@ from sympflow.integrators.methods import NAMES, TRIPLES
 from sympflow.schemes import SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
+    from sympflow.kernels.carry import Carry
     from sympflow.kernels.protocol import Kernel
     from sympflow.kernels.tangent_loops import TangentKernel
 
@@ -275,6 +276,9 @@ class Splitting(OwnStepper):
     def takes_driving(self) -> bool:
         return SPLITTINGS[self.splitting].takes_driving and self.clock == "physical"
 
+    def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> Splitting | None:
+        return self if SPLITTINGS[self.splitting].takes_extended else None
+
     def takes_letters(self, problem: Problem) -> bool:
         system, composition = problem.system, self.composed(problem.system)
         asked = any(map(self.overrides, ("step", "rollout", "substep", "evaluations")))
@@ -335,7 +339,7 @@ class Splitting(OwnStepper):
         if not self.keeps:
             return super().jacobian(system, t, y, h)
         composition = self.composed(system)
-        return forward_tangent(composition.step, composition.lift(y), h)[1]
+        return forward_tangent(lambda x, lengths: composition.step(x, lengths, t), composition.lift(y), h)[1]
 
     def executed(
         self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
@@ -344,8 +348,12 @@ class Splitting(OwnStepper):
             yield from super().executed(system, t_span, y0)
             return
         composition = self.composed(system)
+
+        def jacobian(t: Any, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+            return forward_tangent(lambda z, lengths: composition.step(z, lengths, t), x, h)[1]
+
         for times, states, lengths in in_blocks(super().steps(system, t_span, composition.lift(y0))):
-            yield differentiated(lambda t, x, h: forward_tangent(composition.step, x, h)[1], times, states, lengths)
+            yield differentiated(jacobian, times, states, lengths, system)
 
     def own_stepper(self, problem: Problem) -> Stepper:
         composition = self.composed(problem.system)
@@ -381,8 +389,14 @@ class ArrayComposition(Stepper):
         super().__init__(integrator, problem)
         self.composition = composition
 
-    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
-        return self.composition.rollout(y0, h, n_steps, save, t0)
+    @property
+    def takes_carry(self) -> bool:
+        return True
+
+    def rollout(
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+    ) -> tuple[Array, np.ndarray]:
+        return self.composition.rollout(y0, h, n_steps, save, t0, carry)
 
     def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         return self.composition.step(y, h, t)
