@@ -114,8 +114,8 @@ class SplittingLoops:
         elif system.local is not None:
             if system.damping is not None and system.damping.ndim:
                 raise ValueError(
-                    f"`system` {system.name!r} has a rate of friction for each momentum, and its compiled loops have one "
-                    "for all: use backend='array'."
+                    f"`system` {system.name!r} has a rate of friction for each momentum, and its loops take one for "
+                    "all: use backend='array'."
                 )
             self._has_force_gradient = system.quadratic_kinetic
             self._compile = partial(_LOCAL[system.local.loops], system)
