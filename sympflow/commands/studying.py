@@ -257,21 +257,30 @@ def section(
     coordinate: Annotated[
         str | None, typer.Option(help="The coordinate that is constant on the plane: q1, p2. Default: the first.")
     ] = None,
-    level: Annotated[float, typer.Option(help="Its value there.")] = 0.0,
+    level: Annotated[float | None, typer.Option(help="Its value there. Default: 0.")] = None,
     direction: Annotated[
-        str, typer.Option(help="Crossings up, down or both.", autocompletion=completion.of(tuple(DIRECTIONS)))
-    ] = "up",
+        str | None,
+        typer.Option(help="Crossings up, down or both. Default: up.", autocompletion=completion.of(tuple(DIRECTIONS))),
+    ] = None,
     sample: Annotated[
         float | None, typer.Option(help="Longest time between two looks at the plane. Default: the system's step.")
     ] = None,
+    period: Annotated[
+        float | None,
+        typer.Option(help="Instead of a plane: the states after each period. Default: that of a driven system."),
+    ] = None,
+    since: Annotated[float | None, typer.Option(help="Leave out what is before this time.")] = None,
     axes: Annotated[
         str | None, typer.Option(help="Coordinates of the figure, as q2,p2. Default: the first other pair.")
+    ] = None,
+    turn: Annotated[
+        float | None, typer.Option(help="Length of a turn of the first of them, such as 6.283185307 of an angle.")
     ] = None,
     limit: Annotated[int, typer.Option(help="Crossings in the table; the files have all.")] = 20,
     to: Folder = None,
     quiet: Quiet = False,
 ) -> None:
-    """A Poincaré section: the states in which orbits cross a plane of phase space.
+    """A Poincaré section: the states in which orbits cross a plane of phase space, or those after each period.
 
     Examples:
 
@@ -280,6 +289,8 @@ def section(
       sympflow section henon-heiles --orbits 20 --coordinate q1 --direction up --t-end 2000 --out out/
 
       sympflow section own.py:spring --y0 0.1,0,0,0.4 --y0 0.2,0,0,0.3 --axes q2,p2 --out out/
+
+      sympflow section duffing --method kahan_li8 --orbits 100 --t-end 2000 --since 200 --out out/
     """
     with reporting(ctx):
         from sympflow.studies.figure_style import save
@@ -287,7 +298,7 @@ def section(
 
         scene, chosen = one_scene(system, own), configured(method_name)
         span, start = interval(scene, t_end), _starts(scene, y0, orbits, seed)
-        if direction not in DIRECTIONS:
+        if direction is not None and direction not in DIRECTIONS:
             raise ValueError(f"`--direction` must be one of {', '.join(DIRECTIONS)}; got {direction!r}.")
         pair = [word.strip() for word in axes.split(",")] if axes is not None else [None, None]
         if len(pair) != 2 or not {*pair} <= {None, *names(scene.system.ndof)}:
@@ -296,17 +307,19 @@ def section(
         check_counts(limit=limit)
         if to is not None:
             ready_folder(to)
-        asked = {"dt": dt, "tol": tol, "coordinate": coordinate, "sample": sample}
+        way = None if direction is None else DIRECTIONS[direction]
+        asked = {"dt": dt, "tol": tol, "coordinate": coordinate, "level": level, "direction": way, "sample": sample}
+        asked |= {"period": period}
         options: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
         with progress() as say:
             say(f"{scene.key}: {method_name}")
-            found = poincare_section(
-                scene.system, chosen, span, start, level=level, direction=DIRECTIONS[direction], **options
-            )
+            found = poincare_section(scene.system, chosen, span, start, **options)
+        if since is not None:
+            found = found.since(since)
         show(found.table(limit))
         if to is not None:
             name = to / f"{scene.key}-section"
-            figure = found.figure(*pair)
+            figure = found.figure(pair[0], pair[1], turn)
             written = [found.to_csv(f"{name}.csv"), found.to_json(f"{name}.json"), save(figure, Path(f"{name}.png"))]
             out.print(f"\nWritten to {to}: {', '.join(p.name for p in written)}")
         if not found.success:

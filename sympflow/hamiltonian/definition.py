@@ -34,6 +34,11 @@ class Definition:
         `time_derivative(y, t)`.
     kinetic_timed : bool
         True if T depends on it: then there are `drifted(p, t, s)` and `drift_jacobian(p, t, s)`.
+    has_third_derivative : bool
+        True if there is `third_derivative(q, v, w)` of all arrays; else it is found by differences.
+    loops : str
+        Name of the compiled loops that are generated for it, of a definition by one piece: see
+        `sympflow.hamiltonian.local`.
     """
 
     ndof: int
@@ -45,6 +50,8 @@ class Definition:
     given: bool = False
     timed: bool = False
     kinetic_timed: bool = False
+    has_third_derivative: bool = False
+    loops: str = ""
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""
@@ -63,3 +70,7 @@ class Definition:
     def hessian_vector(self, q: Array, v: Array, *t: Array) -> Array:
         """∇²V(q)·v: (..., d), each, to (..., d)."""
         return (self.potential_hessian(q, *t) @ v[..., None])[..., 0]
+
+    def third_derivative(self, q: Array, v: Array, w: Array, *t: Array) -> Array:
+        """∇³V(q)(v, w): (..., d), each, to (..., d)."""
+        raise NotImplementedError(f"{type(self).__name__} must define third_derivative().")

@@ -14,6 +14,7 @@ from sympflow.hamiltonian.times import checked_time
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
+    from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 
@@ -137,6 +138,24 @@ class Hamiltonian:
         """∂H/∂t of a driven system, 0 of another: (..., 2d) to (...)."""
         self._check_width(y)
         return 0 * y[..., 0] if self.autonomous else self._definition.time_derivative(y, *self._time(t, y))
+
+    def energy_density(self, y: Array, t: Any = None) -> Array:
+        """H at each site of a lattice (..., *shape), or each body of pairs (..., n), which add up to H.
+
+        The energy of a bond or a pair is divided evenly between its ends; that of a bond to a wall is its site's.
+
+        Raises
+        ------
+        ValueError
+            For other systems.
+        """
+        self._check_width(y)
+        if self.local is None:
+            raise ValueError(
+                f"`system` {self.name!r} has no energy density: that is of lattices and pairs, by "
+                "HamiltonianSystem.lattice and HamiltonianSystem.pairs."
+            )
+        return self.local.energy_density(y, *self._time(t, y))
 
     def vector_field(self, y: Array, t: Any = None) -> Array:
         """J∇H(y) = [∇_pH, −∇_qH], with friction [∇_pH, −∇_qH − Γp]: (..., 2d) to (..., 2d)."""
@@ -323,6 +342,8 @@ class Hamiltonian:
 
     def third_derivative(self, q: Array, v: Array, w: Array, t: Any = None) -> Array:
         """∇³V(q)(v, w), for a system without symbols: (..., d), each, to (..., d)."""
+        if self._definition.has_third_derivative:
+            return self._definition.third_derivative(q, v, w, *self._time(t, q))
         if self.numba_functions is None and (self._definition.differentiates_itself or is_tensor(q)):
             import torch
 
@@ -415,6 +436,11 @@ class Hamiltonian:
                 "not apply. Use an implicit method such as 'gauss_legendre6', or a Runge–Kutta method."
             )
         return self
+
+    @property
+    def local(self) -> LocalHamiltonian | None:
+        """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
+        return self._definition if self._definition.loops else None
 
     @cached_property
     def expression(self) -> str | None:

@@ -6,7 +6,7 @@ import copy
 import math
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import sympy
 
     from sympflow.hamiltonian.linear_part import LinearPart
+    from sympflow.hamiltonian.local import LocalHamiltonian
 
 MOST_DEGREES = 1_000_000
 
@@ -220,6 +221,82 @@ class HamiltonianSystem(Hamiltonian):
         self._set_period(period)
         return self
 
+    @classmethod
+    def lattice(
+        cls,
+        *,
+        shape: int | Sequence[int],
+        onsite: str | sympy.Expr | None = None,
+        bond: str | sympy.Expr | Mapping[int, str | sympy.Expr] | None = None,
+        boundary: str | Sequence[str] = "periodic",
+        kinetic: str | sympy.Expr | None = None,
+        fields: str | Sequence[str] = "q",
+        params: Mapping[str, Any] | None = None,
+        damping: float | ArrayLike | None = None,
+        name: str = "lattice",
+        domain: Domain | None = None,
+        y0: ArrayLike | None = None,
+        t_span: tuple[float, float] = (0.0, 100.0),
+        dt: float = 0.05,
+        energy_scale: float | None = None,
+    ) -> HamiltonianSystem:
+        """A lattice of any size, H = Σ_sites [T(p) + U(q)] + Σ_bonds V(r), by expressions for one site and one bond.
+
+        r is the difference along a bond, that of the site with the higher index along its axis less that of the lower:
+        r = q[i + k] − q[i], around the end of a periodic axis too. V need be no even function of it. Compiled loops
+        over sites are generated, whose code does not depend on the size.
+
+        Parameters
+        ----------
+        shape : int or sequence of up to three ints
+            Sites along each axis. A state is y = [q, p]; q are the fields one after the other, each of this shape:
+            ``q.reshape(len(fields), *shape)``.
+        onsite : str or sympy.Expr, optional
+            U of one site in its fields, such as "(q**2 - 1)**2/4".
+        bond : str or sympy.Expr, or mapping of int to these, optional
+            V of one bond in `r`, such as "r**2/2 + r**4/4", or of r_u, r_v of fields u and v; a mapping gives one for
+            each distance of its ends, {1: "r**2/2", 2: "b*r**2"}. Bonds lie along every axis.
+        boundary : {"periodic", "fixed", "free"}, or one for each axis
+            "periodic": the last site is followed by the first. "fixed": beyond both ends all fields are 0, with bonds
+            to these walls. "free": no bond reaches beyond an end.
+        kinetic : str or sympy.Expr, optional
+            T of one site in `p`, or p_u, p_v; the default is p**2/2 for each field.
+        fields : str or sequence of str
+            Names of the fields at a site.
+        params : mapping of str to float or array of the lattice's shape, optional
+            Values of the other symbols; an array has one for each site, and for each bond that of its lower end, or of
+            its other end where the lower one is a wall.
+        damping, name, domain, y0, t_span, dt, energy_scale
+            As for the class.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If an expression cannot be read or holds other names; if the shape, the boundary or the parameters do not
+            fit each other; or if a run would need more memory than the machine has.
+
+        Examples
+        --------
+        >>> system = HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=1024)
+        >>> system.ndof
+        1024
+        """
+        from sympflow.hamiltonian.lattice import LatticeHamiltonian
+
+        local = LatticeHamiltonian(onsite, bond, shape, boundary, kinetic, fields, params)
+        return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale)
+
+    @classmethod
+    def _of_pieces(
+        cls, local: LocalHamiltonian, damping: float | ArrayLike | None, name: str, *scene: Any
+    ) -> HamiltonianSystem:
+        """A system by a definition of one piece."""
+        self = cls.__new__(cls)
+        Hamiltonian.__init__(self, name, local, local.inverse_mass, local.quadratic_kinetic)
+        self._set_friction(damping)
+        self._set_scene(local.params, *scene)
+        return self
+
     def _set_friction(self, damping: float | ArrayLike | None) -> None:
         G = matrices.damping(damping, self.ndof)
         self.friction = None if G is None else Friction(G)
@@ -236,7 +313,7 @@ class HamiltonianSystem(Hamiltonian):
 
     def _set_scene(
         self,
-        params: dict[str, float],
+        params: Mapping[str, Any],
         domain: Domain | None,
         y0: ArrayLike | None,
         t_span: tuple[float, float],
@@ -456,7 +533,13 @@ def parameters_text(
     params: Mapping[str, Any], names: Mapping[str, str] = MappingProxyType({}), equals: str = "="
 ) -> str:
     """Parameters in a row, name=value, by other names where there are some; samples by their description."""
-    shown = {k: f"{v:g}" if isinstance(v, int | float) else str(v) for k, v in params.items()}
+
+    def text(value: Any) -> str:
+        if isinstance(value, np.ndarray):
+            return f"array of shape {value.shape}"
+        return f"{value:g}" if isinstance(value, int | float) else str(value)
+
+    shown = {k: text(v) for k, v in params.items()}
     return ", ".join(f"{names.get(k, k)}{equals}{v}" for k, v in shown.items())
 
 

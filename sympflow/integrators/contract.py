@@ -270,6 +270,22 @@ class Integrator:
         raise NotImplementedError(f"{type(self).__name__} must define steps().")
 
 
+class ByVectorField(Integrator):
+    """An integrator whose steps evaluate `system.vector_field` at its times, and take all that this holds."""
+
+    @property
+    def takes_friction(self) -> bool:
+        return True
+
+    @property
+    def takes_forces(self) -> bool:
+        return True
+
+    @property
+    def takes_driving(self) -> bool:
+        return True
+
+
 def in_blocks(steps: Steps) -> Steps:
     """The chunks of a stream of steps, divided so that the Jacobians of each fit into the memory."""
     for times, states, lengths in steps:

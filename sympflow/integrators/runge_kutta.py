@@ -12,28 +12,16 @@ from sympflow.arguments import as_float
 from sympflow.arrays import Array, per_state, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
-from sympflow.integrators.contract import Integrator
+from sympflow.integrators.contract import ByVectorField
 from sympflow.integrators.grid import no_event
 
 
-class ExplicitStep(Integrator):
+class ExplicitStep(ByVectorField):
     """One step of an explicit Runge–Kutta method with the tableau A, B, and its derivative."""
 
     symplectic: ClassVar[bool] = False
     A: ClassVar[Any]
     B: ClassVar[Any]
-
-    @property
-    def takes_friction(self) -> bool:
-        return True
-
-    @property
-    def takes_forces(self) -> bool:
-        return True
-
-    @property
-    def takes_driving(self) -> bool:
-        return True
 
     def step(self, system: HamiltonianSystem, t: Any, y: Array, h: float | Array) -> Array:
         """One step without error control."""

@@ -29,7 +29,7 @@ from sympflow.arrays import (
 )
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Recorder
-from sympflow.integrators.contract import ENDED, Integrator, Outcome, Problem, Steps, finished
+from sympflow.integrators.contract import ENDED, ByVectorField, Integrator, Outcome, Problem, Steps, finished
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
@@ -92,22 +92,10 @@ class TooManyStepsError(Exception):
     """Raised by `integrate` where a bound on the number of steps is met: the message says so, and the remedy."""
 
 
-class Watched(Integrator):
+class Watched(ByVectorField):
     """A method of torchdiffeq that interpolates: outputs, events and dense output are one polynomial in each step."""
 
     finds_events: ClassVar[bool] = True
-
-    @property
-    def takes_friction(self) -> bool:
-        return True
-
-    @property
-    def takes_forces(self) -> bool:
-        return True
-
-    @property
-    def takes_driving(self) -> bool:
-        return True
 
     def outputs(self, problem: Problem) -> tuple[np.ndarray, dict[str, Any]]:
         """The times to report, and what the statistics say of the steps."""

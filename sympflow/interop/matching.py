@@ -312,18 +312,6 @@ def _drawn(domain: Domain | None, width: int) -> np.ndarray:
     return np.empty((0, width)) if domain is None else domain.sample(N_WITHIN, 20260101)
 
 
-def check_not_driven(system: HamiltonianSystem, peer: str) -> None:
-    """Refuse a driven system, whose time the loops of a peer do not hand on to our steps.
-
-    Raises
-    ------
-    ValueError
-        With the remedy.
-    """
-    remedy = f"use sympflow.solve(), or {peer}'s own methods on system(t, y)"
-    system.check_autonomous(f"and {peer} does not tell our methods the time", remedy)
-
-
 def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
     """The fixed-step integrator that `method` and `options` mean.
 

@@ -12,9 +12,9 @@ from scipy.optimize import brentq
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sympflow.arrays import differentiable, readable, to_numpy, values_of_times
+from sympflow.arrays import differentiable, one_lane, readable, to_numpy, unfollowed, values_of_times
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, Problem
+from sympflow.integrators.base import FixedStep, Problem, rollout
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 
@@ -39,6 +39,8 @@ class Path:
         None for a flow that needs none.
     y0 : tensor of shape (..., 2d)
     direction : 1 or -1
+    t0 : tensor of shape ()
+        The time of y0, on which the steps of a driven system depend.
     before_step : callable, optional
         Called before each step, which are then made one by one.
     """
@@ -49,12 +51,16 @@ class Path:
         system: HamiltonianSystem | None,
         y0: Tensor,
         direction: int,
+        t0: Tensor,
         before_step: BeforeStep | None = None,
     ) -> None:
         self.integrator, self.y0, self.before_step = integrator, y0, before_step
         self.system: HamiltonianSystem = system  # type: ignore[assignment]
         self.h = math.copysign(integrator.step_length(self.system), direction)
-        self.eager = self._learns()
+        self.driven = system is not None and not system.autonomous
+        self.start = t0.to(torch.float64)
+        self.t0: Any = 0.0 if not self.driven else self.start if differentiable(t0) else float(t0)
+        self.eager = self._learns() or differentiable(self.t0)
 
     def __call__(self, s: Tensor) -> Tensor:
         """ψ_s(y0), (n, ..., 2d), for elapsed times s (n,), each 0 or with the sign of the direction.
@@ -68,7 +74,11 @@ class Path:
             return states
         if self.before_step is not None and numbers(r)[-1]:
             self.before_step(float(numbers(count)[-1]) * self.h, states[-1], float(numbers(r)[-1]))
-        return self.step(states, _each(r.to(states.dtype), states))
+        return self.step(states, _each(r.to(states.dtype), states), self.times(count, states))
+
+    def times(self, count: Tensor, states: Tensor) -> Any:
+        """The times (n, ...) of states (n, ..., 2d) after `count` (n,) steps, of a driven system."""
+        return _each(self.t0 + count.to(torch.float64) * self.h, states) if self.driven else 0.0
 
     def located(self, s: Tensor) -> tuple[Tensor, Tensor]:
         """Counts k of whole steps and remainders r (n,), in float64, with s = k·h + r; gradients flow from s to r.
@@ -76,7 +86,11 @@ class Path:
         As `Grid.locate`: a quotient within a few ulp of an integer is that integer. Under `torch.func.vmap` each lane
         has its own.
         """
-        far = float(np.abs(numbers(s)).max(initial=0.0))
+        elapsed = numbers(s)
+        far = float(np.abs(elapsed).max(initial=0.0))
+        if self.driven:
+            t0 = float(one_lane(self.start))
+            self.system.check_times(t0 + elapsed.min(initial=0.0), t0 + elapsed.max(initial=0.0))
         Grid(0.0, math.copysign(far, self.h) or self.h, abs(self.h))  # refuses too many steps
         s = s.to(torch.float64)
         x = s.detach() / self.h
@@ -86,18 +100,23 @@ class Path:
         r = s - count * self.h
         return count.to(torch.int64), torch.where(on_grid, r - r.detach(), r)
 
-    def rollout(self, save: np.ndarray, start: Tensor | None = None) -> Tensor:
-        """The states after the steps `save` (sorted counts) from y0, or `start`: compiled if torch follows nothing."""
+    def rollout(self, save: np.ndarray, start: Tensor | None = None, first: int = 0) -> Tensor:
+        """The states after the steps `save` (sorted counts): compiled if torch follows nothing.
+
+        From y0, or from `start`, the state after `first` steps.
+        """
         y: Any = self.y0 if start is None else start
         if self.before_step is not None:
             return self._one_by_one(save)
-        n_steps = int(save.max(initial=0))
+        n_steps, t0 = int(save.max(initial=0)), self.t0 + first * self.h if self.driven else 0.0
+        if isinstance(t0, Tensor):  # followed by torch, which the numbers of a run are not
+            return rollout(lambda k, z: self.step(z, self.h, t0 + k * self.h), y, n_steps, save)[0]
         plain = self._plain(y)
         if plain:
             y = to_numpy(y)
         with naming_plugin(self.integrator):
-            stepper = self.integrator.stepper(Problem(self.system, 0.0, n_steps * self.h, y))
-            states, _ = stepper.rollout(y, self.h, n_steps, save)
+            stepper = self.integrator.stepper(Problem(self.system, t0, t0 + n_steps * self.h, y))
+            states, _ = stepper.rollout(y, self.h, n_steps, save, t0)
         return torch.from_numpy(np.ascontiguousarray(states)) if plain else states
 
     def _one_by_one(self, save: np.ndarray) -> Tensor:
@@ -109,22 +128,26 @@ class Path:
                 states.append(y)
             if k < save.max(initial=0):
                 self.before_step(k * self.h, y, self.h)
-                y = self.step(y, self.h)
+                y = self.step(y, self.h, self.t0 + k * self.h if self.driven else 0.0)
         return torch.stack(states)
 
-    def step(self, y: Tensor, h: float | Tensor) -> Tensor:
-        """A step of length h, a number or one for each state: by NumPy where nothing is to be differentiated."""
-        return self._stepped(self.integrator.step, y, h)
+    def step(self, y: Tensor, h: float | Tensor, t: Any) -> Tensor:
+        """A step of length h from the time t, each a number or one for each state.
 
-    def inverse(self, y: Tensor) -> Tensor:
-        """The state from which a whole step leads to y."""
-        return self._stepped(self.integrator.inverse, y, self.h)
+        By NumPy where nothing is to be differentiated. The time is 0 where the system does not depend on it.
+        """
+        return self._stepped(self.integrator.step, y, h, t)
 
-    def _stepped(self, function: Callable[..., Any], y: Tensor, h: float | Tensor) -> Tensor:
+    def inverse(self, y: Tensor, t: Any) -> Tensor:
+        """The state from which a whole step, which begins at t, leads to y."""
+        return self._stepped(self.integrator.inverse, y, self.h, t)
+
+    def _stepped(self, function: Callable[..., Any], y: Tensor, h: float | Tensor, t: Any) -> Tensor:
         with naming_plugin(self.integrator):
-            if differentiable(h) or not self._plain(y):
-                return function(self.system, 0.0, y, h)
-            stepped = function(self.system, 0.0, to_numpy(y), to_numpy(h) if isinstance(h, Tensor) else h)
+            if differentiable(h, t) or not self._plain(y):
+                return function(self.system, t, y, h)
+            at, length = (to_numpy(x) if isinstance(x, Tensor) else x for x in (t, h))
+            stepped = function(self.system, at, to_numpy(y), length)
         return torch.from_numpy(np.ascontiguousarray(stepped))
 
     def _plain(self, y: Tensor) -> bool:
@@ -158,7 +181,7 @@ class Path:
         TypeError
             If the values of the states are hidden, by `torch.func.vmap` or `torch.compile`.
         """
-        if not readable(self.y0) or (self.eager and not readable(self.step(self.y0, self.h))):
+        if not readable(self.y0) or (self.eager and not readable(self.step(self.y0, self.h, self.t0))):
             raise TypeError(
                 "`event_fn` is followed by the values of the states, which torch.func.vmap and torch.compile hide: "
                 "call it outside of them, for one event at a time."
@@ -168,11 +191,12 @@ class Path:
         s = zero = torch.tensor(value, dtype=torch.float64, device=self.y0.device)
         count, r = self.located(zero[None])
         start, inside = self(count.to(torch.float64) * self.h)[0], float(r[0])
+        t = self.start + float(count[0]) * self.h if self.driven else 0.0
 
         def state(time: Tensor) -> Tensor:
             remainder = (time - zero + inside).to(start.dtype)
             moves = inside or differentiable(remainder)
-            return self.step(start, remainder.expand(start.shape[:-1])) if moves else start
+            return self.step(start, remainder.expand(start.shape[:-1]), t) if moves else start
 
         if not differentiable(c := g(s, state(s))):
             return s, state(s)
@@ -191,20 +215,23 @@ class Path:
         before = value(0.0, self.y0.detach())
         if before == 0:
             return 0.0
-        k, chunk, y = 0, 8, self.y0.detach()
+        k, chunk, y, t0 = 0, 8, self.y0.detach(), unfollowed(self.start)
         while k < MAX_EVENT_STEPS:
-            ahead = Path(self.integrator, self.system, y, 1 if self.h > 0 else -1)
+            ahead = Path(self.integrator, self.system, y, 1 if self.h > 0 else -1, t0 + k * self.h)
             ahead.eager = self.eager  # the map whose derivatives follow, not a compiled copy of its weights
             states = ahead.rollout(np.arange(chunk + 1))
-            inner = self._samples(states[:-1])
+            inner = ahead._samples(states[:-1])
             parts = inner.shape[1] + 1
             for j in range(chunk):
                 a = start = (k + j) * self.h
+                if self.driven:
+                    self.system.check_times(ahead.t0, ahead.t0 + j * self.h)
                 for i in range(1, parts + 1):
                     b, y_b = start + self.h * i / parts, inner[j, i - 1] if i < parts else states[j + 1]
                     after = value(b, y_b)
                     if np.sign(before) * np.sign(after) <= 0:  # the product itself may underflow
-                        return self._locate(value, start, states[j], (a, before), (b, after))
+                        t = ahead.t0 + j * self.h if self.driven else 0.0
+                        return self._locate(value, start, states[j], t, (a, before), (b, after))
                     if not math.isfinite(after):
                         raise RuntimeError(
                             f"`event_fn` found no zero: the solution became non-finite after an elapsed time of "
@@ -221,17 +248,18 @@ class Path:
         repeated = states[:, None].expand(-1, parts - 1, *states.shape[1:])
         fractions = torch.arange(1, parts, dtype=states.dtype, device=states.device) / parts
         h = (self.h * fractions).reshape(-1, *[1] * (states.ndim - 2)).expand(repeated.shape[:-1])
-        return repeated if parts == 1 else self.step(repeated, h)
+        return repeated if parts == 1 else self.step(repeated, h, self.times(torch.arange(len(states)), repeated))
 
     def _locate(
         self,
         value: Callable[[float, Tensor], float],
         start: float,
         y: Tensor,
+        t: float,
         left: tuple[float, float],
         right: tuple[float, float],
     ) -> float:
-        """The zero between two (s, g), in the step from y at `start`."""
+        """The zero between two (s, g), in the step from y at `start`, the time t."""
         (a, g_a), (b, g_b) = left, right
         known = {a: g_a, b: g_b}
         # a power of two, exact: Brent's own products shall not underflow, either
@@ -240,7 +268,7 @@ class Path:
         def f(s: float) -> float:
             if s in known:
                 return known[s] * unit
-            return value(s, self.step(y, s - start)) * unit
+            return value(s, self.step(y, s - start, t)) * unit
 
         return b if g_b == 0 else float(brentq(f, a, b, xtol=_EPS, rtol=_EPS))
 
@@ -259,20 +287,20 @@ class DensePath(Path):
     def __init__(
         self, integrator: FixedStep, system: HamiltonianSystem | None, y0: Tensor, direction: int, times: Tensor
     ) -> None:
-        super().__init__(integrator, system, y0, direction)
+        super().__init__(integrator, system, y0, direction, times[0])
         count, _ = self.located(times[1:] - times[0])
-        self.times = numbers(times)
+        self.span = numbers(times)
         self.states = super().rollout(np.arange(int(numbers(count).max()) + 1))
 
     def __call__(self, s: Tensor) -> Tensor:
-        found, length, slack = numbers(s), self.times[1] - self.times[0], _EPS * np.abs(self.times).max()
+        found, length, slack = numbers(s), self.span[1] - self.span[0], _EPS * np.abs(self.span).max()
         if found.size and not (found.min() >= min(0.0, length) - slack and found.max() <= max(0.0, length) + slack):
             raise ValueError(
-                f"`t` must lie between {self.times[0]:g} and {self.times[1]:g}, the interval that was solved."
+                f"`t` must lie between {self.span[0]:g} and {self.span[1]:g}, the interval that was solved."
             )
         return super().__call__(s)
 
-    def rollout(self, save: np.ndarray, start: Tensor | None = None) -> Tensor:
+    def rollout(self, save: np.ndarray, start: Tensor | None = None, first: int = 0) -> Tensor:
         return self.states[torch.as_tensor(save, device=self.states.device)]
 
 
@@ -296,11 +324,12 @@ class AdjointPath(Path):
     def __init__(self, *arguments: Any, parameters: Sequence[Tensor] = (), **more: Any) -> None:
         super().__init__(*arguments, **more)
         self.eager = False  # nothing is differentiated in the forward run
+        self.t0 = float(self.start.detach()) if self.driven else 0.0
         known = {id(w): w for w in (*self.weights(), *parameters) if w.requires_grad}
         self.parameters = tuple(known.values())
 
     def __call__(self, s: Tensor) -> Tensor:
-        return _PulledBack.apply(self, s, self.y0, *self.parameters)
+        return _PulledBack.apply(self, s, self.start if self.driven else None, self.y0, *self.parameters)
 
     def backwards(self, grid: Tensor, saved: np.ndarray) -> Iterator[tuple[int, Tensor]]:
         """The states after k steps, k from the last of `saved` to 0, where those after the steps `saved` are known."""
@@ -310,7 +339,7 @@ class AdjointPath(Path):
             try:
                 y = grid[i]
                 for k in range(last - 1, first, -1):
-                    y = self.inverse(y)
+                    y = self.inverse(y, self.t0 + k * self.h if self.driven else 0.0)
                     yield k, y
             except TypeError:  # there is none
                 yield from self._run_again(grid[i - 1], first, last)
@@ -318,40 +347,49 @@ class AdjointPath(Path):
 
     def _run_again(self, y: Tensor, first: int, last: int) -> Iterator[tuple[int, Tensor]]:
         """The same for the steps between two counts, of a map without an inverse."""
-        path = Path(self.integrator, self.system, y, 1 if self.h > 0 else -1)
+        t0 = torch.tensor(self.t0 + first * self.h, dtype=torch.float64)
+        path = Path(self.integrator, self.system, y, 1 if self.h > 0 else -1, t0)
         stride = math.isqrt(last - first) + 1
         marks = np.arange(0, last - first, stride)
         for mark, start in zip(marks[::-1].tolist(), path.rollout(marks).flip(0), strict=True):
             n = min(stride, last - first - mark)
-            for j, state in zip(range(n - 1, -1, -1), path.rollout(np.arange(n), start).flip(0), strict=True):
+            for j, state in zip(range(n - 1, -1, -1), path.rollout(np.arange(n), start, mark).flip(0), strict=True):
                 if mark + j:
                     yield first + mark + j, state
 
-    def pulled(self, y: Tensor, h: float | Tensor, a: Tensor) -> tuple[Tensor, Tensor | None, list[Tensor | None]]:
-        """The cotangents of y, of h and of the parameters in a step from y, where that of its end is a."""
+    def pulled(self, y: Tensor, h: float | Tensor, t: Any, a: Tensor) -> tuple[Tensor, list[Any], list[Any]]:
+        """The cotangents of y, of h and t, and of the parameters in a step from y at t, where that of its end is a.
+
+        None for an h or t without a graph.
+        """
         with torch.enable_grad(), naming_plugin(self.integrator):
             y = y.detach().requires_grad_(True)
-            inputs = [y, h, *self.parameters] if isinstance(h, Tensor) and h.requires_grad else [y, *self.parameters]
-            end = self.integrator.step(self.system, 0.0, y, h)
+            inputs: list[Any] = [y, *self.parameters]
+            wanted = [isinstance(x, Tensor) and x.requires_grad for x in (h, t)]
+            inputs += [x for x, asked in zip((h, t), wanted, strict=True) if asked]
+            end = self.integrator.step(self.system, t, y, h)
             # what is retained is freed with `end`; the part of a graph that lies outside of the step has to stay
             found: list[Tensor | None] = list(torch.autograd.grad(end, inputs, a, allow_unused=True, retain_graph=True))
         of_y = torch.zeros_like(y) if found[0] is None else found[0]
         n = len(self.parameters)
-        return of_y, (found[1] if len(inputs) > 1 + n else None), found[len(found) - n :]
+        others = iter(found[1 + n :])
+        return of_y, [next(others) if asked else None for asked in wanted], found[1 : 1 + n]
 
 
 class _PulledBack(torch.autograd.Function):
     """The states of an `AdjointPath` at the elapsed times s."""
 
     @staticmethod
-    def forward(ctx: Any, path: AdjointPath, s: Tensor, y0: Tensor, *parameters: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, path: AdjointPath, s: Tensor, start: Tensor | None, y0: Tensor, *parameters: Tensor
+    ) -> Tensor:
         count, r = path.located(s)
         saved = np.union1d(0, numbers(count))
         grid = path.rollout(saved)
         ctx.path, ctx.saved, ctx.dtype = path, saved, s.dtype
         ctx.save_for_backward(s, grid, *parameters)
         states = grid[_places(saved, count)]
-        return path.step(states, _each(r.to(states.dtype), states)) if r.any() else states
+        return path.step(states, _each(r.to(states.dtype), states), path.times(count, states)) if r.any() else states
 
     @staticmethod
     @once_differentiable
@@ -361,6 +399,7 @@ class _PulledBack(torch.autograd.Function):
         count, r = path.located(s.detach())
         counts, remainders = numbers(count), numbers(r)
         of_s, of_parameters = torch.zeros_like(r), [torch.zeros_like(w) for w in path.parameters]
+        of_start = torch.zeros((), dtype=torch.float64, device=s.device)
         a, top = torch.zeros_like(grid[0]), int(saved[-1])
 
         def add(found: list[Tensor | None]) -> None:
@@ -369,9 +408,14 @@ class _PulledBack(torch.autograd.Function):
                     of_parameters[i] += part
 
         for k, y in path.backwards(grid, saved):
+            t: Any = 0.0
+            if path.driven:
+                t = torch.tensor(path.t0 + k * path.h, dtype=torch.float64, device=s.device)
+                t.requires_grad_(ctx.needs_input_grad[2])
             if k < top:
-                a, _, found = path.pulled(y, path.h, a)
+                a, (_, of_t), found = path.pulled(y, path.h, t, a)
                 add(found)
+                of_start = of_start if of_t is None else of_start + of_t
             for i in np.flatnonzero(counts == k).tolist():
                 if not (ctx.needs_input_grad[1] or remainders[i]):
                     a = a + cotangents[i]
@@ -379,21 +423,26 @@ class _PulledBack(torch.autograd.Function):
                 h = r[i].to(y.dtype).requires_grad_(ctx.needs_input_grad[1])
                 with torch.enable_grad():
                     lengths = h.expand(y.shape[:-1])
-                of_y, of_h, found = path.pulled(y, lengths, cotangents[i])
+                of_y, (of_lengths, of_t), found = path.pulled(y, lengths, t, cotangents[i])
                 a = a + of_y
                 add(found)
-                if of_h is not None:
-                    of_s[i] = of_h.sum()
-        return None, of_s.to(ctx.dtype) if ctx.needs_input_grad[1] else None, a, *of_parameters
+                of_start = of_start if of_t is None else of_start + of_t
+                if of_lengths is not None:
+                    of_s[i] = of_lengths.sum()
+        times = (
+            of_s.to(ctx.dtype) if ctx.needs_input_grad[1] else None,
+            of_start if ctx.needs_input_grad[2] else None,
+        )
+        return None, *times, a, *of_parameters
 
 
-def leaves(system: HamiltonianSystem, y: Tensor) -> list[Tensor]:
-    """The leaves of the graph on which the vector field at y depends, other than y: such as a network's weights."""
+def leaves(system: HamiltonianSystem, y: Tensor, t: float) -> list[Tensor]:
+    """The leaves of the graph on which the vector field at y and t depends, other than y: a network's weights."""
     y = y.detach()
     if not system.learns(y):
         return []
     found: list[Tensor] = []
-    waiting, seen = [system.vector_field(y).grad_fn], set()
+    waiting, seen = [system.vector_field(y, t).grad_fn], set()
     while waiting:
         node = waiting.pop()
         if node is None or node in seen:

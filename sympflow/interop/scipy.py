@@ -17,7 +17,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem, Stepper
 from sympflow.integrators.grid import Grid, no_event, open_end
 from sympflow.integrators.registry import check_applies, naming_plugin
-from sympflow.interop.matching import Comparison, check_not_driven, fixed_step
+from sympflow.interop.matching import Comparison, fixed_step
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
@@ -64,7 +64,6 @@ def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: An
         )
     integrator = fixed_step(method, options, "SciPy")
     if system is not None:
-        check_not_driven(system, "SciPy")
         check_applies(integrator, system)
     return _solver_class(integrator, system)
 
@@ -139,6 +138,8 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
         self._check(fun)
         system = self._solved
         dt = self.integrator.step_length(system)
+        if self._driven and math.isfinite(t_bound):
+            system.check_times(t0, t_bound)
         self._grid = Grid(t0, open_end(t0, t_bound, dt), dt)
         self._stepper = self._counts.stepper = self.integrator.stepper(Problem(system, t0, self._grid.t1, self.y))
         self._parts = max(1, math.ceil(abs(self._grid.h) / max_step * (1 - 1e-12)))
@@ -165,8 +166,8 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
             raise ValueError(f"`y0` must have length {size}, [q, p]; got {self.n}.")
         if not np.isfinite(self.y).all():
             raise ValueError("`y0` must be finite; it holds NaN or infinity.")
+        self._driven = self._solved is not None and not self._solved.autonomous
         if self._solved is not None and self._solved is not self.system:
-            check_not_driven(self._solved, "SciPy")
             check_applies(integrator, self._solved)
         self.y = self.y.astype(float)
         self._comparison = Comparison("fun", integrator, self._solved, REMEDY)
@@ -222,6 +223,11 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
             whole = self._k < grid.n_steps
             self._h = grid.h if whole else grid.remainder
             self._end = grid.time(self._k + 1) if whole else grid.t1
+            if self._driven and math.isinf(self.t_bound):
+                try:
+                    self._solved.check_times(self._t_anchor, self._end)
+                except ValueError as error:
+                    return False, str(error)
             y_end = self._whole_step() if whole else self._shorter(self._h)
             if not np.isfinite(y_end).all():
                 return False, (
@@ -254,7 +260,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
 
     def _shorter(self, h: float) -> np.ndarray:
         with naming_plugin(self.integrator), np.errstate(all="ignore"):
-            y = self._stepper.shorter(self._anchor, h)
+            y = self._stepper.shorter_from(self._t_anchor, self._anchor, h)
         self._counts.shorter += 1
         return y
 
@@ -306,6 +312,6 @@ class FlowOutput(DenseOutput):
         states[times == self.t] = self._y
         if moving.any():
             with naming_plugin(self._integrator), np.errstate(all="ignore"):
-                states[moving] = self._stepper.shorter(states[moving], h[moving])
+                states[moving] = self._stepper.shorter_from(self._t_anchor, states[moving], h[moving])
             self._counts.shorter += int(np.count_nonzero(moving))
         return states.T if t.ndim else states[0]

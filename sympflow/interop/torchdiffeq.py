@@ -25,7 +25,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import available, check_applies
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED
-from sympflow.interop.matching import Comparison, check_not_driven, fixed_step
+from sympflow.interop.matching import Comparison, fixed_step
 from sympflow.interop.path import AdjointPath, BeforeStep, DensePath, Path, leaves, numbers
 
 State = Tensor | tuple[Tensor, ...]
@@ -117,11 +117,12 @@ def _integrated(
     _check_state(y, system, integrator)
     compared = _Compared(func, y0, t, integrator, system)
     if event_fn is None:
-        path = make_path(integrator, system, y, direction, before_step=_announced(func, y, t, pack, integrator))
+        announced = _announced(func, y, t, pack, integrator)
+        path = make_path(integrator, system, y, direction, t[0], before_step=announced)
         return pack(compared.run(path, t))
     if len(t) != 2:
         raise ValueError(f"`t` must have 2 entries with `event_fn`, the start and a direction; got {len(t)}.")
-    found, states = _until_event(make_path(integrator, system, y, direction), t[0], event_fn, pack)
+    found, states = _until_event(make_path(integrator, system, y, direction, t[0]), t[0], event_fn, pack)
     compared.along(found[None], states[1:])
     return found, pack(states)
 
@@ -275,10 +276,11 @@ def odeint_adjoint(
         given = tuple(func.parameters())
 
     def make_path(integrator: FixedStep, system: HamiltonianSystem | None, y: Tensor, *more: Any, **named: Any) -> Path:
-        own = [] if adjoint_params is not None or system is None else leaves(system, y)
+        start = float(one_lane(t)[0])
+        own = [] if adjoint_params is not None or system is None else leaves(system, y, start)
         parameters = (*(given or ()), *own)
         flow = integrator.flow_for(system)  # type: ignore[arg-type]
-        field = [system.vector_field(unfollowed(y))] if system is not None and system.learns(y) else []
+        field = [system.vector_field(unfollowed(y), start)] if system is not None and system.learns(y) else []
         if transformed(y, t, *field, *parameters, *(() if flow is None else flow.parameters())):
             raise TypeError(
                 "`odeint_adjoint` is for reverse mode, backward() and torch.autograd.grad: in forward mode, and inside "
@@ -376,7 +378,6 @@ def _build(func: Any, method: Any, options: dict[str, Any] | None) -> tuple[Fixe
             "or options={'system': system}; sympflow.interop.systems converts a module."
         )
     if system is not None:
-        check_not_driven(system, "torchdiffeq")
         check_applies(integrator, system)
     return integrator, system
 
@@ -562,7 +563,7 @@ class _Solver:
         self.integrator, self.system = integrator, system
         y, _ = _joined(self._given(y0))
         _check_state(y, system, integrator)
-        self.path = Path(integrator, system, y, self.direction)
+        self.joined = y
         self.announced = None if getattr(func, "callback_step", None) is None else announced
 
     @classmethod
@@ -570,22 +571,28 @@ class _Solver:
         return {"callback_step"}
 
     def integrate(self, t: Tensor) -> Tensor:
+        path = self._path(t[0])
         if self.announced is not None:
             start, callback = t[0].detach(), self.announced.callback_step
 
             def before_step(s: float, y: Tensor, h: float) -> None:
                 callback(start + abs(s), self._flat(y[None])[0], torch.tensor(abs(h)).to(start))
 
-            self.path.before_step = before_step
-        return self._flat(self._compared(t).run(self.path, self.direction * t))
+            path.before_step = before_step
+        return self._flat(self._compared(t).run(path, self.direction * t))
 
     def integrate_until_event(self, t0: Tensor, event_fn: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
         def g(s: Tensor, y: Tensor) -> Tensor:
             return event_fn((t0 + self.direction * s).to(t0), self._flat(y[None])[0])
 
         self._compared(torch.stack([t0, t0 + self.direction]))
-        s, y = self.path.first_zero(g)
-        return t0 + self.direction * s, self._flat(torch.stack([self.path.y0, y]))
+        path = self._path(t0)
+        s, y = path.first_zero(g)
+        return t0 + self.direction * s, self._flat(torch.stack([path.y0, y]))
+
+    def _path(self, t0: Tensor) -> Path:
+        """The path from a time of torchdiffeq's, which increases."""
+        return Path(self.integrator, self.system, self.joined, self.direction, self.direction * t0)
 
     def _compared(self, t: Tensor) -> _Compared:
         return _Compared(self.func, self._given(self.y0), self.direction * t, self.integrator, self.system)

@@ -28,7 +28,7 @@ from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.registry import check_applies, naming_plugin
-from sympflow.interop.matching import Comparison, check_not_driven, fixed_step
+from sympflow.interop.matching import Comparison, fixed_step
 
 _REMEDY = "Register the system of the term: register(name, system), and solve_ivp(system, ...)."
 
@@ -65,7 +65,6 @@ def step_method(method: Any, system: HamiltonianSystem, **options: Any) -> Sympl
     if "dt" in options:
         raise TypeError("`dt` is not an option here: the step length is torchode's `dt0`, one for each sample.")
     integrator = fixed_step(method, options, "torchode")
-    check_not_driven(system, "torchode")
     check_applies(integrator, system)
     return SymplecticStep(integrator, system)
 
@@ -127,6 +126,9 @@ class SymplecticStep(SingleStepMethod):
             raise ValueError(
                 f"`y0` must have shape (batch, {2 * self.system.ndof}), [q, p]; got {problem.n_features} features."
             )
+        if not self.system.autonomous:
+            times = to_numpy(torch.stack([problem.t_start, problem.t_end]).detach())
+            self.system.check_times(times.min(), times.max())
         return Run(term, problem, self, stats, args)
 
     def step(
@@ -154,11 +156,12 @@ class SymplecticStep(SingleStepMethod):
                 "Drive it with torchode.FixedStepController and a smaller dt0."
             )
         state.compare(t0, y0, last=bool((left.abs() <= dt.detach().abs() * (1 + 1e-12)).all()))
-        return StepResult(self._advance(y0, dt), None), Beginning(t0, y0), state, None
+        return StepResult(self._advance(t0, y0, dt), None), Beginning(t0, y0), state, None
 
-    def _advance(self, y: Tensor, h: Tensor) -> Tensor:
+    def _advance(self, t: Tensor, y: Tensor, h: Tensor) -> Tensor:
+        at: Any = 0.0 if self.system.autonomous else t
         with naming_plugin(self.integrator):
-            return self.integrator.step(self.system, 0.0, y, h.to(y.dtype))
+            return self.integrator.step(self.system, at, y, h.to(y.dtype))
 
     def merge_states(self, accept: Tensor, current: Run, previous: Run) -> Run:
         return current
@@ -177,4 +180,5 @@ class Within:
         self.method, self.data = method, data
 
     def evaluate(self, t: Tensor, idx: Tensor) -> Tensor:
-        return self.method._advance(self.data.y0[idx], t - self.data.t0[idx])
+        t0 = self.data.t0[idx]
+        return self.method._advance(t0, self.data.y0[idx], t - t0)

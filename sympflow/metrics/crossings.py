@@ -1,8 +1,11 @@
-"""Crossings of a plane: in steps on a grid those of all trajectories at once, else by events of each."""
+"""Crossings of a plane: in steps on a grid those of all trajectories at once, else by events of each.
+
+Also the states after whole periods, the crossings of a driven system with the planes t = t0 + k·T.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -50,6 +53,47 @@ def crossings(
         with naming_plugin(integrator):
             return _Search(integrator, system, plane, sample).run(t_span, rows)
     return _by_events(integrator, system, t_span, rows, plane, sample)
+
+
+def stroboscopic(
+    integrator: Integrator, system: HamiltonianSystem, t_span: tuple[float, float], rows: np.ndarray, period: float
+) -> Crossings:
+    """The states (n, 2d) at t0 + k·T of the trajectories from `rows` (N, 2d), those at t0 among them.
+
+    Fixed steps are shortened to T/m with a whole m, so that all these times are ends of steps; trained flows, which are
+    other maps at other steps, and methods that choose theirs are asked for them as outputs.
+    """
+    t0, t1 = t_span
+    n = whole_periods(t_span, period)
+    turn = float(np.copysign(period, t1 - t0))
+    single = len(rows) == 1
+    y0 = rows[0] if single else rows
+    if isinstance(integrator, FixedStep) and integrator.on_grid and not integrator.trained:
+        dt = dividing_step(period, integrator.step_length(system))
+        fitted = replace(integrator, dt=dt)
+        every = round(period / dt)
+        sol = solve(system, fitted, (t0, t0 + n * turn), y0, save_every=every, on_domain_exit="ignore")
+    else:
+        times = t0 + turn * np.arange(n + 1)
+        sol = solve(system, integrator, (t0, times[-1]), y0, t_eval=times, on_domain_exit="ignore")
+    states = np.moveaxis(sol.y, -1, -2).reshape(len(rows), len(sol.t), -1)
+    trajectory, k = np.nonzero(np.isfinite(states).all(-1))
+    whole = np.rint((sol.t - t0) / turn)
+    at_period = np.abs(sol.t - t0 - whole * turn) <= 1e-9 * period  # a run that fails ends where it can
+    kept = at_period[k]
+    trajectory, k = trajectory[kept], k[kept]
+    status = np.broadcast_to(np.asarray(sol.status), len(rows))
+    return Crossings(trajectory, sol.t[k], states[trajectory, k], status, sol.message)
+
+
+def whole_periods(t_span: tuple[float, float], period: float) -> int:
+    """How many periods an interval holds; one of them short by no more than rounding is whole."""
+    return int(np.floor(abs(t_span[1] - t_span[0]) / period * (1 + 1e-12)))
+
+
+def dividing_step(period: float, longest: float) -> float:
+    """T/m, with the least whole number m for which it is no longer than a step, but for rounding."""
+    return period / max(1, int(np.ceil(period / longest * (1 - 1e-12))))
 
 
 def _by_events(
@@ -119,7 +163,7 @@ class _Search:
             piece = Problem(self.system, float(t[0]), float(t[-1]) + step, y[0])
             stepper = self.integrator.stepper(piece)
             states, _ = stepper.rollout(y[0], step, n, np.arange(n + 1), float(t[0]))
-            end = states[-1] if step == grid.h else stepper.shorter(y[0], step)
+            end = states[-1] if step == grid.h else stepper.shorter_from(float(t[0]), y[0], step)
         return np.asarray(end)
 
     def search(self, t: np.ndarray, y: np.ndarray, h: np.ndarray, y_end: np.ndarray) -> None:
@@ -133,7 +177,7 @@ class _Search:
         for part in range(parts):
             with np.errstate(all="ignore"):
                 # the end of a step must be the beginning of the next to the last bit, or a zero there is lost
-                y_part = y_end if part == parts - 1 else self._step(y, h * ((part + 1) / parts))
+                y_part = y_end if part == parts - 1 else self._step(t, y, h * ((part + 1) / parts))
                 after = self.plane.height(y_part)
                 up, down = ((before < 0) | starts) & (after >= 0), ((before > 0) | starts) & (after <= 0)
             starts = np.zeros_like(starts)
@@ -150,12 +194,12 @@ class _Search:
         low, high = np.full(len(y), a), np.where(sign == 0, a, b)
         for _ in range(54):
             middle = (low + high) / 2
-            g = self.plane.height(self._step(y, h * middle))
+            g = self.plane.height(self._step(t, y, h * middle))
             low, high = np.where(g * sign > 0, middle, low), np.where(g * sign > 0, high, middle)
-        self.found.append((np.nonzero(crossed)[1], t + h * high, self._step(y, h * high)))
+        self.found.append((np.nonzero(crossed)[1], t + h * high, self._step(t, y, h * high)))
 
-    def _step(self, y: np.ndarray, h: np.ndarray) -> np.ndarray:
-        return self.integrator.step(self.system, 0.0, y, h)
+    def _step(self, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:
+        return self.integrator.step(self.system, 0.0 if self.system.autonomous else t, y, h)  # type: ignore[arg-type]
 
     def _located(self, width: int, direction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The crossings that were found, by trajectory and along the run."""

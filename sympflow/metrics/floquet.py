@@ -23,6 +23,7 @@ from sympflow.arguments import real_number
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build, check_applies
+from sympflow.metrics.crossings import dividing_step
 from sympflow.solver import check_y0, solve
 
 GROWS = 1e-5
@@ -127,7 +128,7 @@ def floquet_multipliers(
         raise ValueError(f"`y0` must be one state, of shape ({2 * system.ndof},); got {start.shape}.")
     integrator = build(method, options)
     if "dt" in integrator.options() and integrator.step_length(system) == system.dt and "dt" not in options:
-        integrator = build(method, {**options, "dt": T / math.ceil(T / system.dt)})
+        integrator = build(method, {**options, "dt": dividing_step(T, system.dt)})
     integrator = integrator.resolved(system, start, float(T))
     check_applies(integrator, system, start)
     t_span = (float(t0), float(t0 + T))

@@ -1,10 +1,10 @@
-"""poincare_section(): where trajectories cross a plane of phase space, located on the method's own map."""
+"""poincare_section(): where trajectories cross a plane of phase space, or where they are after each period."""
 
 from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass, field, make_dataclass
+from dataclasses import dataclass, field, make_dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator
 from sympflow.integrators.registry import name_of
-from sympflow.metrics.crossings import Plane, crossings
-from sympflow.metrics.orbits import checked_orbits
+from sympflow.metrics.crossings import Crossings, Plane, crossings, stroboscopic, whole_periods
+from sympflow.metrics.orbits import Orbits, checked_orbits
 from sympflow.studies.figure_style import saved
 from sympflow.studies.reports import Column, Report, described, text_table, title
 
@@ -30,16 +30,20 @@ def poincare_section(
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
-    coordinate: int | str = 0,
-    level: float = 0.0,
-    direction: int = 1,
+    coordinate: int | str | None = None,
+    level: float | None = None,
+    direction: int | None = None,
     sample: float | None = None,
+    period: float | None = None,
     **options: Any,
 ) -> PoincareSection:
-    """The states in which trajectories cross the plane y[coordinate] = level.
+    """The states in which trajectories cross the plane y[coordinate] = level, or those after each period.
 
     Each crossing is located to rounding on the dense output of the method, as an event is: of fixed steps that is a
     shorter step. The run streams: only the crossings are stored.
+
+    Of a driven system the section is *stroboscopic*: the states at t0, t0 + T, t0 + 2T …, which are ends of steps; the
+    map from each to the next is that of a system of d degrees of freedom, area-preserving for d = 1 without friction.
 
     Parameters
     ----------
@@ -49,15 +53,21 @@ def poincare_section(
         The default is the system's.
     y0 : array_like of shape (..., 2d), optional
         One state, or a batch of them. With fixed steps the trajectories advance together. The default is the system's.
-    coordinate : int or str
-        Index into [q, p], or a name such as "q1" or "p2".
-    level : float
-    direction : 1, -1 or 0
-        Only crossings upwards, only downwards, or both, along the run as for events: in a run backward in time the
-        coordinate decreases with t where it is crossed upwards. A start on the plane counts, as it does for events.
+    coordinate : int or str, optional
+        Index into [q, p], or a name such as "q1" or "p2"; by default the first. Naming one for a driven system asks for
+        its crossings of a plane, at whatever times.
+    level : float, optional
+        By default 0.
+    direction : 1, -1 or 0, optional
+        Only crossings upwards, the default, only downwards, or both, along the run as for events: in a run backward in
+        time the coordinate decreases with t where it is crossed upwards. A start on the plane counts, as it does for
+        events.
     sample : float, optional
         Longest time between two samples; two crossings within it are missed. The default is `system.dt`, or the
         method's step where that is shorter.
+    period : float, optional
+        T, for a stroboscopic section; by default that of a driven system. Not together with a plane. Fixed steps become
+        the largest up to `dt` that divides T; trained flows keep theirs.
     **options
         Options of the method.
 
@@ -79,36 +89,74 @@ def poincare_section(
     >>> section.states.shape[1]
     4
     """
+    plane = {"coordinate": coordinate, "level": level, "direction": direction, "sample": sample}
+    T = _checked_period(system, period, [name for name, value in plane.items() if value is not None])
+    if T is not None:
+        orbits = checked_orbits(system, method, t_span, y0, options, "a stroboscopic section is one of")
+        if not whole_periods(orbits.t_span, T):
+            t0, t1 = orbits.t_span
+            raise ValueError(f"`t_span` ({t0:g}, {t1:g}) is shorter than the period {T:g}: choose a later end.")
+        seen = stroboscopic(orbits.integrator, system, orbits.t_span, orbits.rows, T)
+        return _section(orbits, seen, T)
     orbits = checked_orbits(system, method, t_span, y0, options, "crossings are located on")
-    index = _check_coordinate(coordinate, system.ndof)
+    index = _check_coordinate(0 if coordinate is None else coordinate, system.ndof)
+    direction = 1 if direction is None else direction
     if direction not in (-1, 0, 1):
         raise ValueError(f"`direction` must be 1 (upwards), -1 (downwards) or 0 (both); got {direction!r}.")
+    level = 0.0 if level is None else level
     if not (_is_number(level) and math.isfinite(level)):
         raise ValueError(f"`level` must be a finite number, the value of the coordinate on the plane; got {level!r}.")
     sample = system.dt if sample is None else sample
     if not (_is_number(sample) and sample > 0):
         raise ValueError(f"`sample` must be a positive number, a time; got {sample!r}.")
-    plane = Plane(index, float(level), direction)
-    found = crossings(orbits.integrator, system, orbits.t_span, orbits.rows, plane, float(sample))
+    where = Plane(index, float(level), direction)
+    seen = crossings(orbits.integrator, system, orbits.t_span, orbits.rows, where, float(sample))
+    return _section(orbits, seen, where)
+
+
+def _checked_period(system: HamiltonianSystem, period: float | None, plane: list[str]) -> float | None:
+    """The period of a stroboscopic section; None for one by a plane, of which some arguments were given."""
+    if period is not None:
+        if plane:
+            raise ValueError(
+                f"`period` and `{plane[0]}` ask for two kinds of section, after each period and in a plane: give one."
+            )
+        if not (_is_number(period) and 0 < period < math.inf):
+            raise ValueError(f"`period` must be positive and finite; got {period!r}.")
+        return float(period)
+    if plane or not isinstance(system, HamiltonianSystem) or system.autonomous:
+        return None
+    if system.period is None:
+        raise ValueError(
+            f"`period` is needed: {system.name!r} is driven and has none of its own. Give it, or a plane by "
+            "`coordinate`."
+        )
+    return system.period
+
+
+def _section(orbits: Orbits, seen: Crossings, where: Plane | float) -> PoincareSection:
+    """The result, by the plane or by the period."""
+    plane = where if isinstance(where, Plane) else None
     return PoincareSection(
-        system,
+        orbits.system,
         orbits.integrator,
         orbits.t_span,
         orbits.rows,
-        index,
-        float(level),
-        direction,
-        found.trajectory,
-        found.t,
-        found.states,
-        status=found.status if orbits.batch else int(found.status[0]),
-        message=found.message,
+        None if plane is None else plane.coordinate,
+        None if plane is None else plane.level,
+        None if plane is None else plane.direction,
+        seen.trajectory,
+        seen.t,
+        seen.states,
+        seen.status if orbits.batch else int(seen.status[0]),
+        seen.message,
+        where if isinstance(where, float) else None,
     )
 
 
 @dataclass(frozen=True)
 class PoincareSection(Report):
-    """The crossings of a plane, those of each trajectory together and in order of time.
+    """The crossings of a plane, or the states after each period; those of each trajectory together, in order of time.
 
     Attributes
     ----------
@@ -117,7 +165,7 @@ class PoincareSection(Report):
     y0 : ndarray (N, 2d)
         The initial states.
     coordinate, level, direction
-        The plane.
+        The plane; None of a stroboscopic section.
     trajectory : ndarray (n,)
         The index of the initial state that each crossing belongs to.
     t : ndarray (n,)
@@ -127,20 +175,23 @@ class PoincareSection(Report):
         be those of a solution that is exploding already.
     message : str
         In words, with the time and the remedy.
+    period : float or None
+        T of a stroboscopic section.
     """
 
     system: HamiltonianSystem
     integrator: Integrator
     t_span: tuple[float, float]
     y0: np.ndarray = field(repr=False)
-    coordinate: int
-    level: float
-    direction: int
+    coordinate: int | None
+    level: float | None
+    direction: int | None
     trajectory: np.ndarray = field(repr=False)
     t: np.ndarray = field(repr=False)
     states: np.ndarray = field(repr=False)
     status: int | np.ndarray
     message: str
+    period: float | None = None
 
     @property
     def success(self) -> bool:
@@ -149,6 +200,13 @@ class PoincareSection(Report):
 
     def __len__(self) -> int:
         return len(self.t)
+
+    def since(self, t: float) -> PoincareSection:
+        """Return the section from a time on, along the run: without what passes before a damped system settles."""
+        if not (_is_number(t) and math.isfinite(t)):
+            raise ValueError(f"`t` must be a finite number, a time; got {t!r}.")
+        kept = self.t >= t if self.t_span[1] >= self.t_span[0] else self.t <= t
+        return replace(self, trajectory=self.trajectory[kept], t=self.t[kept], states=self.states[kept])
 
     @cached_property
     def rows(self) -> tuple[Any, ...]:
@@ -194,20 +252,24 @@ class PoincareSection(Report):
             "method": name_of(self.integrator),
             "t_span": list(self.t_span),
             "y0": self.y0.tolist(),
-            "coordinate": names(self.system.ndof)[self.coordinate],
+            "coordinate": None if self.coordinate is None else names(self.system.ndof)[self.coordinate],
             "level": self.level,
             "direction": self.direction,
+            "period": self.period,
             "status": np.asarray(self.status).tolist(),
             "message": self.message,
         }
 
-    def figure(self, x: int | str | None = None, y: int | str | None = None) -> Figure:
-        """The crossings in the plane of two coordinates, each trajectory in a shade of its own.
+    def figure(self, x: int | str | None = None, y: int | str | None = None, turn: float | None = None) -> Figure:
+        """The states in the plane of two coordinates, each trajectory in a shade of its own.
 
         Parameters
         ----------
         x, y : int or str, optional
-            The coordinates; the default is the first other position, or p if there is none, and its momentum.
+            The coordinates; the default is the first position, other than that of the plane, or p if there is none, and
+            its momentum.
+        turn : float, optional
+            Length of a turn in x, 2π where it is an angle: it is drawn from −turn/2 to turn/2.
 
         Raises
         ------
@@ -220,18 +282,33 @@ class PoincareSection(Report):
         position = next((j for j in range(d) if j != self.coordinate), d)
         i = position if x is None else _check_coordinate(x, d)
         j = (position + d if position < d else 0) if y is None else _check_coordinate(y, d)
-        way = {1: f", {label[self.coordinate]} increasing", -1: f", {label[self.coordinate]} decreasing", 0: ""}
-        in_time = self.direction if self.t_span[1] >= self.t_span[0] else -self.direction
-        plane = f"{label[self.coordinate]} = {self.level:g}{way[in_time]}"
-        heading = f"{title(self.system)}, {name_of(self.integrator)}: {plane}"
         points = self.states[:, [i, j]]
+        if turn is not None:
+            if not (_is_number(turn) and 0 < turn < math.inf):
+                raise ValueError(f"`turn` must be positive and finite, such as 2*pi; got {turn!r}.")
+            points[:, 0] -= turn * np.rint(points[:, 0] / turn)
+        heading = f"{title(self.system)}, {name_of(self.integrator)}: {self._seen}"
         return section_figure(points, self.trajectory, len(self.y0), (label[i], label[j]), heading)
 
+    @property
+    def _seen(self) -> str:
+        """The plane, or the times, in words."""
+        if self.coordinate is None or self.direction is None:
+            return f"after each period T = {self.period:g}"
+        name = names(self.system.ndof)[self.coordinate]
+        way = {1: f", {name} increasing", -1: f", {name} decreasing", 0: ""}
+        in_time = self.direction if self.t_span[1] >= self.t_span[0] else -self.direction
+        return f"{name} = {self.level:g}{way[in_time]}"
+
     def plot(
-        self, x: int | str | None = None, y: int | str | None = None, path: str | os.PathLike[str] | None = None
+        self,
+        x: int | str | None = None,
+        y: int | str | None = None,
+        path: str | os.PathLike[str] | None = None,
+        turn: float | None = None,
     ) -> Figure:
         """The figure, as `figure`; with a path it is also saved."""
-        return saved(self.figure(x, y), path)
+        return saved(self.figure(x, y, turn), path)
 
 
 def names(ndof: int) -> list[str]:

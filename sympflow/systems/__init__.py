@@ -18,6 +18,7 @@ from sympflow.systems.celestial import (
     three_body,
 )
 from sympflow.systems.chains import fput, lax_eigenvalues, lennard_jones, oscillatory_energies, toda_lattice
+from sympflow.systems.driven import driven_pendulum, duffing, fodo_cell, fodo_matrices, kicked, paul_trap
 from sympflow.systems.textbook import (
     charged_particle,
     damped_oscillator,
@@ -64,6 +65,11 @@ SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {
     "damped-oscillator": damped_oscillator,
     "damped-pendulum": damped_pendulum,
     "decaying-orbit": decaying_orbit,
+    "driven-pendulum": driven_pendulum,
+    "paul-trap": paul_trap,
+    "duffing": duffing,
+    "fodo-cell": fodo_cell,
+    "kicked": kicked,
 }
 """The built-in scenes by the name that the command line uses."""
 
@@ -172,5 +178,6 @@ def _key(name: str) -> str:
 
 
 __all__ = ["SYSTEMS", "available", "from_toml", "get", "register"]
-__all__ += ["kepler_ellipse", "lax_eigenvalues", "magnetic_moment", "oscillatory_energies", "perihelion_angle"]
+__all__ += ["fodo_matrices", "kepler_ellipse", "lax_eigenvalues", "magnetic_moment", "oscillatory_energies"]
+__all__ += ["perihelion_angle"]
 __all__ += [factory.__name__ for factory in SYSTEMS.values()]

@@ -182,6 +182,10 @@ def test_a_blow_up_prints_no_warnings_of_numpy(tmp_path):
         (["bench", "own.toml"], "`system` 'own.toml': there is no such file"),
         (["section", "pendulum", "--direction", "left"], "`--direction` must be one of up, down, both"),
         (["section", "pendulum", "--axes", "q"], "`--axes` must be two of q, p"),
+        (
+            ["section", "kicked", "--period", "2", "--level", "0"],
+            "`--period` and `--level` ask for two kinds of section",
+        ),
         (["section", "pendulum", "--coordinate", "z"], "`--coordinate` must be one of q, p"),
         (["section", "pendulum", "--orbits", "2", "--y0", "1,0"], "`--orbits` and `--y0` both choose"),
         (["section", "pendulum", "--y0", "1,0", "--y0", "1"], "`--y0` must have the same number of components"),
@@ -304,6 +308,12 @@ def test_a_section_is_printed_and_written(tmp_path):
     assert (tmp_path / "henon-heiles-section.png").stat().st_size > 1000
     assert json.loads((tmp_path / "henon-heiles-section.json").read_text())["coordinate"] == "q1"
     assert f"… {len(rows) - 3} more" in result.stdout
+    words = ("duffing", "--method", "rk4", "--dt", 0.3, "--t-end", 40, "--since", 10, "--turn", 3, "--force", 0.2)
+    result = run("section", *words, "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    with next(tmp_path.glob("duffing*.csv")).open() as file:
+        times = [float(row["t"]) for row in csv.DictReader(file)]
+    np.testing.assert_allclose(times, 2 * np.pi * np.arange(2, 7))  # after each period
     failed = run("section", "henon-heiles", "--method", "verlet", "--y0", "0,0,0,0.7", "--t-end", 20)
     assert failed.exit_code == 1
     assert "became non-finite" in failed.stdout

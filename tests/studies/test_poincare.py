@@ -158,3 +158,93 @@ def test_interop_modules_load_when_used():
     assert sympflow.interop.scipy.as_scipy
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         sympflow.interop.nothing  # noqa: B018
+
+
+# stroboscopic -------------------------------------------------------------------------------------------------------
+
+DUFFING, KICKED = systems.duffing(), systems.kicked(0.9, 1)
+
+
+@pytest.mark.parametrize(("method", "options"), [("kahan_li8", {"dt": 0.1}), ("dop853", {"rtol": 1e-9, "atol": 1e-9})])
+@pytest.mark.parametrize("n", [3, -1])
+def test_a_stroboscopic_section_has_the_states_after_whole_periods(method, options, n):
+    """All N trajectories at once, the start among them, from any t0; fixed steps end there."""
+    T, t0, sign = DUFFING.period, 0.7, np.sign(n)
+    y0 = np.array([[0.5, 0.1], [1.0, -0.2]])
+    section = poincare_section(DUFFING, method, (t0, t0 + (n + 0.4 * sign) * T), y0, **options)
+    times = t0 + sign * T * np.arange(abs(n) + 1)
+    exact = solve(DUFFING, "dop853", (t0, times[-1]), y0, t_eval=times, rtol=1e-12, atol=1e-13)
+    assert section.trajectory.tolist() == [0] * len(times) + [1] * len(times)
+    np.testing.assert_allclose(section.t, np.tile(times, 2), rtol=1e-14)
+    np.testing.assert_allclose(section.states, np.moveaxis(exact.y, -1, -2).reshape(-1, 2), atol=1e-6)
+    assert section.success
+    assert section.period == T
+    assert section.coordinate is None
+
+
+def test_the_section_of_waves_is_the_standard_map():
+    """The half-kicked one of verlet, whose default step divides the period."""
+    K, n = 0.9, 20
+    section = poincare_section(KICKED, "verlet", (0, n))
+    q, p = section.states.T
+    kick = K / 2 * np.sin(q)
+    np.testing.assert_allclose(q[1:], q[:-1] + p[:-1] + kick[:-1], atol=1e-13)
+    np.testing.assert_allclose(p[1:] - kick[1:], p[:-1] + kick[:-1], atol=1e-13)
+    late = section.since(15)
+    assert late.t.tolist() == [15, 16, 17, 18, 19, 20]
+    assert len(poincare_section(KICKED, "verlet", (0, n), dt=0.3).states) == n + 1  # steps of ¼
+
+
+def test_a_plane_in_a_driven_system_is_crossed_at_the_times_that_events_find():
+    def g(t, y):
+        return y[0]
+
+    g.direction = 1
+    section = poincare_section(DUFFING, "kahan_li8", (0.3, 60), coordinate="q", dt=0.2)
+    sol = solve(DUFFING, "kahan_li8", (0.3, 60), t_eval=[], events=g, dt=0.2)
+    assert len(section) == len(sol.t_events[0]) > 1
+    np.testing.assert_allclose(section.t, sol.t_events[0], atol=1e-12)
+    np.testing.assert_allclose(section.states, sol.y_events[0], atol=1e-12)
+
+
+def test_a_failed_stroboscopic_run_keeps_the_periods_before():
+    runaway = sympflow.HamiltonianSystem.from_sympy(
+        "p**2/2 - q**4*(1 + cos(t)/2)", time="t", period=2 * np.pi, y0=[0.1, 0.0]
+    )
+    section = poincare_section(runaway, "kahan_li8", (0, 100), dt=0.05)
+    assert not section.success
+    assert section.status == -1
+    assert 1 <= len(section) < 15
+    assert "Reduce" in section.table() or "infinite" in section.table()
+
+
+def test_the_figure_of_an_angle_is_folded_into_a_turn(tmp_path):
+    section = poincare_section(KICKED, "verlet", (0, 50), [[0.0, 3.0], [1.0, 2.5]])
+    assert np.abs(section.states[:, 0]).max() > 10
+    figure = section.plot(path=tmp_path / "section.png", turn=2 * np.pi)
+    points = figure.axes[0].collections[0].get_offsets()
+    assert np.abs(points[:, 0]).max() <= np.pi
+    assert "after each period T = 1" in figure.axes[0].get_title()
+    assert json.loads(section.to_json(tmp_path / "section.json").read_text())["period"] == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"period": 1.0, "coordinate": 0}, r"^`period` and `coordinate` ask for two kinds"),
+        ({"period": 1.0, "direction": 1}, r"^`period` and `direction` ask for two kinds"),
+        ({"period": -1.0}, r"^`period` must be positive"),
+        ({"t_span": (0, 1)}, r"^`t_span` \(0, 1\) is shorter than the period"),
+    ],
+)
+def test_bad_stroboscopic_arguments(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        poincare_section(DUFFING, "verlet", **arguments)
+
+
+def test_a_driven_system_without_a_period_needs_one():
+    system = sympflow.HamiltonianSystem.from_sympy("p**2/2 + q**2*(1 + t**2)/2", time="t", y0=[1.0, 0.0])
+    with pytest.raises(ValueError, match=r"^`period` is needed: 'custom' is driven"):
+        poincare_section(system, "verlet", (0, 1))
+    assert len(poincare_section(system, "leapfrog", (0, 1), period=0.5)) == 3
+    assert len(poincare_section(OSCILLATOR, "leapfrog", (0, 20), period=2 * np.pi)) == 4  # of any system

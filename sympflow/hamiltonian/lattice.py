@@ -1,0 +1,434 @@
+"""Lattices of any size, by the potential of one site and of one bond."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from sympflow.arguments import plain, real_number
+from sympflow.arrays import Array, is_tensor, library
+from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
+
+BOUNDARIES = "periodic", "fixed", "free"
+MOST_AXES = 3
+
+
+class LatticeHamiltonian(LocalHamiltonian):
+    """H = Σ_sites [T(p) + U(q)] + Σ_bonds V(r), see `HamiltonianSystem.lattice`.
+
+    Positions (..., d) are those of the fields one after the other, each of the lattice's shape.
+
+    Attributes
+    ----------
+    shape : tuple of int
+    boundary : tuple of str
+        For each axis.
+    fields : tuple of str
+    params : dict of str to float or ndarray of that shape
+    U, T : Expr
+        U and T of one site, in the letters `x`, `p` and `c`.
+    bonds : dict of int to Expr
+        V by the distance of the ends of a bond, in the letters `r` and `c`.
+    x, p, r, v, w : tuple of Symbol
+        Letters of the fields: at a site, momenta, differences along a bond; and two directions.
+    c : tuple of Symbol
+        Letters of the parameters in the order of `params`.
+    """
+
+    loops = "lattice"
+
+    def __init__(
+        self,
+        onsite: str | sp.Expr | None,
+        bond: str | sp.Expr | Mapping[int, str | sp.Expr] | None,
+        shape: Any,
+        boundary: Any,
+        kinetic: str | sp.Expr | None,
+        fields: Any,
+        params: Mapping[str, Any] | None,
+    ) -> None:
+        self.shape = _checked_shape(shape)
+        self.boundary = _checked_boundary(boundary, len(self.shape))
+        self.fields = _checked_fields(fields)
+        n_sites = math.prod(self.shape)
+        check_memory(float(n_sites) * len(self.fields), "`shape`")
+        self.ndof = n_sites * len(self.fields)
+        self.params = _checked_params(params, self.shape)
+        self._set_letters()
+        self._read(onsite, bond, kinetic)
+        self._check_sizes()
+        self._set_mass()
+
+    def _set_letters(self) -> None:
+        fields = self.fields
+        self.x, self.p, self.r, self.v, self.w = (letters(kind, fields) for kind in "xprvw")
+        self.c = letters("c", tuple(self.params))
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """How the positions, momenta and differences of the fields are written."""
+        if len(self.fields) == 1:
+            return {"x": self.fields, "p": ("p",), "r": ("r",)}
+        return {"x": self.fields, **{kind: tuple(f"{kind}_{f}" for f in self.fields) for kind in "pr"}}
+
+    def _read(self, onsite: Any, bond: Any, kinetic: Any) -> None:
+        names = self.names
+        if onsite is None and bond is None:
+            raise TypeError("`onsite` or `bond` must be given: the potential of one site, of one bond, or both.")
+        values = dict(zip(self.params, self.c, strict=True))
+        written = [name for row in names.values() for name in row]
+        for name in written:
+            if name in values:
+                raise ValueError(f"`params` gives a value to {name!r}, which is a coordinate: rename the parameter.")
+        if len(set(written)) < len(written):
+            raise ValueError(f"`fields` are {self.fields}, of which the names {', '.join(written)} follow: rename one.")
+
+        def expression(argument: str, given: Any, kind: str, example: str) -> sp.Expr:
+            own = dict(zip(names[kind], getattr(self, kind), strict=True))
+            return parsed(argument, given, {**own, **values}, example)
+
+        self.U = sp.S.Zero if onsite is None else expression("onsite", onsite, "x", f"{self.fields[0]}**2/2")
+        default = sp.Add(*[s**2 / 2 for s in self.p])
+        self.T = default if kinetic is None else expression("kinetic", kinetic, "p", f"{names['p'][0]}**2/2")
+        self.bonds = {
+            _checked_distance(k): expression("bond", V, "r", f"{names['r'][0]}**2/2")
+            for k, V in (bond.items() if isinstance(bond, Mapping) else [(1, bond)] if bond is not None else [])
+        }
+        for argument, f, own in (("onsite", self.U, self.x), ("kinetic", self.T, self.p)):
+            if (argument == "kinetic" or onsite is not None) and not f.free_symbols & set(own):
+                raise ValueError(f"`{argument}` must depend on {' or '.join(names[own[0].name[0]])}; got {f}.")
+        for s in self.p:
+            if s not in self.T.free_symbols:
+                raise ValueError(f"`kinetic` must depend on every momentum, {', '.join(names['p'])}; got {kinetic!r}.")
+        for V in self.bonds.values():
+            if not V.free_symbols & set(self.r):
+                raise ValueError(f"`bond` must depend on {' or '.join(names['r'])}, differences along it; got {V}.")
+        used = set().union(*(f.free_symbols for f in (self.U, self.T, *self.bonds.values())))
+        for name, s in values.items():
+            if s not in used:
+                raise ValueError(f"`params` has {name!r}, which no expression uses: remove it.")
+
+    def _check_sizes(self) -> None:
+        reach = max(self.bonds, default=0)
+        for n, boundary in zip(self.shape, self.boundary, strict=True):
+            least = {"periodic": 2 * reach + 1, "free": reach + 1, "fixed": reach}[boundary]
+            if reach and n < least:
+                raise ValueError(
+                    f"`shape` has an axis of {n} sites, and bonds over a distance of {reach} need at least {least} "
+                    f"where the boundary is {boundary!r}: each pair of sites then has one bond."
+                )
+
+    def _set_mass(self) -> None:
+        """Find out whether T = ½ pᵀM⁻¹p with a diagonal M."""
+        T = self.T
+        M = sp.hessian(T, self.p)
+        half = sp.Add(*[M[i, i] * s**2 / 2 for i, s in enumerate(self.p)])
+        self.quadratic_kinetic = (
+            not M.free_symbols & set(self.p) and M.is_diagonal() and sp.expand(T - half).equals(0) is True
+        )
+        self.inverse_mass = None
+        if not self.quadratic_kinetic or all(M[i, i] == 1 for i in range(len(self.p))):
+            return
+        values = dict(zip(self.c, self.params.values(), strict=True))
+        columns = []
+        for i in range(len(self.p)):
+            used = sorted(M[i, i].free_symbols, key=str)
+            with np.errstate(all="ignore"):
+                value = sp.lambdify(used, M[i, i], "numpy")(*(values[s] for s in used))
+            columns.append(np.broadcast_to(np.asarray(value, dtype=float), self.shape).ravel())
+        inverse_mass = np.concatenate(columns)
+        if not np.isfinite(inverse_mass).all() or not (inverse_mass != 0).all():
+            raise ValueError("`kinetic` has a mass that is 0 or infinite with the values in `params`: change them.")
+        self.inverse_mass = inverse_mass
+
+    # array functions, positions (..., d) ------------------------------------------------------------------------------
+
+    def potential(self, q: Array) -> Array:
+        x = self._on_sites(q)
+        V: Any = 0.0
+        if self.U != 0:
+            V = _total(self._site_values("onsite", [self.U], self.x, x)[0], self.shape)
+        for axis, k in self._kinds():
+            values = self._bond_values(axis, k, "", [self.bonds[k]], self.r, self._differences(x, axis, k))[0]
+            V = V + _total(self._own_bonds(values, axis, k), self.shape)
+        return V
+
+    def potential_gradient(self, q: Array) -> Array:
+        def slopes(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
+            return [sp.diff(f, s) for s in x]
+
+        return self._gathered("1", slopes, q)
+
+    def hessian_vector(self, q: Array, v: Array, *t: Array) -> Array:
+        def slopes(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
+            return [sp.diff(_along(f, x, self.v), s) for s in x]
+
+        return self._gathered("2", slopes, q, v)
+
+    def third_derivative(self, q: Array, v: Array, w: Array, *t: Array) -> Array:
+        def slopes(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
+            return [sp.diff(_along(_along(f, x, self.v), x, self.w), s) for s in x]
+
+        return self._gathered("3", slopes, q, v, w)
+
+    def kinetic(self, p: Array) -> Array:
+        return _total(self._kinetic_of_sites(p), self.shape)
+
+    def _kinetic_of_sites(self, p: Array) -> Array:
+        """T at each site: (..., d) to (..., *shape)."""
+        return self._site_values("kinetic", [self.T], self.p, self._on_sites(p))[0]
+
+    def kinetic_gradient(self, p: Array) -> Array:
+        slopes = [sp.diff(self.T, s) for s in self.p]
+        return _joined(self._site_values("kinetic 1", slopes, self.p, self._on_sites(p)), len(self.shape))
+
+    def kinetic_hessian(self, p: Array) -> Array:
+        """∇²T, dense: (..., d) to (..., d, d)."""
+        xp, n, F = library(p), math.prod(self.shape), len(self.fields)
+        S = xp.zeros((*p.shape, p.shape[-1]), dtype=p.dtype)
+        entries = [sp.diff(self.T, a, b) for a, b in product(self.p, self.p)]
+        values = self._site_values("kinetic 2", entries, self.p, self._on_sites(p))
+        sites = np.arange(n)
+        for (i, j), value in zip(product(range(F), range(F)), values, strict=True):
+            S[..., i * n + sites, j * n + sites] = value.reshape(*p.shape[:-1], n)
+        return S
+
+    def energy_density(self, y: Array, *t: Array) -> Array:
+        x, p = self._on_sites(y[..., : self.ndof]), y[..., self.ndof :]
+        density = self._kinetic_of_sites(p)
+        if self.U != 0:
+            density = density + self._site_values("onsite", [self.U], self.x, x)[0]
+        for axis, k in self._kinds():
+            V = self._bond_values(axis, k, "", [self.bonds[k]], self.r, self._differences(x, axis, k))[0]
+            n, at = self.shape[axis], axis - len(self.shape)
+            if self.boundary[axis] == "free":
+                V = _padded(V, at, k, "zeros")
+            first, second = _cut(V, at, k, k + n), _cut(V, at, 0, n)
+            density = density + (first + second) / 2
+            if self.boundary[axis] == "fixed":  # the other half of bonds to a wall
+                nothing = 0 * _cut(V, at, 0, n - k)
+                lower, upper = [_cut(V, at, 0, k), nothing], [nothing, _cut(V, at, n, n + k)]
+                density = density + (_join(lower, at) + _join(upper, at)) / 2
+        return density
+
+    # how values of bonds stand: one for each site i from −k to n − 1, that of the bond from i to i + k along an axis;
+    # of free ends those from 0 to n − k − 1
+
+    def _kinds(self) -> list[tuple[int, int]]:
+        """The axes and distances of bonds."""
+        return [(axis, k) for axis in range(len(self.shape)) for k in self.bonds]
+
+    def _gathered(self, order: str, slopes: Any, q: Array, *directions: Array) -> Array:
+        """Derivatives of V by sites (..., d), of those of one site and one bond."""
+        parts = [self._on_sites(each) for each in (q, *directions)]
+        given = (self.v, self.w)[: len(directions)]
+        out: list[Any] = [0.0] * len(self.fields)
+        if self.U != 0:
+            variables = sum(given, self.x)
+            out = self._site_values(f"onsite {order}", slopes(self.U, self.x), variables, *parts)
+        for axis, k in self._kinds():
+            variables = sum(given, self.r)
+            differences = [self._differences(x, axis, k) for x in parts]
+            values = self._bond_values(axis, k, order, slopes(self.bonds[k], self.r), variables, *differences)
+            n, at = self.shape[axis], axis - len(self.shape)
+            free = self.boundary[axis] == "free"
+            for i, value in enumerate(values):
+                slope = _padded(value, at, k, "zeros") if free else value
+                out[i] = out[i] + _cut(slope, at, 0, n) - _cut(slope, at, k, k + n)
+        return _joined(out, len(self.shape))
+
+    def _on_sites(self, q: Array) -> list[Array]:
+        """The fields (..., *shape) of positions (..., d)."""
+        fields = q.reshape(*q.shape[:-1], len(self.fields), *self.shape)
+        axis = -1 - len(self.shape)
+        return [fields.select(axis, i) if is_tensor(q) else fields.take(i, axis) for i in range(len(self.fields))]
+
+    def _differences(self, x: Sequence[Array], axis: int, k: int) -> list[Array]:
+        at = axis - len(self.shape)
+        found = []
+        for field in x:
+            around = _padded(field, at, k, self.boundary[axis])
+            n = around.shape[at]
+            found.append(_cut(around, at, k, n) - _cut(around, at, 0, n - k))
+        return found
+
+    def _own_bonds(self, values: Array, axis: int, k: int) -> Array:
+        """The values of bonds, each once."""
+        at = axis - len(self.shape)
+        return _cut(values, at, k, values.shape[at]) if self.boundary[axis] == "periodic" else values
+
+    def _site_values(
+        self, key: str, expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], *arrays: Sequence[Array]
+    ) -> list[Array]:
+        return self._of_letters(key, expressions, variables, [x for row in arrays for x in row], list(self._sites))
+
+    def _bond_values(
+        self,
+        axis: int,
+        k: int,
+        order: str,
+        expressions: Sequence[sp.Expr],
+        variables: Sequence[sp.Symbol],
+        *arrays: Sequence[Array],
+    ) -> list[Array]:
+        given = [x for row in arrays for x in row]
+        return self._of_letters(f"bond {k} {order}", expressions, variables, given, self._of_bonds(axis, k))
+
+    def _of_letters(
+        self,
+        key: str,
+        expressions: Sequence[sp.Expr],
+        variables: Sequence[sp.Symbol],
+        arrays: Sequence[Array],
+        parameters: Sequence[Any],
+    ) -> list[Array]:
+        like = arrays[0]
+        if is_tensor(like):
+            import torch
+
+            parameters = [torch.tensor(c, dtype=like.dtype, device=like.device) for c in parameters]
+        elif like.dtype != np.float64:
+            parameters = [np.asarray(c, dtype=like.dtype) for c in parameters]
+        values = self._values(key, lambda: expressions, (*variables, *self.c), *arrays, *parameters)
+        return [value + 0 * like if not getattr(value, "ndim", 0) else value for value in values]
+
+    @property
+    def _sites(self) -> tuple[Any, ...]:
+        """The values of the parameters, those of sites as arrays."""
+        return tuple(self.params.values())
+
+    def _of_bonds(self, axis: int, k: int) -> list[Any]:
+        """The same for the bonds along an axis: those at its first end, or where that is a wall at its other."""
+        return [self._of_first_ends(c, axis, k) if isinstance(c, np.ndarray) else c for c in self._sites]
+
+    def _of_first_ends(self, values: np.ndarray, axis: int, k: int) -> np.ndarray:
+        at, n, boundary = axis - len(self.shape), self.shape[axis], self.boundary[axis]
+        if boundary == "free":
+            return _cut(values, at, 0, n - k)
+        before = [_cut(values, at, n - k, n)] if boundary == "periodic" else [_cut(values, at, 0, 1)] * k
+        return _join([*before, values], at)
+
+
+def _along(f: sp.Expr, x: Sequence[sp.Symbol], v: Sequence[sp.Symbol]) -> sp.Expr:
+    """The derivative of f along v."""
+    return sp.Add(*[s * sp.diff(f, z) for z, s in zip(x, v, strict=True)])
+
+
+def _total(values: Array, shape: tuple[int, ...]) -> Array:
+    """The sum over sites or bonds."""
+    return values.sum(tuple(range(-len(shape), 0)))
+
+
+def _cut(x: Array, axis: int, first: int, last: int) -> Array:
+    """x[first:last] along an axis counted from the end."""
+    return x[(..., slice(first, last), *[slice(None)] * (-1 - axis))]
+
+
+def _join(parts: Sequence[Array], axis: int) -> Array:
+    if is_tensor(parts[0]):
+        import torch
+
+        return torch.cat(tuple(parts), dim=axis)
+    return np.concatenate(parts, axis=axis)
+
+
+def _padded(x: Array, axis: int, k: int, boundary: str) -> Array:
+    """x with k places before and behind, along an axis counted from the end; as it is where the ends are free."""
+    n = x.shape[axis]
+    if boundary == "free":
+        return x
+    if boundary == "periodic":
+        return _join([_cut(x, axis, n - k, n), x, _cut(x, axis, 0, k)], axis)
+    shape = [*x.shape]
+    shape[axis] = k
+    zeros = x.new_zeros(shape) if is_tensor(x) else np.zeros(shape, dtype=x.dtype)
+    return _join([zeros, x, zeros], axis)
+
+
+def _joined(fields: Sequence[Array], n_axes: int) -> Array:
+    """The fields (..., *shape) as positions (..., d)."""
+    if len(fields) > 1:
+        fields = library(fields[0]).broadcast_tensors(*fields) if is_tensor(fields[0]) else np.broadcast_arrays(*fields)
+    flat = [x.reshape(*x.shape[: x.ndim - n_axes], -1) for x in fields]
+    return flat[0] if len(flat) == 1 else _join(flat, -1)
+
+
+def _checked_shape(shape: Any) -> tuple[int, ...]:
+    sizes = tuple(shape) if isinstance(shape, Sequence | np.ndarray) and not isinstance(shape, str) else (shape,)
+    sizes = tuple(map(plain, sizes))
+    if not 1 <= len(sizes) <= MOST_AXES or not all(
+        isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in sizes
+    ):
+        raise ValueError(
+            f"`shape` must be one to {MOST_AXES} positive integers, the sites along each axis, such as (1024,) or "
+            f"(64, 64); got {reprlib.repr(shape)}."
+        )
+    return sizes
+
+
+def _checked_boundary(boundary: Any, n_axes: int) -> tuple[str, ...]:
+    names = (boundary,) * n_axes if isinstance(boundary, str) else boundary
+    if not isinstance(names, tuple | list) or len(names) != n_axes or not all(name in BOUNDARIES for name in names):
+        raise ValueError(
+            f"`boundary` must be one of {', '.join(map(repr, BOUNDARIES))}, or one for each of the {n_axes} axes; got "
+            f"{boundary!r}."
+        )
+    return tuple(names)
+
+
+def _checked_fields(fields: Any) -> tuple[str, ...]:
+    names = (fields,) if isinstance(fields, str) else fields
+    if (
+        not isinstance(names, tuple | list)
+        or not names
+        or not all(isinstance(name, str) and name.isidentifier() and name != "t" for name in names)
+        or len(set(names)) < len(names)
+    ):
+        raise ValueError(f"`fields` must be different names, such as ('u', 'v'); got {reprlib.repr(fields)}.")
+    return tuple(names)
+
+
+def _checked_distance(k: Any) -> int:
+    k = plain(k)
+    if not isinstance(k, int) or isinstance(k, bool) or k < 1:
+        raise ValueError(f"`bond` by distances must have the integers 1, 2, … as keys; got {k!r}.")
+    return k
+
+
+def _checked_params(params: Any, shape: tuple[int, ...]) -> dict[str, float | np.ndarray]:
+    if not isinstance(params, Mapping | None):
+        raise TypeError(
+            f"`params` must be a mapping of names to numbers or arrays; got {type(params).__name__}: pass a dict."
+        )
+    checked: dict[str, float | np.ndarray] = {}
+    for name, given in (params or {}).items():
+        if not isinstance(name, str) or not name.isidentifier():
+            raise ValueError(f"`params` must have names as keys; got {name!r}.")
+        value = plain(given)
+        if real_number(value):
+            if not math.isfinite(value):
+                raise ValueError(f"`params` has {name} = {given!r}: give a finite real number.")
+            checked[name] = value
+            continue
+        try:
+            array = np.array(value, dtype=float)
+        except (TypeError, ValueError):
+            raise TypeError(
+                f"`params` has {name} = {reprlib.repr(given)}: give a number or an array of them."
+            ) from None
+        if array.shape != shape:
+            raise ValueError(
+                f"`params` has {name} of shape {array.shape}, and that of the lattice is {shape}: give one value for "
+                "each site, or a number for all."
+            )
+        if not np.isfinite(array).all():
+            raise ValueError(f"`params` has {name} with a value that is not finite: give finite real numbers.")
+        array.setflags(write=False)
+        checked[name] = array
+    return checked

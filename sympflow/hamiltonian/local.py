@@ -1,0 +1,165 @@
+"""Hamiltonians of any size that are symbolic in one piece, a site and a bond or a pair; vectors stay arrays.
+
+A subclass states the pieces as expressions in a few letters, and adds their values up over the system by array
+operations. Nothing that it holds, but what depends on sites, is as long as the system.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from sympflow.arrays import Array, is_tensor, library
+from sympflow.hamiltonian.definition import Definition
+from sympflow.hamiltonian.expression import Unreadable, read
+from sympflow.hamiltonian.symbolic import generate, printable
+
+__all__ = ["LocalHamiltonian", "check_memory", "letters", "parsed"]
+
+MOST_DENSE = 50_000_000
+"""Entries of matrices ∇²V that are made at a time."""
+VECTORS_OF_A_RUN = 12
+"""Vectors of d numbers that a run holds: its state, the next one, copies to look for what is not finite, forces."""
+
+
+class LocalHamiltonian(Definition):
+    """H = T(p) + V(q) as a sum over sites and bonds, or over pairs, by one expression for each kind of term.
+
+    A subclass defines `potential`, `potential_gradient`, `hessian_vector`, `third_derivative` and, unless T is
+    quadratic, `kinetic` and its derivatives; all of arrays and tensors (..., d), at the cost of O(d).
+
+    Attributes
+    ----------
+    loops : str
+        Name of the compiled loops that are generated for it: see `sympflow.kernels.splitting_loops`.
+    inverse_mass : ndarray of shape (d,) or None
+        M⁻¹ of T = ½ pᵀM⁻¹p; None if it is the identity or T is not quadratic.
+    quadratic_kinetic : bool
+    params : mapping of str to float or ndarray
+    """
+
+    separable = True
+    has_third_derivative = True
+    loops: str
+    inverse_mass: np.ndarray | None
+    quadratic_kinetic: bool
+    params: Mapping[str, Any]
+
+    def potential_hessian(self, q: Array, *t: Array) -> Array:
+        """∇²V(q), dense: (..., d) to (..., d, d).
+
+        Raises
+        ------
+        ValueError
+            If that has more than 5e7 entries: `hessian_vector` needs none of them.
+        """
+        d = self.ndof
+        if np.prod(q.shape, dtype=float) * d > MOST_DENSE:
+            raise ValueError(
+                f"`system` has {d:,} degrees of freedom, of which a dense ∇²V has {float(d) * d:.3g} entries for each "
+                "state: take a method with force gradients or none, which need ∇²V·v alone, or a piece of the system."
+            )
+        xp = library(q)
+        basis = xp.eye(d, dtype=q.dtype, device=q.device) if is_tensor(q) else np.eye(d, dtype=q.dtype)
+        return self.hessian_vector(q[..., None, :], basis + 0 * q[..., None, :], *t)
+
+    def energy_density(self, y: Array, *t: Array) -> Array:
+        """H at each site or body, which add up to H: (..., 2d) to (..., n)."""
+        raise NotImplementedError(f"{type(self).__name__} must define energy_density().")
+
+    def _values(
+        self, key: str, expressions: Callable[[], Sequence[sp.Expr]], variables: Sequence[sp.Symbol], *arrays: Array
+    ) -> list[Array]:
+        """The values of expressions in some variables, by functions generated for NumPy or torch when first called."""
+        name = "torch" if any(map(is_tensor, arrays)) else "numpy"
+        function = self._functions.get((key, name))
+        if function is None:
+            code = [printable(f) for f in expressions()]
+            function = self._functions[key, name] = generate(code, variables, name)
+        try:
+            return function(*arrays)
+        except (NameError, AttributeError, TypeError) as error:
+            raise TypeError(
+                f"`{key.partition(' ')[0]}` cannot be evaluated with {name} ({error}): write it with functions that "
+                f"{name} has."
+            ) from error
+
+    @cached_property
+    def _functions(self) -> dict[tuple[str, str], Callable[..., list[Any]]]:
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the generated functions, which cannot be pickled and are generated again."""
+        return {name: value for name, value in vars(self).items() if name != "_functions"}
+
+
+def letters(kind: str, names: Sequence[str]) -> tuple[sp.Symbol, ...]:
+    """Real symbols kind_0, kind_1, … for things of these names."""
+    return tuple(sp.Symbol(f"{kind}_{i}", real=True) for i in range(len(names)))
+
+
+def parsed(argument: str, expression: str | sp.Expr, symbols: Mapping[str, sp.Symbol], example: str) -> sp.Expr:
+    """Return the expression in the symbols that its names stand for.
+
+    Parameters
+    ----------
+    argument : str
+        Name of the argument, for messages.
+    expression : str or sympy.Expr
+    symbols : mapping of str to Symbol
+        By the names that the expression may hold.
+    example : str
+        A legal one, for messages.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it cannot be read, is not real, or has other names.
+    """
+    if isinstance(expression, str):
+        try:
+            f = read(expression, set(symbols))
+        except Unreadable as error:
+            raise ValueError(
+                f"`{argument}` cannot be parsed: {expression[:200]!r} ({error}). Write it as {example!r}."
+            ) from None
+    elif isinstance(expression, sp.Expr | int | float) and not isinstance(expression, bool):
+        f = sp.sympify(expression)
+    else:
+        raise TypeError(
+            f"`{argument}` must be a string or a SymPy expression such as {example!r}; got {type(expression).__name__}."
+        )
+    unknown = sorted(s.name for s in f.free_symbols if s.name not in symbols)
+    if unknown:
+        raise ValueError(
+            f"`{argument}` holds {', '.join(unknown)}, and its names are {', '.join(symbols)}: give other ones a value "
+            "in `params`."
+        )
+    if not isinstance(f, sp.Expr) or f.has(sp.I, sp.zoo, sp.nan, sp.oo):
+        raise ValueError(f"`{argument}` must be a real, finite expression such as {example!r}; got {f}.")
+    return f.xreplace({s: symbols[s.name] for s in f.free_symbols})
+
+
+def check_memory(ndof: float, what: str) -> None:
+    """Refuse a system whose runs do not fit into the memory of the machine, before anything is allocated.
+
+    Raises
+    ------
+    ValueError
+        With the bytes that a run needs, and those that there are.
+    """
+    needed = 8.0 * VECTORS_OF_A_RUN * ndof
+    try:
+        available = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):  # Windows
+        available = 2.0**40
+    if needed > available:
+        raise ValueError(
+            f"{what} has {ndof:.3g} degrees of freedom, so that a run holds about {needed / 1e9:.3g} GB in its "
+            f"vectors, and this machine has {available / 1e9:.3g} GB: take a smaller one."
+        )

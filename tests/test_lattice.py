@@ -1,0 +1,175 @@
+"""Lattices of any size: the same H as written out by every site and bond, and its derivatives."""
+
+from __future__ import annotations
+
+import itertools
+import pickle
+import re
+
+import numpy as np
+import pytest
+import torch
+
+import sympflow as sf
+from sympflow import HamiltonianSystem
+
+RNG = np.random.default_rng(20)
+BOUNDARIES = ("periodic", "fixed", "free")
+
+
+def written_out(onsite, bonds, shape, boundary, kinetic=None, fields=("q",), params=None):
+    """The same system by `from_sympy`: its terms one by one, in the order that the docstring of `lattice` states."""
+    n, single = int(np.prod(shape)), len(fields) == 1
+    index = np.arange(n).reshape(shape)
+    boundary = (boundary,) * len(shape) if isinstance(boundary, str) else boundary
+
+    def put(expression, names):
+        return (
+            "(" + re.sub(r"[A-Za-z_]\w*", lambda word: f"({names.get(word.group(), word.group())})", expression) + ")"
+        )
+
+    def values(site):
+        return {k: repr(float(np.broadcast_to(v, shape).flat[site])) for k, v in (params or {}).items()}
+
+    def position(f, site):
+        return "0" if site is None else f"q{f * n + site + 1}"
+
+    terms = []
+    for i in range(n):
+        here = {name: position(f, i) for f, name in enumerate(fields)}
+        momenta = {"p" if single else f"p_{name}": f"p{f * n + i + 1}" for f, name in enumerate(fields)}
+        terms.append(put(kinetic or " + ".join(f"{p}**2/2" for p in momenta), {**momenta, **values(i)}))
+        if onsite:
+            terms.append(put(onsite, {**here, **values(i)}))
+    for (k, V), axis in itertools.product(bonds.items(), range(len(shape))):
+        for first in itertools.product(*(range(-k if a == axis else 0, m) for a, m in enumerate(shape))):
+            ends = []
+            for at in (first[axis], first[axis] + k):
+                inside = 0 <= at < shape[axis]
+                if boundary[axis] == "periodic":
+                    inside = first[axis] >= 0
+                place = [*first]
+                place[axis] = at % shape[axis]
+                ends.append(int(index[tuple(place)]) if inside else None)
+            if ends == [None, None] or (boundary[axis] == "free" and None in ends):
+                continue
+            wall = [*first]
+            wall[axis] = 0
+            own = values(int(index[tuple(wall)]) if ends[0] is None else ends[0])
+            r = {
+                "r" if single else f"r_{name}": f"{position(f, ends[1])} - {position(f, ends[0])}"
+                for f, name in enumerate(fields)
+            }
+            terms.append(put(V, {**r, **own}))
+    return HamiltonianSystem.from_sympy(" + ".join(terms))
+
+
+RING = {"onsite": None, "bond": "r**2/2 + r**4/4", "shape": (6,)}
+DISORDERED = {
+    "onsite": "a*q**2/2",
+    "bond": {1: "exp(r) - r", 2: "b*r**3/3"},
+    "kinetic": "p**2/(2*m)",
+    "shape": (7,),
+    "params": {"a": RNG.random(7), "b": 0.3, "m": RNG.random(7) + 0.5},
+}
+SHEET = {"onsite": "1 - cos(q)", "bond": "k*r**2/2 + r**3/3", "shape": (3, 4), "params": {"k": RNG.random((3, 4))}}
+FIELDS = {
+    "onsite": "u**2*v**2/2 + u**4/4",
+    "bond": "r_u**2/2 + r_v**2/2 + sin(r_u*r_v)",
+    "fields": ("u", "v"),
+    "shape": (3, 2, 3),
+}
+MIXED_MASSES = {
+    "onsite": "u*v",
+    "bond": "r_u**2/2 + r_v**4/4",
+    "fields": ("u", "v"),
+    "kinetic": "p_u**2/2 + p_v**4/4 + p_u*p_v",
+    "shape": (3,),
+}
+CASES = [
+    (RING, "periodic"),
+    *((DISORDERED, boundary) for boundary in BOUNDARIES),
+    (SHEET, ("fixed", "free")),
+    (FIELDS, ("periodic", "free", "fixed")),
+    (MIXED_MASSES, "free"),
+]
+
+
+@pytest.mark.parametrize(("definition", "boundary"), CASES)
+def test_a_lattice_is_the_sum_over_its_sites_and_bonds(definition, boundary):
+    lattice = HamiltonianSystem.lattice(**definition, boundary=boundary)
+    bonds = definition["bond"] if isinstance(definition["bond"], dict) else {1: definition["bond"]}
+    plain = written_out(**{k: v for k, v in definition.items() if k != "bond"}, bonds=bonds, boundary=boundary)
+    d = plain.ndof
+    assert lattice.ndof == d
+    assert lattice.quadratic_kinetic == plain.quadratic_kinetic
+    y, (v, w) = RNG.uniform(-0.8, 0.8, (2, 2 * d)), RNG.normal(size=(2, d))
+    q = y[:, :d]
+
+    def same(found, expected):  # sums of some dozen terms each
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-13 * max(1.0, abs(expected).max()))
+
+    same(lattice.hamiltonian(y), plain.hamiltonian(y))
+    same(lattice.gradient(y), plain.gradient(y))
+    same(lattice.hessian(y), plain.hessian(y))
+    same(lattice.hessian_vector(q, v), plain.hessian_vector(q, v))
+    same(lattice.energy_density(y).reshape(2, -1).sum(-1), plain.hamiltonian(y))
+    step = 1e-5
+    change = lattice.hessian_vector(q + step * w, v) - lattice.hessian_vector(q - step * w, v)
+    np.testing.assert_allclose(lattice.third_derivative(q, v, w), change / (2 * step), rtol=1e-6, atol=1e-7)
+    if plain.quadratic_kinetic:
+        same(lattice.curvature_gradient(q), plain.curvature_gradient(q))
+    y_followed = torch.tensor(y, requires_grad=True)
+    (slope,) = torch.autograd.grad(lattice.hamiltonian(y_followed).sum(), y_followed)
+    same(slope.numpy(), lattice.gradient(y))
+    again = pickle.loads(pickle.dumps(lattice))
+    np.testing.assert_array_equal(again.gradient(y), lattice.gradient(y))
+
+
+def test_a_pickle_does_not_grow_with_the_lattice():
+    few, many = (len(pickle.dumps(HamiltonianSystem.lattice(bond="r**2/2", shape=n))) for n in (8, 100_000))
+    assert many < few + 16
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"shape": (0,)}, "`shape` must be one to 3 positive integers"),
+        ({"shape": (4, 4, 4, 4)}, "`shape` must be one to 3"),
+        ({"shape": 2.5}, "`shape`"),
+        ({"shape": (2,)}, "`shape` has an axis of 2 sites"),
+        ({"shape": (10**6, 10**6)}, "`shape` has 1e.12 degrees of freedom.*GB"),
+        ({"boundary": "open"}, "`boundary` must be one of 'periodic', 'fixed', 'free'"),
+        ({"boundary": ("free", "free")}, "`boundary`.*1 axes"),
+        ({"bond": "q**2"}, "`bond` holds q"),
+        ({"bond": "k*r**2"}, "`bond` holds k"),
+        ({"bond": "1"}, "`bond` must depend on r"),
+        ({"bond": "r +* 2"}, "`bond` cannot be parsed"),
+        ({"bond": {0: "r**2"}}, "`bond` by distances"),
+        ({"bond": None}, "`onsite` or `bond`"),
+        ({"onsite": "p"}, "`onsite` holds p"),
+        ({"kinetic": "p**2/2 + q"}, "`kinetic` holds q"),
+        ({"fields": ("u", "u")}, "`fields`"),
+        ({"fields": ("u", "r_u"), "bond": "r_u**2", "kinetic": "p_u**2 + p_r_u**2"}, "`fields`"),
+        ({"params": {"k": 1.0}}, "`params` has 'k', which no expression uses"),
+        ({"params": {"k": np.ones(5)}, "onsite": "k*q**2"}, r"`params` has k of shape \(5,\)"),
+        ({"params": {"k": np.full(6, np.nan)}, "onsite": "k*q**2"}, "`params` has k with a value that is not finite"),
+        ({"params": {"r": 1.0}}, "`params` gives a value to 'r'"),
+        ({"params": {"m": 0.0}, "kinetic": "m*p**2"}, "`kinetic` has a mass"),
+        ({"y0": np.zeros(11)}, r"`y0` must have shape \(12,\)"),
+    ],
+)
+def test_bad_lattices_are_refused(changed, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        HamiltonianSystem.lattice(**{**RING, **changed})
+
+
+def test_a_dense_hessian_of_a_large_lattice_is_refused_before_it_is_made():
+    system = HamiltonianSystem.lattice(bond="r**2/2", shape=10**6)
+    with pytest.raises(ValueError, match="dense"):
+        system.potential_hessian(np.zeros(10**6))
+
+
+def test_only_lattices_have_an_energy_density():
+    with pytest.raises(ValueError, match="no energy density"):
+        sf.systems.pendulum().energy_density(np.zeros(2))
