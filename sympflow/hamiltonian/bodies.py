@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -114,7 +114,7 @@ class PairsHamiltonian(LocalHamiltonian):
         used = [bool({a, b} & V.free_symbols) for a, b in zip(first, second, strict=True)]
         for name, is_used in zip(columns, used, strict=True):
             if name != "m" and not is_used:
-                raise ValueError(f"`bodies` has {name!r}, and the potential uses neither {name}1 nor {name}2: remove it.")
+                raise ValueError(f"`bodies` has {name!r}, and V uses neither {name}1 nor {name}2: remove it.")
         exchanged = V.xreplace(dict(zip((*first, *second), (*second, *first), strict=True)))
         if sp.simplify(V - exchanged) != 0:
             raise ValueError(
@@ -176,20 +176,24 @@ class PairsHamiltonian(LocalHamiltonian):
             density = _added(_added(density, pairs.i, half), pairs.j, half)
         return density[..., 0]
 
-    def momentum(self, y: Array) -> Array:
-        """Σ p_i: (..., 2d) to (..., dim)."""
-        return self._of_bodies(y[..., self.ndof :]).sum(-2)
+    def remark(self, q: np.ndarray) -> str:
+        from scipy.spatial import cKDTree
 
-    def coincident(self, q: np.ndarray) -> tuple[int, int] | None:
-        """The first two bodies at one place, of one state q (d,); None where there are none."""
-        x = q.reshape(self.n_bodies, self.dim)
-        x = x if self.box is None else np.mod(x, self.box)
-        order = np.lexsort(x.T)
-        same = np.flatnonzero((x[order[1:]] == x[order[:-1]]).all(-1))
-        if not same.size:
-            return None
-        i, j = sorted((int(order[same[0]]), int(order[same[0] + 1])))
-        return i, j
+        x = self._in_box(q.reshape(self.n_bodies, self.dim))
+        distances, neighbours = cKDTree(x, boxsize=self.box).query(x, 2)
+        i = int(np.argmin(distances[:, 1]))
+        i, j = sorted({i, *neighbours[i].tolist()})[:2]
+        apart = distances[:, 1].min()
+        if apart > 0:
+            return f"the nearest bodies, {i} and {j}, are {apart:.3g} apart: take shorter steps, or `softening`."
+        return f"the bodies {i} and {j} are at one place, r = 0: pass `softening`, or another `y0`."
+
+    def _in_box(self, x: np.ndarray) -> np.ndarray:
+        """Places (n, dim) inside of the box."""
+        if self.box is None:
+            return x
+        x = np.mod(x, self.box)
+        return np.where(x >= self.box, 0.0, x)  # of a rounding
 
     # how pairs are met ------------------------------------------------------------------------------------------------
 
@@ -213,7 +217,7 @@ class PairsHamiltonian(LocalHamiltonian):
         return out.reshape(*out.shape[:-2], self.ndof)
 
     def _pairs(self, *arrays: Array) -> Iterator[Pairs]:
-        """The pairs that interact, in pieces that fit into memory; with a cut-off those of one state, of a batch all."""
+        """The pairs that interact, in pieces that fit into memory; with a cut-off those of any state of a batch."""
         shape = np.broadcast_shapes(*(x.shape for x in arrays))
         bodies = [self._of_bodies(x) for x in arrays]
         most = max(1, MOST_PAIRS // max(1, math.prod(shape[:-1])))
@@ -245,18 +249,13 @@ class PairsHamiltonian(LocalHamiltonian):
         from scipy.spatial import cKDTree
 
         found = []
-        for x in states:
-            finite = np.isfinite(x).all(-1)
-            x = x if finite.all() else np.where(finite[:, None], x, 0.0)
-            if self.box is not None:
-                x = np.mod(x, self.box)
-                x = np.where(x >= self.box, 0.0, x)  # of a rounding
-            found.append(cKDTree(x, boxsize=self.box).query_pairs(self.cutoff, output_type="ndarray"))
+        for x in np.where(np.isfinite(states), states, 0.0):
+            found.append(cKDTree(self._in_box(x), boxsize=self.box).query_pairs(self.cutoff, output_type="ndarray"))
         return found[0] if len(found) == 1 else np.unique(np.concatenate(found), axis=0)
 
 
 class Pairs:
-    """Pairs of bodies and the differences x of what is given at both, of several arrays; the first that of positions."""
+    """Pairs of bodies, with the differences x of several arrays, the first of positions, between their ends."""
 
     def __init__(self, local: PairsHamiltonian, i: np.ndarray, j: np.ndarray, x: list[Array]) -> None:
         self.local, self.i, self.j, self.x = local, i, j, x
@@ -272,10 +271,8 @@ class Pairs:
             value = local._values(f"potential {k}", lambda: [local.slopes[k]], variables, s, *given)[0] + 0 * s
         if local.cutoff is None:
             return value
-        inside = s < local.cutoff**2 + local.softening**2
-        if is_tensor(s):
-            return value * inside
-        return np.where(inside | np.isnan(s), value, 0.0)
+        outside = s >= local.cutoff**2 + local.softening**2
+        return value.masked_fill(outside, 0.0) if is_tensor(s) else np.where(outside, 0.0, value)
 
 
 def _added(out: Array, ends: np.ndarray, values: Array) -> Array:
@@ -300,6 +297,7 @@ def _checked_dim(dim: Any) -> int:
 
 
 def _checked_column(name: str, values: Any) -> np.ndarray:
+    check_memory(float(np.size(values)), f"`{name}`")
     try:
         array = np.array(plain(values), dtype=float)
     except (TypeError, ValueError):

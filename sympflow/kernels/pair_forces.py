@@ -7,7 +7,7 @@ on both bodies of a pair are the same number, added to one and taken from the ot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -33,7 +33,7 @@ def pair_data(local: PairsHamiltonian) -> np.ndarray:
 
 
 def pair_source(local: PairsHamiltonian, kinds: Sequence[str]) -> str:
-    """``gradient(q, data, out)``, ``hessian_vector(q, v, data, out)`` and ``bend(q, v, data, out)``, as text.
+    """``gradient(q, out, data)``, ``hessian_vector(q, v, out, data)`` and ``bend(q, v, out, data)``, as text.
 
     The code is the same for all numbers of bodies, masses and parameters.
     """
@@ -47,7 +47,8 @@ def pair_source(local: PairsHamiltonian, kinds: Sequence[str]) -> str:
         "FEW": FEW,
     }
     header = "\n".join(f"{name} = {value}" for name, value in constants.items())
-    return "\n\n\n".join([header, template("cells"), *(_functions(local, kind) for kind in kinds)])
+    cells = [] if local.cutoff is None else [template("cells")]
+    return "\n\n\n".join([header, *cells, *(_functions(local, kind) for kind in kinds)])
 
 
 def _functions(local: PairsHamiltonian, kind: str) -> str:
@@ -69,7 +70,8 @@ def _functions(local: PairsHamiltonian, kind: str) -> str:
         "# begin": [f"total_{k} = 0.0" for k in sums.axes],
         "# both lanes": [f"mine[{k} * LANES + lane] += f_{k}" for k in sums.axes]
         + [f"Fj[{k} * LANES + lane] -= f_{k}" for k in sums.axes],
-        "# both": [f"total_{k} += f_{k}" for k in sums.axes] + [f"out[{_few(k, 'j', local)}] -= f_{k}" for k in sums.axes],
+        "# both": [f"total_{k} += f_{k}" for k in sums.axes]
+        + [f"out[{_few(k, 'j', local)}] -= f_{k}" for k in sums.axes],
         "# end": [f"out[{_few(k, 'i', local)}] += total_{k}" for k in sums.axes],
     }
     return _filled(text, lines)

@@ -1,7 +1,7 @@
 """Bodies sorted into cells, so that those within the cut-off of one are in the cells around its own.
 
-Source text for `pairs`. `DIM` is the number of coordinates, `CUT` True if there is a cut-off, and `PERIODIC` if there
-is a box. Cells have three axes, one cell along those that bodies do not have.
+Source text for `pairs`. `DIM` is the number of coordinates, and `PERIODIC` True if there is a box. Cells have three
+axes, with one cell along those that bodies do not have.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -11,14 +11,12 @@ import math
 import numpy as np
 from numba import njit
 
+
 @njit(**OPTIONS)
-def sorted_cells(q, data):
-    """The bodies by their cells, the place of the first of each, and the cells along each axis; no cells if few."""
+def sorted_cells(q, data, order):
+    """Sort the bodies by their cells; the place of the first of each, and the cells along each axis; none if few."""
     n = len(q) // DIM
-    order, shape = np.arange(n), np.ones(3, dtype=np.int64)
-    nothing = np.empty(0, dtype=np.int64)
-    if not CUT:
-        return order, nothing, shape
+    shape, nothing = np.ones(3, dtype=np.int64), np.empty(0, dtype=np.int64)
     low, size = np.zeros(3), np.ones(3)
     length = math.sqrt(data[1] - data[0])
     for k in range(DIM):
@@ -30,12 +28,12 @@ def sorted_cells(q, data):
                 low[k], high = min(low[k], q[DIM * i + k]), max(high, q[DIM * i + k])
             extent = high - low[k]
         if not extent < math.inf:
-            return order, nothing, shape
+            return nothing, shape
         most = int(2.0 * n ** (1.0 / DIM)) + 1  # no more cells than pay
         shape[k] = max(1, min(most, int(min(extent / length, 1e6))))
         size[k] = extent / shape[k]
         if PERIODIC and shape[k] < 3:
-            return order, nothing, shape
+            return nothing, shape
     cells, starts = np.empty(n, dtype=np.int64), np.zeros(shape[0] * shape[1] * shape[2] + 1, dtype=np.int64)
     for i in range(n):
         cell, stride = 0, 1
@@ -44,7 +42,7 @@ def sorted_cells(q, data):
             if PERIODIC:
                 x -= data[2 + k] * math.floor(x / data[2 + k])
             if not abs(x) < math.inf:
-                return order, nothing, shape
+                return nothing, shape
             cell += stride * (min(shape[k] - 1, int(x / size[k])) if size[k] > 0.0 else 0)
             stride *= shape[k]
         cells[i] = cell
@@ -55,7 +53,7 @@ def sorted_cells(q, data):
     for i in range(n):
         order[places[cells[i]]] = i
         places[cells[i]] += 1
-    return order, starts, shape
+    return starts, shape
 
 
 @njit(**OPTIONS)
@@ -85,3 +83,13 @@ def rows_around(cell, i, starts, shape, rows):
             rows[2 * found], rows[2 * found + 1] = starts[row], starts[row + 1]
             found += 1
     return found
+
+
+@njit(**OPTIONS)
+def met_by(i, cell, starts, shape, rows, n_rows):
+    """The number of ranges that the body at place i meets, and its cell; without cells all bodies after it."""
+    if len(starts) == 0:
+        return n_rows, cell
+    while i >= starts[cell + 1]:
+        cell += 1
+    return rows_around(cell, i, starts, shape, rows), cell

@@ -3,13 +3,12 @@
 Comments alone on their lines stand for code that depends on the potential, and `KIND`, `WIDTH` and `vectors` for names.
 A block holds `LANES` bodies, as rows of coordinates and of what else a pair depends on.
 """
-# ruff: noqa: F821, F841, N816
+# ruff: noqa: B007, F821, F841
 # mypy: ignore-errors
-
-import math
 
 import numpy as np
 from numba import njit
+
 
 # ---
 @njit(**OPTIONS)
@@ -43,7 +42,7 @@ def KIND_with_row(i, first, last, X, F, mine, data):
 
 
 @njit(**OPTIONS)
-def KIND_of_few(vectors, data, out):
+def KIND_of_few(vectors, out, data):
     # numbers
     n = np.uint64(len(q) // DIM)
     for k in range(len(q)):
@@ -64,30 +63,27 @@ def KIND_of_few(vectors, data, out):
 
 
 @njit(**OPTIONS)
-def KIND(vectors, data, out):
+def KIND(vectors, out, data):
     if len(q) < FEW * DIM:
-        KIND_of_few(vectors, data, out)
+        KIND_of_few(vectors, out, data)
         return
     n = np.uint64(len(q) // DIM)
     n_blocks = (len(q) // DIM + LANES - 1) // LANES
     X, F, mine = np.zeros(n_blocks * WIDTH * LANES), np.zeros(n_blocks * DIM * LANES), np.empty(DIM * LANES)
-    order, starts, shape = sorted_cells(q, data)
+    order = np.arange(len(q) // DIM)
+    if CUT:
+        starts, shape = sorted_cells(q, data, order)
     for place in range(n):
         j = np.uint64(order[place])
         at = place // np.uint64(LANES) * np.uint64(WIDTH * LANES) + place % np.uint64(LANES)
         # packed
-    if len(starts) == 0:
-        for i in range(len(order)):
-            KIND_with_row(i, i + 1, len(order), X, F, mine, data)
-    else:
-        rows = np.empty(20, dtype=np.int64)
-        cell = 0
-        for i in range(len(order)):
-            while i >= starts[cell + 1]:
-                cell += 1
-            n_rows = rows_around(cell, i, starts, shape, rows)
-            for k in range(n_rows):
-                KIND_with_row(i, rows[2 * k], rows[2 * k + 1], X, F, mine, data)
+    rows, n_rows, cell = np.empty(20, dtype=np.int64), 1, 0
+    for i in range(len(order)):
+        rows[0], rows[1] = i + 1, len(order)
+        if CUT:
+            n_rows, cell = met_by(i, cell, starts, shape, rows, n_rows)
+        for k in range(n_rows):
+            KIND_with_row(i, rows[2 * k], rows[2 * k + 1], X, F, mine, data)
     for place in range(n):
         j = np.uint64(order[place])
         at = place // np.uint64(LANES) * np.uint64(DIM * LANES) + place % np.uint64(LANES)
