@@ -21,6 +21,7 @@ _HOME = {
     "solve": "solver",
     "ensemble": "ensembles.sweep",
     "Solution": "solution",
+    "Interrupted": "integrators.contract",
     "get": "integrators.registry",
     "available": "integrators.registry",
     "register": "integrators.registry",
@@ -73,6 +74,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.doubling import doubled as doubled
     from sympflow.hamiltonian.system import HamiltonianSystem as HamiltonianSystem
     from sympflow.hamiltonian.time_transformation import time_transformed as time_transformed
+    from sympflow.integrators.contract import Interrupted as Interrupted
     from sympflow.integrators.registry import available as available
     from sympflow.integrators.registry import get as get
     from sympflow.integrators.registry import register as register

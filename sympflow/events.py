@@ -130,6 +130,13 @@ class EventSearch:
         """Return a search for the same events that has found none."""
         return EventSearch(self.events, self.max_interval)
 
+    def forget_after(self, t: float, h: float) -> None:
+        """Leave out what was found later in the run than at t, in steps of length h that were not searched."""
+        self.end = None
+        for zeros in self.found:
+            while zeros and (zeros[-1][0] - t) * h > 0:
+                zeros.pop()
+
     def parts(self, h: float, default: float = math.inf) -> int:
         """The number of equal parts at whose ends a step of length h is sampled; `default` is the interval if unset."""
         return max(1, math.ceil(abs(h) / (self.max_interval or default) * (1 - 4 * _EPS)))

@@ -24,9 +24,10 @@ from sympflow.arrays import Array, finite_states, is_tensor, lanes, readable
 from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import report_lanes, run_and_search
-from sympflow.integrators.contract import Failure, Integrator, Outcome, Problem
+from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
 from sympflow.integrators.domain_exit import check_domain, check_system_along
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
+from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, naming_plugin
 from sympflow.solution import Solution, joined
 
@@ -54,6 +55,7 @@ def solve(
     event_step: float | None = None,
     backend: str = "auto",
     on_domain_exit: str | None = None,
+    progress: Asked = False,
     **options: Any,
 ) -> Solution:
     """Solve x' = J∇H(x), x(t0) = y0.
@@ -73,9 +75,9 @@ def solve(
         Values of parameters of the system for each trajectory: numbers, or arrays that broadcast with the batch of y0;
         of one state y0 they make a batch. The others keep the system's values. Splitting methods on the splitting
         "kinetic", but for those with force gradients and with friction, take them as numbers of one compiled run, and
-        each trajectory is that on ``system.with_params(...)`` up to rounding. Elsewhere trajectories of equal values
-        run together, one set of values after the other, and are so bit by bit. A trained flow holds for its own
-        parameters alone.
+        each trajectory is that of a batch on ``system.with_params(...)``, with compensated sums up to rounding.
+        Elsewhere trajectories of equal values run together, one set of values after the other. A trained flow holds for
+        its own parameters alone.
     t_eval : array_like of shape (n,), optional
         Times to report, ordered from start to end. The default is every step. No other state is stored.
     dense_output : bool
@@ -100,6 +102,9 @@ def solve(
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
         statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The
         default is "warn" for trained flows, whose figures hold in Ω, and "ignore" for classical methods.
+    progress : bool or callable
+        True for a bar on stderr; or a function of the time that is done and the whole one, called a few times a second.
+        A method that is not run in pieces, such as one of a library, tells its end only.
     **options
         Options of the method: `dt` for fixed steps (default `system.dt`, or the flow's Δt), `rtol` and `atol` for
         adaptive ones, `flow` for "sympflow" and "mlp".
@@ -116,6 +121,8 @@ def solve(
         For bad arguments, at once: the message names the argument and the remedy.
     RuntimeError
         If the method is that of a plug-in and fails: the message names the plug-in.
+    Interrupted
+        A KeyboardInterrupt, by Ctrl-C in a run of a second or more: its `solution` is what was computed until then.
 
     Examples
     --------
@@ -157,6 +164,21 @@ def solve(
     if search is not None:
         check_event_search(search, y_start, abs(t1 - t0))
     problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend, search)
+    if progress is False:
+        return _answered(integrator, problem, action, rows)
+    sign = math.copysign(1.0, t1 - t0)
+    bar = Progress(progress, abs(t1 - t0), lambda done: f"t = {t0 + sign * done:.6g} of {t1:.6g}")
+    try:
+        sol = _answered(integrator, replace(problem, progress=bar), action, rows)
+        if sol.success and not bar.complete:
+            bar(bar.total)
+    finally:
+        bar.end()
+    return sol
+
+
+def _answered(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None) -> Solution:
+    """The solution of a validated problem, where trajectories may have parameters of their own."""
     if rows is None or rows.uniform:
         sol = _solved(integrator, problem, action)
         sol.rows = rows
@@ -176,13 +198,16 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     else:
         check_memory(integrator, problem)
 
-    start = time.perf_counter()
+    start, stopped = time.perf_counter(), None
     with naming_plugin(integrator):
-        outcome, problem = run(integrator, problem)
+        try:
+            outcome, problem = run(integrator, problem)
+        except Interrupted as stop:
+            outcome, stopped = stop.outcome, stop
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
     failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
-    if failed and problem.letters is None and readable(y_start):
+    if failed and stopped is None and problem.letters is None and readable(y_start):
         from sympflow.integrators.diagnosis import note_singularities
 
         note_singularities(outcome, integrator, problem)
@@ -193,7 +218,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     if action != "ignore" and readable(outcome.y):
         check_domain(outcome, integrator, system, action)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
-    return Solution(
+    sol = Solution(
         t=outcome.t,
         y=y,
         status=outcome.status,
@@ -207,6 +232,9 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
         t_events=None if problem.events is None else problem.events.times(),
         y_events=None if problem.events is None else problem.events.states(y_start),
     )
+    if stopped is not None:
+        raise Interrupted(outcome, sol) from None
+    return sol
 
 
 def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows) -> Solution:

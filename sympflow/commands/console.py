@@ -206,7 +206,7 @@ def write_comparisons(
         say(f"{scene.key}: figures")
         written += [comparison.to_csv(folder / f"{scene.key}.csv"), comparison.to_json(folder / f"{scene.key}.json")]
         written += save_comparison(comparison, folder, prefix=f"{scene.key}-")
-    drawable = [c for c in comparisons if {"error", "energy", "volume"} & set(c.metrics)]
+    drawable = [c for c in comparisons if {"error", "energy", "balance", "volume"} & set(c.metrics)]
     if drawable:
         written.append(save(overview(drawable), folder / "comparison.png"))
     if len(comparisons) > 1:

@@ -38,6 +38,7 @@ Methods = Annotated[
     ),
 ]
 Folder = Annotated[Path | None, typer.Option("--out", help="Folder for the figures, CSV and JSON.")]
+METRICS = ("error", "energy", "drift", "volume", "symplecticity", "reversal", "balance", "conformal")
 DIRECTIONS = {"up": 1, "down": -1, "both": 0}
 
 
@@ -50,12 +51,13 @@ def compare(
     y0: State = None,
     dt: Step = None,
     metrics: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Any of error, energy, drift, volume, symplecticity, reversal.",
-            autocompletion=completion.several(("error", "energy", "drift", "volume", "symplecticity", "reversal")),
+            help="Any of error, energy, drift, volume, symplecticity, reversal; of driven systems balance, of damped "
+            "ones conformal. Default: all that apply, but reversal.",
+            autocompletion=completion.several(METRICS),
         ),
-    ] = "error, energy, drift, volume, symplecticity",
+    ] = None,
     n_outputs: Annotated[int, typer.Option(help="Number of instants at which every method is measured.")] = 1000,
     repeats: Annotated[int, typer.Option(help="Timed runs of each method, interleaved.")] = 5,
     match: Annotated[
@@ -92,7 +94,7 @@ def compare(
                 compare_methods(
                     scene.system,
                     chosen,
-                    [m.strip() for m in metrics.split(",") if m.strip()],
+                    None if metrics is None else [m.strip() for m in metrics.split(",") if m.strip()],
                     t_span=interval(scene, t_end),
                     y0=start,
                     dt=dt,
@@ -166,7 +168,7 @@ def bench(
             if to is not None:
                 name = f"{scene.key}-work-precision"
                 written = [report.to_csv(to / f"{name}.csv"), report.to_json(to / f"{name}.json")]
-                figures = {to / f"{name}.png": "energy_error", to / f"{name}-state.png": "error"}
+                figures = {to / f"{name}.png": report.measure, to / f"{name}-state.png": "error"}
                 written += [save(report.figure(measure), path) for path, measure in figures.items()]
                 out.print(f"\nWritten to {to}: {', '.join(p.name for p in written)}")
 

@@ -18,8 +18,20 @@ from sympflow.arguments import check_dt, check_not_followed
 from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, stack
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
-from sympflow.integrators.contract import ENDED, FINISHED, Failure, Integrator, Outcome, Problem, Steps, finished
+from sympflow.integrators.contract import (
+    ENDED,
+    FINISHED,
+    Failure,
+    Integrator,
+    Outcome,
+    Problem,
+    Steps,
+    finished,
+    interrupted,
+)
 from sympflow.integrators.grid import EPS, Grid
+from sympflow.integrators.windows import MOST_SAVED, Pace, Pieces, Saved, first_window
+from sympflow.kernels.carry import Carry
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
@@ -178,6 +190,12 @@ def _definer(cls: type, name: str) -> type:
 
 
 @cache
+def _steps_one_by_one(cls: type[FixedStep]) -> bool:
+    """True if the `rollout` of a class calls its `step`, and nothing else."""
+    return _definer(cls, "rollout") in (FixedStep, OwnStepper)
+
+
+@cache
 def _is_counted(cls: type[FixedStep]) -> bool:
     """True if the class does not say how many forces its step evaluates: if `evaluations` is of a class above it."""
     return cls.__mro__.index(_definer(cls, "evaluations")) > cls.__mro__.index(_definer(cls, "step"))
@@ -210,11 +228,24 @@ class Stepper:
         self.integrator, self.system, self.problem = integrator, problem.system, problem
         self.backend = "torch" if is_tensor(problem.y0) else "numpy"
 
-    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
+    @property
+    def takes_carry(self) -> bool:
+        """True if `rollout` takes a carry: unless the steps are those of a `rollout` that a class has of its own."""
+        return _steps_one_by_one(type(self.integrator))  # type: ignore[arg-type]
+
+    def rollout(
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+    ) -> tuple[Array, np.ndarray]:
         """Return the states (len(save), ..., 2d) after the steps `save` (sorted counts in 0 … n_steps) of length h.
 
-        Also the index of the last finite state of each trajectory, of shape y0.shape[:-1].
+        Also the index of the last finite state of each trajectory, of shape y0.shape[:-1]. With a `carry` the run from
+        y0 goes on from there: see `kernels.protocol.Kernel.run`.
         """
+        if carry is not None:
+            integrator, system = self.integrator, self.problem.system
+            return rollout(
+                lambda k, y: integrator.checked_step(system, t0 + k * h, y, h), y0, n_steps, save, carry=carry
+            )
         whole = y0 is self.problem.y0 and t0 == self.problem.t0
         seen = self.problem
         piece = seen if whole else Problem(seen.system, t0, t0 + n_steps * h, y0, backend=seen.backend)
@@ -272,8 +303,16 @@ class KernelStepper(Stepper):
         self.driven = self.system is not None and not self.system.autonomous  # a flow alone steps without a system
         self.iterations = 0
 
-    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
+    @property
+    def takes_carry(self) -> bool:
+        return True
+
+    def rollout(
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+    ) -> tuple[Array, np.ndarray]:
         start: dict[str, Any] = {"t0": t0} if self.driven else {}
+        if carry is not None:
+            start["carry"] = carry
         if y0.ndim == 1:
             states, last, iterations = self.kernel.run(h, y0, n_steps, save, **start)
             self.iterations += iterations
@@ -336,13 +375,21 @@ def compiled_loops(
 
 
 def rollout(
-    step: Callable[[int, Array], Array], y: Array, n_steps: int, save: np.ndarray, block: int = 64
+    step: Callable[[int, Array], Array],
+    y: Array,
+    n_steps: int,
+    save: np.ndarray,
+    block: int = 64,
+    carry: Carry | None = None,
 ) -> tuple[Array, np.ndarray]:
     """Apply `step(k, y)` n_steps times; the states at the counts `save`, and the last finite count of each trajectory.
 
     Finiteness is tested once a block; a block that ends non-finite is run again to find where. The run stops when no
-    trajectory is finite any more; later states are NaN.
+    trajectory is finite any more; later states are NaN. With a `carry` it goes on from there, and leaves its end in it.
     """
+    k = 0
+    if carry is not None and carry.running is not None:
+        k, y = carry.steps, carry.running
     tensor = is_tensor(y)
     out: Any = [] if tensor else np.full((len(save), *y.shape), np.nan, dtype=y.dtype)
     wanted = save.tolist()
@@ -351,7 +398,6 @@ def rollout(
     if wanted and wanted[0] == 0:
         out.append(y) if tensor else out.__setitem__(0, y)
         position = 1
-    k = 0
     with np.errstate(all="ignore"):
         while k < n_steps and (finite == n_steps).any():
             start, y_start = k, y
@@ -371,6 +417,8 @@ def rollout(
                     z = step(j, z)
                     first = failed & (finite == n_steps) & ~finite_states(z, in_any_lane=True)
                     finite = np.where(first, j, finite)
+    if carry is not None:
+        carry.advance(n_steps, y)
     if tensor:
         out += [full_of_nan(y)] * (len(wanted) - len(out))
         out = stack(out, axis=0) if out else y[None][:0]
@@ -446,8 +494,16 @@ class GridRun:
     def _whole(self) -> Outcome:
         problem, grid, stepper = self.problem, self.grid, self.stepper
         t, remainder, save, place = self._placed()
-        last = int(save[-1]) if save.size else 0
-        saved, finite = stepper.rollout(problem.y0, grid.h, last, save, problem.t0)
+        asked = last = int(save[-1]) if save.size else 0
+        first = first_window(stepper, problem, last, len(save))
+        if first:
+            saved, finite, last = self._in_windows(first, last, save)
+            if last < asked:
+                save = save[: len(saved)]
+                outputs = len(save) if place is None else int(place.searchsorted(len(save)))
+                t, remainder, place = t[:outputs], remainder[:outputs], None if place is None else place[:outputs]
+        else:
+            saved, finite = stepper.rollout(problem.y0, grid.h, last, save, problem.t0)
 
         y = saved if place is None else saved[place]
         extra = remainder.nonzero()[0]
@@ -459,10 +515,35 @@ class GridRun:
         at_end = int(bool(extra.size) and extra[-1] == len(t) - 1 and t[-1] == grid.t1)
         outcome = Outcome(t, y, 0, finished(problem), self._stats(n_steps + at_end, n_steps, n_saved, int(extra.size)))
         if problem.dense_output:
-            outcome.sol = GridSolution(stepper, grid, saved)
+            reached = grid if last == asked else Grid(grid.t0, grid.time(last), abs(grid.h))
+            outcome.sol = GridSolution(stepper, reached, saved)
         outcome.finite = stepper.compiled and stepper.saves_finite and not extra.size
         self._report_failures(outcome, finite, last)
+        if last < asked:
+            raise interrupted(outcome, grid.time(last))
         return outcome
+
+    def _in_windows(self, first: int, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, int]:
+        """`Stepper.rollout` in windows: also the step that was reached, less than n_steps where Ctrl-C ended it."""
+        problem, h = self.problem, self.grid.h
+        pieces, pace, saved = Pieces(self.stepper, problem, h, Carry()), Pace(first), Saved(len(save), problem.y0)
+        most = max(2, MOST_SAVED // math.prod(problem.y0.shape))
+        k = row = 0
+        try:
+            while k < n_steps and not pieces.ended:
+                to = k + pace.steps(n_steps - k)
+                end = int(save.searchsorted(to, "right"))
+                if end - row > most:
+                    to, end = int(save[row + most - 1]), row + most
+                saved.put(row, pieces.to(to, save[row:end]))
+                pace.took(to - k)
+                row, k = end, to
+                if problem.progress is not None and k < n_steps:
+                    problem.progress(abs(k * h))
+        except KeyboardInterrupt:
+            n_steps = k
+        finite = np.zeros(problem.y0.shape[:-1], dtype=int) if pieces.finite is None else pieces.finite
+        return saved.up_to(row, int(save.searchsorted(n_steps, "right"))), finite, n_steps
 
     def _stats(self, n_told: int, n_steps: int, n_saved: int, n_extra: int) -> dict[str, Any]:
         stepper = self.stepper
@@ -500,36 +581,47 @@ class GridRun:
         kept: list[Array] = []
         chunk, k, shorter, delivered, failed = FIRST_CHUNK, 0, 0, 0, False
         largest = max(1, min(LAST_CHUNK, MOST_SAMPLES // search.parts(grid.h, system.dt)))
+        progress = problem.progress
 
-        while True:
-            n = min(chunk, largest, grid.n_steps - k)
-            states, finite = stepper.rollout(y, grid.h, n, np.arange(n + 1), grid.time(k))
-            good = min(n, int(finite))
-            failed = good < n
-            last = k + n == grid.n_steps or failed
+        stopped, done = False, (0, 0, 1, 0)
+        try:
+            while True:
+                n = min(chunk, largest, grid.n_steps - k)
+                states, finite = stepper.rollout(y, grid.h, n, np.arange(n + 1), grid.time(k))
+                good = min(n, int(finite))
+                failed = good < n
+                last = k + n == grid.n_steps or failed
 
-            taken, ended = self._search(search, k, states[: good + 1])
-            if not ended and last and not failed and grid.remainder:
-                shorter = 1
-                ended = self._search_remainder(search, states[good])
+                taken, ended = self._search(search, k, states[: good + 1])
+                if not ended and last and not failed and grid.remainder:
+                    shorter = 1
+                    ended = self._search_remainder(search, states[good])
 
-            # outputs before the end of this chunk; a state at its end belongs to the next, unless there is none
-            due = delivered + int(np.searchsorted(count[delivered:], k + good, "right" if last else "left"))
-            chosen = slice(delivered, due)
-            y_due = states[count[chosen] - k]
-            outputs.append(shorter_steps(stepper, grid, y_due, count[chosen], remainder[chosen]))
-            delivered = due
-            if problem.dense_output:
-                kept.append(states[: good + 1] if last or ended else states[:good])
-            if ended or last:
-                k += taken if ended else good
-                break
-            y, k, chunk = states[n], k + n, 2 * chunk
+                # outputs before the end of this chunk; a state at its end belongs to the next, unless there is none
+                due = delivered + int(np.searchsorted(count[delivered:], k + good, "right" if last else "left"))
+                chosen = slice(delivered, due)
+                y_due = states[count[chosen] - k]
+                outputs.append(shorter_steps(stepper, grid, y_due, count[chosen], remainder[chosen]))
+                delivered = due
+                if problem.dense_output:
+                    kept.append(states[: good + 1] if last or ended else states[:good])
+                if ended or last:
+                    k += taken if ended else good
+                    break
+                y, k, chunk = states[n], k + n, 2 * chunk
+                done = k, delivered, len(outputs), len(kept)
+                if progress is not None:
+                    progress(abs(k * grid.h))
+        except KeyboardInterrupt:
+            stopped = True
+            k, delivered, n_outputs, n_kept = done
+            outputs, kept = outputs[:n_outputs], [*kept[:n_kept], y[None]]
+            search.forget_after(grid.time(k), grid.h)
 
         t, y_out = times[:delivered], _join(outputs)
         finite_outputs = finite_states(y_out)  # a shorter step may overflow too
         failed = failed or not finite_outputs.all()
-        t_end = search.end[0] if search.end else grid.time(k) if failed else grid.t1
+        t_end = search.end[0] if search.end else grid.time(k) if failed or stopped else grid.t1
         keep = finite_outputs & ((t - t_end) * np.sign(grid.h) <= 0)
         n_keep = len(t) if keep.all() else int(np.argmin(keep))
         t, y_out = t[:n_keep], y_out[:n_keep]
@@ -545,6 +637,8 @@ class GridRun:
             outcome.message = self._failure(t_end, k)
         if problem.dense_output:
             outcome.sol = GridSolution(stepper, Grid(grid.t0, t_end, abs(grid.h)), _join(kept))
+        if stopped:
+            raise interrupted(outcome, t_end)
         return outcome
 
     def _search(self, search: EventSearch, k: int, states: Array) -> tuple[int, bool]:

@@ -24,6 +24,7 @@ from sympflow.integrators.base import rollout
 from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, scheme_evaluations
 
 if TYPE_CHECKING:
+    from sympflow.kernels.carry import Carry
     from sympflow.kernels.protocol import Kernel
     from sympflow.kernels.splitting_loops import SplittingLoops
 
@@ -101,9 +102,11 @@ class Composition(ABC):
         """The step and its Jacobian (..., 2d, 2d); None where `step` itself is to be differentiated."""
         return None
 
-    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
+    def rollout(
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+    ) -> tuple[Array, np.ndarray]:
         """Many steps by array operations, as `base.rollout`."""
-        return rollout(lambda k, y: self.step(y, h, t0 + k * h), y0, n_steps, save)
+        return rollout(lambda k, y: self.step(y, h, t0 + k * h), y0, n_steps, save, carry=carry)
 
     @abstractmethod
     def kernel(self, compensated: bool) -> Kernel:
@@ -303,8 +306,10 @@ class ExactMaps(Composition):
         back = [m.inverse() for m in reversed(self.maps(h))]
         return parts.from_modes(*parts.apply(back, *parts.to_modes(y)))
 
-    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
-        return rollout_in_modes(self.parts, self.maps(h), y0, n_steps, save)
+    def rollout(
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+    ) -> tuple[Array, np.ndarray]:
+        return rollout_in_modes(self.parts, self.maps(h), y0, n_steps, save, carry)
 
     def kernel(self, compensated: bool) -> Kernel:
         from sympflow.kernels.parts_loops import parts_loops
@@ -322,7 +327,12 @@ def known_maps(composition: ExactMaps, h: float) -> Sequence[Map]:
 
 
 def rollout_in_modes(
-    parts: ExactParts, maps: Sequence[Map], y0: Array, n_steps: int, save: np.ndarray
+    parts: ExactParts,
+    maps: Sequence[Map],
+    y0: Array,
+    n_steps: int,
+    save: np.ndarray,
+    carry: Carry | None = None,
 ) -> tuple[Array, np.ndarray]:
     """`base.rollout` of exact flows, in the modes from beginning to end."""
     d = parts.ndof
@@ -332,7 +342,7 @@ def rollout_in_modes(
     def step(k: int, z: Array) -> Array:
         return concatenate(parts.apply(known, z[..., :d], z[..., d:]))
 
-    modes, finite = rollout(step, concatenate(start), n_steps, save)
+    modes, finite = rollout(step, concatenate(start), n_steps, save, carry=carry)
     states = parts.from_modes(modes[..., :d], modes[..., d:])
     if not (len(save) and save[0] == 0):
         return states, finite

@@ -41,6 +41,7 @@ from sympflow.arguments import MAX_ASKED_VALUES
 from sympflow.arrays import Array, is_tensor, jvp, to_numpy
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.progress import Progress
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
@@ -56,6 +57,16 @@ MOST_ENTRIES = 20_000_000
 
 FINISHED = "The solver successfully reached the end of the integration interval."
 ENDED = "A termination event occurred."
+
+
+INTERRUPTED = "The run was interrupted after t = {t:.17g}; what was computed until then is kept."
+
+
+def interrupted(outcome: Outcome, t: float) -> Interrupted:
+    """Return the error of a run that Ctrl-C ended after time t, with its outcome, which is marked as failed."""
+    outcome.status = np.full(outcome.y.shape[1:-1], -1) if outcome.y.ndim > 2 else -1
+    outcome.message, outcome.stats["interrupted_at"] = INTERRUPTED.format(t=t), t
+    return Interrupted(outcome)
 
 
 def finished(problem: Problem) -> str:
@@ -86,6 +97,20 @@ class Failure(Enum):
     )
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a long run, with what was computed until then.
+
+    Attributes
+    ----------
+    solution : Solution
+        The outputs up to where the run was, with status −1, the time in the message and in `stats["interrupted_at"]`.
+    """
+
+    def __init__(self, outcome: Outcome, solution: Any = None) -> None:
+        super().__init__(outcome.message)
+        self.outcome, self.solution = outcome, solution
+
+
 @dataclass(frozen=True)
 class Problem:
     """A validated initial value problem, and the outputs that `solve` asks an integrator for."""
@@ -101,6 +126,8 @@ class Problem:
     events: EventSearch | None = None
     letters: np.ndarray | None = None
     """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
+    progress: Progress | None = None
+    """What is told how much of the time from t0 to t1 is done."""
 
 
 @dataclass
@@ -210,6 +237,10 @@ class Integrator:
     def flow_for(self, system: HamiltonianSystem) -> FlowMap | None:
         """Return the trained flow that is used for a system, one in the system's own time; None if there is none."""
         return None
+
+    def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> Integrator | None:
+        """Return the same method on a driven system with the time and its momentum E; None where it is none there."""
+        return None if self.trained else self
 
     def identity_for(self, system: HamiltonianSystem) -> Identity | None:
         """Return the H that the trained flow for a system was made for; None without a flow, or where it is unknown."""

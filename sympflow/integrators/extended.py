@@ -11,7 +11,7 @@ import numpy as np
 
 from sympflow.arrays import Array, to_numpy
 from sympflow.events import EventSearch
-from sympflow.integrators.contract import Outcome, Problem
+from sympflow.integrators.contract import Interrupted, Outcome, Problem
 
 APART = 0.1
 """Distance of two copies, over the largest coordinate or momentum of the run, beyond which its states mean little."""
@@ -60,7 +60,11 @@ def extended_run(run: Callable[[Problem], Outcome], extension: Extension, proble
     """
     search = problem.events
     lifted = None if search is None else EventSearch(_of_projections(search, extension), search.max_interval)
-    outcome = run(replace(problem, y0=extension.lift(problem.y0), events=lifted))
+    stopped = None
+    try:
+        outcome = run(replace(problem, y0=extension.lift(problem.y0), events=lifted))
+    except Interrupted as stop:
+        outcome, stopped = stop.outcome, stop
     x = outcome.y
     if search is not None and lifted is not None:
         search.found = [[(t, extension.project(y)) for t, y in zeros] for zeros in lifted.found]
@@ -71,6 +75,8 @@ def extended_run(run: Callable[[Problem], Outcome], extension: Extension, proble
         outcome.sol = Projected(outcome.sol, extension)
     if len(x):
         _warn_of_distance(extension, to_numpy(x), outcome)
+    if stopped is not None:
+        raise stopped
     return outcome
 
 

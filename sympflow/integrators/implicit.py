@@ -16,6 +16,7 @@ from sympflow.integrators.base import KernelStepper, OwnStepper, Problem, Steppe
 from sympflow.integrators.contract import Failure
 
 if TYPE_CHECKING:
+    from sympflow.kernels.carry import Carry
     from sympflow.kernels.implicit_loops import ImplicitKernel, Tableau
 
 MOST_ITERATIONS = 50
@@ -220,8 +221,14 @@ class ArrayGauss(_Counts, Stepper):
         super().__init__(gauss, problem)
         self.gauss, self.iterations = gauss, 0
 
-    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
-        return rollout(lambda k, y: self.shorter(y, h, t0 + k * h), y0, n_steps, save)
+    @property
+    def takes_carry(self) -> bool:
+        return True
+
+    def rollout(
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+    ) -> tuple[Array, np.ndarray]:
+        return rollout(lambda k, y: self.shorter(y, h, t0 + k * h), y0, n_steps, save, carry=carry)
 
     def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         y_next, iterations = self.gauss.counted_step(self.system, t, y, h)

@@ -16,7 +16,7 @@ from sympflow.arguments import MAX_SAVED_VALUES, as_float, check_counts
 from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Recorder
-from sympflow.integrators.contract import ENDED, FINISHED, Outcome, Problem, Steps
+from sympflow.integrators.contract import ENDED, FINISHED, Interrupted, Outcome, Problem, Steps, interrupted
 from sympflow.integrators.grid import MOST_OPEN_STEPS, Grid
 from sympflow.integrators.runge_kutta import RungeKutta, hopeless
 
@@ -32,7 +32,7 @@ class _Scipy(RungeKutta):
     rtol, atol : float
         The local error is kept below atol + rtol·|y|; the defaults are SciPy's.
     max_step : float
-        Longest step.
+        Longest step; where a sampled parameter jumps, also the shortest time between two jumps.
     first_step : float, optional
         Length of the first step, at most that of the interval; the solver chooses it by default.
     max_steps : int, optional
@@ -81,7 +81,8 @@ class _Scipy(RungeKutta):
         """The SciPy solver at t0, or None if the vector field or the first step is not finite there."""
         first = None if self.first_step is None else min(self.first_step, abs(t1 - t0))
         with np.errstate(all="ignore"):
-            solver = self.solver(system, t0, y0, t1, self.max_step, self.rtol, self.atol, first_step=first)
+            longest = min(self.max_step, system.shortest_piece)
+            solver = self.solver(system, t0, y0, t1, longest, self.rtol, self.atol, first_step=first)
         return solver if np.isfinite(solver.f).all() and 0 < solver.h_abs < math.inf else None
 
     def _no_start(self, system: HamiltonianSystem, t0: float, y0: np.ndarray) -> str:
@@ -104,7 +105,12 @@ class _Scipy(RungeKutta):
         t_eval = problem.t_eval
         if t_eval is None:  # the trajectories take different steps: report on a common grid
             t_eval = Grid(problem.t0, problem.t1, problem.system.dt).outputs(None, problem.save_every)[0]
-        runs = [self._run_one(problem, y0, t_eval) for y0 in problem.y0.reshape(-1, problem.y0.shape[-1])]
+        runs, problem = [], replace(problem, progress=None)
+        try:
+            for y0 in problem.y0.reshape(-1, problem.y0.shape[-1]):
+                runs.append(self._run_one(problem, y0, t_eval))
+        except Interrupted as stop:  # of one trajectory of a batch
+            raise KeyboardInterrupt from stop
         y = np.full((len(t_eval), len(runs), problem.y0.shape[-1]), np.nan)
         for i, run in enumerate(runs):
             y[: len(run.y), i] = run.y
@@ -139,32 +145,38 @@ class _Scipy(RungeKutta):
         record = Recorder(replace(problem, y0=y0), np.empty(0) if t_eval is None else t_eval)
         if t1 == t0:
             record.empty(t0, y0)
-        y_old, reached, most = y0, t0, self.most_steps(t1, y0.size)
+        y_old, reached, most, stopped = y0, t0, self.most_steps(t1, y0.size), False
         with np.errstate(all="ignore"):
-            while solver is not None and solver.status == "running":
-                failure = solver.step()
-                if solver.status == "failed":
-                    failure = f"{failure} The solver stopped at t = {solver.t:.17g}."
-                    break
-                if not np.isfinite(solver.y).all():
-                    failure = f"The solution became non-finite after t = {solver.t_old:.17g}. End `t_span` earlier."
-                    break
-                stats["n_steps"] += 1
-                interpolant = _Lazily(solver.dense_output)
-                t_new, y_new = record.take(solver.t_old, y_old, solver.t, solver.y, interpolant)
-                if problem.dense_output:
-                    interpolants.append(interpolant.output)
-                if t_eval is None or problem.dense_output:
-                    times.append(t_new)
-                    states.append(y_new)
-                if record.end is not None:
-                    break
-                y_old, reached = y_new, t_new
-                failure = hopeless(stats["n_steps"], t0, solver.t, t1, most)
-                if failure:
-                    break
+            try:
+                while solver is not None and solver.status == "running":
+                    failure = solver.step()
+                    if solver.status == "failed":
+                        failure = f"{failure} The solver stopped at t = {solver.t:.17g}."
+                        break
+                    if not np.isfinite(solver.y).all():
+                        failure = f"The solution became non-finite after t = {solver.t_old:.17g}. End `t_span` earlier."
+                        break
+                    stats["n_steps"] += 1
+                    interpolant = _Lazily(solver.dense_output)
+                    t_new, y_new = record.take(solver.t_old, y_old, solver.t, solver.y, interpolant)
+                    if problem.dense_output:
+                        interpolants.append(interpolant.output)
+                    if t_eval is None or problem.dense_output:
+                        times.append(t_new)
+                        states.append(y_new)
+                    if record.end is not None:
+                        break
+                    y_old, reached = y_new, t_new
+                    if problem.progress is not None:
+                        problem.progress(abs(reached - t0))
+                    failure = hopeless(stats["n_steps"], t0, solver.t, t1, most)
+                    if failure:
+                        break
+            except KeyboardInterrupt:
+                stopped = True
         stats["force_evaluations"] = 0 if solver is None else int(solver.nfev)
         if t_eval is None:
+            del times[len(states) :]  # Ctrl-C may come between the two
             keep = sorted({*range(0, len(times), problem.save_every), len(times) - 1})
             t, y = np.array(times)[keep], np.array(states)[keep]
         else:
@@ -176,6 +188,8 @@ class _Scipy(RungeKutta):
             stats["failed_at"] = float(reached)
         if problem.dense_output:
             outcome.sol = OdeSolution(times, interpolants) if interpolants else _Constant(y0)
+        if stopped:
+            raise interrupted(outcome, float(reached))
         return outcome
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:

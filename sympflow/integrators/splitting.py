@@ -23,6 +23,7 @@ from sympflow.integrators.methods import NAMES, TRIPLES
 from sympflow.schemes import SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
+    from sympflow.kernels.carry import Carry
     from sympflow.kernels.protocol import Kernel
     from sympflow.kernels.tangent_loops import TangentKernel
 
@@ -381,8 +382,14 @@ class ArrayComposition(Stepper):
         super().__init__(integrator, problem)
         self.composition = composition
 
-    def rollout(self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0) -> tuple[Array, np.ndarray]:
-        return self.composition.rollout(y0, h, n_steps, save, t0)
+    @property
+    def takes_carry(self) -> bool:
+        return True
+
+    def rollout(
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+    ) -> tuple[Array, np.ndarray]:
+        return self.composition.rollout(y0, h, n_steps, save, t0, carry)
 
     def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         return self.composition.step(y, h, t)

@@ -3,42 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.kernels.carry import Carry
 from sympflow.kernels.modules import run_one, run_rows
 
 __all__ = ["Carry", "Kernel", "Run", "Steps", "run_state", "run_states"]
 
 NOTHING = np.empty(0), np.empty((0, 0))
 """The running state of runs that are not cut, of one state and of a batch."""
-
-
-@dataclass
-class Carry:
-    """The place where a run is cut: with it, pieces of a run give the same bits as the run in one piece.
-
-    The states that a run saves are not enough for that: consecutive steps share a kick or a drift, so that the running
-    state is another one, and compensated sums have errors. A run that is given a carry goes on from it, and leaves in
-    it where it ends; one that is interrupted leaves it as it was.
-
-    Attributes
-    ----------
-    steps : int
-        The steps made so far; 0 before a run.
-    running : ndarray of shape (K,), or (N, K) of a batch; or None
-        The kernel's own; None before a run. NaN where a trajectory has ended.
-    """
-
-    steps: int = 0
-    running: np.ndarray | None = None
-
-    def advance(self, steps: int, running: np.ndarray) -> None:
-        """Take the place after so many steps."""
-        self.steps, self.running = steps, running
 
 
 class Run(NamedTuple):

@@ -285,9 +285,9 @@ class SplittingKernel(Kernel):
 class VariedKernel(SplittingKernel):
     """The loops of batches of N trajectories that have their own values (k, N) of `SplittingLoops.values`.
 
-    Each takes the steps of `SplittingKernel` on a system with its values up to rounding: what the compiler takes out of
-    loops there, products of values, it may fuse with sums here. A batch may be several of such ones, one after the
-    other.
+    Each takes the steps of `SplittingKernel` on a system with its values, with compensated sums up to rounding:
+    products of values, which the compiler takes out of loops there, it may fuse with sums here. A batch may be several
+    of such ones, one after the other.
     """
 
     def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool, values: np.ndarray) -> None:
@@ -398,10 +398,10 @@ class LoopFunctions:
         )
 
 
-def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0) -> str:
+def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0, driven: bool = False) -> str:
     return (
         f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': cache}}\n"
-        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}\nN_VALUES = {n_values}"
+        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}\nN_VALUES = {n_values}\nDRIVEN = {driven}"
     )
 
 
@@ -469,7 +469,7 @@ def symbolic_module(
     lanes = lanes_source(kinds, scheduled, friction, n, varied)
     sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
     if scheduled:
-        sources.append(kicks_source(symbols, level, monomials))
+        sources.append(kicks_source(symbols, level, monomials, varied=varied))
     elif level == POLYNOMIAL:
         sources.append(polynomial_kick_source(symbols, monomials))
     elif level:
@@ -478,7 +478,8 @@ def symbolic_module(
         sources.append(curvature_kick_source(symbols))
     algebra = "\n\n\n".join(sources)
     before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
-    header = _header(compensated, cache=True, scheduled=scheduled, n_values=n if varied else 0)
+    n_values = n if varied else 0
+    header = _header(compensated, cache=True, scheduled=scheduled, n_values=n_values, driven=driving is not None)
     return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
 
 

@@ -20,8 +20,9 @@ from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import build, name_of, naming_plugin
 from sympflow.metrics.accuracy import reference_error, time_reversal_error
 from sympflow.metrics.energy import energy_drift, energy_error, failed, max_energy_error
+from sympflow.metrics.energy_balance import energy_balance_error
 from sympflow.metrics.reference import Reference
-from sympflow.metrics.symplectic import symplecticity_defect, volume_error
+from sympflow.metrics.symplectic import conformal_defect, symplecticity_defect, volume_error
 from sympflow.solution import Solution
 from sympflow.studies.reports import seconds
 
@@ -158,6 +159,9 @@ class Row:
     energy_error : float
         max |ΔH| over the instants, relative as in `sympflow.energy_error`; of a batch the median, in a study of
         stability the largest over all initial states.
+    balance_error : float
+        Of a driven system, max |H − H(y0) − ∫ ∂H/∂t dt| over the instants, relative as in
+        `sympflow.energy_balance_error`; of a batch the median.
     energy_drift, energy_drift_error : float
         Slope of the energy error per unit time, and its standard error by batch means; of a batch, those of the median
         slope.
@@ -172,6 +176,8 @@ class Row:
         magnitude, over the first 256 steps.
     symplecticity_defect : float
         max ‖AᵀJA − J‖/‖A‖² over the steps and trajectories; in a study of stability over the first 256 steps.
+    conformal_defect : float
+        Of a damped system, max ‖AᵀJA − e^{−γh}J‖/‖A‖² over the steps and trajectories.
     time_reversal_error : float
         ‖y − y0‖ after there and back; of a batch the median.
     training_time : float
@@ -203,6 +209,7 @@ class Row:
     hessian_evaluations: float | None = None
     error: float | None = None
     energy_error: float | None = None
+    balance_error: float | None = None
     energy_drift: float | None = None
     energy_drift_error: float | None = None
     blow_up: float | None = None
@@ -210,6 +217,7 @@ class Row:
     domain_exit: float | None = None
     volume_error: float | None = None
     symplecticity_defect: float | None = None
+    conformal_defect: float | None = None
     time_reversal_error: float | None = None
     training_time: float | None = None
     break_even: float | None = None
@@ -234,7 +242,8 @@ class Attempt:
     sols : tuple of Solution
         The runs, of one method under one set of conditions; empty if it does not apply or broke.
     energy, volume : ndarray or None
-        |energy error| (..., n) and volume error (..., n) at the times of the solution, where these were measured.
+        |energy error| (..., n), of a driven system that of the balance, and volume error (..., n) at the times of the
+        solution, where these were measured.
     """
 
     candidate: Candidate
@@ -361,6 +370,13 @@ def energy(attempt: Attempt) -> None:
     attempt.fill(energy_error=float(np.median(max_energy_error(sol))))
 
 
+def balance(attempt: Attempt) -> None:
+    """The error of the energy balance over time, and its maximum."""
+    (sol,) = attempt.sols
+    attempt.energy = series = energy_balance_error(sol, relative=True)
+    attempt.fill(balance_error=float(np.median(largest(series, sol))))
+
+
 def drift(attempt: Attempt) -> None:
     """The trend of the energy error: the median slope over all trajectories, with its own standard error."""
     if attempt.lost:
@@ -389,6 +405,13 @@ def symplecticity(attempt: Attempt) -> None:
     (sol,) = attempt.sols
     lost = attempt.lost
     attempt.fill(symplecticity_defect=np.inf if lost else float(np.max(symplecticity_defect(sol, relative=True))))
+
+
+def conformality(attempt: Attempt) -> None:
+    """The largest defect of a step of a damped system, relative to the step's norm."""
+    (sol,) = attempt.sols
+    lost = attempt.lost
+    attempt.fill(conformal_defect=np.inf if lost else float(np.max(conformal_defect(sol, relative=True))))
 
 
 def reversal(attempt: Attempt) -> None:

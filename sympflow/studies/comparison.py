@@ -17,6 +17,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem, parameters_text
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.accuracy import check_problem, states_of
 from sympflow.metrics.energy import max_energy_error
+from sympflow.metrics.energy_balance import jumps_in_time
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
@@ -43,6 +44,8 @@ MEASURES: dict[str, Metric] = {
     "volume": attempts.volume,
     "symplecticity": attempts.symplecticity,
     "reversal": attempts.reversal,
+    "balance": attempts.balance,
+    "conformal": attempts.conformality,
 }
 METRICS = ("error", *MEASURES)
 MATCHES = ("time", "evaluations", "energy_error")
@@ -52,7 +55,7 @@ PAPER = ("sympflow", "mlp", "verlet", "leapfrog", "rk45")
 def compare(
     system: HamiltonianSystem,
     methods: Sequence[Any] = PAPER,
-    metrics: Sequence[str] = METRICS[:5],
+    metrics: Sequence[str] | None = None,
     *,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
@@ -74,8 +77,10 @@ def compare(
     methods : sequence
         Each a name, a configured integrator such as ``get("verlet")(dt=0.01)``, a trained flow, or a pair
         (label, any of these).
-    metrics : sequence of str
-        Any of "error", "energy", "drift", "volume", "symplecticity" and "reversal". Others are not computed.
+    metrics : sequence of str, optional
+        Any of "error", "energy", "drift", "volume", "symplecticity" and "reversal"; of a driven system "balance", the
+        energy balance, in place of "energy" and "drift"; of a damped one "conformal" in place of all that is not kept.
+        By default those that apply to the system, without "reversal". Others are not computed.
     t_span, y0 : optional
         Interval and initial state (or batch); the system's by default.
     dt : float, optional
@@ -114,16 +119,9 @@ def compare(
     """
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
-    asked = _check_metrics(metrics)
+    asked = default_metrics(system) if metrics is None else _check_metrics(metrics)
     check_counts(n_outputs=n_outputs, repeats=repeats)
-    unkept = [m for m in asked if m not in ("error", "reversal")]
-    if unkept or match == "energy_error":
-        what = f"which `metrics` {', '.join(map(repr, unkept))}" if unkept else "which `match` 'energy_error'"
-        system.check_conservative(f"{what} presume is not there", "pass metrics=['error'], and match by 'time'")
-        if match == "energy_error" or not {"energy", "drift"}.isdisjoint(unkept):
-            system.check_autonomous(
-                "so that its energy is not kept", "pass metrics=['error'], match by 'time', or use energy_balance_error"
-            )
+    _check_apply(system, asked, match)
     if match is not None and match not in MATCHES:
         raise ValueError(f"`match` must be one of {', '.join(map(repr, MATCHES))}, or None; got {match!r}.")
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
@@ -160,6 +158,26 @@ def compare(
             say(f"{system.name}: measuring {one.candidate.label}")
             one.measure(MEASURES, [metric for metric in asked if metric in MEASURES])
     return Comparison(system, (t0, t1), start, t, asked, repeats, match, truth, tuple(runs))
+
+
+def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
+    """The metrics of what the flow of a system keeps."""
+    if system.conservative:
+        energy = ("energy", "drift") if system.autonomous else () if jumps_in_time(system) else ("balance",)
+        return ("error", *energy, "volume", "symplecticity")
+    shrinks_evenly = system.external_force is None and system.friction is not None and system.friction.isotropic
+    return ("error", "conformal") if shrinks_evenly else ("error",)
+
+
+def _check_apply(system: HamiltonianSystem, asked: Sequence[str], match: str | None) -> None:
+    """Refuse metrics of what the flow of a system does not keep."""
+    unkept = [m for m in asked if m not in ("error", "reversal", "conformal")]
+    if unkept or match == "energy_error":
+        what = f"which `metrics` {', '.join(map(repr, unkept))}" if unkept else "which `match` 'energy_error'"
+        remedy = f"leave `metrics` out, or pass {list(default_metrics(system))}, and match by 'time'"
+        system.check_conservative(f"{what} presume is not there", remedy)
+        if match == "energy_error" or not {"energy", "drift"}.isdisjoint(unkept):
+            system.check_autonomous("so that its energy is not kept", f"{remedy}: 'balance' is that of its energy")
 
 
 def _identify(system: HamiltonianSystem) -> str:
@@ -378,10 +396,11 @@ class Comparison(Report):
             "hessian_evaluations",
             "error",
             "energy_error",
+            "balance_error",
             "energy_drift",
             "energy_drift_error",
         ),
-        *("volume_error", "symplecticity_defect", "time_reversal_error", "training_time"),
+        *("volume_error", "symplecticity_defect", "conformal_defect", "time_reversal_error", "training_time"),
     )
 
     system: HamiltonianSystem
@@ -491,9 +510,11 @@ def _columns(rows: Sequence[Row]) -> list[Column]:
         Column("Hessians", [f"{row.hessian_evaluations:,}" if row.hessian_evaluations else "" for row in rows]),
         Column("error", [number(row.error) for row in rows]),
         Column("energy error", [number(row.energy_error) for row in rows]),
+        Column("energy balance", [number(row.balance_error) for row in rows]),
         Column("drift per unit t", [_with_error(row.energy_drift, row.energy_drift_error) for row in rows]),
         Column("volume error", [number(row.volume_error) for row in rows]),
         Column("sympl. defect", [number(row.symplecticity_defect) for row in rows]),
+        Column("conf. defect", [number(row.conformal_defect) for row in rows]),
         Column("reversal", [number(row.time_reversal_error) for row in rows]),
         Column("training", [seconds(row.training_time) for row in rows]),
         Column("compiled in", [shown_compile_time(row) for row in rows]),

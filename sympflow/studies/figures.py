@@ -13,7 +13,7 @@ import numpy as np
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
-from sympflow.metrics.crossings import Plane, crossings
+from sympflow.metrics.crossings import Plane, crossings, stroboscopic, whole_periods
 from sympflow.solution import Solution
 from sympflow.solver import solve
 from sympflow.studies.attempts import Attempt, Row
@@ -37,7 +37,11 @@ if TYPE_CHECKING:
 KINDS = ("overview", "energy", "volume", "error", "portrait")
 ROUNDING_FLOOR = 1e-17
 FIGURE_FILES = (".png", ".pdf", ".svg")
-MEASURES = {"energy_error": "largest |energy error|, relative", "error": r"$\max_t\,\|y - y_{\mathrm{ref}}\|$"}
+MEASURES = {
+    "energy_error": "largest |energy error|, relative",
+    "balance_error": "largest |error of the energy balance|, relative",
+    "error": r"$\max_t\,\|y - y_{\mathrm{ref}}\|$",
+}
 COSTS = {"run_time": "run time [s]", "evaluations": "forces + Hessian–vector products, one trajectory"}
 LEAST_PRECISE = 10.0  # error beyond which a point of a work–precision diagram is left out
 SMALLEST, LARGEST = 1e-15, 1e3  # errors shown in figures of stability
@@ -170,7 +174,8 @@ def _energy_panel(ax: Axes, comparison: Compared, styles: dict[str, tuple[str, s
         ax.plot(t, np.fmax.accumulate(e), _dash(run), color=colour, lw=1.6, zorder=order)
     ax.set_yscale("log")
     _limits(ax)
-    dress(ax, "t", "|energy error|" + (", relative" if comparison.system.energy_scale is None else ", scaled"))
+    what = "|error of the energy balance|" if "balance" in comparison.metrics else "|energy error|"
+    dress(ax, "t", what + (", relative" if comparison.system.energy_scale is None else ", scaled"))
 
 
 def _volume_panel(ax: Axes, comparison: Compared, styles: dict[str, tuple[str, str]]) -> None:
@@ -216,7 +221,8 @@ def _drawable(comparison: Compared) -> tuple[str, ...]:
 
 
 def _panels(comparison: Compared) -> tuple[str, ...]:
-    return tuple(k for k in _PANELS if k in comparison.metrics)
+    measured = {"energy" if m == "balance" else m for m in comparison.metrics}
+    return tuple(k for k in _PANELS if k in measured)
 
 
 def _styles(comparisons: Sequence[Compared]) -> dict[str, tuple[str, str]]:
@@ -303,7 +309,7 @@ def portrait(comparison: Compared) -> Figure:
     """Phase space, a panel for each method with the reference behind in grey.
 
     One degree of freedom: the orbit in the (q, p) plane. Two: the Poincaré section q₁ = 0 with q₁ increasing along the
-    run, on each method's own map. More: q₁ against q₂.
+    run, on each method's own map. More: q₁ against q₂. Of a driven system the states after each period, q₁ against p₁.
     """
     system = comparison.system
     runs = [run for run in comparison.runs if run.sol is not None]
@@ -315,7 +321,10 @@ def portrait(comparison: Compared) -> Figure:
     truth = _reference_points(comparison)
     for ax in axes.flat[len(runs) :]:
         ax.set_axis_off()
+    seen_after = _period(comparison) is not None
     x_label, y_label = {1: ("q", "p"), 2: ("q₂", "p₂")}.get(system.ndof, ("q₁", "q₂"))
+    if seen_after and system.ndof > 1:
+        x_label, y_label = "q₁", "p₁"
     for k, (ax, run) in enumerate(zip(axes.flat, runs, strict=False)):
         points = _phase_points(comparison, run.sols[0].integrator)
         ax.plot(*truth.T, ".", color="#C8C8C8", ms=8 if system.ndof == 2 else 2.5, mew=0, zorder=1, rasterized=True)
@@ -334,6 +343,7 @@ def portrait(comparison: Compared) -> Figure:
         ax.tick_params(labelbottom=lowest)
     frame(axes[0, 0], truth, 0.25)  # around the reference: a run that leaves shall not shrink everything else
     section = ": section q₁ = 0, p₁ > 0" if system.ndof == 2 else ""
+    section = ": after each period" if seen_after else section
     heading = filled(f"{comparison.title}{section}; reference in grey", figure.get_figwidth() - 0.1, 10)
     figure.suptitle(heading, fontsize=10, color=TEXT, x=0.01, ha="left")
     return figure
@@ -342,13 +352,22 @@ def portrait(comparison: Compared) -> Figure:
 def _phase_points(comparison: Compared, integrator: Any) -> np.ndarray:
     """The points of one run that a portrait shows, (m, 2)."""
     system = comparison.system
+    starts = to_numpy(comparison.y0).reshape(-1, 2 * system.ndof)
+    period = _period(comparison)
+    if period is not None:
+        return stroboscopic(integrator, system, comparison.t_span, starts, period).states[:, [0, system.ndof]]
     if system.ndof == 2:
-        starts = to_numpy(comparison.y0).reshape(-1, 4)
         found = crossings(integrator, system, comparison.t_span, starts, Plane(0, 0.0, 1), system.dt)
         return found.states[:, [1, 3]]
     t = comparison.t
     sol = solve(system, integrator, comparison.t_span, comparison.y0, t_eval=t, on_domain_exit="ignore")
     return to_numpy(sol.states).reshape(-1, 2 * system.ndof)[:, [0, 1]]
+
+
+def _period(comparison: Compared) -> float | None:
+    """The period of a driven system, of which the interval holds one at least."""
+    period = comparison.system.period
+    return period if period is not None and whole_periods(comparison.t_span, period) else None
 
 
 def _reference_points(comparison: Compared) -> np.ndarray:
@@ -368,7 +387,7 @@ def precision_figure(rows: Sequence[Row], heading: str, measure: str = "energy_e
     Raises
     ------
     ValueError
-        For another measure than "energy_error" or "error".
+        For another measure than "energy_error", "balance_error" or "error".
     """
     if measure not in MEASURES:
         raise ValueError(f"`measure` must be one of {', '.join(map(repr, MEASURES))}; got {measure!r}.")

@@ -17,6 +17,7 @@ from sympflow.arguments import check_counts, check_t_span, positive_numbers
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.metrics.energy import failed
+from sympflow.metrics.energy_balance import jumps_in_time
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
@@ -33,7 +34,7 @@ METHODS = ("verlet", "leapfrog", "blanes_moan4", "srkn11b", "kahan_li8", "rk45",
 TOLERANCES = tuple(10.0**-k for k in range(3, 13))
 LARGEST_STEP, N_STEPS = 32, 14  # the default sweep: from 32·system.dt, halving
 LEVELS = (1e-3, 1e-6, 1e-9)  # energy errors for which the table gives the costs
-FLOOR = 1e-12  # energy error from which smaller steps only cost more
+FLOOR = 1e-12  # error from which smaller steps only cost more
 NEAR_FLOOR = 1e-6  # and of the point before it: an error that is small by chance is no end
 SAMPLE = 4  # trajectories of a batch that are run by a method that takes them one by one
 MARGIN = 100.0  # by which a reference must be better than an error
@@ -56,6 +57,9 @@ def work_precision(
 ) -> WorkPrecision:
     """Sweep steps and tolerances, and measure error, run time and evaluations.
 
+    The error is that of the energy; of a driven system that of the energy balance, see `energy_balance_error`; of a
+    damped one that of the state. The error of the state is measured of all.
+
     Parameters
     ----------
     system : HamiltonianSystem
@@ -66,7 +70,7 @@ def work_precision(
     batch : int or array_like (n, 2d), optional
         Also run this many states of the system's domain (seed 0), or these states. By default there is no batch.
     steps : sequence of float, optional
-        Steps of fixed-step methods; by default 32·system.dt, halved until the energy error is at rounding, at most to
+        Steps of fixed-step methods; by default 32·system.dt, halved until the error is at rounding, at most to
         system.dt/256.
     tolerances : sequence of float
         rtol of adaptive methods, with atol = rtol/1000, the ratio of SciPy's defaults.
@@ -94,12 +98,6 @@ def work_precision(
     """
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
-    system.check_conservative(
-        "so there is no energy error to draw", "use sympflow.compare(system, methods, metrics=['error'])"
-    )
-    system.check_autonomous(
-        "so there is no energy error to draw", "use sympflow.compare(system, methods, metrics=['error'])"
-    )
     tolerances = positive_numbers("tolerances", tolerances)
     if steps is not None:
         steps = positive_numbers("steps", steps)
@@ -125,7 +123,7 @@ def work_precision(
         conditions = Conditions(system, (t0, t1), start, t, backend)
         say = partial(_prefixed, progress, f"{system.name}, {conditions.trajectories} trajectories")
         measured, truth = _measure(conditions, swept, repeats, budget, say)
-        rows += break_even(measured, abs(t1 - t0))
+        rows += break_even(measured, abs(t1 - t0), conditions.measure)
         references.append(truth)
     return WorkPrecision(system, (t0, t1), n_outputs, repeats, tuple(references), tuple(rows))
 
@@ -160,6 +158,16 @@ def _sweep(candidate: Candidate, by_name: bool, steps: Sequence[float], toleranc
     return [integrator]
 
 
+def measure_of(system: HamiltonianSystem) -> str:
+    """The figure of a row by which methods are judged on a system: of what its flow keeps, if that is an energy."""
+    if not system.conservative or (not system.autonomous and jumps_in_time(system)):
+        return "error"
+    return "energy_error" if system.autonomous else "balance_error"
+
+
+_KEPT: dict[str, attempts.Metric] = {"energy_error": attempts.energy, "balance_error": attempts.balance}
+
+
 # the points -----------------------------------------------------------------------------------------------------------
 
 
@@ -176,6 +184,11 @@ class Conditions:
     @property
     def trajectories(self) -> int:
         return self.y0.size // self.y0.shape[-1]
+
+    @property
+    def measure(self) -> str:
+        """The figure of a row by which methods are judged: see `measure_of`."""
+        return measure_of(self.system)
 
     def run(self, integrator: Any, t_span: tuple[float, float] | None = None, t: np.ndarray | None = None) -> Solution:
         """The solution from all initial states, or of a method that takes them one by one from a few.
@@ -196,6 +209,10 @@ def _measure(
     say: Callable[[str], None],
 ) -> tuple[list[Row], Reference | None]:
     """All points for one set of initial states."""
+    say("reference")
+    truth, problem = _reference(conditions)
+    resolved = MARGIN * (0.0 if truth is None or truth.accuracy is None else truth.accuracy)
+    floor = FLOOR if conditions.measure in _KEPT else max(FLOOR, resolved)
     points: list[Attempt] = []
     for candidate, integrators in swept:
         say(candidate.label)
@@ -204,9 +221,13 @@ def _measure(
         for integrator in integrators:
             point = _first(replace(candidate, integrator=integrator), conditions, compile_time)
             points.append(point)
-            row, before = point.row, error
-            error = math.inf if row.energy_error is None else row.energy_error
-            if row.status == "not applicable" or (error < FLOOR and before < NEAR_FLOOR):
+            if truth is None:
+                point.note(f"No error: {problem}")
+            elif point.row.status == "ok":
+                attempts.accuracy(point, truth)
+            before = error
+            error = _figure(point.row, conditions.measure)
+            if point.row.status == "not applicable" or (error < floor and before < max(NEAR_FLOOR, 1e3 * floor)):
                 break
     say("timing")
     again = [p for p in points if p.row.status == "ok" and (p.row.run_time or 0.0) * repeats <= budget]
@@ -216,8 +237,8 @@ def _measure(
     for point in points:
         if point.sol is not None and (few := point.sol.y0.size // point.sol.y0.shape[-1]) < conditions.trajectories:
             _scale(point, few, conditions.trajectories)
-    say("reference")
-    truth = _errors(points, conditions)
+        if point.row.status == "ok" and truth is not None and not (point.row.error or 0.0) >= resolved:
+            point.fill(status="uncertain")
     return [point.row for point in points], truth
 
 
@@ -244,7 +265,8 @@ def _first(candidate: Candidate, conditions: Conditions, compile_time: float | N
         force_evaluations=sol.stats["force_evaluations"] / share,
         hessian_evaluations=sol.stats["hessian_evaluations"] / share,
     )
-    point.measure({"energy": attempts.energy}, ["energy"])
+    if conditions.measure in _KEPT:
+        point.measure({"energy": _KEPT[conditions.measure]}, ["energy"])
     return point
 
 
@@ -255,42 +277,41 @@ def _scale(point: Attempt, few: int, all_of_them: int) -> None:
     point.note(f"Timed on {few} trajectories, which the method takes one by one.")
 
 
-def _errors(points: Sequence[Attempt], conditions: Conditions) -> Reference | None:
-    """Fill in the errors against a reference; mark those that it cannot resolve."""
+def _reference(conditions: Conditions) -> tuple[Reference | None, str]:
+    """The reference; None and the reason where there is none."""
     try:
-        truth = compute_reference(conditions.system, conditions.t_span, conditions.y0, conditions.t)
+        return compute_reference(conditions.system, conditions.t_span, conditions.y0, conditions.t), ""
     except (ValueError, RuntimeError) as problem:
-        for point in points:
-            point.note(f"No error: {problem}")
-        return None
-    for point in points:
-        if point.row.status == "ok":
-            attempts.accuracy(point, truth)
-            resolved = (point.row.error or 0.0) >= MARGIN * (truth.accuracy or 0.0)
-            point.fill(status="ok" if resolved else "uncertain")
-    return truth
+        return None, str(problem)
 
 
 # read off the points --------------------------------------------------------------------------------------------------
 
 
-def break_even(points: list[Row], length: float) -> list[Row]:
+def break_even(points: list[Row], length: float, measure: str = "energy_error") -> list[Row]:
     """Fill in when the training of each flow has paid for itself, for runs over an interval of that length."""
-    done = [p for p in points if p.run_time and p.energy_error is not None and math.isfinite(p.energy_error)]
+    done = [p for p in points if p.run_time and math.isfinite(_figure(p, measure))]
     untrained = [p for p in done if p.training_time is None and p.method not in ("sympflow", "mlp")]
     filled = []
     for point in points:
         if point in done and point.training_time is not None and untrained:
             labels = {p.label for p in untrained}
-            rival = min(cost_at([p for p in untrained if p.label == n], point.energy_error or 0.0) for n in labels)
+            error = _figure(point, measure)
+            rival = min(cost_at([p for p in untrained if p.label == n], error, measure=measure) for n in labels)
             if math.isinf(rival):  # no untrained point is as accurate: nothing to compare with
-                reason = "No break-even: no untrained method was run at a step that reaches this energy error."
+                reason = "No break-even: no untrained method was run at a step that reaches this error."
                 filled.append(replace(point, reason=f"{point.reason} {reason}".strip()))
                 continue
             saved = (rival - (point.run_time or 0.0)) / length
             point = replace(point, break_even=point.training_time / saved if saved > 0 else math.inf)  # noqa: PLW2901
         filled.append(point)
     return filled
+
+
+def _figure(point: Row, measure: str) -> float:
+    """A figure of a row, inf where it is missing."""
+    figure = getattr(point, measure)
+    return math.inf if figure is None else figure
 
 
 def cost_at(points: Sequence[Row], error: float, cost: str = "run_time", measure: str = "energy_error") -> float:
@@ -327,7 +348,7 @@ class WorkPrecision(Report):
     columns: ClassVar[tuple[str, ...]] = (
         *("system", "method", "label", "trajectories", "dt", "tolerance", "status", "reason", "backend", "run_time"),
         *("run_time_spread", "compile_time", "repeats", "force_evaluations", "hessian_evaluations", "error"),
-        *("energy_error", "training_time", "break_even"),
+        *("energy_error", "balance_error", "training_time", "break_even"),
     )
 
     system: HamiltonianSystem
@@ -343,18 +364,24 @@ class WorkPrecision(Report):
         return title(self.system)
 
     @property
+    def measure(self) -> str:
+        """The error by which methods are judged: "energy_error", "balance_error" or "error"."""
+        return measure_of(self.system)
+
+    @property
     def sizes(self) -> list[int]:
         """Numbers of trajectories: 1, and the size of the batch."""
         return sorted({row.trajectories for row in self.rows})
 
     def table(self, levels: tuple[float, ...] = LEVELS) -> str:
-        """Evaluations and run time of each method for each level of the energy error; then every point."""
+        """Evaluations and run time of each method for each level of the error; then every point."""
         heading = [f"{self.title}: t = {self.t_span[0]:g} … {self.t_span[1]:g}, {self.n_outputs} instants"]
         for size, reference in zip(self.sizes, self.references, strict=True):
             known = "none" if reference is None else reference.described()
             heading.append(f"reference for {_size(size)}: {known}")
         blocks = [
-            f"For an energy error of …, {_size(size)} (run time of all, evaluations of one)\n\n{self._at(size, levels)}"
+            f"For {_WORDS[self.measure]} of …, {_size(size)} (run time of all, evaluations of one)\n\n"
+            + self._at(size, levels)
             for size in self.sizes
         ]
         notes = dict.fromkeys(f"  {row.label}: {row.reason}" for row in self.rows if row.reason)
@@ -367,7 +394,7 @@ class WorkPrecision(Report):
         columns = [Column("method", labels, left=True)]
         for level in levels:
             for cost, show in (("force_evaluations", _count), ("run_time", seconds)):
-                found = [cost_at([r for r in rows if r.label == label], level, cost) for label in labels]
+                found = [cost_at([r for r in rows if r.label == label], level, cost, self.measure) for label in labels]
                 head = f"{level:.0e}" if cost == "run_time" else "forces"
                 columns.append(Column(head, [show(x) if math.isfinite(x) else "–" for x in found]))
         first = {row.label: row for row in reversed(rows)}
@@ -394,6 +421,7 @@ class WorkPrecision(Report):
                 Column("Hessians", [_count(r.hessian_evaluations or None) for r in rows]),
                 Column("error", [number(r.error) for r in rows]),
                 Column("energy error", [number(r.energy_error) for r in rows]),
+                Column("energy balance", [number(r.balance_error) for r in rows]),
                 Column("status", ["" if r.status == "ok" else r.status for r in rows], left=True),
             ]
         )
@@ -407,20 +435,26 @@ class WorkPrecision(Report):
             "references": [None if r is None else r.summary() for r in self.references],
         }
 
-    def figure(self, measure: str = "energy_error") -> Figure:
+    def figure(self, measure: str | None = None) -> Figure:
         """Error against run time and against evaluations, log–log; a row for one trajectory and one for the batch.
 
         Parameters
         ----------
-        measure : "energy_error" or "error"
+        measure : "energy_error", "balance_error" or "error", optional
+            By default that by which methods are judged.
         """
         from sympflow.studies.figures import precision_figure
 
-        return precision_figure(self.rows, f"{self.title}, T = {self.t_span[1] - self.t_span[0]:g}", measure)
+        return precision_figure(
+            self.rows, f"{self.title}, T = {self.t_span[1] - self.t_span[0]:g}", measure or self.measure
+        )
 
-    def plot(self, path: str | os.PathLike[str] | None = None, measure: str = "energy_error") -> Figure:
+    def plot(self, path: str | os.PathLike[str] | None = None, measure: str | None = None) -> Figure:
         """The figure, as `figure`; with a path it is also saved."""
         return saved(self.figure(measure), path)
+
+
+_WORDS = {"energy_error": "an energy error", "balance_error": "an energy balance error", "error": "an error"}
 
 
 def _size(n: int) -> str:

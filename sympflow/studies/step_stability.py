@@ -128,7 +128,10 @@ def stability(
             "so its energy error says nothing of stability",
             "study the system without `damping`, or use sympflow.compare",
         )
-        one.check_autonomous("so its energy error says nothing of stability", "use sympflow.compare(metrics=['error'])")
+        one.check_autonomous(
+            "so its energy error says nothing of stability",
+            "use sympflow.compare(system, methods), or floquet_multipliers of a periodic orbit",
+        )
     unknown = [m for m in metrics if m not in METRICS]
     if isinstance(metrics, str) or unknown:
         raise ValueError(f"`metrics` must be a list of names from {', '.join(METRICS)}; got {metrics!r}.")

@@ -246,3 +246,26 @@ def test_the_repr_of_a_row_shows_what_is_filled_in():
     assert repr(row) == (
         "Row(system='pendulum', method='verlet', label='verlet', status='ok', run_time=1.5, energy_error=0.0)"
     )
+
+
+@pytest.mark.parametrize(
+    ("scene", "metrics"),
+    [
+        (systems.driven_pendulum, ("error", "balance", "volume", "symplecticity")),
+        (systems.duffing, ("error", "conformal")),
+    ],
+)
+def test_the_default_metrics_are_those_of_what_a_system_keeps(scene, metrics, tmp_path):
+    report = compare(scene(), ["verlet", "rk4", "sympflow"], t_span=(0, 10), n_outputs=20, repeats=1)
+    assert report.metrics == metrics
+    verlet, rk4, flow = report.rows
+    assert flow.status == "not applicable"
+    assert verlet.error < 0.01
+    kept = "balance_error" if "balance" in metrics else "conformal_defect"
+    limit = 1e-3 if kept == "balance_error" else 1e-15
+    assert 0 < getattr(verlet, kept) < limit
+    assert getattr(rk4, kept) > 1e-12
+    assert "not applicable" in report.table()
+    report.plot(tmp_path)
+    assert (tmp_path / "portrait.png").exists()
+    assert (tmp_path / "energy.png").exists() == (kept == "balance_error")

@@ -202,3 +202,18 @@ def test_an_error_that_is_small_by_chance_does_not_end_a_sweep():
     rows = work_precision(systems.harmonic_oscillator(1.3), ["verlet"], steps=[2 / 1.3, 0.4, 0.1], **few).rows
     assert [row.dt for row in rows] == [2 / 1.3, 0.4, 0.1]
     assert 0 < rows[0].energy_error < 1e-12 < rows[2].energy_error < rows[1].energy_error
+
+
+def test_a_driven_system_is_judged_by_its_energy_balance_and_a_damped_one_by_its_state(tmp_path):
+    driven = work_precision(systems.driven_pendulum(), ["verlet"], steps=[0.1, 0.05, 0.025], **QUICK)
+    errors = [row.balance_error for row in driven.rows]
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
+    assert all(row.energy_error is None for row in driven.rows)
+    assert "For an energy balance error of" in driven.table()
+    assert "energy balance" in driven.plot(tmp_path / "driven.png").axes[0].get_xlabel()
+    damped = work_precision(systems.duffing(), ["verlet", "sympflow"], steps=[0.1, 0.05], **QUICK)
+    assert damped.measure == "error"
+    verlet = [row for row in damped.rows if row.label == "verlet"]
+    assert verlet[0].error / verlet[1].error == pytest.approx(4, rel=0.1)
+    assert verlet[0].balance_error is verlet[0].energy_error is None
+    assert damped.rows[-1].status == "not applicable"

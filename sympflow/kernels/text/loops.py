@@ -174,15 +174,16 @@ def step_each(table, x, h, t, y, out):
 
 
 @njit(**OPTIONS)
-def map_each(table, y, out):
-    """A map of fixed numbers, the columns of a table, of every row of `y`."""
+def map_each(table, steps, y, out):
+    """A map of fixed numbers, the columns of a table, of every row of `y`, after so many `steps`, told in turn."""
     work = prepared(table)
     for i in range(y.shape[0]):
         q, p = unpack(y[i])
+        k = steps[i % len(steps)]
         q_error, p_error = no_error(q), no_error(p)
         for j in range(columns_of(table)):
             q, p, q_error, p_error = called_stage(
-                q, p, q_error, p_error, numbers_of(table, j), drift_of(table, j), j, work
+                q, p, q_error, p_error, numbers_of(table, j, k), drift_of(table, j), j, work
             )
         pack(q, p, out[i])
 
@@ -218,14 +219,14 @@ def rollout_processed(before, run, after, y0, n_steps, save, out, stop, first, r
     """`rollout` from `y0` (2d,) in other coordinates, `before` into them and `after` out of them."""
     start = np.empty((1, len(y0)))
     if first == 0:
-        map_rows(before, y0.reshape((1, len(y0))), start)
+        map_rows(before, np.zeros(1, np.int64), y0.reshape((1, len(y0))), start)
     n_finite = rollout(run, start[0], n_steps, save, out, stop, first, running)
     at_start = 0
     while at_start < len(save) and save[at_start] <= 0:
         q, p = unpack(y0)
         pack(q, p, out[at_start])
         at_start += 1
-    map_rows(after, out[at_start:], out[at_start:])
+    map_rows(after, save[at_start:], out[at_start:], out[at_start:])
     return up_to_finite(out, save, n_finite)
 
 
@@ -234,10 +235,10 @@ def rollout_processed_rows(before, run, after, y0, n_steps, save, out, n_finite,
     """The same of every row of `y0` (N, 2d)."""
     start = np.empty(y0.shape)
     if first == 0:
-        map_rows(before, y0, start)
+        map_rows(before, np.zeros(1, np.int64), y0, start)
     rollout_rows(run, start, n_steps, save, out, n_finite, stop, first, running)
     outputs = out.reshape((-1, y0.shape[1]))
-    map_rows(after, outputs, outputs)
+    map_rows(after, save, outputs, outputs)
     for i in range(len(y0)):
         for row in range(len(save)):
             if save[row] > 0:

@@ -1,0 +1,113 @@
+"""Long runs: windows give the bits of one piece, Ctrl-C keeps what was computed, and progress is told."""
+
+import numpy as np
+import pytest
+
+import sympflow
+from sympflow.integrators import progress, windows
+from sympflow.integrators.contract import Interrupted
+from sympflow.solver import solve
+from sympflow.systems import henon_heiles
+
+SYSTEM = henon_heiles()
+BATCH = SYSTEM.y0 + 0.02 * np.random.default_rng(0).standard_normal((3, 4))
+SPAN, DT = (0.0, 40.0), 0.05
+TIMES = np.array([0.0, 0.05, 3.3, 3.31, 12.345, 12.345, 39.9, 40.0])
+
+
+@pytest.fixture
+def short_windows(monkeypatch):
+    monkeypatch.setattr(windows, "ONE", 100)
+    monkeypatch.setattr(windows, "MANY", 300)
+    monkeypatch.setattr(windows, "ARRAY_STEPS", 30)
+    monkeypatch.setattr(windows.Pace, "took", lambda self, n: None)
+
+
+class Told(list):
+    """A progress function that keeps what it is told, and that Ctrl-C interrupts once so much is done."""
+
+    def __init__(self, until=np.inf):
+        self.until = until
+
+    def __call__(self, done, total):
+        self.append((done, total))
+        if done >= self.until:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("t_eval", [None, TIMES], ids=["steps", "times"])
+@pytest.mark.parametrize("y0", [SYSTEM.y0, BATCH], ids=["one", "batch"])
+@pytest.mark.parametrize("backend", ["compiled", "array"])
+def test_windows_give_the_bits_of_one_piece(short_windows, backend, y0, t_eval):
+    options = {"t_eval": t_eval, "dt": DT, "backend": backend}
+    whole = solve(SYSTEM, "verlet", SPAN, y0, **options)
+    cut = solve(SYSTEM, "verlet", SPAN, y0, progress=Told(), **options)
+    np.testing.assert_array_equal(cut.y, whole.y)
+    np.testing.assert_array_equal(cut.t, whole.t)
+    assert {**cut.stats, "wall_time": 0} == {**whole.stats, "wall_time": 0}
+
+
+def test_a_run_that_fails_in_a_window_ends_as_in_one_piece(short_windows):
+    y0 = np.array([BATCH[0], [0.0, 1.5, 1.0, 1.0], BATCH[1]])
+    for start in (y0, y0[1]):
+        whole = solve(SYSTEM, "verlet", SPAN, start, dt=DT)
+        cut = solve(SYSTEM, "verlet", SPAN, start, dt=DT, progress=Told())
+        np.testing.assert_array_equal(cut.y, whole.y)
+        np.testing.assert_array_equal(cut.status, whole.status)
+        np.testing.assert_array_equal(cut.stats["failed_at"], whole.stats["failed_at"])
+        assert cut.message == whole.message
+
+
+def test_progress_grows_up_to_the_whole_time(short_windows, monkeypatch):
+    monkeypatch.setattr(progress, "BETWEEN", 0.0)
+    for more in ({}, {"backend": "array"}, {"events": lambda t, y: y[0]}):
+        told = Told()
+        solve(SYSTEM, "verlet", SPAN[::-1], dt=DT, progress=told, **more)
+        done = [part for part, _ in told]
+        assert len(done) > 3
+        assert done == sorted(set(done))
+        assert told[-1] == (40.0, 40.0)
+
+
+def test_a_bar_is_drawn_on_stderr(short_windows, capsys):
+    solve(SYSTEM, "verlet", SPAN, dt=DT, progress=True)
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.rstrip().startswith("\r[####")
+    assert "100 %  t = 40 of 40" in shown.err
+    with pytest.raises(TypeError, match=r"`progress` must be True, False, or a function of \(done, total\); got 'yes'"):
+        solve(SYSTEM, "verlet", SPAN, dt=DT, progress="yes")
+
+
+@pytest.mark.parametrize(
+    ("y0", "options"),
+    [
+        (SYSTEM.y0, {}),
+        (SYSTEM.y0, {"t_eval": TIMES}),
+        (SYSTEM.y0, {"dense_output": True}),
+        (SYSTEM.y0, {"backend": "array"}),
+        (SYSTEM.y0, {"events": lambda t, y: y[0]}),
+        (BATCH, {"save_every": 7}),
+    ],
+    ids=["steps", "times", "dense", "array", "events", "batch"],
+)
+def test_what_was_computed_before_ctrl_c_is_kept(short_windows, monkeypatch, y0, options):
+    monkeypatch.setattr(progress, "BETWEEN", 0.0)
+    whole = solve(SYSTEM, "verlet", SPAN, y0, dt=DT, **options)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        solve(SYSTEM, "verlet", SPAN, y0, dt=DT, progress=Told(10.0), **options)
+    assert type(caught.value) is sympflow.Interrupted is Interrupted
+    sol = caught.value.solution
+    until = sol.stats["interrupted_at"]
+    n = len(sol.t)
+    assert 10 <= until < 40
+    assert np.all(np.asarray(sol.status) == -1)
+    assert sol.message == str(caught.value)
+    assert sol.message.startswith(f"The run was interrupted after t = {until:.17g}")
+    np.testing.assert_array_equal(sol.t, whole.t[:n])
+    np.testing.assert_array_equal(sol.y, whole.y[..., :n])
+    assert n == np.count_nonzero(whole.t < until + DT / 2) or "events" in options
+    if sol.sol is not None:
+        np.testing.assert_array_equal(sol.sol(3.3), whole.sol(3.3))
+    if sol.t_events is not None:
+        np.testing.assert_array_equal(sol.t_events[0], whole.t_events[0][whole.t_events[0] <= until])
