@@ -120,7 +120,7 @@ def test_values_without_a_system_fail_their_orbits():
 @pytest.mark.parametrize(
     ("how", "error", "message"),
     [
-        ({"params": {"lam": [1.0]}}, ValueError, "`params` has 'lam', which the system 'henon_heiles' has not"),
+        ({"params": {"lam": [1.0]}}, ValueError, "`params` has 'lam', no parameter of 'henon_heiles', which has none"),
         ({"params": 3}, TypeError, "`params` must map names"),
         ({"reduce": "finall"}, ValueError, "Did you mean 'final'"),
         ({"reduce": 3}, TypeError, "`reduce` must be a name"),
