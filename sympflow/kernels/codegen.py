@@ -336,7 +336,7 @@ def is_finite(q, p):
 
 
 @njit(**OPTIONS)
-def workspace():
+def workspace(table):
     return None
 
 
