@@ -57,7 +57,7 @@ class Solution:
         The problem that was solved and the method that did it: metrics execute the run again from these.
     rows : ParameterRows or None
         The parameters of each trajectory, where `solve` was given `params`: see `params` and `by_parameters`. `system`
-        is then the one that was given, unless all trajectories have the same values.
+        is then the one that was given, unless they were given as numbers.
     """
 
     t: np.ndarray = field(repr=False)

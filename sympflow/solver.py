@@ -75,9 +75,9 @@ def solve(
         Values of parameters of the system for each trajectory: numbers, or arrays that broadcast with the batch of y0;
         of one state y0 they make a batch. The others keep the system's values. Splitting methods on the splitting
         "kinetic", but for those with force gradients and with friction, take them as numbers of one compiled run, and
-        each trajectory is that on ``system.with_params(...)`` up to rounding. Elsewhere trajectories of equal values
-        run together, one set of values after the other, and are so bit by bit. A trained flow holds for its own
-        parameters alone.
+        each trajectory is that of a batch on ``system.with_params(...)``, with compensated sums up to rounding.
+        Elsewhere trajectories of equal values run together, one set of values after the other. A trained flow holds for
+        its own parameters alone.
     t_eval : array_like of shape (n,), optional
         Times to report, ordered from start to end. The default is every step. No other state is stored.
     dense_output : bool

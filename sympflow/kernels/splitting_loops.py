@@ -278,9 +278,9 @@ class SplittingKernel(Kernel):
 class VariedKernel(SplittingKernel):
     """The loops of batches of N trajectories that have their own values (k, N) of `SplittingLoops.values`.
 
-    Each takes the steps of `SplittingKernel` on a system with its values up to rounding: what the compiler takes out of
-    loops there, products of values, it may fuse with sums here. A batch may be several of such ones, one after the
-    other.
+    Each takes the steps of `SplittingKernel` on a system with its values, with compensated sums up to rounding:
+    products of values, which the compiler takes out of loops there, it may fuse with sums here. A batch may be several
+    of such ones, one after the other.
     """
 
     def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool, values: np.ndarray) -> None:
@@ -444,7 +444,7 @@ def symbolic_module(
     lanes = lanes_source(kinds, scheduled, friction, n, varied)
     sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
     if scheduled:
-        sources.append(kicks_source(symbols, level, monomials))
+        sources.append(kicks_source(symbols, level, monomials, varied=varied))
     elif level == POLYNOMIAL:
         sources.append(polynomial_kick_source(symbols, monomials))
     elif level:
