@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+from conftest import load_example
 from scipy.interpolate import CubicSpline, PPoly
 from scipy.special import mathieu_a, mathieu_b, mathieu_cem
 
@@ -158,3 +159,14 @@ def test_steps_of_the_kicked_scene_are_the_standard_map():
 def test_bad_parameters(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+@pytest.mark.slow
+def test_the_pictures_are_drawn(tmp_path, capsys):
+    load_example("driven_maps").main(["--quick", "--out", str(tmp_path)])
+    assert "Duffing: 620 states" in capsys.readouterr().out
+    assert {p.stem for p in tmp_path.glob("*.png")} == {
+        "duffing_attractor",
+        "driven_pendulum_section",
+        "mathieu_stability",
+    }
