@@ -228,6 +228,10 @@ def certify(
         "which takes energy away, and a certificate bounds the error of an energy that is kept",
         "see flow.figures, or sympflow.reference_error of a run",
     )
+    system.check_autonomous(
+        "so that its energy changes, and a certificate bounds the error of an energy that is kept",
+        "see flow.figures, or sympflow.energy_balance_error of a run",
+    )
     x, unseen = (domain.sample(n, _seed(seed, i)) for i, n in enumerate((states, held_out)))
     energy, relative, left = _energy_errors(flow, system, domain, unseen, t_end)
     return Certificate(

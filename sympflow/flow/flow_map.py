@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from typing import Any, ClassVar, Self
 
@@ -95,6 +96,8 @@ class FlowMap(nn.Module):
     """True if ψ_t is the flow of a Hamiltonian, with an exact inverse; with friction conformally symplectic."""
     takes_friction: ClassVar[bool] = False
     """True if the maps of the family hold the friction of a damped system that they are made for."""
+    takes_driving: ClassVar[bool] = False
+    """True if the maps of the family take the time, of a driven system that they are made for."""
     identity: Identity | None = None  # these two of flows in pickles of earlier versions, which did not have them
     unfitted: tuple[tuple[float, float], ...] = ()
 
@@ -145,50 +148,51 @@ class FlowMap(nn.Module):
 
     # the bare map on [0, Δt] --------------------------------------------------------------------------
 
-    def psi(self, t: float | Tensor, x: Tensor) -> Tensor:
+    def psi(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """ψ̄_t(x) for t ∈ [0, Δt], unchecked and without synchronising with the host: for inner loops.
 
-        `t` is a number or a tensor that broadcasts against the batch shape of `x` (..., 2d).
+        `t` is a number or a tensor that broadcasts against the batch shape of `x` (..., 2d); so is `t0`, the time of x,
+        which the flow of a driven system takes.
         """
-        t, y, batch = self._columns(t, x)
-        return self._states(self._map(t, y), batch)
+        return self.project(self._psi(t, self.lift(x, t0)))
 
-    def psi_inverse(self, t: float | Tensor, x: Tensor) -> Tensor:
-        """ψ̄_t⁻¹(x) for t ∈ [0, Δt], unchecked."""
-        t, y, batch = self._columns(t, x)
-        return self._states(self._map_inverse(t, y), batch)
+    def psi_inverse(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
+        """ψ̄_t⁻¹(x) for t ∈ [0, Δt], unchecked; x is at the time t0 + t."""
+        return self.project(self._psi(t, self.lift(x, t0, t), back=True))
 
-    def psi_and_velocity(self, t: float | Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    def psi_and_velocity(self, t: float | Tensor, x: Tensor, t0: Any = None) -> tuple[Tensor, Tensor]:
         """ψ̄_t(x) and d/dt ψ̄_t(x), each (..., 2d), for t ∈ [0, Δt], unchecked."""
-        t, y, batch = self._columns(t, x)
+        t, y, batch = self._columns(t, self.lift(x, t0))
         y, dy = self._map_tangent(t, y)
-        return self._states(y, batch), self._states(dy, batch)
+        return self.project(self._states(y, batch)), self.project(self._states(dy, batch))
 
-    def velocity(self, t: float | Tensor, x: Tensor) -> Tensor:
+    def velocity(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """d/dt ψ̄_t(x), (..., 2d), for t ∈ [0, Δt], in closed form."""
-        return self.psi_and_velocity(self._bare_time(t, x), x)[1]
+        return self.psi_and_velocity(self._bare_time(t, x), x, t0)[1]
 
-    def initial_velocity(self, x: Tensor) -> Tensor:
+    def initial_velocity(self, x: Tensor, t0: Any = None) -> Tensor:
         """d/dt ψ̄_t(x) at t = 0, (..., 2d)."""
-        return self.velocity(0.0, x)
+        return self.velocity(0.0, x, t0)
 
-    def hamiltonian(self, t: float | Tensor, x: Tensor) -> Tensor:
+    def hamiltonian(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """𝓗(ψ̄)(t, x), (...), for t ∈ [0, Δt]: the Hamiltonian of which ψ̄_t is the exact flow.
+
+        That of a driven system is near H(t0 + t, x).
 
         Raises
         ------
         TypeError
             If this is an unconstrained network, which has none.
         """
-        return self.hamiltonian_unchecked(self._bare_time(t, x), x)
+        return self.hamiltonian_unchecked(self._bare_time(t, x), x, t0)
 
-    def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor) -> Tensor:
+    def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """`hamiltonian` without checks, for inner loops."""
         raise TypeError("`flow` is an unconstrained network, which is the flow of no Hamiltonian: use a SympFlow.")
 
     # every t ------------------------------------------------------------------------------------------
 
-    def forward(self, t: float | Tensor, x: Tensor) -> Tensor:
+    def forward(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """ψ_t(x) for every t.
 
         ψ_t = ψ̄_r ∘ (ψ̄_Δt)^k with k = ⌊t/Δt⌋, r = t − kΔt; for t < 0 it is (ψ̄_r)⁻¹ ∘ (ψ̄_Δt)⁻ᵏ with |t| for t.
@@ -200,31 +204,80 @@ class FlowMap(nn.Module):
             One time, or a tensor that broadcasts against the batch shape of x.
         x : tensor, shape (..., 2d)
             In the dtype and on the device of the flow.
+        t0 : float or tensor
+            The time of x, of a driven system, for which alone it counts: one, or one for each state.
 
         Raises
         ------
         ValueError, TypeError
-            If an argument has the wrong type, shape, dtype or device, or t is not finite.
+            If an argument has the wrong type, shape, dtype or device, t or t0 is not finite, or t0 is missing.
         """
         t = self._checked_time(t, x)
         self.warn_of_times(t)
+        x = self.lift(x, t0)
         if isinstance(t, float):
-            return self._whole(whole_steps(abs(t), self.dt), t < 0, x)
+            return self.project(self._whole(whole_steps(abs(t), self.dt), t < 0, x))
         k, r, back, x = self._split(t, x)
         x = self._repeat(k * ~back, False, x)
         x = self._repeat(k * back, True, x)
-        return self._remainder(r, back, x)
+        return self.project(self._remainder(r, back, x))
 
-    def inverse(self, t: float | Tensor, x: Tensor) -> Tensor:
-        """The exact inverse of ψ_t, for every t: arguments as for the call."""
+    def inverse(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
+        """The exact inverse of ψ_t, for every t: arguments as for the call, x being at the time t0 + t."""
         t = self._checked_time(t, x)
         self.warn_of_times(t)
+        x = self.lift(x, t0, t)
         if isinstance(t, float):
-            return self._whole(whole_steps(abs(t), self.dt), t >= 0, x, remainder_first=True)
+            return self.project(self._whole(whole_steps(abs(t), self.dt), t >= 0, x, remainder_first=True))
         k, r, back, x = self._split(t, x)
         x = self._remainder(r, ~back, x)
         x = self._repeat(k * ~back, True, x)
-        return self._repeat(k * back, False, x)
+        return self.project(self._repeat(k * back, False, x))
+
+    # the time as a coordinate -------------------------------------------------------------------------
+
+    @property
+    def driven(self) -> bool:
+        """True for the flow of a driven system, whose maps take and give states [q, t, p] with their time."""
+        return False
+
+    @property
+    def period(self) -> float | None:
+        """The period in t0 of the flow of a driven system, where there is one."""
+        return None
+
+    def lift(self, x: Tensor, t0: Any = None, passed: Any = 0.0) -> Tensor:
+        """The states that the maps take: of a driven system (..., 2d) at the time t0 + passed to [q, t, p], else x.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a driven system's t0 is missing, no finite number, or of another shape than the batch.
+        """
+        if not self.driven:
+            return x
+        time = start_time(t0, x, self.period)
+        time = (time + torch.as_tensor(passed, dtype=torch.float64, device=x.device)).to(x.dtype)
+        batch = torch.broadcast_shapes(x.shape[:-1], time.shape)
+        x, time = x.expand(*batch, x.shape[-1]), time.expand(batch)
+        return torch.cat([x[..., : self.ndof], time[..., None], x[..., self.ndof :]], dim=-1)
+
+    def project(self, z: Tensor) -> Tensor:
+        """The states [q, p] of those that the maps take."""
+        return torch.cat([z[..., : self.ndof], z[..., self.ndof + 1 :]], dim=-1) if self.driven else z
+
+    def on_extended(self, extended: HamiltonianSystem) -> Self | None:
+        """Return the same maps of a driven system with a coordinate more, of which the momentum is −∫ ∂H/∂t dt.
+
+        None where the functions of a system are no part of the maps.
+        """
+        return None
+
+    def at_time(self, z: Tensor, time: Any) -> Tensor:
+        """Such states of a driven system with another time, a number or (...)."""
+        d = self.ndof
+        time = torch.as_tensor(time, dtype=z.dtype, device=z.device).expand(z.shape[:-1])
+        return torch.cat([z[..., :d], time[..., None], z[..., d + 1 :]], dim=-1)
 
     def warn_of_times(self, t: Any) -> None:
         """Warn where a time, or one of several, is k·Δt + r with an r at which the flow was fitted to nothing.
@@ -275,17 +328,21 @@ class FlowMap(nn.Module):
 
     def _repeat(self, k: Tensor, back: bool, x: Tensor) -> Tensor:
         """ψ̄_Δt, or its inverse, k times, with a count k for each state."""
-        step = self.psi_inverse if back else self.psi
         for j in range(int(to_values(k).max(initial=0))):
-            x = _where(k > j, lambda t, y: step(self.dt, y), k, x)
+            x = _where(k > j, lambda t, y: self._psi(self.dt, y, back), k, x)
         return x
 
     def _remainder(self, r: Tensor, back: Tensor, x: Tensor) -> Tensor:
         moving = (r > 0) | differentiable(r)  # at r = 0 the state stays, but has a derivative
-        x = _where(moving & ~back, self.psi, r, x)
-        return _where(moving & back, self.psi_inverse, r, x)
+        x = _where(moving & ~back, self._psi, r, x)
+        return _where(moving & back, partial(self._psi, back=True), r, x)
 
-    # a run of many steps --------------------------------------------------------------------------------------
+    def _psi(self, t: float | Tensor, z: Tensor, back: bool = False) -> Tensor:
+        """ψ̄_t, or its inverse, of lifted states."""
+        t, y, batch = self._columns(t, z)
+        return self._states((self._map_inverse if back else self._map)(t, y), batch)
+
+    # a run of many steps, of lifted states --------------------------------------------------------------------
 
     def prepare(self, t: float | Tensor, x: Tensor) -> Tensor:
         """χ_t⁻¹(x), unchecked, where ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹: the start of a run of steps of t by `kernel_step`."""
@@ -293,7 +350,7 @@ class FlowMap(nn.Module):
 
     def kernel_step(self, t: float | Tensor, x: Tensor, back: bool = False) -> Tensor:
         """K_t(x), or its inverse, unchecked; K_t is ψ̄_t where there is no χ."""
-        return self.psi_inverse(t, x) if back else self.psi(t, x)
+        return self._psi(t, x, back)
 
     def finish(self, t: float | Tensor, x: Tensor) -> Tensor:
         """χ_t(x), unchecked: the output of such a run."""
@@ -408,7 +465,7 @@ class FlowMap(nn.Module):
         ValueError
             If the system has friction, and the family of the flow has not.
         """
-        check_for_flows(system, self.takes_friction)
+        check_for_flows(system, self.takes_friction, self.takes_driving)
         self.fingerprint, self.system_name = system.fingerprint, system.name
         self.identity = Identity.of(system, domain)
 
@@ -424,7 +481,7 @@ class FlowMap(nn.Module):
     def check_system(self, system: HamiltonianSystem) -> None:
         """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
         check_system(system)
-        check_for_flows(system, self.takes_friction)
+        check_for_flows(system, self.takes_friction, self.takes_driving)
         if self.fingerprint is not None and self.matches(system):
             return
         origin = self.origin
@@ -444,6 +501,13 @@ class FlowMap(nn.Module):
         if system.ndof != self.ndof:
             raise ValueError(
                 f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: {remedy}"
+            )
+        if not (system.autonomous or self.matches(system)):
+            raise ValueError(
+                f"`system` {system.name!r} is driven, H depends on t, and the flow was trained with another drive or "
+                f"none, for {self.system_name!r}: its amplitude, its frequency or another parameter differs. Pass the "
+                "flow of this system, or train one with sympflow.train(system), from these numbers by "
+                "sympflow.train(system, flow=flow.transferred(system))."
             )
         if not self.matches(system):
             raise ValueError(
@@ -612,6 +676,47 @@ class FlowMap(nn.Module):
     def __repr__(self) -> str:
         system = f" of {self.system_name}" if self.system_name else ""
         return f"<{type(self).__name__}{system}: ndof={self.ndof}, dt={self.dt:g}, {self.n_parameters} parameters>"
+
+
+def start_time(t0: Any, x: Tensor, period: float | None) -> Tensor:
+    """Return the time of states x (..., 2d) of a driven system in double precision, (), or of the batch's shape.
+
+    For states of less precision it is reduced by the period, without which it would be rounded as they are.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is missing, no finite real number, or of another shape, or there is no period to reduce it by.
+    """
+    if t0 is None:
+        raise TypeError("`t0` is missing, the time of `x`: the system of the flow is driven, as in flow(t, x, t0=0.0).")
+    try:
+        time = t0 if isinstance(t0, Tensor) else torch.as_tensor(np.array(t0))
+        time = time.to(x.device)
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"`t0` must be a number or a tensor of times; got {t0!r}: pass seconds.") from None
+    if time.dtype == torch.bool or time.is_complex():
+        raise TypeError(f"`t0` must be real times; got {time.dtype}: use a floating-point tensor.")
+    if time.ndim and not _fits(time.shape, x.shape[:-1]):
+        raise ValueError(
+            f"`t0` of shape {tuple(time.shape)} does not fit the batch shape {tuple(x.shape[:-1])} of `x`: give one "
+            "time, or one for each state."
+        )
+    if has_values(time) and not finite_states(time.reshape(-1, 1).double()).all():
+        raise ValueError("`t0` must be finite: pass the time of the states.")
+    time = time.double()
+    if x.dtype == torch.float64:
+        return time
+    if period is None:
+        raise TypeError(
+            f"`x` is {x.dtype}, in which times are rounded too much: use float64, or give the system its `period`."
+        )
+    return time % period
+
+
+def _fits(shape: torch.Size, batch: torch.Size) -> bool:
+    """Return True if an array broadcasts to a batch."""
+    return len(shape) <= len(batch) and all(n in (1, m) for n, m in zip(shape[::-1], batch[::-1], strict=False))
 
 
 def to_values(t: Tensor) -> np.ndarray:

@@ -98,7 +98,7 @@ class MLPFlow(FlowMap):
         hidden = checked_widths(plan.get("hidden"), 2 * ndof)
         return cls(ndof, hidden, str(plan.get("activation")), dt, dtype)
 
-    def forward(self, t: float | Tensor, x: Tensor) -> Tensor:
+    def forward(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """ψ_t(x) for t ≥ 0, extended beyond Δt as SympFlow is; for t < 0 a ValueError, for want of an inverse."""
         checked = self._checked_time(t, x)
         negative = checked < 0 if isinstance(checked, float) else bool((to_values(checked) < 0).any())
@@ -106,7 +106,7 @@ class MLPFlow(FlowMap):
             raise ValueError("`t` must not be negative: an MLPFlow has no exact inverse; use a SympFlow to go back.")
         return super().forward(t, x)
 
-    def inverse(self, t: float | Tensor, x: Tensor) -> Tensor:
+    def inverse(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """Not available: an unconstrained network need not be invertible."""
         raise TypeError("`inverse` does not exist for an MLPFlow, which need not be invertible: use a SympFlow.")
 

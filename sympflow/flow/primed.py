@@ -38,6 +38,7 @@ from sympflow.flow.primed_potentials import (
     PolynomialTerm,
     PrimedDrift,
     PrimedPotential,
+    Sum,
     Term,
 )
 from sympflow.flow.sympflow import SympFlow
@@ -78,7 +79,8 @@ class PrimedShape:
     monomials : tuple of tuple of int
         The exponents m of polynomials that stand in place of both, for symbolic systems; none for none.
     timed : bool
-        True if the drifts of the kernel add up to t at every t, as they must with friction: then its e^{−γt} is exact.
+        True if the drifts of the kernel add up to t at every t, as they must with friction, with an exact e^{−γt},
+        and in a driven system, in which the time moves with them.
 
     Raises
     ------
@@ -411,7 +413,7 @@ class PrimedFlow(SympFlow):
         The maps in the order in which they are executed: χ⁻¹, K, χ.
     """
 
-    takes_friction = True
+    takes_friction = takes_driving = True
 
     def __init__(
         self,
@@ -436,7 +438,7 @@ class PrimedFlow(SympFlow):
         self._tables: Kept[Tables] = Kept(column._parameters for column in columns_of(self.substeps))
         self._binding = Binding(system)
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
-        self.layers = tuple(self._layer(substep) for substep in self.substeps)  # type: ignore[assignment]
+        self.layers = tuple(map(self._layer, range(len(self.substeps))))  # type: ignore[assignment]
         if system is not None:
             self.identify(system)
 
@@ -464,13 +466,18 @@ class PrimedFlow(SympFlow):
         )
         processor, curvature, polynomial = map(plain, (processor, curvature, polynomial))
         check_system(system)
-        check_for_flows(system, cls.takes_friction)
+        check_for_flows(system, cls.takes_friction, cls.takes_driving)
         check_flag("palindromic", palindromic)
         check_flag("curvature", curvature)
         if force_gradient is not None:
             check_flag("force_gradient", force_gradient)
         if not system.separable:
             raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
+        if system.kinetic_timed:
+            raise ValueError(
+                f"`system` {system.name!r} has a kinetic energy that depends on t, and flows are primed with V(q, t) "
+                "alone: use a splitting method such as 'kahan_li8'."
+            )
         if system.friction is not None and not system.quadratic_kinetic:
             raise ValueError(
                 f"`system` {system.name!r} has friction, which drifts hold where the kinetic energy is ½ pᵀM⁻¹p: use a "
@@ -498,7 +505,7 @@ class PrimedFlow(SympFlow):
             processor=processor,
             curvature=curvature,
             monomials=exponents,
-            timed=system.friction is not None,
+            timed=_is_timed(system),
         )
         flow = cls(system.ndof, shape, dt, system, dtype, device)
         kicks, drifts = ([s for s in substeps if s.kind == kind] for kind in ("kick", "drift"))
@@ -556,14 +563,16 @@ class PrimedFlow(SympFlow):
         """The number of terms that a kick has beside V."""
         return len(self.monomials) or sum(c is not None for c in (self.gradients, self.curvatures))
 
-    def _layer(self, substep: Substep) -> Kick | Drift:
+    def _layer(self, i: int) -> Kick | Drift:
+        substep = self.substeps[i]
         if substep.kind == "drift":
             return PrimedDrift(self.ndof, self._binding, substep.weight)
+        passed = Sum(tuple(s.weight for s in self.substeps[:i] if s.kind == "drift"))
         terms: list[tuple[Term, Entry]] = [(POTENTIAL, substep.weight)]
-        if self.monomials:
-            return Kick(PrimedPotential(self.ndof, self._binding, terms, PolynomialTerm(self.monomials, substep.more)))
-        terms += zip((FORCE_GRADIENT, CURVATURE), substep.more, strict=False)
-        return Kick(PrimedPotential(self.ndof, self._binding, terms))
+        polynomial = PolynomialTerm(self.monomials, substep.more) if self.monomials else None
+        if polynomial is None:
+            terms += zip((FORCE_GRADIENT, CURVATURE), substep.more, strict=False)
+        return Kick(PrimedPotential(self.ndof, self._binding, terms, polynomial, passed))
 
     # the frozen tables --------------------------------------------------------------------------------------
 
@@ -617,13 +626,13 @@ class PrimedFlow(SympFlow):
         return tables.kernel
 
     @torch.no_grad()
-    def _step_of_arrays(self, h: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """ψ̄_h of rows y (N, 2d), for h < 0 the inverse of ψ̄_|h|, each with its own h (N,)."""
-        out = np.array(y)
-        for rows, step in ((h > 0, self.psi), (h < 0, self.psi_inverse)):
+    def _step_of_arrays(self, h: np.ndarray, y: np.ndarray, t: Any = 0.0) -> np.ndarray:
+        """ψ̄_h of rows y (N, 2d) at times t, for h < 0 the inverse of ψ̄_|h|, each with its own h (N,)."""
+        out = self.lift(torch.from_numpy(np.array(y)), torch.from_numpy(np.array(t, dtype=float)))
+        for rows, back in ((h > 0, False), (h < 0, True)):
             if rows.any():
-                out[rows] = step(torch.from_numpy(np.abs(h[rows])), torch.from_numpy(y[rows])).numpy()
-        return out
+                out[rows] = self._psi(torch.from_numpy(np.abs(h[rows])), out[rows], back)
+        return self.project(out).numpy()
 
     # kernel and processor as maps ---------------------------------------------------------------------------
 
@@ -675,7 +684,7 @@ class PrimedFlow(SympFlow):
             If the system has not as many degrees of freedom, or no such flow.
         """
         check_system(system)
-        check_for_flows(system, self.takes_friction)
+        check_for_flows(system, self.takes_friction, self.takes_driving)
         if system.ndof != self.ndof:
             raise ValueError(f"`system` has {system.ndof} degrees of freedom, the flow {self.ndof}: give one of those.")
         if not system.separable or (self.terms and not (system.quadratic_kinetic and system.has_hessian_vector)):
@@ -683,8 +692,15 @@ class PrimedFlow(SympFlow):
                 f"`system` {system.name!r} has no kicks and drifts such as the flow's: it must be H = ½ pᵀM⁻¹p + V(q), "
                 "with `hessian_vector` where V is a function."
             )
-        shape = replace(self.shape, timed=system.friction is not None)
-        other = type(self)(self.ndof, shape, self.dt, system, self.dtype, self.device)
+        return self._of(system, replace(self.shape, timed=_is_timed(system)))
+
+    def on_extended(self, extended: HamiltonianSystem) -> Self:
+        monomials = tuple((*m, *[0] * (extended.ndof - self.ndof)) for m in self.monomials)
+        return self._of(extended, replace(self.shape, monomials=monomials)).requires_grad_(False)
+
+    def _of(self, system: HamiltonianSystem, shape: PrimedShape) -> Self:
+        """A flow of a system with the numbers of this one."""
+        other = type(self)(system.ndof, shape, self.dt, system, self.dtype, self.device)
         mine = dict(self.columns())
         for name, column in other.columns():
             column.set(to_numpy(mine[name].table))
@@ -693,9 +709,22 @@ class PrimedFlow(SympFlow):
     def bound(self, system: HamiltonianSystem) -> Self:
         return self if self._binding.known else self.bind(system)
 
-    def initial_velocity(self, x: Tensor) -> Tensor:
+    @property
+    def driven(self) -> bool:
+        return self._binding.known and not self._binding.system.autonomous
+
+    @property
+    def period(self) -> float | None:
+        return self._binding.system.period if self._binding.known else None
+
+    def initial_velocity(self, x: Tensor, t0: Any = None) -> Tensor:
         """d/dt ψ̄_t(x) at t = 0: that of its system, as the coefficients of V and T sum up to 1."""
-        return super().initial_velocity(x) if self.system is None else self.system.vector_field(x)
+        return super().initial_velocity(x, t0) if self.system is None else self.system.vector_field(x, t0)
+
+
+def _is_timed(system: HamiltonianSystem) -> bool:
+    """Return True if the drifts of a kernel must add up to t."""
+    return system.friction is not None or not system.autonomous
 
 
 def _check_counts(stages: Any, processor: Any) -> None:

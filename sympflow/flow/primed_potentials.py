@@ -60,56 +60,74 @@ class Factor(Protocol):
 
 
 @dataclass(frozen=True)
+class Sum:
+    """A sum of such functions, as the drifts before a kick, by which the time has moved on."""
+
+    factors: tuple[Factor, ...]
+
+    def value(self, t: Time) -> Time:
+        return sum((f.value(t) for f in self.factors), 0 * t)
+
+    def rate(self, t: Time) -> Time:
+        return sum((f.rate(t) for f in self.factors), 0 * t)
+
+
+Function = Callable[..., Tensor]
+"""Function of a system, x (N, d) and, where the system is driven, the times (N,)."""
+
+
+@dataclass(frozen=True)
 class Term:
-    """A function U(x) that a system defines, with its gradient; x is (N, d)."""
+    """A function U(x) that a system defines, (N,), with its gradient (N, d)."""
 
-    value: Callable[[HamiltonianSystem, Tensor], Tensor]
-    gradient: Callable[[HamiltonianSystem, Tensor], Tensor]
+    value: Function
+    gradient: Function
 
 
-def _called(f: Callable[[Array], Array], system: HamiltonianSystem, q: Tensor) -> Tensor:
-    """f(q), by way of NumPy where the functions of the system take nothing else."""
+def _called(f: Callable[..., Array], system: HamiltonianSystem, q: Tensor, t: Tensor | None) -> Tensor:
+    """f(q, t), by way of NumPy where the functions of the system take nothing else."""
     if system.takes_tensors:
-        return f(q)
+        return f(q, t)
     if q.requires_grad:
         raise TypeError(
             f"`system` {system.name!r} has functions of NumPy arrays, through which no gradient flows: write them for "
             "tensors too, or use HamiltonianSystem.from_sympy."
         )
-    return torch.as_tensor(f(q.cpu().numpy()), dtype=q.dtype, device=q.device)
+    times = None if t is None else t.cpu().numpy()
+    return torch.as_tensor(f(q.cpu().numpy(), times), dtype=q.dtype, device=q.device)
 
 
-def _force_gradient_value(system: HamiltonianSystem, q: Tensor) -> Tensor:
-    F = _called(system.force, system, q)
+def _force_gradient_value(system: HamiltonianSystem, q: Tensor, t: Tensor | None = None) -> Tensor:
+    F = _called(system.force, system, q, t)
     return -(F * system.velocity(F)).sum(-1) / 2
 
 
-def _force_gradient(system: HamiltonianSystem, q: Tensor) -> Tensor:
-    return _called(lambda x: system.hessian_vector(x, system.velocity(system.force(x))), system, q)
+def _force_gradient(system: HamiltonianSystem, q: Tensor, t: Tensor | None = None) -> Tensor:
+    return _called(lambda x, s: system.hessian_vector(x, system.velocity(system.force(x, s)), s), system, q, t)
 
 
-def _curvature(system: HamiltonianSystem, q: Tensor) -> Tensor:
-    return system.curvature(q)
+def _curvature(system: HamiltonianSystem, q: Tensor, t: Tensor | None = None) -> Tensor:
+    return system.curvature(q, t)
 
 
-def _curvature_gradient(system: HamiltonianSystem, q: Tensor) -> Tensor:
-    return system.curvature_gradient(q)
+def _curvature_gradient(system: HamiltonianSystem, q: Tensor, t: Tensor | None = None) -> Tensor:
+    return system.curvature_gradient(q, t)
 
 
-def _potential(system: HamiltonianSystem, q: Tensor) -> Tensor:
-    return _called(system.potential, system, q)
+def _potential(system: HamiltonianSystem, q: Tensor, t: Tensor | None = None) -> Tensor:
+    return _called(system.potential, system, q, t)
 
 
-def _potential_gradient(system: HamiltonianSystem, q: Tensor) -> Tensor:
-    return -_called(system.force, system, q)
+def _potential_gradient(system: HamiltonianSystem, q: Tensor, t: Tensor | None = None) -> Tensor:
+    return -_called(system.force, system, q, t)
 
 
-def _kinetic(system: HamiltonianSystem, p: Tensor) -> Tensor:
-    return system.kinetic(p)
+def _kinetic(system: HamiltonianSystem, p: Tensor, t: Tensor | None = None) -> Tensor:
+    return system.kinetic(p, t)
 
 
-def _velocity(system: HamiltonianSystem, p: Tensor) -> Tensor:
-    return system.velocity(p)
+def _velocity(system: HamiltonianSystem, p: Tensor, t: Tensor | None = None) -> Tensor:
+    return system.velocity(p, t)
 
 
 # Functions with names, by which pickle finds them.
@@ -121,12 +139,17 @@ CURVATURE = Term(_curvature, _curvature_gradient)
 KINETIC = Term(_kinetic, _velocity)
 
 
+def _apart(system: HamiltonianSystem, x: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Columns (d, N), or with the times in a last row (d + 1, N), as rows (N, d), and the times."""
+    return (x.T, None) if len(x) == system.ndof else (x[:-1].T, x[-1])
+
+
 def _gradient_columns(U: Term, system: HamiltonianSystem, x: Tensor) -> Tensor:
-    return U.gradient(system, x.T).T
+    return U.gradient(system, *_apart(system, x)).T
 
 
 def _gradient_and_change(U: Term, system: HamiltonianSystem, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
-    """∇U on columns (d, N), and its derivative along dx.
+    """∇U on columns (d, N), or with the times (d + 1, N), and its derivative along dx.
 
     Numba functions end at ∇²V·v: what lacks is a difference.
     """
@@ -180,6 +203,8 @@ class PolynomialTerm:
 class PrimedDrift(Drift):
     """The drift of a system over a time s = t a(t/Δt); with friction the exact flow of q' = M⁻¹p, p' = −Γp.
 
+    Of a driven system the positions are (d + 1, N), with the time as the last, which the drift moves by s.
+
     Parameters
     ----------
     ndof : int
@@ -192,36 +217,59 @@ class PrimedDrift(Drift):
         super().__init__(PrimedPotential(ndof, binding, [(KINETIC, time)]))
         self._binding, self._time = binding, time
 
-    def _decayed(self, s: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    @property
+    def _plain(self) -> bool:
+        """True without friction and driving."""
         system = self._binding.system
-        assert system.friction is not None
-        mean, end = system.friction.drift(p.T, _each(s))
-        return q + system.velocity(mean).T, end.T
+        return system.friction is None and system.autonomous
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        if self._binding.system.friction is None:
-            return super().forward(t, q, p)
-        return self._decayed(self._time.value(t), q, p)
-
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        if self._binding.system.friction is None:
-            return super().inverse(t, q, p)
-        return self._decayed(-self._time.value(t), q, p)
-
-    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _moved(self, s: Time, q: Tensor, p: Tensor, passed: Time = 0.0) -> tuple[Tensor, Tensor]:
+        """The linear map of a drift over s, and by how much the time moves with it."""
         system = self._binding.system
         if system.friction is None:
+            mean, end = _each(s) * p.T, p
+        else:
+            mean, end = system.friction.drift(p.T, _each(s))
+            end = end.T
+        change = system.velocity(mean).T
+        if not system.autonomous:
+            change = torch.cat([change, torch.zeros_like(change[:1]) + passed])
+        return q + change, end
+
+    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        if self._plain:
+            return super().forward(t, q, p)
+        s = self._time.value(t)
+        return self._moved(s, q, p, s)
+
+    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        if self._plain:
+            return super().inverse(t, q, p)
+        s = -self._time.value(t)
+        return self._moved(s, q, p, s)
+
+    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        if self._plain:
             return super().tangent(t, q, p, dq, dp)
+        system = self._binding.system
         s, rate = self._time.value(t), self._time.rate(t)
-        q, p = self._decayed(s, q, p)
-        dq, dp = self._decayed(s, dq, dp)  # the drift is linear
-        return q, p, dq + rate * system.velocity(p.T).T, dp + rate * system.friction.force(p.T).T
+        q, p = self._moved(s, q, p, s)
+        dq, dp = self._moved(s, dq, dp, rate)
+        change = rate * system.velocity(p.T).T
+        if not system.autonomous:
+            change = torch.cat([change, torch.zeros_like(change[:1])])
+        if system.friction is not None:
+            dp = dp + rate * system.friction.force(p.T).T
+        return q, p, dq + change, dp
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        self._binding.system.check_conservative(
+        system = self._binding.system
+        system.check_conservative(
             "with which a flow is that of no Hamiltonian", "ask for flow.velocity, or for system.hamiltonian"
         )
-        return super().pull_back(t, q, p)
+        if system.autonomous:
+            return super().pull_back(t, q, p)
+        return *self.inverse(t, q, p), self._time.rate(t) * system.kinetic(p.T)
 
 
 def _each(s: Time) -> Time:
@@ -232,6 +280,8 @@ def _each(s: Time) -> Time:
 class PrimedPotential(Potential):
     """V(t, x) = Σ_j c_j(t) U_j(x), with U_j functions of the system and c_j(0) = 0, and perhaps a polynomial.
 
+    Of a driven system, U_j(q, t), x is (d + 1, N), the positions and the times, and gradients are those by q.
+
     Parameters
     ----------
     ndof : int
@@ -239,7 +289,11 @@ class PrimedPotential(Potential):
     terms : sequence of (Term, Factor)
         U_j, and c_j, for instance an entry of a table.
     polynomial : PolynomialTerm, optional
+    passed : Factor, optional
+        By how much the time has moved on since the beginning of a step, in a driven system.
     """
+
+    _passed: Factor | None = None  # of pickles of earlier versions, which did not have it
 
     def __init__(
         self,
@@ -247,36 +301,44 @@ class PrimedPotential(Potential):
         binding: Binding,
         terms: Sequence[tuple[Term, Factor]],
         polynomial: PolynomialTerm | None = None,
+        passed: Factor | None = None,
     ) -> None:
         super().__init__()
         self.ndof, self.binding = ndof, binding
-        self._terms, self._polynomial = terms, polynomial
+        self._terms, self._polynomial, self._passed = terms, polynomial, passed
 
     def impulse(self, t: Time, x: Tensor) -> Tensor:
         system = self.binding.system
-        impulse = sum(c.value(t) * U.gradient(system, x.T).T for U, c in self._terms)
+        q, at = _apart(system, x)
+        impulse = sum(c.value(t) * U.gradient(system, q, at).T for U, c in self._terms)
         if self._polynomial is not None:
-            impulse = impulse + self._polynomial.gradient(self._polynomial.at(t, x), x)
+            impulse = impulse + self._polynomial.gradient(self._polynomial.at(t, x), q.T)
         return impulse  # type: ignore[return-value]
 
     def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
         system = self.binding.system
-        rate = sum(c.rate(t) * U.value(system, x.T) for U, c in self._terms)
+        q, at = _apart(system, x)
+        rate = sum(c.rate(t) * U.value(system, q, at) for U, c in self._terms)
+        if at is not None and self._passed is not None:
+            for U, c in self._terms:
+                _, change = jvp(partial(U.value, system, q), at, torch.ones_like(at))
+                rate = rate + c.value(t) * self._passed.rate(t) * change
         if self._polynomial is not None:
-            rate = rate + self._polynomial.value(self._polynomial.rate(t, x), x)
+            rate = rate + self._polynomial.value(self._polynomial.rate(t, x), q.T)
         return self.impulse(t, x), rate  # type: ignore[return-value]
 
     def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
         system = self.binding.system
-        impulse = tangent = torch.zeros_like(x)
+        q, dq = x[: system.ndof], dx[: system.ndof]
+        impulse = tangent = torch.zeros_like(q)
         for U, c in self._terms:
             slope, change = _gradient_and_change(U, system, x, dx)
             impulse = impulse + c.value(t) * slope
             tangent = tangent + c.rate(t) * slope + c.value(t) * change
         if self._polynomial is not None:
-            slope, change = jvp(partial(self._polynomial.gradient, self._polynomial.at(t, x)), x, dx)
+            slope, change = jvp(partial(self._polynomial.gradient, self._polynomial.at(t, x)), q, dq)
             impulse = impulse + slope
-            tangent = tangent + self._polynomial.gradient(self._polynomial.rate(t, x), x) + change
+            tangent = tangent + self._polynomial.gradient(self._polynomial.rate(t, x), q) + change
         return impulse, tangent
 
     def to_dict(self) -> dict[str, Any]:

@@ -388,17 +388,17 @@ class SympFlow(FlowMap):
         check_compilable(self.dtype, self.device)
         return MLPFlowKernel(self.ndof, networks)
 
-    def hamiltonian(self, t: float | Tensor, x: Tensor) -> Tensor:
+    def hamiltonian(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """𝓗(ψ̄)(t, x), (...), for t ∈ [0, Δt]: the Hamiltonian of which ψ̄_t is the exact flow.
 
         The sum over the layers of ∂_tV at the point pulled back through the layers after it (the recursion of [1]_,
         section 2.2). It is defined up to a function of t alone.
         """
-        return super().hamiltonian(t, x)
+        return super().hamiltonian(t, x, t0)
 
-    def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor) -> Tensor:
+    def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """`hamiltonian` without checks, for inner loops."""
-        t, y, batch = self._columns(t, x)
+        t, y, batch = self._columns(t, self.lift(x, t0, t))
         q, p = y.chunk(2)
         H = torch.zeros_like(y[0])
         for layer in reversed(self.layers):
@@ -420,7 +420,7 @@ class SympFlow(FlowMap):
 
     def _map_tangent(self, t: float | Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         q, p = y.chunk(2)
-        dq = dp = torch.zeros_like(q)
+        dq, dp = torch.zeros_like(q), torch.zeros_like(p)
         for layer in self.layers:
             q, p, dq, dp = layer.tangent(t, q, p, dq, dp)  # type: ignore[operator]
         return torch.cat([q, p]), torch.cat([dq, dp])

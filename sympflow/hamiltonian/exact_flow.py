@@ -16,18 +16,20 @@ def reference_step(
     t: float,
     rtol: float = 1e-12,
     check: Callable[[], None] = lambda: None,
+    t0: np.ndarray | None = None,
 ) -> np.ndarray:
     """φ_H,t(x) by DOP853, for states x (n, 2d): (n, 2d), with NaN where the solution does not exist.
 
-    `check` is called at every evaluation of the vector field, and may raise to end it.
+    `check` is called at every evaluation of the vector field, and may raise to end it. `t0` (n,) are the times of the
+    states, of a driven system.
     """
     scale = np.abs(x).max(0)
     scale = np.where(scale > 0, scale, 1.0)
 
-    def integrate(x: np.ndarray) -> np.ndarray | None:
-        def velocity(_: float, y: np.ndarray) -> np.ndarray:
+    def integrate(x: np.ndarray, t0: np.ndarray | None) -> np.ndarray | None:
+        def velocity(s: float, y: np.ndarray) -> np.ndarray:
             check()
-            v = system.vector_field(y.reshape(x.shape)).ravel()
+            v = system.vector_field(y.reshape(x.shape), None if t0 is None else t0 + s).ravel()
             if not np.isfinite(v).all():
                 raise FloatingPointError  # SciPy would go on for ever
             return v
@@ -40,8 +42,8 @@ def reference_step(
             return None
         return run.y[:, -1].reshape(x.shape) if run.status == 0 else None
 
-    together = integrate(x)
+    together = integrate(x, t0)
     if together is not None:
         return together
-    alone = (integrate(row[None]) for row in x)
+    alone = (integrate(x[[i]], None if t0 is None else t0[[i]]) for i in range(len(x)))
     return np.concatenate([np.full((1, x.shape[1]), np.nan) if row is None else row for row in alone])

@@ -63,7 +63,7 @@ def _close(u: np.ndarray, v: np.ndarray) -> bool:
     return np.allclose(u, v, rtol=0, atol=TOLERANCE * np.abs(finite).max(initial=0.0), equal_nan=True)
 
 
-def check_for_flows(system: Hamiltonian, takes_friction: bool = False) -> None:
+def check_for_flows(system: Hamiltonian, takes_friction: bool = False, takes_driving: bool = False) -> None:
     """Refuse a system of which a flow would leave something out: friction, a force that is none of H, or the time.
 
     Parameters
@@ -71,6 +71,8 @@ def check_for_flows(system: Hamiltonian, takes_friction: bool = False) -> None:
     system : Hamiltonian
     takes_friction : bool
         True for flows that hold the friction −Γp.
+    takes_driving : bool
+        True for flows that take the time.
 
     Raises
     ------
@@ -83,9 +85,11 @@ def check_for_flows(system: Hamiltonian, takes_friction: bool = False) -> None:
             "fit such a flow by sympflow.train(system), or use a splitting method such as 'verlet' or 'kahan_li8', or "
             "a Runge–Kutta method such as 'dop853'",
         )
-    system.check_autonomous(
-        "which no trained flow has", "solve it by a splitting method such as 'verlet' or 'kahan_li8'"
-    )
+    if not takes_driving:
+        system.check_autonomous(
+            "which trained flows take only where they are primed, with H = ½ pᵀM⁻¹p + V(q, t)",
+            "fit such a flow by sympflow.train(system), or use a splitting method such as 'verlet' or 'kahan_li8'",
+        )
 
 
 def without_friction(mine: Sequence[float], identity: Identity | None, system: Hamiltonian) -> bool:

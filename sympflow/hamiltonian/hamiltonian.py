@@ -258,6 +258,14 @@ class Hamiltonian:
         if not self.autonomous:
             raise ValueError(f"`system` {self.name!r} is driven, H depends on t, {what}: {remedy}.")
 
+    @property
+    def shortest_piece(self) -> float:
+        """The shortest time between two jumps of H in t, those of sampled parameters; inf if there are none.
+
+        An adaptive method may step over a pulse that no stage meets; one with steps no longer than this does not.
+        """
+        return self._definition.shortest_piece
+
     def check_times(self, t0: float, t1: float) -> None:
         """Refuse an interval that leaves the times of sampled parameters.
 
@@ -436,6 +444,10 @@ class Hamiltonian:
                 "not apply. Use an implicit method such as 'gauss_legendre6', or a Runge–Kutta method."
             )
         return self
+
+    def remark(self, q: np.ndarray) -> str:
+        """A clause on the last positions (d,) of a run that could not go on, such as bodies that met; or nothing."""
+        return self._definition.remark(q)
 
     @property
     def local(self) -> LocalHamiltonian | None:

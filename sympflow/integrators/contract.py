@@ -248,6 +248,10 @@ class Integrator:
         """Return the trained flow that is used for a system, one in the system's own time; None if there is none."""
         return None
 
+    def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> Integrator | None:
+        """Return the same method on a driven system with the time and its momentum E; None where it is none there."""
+        return None if self.trained else self
+
     def identity_for(self, system: HamiltonianSystem) -> Identity | None:
         """Return the H that the trained flow for a system was made for; None without a flow, or where it is unknown."""
         flow = self.flow_for(system)

@@ -124,6 +124,10 @@ class FlowIntegrator(OwnStepper):
             flows[asked] = known((name, kind_of(system), tolerance), lambda: shipped(system, name, tolerance))
         return flows[asked]
 
+    def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> FlowIntegrator | None:
+        flow = self.flow_for(system).on_extended(extended)
+        return None if flow is None else type(self)(flow=flow, dt=self.dt)
+
     def check(self, system: HamiltonianSystem) -> None:
         if self.flow is not None:
             self.flow.check_system(system)
@@ -183,10 +187,10 @@ class FlowIntegrator(OwnStepper):
         return run.outcome()
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        return self.own_stepper(Problem(system, t, t, y)).shorter(y, h)
+        return self.own_stepper(Problem(system, t, t, y)).shorter(y, h, t)
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        return _apply(self.flow_like(system, y).inverse, y, h)
+        return _apply(self.flow_like(system, y).inverse, y, h, t)
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         self.flow_for(system)  # files cannot be read inside a function transform
@@ -210,22 +214,28 @@ class FlowStepper(Stepper):
         if not is_tensor(y0):
             inner = _as_tensors(carry)
             with torch.no_grad():
-                states, finite = self.rollout(torch.from_numpy(np.ascontiguousarray(y0)), h, n_steps, save, carry=inner)
+                whole = torch.from_numpy(np.ascontiguousarray(y0))
+                states, finite = self.rollout(whole, h, n_steps, save, t0, inner)
             if carry is not None and inner is not None:
                 carry.advance(n_steps, to_numpy(inner.running))
             return to_numpy(states), finite
         flow, t = self.flow, abs(h)
         if not flow.symplectic:  # without an inverse: the call says so where h < 0
             return rollout(lambda k, y: flow(h, y), y0, n_steps, save, carry=carry)
-        states, finite = rollout(
-            lambda k, y: flow.kernel_step(t, y, h < 0), flow.prepare(t, y0), n_steps, save, carry=carry
-        )
-        states = flow.finish(t, states)
+        start_state = flow.prepare(t, flow.lift(y0, t0))
+
+        def step(k: int, y: Array) -> Array:
+            if flow.driven:
+                y = flow.at_time(y, start_state[..., flow.ndof] + k * h)
+            return flow.kernel_step(t, y, h < 0)
+
+        states, finite = rollout(step, start_state, n_steps, save, carry=carry)
+        states = flow.project(flow.finish(t, states))
         start = int(np.count_nonzero(save == 0))  # `save` is sorted
         return torch.cat([y0.expand(start, *y0.shape), states[start:]]), finite
 
     def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        return _apply(self.flow, y, h)
+        return _apply(self.flow, y, h, t)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         return self.flow.evaluations(n_steps, n_saved, n_extra, self.backend)
@@ -254,13 +264,13 @@ class CompiledFlowStepper(KernelStepper):
         return self.flow.evaluations(n_steps, n_saved, n_extra, "compiled") if counted is None else counted
 
 
-def _apply(function: Any, y: Array, h: float | Array) -> Array:
-    """function(h, y) of tensors, for tensors or arrays."""
+def _apply(function: Any, y: Array, h: float | Array, t: Any) -> Array:
+    """function(h, y, t) of tensors, for tensors or arrays."""
     if is_tensor(y):
-        return function(h, y)
+        return function(h, y, t)
     with torch.no_grad():
         length = torch.from_numpy(np.array(h)) if np.ndim(h) else float(h)
-        return to_numpy(function(length, torch.from_numpy(np.ascontiguousarray(y))))
+        return to_numpy(function(length, torch.from_numpy(np.ascontiguousarray(y)), t))
 
 
 @dataclass(frozen=True)
@@ -310,6 +320,11 @@ class SympFlowIntegrator(FlowIntegrator):
     @property
     def takes_friction(self) -> bool:
         """True: a flow holds the friction of the system that it was made for, and refuses every other."""
+        return True
+
+    @property
+    def takes_driving(self) -> bool:
+        """True: a flow takes the time of the driven system that it was made for, and refuses every other."""
         return True
 
     @property

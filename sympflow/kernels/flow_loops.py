@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol
 
@@ -28,7 +29,7 @@ __all__ = [
 ]
 
 
-ArrayStep = Callable[[np.ndarray, np.ndarray], np.ndarray]
+ArrayStep = Callable[..., np.ndarray]
 
 
 class TableSource(Protocol):
@@ -83,8 +84,8 @@ class PrimedFlowKernel(Kernel):
     compensated : bool
         Sum with Kahan's compensation in runs.
     step : callable, optional
-        ψ̄_h of rows y (N, 2d) by array operations, ``step(h, y)`` with h (N,): of a system with friction, where the
-        numbers of a step are no polynomials in h.
+        ψ̄_h of rows y (N, 2d) by array operations, ``step(h, y, t)`` with h and the times t (N,): of a system with
+        friction, where the numbers of a step are no polynomials in h.
     """
 
     saves_finite = True
@@ -109,11 +110,19 @@ class PrimedFlowKernel(Kernel):
         """Count those of the numbers that the kernel has: see `Kernel`."""
         return self._tables.evaluations(n_steps, n_saved, n_extra, "compiled")
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
-        """`n_steps` times ψ̄_h from one state: see `Kernel`."""
+    def run(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        carry: Carry | None = None,
+        t0: float = 0.0,
+    ) -> Run:
+        """`n_steps` times ψ̄_h from one state, of a driven system at the time t0: see `Kernel`."""
         if not self._tables.processed:
-            return self._kernel(h).run(abs(h), y0, n_steps, save, carry)
-        tables = self._processed(h)
+            return self._kernel(h).run(abs(h), y0, n_steps, save, carry, t0)
+        tables = self._processed(h, t0)
         rollout = partial(self._functions().rollout_processed, *tables)
         width, work = len(y0) * (1 + self._compensated), _stages(tables, n_steps, save) * len(y0) // 2
         return run_state(rollout, y0, n_steps, save, carry, width, work)
@@ -126,13 +135,14 @@ class PrimedFlowKernel(Kernel):
         save: np.ndarray,
         threads: int | None = None,
         carry: Carry | None = None,
+        t0: float = 0.0,
     ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         if len(y0) == 1:
-            return _one_row(self.run, h, y0, n_steps, save, carry)
+            return _one_row(partial(self.run, t0=t0), h, y0, n_steps, save, carry)
         if not self._tables.processed:
-            return self._kernel(h).run_batch(abs(h), y0, n_steps, save, threads, carry)
-        tables, rollout = self._processed(h), self._functions().rollout_processed_batch
+            return self._kernel(h).run_batch(abs(h), y0, n_steps, save, threads, carry, t0)
+        tables, rollout = self._processed(h, t0), self._functions().rollout_processed_batch
 
         def rows(_: slice, *rest: Any) -> None:
             rollout(*tables, *rest)
@@ -141,57 +151,78 @@ class PrimedFlowKernel(Kernel):
         width, work = size * (1 + self._compensated), _stages(tables, n_steps, save) * size // 2
         return run_states(rows, y0, n_steps, save, threads, carry, width, work)
 
-    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
-        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,); its numbers are polynomials in h."""
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
+        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,); its numbers are polynomials in h.
+
+        `t` are the times of the rows, of a driven system.
+        """
         h = np.asarray(h, dtype=np.float64)
         h = h.repeat(len(y)) if h.ndim == 0 else h
         if self._step is not None:
-            return Steps(self._step(h, np.ascontiguousarray(y, dtype=np.float64)))
+            return Steps(self._step(h, np.ascontiguousarray(y, dtype=np.float64), t))
         if len(h) == 1 and h[0] != 0:
             back = bool(h[0] < 0)
-            return Steps(self._stepped(-h if back else h, y, back))
+            return Steps(self._stepped(-h if back else h, y, back, t))
         forwards = h > 0
         if forwards.all():
-            return Steps(self._stepped(h, y, False))
+            return Steps(self._stepped(h, y, False, t))
         if (h < 0).all():
-            return Steps(self._stepped(-h, y, True))
-        out = np.array(y, dtype=np.float64)
+            return Steps(self._stepped(-h, y, True, t))
+        out, times = np.array(y, dtype=np.float64), np.broadcast_to(np.asarray(t, dtype=np.float64), h.shape)
         for rows, back in ((forwards, False), (h < 0, True)):
             if rows.any():
-                out[rows] = self._stepped(np.abs(h[rows]), y[rows], back)
+                out[rows] = self._stepped(np.abs(h[rows]), y[rows], back, times[rows])
         return Steps(out)
 
-    def _stepped(self, t: np.ndarray, y: np.ndarray, back: bool) -> np.ndarray:
+    def _stepped(self, h: np.ndarray, y: np.ndarray, back: bool, t: ArrayLike) -> np.ndarray:
         tables = self._tables
-        return self._splitting.step_rows(tables.polynomials(back), tables.variable(t), t, y, tables.monomials)
+        return self._splitting.step_rows(tables.polynomials(back), tables.variable(h), h, y, tables.monomials, t)
 
     def _kernel(self, h: float) -> SplittingKernel:
         """K_h, or for h < 0 its inverse."""
         scheme = self._tables.scheme("primed kernel", abs(h), back=h < 0)
         if (step := self._step) is not None:
-            return self._splitting.damped_kernel(scheme, lambda y, h: step(h, y))
+            return self._splitting.damped_kernel(scheme, partial(_stepped_by, step))
         return self._splitting.kernel(scheme, self._compensated)
 
     def _functions(self) -> LoopFunctions:
         """The compiled functions for the kicks of the flow."""
         return self._splitting.functions(self._tables.level, self._compensated, self._tables.monomials)
 
-    def _processed(self, h: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The tables of χ⁻¹, of a run of K, and of χ, of steps |h|, or for h < 0 of their inverse."""
+    def _processed(self, h: float, t0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The tables of χ⁻¹, of a run of K, and of χ, of steps |h|, or for h < 0 of their inverse.
 
-        def make() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        In a driven system the time moves with the drifts of χ⁻¹ too: K begins before t0 by those of χ.
+        """
+        loops = self._splitting
+
+        def stages() -> tuple[StageTable, StageTable, StageTable]:
             t, tables = abs(h), self._tables
             kernel = run_table(tables.scheme("primed kernel", t, back=h < 0), t)
             before, after = (single_table(tables.scheme("primed processor", t, back=back), t) for back in (True, False))
-            rows = self._splitting.rows
-            return rows(before), rows(kernel), rows(after)
+            # The loops read the numbers of all terms, of maps that lack some too.
+            before, kernel, after = (replace(table, level=tables.level) for table in (before, kernel, after))
+            return before, kernel, after
 
-        return self._tables.kept(("processed", h, self._splitting.values), make)
+        if loops.driven:
+            before, kernel, after = self._tables.kept(("stages", h), stages)
+            start = t0 - float(after.drifts.sum())
+            return loops.rows(before, h, t0), loops.rows(kernel, abs(h), start), loops.rows(after, h, start)
+
+        def make() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            before, kernel, after = map(loops.rows, stages())
+            return before, kernel, after
+
+        return self._tables.kept(("processed", h, loops.values), make)
 
 
 def _stages(tables: Sequence[np.ndarray], n_steps: int, save: np.ndarray) -> int:
     """Stages of a step of a run with a processor, with its share of those of the outputs."""
     return tables[1].shape[1] + tables[2].shape[1] * -(-len(save) // max(n_steps, 1))
+
+
+def _stepped_by(step: ArrayStep, y: np.ndarray, h: np.ndarray, t: Any = 0.0) -> np.ndarray:
+    return step(h, y, t)
 
 
 class MapSource(Protocol):

@@ -170,6 +170,7 @@ def _rollout(
         two_stages_source(kinds, friction, n),
         kicks_source(symbols, level, monomials, vectors),
     ]
-    constants = {"COMPENSATED": False, "SCHEDULED": True, "N_VALUES": 0, "VECTORS": vectors, "SINGLE": single}
+    constants = {"COMPENSATED": False, "SCHEDULED": True, "DRIVEN": False, "N_VALUES": 0}
+    constants |= {"VECTORS": vectors, "SINGLE": single}
     texts = ("loops", "aligned", "lanes", "tangents")
     return load_algebra("\n\n\n".join([template("elementary"), *sources]), texts, **constants).rollout_tangents

@@ -33,8 +33,9 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     with E as one more momentum; memory is that of the outputs. Methods that choose their steps then control the error
     of E too.
 
-    For systems without symbols, T(p, t) in splitting methods, and trained flows, it is the integral of ∂H/∂t along the
-    steps as executed, by Gauss–Legendre quadrature of 6 nodes within each.
+    For systems without symbols, T(p, t) in splitting methods, splittings other than "kinetic", and trained flows that
+    are not primed, it is the integral of ∂H/∂t along the steps as executed, by Gauss–Legendre quadrature of 6 nodes
+    within each.
 
     Parameters
     ----------
@@ -47,7 +48,8 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     TypeError
         If `sol` is not a Solution.
     ValueError
-        For a system with friction, whose losses are no part of the balance.
+        For a system with friction, whose losses are no part of the balance; for one of which H jumps in t, where it has
+        no ∂H/∂t.
 
     References
     ----------
@@ -57,6 +59,11 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     sol.system.check_conservative(
         "so that its energy is also lost to friction", "use sympflow.reference_error(sol), or solve it without damping"
     )
+    if jumps_in_time(sol.system):
+        raise ValueError(
+            f"`sol` is of {sol.system.name!r}, of which H jumps at some times, where ∂H/∂t is not finite: use "
+            "sympflow.reference_error(sol), sympflow.symplecticity_defect(sol)."
+        )
     if sol.varied:
         return gathered(sol, lambda part: energy_balance_error(part, relative))
     with np.errstate(all="ignore"):
@@ -65,6 +72,11 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
         if relative:
             error = error / (sol.system.energy_scale or np.nanmax(np.abs(H), axis=-1, keepdims=True))
     return np.where(np.isnan(error) & np.isfinite(H), np.inf, error)
+
+
+def jumps_in_time(system: HamiltonianSystem) -> bool:
+    """Return True if H is known to jump at some times, so that there is no energy balance."""
+    return system.symbols is not None and system.symbols.jumps
 
 
 def _start_energy(sol: Solution) -> np.ndarray:
@@ -79,13 +91,14 @@ def _balanced(sol: Solution) -> tuple[np.ndarray, np.ndarray]:
     H = np.asarray(system.hamiltonian(y, np.broadcast_to(sol.t, y.shape[:-1])))
     if system.autonomous:
         return H, np.zeros(H.shape)
-    extended = _extended(sol)
-    if extended is None:
+    extended = extended_system(system)
+    integrator = None if extended is None else sol.integrator.on_extended(system, extended)
+    if extended is None or integrator is None:
         return H, _quadrature(sol)
     y0, d = to_numpy(sol.y0).astype(float), system.ndof
     zero = np.zeros((*y0.shape[:-1], 1))
     start = np.concatenate([y0[..., :d], zero, y0[..., d:], zero], axis=-1)
-    run = solve(extended, sol.integrator, sol.t_span, start, t_eval=sol.t)
+    run = solve(extended, integrator, sol.t_span, start, t_eval=sol.t)
     states = np.moveaxis(run.y, -2, -1)
     n, kept = len(run.t), [i for i in range(2 * d + 2) if i not in (d, 2 * d + 1)]
     H[..., :n] = system.hamiltonian(states[..., kept], np.broadcast_to(run.t, states.shape[:-1]))
@@ -94,11 +107,10 @@ def _balanced(sol: Solution) -> tuple[np.ndarray, np.ndarray]:
     return H, work
 
 
-def _extended(sol: Solution) -> HamiltonianSystem | None:
-    """H(t + s, q, p) in [q, s, p, E], in which s stays 0 and E' = −∂H/∂t; None where it is not for the method."""
-    system = sol.system
+def extended_system(system: HamiltonianSystem) -> HamiltonianSystem | None:
+    """H(t + s, q, p) in [q, s, p, E], in which s stays 0 and E' = −∂H/∂t; None where it cannot be written so."""
     symbols = system.symbols
-    if symbols is None or sol.integrator.trained or symbols.samples or system.kinetic_timed:
+    if symbols is None or symbols.samples or system.kinetic_timed:
         return None
     if system not in _EXTENDED:
         d, time = system.ndof, symbols.time

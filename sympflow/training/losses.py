@@ -45,6 +45,9 @@ class Loss:
     label_weight: float = 0.0
 
     def __post_init__(self) -> None:
+        self.system.check_autonomous(
+            "and the losses compare at no time of it", "fit a primed flow to its labels, optimizer='gauss-newton'"
+        )
         if self.matching_weight:
             self.system.check_conservative(
                 "with which a flow is that of no Hamiltonian, so there is none to match",
@@ -91,6 +94,10 @@ class Loss:
         return self.total(self.terms(flow, points))
 
 
+def never() -> None:
+    """The check that ends nothing."""
+
+
 @dataclass(frozen=True)
 class Objective:
     """A loss of a flow at given points, as a number, or as the residuals whose sum of squares it is.
@@ -110,7 +117,7 @@ class Objective:
     flow: FlowMap
     points: Points
     draw: int = 0
-    check: Callable[[], None] = lambda: None
+    check: Callable[[], None] = never
 
     def __call__(self) -> Tensor:
         self.check()

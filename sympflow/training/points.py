@@ -43,6 +43,7 @@ class Stream(IntEnum):
     SCALING = 4
     RESTARTS = 5
     LABELS = 6
+    TIMES = 7
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,37 @@ def stream_seed(seed: int, stream: Stream, block: int = 0) -> int:
 def states(domain: Domain, n: int, seed: int, stream: Stream, block: int = 0) -> np.ndarray:
     """n states (n, 2d) of the domain."""
     return domain.sample(n, stream_seed(seed, stream, block))
+
+
+def times_of(system: HamiltonianSystem, dt: float) -> tuple[float, float]:
+    """The interval of the times at which steps of a driven system begin: its period, or else its `t_span` less Δt.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    if system.period is not None:
+        return 0.0, system.period
+    low, high = min(system.t_span), max(system.t_span)
+    system.check_times(low, high)
+    if high - low <= dt:
+        raise ValueError(
+            f"`system` {system.name!r} is driven, without a `period` and for t from {low:g} to {high:g}, in which no "
+            f"step of dt = {dt:g} begins and ends: give it the period of the drive, or a longer `t_span`."
+        )
+    return low, high - dt
+
+
+def start_times(
+    system: HamiltonianSystem, dt: float, n: int, seed: int, stream: Stream, block: int = 0
+) -> np.ndarray | None:
+    """Random times (n,) at which steps of a driven system begin; None for another."""
+    if system.autonomous:
+        return None
+    low, high = times_of(system, dt)
+    rng = np.random.default_rng([stream_seed(seed, stream, block), int(Stream.TIMES)])
+    return low + (high - low) * rng.random(n)
 
 
 class PointSource:
@@ -141,14 +173,24 @@ class Labels:
     t : (J,), ascending, positive
     x : (N, 2d)
     y : (J, N, 2d)
+    t0 : (N,) or None
+        The times of the states x, of a driven system: then y are the states at t0 + t.
     """
 
     t: np.ndarray
     x: np.ndarray
     y: np.ndarray
+    t0: np.ndarray | None = None
 
     @classmethod
-    def of(cls, system: HamiltonianSystem, x: np.ndarray, t: np.ndarray, deadline: Deadline | None = None) -> Labels:
+    def of(
+        cls,
+        system: HamiltonianSystem,
+        x: np.ndarray,
+        t: np.ndarray,
+        deadline: Deadline | None = None,
+        t0: np.ndarray | None = None,
+    ) -> Labels:
         """Make labels by DOP853 at rtol = 1e-13, all states in one integration from each time to the next.
 
         States whose solution ends before the last time are left out.
@@ -162,18 +204,25 @@ class Labels:
         for time in t:
             check = (lambda: None) if deadline is None else deadline.check
             try:
-                after = reference_step(system, y[-1], float(time - reached), LABEL_TOLERANCE, check)
+                begun = None if t0 is None else t0 + reached
+                after = reference_step(system, y[-1], float(time - reached), LABEL_TOLERANCE, check, begun)
             except OutOfTime:
                 raise OutOfTime(
                     f"the exact solution was followed from {len(y[-1])} states to t = {reached:.3g} of {t[-1]:.3g} only"
                 ) from None
             exists = np.isfinite(after).all(-1)
             y, reached = [states[exists] for states in (*y, after)], time
-        return cls(np.asarray(t), y[0], np.stack(y[1:]))
+            t0 = None if t0 is None else t0[exists]
+        return cls(np.asarray(t), y[0], np.stack(y[1:]), t0)
 
     @classmethod
     def needed(
-        cls, system: HamiltonianSystem, x: np.ndarray, t: np.ndarray, deadline: Deadline | None = None
+        cls,
+        system: HamiltonianSystem,
+        x: np.ndarray,
+        t: np.ndarray,
+        deadline: Deadline | None = None,
+        t0: np.ndarray | None = None,
     ) -> Labels:
         """`of`, for a fit, which cannot do without.
 
@@ -184,18 +233,23 @@ class Labels:
         OutOfTime
             As `of` does.
         """
-        labels = cls.of(system, x, t, deadline)
+        labels = cls.of(system, x, t, deadline, t0)
         if not len(labels.x):
             raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
         return labels
 
     def at(self, j: int) -> Labels:
         """The labels at the j-th time alone."""
-        return Labels(self.t[[j]], self.x, self.y[[j]])
+        return Labels(self.t[[j]], self.x, self.y[[j]], self.t0)
 
     def first(self, n: int) -> Labels:
         """The labels of the first n states."""
-        return Labels(self.t, self.x[:n], self.y[:, :n])
+        return Labels(self.t, self.x[:n], self.y[:, :n], None if self.t0 is None else self.t0[:n])
+
+    @property
+    def times(self) -> np.ndarray | None:
+        """The times of the states y (J, N), of a driven system."""
+        return None if self.t0 is None else self.t[:, None] + self.t0
 
 
 @np.errstate(all="ignore")
@@ -236,6 +290,7 @@ def _share(error: Any, of: Any) -> float:
 
 def handed_in(data: Any, system: HamiltonianSystem, dt: float) -> Labelled:
     """The labels that were handed in, as float64 arrays."""
+    system.check_autonomous("and `data` tell no time at which a step begins", "leave them out")
     if not isinstance(data, tuple | list) or len(data) != 3:
         raise TypeError(
             "`data` must be three arrays, times (n,), states (n, 2d) and where they go (n, 2d): pass a tuple."

@@ -18,7 +18,7 @@ from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.options import NewFlow
-from sympflow.training.points import Stream, states
+from sympflow.training.points import Stream, start_times, states
 from sympflow.training.table_fit import take_over
 from sympflow.training.table_step import DENSE, forces_of
 
@@ -122,40 +122,52 @@ def default_primed(
 
 
 def frequency(system: HamiltonianSystem, domain: Domain | None) -> float:
-    """The fastest frequency of the linearized motion that 99 % of the states of the domain stay below."""
+    """The fastest frequency of the linearized motion that 99 % of the states of the domain stay below.
+
+    At least that of the drive, of a driven system with a period.
+    """
     if domain is None:
         raise ValueError(f"`domain` is not known for the system {system.name!r}: pass one.")
     d, large = system.ndof, system.ndof > DENSE and system.quadratic_kinetic
     y = domain.sample(FEWER_SAMPLES if large else SAMPLES, SEED)
     q, p = y[:, :d], y[:, d:]
+    t = start_times(system, 0.0, len(y), SEED, Stream.SCALING)
     if large:
-        squares = _largest_eigenvalues(system, q)
+        squares = _largest_eigenvalues(system, q, t)
     else:
-        squares = np.linalg.eigvals(system.kinetic_hessian(p) @ potential_hessian(system, q)).real.max(-1)
+        squares = np.linalg.eigvals(system.kinetic_hessian(p) @ potential_hessian(system, q, t)).real.max(-1)
     squares = squares[np.isfinite(squares)]
     omega = math.sqrt(max(float(np.quantile(squares, QUANTILE)), 0.0)) if len(squares) else 0.0
+    if system.period is not None:
+        omega = max(omega, 2 * math.pi / system.period)
     if omega == 0.0:  # nowhere bound: what a state needs to cross the domain
         speed = np.linalg.norm(system.velocity(p), axis=-1)
         omega = float(np.quantile(speed, QUANTILE) / max(float(q.std(0).max()), np.finfo(float).tiny)) or 1.0
     return omega
 
 
-def potential_hessian(system: HamiltonianSystem, q: np.ndarray) -> np.ndarray:
-    """∇²V (n, d, d), from differences of ∇V where it is not known."""
+def potential_hessian(system: HamiltonianSystem, q: np.ndarray, t: np.ndarray | None = None) -> np.ndarray:
+    """∇²V (n, d, d), of a driven system at times t (n,), from differences of ∇V where it is not known."""
     if system.has_hessian_vector:
-        return system.potential_hessian(q)
-    return np.moveaxis(-forces_of(system, 0).all(q.T)[1][0], -1, 0)
+        return system.potential_hessian(q, t)
+    d = system.ndof
+    return np.moveaxis(-forces_of(system, 0).all(_with_times(q, t).T)[1][0][:d, :d], -1, 0)
 
 
-def _largest_eigenvalues(system: HamiltonianSystem, q: np.ndarray) -> np.ndarray:
+def _with_times(q: np.ndarray, t: np.ndarray | None) -> np.ndarray:
+    """Positions (n, d) as `forces_of` takes them, with the times of a driven system."""
+    return q if t is None else np.concatenate([q, t[:, None]], axis=1)
+
+
+def _largest_eigenvalues(system: HamiltonianSystem, q: np.ndarray, t: np.ndarray | None = None) -> np.ndarray:
     """The eigenvalue of M⁻¹∇²V of largest size, by the power method: (n, d) to (n,)."""
-    forces = forces_of(system, 0)
+    forces, d = forces_of(system, 0), system.ndof
     v = np.random.default_rng(SEED).standard_normal(q.shape)
-    size = np.ones(len(q))
+    size, still = np.ones(len(q)), None if t is None else 0 * t
     with np.errstate(all="ignore"):
         for _ in range(ITERATIONS):
-            v = v / size[:, None]
-            v = system.velocity(-forces.along(q.T, v.T[None])[1][0][0].T)
+            along = _with_times(v / size[:, None], still)
+            v = system.velocity(-forces.along(_with_times(q, t).T, along.T[None])[1][0][0, :d].T)
             size = np.linalg.norm(v, axis=-1)
     return size
 
@@ -163,15 +175,15 @@ def _largest_eigenvalues(system: HamiltonianSystem, q: np.ndarray) -> np.ndarray
 def check_step(system: HamiltonianSystem, domain: Domain, dt: float) -> None:
     """Raise ValueError where Δt is far beyond the periods of the system, or what changes it, at half of the states."""
     y = domain.sample(FEWER_SAMPLES, SEED)
-    d = system.ndof
+    d, t = system.ndof, start_times(system, 0.0, len(y), SEED, Stream.SCALING)
     with np.errstate(all="ignore"):
         if system.separable and system.quadratic_kinetic and d > DENSE:
-            rates = np.sqrt(_largest_eigenvalues(system, y[:, :d]))
+            rates = np.sqrt(_largest_eigenvalues(system, y[:, :d], t))
         elif system.separable:
-            squares = system.kinetic_hessian(y[:, d:]) @ potential_hessian(system, y[:, :d])
+            squares = system.kinetic_hessian(y[:, d:], t) @ potential_hessian(system, y[:, :d], t)
             rates = np.sqrt(_sizes(squares))
         else:
-            second = system.hessian(y)
+            second = system.hessian(y, t)
             rates = _sizes(np.concatenate([second[:, d:], -second[:, :d]], axis=1))
     rates = rates[np.isfinite(rates)]
     rate = float(np.median(rates)) if len(rates) else 0.0

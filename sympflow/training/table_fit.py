@@ -13,6 +13,7 @@ Every piece of it has a deadline, which is asked within each evaluation.
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from dataclasses import dataclass, field, replace
@@ -37,11 +38,12 @@ from sympflow.training.points import (
     PointSource,
     Stream,
     shares_missed,
+    start_times,
     states,
     step_errors,
     stream_seed,
 )
-from sympflow.training.runs import LABEL_SHARE, SearchRun
+from sympflow.training.runs import LABEL_SHARE, SearchRun, descended
 from sympflow.training.session import Deadline, Session
 from sympflow.training.table_step import Check, TableStep
 
@@ -124,6 +126,10 @@ class TableRun(SearchRun):
         fractions = FRACTIONAL_TIMES
         step, table = TableStep(system, flow.sequence, flow.tables.level, flow.monomials), Table(flow)
         unit = np.array(scaling.x)
+        if options.residual_weight or options.matching_weight or data is not None:
+            system.check_autonomous(
+                "and what is not its own labels tells no time at which a step begins", "leave out `loss` and `data`"
+            )
         parts: list[tuple[float, Fit]] = []
         frozen = weighted = None
         if options.label_weight and data is None:
@@ -134,7 +140,8 @@ class TableRun(SearchRun):
             x = states(domain, points, options.seed, Stream.RESIDUAL)
             t = flow.dt * np.arange(1, options.label_times + 1) / options.label_times
             began = deadline.session.passed
-            labels = Labels.needed(system, x, t, deadline.part(LABEL_SHARE))
+            t0 = start_times(system, flow.dt, points, options.seed, Stream.RESIDUAL)
+            labels = Labels.needed(system, x, t, deadline.part(LABEL_SHARE), t0)
             if (deadline.session.passed - began) / len(t) * fractions > HELD_OUT_SHARE * deadline.left:
                 fractions = min(fractions, len(t))
             slope = energy_slope(system, labels, options.energy_weight)
@@ -163,7 +170,8 @@ class TableRun(SearchRun):
             parts.append((1.0, LossFit(table, Objective(loss, flow, points_at))))
         x = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
         t = flow.dt * (np.arange(fractions) + 0.5) / fractions
-        held_out = Labels.of(system, x, np.append(t, flow.dt), deadline.part(LABEL_SHARE))
+        t0 = start_times(system, flow.dt, len(x), options.seed, Stream.REFERENCE)
+        held_out = Labels.of(system, x, np.append(t, flow.dt), deadline.part(LABEL_SHARE), t0)
         whole = parts[0][1] if len(parts) == 1 else StackedFit(*parts)  # one weight changes nothing
         run = cls(flow, system, domain, scaling, options, step, frozen, weighted, whole, held_out, tried)
         began = deadline.session.passed
@@ -175,9 +183,12 @@ class TableRun(SearchRun):
         super().begin(session)
         self._frozen_end = self.whole_end.part(FROZEN_SHARE)
 
-    def next_minimum(self, deadline: Deadline) -> Minimum:
-        steps = min(SEARCH_STEPS, self.options.steps)
-        return (self.frozen or self.whole).minimize(self._start(), steps, deadline)
+    def searched(self) -> Fit:
+        return self.frozen or self.whole
+
+    @property
+    def search_steps(self) -> int:
+        return min(SEARCH_STEPS, self.options.steps)
 
     def found(self, minimum: Minimum) -> dict[str, float]:
         self.table.assign(self._continued(min(self.minima, key=lambda m: m.cost)))
@@ -187,11 +198,12 @@ class TableRun(SearchRun):
         finalists, frozen, steps = _distinct(self.minima)[:FINALISTS], self.frozen, self.options.steps
         if frozen is not None:
             for fit in filter(None, (frozen, self.weighted)):
-                finalists = [fit.minimize(m.x, steps, self._frozen_end, thorough=True) for m in finalists]
+                common = (fit, steps, self._frozen_end, True)
+                finalists = list(session.each(descended, common, [m.x for m in finalists]))
         starts = [self._continued(m) for m in _distinct(finalists)[:FITTED]]
         if not finalists or frozen is None or self._frozen_cost(self.given) < HOPELESS * min(m.cost for m in finalists):
             starts.insert(0, self.given)
-        fitted = [self.whole.minimize(theta, steps, self.whole_end, thorough=True) for theta in starts]
+        fitted = list(session.each(descended, (self.whole, steps, self.whole_end, True), starts))
         best = min(fitted, key=lambda m: m.cost)
         if not math.isfinite(best.cost):
             raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
@@ -246,9 +258,9 @@ class TableRun(SearchRun):
         )
         return self.at_start
 
-    def _start(self) -> np.ndarray:
-        """The start of the next search: the flow as it was given, then random tables."""
-        restart, table, given = len(self.minima), self.table, self.given
+    def start_of(self, restart: int) -> np.ndarray:
+        """The start of a search: the flow as it was given, then random tables."""
+        table, given = self.table, self.given
         offset, design = table.polynomial(np.array([table.dt]))
         coefficients = offset[0] + design[0] @ given
         if restart:
@@ -291,10 +303,10 @@ def _check_memory(points: int, options: TableOptions, numbers: int, ndof: int) -
 
 def energy_slope(system: HamiltonianSystem, labels: Labels, weight: float) -> np.ndarray | None:
     """∇H at the labels (J, N, 2d), divided by the spread of H over Ω: `TableFit`; None if it is to count nothing."""
-    spread = float(np.std(system.hamiltonian(labels.x)))
+    spread = float(np.std(system.hamiltonian(labels.x, labels.t0)))
     if not (weight > 0 and 0 < spread < math.inf):
         return None
-    return math.sqrt(weight) / spread * system.gradient(labels.y)
+    return math.sqrt(weight) / spread * system.gradient(labels.y, labels.times)
 
 
 def _with_and_without(
@@ -332,6 +344,10 @@ class Fit:
         """The residuals and their Jacobian, (m, f)."""
         raise NotImplementedError
 
+    def own(self) -> Fit:
+        """The same for one thread alone; one that changes nothing is that already."""
+        return self
+
     def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
         """Least squares from θ; a thorough one goes on where little is gained, as along a narrow curved valley.
 
@@ -355,6 +371,9 @@ class StackedFit(Fit):
     def __init__(self, *parts: tuple[float, Fit]) -> None:
         self.parts = parts
 
+    def own(self) -> Fit:
+        return StackedFit(*((weight, fit.own()) for weight, fit in self.parts))
+
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
         return np.concatenate([math.sqrt(weight) * fit.residuals(theta, check) for weight, fit in self.parts])
 
@@ -368,6 +387,9 @@ class LossFit(Fit):
 
     def __init__(self, table: Table, objective: Objective) -> None:
         self.table, self.objective = table, objective
+
+    def own(self) -> Fit:  # the parameters are put into the flow
+        return copy.deepcopy(self)
 
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
         self.table.assign(theta)
@@ -408,11 +430,21 @@ class TableFit(Fit):
         self.step, self.offset, self.design = step, offset, design
         self.times, self.count = len(labels.t), len(labels.x)
         self._x = np.tile(labels.x.T, (1, self.times))
+        self._t0 = None if labels.t0 is None else np.tile(labels.t0, self.times)
         self._y = np.ascontiguousarray(labels.y.reshape(-1, labels.x.shape[1]).T)
         # The sum of squares is a mean over states and times.
         each = np.repeat(weight, self.count) / math.sqrt(self.times * self.count)
         self._scale = each / unit[:, None]
         self._slope = None if slope is None else each * slope.reshape(-1, slope.shape[-1]).T
+
+    def __getstate__(self) -> dict[str, Any]:
+        """With the order of `design` in memory, by which its products are rounded."""
+        order = tuple(int(axis) for axis in np.argsort(self.design.strides)[::-1])
+        return {**vars(self), "design": (order, self.design.transpose(order))}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        order, packed = state["design"]
+        vars(self).update(state | {"design": packed.transpose(np.argsort(order))})
 
     def coefficients(self, theta: np.ndarray) -> np.ndarray:
         """(n, P), P = J N."""
@@ -420,12 +452,12 @@ class TableFit(Fit):
 
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
         with np.errstate(all="ignore"):
-            y = self.step(self.coefficients(theta), self._x, check)
+            y = self.step(self.coefficients(theta), self._x, check, self._t0)
             return self._rows(self._errors(y - self._y)).ravel()
 
     @np.errstate(all="ignore")  # as in the residuals: what is not finite is rejected
     def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
-        y, J = self.step.with_jacobian(self.coefficients(theta), self._x, check)
+        y, J = self.step.with_jacobian(self.coefficients(theta), self._x, check, self._t0)
         by_table = self._rows(self._errors(J))  # (J, (2d + 1) N, n)
         J = (by_table @ self.design).reshape(-1, self.design.shape[-1])
         return self._rows(self._errors(y - self._y)).ravel(), J
@@ -609,7 +641,7 @@ def differences(flow: PrimedFlow, step: TableStep, labels: Labels) -> np.ndarray
     table = Table(flow)
     offset, design = table.polynomial(labels.t)
     coefficients = offset + design @ table.parameters()
-    return np.stack([step(c[:, None], labels.x.T).T for c in coefficients]) - labels.y
+    return np.stack([step(c[:, None], labels.x.T, t0=labels.t0).T for c in coefficients]) - labels.y
 
 
 @np.errstate(all="ignore")

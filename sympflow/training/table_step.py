@@ -2,17 +2,22 @@
 
 The step needs the forces of a system and their Jacobians: F = −∇V, G = ∇²V v and C = −∇(½ v·∇²V v), with v = M⁻¹∇V; or
 after F the −∇q^m of each monomial. Arrays are feature-major: q and F, G, C are (d, P), Jacobians (d, d, P).
+
+A driven system is the autonomous one of positions (q, t) and momenta (p, 1), with M⁻¹ extended by 1 for the velocity of
+t in drifts, by 0 in v, and the force (−∂V/∂q, 0). So the derivatives by the drifts hold those by the times of kicks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import derivative
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -30,7 +35,7 @@ class TableStep:
     """The map of kicks p += w F(q) + g ∇²V v − c ∇(½ v·∇²V v), v = M⁻¹∇V(q), and drifts q += a M⁻¹p of a system.
 
     Arrays are feature-major: states y (2d, P). A coefficient is a row of P numbers, one a state, so that states may
-    be at different times: c (n, P), or (n, 1).
+    be at different times: c (n, P), or (n, 1). The states of a driven system begin at times t0 (P,).
 
     Parameters
     ----------
@@ -51,9 +56,11 @@ class TableStep:
                 f"`system` {system.name!r} must have a kinetic energy ½ pᵀM⁻¹p for its table to be fitted by "
                 "Gauss–Newton steps: use optimizer='bfgs'."
             )
-        self.ndof, self.sequence = system.ndof, tuple(sequence)
-        self._inverse_mass = system.kinetic_hessian(np.zeros(system.ndof))
-        self._times_inverse_mass, self._friction = system.velocity, system.friction
+        self.ndof, self.sequence, self._driven = system.ndof, tuple(sequence), not system.autonomous
+        self._inverse_mass = _inverse_mass(system, 1.0)
+        self._times_inverse_mass, self._friction = _velocities(system, 1.0), system.friction
+        if self._driven and system.friction is not None:
+            self._friction = Friction(_extended(system.friction.matrix(system.ndof), 0.0))
         self._forces = forces_of(system, level, monomials)
         n, terms = len(sequence), len(monomials) or level
         kicks = [i for i in range(n) if sequence[i] == "kick"]
@@ -63,12 +70,26 @@ class TableStep:
             kick: [kick, *(n + term * len(kicks) + j for term in range(terms))] for j, kick in enumerate(kicks)
         }
 
-    def __call__(self, c: np.ndarray, y: np.ndarray, check: Check = lambda: None) -> np.ndarray:
+    def _opened(self, y: np.ndarray, t0: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """The positions and momenta on which maps are applied, with the time among them: (D, P) each."""
+        q, p = y[: self.ndof], y[self.ndof :]
+        if not self._driven:
+            return q, p
+        assert t0 is not None
+        return np.concatenate([q, t0[None]]), np.concatenate([p, np.ones((1, p.shape[1]))])
+
+    def _closed(self, q: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """The states (2d, P) of these."""
+        return np.concatenate([q[: self.ndof], p[: self.ndof]])
+
+    def __call__(
+        self, c: np.ndarray, y: np.ndarray, check: Check = lambda: None, t0: np.ndarray | None = None
+    ) -> np.ndarray:
         """The step: coefficients c in the order of the sequence, then of each further term those of the kicks.
 
         `check` is called at each kick, and may raise to end the step.
         """
-        q, p = y[: self.ndof], y[self.ndof :]
+        q, p = self._opened(y, t0)
         for i, kind in enumerate(self.sequence):
             if kind == "drift":
                 change, p = self._drifted(p, c[i], self._inverse_mass.__matmul__)
@@ -77,7 +98,7 @@ class TableStep:
                 check()
                 for place, F in zip(self._places[i], self._forces.values(q), strict=True):
                     p = p + c[place] * F
-        return np.concatenate([q, p])
+        return self._closed(q, p)
 
     def _drifted(self, p: np.ndarray, s: np.ndarray, velocity: Callable[[np.ndarray], np.ndarray]) -> Any:
         """The change of q and the p after drifts of times s (P,) or (1,), of momenta (..., d, P)."""
@@ -90,16 +111,18 @@ class TableStep:
         """−Γp of momenta (d, P), their rate in a drift."""
         return np.zeros_like(p) if self._friction is None else self._friction.force(p.T).T
 
-    def with_jacobian(self, c: np.ndarray, y: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
+    def with_jacobian(
+        self, c: np.ndarray, y: np.ndarray, check: Check = lambda: None, t0: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The step, and its derivatives by each coefficient: (n, 2d, P); `check` as in the step."""
-        return (self._backward if 2 * self.ndof <= self.n_coefficients else self._forward)(c, y, check)
+        return (self._backward if 2 * self.ndof <= self.n_coefficients else self._forward)(c, y, check, t0)
 
-    def _forward(self, c: np.ndarray, y: np.ndarray, check: Check) -> tuple[np.ndarray, np.ndarray]:
+    def _forward(
+        self, c: np.ndarray, y: np.ndarray, check: Check, t0: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """A tangent for each coefficient is carried along: the cheaper way for many degrees of freedom."""
-        d = self.ndof
-        q, p = y[:d], y[d:]
-        J = np.zeros((self.n_coefficients, *y.shape))
-        by_q, by_p = J[:, :d], J[:, d:]
+        q, p = self._opened(y, t0)
+        by_q, by_p = np.zeros((2, self.n_coefficients, *q.shape))
         moved: list[int] = []  # the coefficients that were met
         for i, kind in enumerate(self.sequence):
             check()
@@ -118,19 +141,23 @@ class TableStep:
                     by_p[place] += F
                     p = p + c[place] * F
                 moved += self._places[i]
-        return np.concatenate([q, p]), J
+        d = self.ndof
+        return self._closed(q, p), np.concatenate([by_q[:, :d], by_p[:, :d]], axis=1)
 
     def _velocity(self, p: np.ndarray) -> np.ndarray:
         """M⁻¹p: (..., d, P)."""
         return self._times_inverse_mass(p.swapaxes(-1, -2)).swapaxes(-1, -2)
 
-    def _backward(self, c: np.ndarray, y: np.ndarray, check: Check) -> tuple[np.ndarray, np.ndarray]:
+    def _backward(
+        self, c: np.ndarray, y: np.ndarray, check: Check, t0: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The states are stored on the way, and the derivative of the map after each is built on the way back.
 
         With few degrees of freedom that is cheaper than a tangent for each coefficient.
         """
         d = self.ndof
-        q, p = y[:d], y[d:]
+        q, p = self._opened(y, t0)
+        width = len(q)
         passed: list[tuple[np.ndarray, ...]] = []
         for i, kind in enumerate(self.sequence):
             if kind == "drift":
@@ -144,7 +171,7 @@ class TableStep:
                 passed.append((sum(w * D for w, D in zip(weights, jacobians, strict=True)), *forces))
                 p = p + sum(w * F for w, F in zip(weights, forces, strict=True))
         J = np.empty((self.n_coefficients, *y.shape))
-        after_q, after_p = np.zeros((2 * d, d, y.shape[1])), np.zeros((2 * d, d, y.shape[1]))
+        after_q, after_p = np.zeros((2, 2 * d, width, y.shape[1]))  # of the states that `_closed` gives
         after_q[np.arange(d), np.arange(d)] = 1.0
         after_p[np.arange(d, 2 * d), np.arange(d)] = 1.0
         for i in reversed(range(len(self.sequence))):
@@ -162,9 +189,28 @@ class TableStep:
                 slope, *forces = passed[i]
                 for place, F in zip(self._places[i], forces, strict=True):
                     J[place] = _apply(after_p, F)
-                for k in range(d):
+                for k in range(width):
                     after_q += after_p[:, k, None] * slope[k]
-        return np.concatenate([q, p]), J
+        return self._closed(q, p), J
+
+
+def _extended(matrix: np.ndarray, corner: float) -> np.ndarray:
+    """A matrix with one more row and column, 0 but for the corner."""
+    return np.block([[matrix, np.zeros((len(matrix), 1))], [np.zeros((1, len(matrix))), np.full((1, 1), corner)]])
+
+
+def _inverse_mass(system: HamiltonianSystem, of_time: float) -> np.ndarray:
+    """M⁻¹, of a driven system extended by that of the time."""
+    M = system.kinetic_hessian(np.zeros(system.ndof))
+    return M if system.autonomous else _extended(M, of_time)
+
+
+def _velocities(system: HamiltonianSystem, of_time: float) -> Callable[[np.ndarray], np.ndarray]:
+    """M⁻¹p of rows (..., D), extended likewise."""
+    if system.autonomous:
+        return system.velocity
+    d = system.ndof
+    return lambda p: np.concatenate([system.velocity(p[..., :d]), of_time * p[..., d:]], axis=-1)
 
 
 def _same(v: np.ndarray) -> np.ndarray:
@@ -203,12 +249,16 @@ def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = ()) 
 
 
 class SymbolicForces:
-    """All derivatives in closed form, generated from the symbols when first asked for."""
+    """All derivatives in closed form, generated from the symbols when first asked for.
+
+    Positions of a driven system are (d + 1, P), with the time, on which no force acts.
+    """
 
     def __init__(self, symbols: Any, level: int, monomials: Monomials) -> None:
         import sympy as sp
 
         slope = sp.Matrix(symbols.slope)
+        self._samples = symbols.samples
         terms = [-slope]
         if level in (FORCE_GRADIENT, CURVATURE):
             v = symbols.inverse_mass * slope
@@ -217,16 +267,23 @@ class SymbolicForces:
             terms.append(sp.Matrix([-sp.diff(symbols.W, s) for s in symbols.q]))
         products = [sp.Mul(*map(sp.Pow, symbols.q, m)) for m in monomials]
         terms += [sp.Matrix([-sp.diff(product, s) for s in symbols.q]) for product in products]
-        self._d, self._n, self._q, self._terms = symbols.ndof, len(terms), symbols.q, terms
+        time = () if symbols.time is None else (symbols.time,)
+        terms = [term.col_join(sp.zeros(len(time), 1)) for term in terms]
+        self._d, self._n, self._q, self._terms = symbols.ndof + len(time), len(terms), (*symbols.q, *time), terms
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The expressions: functions are generated where they are used."""
+        return {name: value for name, value in vars(self).items() if name not in ("_values", "_all", "_along")}
 
     @cached_property
     def _values(self) -> Callable[[np.ndarray], np.ndarray]:
-        return _generated(self._q, [f for term in self._terms for f in term])
+        return _generated(self._q, [f for term in self._terms for f in term], self._samples)
 
     @cached_property
     def _all(self) -> Callable[[np.ndarray], np.ndarray]:
         values = [f for term in self._terms for f in term]
-        return _generated(self._q, [*values, *(f for term in self._terms for f in term.jacobian(self._q))])
+        slopes = [f for term in self._terms for f in term.jacobian(self._q)]
+        return _generated(self._q, [*values, *slopes], self._samples)
 
     @cached_property
     def _along(self) -> Callable[[np.ndarray], np.ndarray]:
@@ -234,7 +291,7 @@ class SymbolicForces:
 
         directions = sp.symbols(f"v1:{self._d + 1}", real=True)
         changes = [_derivative(f, self._q, directions) for term in self._terms for f in term]
-        return _generated((*self._q, *directions), changes)
+        return _generated((*self._q, *directions), changes, self._samples)
 
     def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
         return self._values(q).reshape(self._n, self._d, q.shape[1])  # type: ignore[return-value]
@@ -264,19 +321,25 @@ class ArrayForces:
 
     The Jacobian of G(q) = ∇²V(q) v(q), v = M⁻¹∇V, is ∇²V M⁻¹ ∇²V and the derivative of ∇²V along v, a central
     difference of two Hessians: third derivatives of V are never asked for, so there is no C.
+
+    Positions of a driven system are (d + 1, P), with the time, on which no force acts.
     """
 
     def __init__(self, system: HamiltonianSystem, level: int) -> None:
         assert level < CURVATURE
         self.system, self.force_gradient = system, level >= FORCE_GRADIENT
+        self._velocity = _velocities(system, 0.0)
         self._gradient, self._product = _row_functions(system)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return ArrayForces, (self.system, FORCE_GRADIENT if self.force_gradient else 0)
 
     def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
         rows = np.ascontiguousarray(q.T)
         slope = self._gradient(rows)
         if not self.force_gradient:
             return (-slope.T,)
-        return -slope.T, self._product(rows, self.system.velocity(slope)).T
+        return -slope.T, self._product(rows, self._velocity(slope)).T
 
     def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         rows = np.ascontiguousarray(q.T)
@@ -284,9 +347,9 @@ class ArrayForces:
         F, DF = -slope.T, np.moveaxis(-hessian, 0, -1)
         if not self.force_gradient:
             return (F,), (DF,)
-        v = self.system.velocity(slope)
-        ends, length = _ends(rows, v)
-        inverse_mass = self.system.kinetic_hessian(np.zeros(self.system.ndof))
+        v = self._velocity(slope)
+        ends, length = self._ends(rows, v)
+        inverse_mass = _inverse_mass(self.system, 0.0)
         along = (self._hessian(ends[0]) - self._hessian(ends[1])) / (2 * length[..., None])
         DG = along + hessian @ inverse_mass @ hessian
         return (F, (hessian @ v[..., None])[..., 0].T), (DF, np.moveaxis(DG, 0, -1))
@@ -298,26 +361,26 @@ class ArrayForces:
         F, DF = -slope.T, -change.swapaxes(-1, -2)
         if not self.force_gradient:
             return (F,), (DF,)
-        acceleration = self.system.velocity(slope)
-        ends, length = _ends(rows, acceleration)
+        acceleration = self._velocity(slope)
+        ends, length = self._ends(rows, acceleration)
         DG = (self._product(ends[0], directions) - self._product(ends[1], directions)) / (2 * length)
-        DG = DG + self._product(rows, self.system.velocity(change))
+        DG = DG + self._product(rows, self._velocity(change))
         return (F, self._product(rows, acceleration).T), (DF, DG.swapaxes(-1, -2))
 
     def _hessian(self, rows: np.ndarray) -> np.ndarray:
         """∇²V: (P, d) to (P, d, d)."""
-        given = self.system.symbols is not None or self.system.numba_functions is not None
+        given = self.system.symbols is not None or self.system.numba_functions is not None or not self.system.autonomous
         if not given and self.system.has_hessian_vector:
             return self.system.potential_hessian(rows)
         basis = np.broadcast_to(np.eye(rows.shape[1])[:, None], (rows.shape[1], *rows.shape))
         return np.moveaxis(self._product(rows, basis), 0, -1)
 
-
-def _ends(rows: np.ndarray, v: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """The states on both sides of each row along v (P, d), and their distance from it over that of v (P, 1)."""
-    largest = np.abs(v).max(-1, keepdims=True)
-    length = ALONG * np.maximum(np.abs(rows).max(-1, keepdims=True), 1e-300) / np.where(largest > 0, largest, 1.0)
-    return (rows + length * v, rows - length * v), length
+    def _ends(self, rows: np.ndarray, v: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+        """The states on both sides of each row along v (P, D), and their distance from it over that of v (P, 1)."""
+        largest = np.abs(v).max(-1, keepdims=True)
+        size = np.abs(rows[:, : self.system.ndof]).max(-1, keepdims=True)
+        length = ALONG * np.maximum(size, 1e-300) / np.where(largest > 0, largest, 1.0)
+        return (rows + length * v, rows - length * v), length
 
 
 def _row_functions(system: HamiltonianSystem) -> tuple[Callable[[np.ndarray], np.ndarray], Product]:
@@ -329,6 +392,8 @@ def _row_functions(system: HamiltonianSystem) -> tuple[Callable[[np.ndarray], np
     def slopes(rows: np.ndarray) -> np.ndarray:
         return -system.force(rows)
 
+    if not system.autonomous:
+        return _functions_in_time(system)
     if system.symbols is not None:
         return slopes, _symbolic_product(system.symbols)
     if system.numba_functions is None:
@@ -353,6 +418,32 @@ def _row_functions(system: HamiltonianSystem) -> tuple[Callable[[np.ndarray], np
         return out.reshape(shape)
 
     return compiled_slopes, compiled_products
+
+
+def _functions_in_time(system: HamiltonianSystem) -> tuple[Callable[[np.ndarray], np.ndarray], Product]:
+    """The same of a driven system, rows being (..., P, d + 1); by the time from differences."""
+    d = system.ndof
+    short = PRODUCT * (1.0 if system.period is None else system.period / (2 * np.pi))
+
+    def slopes(rows: np.ndarray) -> np.ndarray:
+        return np.concatenate([-system.force(rows[..., :d], rows[..., d]), np.zeros_like(rows[..., d:])], axis=-1)
+
+    def product(rows: np.ndarray, v: np.ndarray) -> np.ndarray:
+        rows, v = np.broadcast_arrays(rows, v)
+        q, t = rows[..., :d], rows[..., d]
+
+        def slope(x: np.ndarray) -> np.ndarray:
+            return -system.force(x, t)
+
+        if system.has_hessian_vector:
+            change = system.hessian_vector(q, v[..., :d], t)
+        else:
+            change = _differences_of(slope)(q, v[..., :d])
+        ahead, behind = (system.force(q, t + s) - system.force(q, t - s) for s in (short, 2 * short))
+        by_time = (behind - 8 * ahead) / (12 * short)
+        return np.concatenate([change + by_time * v[..., d:], np.zeros_like(v[..., d:])], axis=-1)
+
+    return slopes, product
 
 
 _PRODUCTS: WeakKeyDictionary[Any, Product] = WeakKeyDictionary()
@@ -407,14 +498,25 @@ def _compiled(gradient: Any, hessian_vector: Any) -> tuple[Callable[..., None], 
     return slopes, products
 
 
-def _generated(variables: Sequence[Any], expressions: list[Any]) -> Callable[[np.ndarray], np.ndarray]:
-    """The expressions as one function of (d, P), with common subexpressions shared: (n, P)."""
+def _generated(
+    variables: Sequence[Any], expressions: list[Any], samples: Mapping[str, Any] = MappingProxyType({})
+) -> Callable[[np.ndarray], np.ndarray]:
+    """The expressions as one function of (d, P), with common subexpressions shared: (n, P).
+
+    They may hold values of samples at a time that is one of the variables.
+    """
     import sympy as sp
 
-    function = sp.lambdify(variables, expressions, modules="numpy", cse=True)
+    letters: dict[Any, Any] = {}
+    if samples:
+        from sympflow.hamiltonian.driving import with_letters
+
+        expressions, letters = with_letters(expressions)
+    sampled = [(samples[a.name_of_samples], a.order, sp.lambdify(variables, a.at, modules="numpy")) for a in letters]
+    function = sp.lambdify((*variables, *letters.values()), expressions, modules="numpy", cse=True)
 
     def evaluate(q: np.ndarray) -> np.ndarray:
-        values = function(*q)
+        values = function(*q, *(each(at(*q), order) for each, order, at in sampled))
         out = np.empty((len(values), q.shape[1]))
         for i, value in enumerate(values):
             out[i] = value

@@ -14,7 +14,7 @@ from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 from sympflow.training.options import TableOptions
-from sympflow.training.points import USELESS, Stream, shares_missed, states, step_errors
+from sympflow.training.points import USELESS, Stream, shares_missed, start_times, states, step_errors
 from sympflow.training.session import Deadline, OutOfTime, Session
 from sympflow.training.starts import PHASE, SEED, Primed, default_primed
 from sympflow.training.table_fit import TableRun
@@ -22,7 +22,10 @@ from sympflow.training.table_fit import TableRun
 PHASES = (PHASE, 1.25, 1.5)  # ω Δt of the flows that are tried
 STARTS, STEPS, FINAL_STEPS, POINTS = 6, 40, 160, 80  # of a trial's search, and what follows the best start
 ORBITS, LENGTH = 20, 256  # held-out orbits of a trial, and their steps
-FEWER, REFERENCE = 32, 1e-10  # steps of orbits with friction, and the tolerance of the exact ones beside them
+FEWER, REFERENCE = (
+    32,
+    1e-10,
+)  # steps of orbits of which the energy changes, and the tolerance of the exact ones beside them
 ORDER = 8  # with which the errors of classical schemes fall where these flows are used
 MOST_NDOF = 3  # beyond which trials take too long
 SHARE = 0.5  # of a time budget
@@ -49,7 +52,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     """The flow that gains most: that of `default_primed`, or one with a longer Δt or curvature terms.
 
     Of each the table at Δt is fitted for a few seconds, and followed along held-out orbits. Where its energy error (of
-    a system with friction: the difference from the energy along the exact orbit) is
+    a system with friction or a drive: the difference from the energy along the exact orbit) is
     e, the work of a classical scheme of order p is in proportion to e^(−1/p); so the flow gains most whose kicks take
     the fewest cycles in a unit of time, times e^(1/p), p = 8. Curvature terms are tried with the best Δt, unless they
     make kicks twice as dear. Where all errors are above 1e-5 it is the flow with the smallest, or of those with up to
@@ -88,27 +91,44 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     bends = cycles[1] <= DEAREST * cycles[0]
     with session.bar(len(starts) + bends, f"{system.name} trials") as bar:
 
-        def tried(start: Primed) -> bool:
-            bar.tries(len(found), f"Δt = {start.dt:g}{', with curvature terms' * start.curvature}")
-            made = trial(start, system, domain, deadline)
-            if not deadline.over():  # else it says nothing
+        def attempt(wanted: list[Primed]) -> None:
+            answers = session.each(_trial_of, (system, domain, deadline), wanted)
+            for start in wanted:
+                if deadline.over():
+                    return
+                bar.tries(len(found), f"Δt = {start.dt:g}{', with curvature terms' * start.curvature}")
+                try:
+                    made = next(answers)
+                except KeyboardInterrupt:  # while others work
+                    if session.crew.alone or not interruption.armed:
+                        raise
+                    interruption.asked = True
+                if deadline.over():  # then it says nothing
+                    return
                 found[start] = made
                 # from the first flow on Ctrl-C ends the trials
                 interruption.armed = interruption.armed or made.flow is not None
-            return start in found
 
-        plain = [start for start in starts if not deadline.over() and tried(start)]
-        if not plain:
+        attempt(starts)
+        if not found:
             return Trial(starts[0], math.inf)
-        bent = replace(best(plain), curvature=True)
-        more = bends and not deadline.over() and tried(bent)
-        return found[best([best(plain), bent]) if more else best(plain)]
+        straight = best([*found])
+        bent = replace(straight, curvature=True)
+        if bends:
+            attempt([bent])
+        return found[best([straight, bent]) if bent in found else straight]
 
 
 def tried_starts(system: HamiltonianSystem, domain: Domain, curvature: bool = True) -> list[Primed]:
     """The flows that may be chosen, from the shortest Δt to the longest; with `curvature` also with such terms."""
     plain = list(dict.fromkeys(default_primed(system, domain, phase=phase) for phase in PHASES))
     return plain + [replace(start, curvature=True) for start in plain if curvature]
+
+
+def _trial_of(common: tuple[HamiltonianSystem, Domain, Deadline], start: Primed) -> Trial:
+    """A trial as a piece of work."""
+    system, domain, deadline = common
+    return trial(start, system, domain, deadline)
 
 
 def trial(start: Primed, system: HamiltonianSystem, domain: Domain, deadline: Deadline | None = None) -> Trial:
@@ -129,25 +149,28 @@ def trial(start: Primed, system: HamiltonianSystem, domain: Domain, deadline: De
     fit = run.frozen
     assert fit is not None
     for _ in range(STARTS):
-        run.minima.append(run.next_minimum(deadline))
+        run.minima.append(run.next_minimum(deadline.session, deadline))
     best = min(run.minima, key=lambda m: m.cost)
     for final in filter(None, (fit, run.weighted)):
         best = final.minimize(best.x, FINAL_STEPS, deadline, thorough=True)
     table = fit.coefficients(best.x)[:, :1]
     exact = states(domain, ORBITS, SEED, Stream.REFERENCE)
-    H, worst, y = system.hamiltonian(exact), np.zeros(len(exact)), exact.T
+    t = start_times(system, start.dt, len(exact), SEED, Stream.REFERENCE)
+    H, worst, y = system.hamiltonian(exact, t), np.zeros(len(exact)), exact.T
     scale = np.abs(H) if system.energy_scale is None else system.energy_scale
     labels = run.held_out
     with np.errstate(all="ignore"):
-        missed = run.step(table, labels.x.T).T - labels.y[-1]
+        missed = run.step(table, labels.x.T, t0=labels.t0).T - labels.y[-1]
         if not shares_missed(missed, labels, np.array(scaling.x))[1] < USELESS:
             return Trial(start, math.inf)
-        for _ in range(LENGTH if system.conservative else FEWER):
-            y = run.step(table, y)
-            if not system.conservative:  # the energy that the exact flow has left
-                exact = reference_step(system, exact, start.dt, REFERENCE, deadline.check)
-                H = system.hamiltonian(exact)
-            worst = np.maximum(worst, np.abs(system.hamiltonian(y.T) - H))
+        kept = system.conservative and system.autonomous
+        for _ in range(LENGTH if kept else FEWER):
+            y = run.step(table, y, t0=t)
+            if not kept:  # the energy that the exact flow has
+                exact = reference_step(system, exact, start.dt, REFERENCE, deadline.check, t)
+                t = None if t is None else t + start.dt
+                H = system.hamiltonian(exact, t)
+            worst = np.maximum(worst, np.abs(system.hamiltonian(y.T, t) - H))
         worst /= scale
     error = float(np.median(np.where(np.isnan(worst), np.inf, worst)))
     if not math.isfinite(error) or deadline.over():

@@ -1,0 +1,207 @@
+"""Primed flows of driven systems: fitted with their drive, exactly symplectic, refused for any other."""
+
+from math import pi
+
+import numpy as np
+import pytest
+import torch
+
+import sympflow
+from sympflow import Box, HamiltonianSystem, SympFlow, solve
+from sympflow.training.table_step import ArrayForces, TableStep
+
+DT, T0, W = 0.4, 1.3, 2.7
+
+
+def driven(a=0.1, w=W, **more):
+    return HamiltonianSystem.from_sympy(
+        "p**2/2 - cos(q)*(1 + a*cos(w*t))",
+        **{
+            "name": "driven_pendulum",
+            "time": "t",
+            "params": {"a": a, "w": w},
+            "period": 2 * pi / w,
+            "y0": [0.5, 0.1],
+            "domain": Box([-1, -1], [1, 1]),
+        }
+        | more,
+    )
+
+
+@pytest.fixture(scope="module")
+def system():
+    return driven()
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return HamiltonianSystem.from_sympy("p**2/2 - cos(q)", y0=[0.5, 0.1], domain=Box([-1, -1], [1, 1]))
+
+
+@pytest.fixture(scope="module")
+def flow(system):
+    start = SympFlow.primed(system, 2, processor=2, dt=DT)
+    return sympflow.train(
+        system, flow=start, restarts=4, steps=40, points=60, label_times=3, reference_states=20, progress=False
+    )
+
+
+def states(system, n=4):
+    return system.domain.sample(n, seed=1)
+
+
+def test_a_flow_is_fitted_at_all_times_of_the_drive(system, flow):
+    x, span = states(system, 10), (T0, T0 + 8.0)
+    truth = solve(system, "dop853", span, x, t_eval=span[1:], rtol=1e-12, atol=1e-12).y
+    error, start, scheme = (
+        np.abs(solve(system, each, span, x, t_eval=span[1:], **more).y - truth).max()
+        for each, more in (
+            (flow, {}),
+            (SympFlow.primed(system, 2, dt=DT), {}),
+            ("chin4c", {"dt": DT}),  # three forces and a force gradient a step
+        )
+    )
+    assert error < min(start / 100, scheme / 2)
+    assert flow.figures["one_step_error"] < 1e-5
+    assert flow.shape.timed
+
+
+def test_it_is_symplectic_and_goes_back_and_keeps_the_energy_balance(system, flow):
+    sol = solve(system, flow, (T0, T0 + 400.0), t_eval=np.linspace(T0, T0 + 400.0, 100))
+    assert sol.stats["backend"] == "compiled"
+    assert sympflow.symplecticity_defect(solve(system, flow, (T0, T0 + 8.0))).max() < 1e-13
+    balance = sympflow.energy_balance_error(sol)
+    assert balance.max() < 1e-5
+    assert balance[50:].max() < 3 * balance[:50].max()
+    back = solve(system, flow, (T0 + 8.0, T0), solve(system, flow, (T0, T0 + 8.0)).y[:, -1])
+    np.testing.assert_allclose(back.y[:, -1], system.y0, atol=1e-13)
+
+
+@pytest.mark.parametrize("damping", [None, 0.2], ids=["conservative", "damped"])
+def test_loops_arrays_and_the_map_itself_agree(system, flow, damping):
+    if damping is not None:
+        system = driven(damping=damping)
+        flow = flow.transferred(system)
+    x, times = states(system), [T0, T0 + 0.3, T0 + 2.0, T0 + 3.1]
+    compiled, arrays = (
+        solve(system, "sympflow", (T0, times[-1]), x, flow=flow, t_eval=times, backend=backend).y
+        for backend in ("compiled", "array")
+    )
+    np.testing.assert_allclose(compiled, arrays, atol=1e-14)
+    one = solve(system, flow, (T0, times[-1]), x[1], t_eval=times)
+    np.testing.assert_array_equal(one.y, compiled[1])
+    y, t = torch.tensor(x), torch.tensor(3.1, dtype=torch.float64)
+    for time in (t, 3.1):
+        end = flow(time, y, T0)
+        np.testing.assert_allclose(end.detach(), compiled[..., -1], atol=1e-14)
+        torch.testing.assert_close(flow.inverse(time, end, T0), y, atol=1e-14, rtol=0)
+    starts = torch.tensor([0.1, 1.0, 5.0, T0], dtype=torch.float64)
+    np.testing.assert_allclose(flow(t, y, starts)[3].detach(), compiled[3, :, -1], atol=1e-14)
+    later = flow(t, y, T0 + 7 * system.period)
+    torch.testing.assert_close(later, flow(t, y, T0), atol=1e-13, rtol=0)
+
+
+def test_its_velocity_is_that_of_its_hamiltonian(system, flow):
+    y, t, h = torch.tensor(states(system)), torch.tensor([0.1, 0.2, 0.3, 0.39], dtype=torch.float64), 1e-5
+    slope = (flow.psi(t + h, y, T0) - flow.psi(t - h, y, T0)) / (2 * h)
+    velocity = flow.velocity(t, y, T0).detach()
+    torch.testing.assert_close(velocity, slope.detach(), atol=1e-9, rtol=0)
+    end = flow.psi(t, y, T0).detach().requires_grad_(True)
+    (gradient,) = torch.autograd.grad(flow.hamiltonian(t, end, T0).sum(), end)
+    torch.testing.assert_close(torch.cat([gradient[:, 1:], -gradient[:, :1]], -1), velocity, atol=1e-13, rtol=0)
+    H = flow.hamiltonian(t, end, T0) - torch.as_tensor(system.hamiltonian(end.detach().numpy(), T0 + t.numpy()))
+    assert (H - H.mean()).abs().max() < 1e-2
+
+
+@pytest.mark.parametrize("damping", [None, 0.3])
+@pytest.mark.parametrize("level", [1, 2])
+def test_the_derivatives_of_a_step_by_its_numbers(damping, level):
+    step = TableStep(driven(damping=damping), ("drift", "kick", "drift", "kick", "drift"), level)
+    rng = np.random.default_rng(0)
+    c, y, t = 0.4 * rng.normal(size=(step.n_coefficients, 4)), 0.3 * rng.normal(size=(2, 4)), 3 * rng.random(4)
+    for derivatives in (step._forward, step._backward):
+        at, J = derivatives(c, y, lambda: None, t)
+        np.testing.assert_allclose(at, step(c, y, t0=t), atol=1e-14)
+        for k in range(len(c)):
+            e = np.zeros_like(c)
+            e[k] = 1e-6
+            np.testing.assert_allclose(J[k], (step(c + e, y, t0=t) - step(c - e, y, t0=t)) / 2e-6, atol=1e-8)
+
+
+def test_forces_of_arrays_are_those_of_symbols(system):
+    """They are differences in t, as of a system of plain functions, or of samples."""
+    step, arrays = (TableStep(system, ("drift", "kick", "drift", "kick", "drift"), 1) for _ in range(2))
+    arrays._forces = ArrayForces(system, 1)
+    rng = np.random.default_rng(1)
+    c, y, t = 0.4 * rng.normal(size=(step.n_coefficients, 4)), 0.3 * rng.normal(size=(2, 4)), 3 * rng.random(4)
+    for name in ("_forward", "_backward"):
+        for one, other in zip(*(getattr(s, name)(c, y, lambda: None, t) for s in (step, arrays)), strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-8)
+
+
+def test_a_drive_given_by_samples_is_fitted(plain):
+    from scipy.interpolate import CubicSpline
+
+    t = np.linspace(0, 10, 200)
+    system = HamiltonianSystem.from_sympy(
+        "p**2/2 - cos(q)*(1 + a)",
+        params={"a": CubicSpline(t, 0.1 * np.cos(W * t))},
+        t_span=(0, 10),
+        domain=plain.domain,
+    )
+    start = SympFlow.primed(system, 2, dt=DT)
+    options = {"restarts": 1, "steps": 10, "points": 20, "label_times": 2, "reference_states": 5, "progress": False}
+    flow = sympflow.train(system, flow=start, **options)
+    assert flow.figures["one_step_error"] < 1e-4
+    with pytest.raises(ValueError, match=r"^`system` .* no step of dt = 20 begins and ends: give it the period"):
+        sympflow.train(system, flow=SympFlow.primed(system, 2, dt=20.0), **options)
+
+
+def test_a_file_knows_the_drive(system, flow, tmp_path):
+    flow.save(tmp_path / "flow.safetensors")
+    again = sympflow.load(tmp_path / "flow.safetensors", system=system)
+    x = torch.tensor(states(system))
+    assert torch.equal(again(2.0, x, T0), flow(2.0, x, T0))
+    for other in (driven(a=0.11), driven(w=2.8)):
+        with pytest.raises(ValueError, match=r"with another drive or none, .* its amplitude, its frequency"):
+            sympflow.load(tmp_path / "flow.safetensors", system=other)
+
+
+def test_flows_of_another_drive_or_none_are_refused(system, flow, plain):
+    undriven = SympFlow.primed(plain, 2, dt=DT)
+    for use in (
+        lambda: solve(system, undriven),
+        lambda: sympflow.train(system, flow=undriven),
+        lambda: solve(driven(a=0.2), flow),
+    ):
+        with pytest.raises(ValueError, match=r"^`system` 'driven_pendulum' is driven, .*flow\.transferred\(system\)"):
+            use()
+    with pytest.raises(ValueError, match="is not the one that this flow was trained for"):
+        solve(plain, flow)
+    with pytest.raises(ValueError, match="has no shipped sympflow flow"):
+        solve(driven(a=0.123), "sympflow")
+    for use in (
+        lambda: flow.certificate(system),
+        lambda: sympflow.train(system, flow=flow, loss="labels+residual"),
+        lambda: sympflow.train(system, flow=flow, data=(np.zeros(2), np.zeros((2, 2)), np.zeros((2, 2)))),
+        lambda: sympflow.train(system, kind="mlp"),
+        lambda: solve(system, SympFlow(1)),
+        lambda: SympFlow.primed(HamiltonianSystem.from_sympy("p**2/2*(1 + cos(t)/9) - cos(q)", time="t")),
+    ):
+        with pytest.raises(ValueError, match=r"is driven, H depends on t|depends on t, and flows are primed with V"):
+            use()
+
+
+def test_bad_times(system, flow):
+    x = torch.tensor(states(system))
+    with pytest.raises(TypeError, match=r"^`t0` is missing"):
+        flow(1.0, x)
+    with pytest.raises(TypeError, match=r"^`t0` must be a number"):
+        flow(1.0, x, "now")
+    with pytest.raises(ValueError, match=r"^`t0` must be finite"):
+        flow(1.0, x, np.nan)
+    with pytest.raises(ValueError, match=r"^`t0` of shape \(3,\) does not fit"):
+        flow(1.0, x, torch.zeros(3))
+    aperiodic = driven(period=None)
+    with pytest.raises(TypeError, match=r"^`x` is torch.float32, in which times are rounded"):
+        flow.transferred(aperiodic).to(torch.float32)(1.0, x.float(), 1e6)
