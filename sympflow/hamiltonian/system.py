@@ -390,6 +390,8 @@ class HamiltonianSystem(Hamiltonian):
         for name in names:
             if name not in known:
                 has = f"which has {', '.join(known)}" if known else "which has none: write H with symbols for them"
+                if name == "damping" and self.damping is not None:
+                    has += "; its friction is none: make a system for each `damping`"
                 raise ValueError(f"`params` has {name!r}, no parameter of {self.name!r}, {has}.")
 
     def with_params(self, **values: float) -> HamiltonianSystem:

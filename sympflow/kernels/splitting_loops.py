@@ -278,9 +278,9 @@ class SplittingKernel(Kernel):
 class VariedKernel(SplittingKernel):
     """The loops of batches of N trajectories that have their own values (k, N) of `SplittingLoops.values`.
 
-    Each takes the steps of `SplittingKernel` on a system with its values up to rounding: what the compiler takes out of
-    loops there, products of values, it may fuse with sums here. A batch may be several of such ones, one after the
-    other.
+    Each takes the steps of `SplittingKernel` on a system with its values, with compensated sums up to rounding:
+    products of values, which the compiler takes out of loops there, it may fuse with sums here. A batch may be several
+    of such ones, one after the other.
     """
 
     def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool, values: np.ndarray) -> None:
@@ -442,7 +442,10 @@ def symbolic_module(
     n = len(symbols.parameters)
     lanes = lanes_source(kinds, scheduled, friction, n, varied)
     sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
-    sources += [kicks_source(symbols, level, monomials)] if scheduled else plain_kicks_source(symbols, level, monomials)
+    if scheduled:
+        sources.append(kicks_source(symbols, level, monomials, varied=varied))
+    else:
+        sources += plain_kicks_source(symbols, level, monomials)
     algebra = "\n\n\n".join(sources)
     before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
     n_values = n if varied else 0

@@ -477,15 +477,15 @@ def lanes_source(
     """The functions of the text `lanes` that depend on the kinds of kick; not scheduled, sums are compensated.
 
     ``stage_lanes`` is a kick and a drift of all lanes by the same numbers, ``stage_each`` of each lane by its own, by
-    column j of a table. `varied` lanes have their own values of the parameters in both.
+    column j of a table. `varied` lanes have their own values of the parameters in both; scheduled ones take what
+    depends on these from a table in ``own_stages``, which makes two stages.
     """
 
     given = "numbers, " if n_parameters else ""
     n_numbers, values = len(kinds[0].numbers), range(n_parameters)
 
     def together(kick: Kick) -> list[str]:
-        own = [f"common[{i}], " for i in range(n_numbers)] + [f"Y[2 * NDOF + {i}, lane], " for i in values]
-        taken = [f"numbers = ({''.join(own)})"] if varied else []
+        taken = ["numbers = numbers_of_lane(Y, common, lane)"] if varied else []
         kicked = [*taken, *kick.application(scheduled, lane=True)]
         if scheduled:
             return _over_lanes([*kicked, *_drifted_lane(friction, n_parameters)])
@@ -506,11 +506,14 @@ def lanes_source(
     # Kinds are told apart outside the loops: a loop with a branch in it, once it is long, is no longer made of vector
     # instructions.
     passed = "common" if varied else "numbers"
-    source = f"""@njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
+    before = _own_source(n_numbers, n_parameters) if varied else ""
+    source = f"""{before}@njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
 def stage_lanes(Y, error, width, {passed}, a):
     {_cases(kinds, passed + "[{0}] != 0.0", [together(kick) for kick in kinds])}"""
     if not scheduled:
         return source
+    if varied:
+        source += "\n\n\n" + _own_stages_source(n_parameters)
     return f"""N_NUMBERS = {n_numbers}
 
 
@@ -520,6 +523,31 @@ def stage_lanes(Y, error, width, {passed}, a):
 @njit(**OPTIONS, inline="always")
 def stage_each(Y, width, table, j):
     {_cases(kinds, "np.any(table[{1}, j] != 0.0)", [each(kick) for kick in kinds])}"""
+
+
+def _own_source(n_numbers: int, n_parameters: int) -> str:
+    """``numbers_of_lane``, those of a kick with the values of the parameters of a lane."""
+    numbers = [f"common[{i}], " for i in range(n_numbers)]
+    numbers += [f"Y[2 * NDOF + {i}, lane], " for i in range(n_parameters)]
+    return f"@njit(**OPTIONS)\ndef numbers_of_lane(Y, common, lane):\n    return ({''.join(numbers)})\n\n\n"
+
+
+def _own_stages_source(n_parameters: int) -> str:
+    """``own_stages`` of `lanes_source`: one stage, and two in one pass, which loads and stores the states once."""
+
+    def lines(numbers: str, a: str, own: str) -> list[str]:
+        given = f"numbers, a = numbers_of_lane(Y, {numbers}, lane), {a}"
+        return [given, f"p = kicked_by_own(q, p, numbers, {own}, lane)", *_drifted_lane(None, n_parameters)]
+
+    one, other = lines("common_1", "a_1", "own_1"), lines("common_2", "a_2", "own_2")
+    head = '@njit(**OPTIONS, inline="always")\ndef '
+    return "\n\n\n".join(
+        f"{head}{name}(Y, width, {taken}):\n    " + "\n    ".join(_over_lanes(body))
+        for name, taken, body in (
+            ("own_stage_lanes", "common_1, a_1, own_1", one),
+            ("two_own_stages_lanes", "common_1, a_1, own_1, common_2, a_2, own_2", [*one, *other]),
+        )
+    )
 
 
 def _over_lanes(lines: Sequence[str]) -> list[str]:
