@@ -102,9 +102,11 @@ def solve(
         Longest time between two samples of the event functions; two zeros of one between two samples are missed. It
         never changes the run: longer steps are sampled within, by the dense output, as `max_step` does inside
         `solve_ivp`. The default is `system.dt` for fixed steps, which may be long, and every step for adaptive methods.
-    backend : "auto", "compiled" or "array"
+    backend : "auto", "compiled", "array" or "cuda"
         "auto" runs splitting methods on symbolic systems (and on Numba functions) and float64 NumPy states compiled,
-        everything else with array operations. What ran is in `stats["backend"]`.
+        everything else with array operations. "cuda" runs a batch on an NVIDIA GPU, a thread for each trajectory: for
+        schemes on the splitting "kinetic" of autonomous symbolic systems without friction; results agree with compiled
+        ones to rounding. It has been run in Numba's simulator only. What ran is in `stats["backend"]`.
     on_domain_exit : "warn", "stop" or "ignore", optional
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
         statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The
@@ -163,8 +165,13 @@ def solve(
             system = rows.system_of(0)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
     every = check_save_every(save_every, times)
-    if not isinstance(backend, str) or backend not in BACKENDS:
-        raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
+    if not isinstance(backend, str) or backend not in (*BACKENDS, "cuda"):
+        raise ValueError(f"`backend` must be one of {', '.join(map(repr, (*BACKENDS, 'cuda')))}; got {backend!r}.")
+    if backend == "cuda" and not integrator.runs_on_cuda:
+        raise ValueError(
+            f"`backend` 'cuda' is for splitting methods on the splitting 'kinetic' and the clock 'physical'; "
+            f"{integrator.label!r} is none: use backend='auto'."
+        )
     if backend == "compiled" and not integrator.compiles:
         raise ValueError(f"`backend` 'compiled' does not apply to method {integrator.name!r}: use 'auto'.")
     if not isinstance(dense_output, bool | np.bool_):

@@ -59,6 +59,8 @@ __all__ = [
 FEW = 8
 """Outputs that are placed on the grid by NumPy: a compiled pass is worth its loading for more."""
 FIRST_CHUNK, LAST_CHUNK = 8, 1024  # steps between two looks at the events
+COMPILED = ("compiled", "cuda")
+"""What compiled loops say in `stats["backend"]`."""
 MOST_SAMPLES = 65536  # of the events, in a chunk
 
 
@@ -182,7 +184,7 @@ class OwnStepper(FixedStep):
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str, t: Any = 0.0) -> Array:
         if self.overrides("step"):
             return super().substep(system, y, h, backend, t)
-        asked = "auto" if backend == "compiled" else "array"
+        asked = "auto" if backend in COMPILED else "array"
         return self.own_stepper(Problem(system, 0.0, 0.0, y, backend=asked)).shorter_from(t, y, h)
 
 
@@ -308,7 +310,7 @@ class KernelStepper(Stepper):
 
     def __init__(self, integrator: FixedStep, problem: Problem, kernel: Kernel) -> None:
         self.integrator, self.system, self.problem = integrator, problem.system, problem
-        self.kernel, self.backend, self.saves_finite = kernel, "compiled", kernel.saves_finite
+        self.kernel, self.backend, self.saves_finite = kernel, kernel.backend, kernel.saves_finite
         self.driven = self.system is not None and not self.system.autonomous  # a flow alone steps without a system
         self.iterations = 0
 
@@ -354,7 +356,7 @@ def compiled_loops(
     make : callable
         Raises a ValueError with the reason where there is no compiled form.
     y0 : array or tensor
-    backend : "auto", "compiled" or "array"
+    backend : "auto", "compiled", "array" or "cuda"
     compensated : bool
         Compiled loops are needed, for compensated sums.
     reason : str, optional
@@ -376,8 +378,8 @@ def compiled_loops(
             return make()
         except ValueError as error:
             reason = str(error)
-    if backend == "compiled":
-        raise ValueError(f"`backend` 'compiled' does not apply. {reason}") from None
+    if backend in COMPILED:
+        raise ValueError(f"`backend` {backend!r} does not apply. {reason}") from None
     if compensated:
         raise ValueError(f"`compensated` sums need compiled loops. {reason}") from None
     return None
@@ -936,7 +938,7 @@ class GridSolution:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         integrator, grid, states = state["integrator"], state["grid"], state["states"]
-        backend = "auto" if state["backend"] == "compiled" else "array"
+        backend = "auto" if state["backend"] in COMPILED else "array"
         problem = Problem(state["system"], grid.t0, grid.t1, states[0], backend=backend, letters=state.get("letters"))
         GridSolution.__init__(self, integrator.stepper(problem), grid, states)
 
