@@ -26,7 +26,7 @@ from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.provenance import provenance
 from sympflow.integrators.registry import build, check_applies
 from sympflow.kernels.modules import at_most, compiling_alone
-from sympflow.solver import BACKENDS
+from sympflow.solver import BACKENDS, check_own_parameters
 from sympflow.workers import LostWorkers, Parcel, Unpicklable, checked_workers, mapped
 
 if TYPE_CHECKING:
@@ -141,6 +141,7 @@ def ensemble(
     kept = reduction(reduce)
     orbits = initial_states(system, y0, n, seed)
     fixed, axes = _axes(system, params)
+    check_own_parameters(system, {**fixed, **axes}, integrator)
     if fixed:
         system = system.with_params(**fixed)
     first = orbits.states(0, min(len(orbits), SHORTEST_CHUNK))
@@ -183,6 +184,7 @@ def ensemble(
         if store is not None:
             whatever = f"{done} of {len(pieces)} chunks are in `store` {str(store)!r}: call again with resume=True."
         raise RuntimeError(f"{error} {whatever}") from error
+    keeper.finish()
     seconds = time.perf_counter() - start
     return Ensemble(layout.times, axes, system, integrator, (t0, t1), orbits, keeper, seconds)
 
@@ -198,11 +200,7 @@ def _axes(
     fixed: dict[str, float] = {}
     axes: dict[str, np.ndarray] = {}
     for name, given in params.items():
-        if name not in system.params:
-            names = ", ".join(system.params) or "none"
-            raise ValueError(
-                f"`params` has {name!r}, which the system {system.name!r} has not: its parameters are {names}."
-            )
+        system.check_parameters([name])
         values = floats("params", given)
         if values.ndim > 1 or values.size == 0 or not np.isfinite(values).all():
             raise ValueError(

@@ -114,6 +114,7 @@ def test_every_command_that_takes_a_system_takes_it():
     assert "harmonic_oscillator-sympflow" in run("flows", "own.py:spring").stdout  # known by its H
 
 
+@pytest.mark.slow
 def test_a_flow_is_trained_on_it_certified_and_used(files):
     small = ("--stages", 1, "--processor", 0, "--dt", 0.4, "--restarts", 1, "--steps", 2, "--points", 20)
     trained = run("train", "quartic.toml", *small, "--out", "q.safetensors")
