@@ -464,7 +464,6 @@ def symbolic_module(
 
     In `varied` ones each lane has its own values of the parameters.
     """
-    from sympflow.kernels.codegen import curvature_kick_source, gradient_kick_source, polynomial_kick_source
     from sympflow.kernels.kicks import kicks_source
 
     kinds, scheduled = kicks_of(level, len(monomials)), not compensated
@@ -473,17 +472,23 @@ def symbolic_module(
     sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
     if scheduled:
         sources.append(kicks_source(symbols, level, monomials, varied=varied))
-    elif level == POLYNOMIAL:
-        sources.append(polynomial_kick_source(symbols, monomials))
-    elif level:
-        sources.append(gradient_kick_source(symbols))
-    if compensated and level == CURVATURE:
-        sources.append(curvature_kick_source(symbols))
+    else:
+        sources += plain_kicks_source(symbols, level, monomials)
     algebra = "\n\n\n".join(sources)
     before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
     n_values = n if varied else 0
     header = _header(compensated, cache=True, scheduled=scheduled, n_values=n_values, driven=driving is not None)
     return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
+
+
+def plain_kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> list[str]:
+    """The kicks of a level, beside that of the algebra, where they are not scheduled."""
+    from sympflow.kernels.codegen import curvature_kick_source, gradient_kick_source, polynomial_kick_source
+
+    if level == POLYNOMIAL:
+        return [polynomial_kick_source(symbols, monomials)]
+    sources = [gradient_kick_source(symbols)] if level else []
+    return [*sources, curvature_kick_source(symbols)] if level == CURVATURE else sources
 
 
 def _family_loops(
