@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 MOST_DEGREES = 1_000_000
 MOST_WRITTEN_OUT = 400
-"""Coordinates of an expression before a warning: 512 of a chain take 2 s to define, a step 14 times that of a lattice."""
+"""Coordinates of an expression before a warning: 512 of a chain take 2 s to define, and a step 14 times as long."""
 
 
 class Parameters(dict[str, Any]):
@@ -217,8 +217,8 @@ class HamiltonianSystem(Hamiltonian):
         if symbols.ndof > MOST_WRITTEN_OUT:
             warnings.warn(
                 f"`expression` has {symbols.ndof} coordinates: written out, H takes seconds to define, and a step ten "
-                "times as long as by HamiltonianSystem.lattice, from one site and one bond, or HamiltonianSystem.pairs, "
-                "from one pair.",
+                "times as long as by HamiltonianSystem.lattice, from one site and one bond, or by "
+                "HamiltonianSystem.pairs, from one pair. Use one of these.",
                 stacklevel=2,
             )
         self = cls.__new__(cls)
