@@ -116,6 +116,9 @@ class HamiltonianSystem(Hamiltonian):
     array([-0.])
     """
 
+    _period: float | None = None
+    _former_period: float | None = None
+
     def __init__(
         self,
         potential: Callable[..., Array] | None = None,
@@ -288,6 +291,73 @@ class HamiltonianSystem(Hamiltonian):
         return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale)
 
     @classmethod
+    def pairs(
+        cls,
+        potential: str | sympy.Expr,
+        *,
+        masses: ArrayLike,
+        dim: int = 3,
+        box: float | Sequence[float] | None = None,
+        cutoff: float | None = None,
+        softening: float | None = None,
+        params: Mapping[str, float] | None = None,
+        bodies: Mapping[str, ArrayLike] | None = None,
+        damping: float | ArrayLike | None = None,
+        name: str = "pairs",
+        domain: Domain | None = None,
+        y0: ArrayLike | None = None,
+        t_span: tuple[float, float] = (0.0, 1.0),
+        dt: float = 0.001,
+        energy_scale: float | None = None,
+    ) -> HamiltonianSystem:
+        """Bodies that interact in pairs, any number of them: H = Σ_i |p_i|²/(2 m_i) + Σ_{i<j} V(r_ij).
+
+        Both bodies of a pair get the same force, with opposite signs, along the line between them, so that the methods
+        that conserve linear and angular momentum do so up to rounding. Without a cut-off a force costs O(n²), with one
+        O(n). Compiled loops over pairs are generated, whose code depends neither on the number of bodies nor on any
+        value.
+
+        Parameters
+        ----------
+        potential : str or sympy.Expr
+            V of one pair in its distance `r`, in m1 and m2, the masses of both, and in other names of `params` and
+            `bodies`, such as "-G*m1*m2/r". It must be the same with both bodies exchanged.
+        masses : array_like of shape (n,)
+        dim : int
+            Coordinates of a body, 1 to 3. A state is y = [q, p]; ``q.reshape(n, dim)`` are the places of the bodies.
+        box : float or sequence of `dim` floats, optional
+            Lengths of a periodic box: r is the distance to the nearest image.
+        cutoff : float, optional
+            Distance beyond which bodies do not interact, at most half of the box. So that H is smooth, V is replaced by
+            V(r) − V(c) − (r² − c²) V′(c)/(2c).
+        softening : float, optional
+            ε: r is √(|q_i − q_j|² + ε²), which is never 0.
+        params : mapping of str to float, optional
+            Values of names in V that are the same for all pairs.
+        bodies : mapping of str to array_like of shape (n,), optional
+            Values that differ from body to body: of "c" the values are c1 and c2 in V.
+        damping, name, domain, y0, t_span, dt, energy_scale
+            As for the class.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If V cannot be read, holds other names, or is not symmetric; if masses are not positive; if arrays do not
+            have one value for each body; if the cut-off is longer than half the box; or if a run would need more memory
+            than the machine has.
+
+        Examples
+        --------
+        >>> system = HamiltonianSystem.pairs("-m1*m2/r", masses=[1.0, 1e-3, 1e-4])
+        >>> system.ndof
+        9
+        """
+        from sympflow.hamiltonian.bodies import PairsHamiltonian
+
+        local = PairsHamiltonian(potential, masses, dim, box, cutoff, softening, params, bodies)
+        return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale)
+
+    @classmethod
     def _of_pieces(
         cls, local: LocalHamiltonian, damping: float | ArrayLike | None, name: str, *scene: Any
     ) -> HamiltonianSystem:
@@ -310,7 +380,16 @@ class HamiltonianSystem(Hamiltonian):
         if not real_number(period) or not 0 < period < 1e100:
             raise ValueError(f"`period` must be positive and finite; got {period!r}.")
         check_period(self.hamiltonian, self.ndof, self.y0, float(period))
-        self.period = float(period)
+        self._period = float(period)
+
+    @property
+    def period(self) -> float | None:  # type: ignore[override]
+        """The period of H in t, where one was named, or was that of the system of other parameters and still is."""
+        if self._former_period is not None:
+            former, self._former_period = self._former_period, None
+            with suppress(ValueError):
+                self._set_period(former)
+        return self._period
 
     def _set_scene(
         self,
@@ -431,8 +510,7 @@ class HamiltonianSystem(Hamiltonian):
             dt=self.dt,
             energy_scale=self.energy_scale,
         )
-        with suppress(ValueError):  # values of the drive may have changed its period
-            made._set_period(self.period)
+        made._former_period = self.period  # values of the drive may have changed it: tested where it is asked for
         return made
 
     def check_functions(self, y0: Array | None = None) -> None:

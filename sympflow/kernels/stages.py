@@ -17,6 +17,7 @@ __all__ = [
     "StageTable",
     "TimeAlone",
     "TimedNumbers",
+    "WithSystem",
     "kicks_of",
     "lanes_source",
     "numbers_of_kicks",
@@ -343,7 +344,20 @@ def damped(p, a):
 
 _DRIFT_OF = """@njit(**OPTIONS, forceinline=True)
 def drift_of(table, j):
-    return table[0, j]"""
+    return {stages}[0, j]"""
+_TABLE = """@njit(**OPTIONS, forceinline=True)
+def columns_of(table):
+    return {stages}.shape[1]
+
+
+@njit(**OPTIONS)
+def first_coefficients(table):
+    return {first}
+
+
+@njit(**OPTIONS)
+def drift_at(table, j, x):
+    return polynomial({stages}[0, j], x)"""
 
 
 class TimedNumbers(Protocol):
@@ -375,6 +389,21 @@ def numbers_at(table, j, x, h, t):
     return ({", ".join([*values, "time"])})"""
 
 
+class WithSystem:
+    """The numbers of kicks, and after them the array of a system's own numbers: a table is (stages, numbers, M⁻¹)."""
+
+    def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
+        numbers, values = numbers_of_kicks(kinds, "table[0]")
+        return f"""@njit(**OPTIONS)
+def numbers_of(table, j, k=0):
+    return ({", ".join([*numbers, "table[1]"])})
+
+
+@njit(**OPTIONS)
+def numbers_at(table, j, x, h, t):
+    return ({", ".join([*values, "table[1]"])})"""
+
+
 def time_lines(row: int) -> tuple[str, str]:
     """The time of kick j of step k of a run, and in a step h from t on; `row` is the first of those of the time."""
     return (
@@ -383,12 +412,12 @@ def time_lines(row: int) -> tuple[str, str]:
     )
 
 
-def numbers_of_kicks(kinds: Sequence[Kick]) -> tuple[list[str], list[str]]:
+def numbers_of_kicks(kinds: Sequence[Kick], stages: str = "table") -> tuple[list[str], list[str]]:
     """The numbers of kicks as code: those of a run, and those of a step h by polynomials in x."""
     rows = range(1, 1 + len(kinds[0].numbers))
     steps = {1: "h", 3: "h ** 3", 5: "h ** 5"}
-    values = [f"{steps[n]} * polynomial(table[{i}, j], x)" for i, n in zip(rows, kinds[0].powers, strict=True)]
-    return [f"table[{i}, j]" for i in rows], values
+    values = [f"{steps[n]} * polynomial({stages}[{i}, j], x)" for i, n in zip(rows, kinds[0].powers, strict=True)]
+    return [f"{stages}[{i}, j]" for i in rows], values
 
 
 def _numbers_source(kinds: Sequence[Kick], n_parameters: int) -> str:
@@ -413,13 +442,14 @@ def stages_source(
     friction: DampedDrift | None = None,
     n_parameters: int = 0,
     driving: TimedNumbers | None = None,
+    stages: str = "table",
 ) -> str:
     """The functions of the text `loops` that depend on the kinds of kick, on friction and on the time.
 
     ``numbers_of(table, j, k)`` are the numbers of kick j of step k, ``numbers_at(table, j, x, h, t)`` those of a step h
     by polynomials in x that begins at the time t; the values of the parameters of H, which are taken where there is no
-    friction, come after them. ``drift_of(table, j)`` are those of a drift. ``stage`` is a kick and a drift of one
-    trajectory.
+    friction, come after them. ``drift_of(table, j)`` are those of a drift. `stages` is the array of these numbers, by
+    the `table` that the loops are given. ``stage`` is a kick and a drift of one trajectory.
     """
     given = "numbers, " if n_parameters else ""
     drifted = f"return move(q, q_error, drift(p, a, {given}work))"
@@ -431,10 +461,14 @@ def stages_source(
     begin = ["fill_coefficients(numbers, work[j])"] if driving is not None and scheduled else []
     first = 1 + len(kinds[0].numbers)
     n_rows = first + (0 if friction is None else 2 * friction.size)
+    table = {"stages": stages, "first": "table[:, :, 0]" if stages == "table" else "table"}
     return f"""{_numbers_source(kinds, n_parameters) if driving is None else driving.source(kinds, n_rows)}
 
 
-{_DRIFT_OF if friction is None else friction.source(first)}
+{_TABLE.format(**table)}
+
+
+{_DRIFT_OF.format(**table) if friction is None else friction.source(first)}
 
 
 @njit(**OPTIONS, forceinline=True)
