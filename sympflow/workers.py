@@ -10,10 +10,11 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -255,6 +256,58 @@ def mapped(
                     stacklevel=2,
                 )
                 workers, answers = n, _rounds(n, call, processes=True)
+
+
+class Crew:
+    """Workers that stay from one map to the next, closed as a context; a number is one of processes.
+
+    Ctrl-C is left to the program that has them: it ends them.
+
+    Parameters
+    ----------
+    workers : int, object with .map, or callable
+        See the module's docstring.
+    """
+
+    def __init__(self, workers: Any = 1) -> None:
+        self.workers = checked_workers(workers)
+        self._pool: ProcessPoolExecutor | None = None
+
+    @property
+    def alone(self) -> bool:
+        """True if all is done on this thread."""
+        return isinstance(self.workers, int) and self.workers == 1
+
+    def map(self, function: Callable[[Any, Any], Any], common: Any, items: Sequence[Any]) -> Iterator[Any]:
+        """Yield `function(common, item)` of each item, in their order; raises as `mapped` does."""
+        workers = self.workers
+        if isinstance(workers, int) and workers > 1 and len(items) > 1:
+            if self._pool is None:
+                self._pool = ProcessPoolExecutor(workers, _context(), _leave_interrupts)
+            workers = self._pool
+        early: dict[int, Any] = {}
+        following = 0
+        for index, value in mapped(function, common, items, workers):
+            early[index] = value
+            while following in early:
+                yield early.pop(following)
+                following += 1
+
+    def __enter__(self) -> Crew:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the processes, whatever they do."""
+        if self._pool is not None:
+            processes = list((self._pool._processes or {}).values())
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            for process in processes:
+                process.terminate()
+            self._pool = None
+
+
+def _leave_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _rounds(workers: Any, call: _Call, processes: bool) -> Callable[[list[Numbered]], Iterable[Answer]]:

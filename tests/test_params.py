@@ -157,5 +157,6 @@ def test_a_driven_system_keeps_its_period_with_its_driving():
     H = "p**2/2 - k*cos(q)*(1 + cos(w*t)/3)"
     driven = HamiltonianSystem.from_sympy(H, time="t", period=np.pi, params={"w": 2.0, "k": 1.5})
     assert driven.with_params(w=3.0).period is None
+    assert driven.with_params(k=2.0).period == np.pi  # the strength of the drive
     still = HamiltonianSystem.from_sympy("p**2/2 - k*cos(q) + q*cos(2*t)", time="t", period=np.pi, params={"k": 1.5})
     assert still.with_params(k=2.0).period == np.pi

@@ -142,6 +142,9 @@ def train(
         float | None,
         typer.Option(help="Stop after so many seconds. Default: 60 for a primed flow without --restarts and --steps."),
     ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that share the starts of a search; -1 for all cores.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of points and initial weights.")] = 0,
     to: Annotated[
         Path | None, typer.Option("--out", help="File for the flow. Default: SYSTEM-KIND.safetensors.")
@@ -190,6 +193,7 @@ def train(
             "label_weight": label_weight,
             "restarts": restarts,
             "time_budget": time_budget,
+            "workers": workers,
         }
         options: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None}
         to = to or Path(f"{scene.key}-{kind or 'sympflow'}.safetensors")

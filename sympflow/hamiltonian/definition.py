@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,8 @@ class Definition:
         `time_derivative(y, t)`.
     kinetic_timed : bool
         True if T depends on it: then there are `drifted(p, t, s)` and `drift_jacobian(p, t, s)`.
+    shortest_piece : float
+        The shortest time between two jumps of H in t that are known, inf if there are none.
     has_third_derivative : bool
         True if there is `third_derivative(q, v, w)` of all arrays; else it is found by differences.
     loops : str
@@ -50,6 +53,7 @@ class Definition:
     given: bool = False
     timed: bool = False
     kinetic_timed: bool = False
+    shortest_piece: float = inf
     has_third_derivative: bool = False
     loops: str = ""
 

@@ -18,6 +18,9 @@ from sympy.core.symbol import Str
 from sympflow.arrays import Array, is_tensor
 from sympflow.hamiltonian.expression import ELEMENTARY
 
+JUMP = 1e-9
+"""Share of the largest value by which both sides of an end of an interval differ where samples jump."""
+
 # samples -------------------------------------------------------------------------------------------
 
 
@@ -81,6 +84,29 @@ class Samples:
     def span(self) -> tuple[float, float]:
         """The first and the last time of the samples."""
         return float(self.x[0]), float(self.x[-1])
+
+    @cached_property
+    def jumps(self) -> np.ndarray:
+        """The times of the span at which the value jumps, (m,), of a periodic spline its end among them."""
+        lengths = np.diff(self.x)
+        ends = sum(c * lengths ** (len(self.c) - 1 - k) for k, c in enumerate(self.c))
+        starts = self.c[-1]
+        large = JUMP * max(np.abs(ends).max(), np.abs(starts).max())
+        inner = np.abs(ends[:-1] - starts[1:]) > large
+        last = [self.periodic and abs(ends[-1] - starts[0]) > large]
+        return self.x[1:][np.concatenate([inner, last])]
+
+    @property
+    def shortest_piece(self) -> float:
+        """The shortest time between two jumps, or a jump and an end; inf without jumps."""
+        if not len(self.jumps):
+            return np.inf
+        low, high = self.span
+        if self.periodic:
+            times = np.append(self.jumps, self.jumps[0] + high - low)
+        else:
+            times = np.concatenate([[low], self.jumps, [high]])
+        return float(np.diff(times).min())
 
     @cached_property
     def digest(self) -> str:

@@ -258,6 +258,14 @@ class Hamiltonian:
         if not self.autonomous:
             raise ValueError(f"`system` {self.name!r} is driven, H depends on t, {what}: {remedy}.")
 
+    @property
+    def shortest_piece(self) -> float:
+        """The shortest time between two jumps of H in t, those of sampled parameters; inf if there are none.
+
+        An adaptive method may step over a pulse that no stage meets; one with steps no longer than this does not.
+        """
+        return self._definition.shortest_piece
+
     def check_times(self, t0: float, t1: float) -> None:
         """Refuse an interval that leaves the times of sampled parameters.
 

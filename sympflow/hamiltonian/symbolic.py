@@ -184,6 +184,15 @@ class SymbolicHamiltonian(Definition):
         return self.T is not None and self.time in self.T.free_symbols
 
     @cached_property
+    def shortest_piece(self) -> float:  # type: ignore[override]
+        return min((samples.shortest_piece for samples in self.samples.values()), default=math.inf)
+
+    @property
+    def jumps(self) -> bool:
+        """True if H jumps at some times, at those of samples or of a step function of the time."""
+        return self.shortest_piece < math.inf or (self.time is not None and self.Ht.has(sp.DiracDelta))
+
+    @cached_property
     def Ht(self) -> sp.Expr:
         """∂H/∂t."""
         return sp.diff(self.H, self.time)

@@ -7,6 +7,7 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property, lru_cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -308,8 +309,8 @@ class HamiltonianSystem(Hamiltonian):
             raise TypeError("`period` only goes with `time`, for H that depends on t: leave it out.")
         if not real_number(period) or not 0 < period < 1e100:
             raise ValueError(f"`period` must be positive and finite; got {period!r}.")
+        check_period(self.hamiltonian, self.ndof, self.y0, float(period))
         self.period = float(period)
-        check_period(self.hamiltonian, self.ndof, self.y0, self.period)
 
     def _set_scene(
         self,
@@ -395,7 +396,7 @@ class HamiltonianSystem(Hamiltonian):
         """The same system with other values of some parameters: what is compiled, in most methods, serves both.
 
         The scene stays as it is: `y0`, `t_span`, `dt`, the domain and the friction; of a driven system the `period`
-        unless values of the driving change.
+        where H still has it.
 
         Parameters
         ----------
@@ -416,12 +417,10 @@ class HamiltonianSystem(Hamiltonian):
         self.check_parameters(values)
         assert self.symbols is not None
         H, time = self.symbols.written[0], self.symbols.time
-        driving = set() if time is None else {s.name for s in H.diff(time).free_symbols}
-        return HamiltonianSystem.from_sympy(
+        made = HamiltonianSystem.from_sympy(
             H,
             params={**self.params, **values},
             time=time,
-            period=None if driving & values.keys() else self.period,
             damping=self.damping,
             name=self.name,
             domain=self.domain,
@@ -430,6 +429,9 @@ class HamiltonianSystem(Hamiltonian):
             dt=self.dt,
             energy_scale=self.energy_scale,
         )
+        with suppress(ValueError):  # values of the drive may have changed its period
+            made._set_period(self.period)
+        return made
 
     def check_functions(self, y0: Array | None = None) -> None:
         """Test once that the functions of a user agree with each other: `solve`, `train` and their like call it.

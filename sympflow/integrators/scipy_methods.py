@@ -32,7 +32,7 @@ class _Scipy(RungeKutta):
     rtol, atol : float
         The local error is kept below atol + rtol·|y|; the defaults are SciPy's.
     max_step : float
-        Longest step.
+        Longest step; where a sampled parameter jumps, also the shortest time between two jumps.
     first_step : float, optional
         Length of the first step, at most that of the interval; the solver chooses it by default.
     max_steps : int, optional
@@ -81,7 +81,8 @@ class _Scipy(RungeKutta):
         """The SciPy solver at t0, or None if the vector field or the first step is not finite there."""
         first = None if self.first_step is None else min(self.first_step, abs(t1 - t0))
         with np.errstate(all="ignore"):
-            solver = self.solver(system, t0, y0, t1, self.max_step, self.rtol, self.atol, first_step=first)
+            longest = min(self.max_step, system.shortest_piece)
+            solver = self.solver(system, t0, y0, t1, longest, self.rtol, self.atol, first_step=first)
         return solver if np.isfinite(solver.f).all() and 0 < solver.h_abs < math.inf else None
 
     def _no_start(self, system: HamiltonianSystem, t0: float, y0: np.ndarray) -> str:

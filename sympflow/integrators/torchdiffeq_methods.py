@@ -371,7 +371,9 @@ class Adaptive(Watched, RungeKutta):
         s = torch.tensor([0.0, length], dtype=torch.float64, device=y.device)
         assert isinstance(trace, _Stages)
         most = trace.most_steps or self.max_num_steps
-        options = {"max_num_steps": most}
+        options: dict[str, Any] = {"max_num_steps": most}
+        if trace.system.shortest_piece < math.inf:
+            options["max_step"] = trace.system.shortest_piece
         try:
             odeint(trace, y, s, rtol=self.rtol, atol=self.atol, method=self.name, options=options)
         except AssertionError:

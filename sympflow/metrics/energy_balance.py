@@ -47,7 +47,8 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     TypeError
         If `sol` is not a Solution.
     ValueError
-        For a system with friction, whose losses are no part of the balance.
+        For a system with friction, whose losses are no part of the balance; for one of which H jumps in t, where it has
+        no ∂H/∂t.
 
     References
     ----------
@@ -57,6 +58,11 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     sol.system.check_conservative(
         "so that its energy is also lost to friction", "use sympflow.reference_error(sol), or solve it without damping"
     )
+    if jumps_in_time(sol.system):
+        raise ValueError(
+            f"`sol` is of {sol.system.name!r}, of which H jumps at some times, where ∂H/∂t is not finite: use "
+            "sympflow.reference_error(sol), sympflow.symplecticity_defect(sol)."
+        )
     if sol.varied:
         return gathered(sol, lambda part: energy_balance_error(part, relative))
     with np.errstate(all="ignore"):
@@ -65,6 +71,11 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
         if relative:
             error = error / (sol.system.energy_scale or np.nanmax(np.abs(H), axis=-1, keepdims=True))
     return np.where(np.isnan(error) & np.isfinite(H), np.inf, error)
+
+
+def jumps_in_time(system: HamiltonianSystem) -> bool:
+    """Return True if H is known to jump at some times, so that there is no energy balance."""
+    return system.symbols is not None and system.symbols.jumps
 
 
 def _start_energy(sol: Solution) -> np.ndarray:

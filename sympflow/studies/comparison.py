@@ -17,6 +17,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem, parameters_text
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.accuracy import check_problem, states_of
 from sympflow.metrics.energy import max_energy_error
+from sympflow.metrics.energy_balance import jumps_in_time
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
@@ -162,7 +163,7 @@ def compare(
 def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
     """The metrics of what the flow of a system keeps."""
     if system.conservative:
-        energy = ("energy", "drift") if system.autonomous else ("balance",)
+        energy = ("energy", "drift") if system.autonomous else () if jumps_in_time(system) else ("balance",)
         return ("error", *energy, "volume", "symplecticity")
     shrinks_evenly = system.external_force is None and system.friction is not None and system.friction.isotropic
     return ("error", "conformal") if shrinks_evenly else ("error",)

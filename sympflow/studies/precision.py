@@ -17,6 +17,7 @@ from sympflow.arguments import check_counts, check_t_span, positive_numbers
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.metrics.energy import failed
+from sympflow.metrics.energy_balance import jumps_in_time
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
@@ -159,7 +160,7 @@ def _sweep(candidate: Candidate, by_name: bool, steps: Sequence[float], toleranc
 
 def measure_of(system: HamiltonianSystem) -> str:
     """The figure of a row by which methods are judged on a system: of what its flow keeps, if that is an energy."""
-    if not system.conservative:
+    if not system.conservative or (not system.autonomous and jumps_in_time(system)):
         return "error"
     return "energy_error" if system.autonomous else "balance_error"
 

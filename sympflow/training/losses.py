@@ -94,6 +94,10 @@ class Loss:
         return self.total(self.terms(flow, points))
 
 
+def never() -> None:
+    """The check that ends nothing."""
+
+
 @dataclass(frozen=True)
 class Objective:
     """A loss of a flow at given points, as a number, or as the residuals whose sum of squares it is.
@@ -113,7 +117,7 @@ class Objective:
     flow: FlowMap
     points: Points
     draw: int = 0
-    check: Callable[[], None] = lambda: None
+    check: Callable[[], None] = never
 
     def __call__(self) -> Tensor:
         self.check()

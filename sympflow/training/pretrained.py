@@ -3,6 +3,7 @@
 python -m sympflow.training.pretrained                                  all of them
 python -m sympflow.training.pretrained henon_heiles --kind sympflow     one
 python -m sympflow.training.pretrained kepler --rung primed-3-0.08      one rung of a ladder of primed flows
+python -m sympflow.training.pretrained kepler --workers 2                the ladder of a scene, by two processes
 python -m sympflow.training.pretrained fput_50                          one of a stiff system
 python -m sympflow.training.pretrained --measure                        their figures, without training
 python -m sympflow.training.pretrained --measure --keep                 and put them into the files
@@ -20,6 +21,7 @@ from typing import Any
 import torch
 
 from sympflow.flow.files import load
+from sympflow.flow.flow_map import FlowMap
 from sympflow.training.shipped import rows
 from sympflow.training.shipped.recipe import Recipe, file_of, made, scenes
 
@@ -41,6 +43,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("scenes", nargs="*", metavar="scene", help=f"of {', '.join(known)}; all if none is named")
     parser.add_argument("--kind", choices=KINDS, help="one architecture only")
     parser.add_argument("--rung", help="one rung only of a ladder of primed flows, for instance primed-3-0.08")
+    parser.add_argument("--workers", type=int, default=1, help="processes that share the flows (default: 1)")
     parser.add_argument("--out", type=Path, help="folder to write to (default: the package)")
     parser.add_argument("--measure", action="store_true", help="only measure the files that are there")
     parser.add_argument("--keep", action="store_true", help="with --measure: put the figures into the files")
@@ -53,7 +56,7 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error(f"unknown scene {', '.join(unknown)}: choose from {', '.join(known)}")
     if options.rung is not None and options.rung not in rungs:
         parser.error(f"unknown rung {options.rung}: choose from {', '.join(dict.fromkeys(rungs))}")
-    torch.set_num_threads(1)  # the arrays are small, and one thread is reproducible
+    torch.set_num_threads(1)  # as in the workers, which do the same as one
     wanted = [
         recipe
         for scene in options.scenes or known
@@ -85,7 +88,11 @@ def _figures(recipes: list[Recipe], options: argparse.Namespace) -> Iterator[tup
                 flow.save(file_of(recipe, folder))
             yield file_of(recipe, folder), figures
         return
-    for recipe, flow in made(recipes, lambda recipe, name: load(folder / f"{recipe.scene}-{name}.safetensors")):
+
+    def earlier(recipe: Recipe, name: str) -> FlowMap:
+        return load(folder / f"{recipe.scene}-{name}.safetensors")
+
+    for recipe, flow in made(recipes, earlier, workers=options.workers):
         flow.save(file_of(recipe, folder))
         yield file_of(recipe, folder), flow.figures
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Generator
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -272,19 +273,54 @@ class Unstarted(Run):
         self.flow.load_state_dict(state["best"])
 
 
+class Searched(Protocol):
+    """Least squares that are followed from many starts, by any workers."""
+
+    def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
+        """The minimum that is found from θ."""
+
+    def own(self) -> Searched:
+        """The same for one thread alone."""
+
+
+def descended(common: tuple[Searched, int, Deadline, bool], theta: np.ndarray) -> Minimum:
+    """The minimum that least squares find from θ: a piece of work."""
+    fit, iterations, deadline, thorough = common
+    return fit.own().minimize(theta, iterations, deadline, thorough)
+
+
 @dataclass
 class SearchRun(Run):
     """Many starts, each followed to a minimum, and a flow that is made of the best of them."""
 
     options: SearchOptions
     minima: list[Minimum] = field(default_factory=list, kw_only=True)
+    coming: Generator[Minimum] | None = field(default=None, init=False, repr=False)
+    """The minima of the starts that are left, as the crew finds them."""
 
     UNIT: ClassVar[str] = "starts"
     SEARCH_SHARE: ClassVar[float] = 0.5  # of a time budget
 
     @abstractmethod
-    def next_minimum(self, deadline: Deadline) -> Minimum:
-        """Follow the next start, of number len(minima)."""
+    def searched(self) -> Searched:
+        """The least squares of the search."""
+
+    @abstractmethod
+    def start_of(self, restart: int) -> np.ndarray:
+        """The start of a number: the flow as it was given, then random ones."""
+
+    @property
+    def search_steps(self) -> int:
+        """The most iterations from each start."""
+        return self.options.steps
+
+    def next_minimum(self, session: Session, deadline: Deadline) -> Minimum:
+        """The minimum of the next start, of number len(minima)."""
+        if self.coming is None:
+            common = (self.searched(), self.search_steps, deadline, False)
+            starts = [self.start_of(k) for k in range(len(self.minima), self.planned)]
+            self.coming = session.each(descended, common, starts)
+        return next(self.coming)
 
     @abstractmethod
     def found(self, minimum: Minimum) -> dict[str, float]:
@@ -313,13 +349,15 @@ class SearchRun(Run):
         return self.search_end.over()
 
     def advance(self, session: Session) -> Advance:
-        minimum = self.next_minimum(self.search_end)
+        minimum = self.next_minimum(session, self.search_end)
         self.minima.append(minimum)
         # a start that was stopped is followed to its end another time
         return Advance(minimum.cost, self.found(minimum), minimum.reason != STOPPED)
 
     def end(self, session: Session) -> str | None:
         interruption = session.interruption
+        if self.coming is not None:
+            self.coming.close()
         try:
             try:
                 self.complete(session)

@@ -8,13 +8,14 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
 from sympflow.training.checkpoint import check_writable
 from sympflow.training.options import is_number
+from sympflow.workers import Crew
 
 Path = str | os.PathLike[str]
 Callback = Callable[[int, dict[str, float]], None]
@@ -75,6 +76,8 @@ class Session:
         Whether to show a bar; None means on a terminal only.
     callback : callable, optional
         callback(step, figures) after each validation.
+    crew : Crew
+        Those who do independent pieces of work.
     interruption : Interruption
         Asks the run to end.
 
@@ -82,6 +85,8 @@ class Session:
     ----------
     cut : bool
         Whether the time was up when a `Deadline` was asked.
+    crew_is_busy : bool
+        Whether the crew has work.
 
     Raises
     ------
@@ -94,8 +99,10 @@ class Session:
     time_budget: float | None = None
     progress: bool | None = False
     callback: Callback | None = None
+    crew: Crew = field(default_factory=Crew)
     interruption: Interruption = field(default_factory=Interruption)
     cut: bool = field(default=False, init=False)
+    crew_is_busy: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         self._began = time.perf_counter()
@@ -122,6 +129,30 @@ class Session:
         """The moment by which all that the session does has to end."""
         return Deadline(self, math.inf if self.time_budget is None else self._began + self.time_budget)
 
+    def each(self, function: Callable[[Any, Any], Any], common: Any, items: Sequence[Any]) -> Generator[Any]:
+        """Yield `function(common, item)` of each item in order, done by the crew; the function is one of a module.
+
+        What a piece of work does itself by `each` it does alone. While others work Ctrl-C raises KeyboardInterrupt
+        here. Once it has asked for the end this thread does the rest.
+        """
+        if self.crew.alone or self.crew_is_busy or self.interruption.asked or len(items) < 2:
+            for item in items:
+                yield function(common, item)
+            return
+        answers, interruption = self.crew.map(function, common, items), self.interruption
+        self.crew_is_busy = True
+        try:
+            for left in reversed(range(len(items))):
+                armed, interruption.armed = interruption.armed, False
+                try:
+                    answer = next(answers)
+                finally:
+                    interruption.armed = armed
+                self.crew_is_busy = left > 0
+                yield answer
+        finally:
+            self.crew_is_busy = False
+
     def bar(self, total: int, label: str, start: int = 0) -> Silent:
         """The display of so many steps, as a context."""
         if not (sys.stderr.isatty() if self.progress is None else self.progress):
@@ -146,6 +177,10 @@ class Deadline:
 
     session: Session
     end: float = math.inf
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By the time of day, for another process, which has no part in the session."""
+        return _deadline_at, (time.time() + self.left,)
 
     @property
     def left(self) -> float:
@@ -172,6 +207,10 @@ class Deadline:
     def before(self, seconds: float) -> Deadline:
         """So many seconds earlier, for what comes after."""
         return Deadline(self.session, self.end - seconds)
+
+
+def _deadline_at(end: float) -> Deadline:
+    return Deadline(Session(), time.perf_counter() + end - time.time())
 
 
 # progress -------------------------------------------------------------------------------------------------------

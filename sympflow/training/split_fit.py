@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -65,11 +66,12 @@ class SplitRun(SearchRun):
         deadline = Session().deadline if deadline is None else deadline
         return cls(flow, system, domain, None, options, SplitFit(flow, system, domain, options, deadline))
 
-    def next_minimum(self, deadline: Deadline) -> Minimum:
-        """At Δt, its x the numbers u: from the flow as it is, then from random ones."""
-        fit, restart, last = self.fit, len(self.minima), len(self.fit.t) - 1
-        u = fit.random(restart) if restart else fit.current(fit.t[last])
-        return fit.minimize(u, last, self.options.steps, deadline.over)
+    def searched(self) -> AtEnd:
+        return AtEnd(self.fit)
+
+    def start_of(self, restart: int) -> np.ndarray:
+        """Numbers u at Δt: those of the flow as it is, then random ones."""
+        return self.fit.random(restart) if restart else self.fit.current(self.fit.t[-1])
 
     def found(self, minimum: Minimum) -> dict[str, float]:
         self.history.append({"step": len(self.minima), "loss": minimum.cost, "iterations": minimum.iterations})
@@ -88,6 +90,21 @@ class SplitRun(SearchRun):
 
     def missed(self) -> tuple[float, float]:
         return self.fit.missed()
+
+
+@dataclass(frozen=True)
+class AtEnd:
+    """The fit at Δt, of the numbers u."""
+
+    fit: SplitFit
+
+    def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
+        """The minimum from the numbers θ = u; none of the searches is thorough."""
+        return self.fit.minimize(theta, len(self.fit.t) - 1, iterations, deadline.over)
+
+    def own(self) -> AtEnd:
+        """The same: nothing changes in it."""
+        return self
 
 
 def _phases(share: np.ndarray) -> np.ndarray:
@@ -115,6 +132,14 @@ class SplitFit:
         x = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
         between = _phases((np.arange(2 * options.label_times) + 1) / (2 * options.label_times))
         self.held_out = Labels.of(system, x, flow.dt * between, deadline.part(LABEL_SHARE))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in ("kernel", "parts", "columns")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.parts, self.columns = self.flow.parts, self.flow.columns()
+        self.kernel = parts_loops(self.parts)
 
     def _modes(self, y: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(np.concatenate(self.parts.to_modes(y), axis=-1))

@@ -13,6 +13,7 @@ Every piece of it has a deadline, which is asked within each evaluation.
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from dataclasses import dataclass, field, replace
@@ -42,7 +43,7 @@ from sympflow.training.points import (
     step_errors,
     stream_seed,
 )
-from sympflow.training.runs import LABEL_SHARE, SearchRun
+from sympflow.training.runs import LABEL_SHARE, SearchRun, descended
 from sympflow.training.session import Deadline, Session
 from sympflow.training.table_step import Check, TableStep
 
@@ -182,9 +183,12 @@ class TableRun(SearchRun):
         super().begin(session)
         self._frozen_end = self.whole_end.part(FROZEN_SHARE)
 
-    def next_minimum(self, deadline: Deadline) -> Minimum:
-        steps = min(SEARCH_STEPS, self.options.steps)
-        return (self.frozen or self.whole).minimize(self._start(), steps, deadline)
+    def searched(self) -> Fit:
+        return self.frozen or self.whole
+
+    @property
+    def search_steps(self) -> int:
+        return min(SEARCH_STEPS, self.options.steps)
 
     def found(self, minimum: Minimum) -> dict[str, float]:
         self.table.assign(self._continued(min(self.minima, key=lambda m: m.cost)))
@@ -194,11 +198,12 @@ class TableRun(SearchRun):
         finalists, frozen, steps = _distinct(self.minima)[:FINALISTS], self.frozen, self.options.steps
         if frozen is not None:
             for fit in filter(None, (frozen, self.weighted)):
-                finalists = [fit.minimize(m.x, steps, self._frozen_end, thorough=True) for m in finalists]
+                common = (fit, steps, self._frozen_end, True)
+                finalists = list(session.each(descended, common, [m.x for m in finalists]))
         starts = [self._continued(m) for m in _distinct(finalists)[:FITTED]]
         if not finalists or frozen is None or self._frozen_cost(self.given) < HOPELESS * min(m.cost for m in finalists):
             starts.insert(0, self.given)
-        fitted = [self.whole.minimize(theta, steps, self.whole_end, thorough=True) for theta in starts]
+        fitted = list(session.each(descended, (self.whole, steps, self.whole_end, True), starts))
         best = min(fitted, key=lambda m: m.cost)
         if not math.isfinite(best.cost):
             raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
@@ -253,9 +258,9 @@ class TableRun(SearchRun):
         )
         return self.at_start
 
-    def _start(self) -> np.ndarray:
-        """The start of the next search: the flow as it was given, then random tables."""
-        restart, table, given = len(self.minima), self.table, self.given
+    def start_of(self, restart: int) -> np.ndarray:
+        """The start of a search: the flow as it was given, then random tables."""
+        table, given = self.table, self.given
         offset, design = table.polynomial(np.array([table.dt]))
         coefficients = offset[0] + design[0] @ given
         if restart:
@@ -345,6 +350,10 @@ class Fit:
         """The residuals and their Jacobian, (m, f)."""
         raise NotImplementedError
 
+    def own(self) -> Fit:
+        """The same for one thread alone; one that changes nothing is that already."""
+        return self
+
     def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
         """Least squares from θ; a thorough one goes on where little is gained, as along a narrow curved valley.
 
@@ -368,6 +377,9 @@ class StackedFit(Fit):
     def __init__(self, *parts: tuple[float, Fit]) -> None:
         self.parts = parts
 
+    def own(self) -> Fit:
+        return StackedFit(*((weight, fit.own()) for weight, fit in self.parts))
+
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
         return np.concatenate([math.sqrt(weight) * fit.residuals(theta, check) for weight, fit in self.parts])
 
@@ -381,6 +393,9 @@ class LossFit(Fit):
 
     def __init__(self, table: Table, objective: Objective) -> None:
         self.table, self.objective = table, objective
+
+    def own(self) -> Fit:  # the parameters are put into the flow
+        return copy.deepcopy(self)
 
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
         self.table.assign(theta)
@@ -428,6 +443,15 @@ class TableFit(Fit):
         each = np.repeat(weight, self.count) / math.sqrt(self.times * self.count)
         self._scale = each / unit[:, None]
         self._slope = None if slope is None else each * slope.reshape(-1, slope.shape[-1]).T
+
+    def __getstate__(self) -> dict[str, Any]:
+        """With the order of `design` in memory, by which its products are rounded."""
+        order = tuple(int(axis) for axis in np.argsort(self.design.strides)[::-1])
+        return {**vars(self), "design": (order, self.design.transpose(order))}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        order, packed = state["design"]
+        vars(self).update(state | {"design": packed.transpose(np.argsort(order))})
 
     def coefficients(self, theta: np.ndarray) -> np.ndarray:
         """(n, P), P = J N."""

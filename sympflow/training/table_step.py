@@ -296,6 +296,10 @@ class SymbolicForces:
             self._q = (*symbols.q, t, s)
         self._d, self._n, self._terms = len(self._q), len(terms), terms
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The expressions: functions are generated where they are used."""
+        return {name: value for name, value in vars(self).items() if name not in ("_values", "_all", "_along")}
+
     @cached_property
     def _values(self) -> Callable[[np.ndarray], np.ndarray]:
         return _generated(self._q, [f for term in self._terms for f in term], self._samples)
@@ -351,6 +355,9 @@ class ArrayForces:
         self.system, self.force_gradient = system, level >= FORCE_GRADIENT
         self._velocity = _velocities(system, 0.0)
         self._gradient, self._product = _row_functions(system)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return ArrayForces, (self.system, FORCE_GRADIENT if self.force_gradient else 0)
 
     def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
         rows = np.ascontiguousarray(q.T)

@@ -43,6 +43,7 @@ from sympflow.training.session import Deadline, OutOfTime, Path, Session
 from sympflow.training.split_fit import SplitRun
 from sympflow.training.starts import check_step, default_primed, new_network, scaling_of
 from sympflow.training.table_fit import TableRun
+from sympflow.workers import Crew
 
 BUDGET = 60.0  # seconds of a fit of which nothing else is said
 
@@ -88,6 +89,7 @@ def train(
     time_budget: float | None = None,
     progress: bool | None = None,
     callback: Callable[[int, dict[str, float]], None] | None = None,
+    workers: Any = 1,
     **unknown: Any,
 ) -> Any:
     """Train a flow map of `system` on [0, dt]: with nothing else given, the best that is known for it.
@@ -159,6 +161,10 @@ def train(
         Show a progress bar; the default is on a terminal only.
     callback : callable, optional
         callback(step, figures) after each validation; `figures` has the held-out losses and one-step error.
+    workers : int, object with .map, or callable
+        Who follows the starts and fits of "gauss-newton" on a primed or a split flow, and makes the trials: a number of
+        processes, −1 for as many as there are cores, or an engine as for `sympflow.ensemble`. Without a time budget the
+        result is the same to the last bit whatever they are.
 
     Returns
     -------
@@ -193,7 +199,7 @@ def train(
     dt = plain(dt)
     if dt is not None and not (is_number(dt) and 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
-    session = Session(checkpoint, resume, plain(time_budget), progress, callback)
+    session = Session(checkpoint, resume, plain(time_budget), progress, callback, Crew(workers))
     new = NewFlow(kind, stages, processor, pairs, hidden, activation, dtype, device)
     asked = NewFit(
         optimizer=optimizer,
@@ -239,7 +245,12 @@ def fit_flow(
     hurried = untold and session.time_budget is None and session.resume is None and kind == "primed" and asked.searches
     if hurried:
         session.time_budget = BUDGET
-    with session.interruption:
+    if not ((kind in ("primed", "split") and asked.searches) or session.crew.alone):
+        raise TypeError(
+            "`workers` share the starts of a search by 'gauss-newton' for primed and split flows, and this fit is one "
+            "run of steps: leave it out."
+        )
+    with session.interruption, session.crew:
         tried = None
         if dt is not None and flow is None:
             check_step(system, domain, dt)

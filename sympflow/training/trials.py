@@ -91,27 +91,44 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     bends = cycles[1] <= DEAREST * cycles[0]
     with session.bar(len(starts) + bends, f"{system.name} trials") as bar:
 
-        def tried(start: Primed) -> bool:
-            bar.tries(len(found), f"Δt = {start.dt:g}{', with curvature terms' * start.curvature}")
-            made = trial(start, system, domain, deadline)
-            if not deadline.over():  # else it says nothing
+        def attempt(wanted: list[Primed]) -> None:
+            answers = session.each(_trial_of, (system, domain, deadline), wanted)
+            for start in wanted:
+                if deadline.over():
+                    return
+                bar.tries(len(found), f"Δt = {start.dt:g}{', with curvature terms' * start.curvature}")
+                try:
+                    made = next(answers)
+                except KeyboardInterrupt:  # while others work
+                    if session.crew.alone or not interruption.armed:
+                        raise
+                    interruption.asked = True
+                if deadline.over():  # then it says nothing
+                    return
                 found[start] = made
                 # from the first flow on Ctrl-C ends the trials
                 interruption.armed = interruption.armed or made.flow is not None
-            return start in found
 
-        plain = [start for start in starts if not deadline.over() and tried(start)]
-        if not plain:
+        attempt(starts)
+        if not found:
             return Trial(starts[0], math.inf)
-        bent = replace(best(plain), curvature=True)
-        more = bends and not deadline.over() and tried(bent)
-        return found[best([best(plain), bent]) if more else best(plain)]
+        straight = best([*found])
+        bent = replace(straight, curvature=True)
+        if bends:
+            attempt([bent])
+        return found[best([straight, bent]) if bent in found else straight]
 
 
 def tried_starts(system: HamiltonianSystem, domain: Domain, curvature: bool = True) -> list[Primed]:
     """The flows that may be chosen, from the shortest Δt to the longest; with `curvature` also with such terms."""
     plain = list(dict.fromkeys(default_primed(system, domain, phase=phase) for phase in PHASES))
     return plain + [replace(start, curvature=True) for start in plain if curvature]
+
+
+def _trial_of(common: tuple[HamiltonianSystem, Domain, Deadline], start: Primed) -> Trial:
+    """A trial as a piece of work."""
+    system, domain, deadline = common
+    return trial(start, system, domain, deadline)
 
 
 def trial(start: Primed, system: HamiltonianSystem, domain: Domain, deadline: Deadline | None = None) -> Trial:
@@ -132,7 +149,7 @@ def trial(start: Primed, system: HamiltonianSystem, domain: Domain, deadline: De
     fit = run.frozen
     assert fit is not None
     for _ in range(STARTS):
-        run.minima.append(run.next_minimum(deadline))
+        run.minima.append(run.next_minimum(deadline.session, deadline))
     best = min(run.minima, key=lambda m: m.cost)
     for final in filter(None, (fit, run.weighted)):
         best = final.minimize(best.x, FINAL_STEPS, deadline, thorough=True)

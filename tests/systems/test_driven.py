@@ -4,10 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline, PPoly
 from scipy.special import mathieu_a, mathieu_b, mathieu_cem
 
-from sympflow import floquet_multipliers, solve, systems
+from sympflow import energy_balance_error, floquet_multipliers, solve, systems
 from sympflow.hamiltonian.domain import domain_from_dict
+from sympflow.hamiltonian.driving import Samples
 
 SCENES = {name: systems.get(name)() for name in ("driven-pendulum", "paul-trap", "duffing", "fodo-cell", "kicked")}
 
@@ -79,6 +81,28 @@ def test_order_in_a_lattice_whose_steps_meet_the_jumps(method, order):
     system, exact = SCENES["fodo-cell"], systems.fodo_matrices()
     errors = [np.abs(cell(system, method, dt=system.dt / n) - exact).max() for n in (1, 2)]
     assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.1)
+
+
+def test_adaptive_methods_do_not_step_over_a_quadrupole():
+    """In a drift their steps would grow beyond its length: no longer than between two jumps, at any tolerance."""
+    system, exact = SCENES["fodo-cell"], systems.fodo_matrices()
+    assert system.shortest_piece == 0.5
+    assert SCENES["duffing"].shortest_piece == math.inf
+    for method in ("dop853", "rk45", "dopri5"):
+        sol = solve(system, method, (0, system.period), [1.0, 0, 0, 0], t_eval=[system.period], rtol=1e-6)
+        assert np.abs(sol.y[[0, 2], -1] - exact[0, :, 0]).max() < 0.01
+    with pytest.raises(ValueError, match=r"^`sol` is of 'fodo_cell', of which H jumps .* use sympflow.reference_error"):
+        energy_balance_error(sol)
+
+
+def test_jumps_of_samples():
+    step = PPoly([[1.0, 2.0, 2.0]], [0.0, 1.0, 3.0, 4.0])
+    for how, jumps, shortest in ((True, [1.0], 1.0), ("periodic", [1.0, 4.0], 1.0)):
+        samples = Samples.of("K", PPoly(step.c, step.x, extrapolate=how))
+        assert samples.jumps.tolist() == jumps
+        assert samples.shortest_piece == shortest
+    smooth = Samples.of("K", CubicSpline(np.arange(6.0), np.sin(np.arange(6.0))))
+    assert len(smooth.jumps) == 0
 
 
 def test_the_matrices_of_the_lattice():

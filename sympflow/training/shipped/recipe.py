@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
+
+import torch
 
 from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Domain
@@ -17,6 +20,7 @@ from sympflow.training.options import NewFit, NewFlow
 from sympflow.training.session import Session
 from sympflow.training.starts import Start
 from sympflow.training.trainer import fit_flow
+from sympflow.workers import Crew
 
 
 class Judge(Protocol):
@@ -99,35 +103,60 @@ class Recipe:
 
 
 def made(
-    recipes: Sequence[Recipe], earlier: Callable[[Recipe, str], FlowMap] | None = None, progress: bool | None = None
+    recipes: Sequence[Recipe],
+    earlier: Callable[[Recipe, str], FlowMap] | None = None,
+    progress: bool | None = None,
+    workers: Any = 1,
 ) -> Iterator[tuple[Recipe, FlowMap]]:
-    """The recipes and their flows, trained and judged, as they are made; those of a scene share its system.
+    """The recipes and their flows, trained and judged, as they are made.
 
-    `earlier` gives, by a recipe and the name of the one that it comes after, a flow that was made before.
+    `earlier` gives, by a recipe and the name of the one that it comes after, a flow that was made before. `workers`
+    share the recipes, a number of them being processes: those that come after others when these are made.
 
     Raises
     ------
     ValueError
         If a recipe comes after one that is neither made nor given.
     """
-    systems: dict[Callable[[], HamiltonianSystem], HamiltonianSystem] = {}
     flows: dict[tuple[str, str], FlowMap] = {}
-    for recipe in recipes:
-        if recipe.system not in systems:
-            systems[recipe.system] = recipe.system()
-        system, before = systems[recipe.system], None
-        if recipe.after is not None:
-            before = flows.get((recipe.scene, recipe.after))
-            if before is None:
-                if earlier is None:
-                    raise ValueError(
-                        f"`rung` {recipe.name!r} starts from {recipe.after!r}: make that first, or all of them."
-                    )
-                before = earlier(recipe, recipe.after).bound(system)
-        flow = recipe.fitted(system, before, progress)
-        recipe.judge(flow, system)
-        flows[recipe.scene, recipe.name] = flow
-        yield recipe, flow
+    left = list(recipes)
+    with Crew(workers) as crew:
+        while left:
+            names = {(recipe.scene, recipe.name) for recipe in left}
+            ready = [recipe for recipe in left if (recipe.scene, recipe.after) not in names]
+            left = [recipe for recipe in left if recipe not in ready]
+            items = [(recipe, _before(recipe, flows, earlier)) for recipe in ready]
+            for recipe, flow in zip(ready, crew.map(_made, progress, items), strict=True):
+                flows[recipe.scene, recipe.name] = flow
+                yield recipe, flow
+
+
+def _before(
+    recipe: Recipe, flows: Mapping[tuple[str, str], FlowMap], earlier: Callable[[Recipe, str], FlowMap] | None
+) -> FlowMap | None:
+    """The flow that a recipe starts from, if it comes after another one."""
+    if recipe.after is None:
+        return None
+    before = flows.get((recipe.scene, recipe.after))
+    if before is None and earlier is None:
+        raise ValueError(f"`rung` {recipe.name!r} starts from {recipe.after!r}: make that first, or all of them.")
+    return earlier(recipe, recipe.after) if before is None and earlier is not None else before
+
+
+def _made(progress: bool | None, item: tuple[Recipe, FlowMap | None]) -> FlowMap:
+    """The flow of a recipe, as a piece of work."""
+    torch.set_num_threads(1)  # the arrays are small, and one thread is reproducible
+    recipe, before = item
+    system = _system(recipe.system)
+    flow = recipe.fitted(system, None if before is None else before.bound(system), progress)
+    recipe.judge(flow, system)
+    return flow
+
+
+@lru_cache(maxsize=1)
+def _system(make: Callable[[], HamiltonianSystem]) -> HamiltonianSystem:
+    """The system of a scene, which its recipes share."""
+    return make()
 
 
 def file_of(recipe: Recipe, folder: Path) -> Path:

@@ -1,0 +1,138 @@
+"""Trials, starts, fits and rungs are shared by workers: the same bits come of it, and Ctrl-C ends it."""
+
+import os
+import pickle
+import signal
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import HamiltonianSystem, SympFlow, systems, train
+from sympflow.training import trials
+from sympflow.training.options import NewFit, SplitOptions, TableOptions
+from sympflow.training.session import Session
+from sympflow.training.shipped.recipe import Recipe, made
+from sympflow.training.split_fit import SplitRun
+from sympflow.training.starts import Primed, scaling_of
+from sympflow.training.table_fit import TableFit, TableRun
+from sympflow.training.table_step import TableStep
+from sympflow.workers import Crew
+
+PENDULUM = systems.pendulum()
+FLOW = SympFlow.primed(PENDULUM, 2, dt=0.5, processor=0)
+QUICK = {"restarts": 3, "steps": 6, "points": 20, "reference_states": 5, "label_times": 2, "progress": False}
+
+
+def fourth_power(q):
+    return (q**4).sum(-1)
+
+
+def same(flow, other):
+    mine, theirs = flow.state_dict(), other.state_dict()
+    return all(torch.equal(mine[name], theirs[name]) for name in mine) and flow.history == other.history
+
+
+def test_searches_are_the_same_whatever_the_workers():
+    alone = train(PENDULUM, flow=FLOW, **QUICK)
+    assert same(train(PENDULUM, flow=FLOW, workers=2, **QUICK), alone)
+    with ThreadPoolExecutor(2) as threads:
+        assert same(train(PENDULUM, flow=FLOW, workers=threads, **QUICK), alone)
+    assert len(alone.history) == QUICK["restarts"] + 1
+
+
+def test_trials_are_the_same_whatever_the_workers(monkeypatch):
+    for name, value in {"STARTS": 2, "STEPS": 5, "FINAL_STEPS": 5, "POINTS": 20, "LENGTH": 5}.items():
+        monkeypatch.setattr(trials, name, value)
+    alone = trials.chosen_trial(PENDULUM, PENDULUM.domain)
+    with ThreadPoolExecutor(2) as threads:
+        found = trials.chosen_trial(PENDULUM, PENDULUM.domain, Session(crew=Crew(threads)))
+    assert (found.start, found.error) == (alone.start, alone.error)
+    assert same(found.flow, alone.flow)
+
+
+def test_fits_are_the_same_in_another_process():
+    """Their products are rounded by the order of arrays in memory, which a pickle must not change."""
+    table = TableOptions(
+        points=20, label_times=3, reference_states=5, residual_weight=1.0, loss_points=10, matching_times=2
+    )
+    run = TableRun.start(FLOW, PENDULUM, PENDULUM.domain, scaling_of(PENDULUM.domain, FLOW.dt, 0), table)
+    theta = run.table.continued(run.frozen.coefficients(run.start_of(1))[:, 0])
+    fits = [(run.frozen, run.start_of(1)), (run.weighted, run.start_of(0)), (run.whole, theta)]
+    by_functions = HamiltonianSystem(potential=fourth_power, ndof=1)
+    other = pickle.loads(pickle.dumps(run.frozen))
+    other.step = TableStep(by_functions, other.step.sequence, 1)
+    for fit, x in [*fits, (other, run.start_of(1))]:
+        for other in (pickle.loads(pickle.dumps(fit)), fit.own()):
+            assert all(np.array_equal(a, b) for a, b in zip(fit.linearized(x), other.linearized(x), strict=True))
+    run.table.assign(run.given)
+    run.whole.own().residuals(theta)
+    assert np.array_equal(run.table.parameters(), run.given)
+
+
+@pytest.mark.slow
+def test_split_fits_are_the_same_in_another_process():
+    spring = systems.spring_pendulum(1e3, coordinates="polar")
+    flow = SympFlow.split(spring, dt=0.05, stages=1, terms=2)
+    options = SplitOptions(points=5, label_times=2, steps=2, restarts=2, reference_states=3)
+    run = SplitRun.start(flow.bound(spring), spring, spring.domain, options)
+    fit, u = run.searched(), run.start_of(1)
+    other = pickle.loads(pickle.dumps(fit.own()))
+    mine, theirs = (f.minimize(u, 2, Session().deadline) for f in (fit, other))
+    assert np.array_equal(mine.x, theirs.x)
+    assert mine.cost == theirs.cost
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends the process there")
+def test_ctrl_c_does_not_wait_for_workers(monkeypatch):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    whole, calls = TableFit.minimize, []
+
+    def minimize(self, *arguments, **options):
+        calls.append(self)
+        if len(calls) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        return whole(self, *arguments, **options)
+
+    monkeypatch.setattr(TableFit, "minimize", minimize)
+    try:
+        with (
+            ThreadPoolExecutor(1) as thread,
+            pytest.warns(RuntimeWarning, match="because it was interrupted. The best"),
+        ):
+            flow = train(PENDULUM, flow=FLOW, workers=thread, **QUICK | {"restarts": 50})
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert flow.recipe["stages"][-1]["restarts_taken"] < 50
+
+
+def test_rungs_come_after_those_that_they_start_from():
+    fit = NewFit(restarts=1, steps=2, points=20, label_times=2, reference_states=5)
+
+    def rung(name, after=None):
+        return Recipe("pendulum", name, systems.pendulum, Primed(0.5, 2, 0), lambda *_: None, (fit,), after=after)
+
+    recipes = [rung("c", "b"), rung("a"), rung("b", "a"), rung("d")]
+    with ThreadPoolExecutor(2) as threads:
+        flows = {recipe.name: flow for recipe, flow in made(recipes, progress=False, workers=threads)}
+    assert list(flows) == ["a", "d", "b", "c"]
+    alone = dict((recipe.name, flow) for recipe, flow in made(recipes, progress=False))
+    assert all(same(flows[name], alone[name]) for name in flows)
+    with pytest.raises(ValueError, match="`rung` 'b' starts from 'a'"):
+        list(made([rung("b", "a")], progress=False))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"workers": 0}, ValueError, "`workers` must be a positive number"),
+        ({"workers": "two"}, TypeError, "`workers` must be a number, an object with .map"),
+        ({"workers": 2, "kind": "mlp"}, TypeError, "`workers` share the starts of a search by 'gauss-newton'"),
+        ({"workers": 2, "optimizer": "bfgs"}, TypeError, "`workers` share the starts"),
+    ],
+)
+def test_what_workers_cannot_share_is_refused(options, error, message):
+    with pytest.raises(error, match=message):
+        train(PENDULUM, **options)
