@@ -52,12 +52,13 @@ class Solution:
     stats : dict
         n_steps, force_evaluations, hessian_evaluations, wall_time (seconds), backend, and dt for fixed steps; where
         a run failed, failed_at, the time of its last finite state, and where its solution becomes infinite
-        blow_up_time, an estimate (in a batch arrays, NaN for the others); newton_iterations of implicit methods.
+        blow_up_time, an estimate (in a batch arrays, NaN for the others;
+        with `params`, of the first 16 sets of values that fail); newton_iterations of implicit methods.
     system, integrator, t_span, y0
         The problem that was solved and the method that did it: metrics execute the run again from these.
     rows : ParameterRows or None
         The parameters of each trajectory, where `solve` was given `params`: see `params` and `by_parameters`. `system`
-        is then the one that was given, unless all trajectories have the same values.
+        is then the one that was given, unless they were given as numbers.
     """
 
     t: np.ndarray = field(repr=False)

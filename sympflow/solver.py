@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Mapping
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 BACKENDS = ("auto", "compiled", "array")
 MAX_EVENT_SAMPLES = 100_000_000
+MOST_DIAGNOSED = 16  # sets of values of parameters
 FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite end
 _FLOAT64 = np.dtype(np.float64)
 
@@ -75,9 +77,9 @@ def solve(
         Values of parameters of the system for each trajectory: numbers, or arrays that broadcast with the batch of y0;
         of one state y0 they make a batch. The others keep the system's values. Splitting methods on the splitting
         "kinetic", but for those with force gradients and with friction, take them as numbers of one compiled run, and
-        each trajectory is that on ``system.with_params(...)`` up to rounding. Elsewhere trajectories of equal values
-        run together, one set of values after the other, and are so bit by bit. A trained flow holds for its own
-        parameters alone.
+        each trajectory is that of a batch on ``system.with_params(...)``, with compensated sums up to rounding.
+        Elsewhere trajectories of equal values run together, one set of values after the other. A trained flow holds for
+        its own parameters alone.
     t_eval : array_like of shape (n,), optional
         Times to report, ordered from start to end. The default is every step. No other state is stored.
     dense_output : bool
@@ -248,13 +250,34 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
     for group in rows.by_form() if action == "ignore" else rows.distinct():
         together = replace(problem, system=group.system, y0=states[group.places], letters=group.letters)
         if group.letters is None or integrator.takes_letters(together):
-            pieces.append((group.places, _solved(integrator, together, action)))
+            sol = _solved(integrator, together, action)
+            pieces.append((group.places, sol))
+            if group.letters is not None and not sol.success:
+                _note_singularities(sol, integrator, together, rows.taken(group.places))
             continue
         for few, system, _ in rows.taken(group.places).distinct():
             index = group.places[few]
             alone = replace(problem, system=system, y0=states[index])
             pieces.append((index, _solved(integrator, alone, action)))
     return joined(pieces, problem.system, problem.y0, rows)
+
+
+def _note_singularities(sol: Solution, integrator: Integrator, problem: Problem, rows: ParameterRows) -> None:
+    """Note when solutions with parameters of their own become infinite, of the first `MOST_DIAGNOSED` that fail."""
+    from sympflow.integrators.diagnosis import note_singularities
+
+    status = np.asarray(sol.status)
+    failed, times = np.flatnonzero(status < 0), np.full(len(status), np.nan)
+    for few, system, _ in itertools.islice(rows.taken(failed).distinct(), MOST_DIAGNOSED):
+        i = failed[few]
+        stats = {name: value[i] if isinstance(value, np.ndarray) else value for name, value in sol.stats.items()}
+        outcome = Outcome(sol.t, np.moveaxis(sol.y[i], -1, 0), status[i], "", stats)
+        note_singularities(outcome, integrator, replace(problem, system=system, y0=problem.y0[i], letters=None))
+        times[i] = outcome.stats.get("blow_up_time", np.nan)
+    if np.isfinite(times).any():
+        sol.stats["blow_up_time"] = times
+        first = int(np.argmax(np.isfinite(times)))
+        sol.message += f" A solution itself becomes infinite, at about t = {times[first]:.10g}: end `t_span` before."
 
 
 def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
@@ -408,16 +431,22 @@ def check_params(
     from sympflow.hamiltonian.parameter_rows import checked_rows
 
     rows = checked_rows(system, params, tuple(y0.shape[:-1]))
-    if integrator.trained:
-        other = [name for name, values in rows.values.items() if (values != system.params[name]).any()]
-        if other:
-            own = ", ".join(f"{name} = {system.params[name]:.9g}" for name in other)
-            raise ValueError(
-                f"`params` changes {', '.join(other)}, and a trained flow, as of method {integrator.name!r}, holds for "
-                f"its own parameters ({own}): train one for each value, or use a classical method such as 'kahan_li8'."
-            )
+    check_own_parameters(system, rows.values, integrator)
     shape = (*rows.shape, y0.shape[-1])
     return rows, (y0.expand(shape) if is_tensor(y0) else np.broadcast_to(y0, shape).copy())
+
+
+def check_own_parameters(system: HamiltonianSystem, values: Mapping[str, ArrayLike], integrator: Integrator) -> None:
+    """Refuse a trained flow for other parameters than those of its system."""
+    if not integrator.trained:
+        return
+    other = [name for name, value in values.items() if np.any(np.asarray(value) != system.params[name])]
+    if other:
+        own = ", ".join(f"{name} = {system.params[name]:.9g}" for name in other)
+        raise ValueError(
+            f"`params` changes {', '.join(other)}, and a trained flow, as of method {integrator.name!r}, holds for "
+            f"its own parameters ({own}): train one for each value, or use a classical method such as 'kahan_li8'."
+        )
 
 
 def check_events(events: Any, event_step: Any) -> EventSearch | None:

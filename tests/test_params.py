@@ -36,7 +36,7 @@ class TestTrajectories:
         assert sol.system is system
         for i in range(len(LAM)):
             alone = own(system, method, y0, i, **options).y[0]
-            np.testing.assert_allclose(sol.y[i], alone, rtol=0, atol=1e-14 if method == "verlet" else 0.0)
+            np.testing.assert_array_equal(sol.y[i], alone)
 
     def test_arrays_compiled_or_not_agree(self, system, y0):
         compiled, arrays = (
@@ -83,7 +83,20 @@ class TestTrajectories:
         assert sol.status.tolist() == [0, 0, -1, 0]
         assert "the first at 2 (lam = 0.7)" in sol.message
         assert np.isfinite(sol.stats["failed_at"][2])
-        np.testing.assert_allclose(sol.y[3], own(system, "verlet", y0, 3, dt=0.25).y[0], rtol=0, atol=1e-14)
+        np.testing.assert_array_equal(sol.y[3], own(system, "verlet", y0, 3, dt=0.25).y[0])
+
+    def test_each_becomes_infinite_at_its_own_time(self, system):
+        y0, lam = np.array([[0.0, 3.0, 0.0, 0.0], [0.1, 0.0, 0.0, 0.1]]), np.array([0.7, 0.7])
+        sol = solve(system, "verlet", (0, 9), y0, params={"lam": lam, "m": [1.2, 1.4]}, dt=0.01)
+        assert sol.status.tolist() == [-1, 0]
+        alone = solve(system.with_params(lam=0.7, m=1.2), "verlet", (0, 9), y0[:1], dt=0.01)
+        np.testing.assert_array_equal(sol.stats["blow_up_time"], [alone.stats["blow_up_time"][0], np.nan])
+        assert "itself becomes infinite, at about t = " in sol.message
+
+    def test_friction_is_no_parameter(self):
+        damped = HamiltonianSystem.from_sympy("p**2/2 - g*cos(q)", params={"g": 1.0}, damping=0.1)
+        with pytest.raises(ValueError, match=r"'damping', no parameter .* make a system for each `damping`"):
+            solve(damped, "verlet", (0, 1), [1.0, 0.0], params={"damping": [0.1, 0.2]}, dt=0.1)
 
     def test_pickles(self, system, y0):
         sol = solve(system, "verlet", (0, 1), y0, params={"lam": LAM}, dt=0.25)
@@ -151,6 +164,8 @@ class TestRefusals:
         name, value = next(iter(system.params.items()))
         with pytest.raises(ValueError, match=f"`params` changes {name}, and a trained flow"):
             solve(system, "sympflow", params={name: [value, 7.0]})
+        with pytest.raises(ValueError, match=f"`params` changes {name}, and a trained flow"):
+            sympflow.ensemble(system, "sympflow", params={name: [value, 7.0]})
 
 
 def test_a_driven_system_keeps_its_period_with_its_driving():

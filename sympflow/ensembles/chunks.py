@@ -189,12 +189,12 @@ class Chunk:
         except (KeyboardInterrupt, MemoryError):
             raise
         except Exception as error:  # of one orbit, most likely, which is then found
-            several = sorted(set(rows.tolist()))
-            if len(several) > 1:
-                for row in several:
-                    self._run(y, times, np.full(max(2, len(rows)), row))
-            else:
+            several = np.unique(rows)
+            if len(several) == 1:
                 self.fail(int(rows[0]), f"{type(error).__name__}: {error}")
+                return
+            for half in np.array_split(several, 2):  # in their places, which those of the other half take too
+                self._run(y, times, np.where(np.isin(rows, half), rows, half[0]))
             return
         shape = y.shape[1:]
         values = sol.y if sol.y.shape[1:] == shape else np.full((len(rows), *shape), np.nan)

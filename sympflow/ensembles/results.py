@@ -170,7 +170,15 @@ class Layout:
         made["status"] = (self.dims, self.shape, np.dtype(np.int8), sizes)
         for name, values in self.coordinates().items():
             made[name] = ((name,), values.shape, values.dtype, values.shape)
-        return {name: Field(*array, attributes=NAMED.get(name, {})) for name, array in made.items()}
+        missing = {"status": NOT_RUN}
+        return {
+            name: Field(*array, attributes=NAMED.get(name, {}), missing=missing.get(name))
+            for name, array in made.items()
+        }
+
+
+NOT_RUN = 2
+"""The status of orbits of a store that have not been run yet."""
 
 
 class Keeper(Protocol):
@@ -188,6 +196,9 @@ class Keeper(Protocol):
     def place(self, block: Block, done: Done) -> None:
         """Put the orbits of a block where they belong."""
 
+    def finish(self) -> None:
+        """Note that all orbits are there."""
+
     def is_done(self, block: Block) -> bool:
         """True if the orbits of a block are there already."""
 
@@ -202,6 +213,9 @@ class Memory:
         self.fields = {name: np.empty((*layout.shape, *s), dtype) for name, (s, dtype) in layout.fields.items()}
         self.status = np.zeros(layout.shape, dtype=np.int8)
         self.messages: dict[Index, str] = {}
+
+    def finish(self) -> None:
+        pass
 
     def is_done(self, block: Block) -> bool:
         return False
@@ -263,7 +277,10 @@ class Ensemble:
 
     @property
     def status(self) -> np.ndarray:
-        """0, or −1 for an orbit that failed, whose row is NaN: int8 of shape (..., N)."""
+        """0, −1 for an orbit that failed, or 2 for one that has not been run yet: int8 of shape (..., N).
+
+        The rows of the latter two are NaN.
+        """
         return self.keeper.status
 
     @property
@@ -284,18 +301,21 @@ class Ensemble:
 
     @property
     def success(self) -> bool:
-        """True if no orbit failed."""
+        """True if all orbits have been run, and none failed."""
         return not self.status.any()
 
     @property
     def message(self) -> str:
         """The outcome of the orbits, in words."""
         status = self.status
-        failed = int(np.count_nonzero(status))
-        if not failed:
-            return f"All {status.size:,} orbits reached the end."
-        index, text = min(self.messages.items())
-        return f"{failed:,} of {status.size:,} orbits failed, the first of them {list(index)}: {text}"
+        failed, waiting = np.count_nonzero(status < 0), np.count_nonzero(status == NOT_RUN)
+        parts = []
+        if waiting:
+            parts.append(f"{waiting:,} of {status.size:,} orbits have not been run yet: call again with resume=True.")
+        if failed:
+            index, text = min(self.messages.items())
+            parts.append(f"{failed:,} of {status.size:,} orbits failed, the first of them {list(index)}: {text}")
+        return " ".join(parts) or f"All {status.size:,} orbits reached the end."
 
     def to_xarray(self) -> xarray.Dataset:
         """The fields as an `xarray.Dataset`; of a store it reads what is used of it, when it is used.

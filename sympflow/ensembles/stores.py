@@ -172,6 +172,10 @@ class EnsembleStore:
         """True if the orbits of a block have been run."""
         return self._store.has("status", self._number(block))
 
+    def finish(self) -> None:
+        """Note that all orbits have been run."""
+        self._store.complete("status")
+
     @property
     def status(self) -> np.ndarray:
         return self._store.read("status")

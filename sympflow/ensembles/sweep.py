@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import MAX_ASKED_VALUES, check_counts, check_flag, check_t_eval, check_t_span, floats
-from sympflow.ensembles.chunks import MOST_VALUES, Chunk
+from sympflow.ensembles.chunks import FAILED, LONGEST_MESSAGE, MOST_VALUES, Chunk
 from sympflow.ensembles.orbits import Drawn, Given, initial_states
-from sympflow.ensembles.reductions import Reduction, reduction
+from sympflow.ensembles.reductions import Fields, Reduction, reduction
 from sympflow.ensembles.results import Block, Done, Ensemble, Keeper, Layout, Memory, blocks, chunk_shape
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.contract import Integrator
+from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.provenance import provenance
 from sympflow.integrators.registry import build, check_applies
 from sympflow.kernels.modules import at_most, compiling_alone
-from sympflow.solver import BACKENDS
+from sympflow.solver import BACKENDS, check_own_parameters
 from sympflow.workers import LostWorkers, Parcel, Unpicklable, checked_workers, mapped
 
 if TYPE_CHECKING:
@@ -141,17 +141,20 @@ def ensemble(
     kept = reduction(reduce)
     orbits = initial_states(system, y0, n, seed)
     fixed, axes = _axes(system, params)
+    check_own_parameters(system, {**fixed, **axes}, integrator)
     if fixed:
         system = system.with_params(**fixed)
     first = orbits.states(0, min(len(orbits), SHORTEST_CHUNK))
     integrator = integrator.resolved(system, first, abs(t1 - t0))
     check_applies(integrator, system, first)
-    task = Task(system, integrator, (t0, t1), times, axes, kept, backend)
+    varied = kept.takes_params and _runs_together(system, integrator, (t0, t1), axes, first, backend)
+    task = Task(system, integrator, (t0, t1), times, axes, kept, backend, varied=varied)
     problem = task.problem(first)
     report = _reporter(progress, math.prod(map(len, axes.values())) * len(orbits))
     start = time.perf_counter()
     with at_most(1):
         fields = kept.fields(problem)
+    task = replace(task, fields=fields)
     layout = Layout(axes, len(orbits), system.ndof, problem.times if kept.state == "y" else times, fields, kept.state)
     sizes = _chunk_shape(layout, problem, chunk, store is None, orbits.together)
     attributes = partial(provenance, system, integrator, (t0, t1))
@@ -181,6 +184,7 @@ def ensemble(
         if store is not None:
             whatever = f"{done} of {len(pieces)} chunks are in `store` {str(store)!r}: call again with resume=True."
         raise RuntimeError(f"{error} {whatever}") from error
+    keeper.finish()
     seconds = time.perf_counter() - start
     return Ensemble(layout.times, axes, system, integrator, (t0, t1), orbits, keeper, seconds)
 
@@ -196,11 +200,7 @@ def _axes(
     fixed: dict[str, float] = {}
     axes: dict[str, np.ndarray] = {}
     for name, given in params.items():
-        if name not in system.params:
-            names = ", ".join(system.params) or "none"
-            raise ValueError(
-                f"`params` has {name!r}, which the system {system.name!r} has not: its parameters are {names}."
-            )
+        system.check_parameters([name])
         values = floats("params", given)
         if values.ndim > 1 or values.size == 0 or not np.isfinite(values).all():
             raise ValueError(
@@ -212,6 +212,32 @@ def _axes(
         else:
             fixed[name] = float(values)
     return fixed, axes
+
+
+def _runs_together(
+    system: HamiltonianSystem,
+    integrator: Integrator,
+    t_span: tuple[float, float],
+    axes: Mapping[str, np.ndarray],
+    y0: np.ndarray,
+    backend: str,
+) -> bool:
+    """True if one compiled run takes orbits with different parameters; else each value has runs of its own.
+
+    It does not depend on the chunk, so that each orbit is run alike in any of them: a value that leaves its part of H
+    as it is, other than 0, 1 and −1, tells for all.
+    """
+    from sympflow.hamiltonian.parameter_rows import ParameterRows
+
+    if not axes or system.symbols is None:
+        return False
+    general = {name: values[np.argmax(~np.isin(values, (0, 1, -1)))] for name, values in axes.items()}
+    try:
+        (rows,) = ParameterRows(system, {name: np.array([value]) for name, value in general.items()}).by_form()
+    except ValueError:
+        return False
+    problem = Problem(rows.system, *t_span, y0[:1], backend=backend, letters=rows.letters)
+    return rows.letters is not None and integrator.takes_letters(problem)
 
 
 # chunks --------------------------------------------------------------------------------------------------------------
@@ -263,6 +289,9 @@ class Task:
     reduction: Reduction
     backend: str
     store: EnsembleStore | None = None
+    fields: Fields = field(default_factory=dict)
+    varied: bool = False
+    """True if the orbits of a chunk run together whatever their parameters, in loops that take those of each."""
     ready: set[int] = field(default_factory=set)
     """Processes in which the method is compiled."""
 
@@ -273,7 +302,7 @@ class Task:
         with _preparing, compiling_alone():
             if os.getpid() not in self.ready:
                 self._few_steps(self.problem(y0[:2]))
-                if self.axes and self.reduction.takes_params:
+                if self.varied:
                     ends = {name: values[[0, -1]] for name, values in self.axes.items()}
                     self._few_steps(replace(self.problem(y0[[0, 0]]), system=self.system, params=ends))
                 self.ready.add(os.getpid())
@@ -308,23 +337,39 @@ def run_piece(task: Task, item: tuple[Block, Given | Drawn]) -> Done:
     """Run the orbits of a block, on this thread alone, and write them into the store, if there is one."""
     block, orbits = item
     y0 = orbits.states(0, len(orbits))
-    if task.axes and task.reduction.takes_params:
-        chunks = [task.whole(block, y0)]
-    else:
-        grid = [values[slice(*ends)] for values, ends in zip(task.axes.values(), block.ranges[:-1], strict=True)]
-        named = [dict(zip(task.axes, map(float, values), strict=True)) for values in itertools.product(*grid)]
-        chunks = [task.chunk(values, y0, block.first + i * len(y0)) for i, values in enumerate(named)]
     parts: list[Done] = []
     with at_most(1):
         task.prepare(y0)
-        for i, chunk in enumerate(chunks):
-            fields = task.reduction.reduce(chunk)
-            parts.append(Done(fields, chunk.status, {i * len(y0) + k: text for k, text in chunk.messages.items()}))
+        if task.varied:
+            parts.append(_reduced(task, task.whole(block, y0), 0))
+        else:
+            grid = [values[slice(*ends)] for values, ends in zip(task.axes.values(), block.ranges[:-1], strict=True)]
+            for i, values in enumerate(itertools.product(*grid)):
+                named, start = dict(zip(task.axes, map(float, values), strict=True)), i * len(y0)
+                try:
+                    chunk = task.chunk(named, y0, block.first + start)
+                except (ValueError, TypeError) as error:
+                    parts.append(_without_a_system(task, len(y0), start, named, error))
+                else:
+                    parts.append(_reduced(task, chunk, start))
     done = parts[0] if len(parts) == 1 else _joined(parts)
     if task.store is None:
         return done
     task.store.write(block, done, y0)
     return Done({}, done.status[:0], {})
+
+
+def _reduced(task: Task, chunk: Chunk, start: int) -> Done:
+    fields = task.reduction.reduce(chunk)
+    return Done(fields, chunk.status, {start + k: text for k, text in chunk.messages.items()})
+
+
+def _without_a_system(task: Task, n: int, start: int, values: Mapping[str, float], error: Exception) -> Done:
+    """The orbits of values of the parameters for which there is no system: all failed."""
+    fields = {name: np.full((n, *shape), np.nan, dtype) for name, (shape, dtype) in task.fields.items()}
+    shown = ", ".join(f"{name} = {value:.9g}" for name, value in values.items())
+    text = f"`params` has {shown}, for which there is no system: {error}"[:LONGEST_MESSAGE]
+    return Done(fields, np.full(n, FAILED, dtype=np.int8), dict.fromkeys(range(start, start + n), text))
 
 
 def _joined(parts: list[Done]) -> Done:

@@ -5,7 +5,8 @@ On the states [q, x, p, y] of two copies, (q, p) and (x, y), the Hamiltonian
     H(q, y) + H(x, p) + ω (|q − x|² + |p − y|²)/2
 
 has the solutions of H where the copies agree. Neither of its first two parts holds a coordinate with its own momentum,
-so each is solved exactly; the third binds the copies, and is an oscillator of frequency 2ω in their difference.
+so each is solved exactly; the third binds the copies, and is an oscillator of frequency 2ω in their difference. Where H
+depends on t the time stands still in the first two, and moves with the third.
 
 References
 ----------
@@ -19,13 +20,14 @@ from __future__ import annotations
 
 from functools import cached_property
 from math import sqrt
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sympflow.arrays import Array, concatenate
 from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative
 from sympflow.hamiltonian.parts import ExactParts, PartFunctions
+from sympflow.hamiltonian.times import probe_times
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
@@ -51,12 +53,13 @@ class FunctionsOfCopies:
 
     def __init__(self, system: HamiltonianSystem, first: bool) -> None:
         self.system, self.first, self.ndof = system, first, 2 * system.ndof
+        self.timed = not system.autonomous
 
-    def hamiltonian(self, x: Array) -> Array:
-        return self.system.hamiltonian(self._state(x))
+    def hamiltonian(self, x: Array, *t: Any) -> Array:
+        return self.system.hamiltonian(self._state(x), *t)
 
-    def gradient(self, x: Array) -> Array:
-        d, g = self.system.ndof, self.system.gradient(self._state(x))
+    def gradient(self, x: Array, *t: Any) -> Array:
+        d, g = self.system.ndof, self.system.gradient(self._state(x), *t)
         zero = 0 * g[..., :d]
         return concatenate([g[..., :d], zero, zero, g[..., d:]] if self.first else [zero, g, zero])
 
@@ -79,7 +82,8 @@ def two_copies(system: HamiltonianSystem, omega: float) -> ExactParts:
     q, p = (tuple(sp.symbols(f"{letter}1:{2 * d + 1}", real=True)) for letter in "qp")
     first = dict(zip((*symbols.q, *symbols.p), (*q[:d], *p[d:]), strict=True))
     second = dict(zip((*symbols.q, *symbols.p), (*q[d:], *p[:d]), strict=True))
-    return ExactParts(coupling, [PartFunctions(symbols.H.xreplace(these), q, p) for these in (first, second)], 2 * d)
+    copies = [PartFunctions(symbols.H.xreplace(these), q, p, symbols) for these in (first, second)]
+    return ExactParts(coupling, copies, 2 * d)
 
 
 def both(y: Array, d: int) -> Array:
@@ -101,6 +105,8 @@ def distance(x: Array, d: int) -> Array:
 def coupling_strength(system: HamiltonianSystem) -> float:
     """The default ω: the largest |λ| of J∇²H at y0, or the median over the domain; 1 where that is 0 or not finite.
 
+    Where H depends on t, the largest of a few times within its period, or else the system's interval.
+
     The copies stay together where the coupling is as strong as what drives them apart; far stronger, its frequency asks
     for shorter steps.
 
@@ -117,9 +123,16 @@ def coupling_strength(system: HamiltonianSystem) -> float:
         raise ValueError(
             f"`system` {system.name!r} has neither a `y0` nor a domain to take the coupling from: give `omega`."
         )
+    t0, t1 = system.t_span
+    times = [t0] if system.autonomous else probe_times(t0, t1 if system.period is None else t0 + system.period)
+    return max(_median_rate(system, y, float(t)) for t in times) or 1.0
+
+
+def _median_rate(system: HamiltonianSystem, y: np.ndarray, t: float) -> float:
+    """The median over the states of the largest |λ| of J∇²H; 0 where none is finite."""
     d = system.ndof
     with np.errstate(all="ignore"):
-        S = np.asarray(system.hessian(y))
+        S = np.asarray(system.hessian(y, t))
     S = S[np.isfinite(S).all((-1, -2))]
     rates = np.abs(np.linalg.eigvals(np.concatenate([S[:, d:], -S[:, :d]], axis=1))).max(-1)
-    return float(np.median(rates)) or 1.0 if len(S) else 1.0
+    return float(np.median(rates)) if len(S) else 0.0

@@ -75,6 +75,10 @@ class Definition:
         """∇²V(q)·v: (..., d), each, to (..., d)."""
         return (self.potential_hessian(q, *t) @ v[..., None])[..., 0]
 
+    def remark(self, q: np.ndarray) -> str:
+        """What is to be said of the last positions (d,) of a run that could not go on: a clause, or nothing."""
+        return ""
+
     def third_derivative(self, q: Array, v: Array, w: Array, *t: Array) -> Array:
         """∇³V(q)(v, w): (..., d), each, to (..., d)."""
         raise NotImplementedError(f"{type(self).__name__} must define third_derivative().")

@@ -445,6 +445,10 @@ class Hamiltonian:
             )
         return self
 
+    def remark(self, q: np.ndarray) -> str:
+        """A clause on the last positions (d,) of a run that could not go on, such as bodies that met; or nothing."""
+        return self._definition.remark(q)
+
     @property
     def local(self) -> LocalHamiltonian | None:
         """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""

@@ -31,17 +31,17 @@ class Scene(Protocol):
     t_span: Any
 
     separable: bool
+    autonomous: bool
 
-    def potential(self, q: Any) -> Any: ...
+    def potential(self, q: Any, t: Any = None) -> Any: ...
 
-    def force(self, q: Any) -> Any: ...
+    def force(self, q: Any, t: Any = None) -> Any: ...
 
-    def potential_hessian(self, q: Any) -> Any: ...
+    def potential_hessian(self, q: Any, t: Any = None) -> Any: ...
 
     def kinetic_hessian(self, p: Any) -> Any: ...
 
     def check_conservative(self, what: str, remedy: str) -> None: ...
-    def check_autonomous(self, what: str, remedy: str) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -163,17 +163,16 @@ class LinearPart:
 
 
 def check_parts_conservative(system: Scene) -> None:
-    """Refuse a system with friction, or a driven one, which the exact flows of parts of H leave out."""
+    """Refuse a system with friction, which the exact flows of parts of H leave out."""
     remedy = "use the splitting 'kinetic', as of 'verlet'"
     system.check_conservative("which exact flows of parts of H omit", remedy)
-    system.check_autonomous("and parts of H that move with t have no exact flows here", remedy)
 
 
 def linear_part(system: Scene) -> LinearPart:
     """The quadratic part of a system, read off its symbols or made from its `stiffness_matrix`.
 
     Of H = T(p) + V(q) or of any other H the terms ½ pᵀBp + ½ qᵀKq + linear ones are taken, where B belongs to
-    coordinates whose kinetic energy is quadratic. What remains is U.
+    coordinates whose kinetic energy is quadratic. What remains is U. Terms that depend on t are part of U.
 
     Raises
     ------
@@ -200,6 +199,12 @@ def linear_part(system: Scene) -> LinearPart:
             f"`system` {system.name!r} has no linear part: no coordinate that quadratic terms bind has a momentum that "
             "enters H by quadratic terms alone. Use 'implicit_midpoint', 'strang_parts' or a Runge–Kutta method."
         )
+    if part is None and not system.autonomous:
+        raise ValueError(
+            f"`system` {system.name!r} has no linear part: no coordinate has quadratic terms, in q and in p, that do "
+            "not depend on t, and the flow of those that do is not known. Use a scheme on the splitting 'kinetic', "
+            "such as 'srkn11b' or 'kahan_li8', or an implicit method."
+        )
     if part is None:
         raise ValueError(
             f"`system` {system.name!r} has no linear part: its potential has no quadratic terms. Use another splitting "
@@ -214,15 +219,15 @@ def _equilibrium(system: Scene, K: np.ndarray) -> np.ndarray:
     By q ← q − K⁺∇V(q) from 0, or from y0 where V is singular there. Where that does not converge, K is no curvature of
     V, and where it starts is as good as any c.
     """
-    inverse = np.linalg.pinv(K, rcond=1 / GAP**2, hermitian=True)
+    inverse, t0 = np.linalg.pinv(K, rcond=1 / GAP**2, hermitian=True), float(system.t_span[0])
     starts = [np.zeros(system.ndof)] + ([] if system.y0 is None else [system.y0[: system.ndof]])
     with np.errstate(all="ignore"):
         for start in starts:
-            if not np.isfinite(system.force(start)).all():
+            if not np.isfinite(system.force(start, t0)).all():
                 continue
             q, last = start.copy(), np.inf
             for _ in range(EQUILIBRIUM_STEPS):
-                change = inverse @ np.asarray(system.force(q))
+                change = inverse @ np.asarray(system.force(q, t0))
                 size = float(np.linalg.norm(change))
                 if not size < last:  # at the level of rounding, or nowhere near
                     break
@@ -328,7 +333,7 @@ def turning(system: Scene, part: LinearPart | None) -> str | None:
         return None
     try:
         with np.errstate(all="ignore"):
-            hessians = np.asarray(system.potential_hessian(q))
+            hessians = np.asarray(system.potential_hessian(q, float(system.t_span[0])))
     except (TypeError, ValueError):  # a callable that has no Hessian: nothing can be compared
         return None
     hessians = hessians[np.isfinite(hessians).all((-1, -2))]
@@ -381,5 +386,5 @@ def _positions(system: Scene) -> np.ndarray | None:
     else:
         return None
     with np.errstate(all="ignore"):
-        V = np.asarray(system.potential(q))
+        V = np.asarray(system.potential(q, float(system.t_span[0])))
     return q[np.argsort(np.where(np.isfinite(V), V, np.inf))[:SAMPLES]]

@@ -7,6 +7,7 @@ import reprlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import sympy as sp
@@ -46,23 +47,22 @@ class ParameterRows:
     values : mapping of str to ndarray
         Of some of its parameters, each of the shape of the batch.
 
+    uniform : bool
+        True if they were given as numbers, which make another system of the whole batch. Arrays never are, whatever
+        their values: what becomes of a trajectory does not depend on the others.
+
     Attributes
     ----------
     shape : tuple of int
     """
 
-    def __init__(self, system: HamiltonianSystem, values: Mapping[str, np.ndarray]) -> None:
-        self.system, self.values = system, dict(values)
+    def __init__(self, system: HamiltonianSystem, values: Mapping[str, np.ndarray], uniform: bool = False) -> None:
+        self.system, self.values, self.uniform = system, dict(values), uniform
         self.shape = next(iter(self.values.values())).shape
 
     @cached_property
     def _columns(self) -> dict[str, np.ndarray]:
         return {name: np.ravel(value) for name, value in self.values.items()}
-
-    @property
-    def uniform(self) -> bool:
-        """True if all trajectories have the same values."""
-        return all(bool((column == column[0]).all()) for column in self._columns.values())
 
     def system_of(self, row: int) -> HamiltonianSystem:
         """The system of a trajectory, by its place in the flattened batch.
@@ -107,17 +107,23 @@ class ParameterRows:
         kinds += [column for name, column in self._columns.items() if any(s.name == name for s in replaced)]
         for index in _groups(kinds) if kinds else [np.arange(math.prod(self.shape))]:
             rows = self.taken(index)
-            if rows.uniform:
-                yield Rows(index, self.system_of(int(index[0])))
-                continue
-            system = self.system_of(int(index[0]))
+            system = self._formed(tuple(float(kind[index[0] if len(kind) > 1 else 0]) for kind in kinds), int(index[0]))
             assert system.symbols is not None
             form = system.symbols.parametric
             letters = [rows._part(part) for part in form.meanings]
-            if form is system.symbols or not all(np.isfinite(letter).all() for letter in letters):
+            swept = any(self._swept(part) for part in form.meanings)
+            if form is system.symbols or not swept or not all(np.isfinite(letter).all() for letter in letters):
                 yield from (Rows(index[few], own) for few, own, _ in rows.distinct())
                 continue
             yield Rows(index, system, np.stack([np.broadcast_to(x, index.shape) for x in letters]))
+
+    def _formed(self, kinds: tuple[float, ...], row: int) -> HamiltonianSystem:
+        """A system of the form of a row, made once: of a trajectory with letters of its own the form alone counts."""
+        known = _FORMED.setdefault(self.system, {})
+        key = tuple(self.values), kinds
+        if key not in known:
+            known[key] = self.system_of(row)
+        return known[key]
 
     def taken(self, index: np.ndarray) -> ParameterRows:
         """The rows of some trajectories, by their places in the flattened batch."""
@@ -171,9 +177,11 @@ class ParameterRows:
 
     def __getstate__(self) -> dict[str, Any]:
         """The definition alone: functions cannot be pickled."""
-        return {"system": self.system, "values": self.values, "shape": self.shape}
+        return {"system": self.system, "values": self.values, "shape": self.shape, "uniform": self.uniform}
 
 
+_Key = tuple[tuple[str, ...], tuple[float, ...]]
+_FORMED: WeakKeyDictionary[HamiltonianSystem, dict[_Key, HamiltonianSystem]] = WeakKeyDictionary()
 _ROUNDED_ONCE: dict[Any, Callable[[np.ndarray], np.ndarray]] = {
     sp.Integer(-1): lambda x: 1 / x,
     sp.Integer(2): lambda x: x * x,
@@ -232,7 +240,8 @@ def checked_rows(system: HamiltonianSystem, params: Any, batch: tuple[int, ...])
             f"`params` must have shapes that broadcast with the batch {batch} of `y0`, as numbers or arrays of one "
             f"value for each trajectory; got {shapes}."
         ) from None
-    return ParameterRows(system, {name: np.broadcast_to(array, shape) for name, array in arrays.items()})
+    numbers = not any(array.ndim for array in arrays.values())
+    return ParameterRows(system, {name: np.broadcast_to(array, shape) for name, array in arrays.items()}, numbers)
 
 
 def _checked_values(name: str, given: Any) -> np.ndarray:

@@ -18,6 +18,7 @@ import numpy as np
 from sympflow.arrays import Array, concatenate, is_tensor, stack
 from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative, linear_part, read_off
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, parse
+from sympflow.hamiltonian.times import probe_times, stage_time
 
 if TYPE_CHECKING:
     import sympy as sp
@@ -41,33 +42,49 @@ class Map:
         g, adds −g ½|∇H_k|²_{M⁻¹} to the Hamiltonian of a part H_k(q), times 1.
     filters : (..., F) or None
         φ: the part acts at c + C φ X in place of q = c + C X, with a factor for each frequency.
+    at : float
+        The share of a step after which a part that depends on t acts, at that time.
     """
 
     part: int
     length: Any
     gradient: Any = 0.0
     filters: Any = None
+    at: float = 0.0
 
     def inverse(self) -> Map:
-        return Map(self.part, -self.length, -self.gradient, self.filters)
+        return Map(self.part, -self.length, -self.gradient, self.filters, self.at)
 
 
 class PartFunctions(SymbolicHamiltonian):
-    """A part H_k(q, p) as a SymPy expression, with array functions of states [q, p]."""
+    """A part H_k(q, p) as a SymPy expression, with array functions of states [q, p]; of t, where it holds that.
 
-    def __init__(self, H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> None:
+    Parameters
+    ----------
+    H : SymPy expression
+    q, p : tuple of Symbol
+    whole : SymbolicHamiltonian
+        With the time and the samples that H may hold.
+    """
+
+    def __init__(
+        self, H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...], whole: SymbolicHamiltonian
+    ) -> None:
         self.H, self.q, self.p, self.ndof = H, q, p, len(q)
         self.V = self.T = None
         self.separable = False
+        self.time = whole.time if whole.time in H.free_symbols else None
+        if whole.samples:
+            self.samples = whole.samples
 
     @property
     def of_positions(self) -> bool:
         """True for a potential, H_k(q)."""
         return not self.H.has(*self.p)
 
-    def hessian_vector(self, y: Array, v: Array) -> Array:
+    def hessian_vector(self, y: Array, v: Array, *t: Any) -> Array:
         """∇²_q H_k(y)·v: (..., 2d), (..., d) to (..., d)."""
-        return (self.hessian(y)[..., : self.ndof, : self.ndof] @ v[..., None])[..., 0]
+        return (self.hessian(y, *t)[..., : self.ndof, : self.ndof] @ v[..., None])[..., 0]
 
 
 class RestOfPotential:
@@ -77,18 +94,19 @@ class RestOfPotential:
 
     def __init__(self, system: HamiltonianSystem, linear: LinearPart) -> None:
         self.system, self.K, self.center, self.ndof = system, linear.stiffness_matrix, linear.center, system.ndof
+        self.timed = not system.autonomous
 
-    def hamiltonian(self, y: Array) -> Array:
+    def hamiltonian(self, y: Array, *t: Any) -> Array:
         q = y[..., : self.ndof]
         x = q - like(self.center, q)
-        return self.system.potential(q) - (x * (x @ like(self.K, q))).sum(-1) / 2
+        return self.system.potential(q, *t) - (x * (x @ like(self.K, q))).sum(-1) / 2
 
-    def gradient(self, y: Array) -> Array:
+    def gradient(self, y: Array, *t: Any) -> Array:
         q = y[..., : self.ndof]
-        return concatenate([-self.system.force(q) - (q - like(self.center, q)) @ like(self.K, q), 0 * q])
+        return concatenate([-self.system.force(q, *t) - (q - like(self.center, q)) @ like(self.K, q), 0 * q])
 
-    def hessian_vector(self, y: Array, v: Array) -> Array:
-        return self.system.hessian_vector(y[..., : self.ndof], v) - v @ like(self.K, v)
+    def hessian_vector(self, y: Array, v: Array, *t: Any) -> Array:
+        return self.system.hessian_vector(y[..., : self.ndof], v, *t) - v @ like(self.K, v)
 
 
 class ExactParts:
@@ -121,6 +139,15 @@ class ExactParts:
     def __len__(self) -> int:
         return len(self.rest) + (self.linear is not None)
 
+    def timed(self, part: int) -> bool:
+        """True if a part depends on the time, at which it then acts."""
+        return part != LINEAR and bool(self.rest[part - 1].timed)
+
+    @property
+    def driven(self) -> bool:
+        """True if some part depends on the time."""
+        return any(functions.timed for functions in self.rest)
+
     def check_filters(self, part: int) -> None:
         """Raise unless the part, filtered, is still solved exactly: it must not come to hold a conjugate pair."""
         if not (self.diagonal or self.rest[part - 1].of_positions):
@@ -148,17 +175,18 @@ class ExactParts:
 
     # flows ----------------------------------------------------------------------------------------------
 
-    def apply(self, maps: Sequence[Map], X: Array, Y: Array) -> tuple[Array, Array]:
-        """The maps one after another, the first first."""
+    def apply(self, maps: Sequence[Map], X: Array, Y: Array, t: Any = 0.0, h: Any = 0.0) -> tuple[Array, Array]:
+        """The maps of a step one after another, the first first; those of parts that move in a step h from t on."""
         for m in maps:
             if m.part == LINEAR:
                 X, Y = self.linear_flow(X, Y, m.length)
                 continue
-            dX, dY = self.slopes(m.part, X, Y, m.filters)
+            time = (stage_time(t, m.at, h),) if self.timed(m.part) else ()
+            dX, dY = self.slopes(m.part, X, Y, m.filters, *time)
             length = each_mode(m.length)
             X, Y = (X, Y - length * dX) if dY is None else (X + length * dY, Y - length * dX)
             if not (isinstance(m.gradient, float) and m.gradient == 0.0):
-                Y = Y + each_mode(m.gradient) * self.force_gradient(m.part, X, m.filters)
+                Y = Y + each_mode(m.gradient) * self.force_gradient(m.part, X, m.filters, *time)
         return X, Y
 
     def linear_flow(self, X: Array, Y: Array, s: Any) -> tuple[Array, Array]:
@@ -185,22 +213,22 @@ class ExactParts:
         """H_k: (...)."""
         return self.rest[part - 1].hamiltonian(self._state(X, Y, filters))
 
-    def slopes(self, part: int, X: Array, Y: Array, filters: Array | None) -> tuple[Array, Array | None]:
-        """∂H_k/∂X and ∂H_k/∂Y, (..., d) each; None for what is zero."""
+    def slopes(self, part: int, X: Array, Y: Array, filters: Array | None, *t: Any) -> tuple[Array, Array | None]:
+        """∂H_k/∂X and ∂H_k/∂Y, (..., d) each; None for what is zero. `t` follows for a part that depends on it."""
         functions, d = self.rest[part - 1], self.ndof
-        g = functions.gradient(self._state(X, Y, filters))
+        g = functions.gradient(self._state(X, Y, filters), *t)
         dX = self._times(self.C.T, g[..., :d])
         dX = dX if filters is None else self.by_class(matching(filters, X)) * dX
         return dX, None if functions.of_positions else self._times(self.inverse_C, g[..., d:])
 
-    def force_gradient(self, part: int, X: Array, filters: Array | None) -> Array:
+    def force_gradient(self, part: int, X: Array, filters: Array | None, *t: Any) -> Array:
         """½ ∇|∇U|²_{M⁻¹} of U(X) = H_k(c + C φ X): (..., d)."""
         functions, d = self.rest[part - 1], self.ndof
         y = self._state(X, 0 * X, filters)
         phi = 1.0 if filters is None else self.by_class(matching(filters, X))
-        v = self.inverse_masses(X) * phi * self._times(self.C.T, functions.gradient(y)[..., :d])
+        v = self.inverse_masses(X) * phi * self._times(self.C.T, functions.gradient(y, *t)[..., :d])
         v = self._times(self.C, phi * v)
-        return phi * self._times(self.C.T, functions.hessian_vector(y, v))
+        return phi * self._times(self.C.T, functions.hessian_vector(y, v, *t))
 
     def inverse_masses(self, X: Array) -> Array:
         """The diagonal M⁻¹ of the modes: Ω of each."""
@@ -375,7 +403,7 @@ def _detected(system: HamiltonianSystem) -> ExactParts:
             f"`system` {system.name!r} does not split into parts that are solved exactly: a term holds a coordinate "
             "and its momentum. Use an implicit or a Runge–Kutta method, or train a SympFlow."
         )
-    rest = [PartFunctions(g, symbols.q, symbols.p) for g in groups]
+    rest = [PartFunctions(g, symbols.q, symbols.p, symbols) for g in groups]
     return ExactParts(linear, sorted(rest, key=lambda part: not part.of_positions), system.ndof)
 
 
@@ -384,7 +412,8 @@ def _groups(H: sp.Expr, symbols: SymbolicHamiltonian) -> list[sp.Expr] | None:
     import sympy as sp
 
     groups: list[tuple[set[sp.Symbol], list[sp.Expr]]] = []
-    terms = [t for t in sp.Add.make_args(H) if t.free_symbols]
+    states = {*symbols.q, *symbols.p}
+    terms = [t for t in sp.Add.make_args(H) if t.free_symbols & states]
     for term in sorted(terms, key=lambda t: -len(t.free_symbols)):
         if _has_pair(term.free_symbols, symbols):
             return None
@@ -410,17 +439,19 @@ def _given(system: HamiltonianSystem, expressions: tuple[str, ...]) -> ExactPart
     parts = [_parsed(expression, system) for expression in expressions]
     difference = sp.expand(sp.Add(*parts) - symbols.H)
     probes = np.random.default_rng(0).uniform(0.3, 0.9, (8, 2 * system.ndof))
-    H = PartFunctions(symbols.H, symbols.q, symbols.p).hamiltonian(probes)
-    with np.errstate(all="ignore"):
-        excess = PartFunctions(difference, symbols.q, symbols.p).hamiltonian(probes) if difference.free_symbols else 0.0
-    if not np.allclose(np.ptp(excess), 0, atol=1e-12 * np.abs(H).max()):
-        raise ValueError(f"`parts` do not add up to the Hamiltonian: they leave out {-difference}.")
+    whole, missing = (PartFunctions(f, symbols.q, symbols.p, symbols) for f in (symbols.H, difference))
+    for t in [()] if system.autonomous else [(s,) for s in probe_times(*system.t_span)]:
+        with np.errstate(all="ignore"):
+            excess = missing.hamiltonian(probes, *t) if difference.free_symbols else 0.0
+            size = np.abs(whole.hamiltonian(probes, *t)).max()
+        if not np.allclose(np.ptp(excess), 0, atol=1e-12 * size):
+            raise ValueError(f"`parts` do not add up to the Hamiltonian: they leave out {-difference}.")
     linear: LinearPart | None = None
     rest: list[PartFunctions] = []
     sequence = []
     for expression, part in zip(expressions, parts, strict=True):
         if not _has_pair(part.free_symbols, symbols):
-            rest.append(PartFunctions(part, symbols.q, symbols.p))
+            rest.append(PartFunctions(part, symbols.q, symbols.p, symbols))
             sequence.append(len(rest))
             continue
         candidate = read_off(part, symbols.q, symbols.p, abs(system.t_span[1] - system.t_span[0]))
@@ -439,12 +470,12 @@ def _parsed(expression: str, system: HamiltonianSystem) -> sp.Expr:
     assert system.symbols is not None
     if not isinstance(expression, str):
         raise ValueError(f"`parts` must be expressions as text; got {expression!r}.")
-    words = set(re.findall(r"[A-Za-z_]\w*", expression))
+    words, time = set(re.findall(r"[A-Za-z_]\w*", expression)), system.symbols.time
     try:
-        part = parse(expression, {name: value for name, value in system.params.items() if name in words})
+        part = parse(expression, {name: value for name, value in system.params.items() if name in words}, time)
     except (ValueError, TypeError) as error:
         raise ValueError(f"`parts` has one that is not admissible: {error}") from None
-    known = {s.name for s in (*system.symbols.q, *system.symbols.p)} | {"q", "p"}
+    known = {s.name for s in (*system.symbols.q, *system.symbols.p)} | {"q", "p", getattr(time, "name", "q")}
     if foreign := {s.name for s in part.free_symbols} - known:
         raise ValueError(f"`parts` has {', '.join(sorted(foreign))}, which the system has not: leave it out.")
     first = {"q": system.symbols.q[0], "p": system.symbols.p[0]}

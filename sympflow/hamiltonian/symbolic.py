@@ -423,9 +423,9 @@ def hessian(f: sp.Expr, x: Sequence[sp.Symbol]) -> sp.Matrix:
     return sp.Matrix(rows)
 
 
-def parse(expression: str | sp.Expr, params: Mapping[str, float]) -> sp.Expr:
-    """The expression in real symbols, its parameters replaced by their values."""
-    return _valued(*_read(expression, checked_params(params), None), None)
+def parse(expression: str | sp.Expr, params: Mapping[str, Any], time: sp.Symbol | None = None) -> sp.Expr:
+    """The expression in real symbols, its parameters replaced by their values, samples by functions of the time."""
+    return _valued(*_read(expression, checked_params(params), time), time)
 
 
 def _read(

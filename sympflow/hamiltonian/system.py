@@ -288,6 +288,73 @@ class HamiltonianSystem(Hamiltonian):
         return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale)
 
     @classmethod
+    def pairs(
+        cls,
+        potential: str | sympy.Expr,
+        *,
+        masses: ArrayLike,
+        dim: int = 3,
+        box: float | Sequence[float] | None = None,
+        cutoff: float | None = None,
+        softening: float | None = None,
+        params: Mapping[str, float] | None = None,
+        bodies: Mapping[str, ArrayLike] | None = None,
+        damping: float | ArrayLike | None = None,
+        name: str = "pairs",
+        domain: Domain | None = None,
+        y0: ArrayLike | None = None,
+        t_span: tuple[float, float] = (0.0, 1.0),
+        dt: float = 0.001,
+        energy_scale: float | None = None,
+    ) -> HamiltonianSystem:
+        """Bodies that interact in pairs, any number of them: H = Σ_i |p_i|²/(2 m_i) + Σ_{i<j} V(r_ij).
+
+        Both bodies of a pair get the same force, with opposite signs, along the line between them, so that the methods
+        that conserve linear and angular momentum do so up to rounding. Without a cut-off a force costs O(n²), with one
+        O(n). Compiled loops over pairs are generated, whose code depends neither on the number of bodies nor on any
+        value.
+
+        Parameters
+        ----------
+        potential : str or sympy.Expr
+            V of one pair in its distance `r`, in m1 and m2, the masses of both, and in other names of `params` and
+            `bodies`, such as "-G*m1*m2/r". It must be the same with both bodies exchanged.
+        masses : array_like of shape (n,)
+        dim : int
+            Coordinates of a body, 1 to 3. A state is y = [q, p]; ``q.reshape(n, dim)`` are the places of the bodies.
+        box : float or sequence of `dim` floats, optional
+            Lengths of a periodic box: r is the distance to the nearest image.
+        cutoff : float, optional
+            Distance beyond which bodies do not interact, at most half of the box. So that H is smooth, V is replaced by
+            V(r) − V(c) − (r² − c²) V′(c)/(2c).
+        softening : float, optional
+            ε: r is √(|q_i − q_j|² + ε²), which is never 0.
+        params : mapping of str to float, optional
+            Values of names in V that are the same for all pairs.
+        bodies : mapping of str to array_like of shape (n,), optional
+            Values that differ from body to body: of "c" the values are c1 and c2 in V.
+        damping, name, domain, y0, t_span, dt, energy_scale
+            As for the class.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If V cannot be read, holds other names, or is not symmetric; if masses are not positive; if arrays do not
+            have one value for each body; if the cut-off is longer than half the box; or if a run would need more memory
+            than the machine has.
+
+        Examples
+        --------
+        >>> system = HamiltonianSystem.pairs("-m1*m2/r", masses=[1.0, 1e-3, 1e-4])
+        >>> system.ndof
+        9
+        """
+        from sympflow.hamiltonian.bodies import PairsHamiltonian
+
+        local = PairsHamiltonian(potential, masses, dim, box, cutoff, softening, params, bodies)
+        return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale)
+
+    @classmethod
     def _of_pieces(
         cls, local: LocalHamiltonian, damping: float | ArrayLike | None, name: str, *scene: Any
     ) -> HamiltonianSystem:
@@ -390,6 +457,8 @@ class HamiltonianSystem(Hamiltonian):
         for name in names:
             if name not in known:
                 has = f"which has {', '.join(known)}" if known else "which has none: write H with symbols for them"
+                if name == "damping" and self.damping is not None:
+                    has += "; its friction is none: make a system for each `damping`"
                 raise ValueError(f"`params` has {name!r}, no parameter of {self.name!r}, {has}.")
 
     def with_params(self, **values: float) -> HamiltonianSystem:

@@ -16,7 +16,7 @@ def stage_time(t: Any, c: float, h: Any) -> Any:
         import torch
 
         h = h.double()
-        t = torch.as_tensor(t, dtype=torch.float64, device=h.device) if isinstance(t, np.ndarray) else t
+        t = torch.tensor(t, dtype=torch.float64, device=h.device) if isinstance(t, np.ndarray) else t
     elif isinstance(h, np.ndarray):
         h = h.astype(float, copy=False)
     return t + c * h

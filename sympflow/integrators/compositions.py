@@ -6,9 +6,11 @@ here and a row of `SPLITTINGS`.
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from functools import cache, lru_cache
+from dataclasses import replace
+from functools import cache, cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 from weakref import WeakKeyDictionary
 
@@ -61,6 +63,8 @@ class Composition(ABC):
     """True if one of the parts holds the friction of a damped system."""
     takes_driving: ClassVar[bool] = False
     """True if the time moves with one of the parts, of a system that depends on it."""
+    takes_extended: ClassVar[bool] = False
+    """True if the parts stay as they are with E, the momentum of the time, as one more momentum."""
 
     def __init__(
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
@@ -138,6 +142,7 @@ class KineticPotential(Composition):
     takes_values: ClassVar[bool] = True
     takes_friction: ClassVar[bool] = True
     takes_driving: ClassVar[bool] = True
+    takes_extended: ClassVar[bool] = True
 
     def __init__(
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
@@ -280,9 +285,17 @@ def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials:
 
 
 class ExactMaps(Composition):
-    """A step that is a list of exact flows of the parts of H; a subclass defines the list."""
+    """A step that is a list of exact flows of the parts of H; a subclass defines the list.
 
+    Where H depends on t, its momentum E belongs to a part that does not, with which the time moves; all others are
+    solved exactly at a time that stands still.
+    """
+
+    takes_driving: ClassVar[bool] = True
     parts: ExactParts
+
+    def check_driving(self) -> None:
+        """Do nothing: the parts were found to be solved exactly when the composition was made."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ExactMaps) and self._key() == other._key()
@@ -299,17 +312,17 @@ class ExactMaps(Composition):
 
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         parts = self.parts
-        return parts.from_modes(*parts.apply(self.maps(h), *parts.to_modes(y)))
+        return parts.from_modes(*parts.apply(self.maps(h), *parts.to_modes(y), t, h))
 
     def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         parts = self.parts
         back = [m.inverse() for m in reversed(self.maps(h))]
-        return parts.from_modes(*parts.apply(back, *parts.to_modes(y)))
+        return parts.from_modes(*parts.apply(back, *parts.to_modes(y), t, h))
 
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
     ) -> tuple[Array, np.ndarray]:
-        return rollout_in_modes(self.parts, self.maps(h), y0, n_steps, save, carry)
+        return rollout_in_modes(self.parts, self.maps(h), y0, n_steps, save, h, t0, carry)
 
     def kernel(self, compensated: bool) -> Kernel:
         from sympflow.kernels.parts_loops import parts_loops
@@ -332,6 +345,8 @@ def rollout_in_modes(
     y0: Array,
     n_steps: int,
     save: np.ndarray,
+    h: float,
+    t0: float,
     carry: Carry | None = None,
 ) -> tuple[Array, np.ndarray]:
     """`base.rollout` of exact flows, in the modes from beginning to end."""
@@ -340,7 +355,7 @@ def rollout_in_modes(
     known = parts.prepared(maps, start[0])
 
     def step(k: int, z: Array) -> Array:
-        return concatenate(parts.apply(known, z[..., :d], z[..., d:]))
+        return concatenate(parts.apply(known, z[..., :d], z[..., d:], t0 + k * h, h))
 
     modes, finite = rollout(step, concatenate(start), n_steps, save, carry=carry)
     states = parts.from_modes(modes[..., :d], modes[..., d:])
@@ -381,11 +396,11 @@ class LinearRest(ExactMaps):
     def maps(self, h: Any) -> list[Map]:
         filters = self.filters(h)
         maps = []
-        for kind, c, c3, *_ in self.scheme.substeps:
+        for (kind, c, c3, *_), at in zip(self.scheme.substeps, self.scheme.substep_times, strict=True):
             if kind == "drift":
                 maps.append(Map(LINEAR, self.times(c * h)))
             elif self.parts.rest:
-                maps.append(Map(1, c * h, c3 * h**3 if c3 else 0.0, filters))
+                maps.append(Map(1, c * h, c3 * h**3 if c3 else 0.0, filters, at))
         return maps
 
     def filters(self, h: Any) -> Any:
@@ -436,7 +451,8 @@ def _each_class(s: Any, parts: ExactParts) -> Any:
 class SolvableParts(ExactMaps):
     """A symmetric composition of Strang steps over any number of parts of H that are solved exactly.
 
-    A Strang step of length h is φ₁(h/2) ∘ … ∘ φ_n(h) ∘ … ∘ φ₁(h/2).
+    A Strang step of length h is φ₁(h/2) ∘ … ∘ φ_n(h) ∘ … ∘ φ₁(h/2). Where H depends on t, the time moves with the
+    innermost part; one that depends on it is divided into two halves, before and after.
     """
 
     label: ClassVar[str] = "parts"
@@ -463,19 +479,27 @@ class SolvableParts(ExactMaps):
         return known[parts]
 
     def maps(self, h: Any) -> list[Map]:
-        parts = self.parts
+        *others, innermost = self.parts.sequence
         maps: list[Map] = []
-        for weight in self.weights:
-            outer = [self._map(k, weight * h / 2) for k in parts.sequence[:-1]]
-            inner = self._map(parts.sequence[-1], weight * h)
-            for m in (*outer, inner, *reversed(outer)):
-                if maps and maps[-1].part == m.part:
-                    m = Map(m.part, maps.pop().length + m.length)  # noqa: PLW2901
+        for weight, start, end in zip(self.weights, self._moments, self._moments[1:], strict=False):
+            outer = [self._map(k, weight * h / 2, start) for k in others]
+            if self.parts.timed(innermost):
+                inner = [self._map(innermost, weight * h / 2, at) for at in (start, end)]
+            else:
+                inner = [self._map(innermost, weight * h, start)]
+            for m in (*outer, *inner, *(replace(m, at=end) for m in reversed(outer))):
+                if maps and maps[-1].part == m.part and not (maps[-1].at != m.at and self.parts.timed(m.part)):
+                    m = replace(m, length=maps.pop().length + m.length)  # noqa: PLW2901
                 maps.append(m)
         return maps
 
-    def _map(self, k: int, h: Any) -> Map:
-        return Map(k, _each_class(h, self.parts) if k == LINEAR else h)
+    @cached_property
+    def _moments(self) -> list[float]:
+        """The beginnings of the Strang steps in a step, and its end."""
+        return [*itertools.accumulate(self.weights[:-1], initial=0.0), 1.0]
+
+    def _map(self, k: int, h: Any, at: float) -> Map:
+        return Map(k, _each_class(h, self.parts) if k == LINEAR else h, at=at)
 
 
 class TwoCopies(SolvableParts):

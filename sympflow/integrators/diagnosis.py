@@ -34,6 +34,7 @@ def note_singularities(outcome: Outcome, integrator: Integrator, problem: Proble
     `blow_up_time` is an estimate. In a batch it is an array, NaN for
     the trajectories that have none; without any it is left out.
     """
+    _note_last_state(outcome, problem)
     if not (problem.system.conservative and problem.system.autonomous):  # a state of the solution is told by its energy
         return
     y0 = to_numpy(problem.y0)
@@ -61,6 +62,21 @@ def note_singularities(outcome: Outcome, integrator: Integrator, problem: Proble
         )
     elif passed[first] and integrator.on_grid:
         outcome.message += " The solution itself goes on there: it takes shorter steps."
+
+
+def _note_last_state(outcome: Outcome, problem: Problem) -> None:
+    """Add to the message what the system has to say of the last finite state of the first trajectory that failed."""
+    d = problem.system.ndof
+    failed = (np.atleast_1d(np.asarray(outcome.status)) < 0).reshape(-1)
+    row = int(np.argmax(failed))
+    outputs = to_numpy(outcome.y).reshape(len(outcome.t), -1, 2 * d)[:, row]
+    finite = np.flatnonzero(np.isfinite(outputs).all(-1))
+    t, y = problem.t0, to_numpy(problem.y0).reshape(-1, 2 * d)[row]
+    if finite.size:
+        t, y = float(outcome.t[finite[-1]]), outputs[finite[-1]]
+    remark = problem.system.remark(y[:d])
+    if remark:
+        outcome.message += f" At t = {t:.10g} {remark}"
 
 
 def _followed(

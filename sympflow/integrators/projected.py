@@ -49,6 +49,10 @@ class Projected(FixedStep):
     def label(self) -> str:
         return f"{self.inner.label}, projected"
 
+    @property
+    def takes_driving(self) -> bool:
+        return self.inner.takes_driving
+
     def check(self, system: HamiltonianSystem) -> None:
         system.as_doubled()
         check_applies(self.inner, system)

@@ -276,6 +276,9 @@ class Splitting(OwnStepper):
     def takes_driving(self) -> bool:
         return SPLITTINGS[self.splitting].takes_driving and self.clock == "physical"
 
+    def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> Splitting | None:
+        return self if SPLITTINGS[self.splitting].takes_extended else None
+
     def takes_letters(self, problem: Problem) -> bool:
         system, composition = problem.system, self.composed(problem.system)
         asked = any(map(self.overrides, ("step", "rollout", "substep", "evaluations")))
@@ -336,7 +339,7 @@ class Splitting(OwnStepper):
         if not self.keeps:
             return super().jacobian(system, t, y, h)
         composition = self.composed(system)
-        return forward_tangent(composition.step, composition.lift(y), h)[1]
+        return forward_tangent(lambda x, lengths: composition.step(x, lengths, t), composition.lift(y), h)[1]
 
     def executed(
         self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
@@ -345,8 +348,12 @@ class Splitting(OwnStepper):
             yield from super().executed(system, t_span, y0)
             return
         composition = self.composed(system)
+
+        def jacobian(t: Any, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+            return forward_tangent(lambda z, lengths: composition.step(z, lengths, t), x, h)[1]
+
         for times, states, lengths in in_blocks(super().steps(system, t_span, composition.lift(y0))):
-            yield differentiated(lambda t, x, h: forward_tangent(composition.step, x, h)[1], times, states, lengths)
+            yield differentiated(jacobian, times, states, lengths, system)
 
     def own_stepper(self, problem: Problem) -> Stepper:
         composition = self.composed(problem.system)

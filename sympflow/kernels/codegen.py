@@ -323,7 +323,7 @@ def is_finite(q, p):
 
 
 @njit(**OPTIONS)
-def workspace():
+def workspace(table):
     return None
 
 

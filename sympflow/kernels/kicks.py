@@ -46,7 +46,9 @@ class _Kick:
     operations: float
 
 
-def kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials = (), vectors: int = 0) -> str:
+def kicks_source(
+    symbols: SymbolicHamiltonian, level: int, monomials: Monomials = (), vectors: int = 0, varied: bool = False
+) -> str:
     """The new p after each kind of kick of a level, each in two shapes, equal but for rounding: see `Kick`.
 
     It is p − b∇V + g∇²V v − c∇(½ v·∇²V v), v = M⁻¹∇V, or p − b∇V − Σ_m e_m ∇q^m. ``kicked(q, p, table, j)`` is the
@@ -58,6 +60,10 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials 
     With deviation vectors q and p hold these after those of the orbit (`Variations`), and a kick moves them by its
     exact linearisation, of which the entries are computed once for all of them, together with the kick of the orbit.
 
+    Where lanes are `varied`, each with its own values of the parameters, the kick of a lane takes what depends on these
+    and on no state from a table: ``fill_own(numbers, own, lane)`` computes `N_OWN` numbers for a lane, and
+    ``kicked_by_own(q, p, numbers, own, lane)`` is ``kicked_lane`` with them. There is one kind of kick then.
+
     Raises
     ------
     ValueError
@@ -68,7 +74,8 @@ def kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials 
         if len(_SOURCES) >= MOST_KEPT:
             del _SOURCES[next(iter(_SOURCES))]
         _SOURCES[key] = _source(Variations(symbols, vectors) if vectors else symbols, level, monomials)
-    return _SOURCES[key]
+    source, own = _SOURCES[key]
+    return f"{source}\n\n{own}" if varied else source
 
 
 def kick_cycles(symbols: SymbolicHamiltonian, level: int) -> float:
@@ -92,11 +99,11 @@ def kick_cycles(symbols: SymbolicHamiltonian, level: int) -> float:
     return min(_scheduled(symbols, shape, "kick_", common).cycles for common in (True, False))
 
 
-_SOURCES: dict[tuple[sp.Expr, tuple[sp.Symbol, ...], int, Monomials, int], str] = {}
-"""Sources by H: systems are often made again, and the search takes a tenth of a second or more."""
+_SOURCES: dict[tuple[sp.Expr, tuple[sp.Symbol, ...], int, Monomials, int], tuple[str, str]] = {}
+"""Sources, and those of varied lanes, by H: systems are often made again, and the search takes a tenth of a second."""
 
 
-def _source(symbols: SymbolicHamiltonian | Variations, level: int, monomials: Monomials) -> str:
+def _source(symbols: SymbolicHamiltonian | Variations, level: int, monomials: Monomials) -> tuple[str, str]:
     functions: list[str] = []
     fill: list[str] = []
     stored: list[str] = []
@@ -122,7 +129,28 @@ def _source(symbols: SymbolicHamiltonian | Variations, level: int, monomials: Mo
     rows = [given, *fill, *(f"row[{i}] = {name}" for i, name in enumerate([*stored, *kept]))]
     filled = "\n    ".join(["@njit(**OPTIONS)\ndef fill_coefficients(numbers, row):", *rows])
     drifts = _drift_source(symbols)
-    return "\n\n\n".join([f"N_COEFFICIENTS = {len(stored) + len(kept)}", filled, *functions, drifts]) + "\n"
+    source = "\n\n\n".join([f"N_COEFFICIENTS = {len(stored) + len(kept)}", filled, *functions, drifts]) + "\n"
+    return source, _own_source(symbols, kinds[0].name, kinds[0].numbers, many)
+
+
+def _own_source(symbols: SymbolicHamiltonian | Variations, name: str, numbers: Sequence[str], kick: _Kick) -> str:
+    """The functions of varied lanes, of a level that has the kick of this name and numbers alone."""
+    body = [*kick.lines, *kick.results]
+    letters = [s.name for s in symbols.parameters]
+    depend = list(letters)
+    for line in kick.coefficients:
+        if any(_mentions(line.partition(" = ")[2], known) for known in depend):
+            depend += _names([line])
+    own = [known for known in depend if any(_mentions(line, known) for line in body)]
+    given = [f"{v} = numbers[{i}]" for i, v in enumerate(numbers)]
+    filled = [f"own[{i}, lane] = {known}" for i, known in enumerate(own)]
+    fill = [*given, *parameter_lines(symbols, [*kick.coefficients, *filled]), *kick.coefficients, *filled]
+    common = [line for line in kick.coefficients if _names([line])[0] not in depend]
+    taken = [f"{known} = own[{i}, lane]" for i, known in enumerate(own)]
+    lines = [*given, *common, *taken, *kick.lines]
+    filling = "\n    ".join(["@njit(**OPTIONS, forceinline=True)\ndef fill_own(numbers, own, lane):", *fill])
+    kicked = _function(symbols, "kicked_by_own", "q, p, numbers, own, lane", lines, kick.results)
+    return f"N_OWN = {len(own)}\n\n\n{filling}\n\n\n{kicked}\n"
 
 
 def _drift_source(symbols: SymbolicHamiltonian | Variations) -> str:

@@ -11,8 +11,9 @@ import sympy as sp
 
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions
 from sympflow.hamiltonian.symbolic import printable
-from sympflow.kernels.codegen import printed, tuple_algebra
+from sympflow.kernels.codegen import printed, statements, tuple_algebra
 from sympflow.kernels.scheduling import FUSED, Schedule
+from sympflow.kernels.stage_times import in_code, letters_of_time, sampled_sources
 
 __all__ = ["IDLE", "TURN_WIDTH", "WITH_GRADIENT", "parts_source"]
 
@@ -26,7 +27,8 @@ def parts_source(parts: ExactParts, filters: bool, gradients: bool) -> str:
     """The functions that `parts_loops` asks for.
 
     A row of the table has `ROW_WIDTH` numbers: six for each frequency; or a weight, a force gradient and the filters
-    of the modes, and then products of these, which ``fill_rows`` computes.
+    of the modes, and then products of these, which ``fill_rows`` computes. Where H depends on t three more follow: the
+    time of the map after the beginning of a step, that of the run, and the step.
 
     Raises
     ------
@@ -37,13 +39,15 @@ def parts_source(parts: ExactParts, filters: bool, gradients: bool) -> str:
     flows = []
     if parts.linear is not None:
         flows.append(_linear_flow(parts))
+    letters = []
     for k, part in enumerate(parts.rest, 1):
+        letters += _letters_source(part, k)
         flows.append(_part_flow(parts, part, k, f"part_{k}", filters))
         if gradients and part.of_positions:
             flows.append(_part_flow(parts, part, WITH_GRADIENT + k, f"gradient_{k}", filters, gradient=True))
     width = max([2 + d, TURN_WIDTH * parts.n_classes, *(flow.width for flow in flows)])
     constants = f"NDOF = {d}\nROW_WIDTH = {width}\nN_CLASSES = {parts.n_classes}\nFILTERS = {filters}"
-    functions = [constants, tuple_algebra(d), *_between_modes(parts), *(flow.source for flow in flows)]
+    functions = [constants, tuple_algebra(d), *_between_modes(parts), *letters, *(flow.source for flow in flows)]
     functions += [_dispatch(flows), _dispatch_lanes(flows), _fill(flows), _dispatch_each(flows), _turns_each(parts)]
     functions.append(_filters_each(parts))
     return "\n\n\n".join(functions) + "\n"
@@ -51,7 +55,13 @@ def parts_source(parts: ExactParts, filters: bool, gradients: bool) -> str:
 
 @dataclass(frozen=True)
 class PartFlow:
-    """The flow of a part as code: its name, what it reads of a row of the table, and what it stores there before."""
+    """The flow of a part as code: its name, what it reads of a row of the table, and what it stores there before.
+
+    Attributes
+    ----------
+    letters : sequence of str
+        Names of what depends on t alone, computed once for all lanes by the function of the part that `timed_by` names.
+    """
 
     code: int
     name: str
@@ -59,10 +69,44 @@ class PartFlow:
     row: Sequence[int]
     stored: list[str] = field(default_factory=list)
     width: int = 0
+    letters: Sequence[str] = ()
+    timed_by: str = ""
 
     @property
     def arguments(self) -> str:
-        return "(" + "".join(f"table[j, {i}], " for i in self.row) + ")"
+        return "(" + "".join(f"{value}, " for value in (*(f"table[j, {i}]" for i in self.row), *self.letters)) + ")"
+
+    def drawn(self, indent: str) -> list[str]:
+        """The line that computes the letters for row j of step k, if there are some."""
+        if not self.letters:
+            return []
+        time = "table[j, ROW_WIDTH + 1] + (k * table[j, ROW_WIDTH + 2] + table[j, ROW_WIDTH])"
+        return [f"{indent}{', '.join(self.letters)}, = {self.timed_by}({time})"]
+
+
+def _lettered(part: PartFunctions, code: int) -> tuple[sp.Expr, dict[sp.Expr, sp.Symbol]]:
+    """H_k with letters for what depends on t alone, and these."""
+    found: dict[sp.Expr, sp.Symbol] = {}
+    if not part.timed:
+        return part.H, found
+    assert part.time is not None
+    return letters_of_time(part.H, part.time, set(), found, f"letter_{code}"), found
+
+
+def _letters_source(part: PartFunctions, code: int) -> list[str]:
+    """``letters_k(time)`` of part k, with the functions of samples that it calls."""
+    _, letters = _lettered(part, code)
+    if not letters:
+        return []
+    assert part.time is not None
+    names = [s.name for s in letters.values()]
+    lines = statements(names, [in_code(f, part.time, "time") for f in letters])
+    head = ["@njit(**OPTIONS)", f"def letters_{code}(time):"]
+    body = [f"    {line}" for line in lines]
+    return [
+        *sampled_sources([*letters], part.samples),
+        "\n".join([*head, *body, f"    return ({''.join(f'{name}, ' for name in names)})"]),
+    ]
 
 
 def _linear_flow(parts: ExactParts) -> PartFlow:
@@ -100,17 +144,21 @@ def _part_flow(
 ) -> PartFlow:
     """x + b J∇H_k(x), and with a force gradient g ∇²U M⁻¹∇U added to y, of a row b, g, φ …"""
     d, q, p = parts.ndof, part.q, part.p
+    number = code % WITH_GRADIENT
+    H, of_time = _lettered(part, number)
+    letters = list(of_time.values())
     x, y, z = (sp.symbols(f"{letter}_0:{d}", real=True) for letter in "xyz")
     b, g = sp.symbols("b_ g_", real=True)
     phi = sp.symbols(f"phi_0:{d}", real=True) if filters else (sp.S.One,) * d
     C = np.eye(d) if filters and parts.diagonal else parts.C  # diagonal ones are in the filters
     positions, momenta = _known(parts)
-    schedule = Schedule(dict(zip((*x, *y), positions + momenta, strict=True)), printed, "s_", PRODUCT)
+    known = dict(zip((*x, *y), positions + momenta, strict=True)) | dict.fromkeys(letters, 0.0)
+    schedule = Schedule(known, printed, "s_", PRODUCT)
     at = {
         q[i]: sp.Add(_number(parts.center[i]), *(_number(C[i, j]) * phi[j] * x[j] for j in range(d))) for i in range(d)
     } | {p[i]: sp.Add(*(_number(parts.inverse_C[j, i]) * y[j] for j in range(d))) for i in range(d)}
-    by_q, by_p = ([sp.diff(part.H, s) for s in symbols] for symbols in (q, p))
-    products = [sp.factor_terms(f) for f in _hessian_vector(part.H, q, z)] if gradient else []
+    by_q, by_p = ([sp.diff(H, s) for s in symbols] for symbols in (q, p))
+    products = [sp.factor_terms(f) for f in _hessian_vector(H, q, z)] if gradient else []
     shared, reduced = sp.cse(
         [printable(f).xreplace(at) for f in (*by_q, *by_p, *products)],
         symbols=sp.numbered_symbols("common_", real=True),
@@ -152,11 +200,13 @@ def _part_flow(
     place = {name: i for i, name in enumerate([*raw, *stored])}
     row = [n for n in place if n in used]
     lines = ["@njit(**OPTIONS, forceinline=True)", f"def {name}(x, y, c):", *_unpacked(d)]
-    lines += [f"    {n} = c[{i}]" for i, n in enumerate(row)]
+    lines += [f"    {n} = c[{i}]" for i, n in enumerate([*row, *(s.name for s in letters)])]
     fill = [f"{n} = row[{i}]" for i, n in enumerate(raw)] + schedule.early
     fill += [f"row[{place[n]}] = {n}" for n in stored]
     source = "\n".join([*lines, *body])
-    return PartFlow(code, name, source, [place[n] for n in row], fill if stored else [], len(place))
+    names = [s.name for s in letters]
+    columns = [place[n] for n in row]
+    return PartFlow(code, name, source, columns, fill if stored else [], len(place), names, f"letters_{number}")
 
 
 def _with_products(
@@ -201,17 +251,19 @@ def _returned(d: int) -> str:
 
 
 def _dispatch(flows: Sequence[PartFlow]) -> str:
-    lines = ["@njit(**OPTIONS, forceinline=True)", "def apply_map(x, y, code, table, j):"]
+    lines = ["@njit(**OPTIONS, forceinline=True)", "def apply_map(x, y, code, table, j, k):"]
     for flow in flows:
-        lines += [f"    if code == {flow.code}:", f"        return {flow.name}(x, y, {flow.arguments})"]
+        lines += [f"    if code == {flow.code}:", *flow.drawn("        ")]
+        lines.append(f"        return {flow.name}(x, y, {flow.arguments})")
     return "\n".join([*lines, "    return x, y"])
 
 
 def _dispatch_lanes(flows: Sequence[PartFlow]) -> str:
-    lines = ["@njit(**OPTIONS, inline='always')", "def apply_map_lanes(Z, width, code, table, j):"]
+    lines = ["@njit(**OPTIONS, inline='always')", "def apply_map_lanes(Z, width, code, table, j, k):"]
     for number, flow in enumerate(flows):
         lines += [
             f"    {'elif' if number else 'if'} code == {flow.code}:",
+            *flow.drawn("        "),
             f"        c = {flow.arguments}",
             "        for lane in range(width):",
             "            x, y = unpack_lane(Z, lane)",
@@ -222,8 +274,13 @@ def _dispatch_lanes(flows: Sequence[PartFlow]) -> str:
 
 
 def _dispatch_each(flows: Sequence[PartFlow]) -> str:
-    """The same where each lane has a row of its own, in the lines of Z from `TABLE` on; products are made here."""
+    """The same where each lane has a row of its own, in the lines of Z from `TABLE` on; products are made here.
+
+    There is none of parts that depend on t, whose maps no flow has as functions of its time.
+    """
     lines = ["@njit(**OPTIONS, inline='always')", "def apply_map_each(Z, width, code):"]
+    if any(flow.letters for flow in flows):
+        return "\n".join([*lines, "    raise NotImplementedError"])
     for number, flow in enumerate(flows):
         lines += [f"    {'elif' if number else 'if'} code == {flow.code}:", "        for lane in range(width):"]
         lines += ["            " + re.sub(r"row\[(\d+)\]", r"Z[TABLE + \1, lane]", line) for line in flow.stored]

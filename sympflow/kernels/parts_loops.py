@@ -20,6 +20,8 @@ from sympflow.kernels.terms import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 
 ONE = np.ones(1, dtype=np.int64)
+TIME_WIDTH = 3  # numbers of a row for its time
+SAME_TIME = 1e-12  # of a step: rounding of sums of weights
 KNOWN_TABLES = 64  # run tables that are kept: those of the steps in use
 
 Maps = Callable[[np.ndarray], Sequence[Map]]
@@ -86,6 +88,7 @@ class PartsLoops:
         parts_source(parts, False, False)
         self.parts = parts
         self._variants: dict[tuple[bool, bool], LoopFunctions] = {}
+        self.driven = parts.driven
         self.mixed = not parts.diagonal  # modes that are sums of coordinates: transformed outside the loops
         self._coefficients: dict[int, tuple[Sequence[Map], np.ndarray, np.ndarray]] = {}
         self._tables: dict[int, tuple[Sequence[Map], tuple[np.ndarray, np.ndarray], LoopFunctions]] = {}
@@ -178,8 +181,9 @@ class PartsLoops:
         return self._variants[filters, gradients]
 
     def table(self, sequence: Sequence[Map], n: int, functions: LoopFunctions) -> tuple[np.ndarray, np.ndarray]:
-        """Codes (m,) and coefficients (n, m, W)."""
-        codes, tables = np.empty(len(sequence), dtype=np.int64), np.zeros((n, len(sequence), functions.row_width))
+        """Codes (m,) and coefficients (n, m, W), those of the time, of a driven system, still 0: see `timed`."""
+        width = functions.row_width + TIME_WIDTH * self.driven
+        codes, tables = np.empty(len(sequence), dtype=np.int64), np.zeros((n, len(sequence), width))
         F = TURN_WIDTH * self.parts.n_classes
         for j, m in enumerate(sequence):
             codes[j] = m.part + WITH_GRADIENT * has_gradient(m)
@@ -193,6 +197,15 @@ class PartsLoops:
         functions.fill_rows(codes, tables)
         return codes, tables
 
+    def timed(self, sequence: Sequence[Map], tables: np.ndarray, t: Any, h: Any) -> np.ndarray:
+        """Tables (..., m, W) of steps h (...) that begin at t (...): a copy with the times, if the system is driven."""
+        if not self.driven:
+            return tables
+        tables, (t, h) = tables.copy(), np.broadcast_arrays(t, h)
+        tables[..., -3] = np.array([m.at for m in sequence]) * h[..., None]
+        tables[..., -2], tables[..., -1] = t[..., None], h[..., None]
+        return tables
+
     def _turns(self, s: np.ndarray) -> np.ndarray:
         """Six numbers that turn each frequency by Ω s, (..., F, 6): t, σ, c and d of `shears`, c − td and d + tc."""
         linear = self.parts.linear
@@ -201,21 +214,31 @@ class PartsLoops:
         t, sigma, c, d = shears(kinds, linear.rates[linear.representatives], s)
         return np.stack([t, sigma, c, d, c - t * d, d + t * c], axis=-1)
 
-    def run_table(self, sequence: Sequence[Map]) -> tuple[np.ndarray, np.ndarray]:
-        """Codes and rows of [opening, inner …, link, closing]: see `text/part_maps.py`."""
+    def run_table(self, sequence: Sequence[Map], h: float = 0.0, t0: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Codes and rows of [opening, inner …, link, closing], of steps h from t0 on: see `text/part_maps.py`."""
         known = self._tables.get(id(sequence))
-        if known is not None and known[0] is sequence:
+        if known is None or known[0] is not sequence:
+            rows, functions = self._rows(sequence), self.functions(sequence)
+            codes, table = self.table(rows, 1, functions)
+            if len(self._tables) >= KNOWN_TABLES:
+                self._tables.clear()
+            known = self._tables[id(sequence)] = sequence, (codes, np.ascontiguousarray(table[0])), functions
+        if not self.driven:
             return known[1]
+        codes, table = known[1]
+        return codes, self.timed(self._rows(sequence), table, t0, h)
+
+    def _rows(self, sequence: Sequence[Map]) -> list[Map]:
+        """The maps of a step in the order of `run_table`."""
         idle = Map(IDLE, 0.0)
         first, last = sequence[0], sequence[-1]
-        merged = merge(last, first) if len(sequence) > 1 else None
-        rows = [idle, *sequence, idle, idle] if merged is None else [first, *sequence[1:-1], merged, last]
-        functions = self.functions(sequence)
-        codes, table = self.table(rows, 1, functions)
-        if len(self._tables) >= KNOWN_TABLES:
-            self._tables.clear()
-        self._tables[id(sequence)] = sequence, (codes, np.ascontiguousarray(table[0])), functions
-        return self._tables[id(sequence)][1]
+        merged = self._merged(last, first) if len(sequence) > 1 else None
+        return [idle, *sequence, idle, idle] if merged is None else [first, *sequence[1:-1], merged, last]
+
+    def _merged(self, last: Map, first: Map) -> Map | None:
+        """The last map of a step and the first of the next, if they are one: of parts that move at the same time."""
+        together = not self.parts.timed(last.part) or abs(last.at - 1 - first.at) < SAME_TIME
+        return merge(last, first) if together else None
 
 
 class PartsKernel(Kernel):
@@ -226,10 +249,19 @@ class PartsKernel(Kernel):
     def __init__(self, loops: PartsLoops, maps: Maps) -> None:
         self.loops, self.maps = loops, maps
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
+    def run(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        carry: Carry | None = None,
+        t0: float = 0.0,
+    ) -> Run:
         """`n_steps` steps of length `h` from one state: see `Kernel`."""
         loops, sequence = self.loops, self.maps(np.asarray(h, dtype=float))
-        rollout, (codes, table), mixed = loops.functions(sequence).rollout, loops.run_table(sequence), loops.mixed
+        rollout, mixed = loops.functions(sequence).rollout, loops.mixed
+        codes, table = loops.run_table(sequence, h, t0)
 
         def steps(start: np.ndarray, *rest: Any) -> int:
             return rollout(codes, table, start, mixed, *rest)
@@ -247,10 +279,12 @@ class PartsKernel(Kernel):
         save: np.ndarray,
         threads: int | None = None,
         carry: Carry | None = None,
+        t0: float = 0.0,
     ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         loops, sequence = self.loops, self.maps(np.asarray(h, dtype=float))
-        rollout, (codes, table), mixed = loops.functions(sequence).rollout_batch, loops.run_table(sequence), loops.mixed
+        rollout, mixed = loops.functions(sequence).rollout_batch, loops.mixed
+        codes, table = loops.run_table(sequence, h, t0)
 
         def rows(_: slice, start: np.ndarray, *rest: Any) -> None:
             rollout(codes, table, start, mixed, *rest)
@@ -259,12 +293,14 @@ class PartsKernel(Kernel):
         Y, n_finite, _ = run_states(rows, start, n_steps, save, threads, carry, start.shape[1], work)
         return Run(loops.states(Y, save, y0[:, None]), n_finite)
 
-    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
-        loops, sequence = self.loops, self.maps(np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1]))
+        lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
+        loops, sequence = self.loops, self.maps(lengths)
         functions = loops.functions(sequence)
         out = np.empty(y.shape)
         codes, tables = loops.table(sequence, len(y), functions)
+        tables = loops.timed(sequence, tables, t, lengths)
         functions.step_each(codes, tables, loops.modes(y), loops.mixed, out)
         return Steps(loops.states(out))
 

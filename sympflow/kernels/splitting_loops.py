@@ -20,6 +20,7 @@ from sympflow.kernels.stages import (
     DampedDrift,
     StageTable,
     TimeAlone,
+    WithSystem,
     kicks_of,
     lanes_source,
     run_table,
@@ -111,12 +112,18 @@ class SplittingLoops:
             self._compile = partial(
                 _array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, self.driven, damped
             )
+        elif system.local is not None:
+            if system.local.loops != "pairs" or self.friction is not None:
+                what = "friction" if self.friction is not None else "no compiled loops"
+                raise ValueError(f"`system` {system.name!r} cannot be compiled: it has {what}. Use backend='array'.")
+            self._has_force_gradient = system.quadratic_kinetic
+            self._compile = partial(_local_loops, system)
         else:
             raise ValueError(
                 "`system` cannot be compiled: it is given by plain functions. Define it with "
                 "HamiltonianSystem.from_sympy or by Numba functions, or use backend='array'."
             )
-        self._has_curvature = system.symbols is not None
+        self._has_curvature = system.symbols is not None or system.local is not None
         self._variants: dict[tuple[int, bool, Monomials, bool], LoopFunctions] = {}
 
     def kernel(self, scheme: Scheme, compensated: bool = False) -> SplittingKernel:
@@ -278,9 +285,9 @@ class SplittingKernel(Kernel):
 class VariedKernel(SplittingKernel):
     """The loops of batches of N trajectories that have their own values (k, N) of `SplittingLoops.values`.
 
-    Each takes the steps of `SplittingKernel` on a system with its values up to rounding: what the compiler takes out of
-    loops there, products of values, it may fuse with sums here. A batch may be several of such ones, one after the
-    other.
+    Each takes the steps of `SplittingKernel` on a system with its values, with compensated sums up to rounding:
+    products of values, which the compiler takes out of loops there, it may fuse with sums here. A batch may be several
+    of such ones, one after the other.
     """
 
     def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool, values: np.ndarray) -> None:
@@ -372,6 +379,24 @@ class LoopFunctions:
     rollout_processed_batch: Callable[..., None]
     step_rows: Callable[..., None]
 
+    def with_system(self, numbers: np.ndarray, inverse_mass: np.ndarray) -> LoopFunctions:
+        """The functions of tables, of those whose tables are (stages, numbers, M⁻¹)."""
+
+        def given(function: Callable[..., Any], n_tables: int = 1) -> Callable[..., Any]:
+            def call(*arguments: Any) -> Any:
+                tables = [(table, numbers, inverse_mass) for table in arguments[:n_tables]]
+                return function(*tables, *arguments[n_tables:])
+
+            return call
+
+        return LoopFunctions(
+            given(self.rollout),
+            given(self.rollout_batch),
+            given(self.rollout_processed, 3),
+            given(self.rollout_processed_batch, 3),
+            given(self.step_rows),
+        )
+
 
 def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0, driven: bool = False) -> str:
     return (
@@ -444,7 +469,7 @@ def symbolic_module(
     lanes = lanes_source(kinds, scheduled, friction, n, varied)
     sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
     if scheduled:
-        sources.append(kicks_source(symbols, level, monomials))
+        sources.append(kicks_source(symbols, level, monomials, varied=varied))
     elif level == POLYNOMIAL:
         sources.append(polynomial_kick_source(symbols, monomials))
     elif level:
@@ -476,7 +501,7 @@ def _family_loops(
         symbols = driving.form
     letters = symbols.parameters
     warn_if_long(symbols.V, symbols.q, system.name)
-    sources = [f"import numpy as np\n\nNDOF = {symbols.ndof}", _given_functions(level, bool(letters))]
+    sources = [f"import numpy as np\n\nNDOF = {symbols.ndof}", _FIXED_SIZE, _given_functions(level, bool(letters))]
     sources.append(gradient_source(symbols.V, symbols.q, "gradient", letters))
     if level in (FORCE_GRADIENT, CURVATURE):
         sources.append(product_source(symbols.V, symbols.q, "hessian_vector", letters))
@@ -489,12 +514,58 @@ def _family_loops(
         sources.append(_inverse_mass_source(M))
         sources.append("" if M is None else f"INVERSE_MASS = np.array({M.tolist()})")
     else:
-        sources.append(gradient_source(symbols.T, symbols.p, "apply_inverse_mass"))
+        sources.append(gradient_source(symbols.T, symbols.p, "kinetic_gradient"))
+        sources.append("@njit(**OPTIONS)\ndef apply_inverse_mass(v, out, work):\n    kinetic_gradient(v, out)")
     sources.append(stages_source(kicks_of(level, len(monomials)), False, friction, 0, driving))
     code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
     before = ["elementary"] if "fast_" in code else []
     header = _header(compensated, cache=True, scheduled=False)
     return _array_functions(vars(load_module("\n\n\n".join([header, *map(template, before), code]))))
+
+
+_FIXED_SIZE = """@njit(**OPTIONS)
+def size(x, copies):
+    return NDOF
+
+
+@njit(**OPTIONS)
+def size_of(table):
+    return NDOF"""
+_ANY_SIZE = """@njit(**OPTIONS)
+def size(x, copies):
+    return len(x) // copies
+
+
+@njit(**OPTIONS)
+def size_of(table):
+    return len(table[2])
+
+
+@njit(**OPTIONS)
+def apply_inverse_mass(v, out, work):
+    inverse_mass = work[4][2]
+    for i in range(len(v)):
+        out[i] = inverse_mass[i] * v[i]"""
+"""A table is (stages, numbers of the system, M⁻¹)."""
+
+
+def _local_loops(
+    system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials, varied: bool = False
+) -> LoopFunctions:
+    """The loops of a system that is given by one piece, of any size: their code depends on the piece alone."""
+    from sympflow.kernels.pair_forces import pair_data, pair_source
+
+    local: Any = system.local
+    if level == POLYNOMIAL or varied:
+        raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
+    sources = [pair_source(local, functions_of(level)), _given_functions(level, True, numbers="numbers[-1]")]
+    sources += [_ANY_SIZE, stages_source(kicks_of(level), False, None, 0, WithSystem(), "table[0]")]
+    code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
+    before = ["elementary"] if "fast_" in code or "fused_multiply_add" in code else []
+    header = _header(compensated, cache=True, scheduled=False)
+    functions = _array_functions(vars(load_module("\n\n\n".join([header, *map(template, before), code]))))
+    inverse_mass = np.ones(system.ndof) if system.inverse_mass is None else np.array(system.inverse_mass)
+    return functions.with_system(pair_data(local), inverse_mass)
 
 
 _INVERSE_MASS_TIMES_V = {
@@ -506,25 +577,26 @@ _INVERSE_MASS_TIMES_V = {
 
 def _inverse_mass_source(inverse_mass: np.ndarray | None) -> str:
     rows = _INVERSE_MASS_TIMES_V[0 if inverse_mass is None else inverse_mass.ndim]
-    return f"@njit(**OPTIONS)\ndef apply_inverse_mass(v, out):\n    for i in range(NDOF):\n        {rows}"
+    return f"@njit(**OPTIONS)\ndef apply_inverse_mass(v, out, work):\n    for i in range(NDOF):\n        {rows}"
 
 
-def _given_functions(level: int, driven: bool, time_first: bool = False) -> str:
+def functions_of(level: int) -> tuple[str, ...]:
+    """The functions of the system that kicks of a level call."""
+    return ("gradient", "hessian_vector", "bend")[: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(level, 0)]
+
+
+def _given_functions(level: int, driven: bool, time_first: bool = False, numbers: str = "numbers") -> str:
     """``gradient_at(q, numbers, out)`` and the others that the text `array_states` calls, by functions of a system.
 
-    Those of a driven one take the letters of `numbers` after their arguments, or the time before them.
+    Those of a driven one take the letters of `numbers` after their arguments, or the time before them; those of one
+    piece its own numbers, the last of them.
     """
-    functions = ["gradient(q, out)", "hessian_vector(q, v, out)", "bend(q, v, out)"]
-    if level not in (FORCE_GRADIENT, CURVATURE):
-        functions = functions[:1]
-    elif level == FORCE_GRADIENT:
-        functions = functions[:2]
     sources = []
-    for function in functions:
-        name, _, arguments = function.rstrip(")").partition("(")
-        call = function
+    for name in functions_of(level):
+        arguments = "q, out" if name == "gradient" else "q, v, out"
+        call = f"{name}({arguments})"
         if driven:
-            call = f"{name}(numbers[-1], {arguments})" if time_first else f"{name}({arguments}, numbers)"
+            call = f"{name}(numbers[-1], {arguments})" if time_first else f"{name}({arguments}, {numbers})"
         given = arguments.removesuffix("out") + "numbers, out"
         sources.append(f"@njit(**OPTIONS)\ndef {name}_at({given}):\n    {call}")
     return "\n\n\n".join(sources)
@@ -547,7 +619,7 @@ def _array_loops(
     monomials: Monomials,
 ) -> LoopFunctions:
     """The loops around the user's Numba functions; compiled for this process only."""
-    mass = _inverse_mass_source(inverse_mass)
+    mass = "\n\n\n".join([_FIXED_SIZE, _inverse_mass_source(inverse_mass)])
     header = _header(compensated, cache=False, scheduled=False)
     stages = stages_source(kicks_of(level), False, friction, 0, TimeAlone() if driven else None)
     given = _given_functions(level, driven, time_first=True)

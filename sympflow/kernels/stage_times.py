@@ -20,7 +20,7 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.codegen import printed, sampled_name, statements
 from sympflow.kernels.stages import Kick, numbers_of_kicks, time_lines
 
-__all__ = ["Driving", "driven_form"]
+__all__ = ["Driving", "driven_form", "in_code", "letters_of_time", "sampled_sources"]
 
 MOST_SAMPLED = 200_000
 """Numbers of samples that compiled code holds."""
@@ -106,7 +106,7 @@ def driven_form(symbols: SymbolicHamiltonian) -> Driving:
     assert symbols.T is not None
     values = dict(zip(symbols.parameters, map(sp.Float, symbols.values), strict=True))
     of_V: dict[sp.Expr, sp.Symbol] = {}
-    V = _with_letters(symbols.V, t, {*symbols.parameters}, of_V, "letter")
+    V = letters_of_time(symbols.V, t, {*symbols.parameters}, of_V, "letter")
     T, of_T = _kinetic(symbols, symbols.T.xreplace(values) if symbols.T.has(t) else symbols.T)
     letters = {s: f for f, s in of_V.items()}
     means = {s: (f, drift((f,), t)[0]) for f, s in of_T.items()}
@@ -120,7 +120,7 @@ def _kinetic(symbols: SymbolicHamiltonian, T: sp.Expr) -> tuple[sp.Expr, dict[sp
     for expression in (T, sp.expand(T)):
         found: dict[sp.Expr, sp.Symbol] = {}
         moving = [term for term in sp.Add.make_args(expression) if term.free_symbols & {*symbols.p}]
-        lettered = _with_letters(sp.Add(*moving), symbols.time, set(), found, "mean")
+        lettered = letters_of_time(sp.Add(*moving), symbols.time, set(), found, "mean")
         letters = {*found.values()}
         if not any(sp.diff(lettered, s).free_symbols & letters for s in letters):
             return lettered, found
@@ -130,7 +130,7 @@ def _kinetic(symbols: SymbolicHamiltonian, T: sp.Expr) -> tuple[sp.Expr, dict[sp
     )
 
 
-def _with_letters(
+def letters_of_time(
     f: sp.Expr, t: sp.Symbol, fixed: set[sp.Symbol], found: dict[sp.Expr, sp.Symbol], prefix: str
 ) -> sp.Expr:
     """The expression with symbols for its parts that depend on t and on fixed symbols alone; these in `found`."""
@@ -142,9 +142,9 @@ def _with_letters(
         return number * found.setdefault(part, sp.Symbol(f"{prefix}_{len(found)}", real=True))
     if f.is_Add or f.is_Mul:
         alone = [a for a in f.args if a.free_symbols <= known]
-        others = [_with_letters(a, t, fixed, found, prefix) for a in f.args if not a.free_symbols <= known]
-        return f.func(_with_letters(f.func(*alone), t, fixed, found, prefix), *others)
-    return f.func(*[_with_letters(a, t, fixed, found, prefix) if isinstance(a, sp.Basic) else a for a in f.args])
+        others = [letters_of_time(a, t, fixed, found, prefix) for a in f.args if not a.free_symbols <= known]
+        return f.func(letters_of_time(f.func(*alone), t, fixed, found, prefix), *others)
+    return f.func(*[letters_of_time(a, t, fixed, found, prefix) if isinstance(a, sp.Basic) else a for a in f.args])
 
 
 # functions of samples ---------------------------------------------------------------------------------------------

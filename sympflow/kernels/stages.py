@@ -17,6 +17,7 @@ __all__ = [
     "StageTable",
     "TimeAlone",
     "TimedNumbers",
+    "WithSystem",
     "kicks_of",
     "lanes_source",
     "numbers_of_kicks",
@@ -343,7 +344,20 @@ def damped(p, a):
 
 _DRIFT_OF = """@njit(**OPTIONS, forceinline=True)
 def drift_of(table, j):
-    return table[0, j]"""
+    return {stages}[0, j]"""
+_TABLE = """@njit(**OPTIONS, forceinline=True)
+def columns_of(table):
+    return {stages}.shape[1]
+
+
+@njit(**OPTIONS)
+def first_coefficients(table):
+    return {first}
+
+
+@njit(**OPTIONS)
+def drift_at(table, j, x):
+    return polynomial({stages}[0, j], x)"""
 
 
 class TimedNumbers(Protocol):
@@ -375,6 +389,21 @@ def numbers_at(table, j, x, h, t):
     return ({", ".join([*values, "time"])})"""
 
 
+class WithSystem:
+    """The numbers of kicks, and after them the array of a system's own numbers: a table is (stages, numbers, M⁻¹)."""
+
+    def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
+        numbers, values = numbers_of_kicks(kinds, "table[0]")
+        return f"""@njit(**OPTIONS)
+def numbers_of(table, j, k=0):
+    return ({", ".join([*numbers, "table[1]"])})
+
+
+@njit(**OPTIONS)
+def numbers_at(table, j, x, h, t):
+    return ({", ".join([*values, "table[1]"])})"""
+
+
 def time_lines(row: int) -> tuple[str, str]:
     """The time of kick j of step k of a run, and in a step h from t on; `row` is the first of those of the time."""
     return (
@@ -383,12 +412,12 @@ def time_lines(row: int) -> tuple[str, str]:
     )
 
 
-def numbers_of_kicks(kinds: Sequence[Kick]) -> tuple[list[str], list[str]]:
+def numbers_of_kicks(kinds: Sequence[Kick], stages: str = "table") -> tuple[list[str], list[str]]:
     """The numbers of kicks as code: those of a run, and those of a step h by polynomials in x."""
     rows = range(1, 1 + len(kinds[0].numbers))
     steps = {1: "h", 3: "h ** 3", 5: "h ** 5"}
-    values = [f"{steps[n]} * polynomial(table[{i}, j], x)" for i, n in zip(rows, kinds[0].powers, strict=True)]
-    return [f"table[{i}, j]" for i in rows], values
+    values = [f"{steps[n]} * polynomial({stages}[{i}, j], x)" for i, n in zip(rows, kinds[0].powers, strict=True)]
+    return [f"{stages}[{i}, j]" for i in rows], values
 
 
 def _numbers_source(kinds: Sequence[Kick], n_parameters: int) -> str:
@@ -413,13 +442,14 @@ def stages_source(
     friction: DampedDrift | None = None,
     n_parameters: int = 0,
     driving: TimedNumbers | None = None,
+    stages: str = "table",
 ) -> str:
     """The functions of the text `loops` that depend on the kinds of kick, on friction and on the time.
 
     ``numbers_of(table, j, k)`` are the numbers of kick j of step k, ``numbers_at(table, j, x, h, t)`` those of a step h
     by polynomials in x that begins at the time t; the values of the parameters of H, which are taken where there is no
-    friction, come after them. ``drift_of(table, j)`` are those of a drift. ``stage`` is a kick and a drift of one
-    trajectory.
+    friction, come after them. ``drift_of(table, j)`` are those of a drift. `stages` is the array of these numbers, by
+    the `table` that the loops are given. ``stage`` is a kick and a drift of one trajectory.
     """
     given = "numbers, " if n_parameters else ""
     drifted = f"return move(q, q_error, drift(p, a, {given}work))"
@@ -431,10 +461,14 @@ def stages_source(
     begin = ["fill_coefficients(numbers, work[j])"] if driving is not None and scheduled else []
     first = 1 + len(kinds[0].numbers)
     n_rows = first + (0 if friction is None else 2 * friction.size)
+    table = {"stages": stages, "first": "table[:, :, 0]" if stages == "table" else "table"}
     return f"""{_numbers_source(kinds, n_parameters) if driving is None else driving.source(kinds, n_rows)}
 
 
-{_DRIFT_OF if friction is None else friction.source(first)}
+{_TABLE.format(**table)}
+
+
+{_DRIFT_OF.format(**table) if friction is None else friction.source(first)}
 
 
 @njit(**OPTIONS, forceinline=True)
@@ -477,15 +511,15 @@ def lanes_source(
     """The functions of the text `lanes` that depend on the kinds of kick; not scheduled, sums are compensated.
 
     ``stage_lanes`` is a kick and a drift of all lanes by the same numbers, ``stage_each`` of each lane by its own, by
-    column j of a table. `varied` lanes have their own values of the parameters in both.
+    column j of a table. `varied` lanes have their own values of the parameters in both; scheduled ones take what
+    depends on these from a table in ``own_stages``, which makes two stages.
     """
 
     given = "numbers, " if n_parameters else ""
     n_numbers, values = len(kinds[0].numbers), range(n_parameters)
 
     def together(kick: Kick) -> list[str]:
-        own = [f"common[{i}], " for i in range(n_numbers)] + [f"Y[2 * NDOF + {i}, lane], " for i in values]
-        taken = [f"numbers = ({''.join(own)})"] if varied else []
+        taken = ["numbers = numbers_of_lane(Y, common, lane)"] if varied else []
         kicked = [*taken, *kick.application(scheduled, lane=True)]
         if scheduled:
             return _over_lanes([*kicked, *_drifted_lane(friction, n_parameters)])
@@ -506,11 +540,14 @@ def lanes_source(
     # Kinds are told apart outside the loops: a loop with a branch in it, once it is long, is no longer made of vector
     # instructions.
     passed = "common" if varied else "numbers"
-    source = f"""@njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
+    before = _own_source(n_numbers, n_parameters) if varied else ""
+    source = f"""{before}@njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
 def stage_lanes(Y, error, width, {passed}, a):
     {_cases(kinds, passed + "[{0}] != 0.0", [together(kick) for kick in kinds])}"""
     if not scheduled:
         return source
+    if varied:
+        source += "\n\n\n" + _own_stages_source(n_parameters)
     return f"""N_NUMBERS = {n_numbers}
 
 
@@ -520,6 +557,31 @@ def stage_lanes(Y, error, width, {passed}, a):
 @njit(**OPTIONS, inline="always")
 def stage_each(Y, width, table, j):
     {_cases(kinds, "np.any(table[{1}, j] != 0.0)", [each(kick) for kick in kinds])}"""
+
+
+def _own_source(n_numbers: int, n_parameters: int) -> str:
+    """``numbers_of_lane``, those of a kick with the values of the parameters of a lane."""
+    numbers = [f"common[{i}], " for i in range(n_numbers)]
+    numbers += [f"Y[2 * NDOF + {i}, lane], " for i in range(n_parameters)]
+    return f"@njit(**OPTIONS)\ndef numbers_of_lane(Y, common, lane):\n    return ({''.join(numbers)})\n\n\n"
+
+
+def _own_stages_source(n_parameters: int) -> str:
+    """``own_stages`` of `lanes_source`: one stage, and two in one pass, which loads and stores the states once."""
+
+    def lines(numbers: str, a: str, own: str) -> list[str]:
+        given = f"numbers, a = numbers_of_lane(Y, {numbers}, lane), {a}"
+        return [given, f"p = kicked_by_own(q, p, numbers, {own}, lane)", *_drifted_lane(None, n_parameters)]
+
+    one, other = lines("common_1", "a_1", "own_1"), lines("common_2", "a_2", "own_2")
+    head = '@njit(**OPTIONS, inline="always")\ndef '
+    return "\n\n\n".join(
+        f"{head}{name}(Y, width, {taken}):\n    " + "\n    ".join(_over_lanes(body))
+        for name, taken, body in (
+            ("own_stage_lanes", "common_1, a_1, own_1", one),
+            ("two_own_stages_lanes", "common_1, a_1, own_1, common_2, a_2, own_2", [*one, *other]),
+        )
+    )
 
 
 def _over_lanes(lines: Sequence[str]) -> list[str]:

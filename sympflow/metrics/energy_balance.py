@@ -33,8 +33,9 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     with E as one more momentum; memory is that of the outputs. Methods that choose their steps then control the error
     of E too.
 
-    For systems without symbols, T(p, t) in splitting methods, and trained flows that are not primed, it is the integral
-    of ∂H/∂t along the steps as executed, by Gauss–Legendre quadrature of 6 nodes within each.
+    For systems without symbols, T(p, t) in splitting methods, splittings other than "kinetic", and trained flows that
+    are not primed, it is the integral of ∂H/∂t along the steps as executed, by Gauss–Legendre quadrature of 6 nodes
+    within each.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ NAMED = {
     "q0": {"long_name": "initial positions"},
     "p0": {"long_name": "initial momenta"},
     "energy": {"long_name": "H along the solution"},
-    "status": {"long_name": "0: the end was reached, 1: an event ended it, -1: failed"},
+    "status": {"long_name": "0: the end was reached, 1: an event ended it, 2: not run yet, -1: failed"},
     DOF: {"long_name": "i of q_i and p_i"},
 }
 """The attributes of arrays, by their names."""

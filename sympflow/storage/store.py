@@ -57,6 +57,9 @@ class Field:
         The default is the whole array.
     attributes : mapping
         As JSON has them.
+    missing : int, optional
+        The number that stands where nothing has been written, of an array that is not complete. A reader of zarr may
+        show it as NaN. The default is NaN, or 0 of other numbers than floats.
     """
 
     dims: tuple[str, ...]
@@ -64,6 +67,7 @@ class Field:
     dtype: Any = float
     chunks: tuple[int, ...] | None = None
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    missing: int | None = None
 
     def __post_init__(self) -> None:
         if not len(self.dims) == len(self.shape) == len(self.chunks or self.shape):
@@ -97,7 +101,7 @@ class Field:
             "chunks": list(self.chunks or ()),
             "dtype": self.dtype.str,
             "compressor": {"id": "zlib", "level": 0},
-            "fill_value": "NaN" if self.dtype.kind == "f" else None,
+            "fill_value": "NaN" if self.dtype.kind == "f" else self.missing,
             "order": "C",
             "filters": None,
         }
@@ -107,7 +111,14 @@ class Field:
         """Return the field that zarr describes so."""
         own = {name: value for name, value in attributes.items() if name != "_ARRAY_DIMENSIONS"}
         shape, chunks = tuple(metadata["shape"]), tuple(metadata["chunks"])
-        return cls(tuple(attributes["_ARRAY_DIMENSIONS"]), shape, np.dtype(metadata["dtype"]), chunks, own)
+        fill = metadata["fill_value"]
+        missing = fill if isinstance(fill, int) else None
+        return cls(tuple(attributes["_ARRAY_DIMENSIONS"]), shape, np.dtype(metadata["dtype"]), chunks, own, missing)
+
+    @property
+    def filled(self) -> float:
+        """The number where nothing has been written."""
+        return np.nan if self.dtype.kind == "f" else self.missing or 0
 
 
 class Store:
@@ -198,7 +209,7 @@ class Store:
         if values.shape == known.chunks:
             chunk = np.ascontiguousarray(values, dtype=known.dtype)
         else:
-            chunk = np.full(known.chunks, np.nan if known.dtype.kind == "f" else 0, dtype=known.dtype)
+            chunk = np.full(known.chunks, known.filled, dtype=known.dtype)
             chunk[tuple(map(slice, values.shape))] = values
         with _told(self.path):
             _replace(self._file(name, index), zlib.compress(chunk.data, 0))
@@ -215,7 +226,7 @@ class Store:
             _replace(self.path / name, text.encode())
 
     def read(self, name: str, index: tuple[int, ...] | None = None) -> np.ndarray:
-        """Return a chunk, or the whole array; NaN, or 0 of other numbers, where nothing has been written.
+        """Return a chunk, or the whole array; `Field.filled` where nothing has been written.
 
         Raises
         ------
@@ -235,7 +246,7 @@ class Store:
             if len(data) != prod(known.chunks) * known.dtype.itemsize:
                 raise zlib.error("another length")
         except FileNotFoundError:
-            return np.full(shape, np.nan if known.dtype.kind == "f" else 0, dtype=known.dtype)
+            return np.full(shape, known.filled, dtype=known.dtype)
         except zlib.error as error:
             file = self._file(name, index)
             raise StoreError(f"`store` {str(self.path)!r} is damaged: {file.name} of {name!r} ({error}).") from None
@@ -285,6 +296,18 @@ class Store:
                 _replace(self.path / key, _json(value), durable=False)
             if state is not None and before:
                 (self.path / before).unlink(missing_ok=True)
+
+    def complete(self, name: str) -> None:
+        """Note that all of an array has been written.
+
+        Raises
+        ------
+        StoreError
+            If it cannot be written.
+        """
+        if self.fields[name].missing is not None:
+            self.fields[name] = replace(self.fields[name], missing=None)
+            self.commit()
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the arrays that the last commit kept; {} if it kept none."""

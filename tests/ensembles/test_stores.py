@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import sympflow
+from sympflow.ensembles import results
 from sympflow.storage import store as storage
 
 SYSTEM = sympflow.systems.henon_heiles()
@@ -56,6 +57,10 @@ def test_a_run_goes_on_where_it_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(storage, "_replace", written)
     done = {file.name: file.stat().st_mtime_ns for file in (path / "status").iterdir() if file.name[0] != "."}
     assert len(done) == 1
+    waiting = np.arange(len(STATES)) >= 64
+    assert np.array_equal(storage.Store.open(path).read("status") == results.NOT_RUN, waiting)
+    with pytest.importorskip("xarray").open_zarr(path) as data:
+        assert np.array_equal(np.isnan(data.status), waiting)
     assert np.array_equal(run(store=path, resume=True, chunk=7).y, run().y, equal_nan=True)
     assert all((path / "status" / name).stat().st_mtime_ns == when for name, when in done.items())
     assert len(os.listdir(path / "q")) > len(done)

@@ -83,7 +83,8 @@ def test_a_users_function():
 
 
 def test_a_grid_of_parameters():
-    system = sympflow.HamiltonianSystem.from_sympy("p**2/2 + k*q**2/2 + a*q**4/4", params={"k": 1.0, "a": 0.1})
+    H = "p**2/(2*m) + k*q**2/2 + a*q**4/4 - F*a*q"  # F a is a product of parameters that is added
+    system = sympflow.HamiltonianSystem.from_sympy(H, params={"k": 1.0, "a": 0.1, "m": 1.3, "F": 0.37})
     k, states = [1.0, 2.0, 4.0], np.array([[1.0, 0.0], [0.5, 0.2]])
 
     def swept(**how):
@@ -93,12 +94,12 @@ def test_a_grid_of_parameters():
     assert result.final.shape == (3, 2, 2, 2)
     assert list(result.params) == ["k", "a"]
     assert result.to_xarray().q.dims == ("k", "a", "orbit", "dof")
-    for chunk in (1, 5):
+    for chunk in (1, 5):  # of one value of the parameters, or of several
         assert np.array_equal(swept(reduce="final", chunk=chunk, workers=2).final, result.final)
     for i, value in enumerate(k):
         changed = system.with_params(k=value, a=0.3)
         expected = sympflow.solve(changed, "verlet", (0, 2), states, dt=0.1)
-        assert np.allclose(result.final[i, 1], expected.y[..., -1], rtol=0, atol=1e-13)
+        assert np.array_equal(result.final[i, 1], expected.y[..., -1])
         H = changed.hamiltonian(expected.states)
         worst = np.abs(H / H[:, :1] - 1).max(1)
         assert np.allclose(swept(reduce="energy_error").energy_error[i, 1], worst, atol=1e-13)
@@ -106,10 +107,20 @@ def test_a_grid_of_parameters():
     assert fixed.final.shape == (2, 2)
 
 
+def test_values_without_a_system_fail_their_orbits():
+    system = sympflow.HamiltonianSystem.from_sympy("p**2/(2*m) + q**2/2", params={"m": 1.0})
+    for backend in ("auto", "array"):
+        how = {"params": {"m": [2.0, 0.0, 3.0]}, "dt": 0.1, "reduce": "final", "backend": backend}
+        result = sympflow.ensemble(system, "verlet", (0, 1), [[1.0, 0.0], [0.0, 1.0]], **how)
+        assert result.status.tolist() == [[0, 0], [-1, -1], [0, 0]]
+        assert "m = 0" in result.messages[1, 1]
+        assert np.isfinite(result.final).all(axis=-1).tolist() == (result.status == 0).tolist()
+
+
 @pytest.mark.parametrize(
     ("how", "error", "message"),
     [
-        ({"params": {"lam": [1.0]}}, ValueError, "`params` has 'lam', which the system 'henon_heiles' has not"),
+        ({"params": {"lam": [1.0]}}, ValueError, "`params` has 'lam', no parameter of 'henon_heiles', which has none"),
         ({"params": 3}, TypeError, "`params` must map names"),
         ({"reduce": "finall"}, ValueError, "Did you mean 'final'"),
         ({"reduce": 3}, TypeError, "`reduce` must be a name"),

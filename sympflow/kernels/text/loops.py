@@ -4,14 +4,16 @@ The algebra says what a state is: q and p are tuples held in registers (a symbol
 (Numba functions). It defines ``unpack``, ``pack``, ``copy``, ``is_finite``, ``move``, ``no_error``, ``drift``,
 ``workspace``, and functions for each kind of kick. `sympflow.kernels.stages` writes what depends on the kinds of kick:
 ``numbers_of`` and ``numbers_at``, which read the numbers of a kick from a table and, where H depends on t, compute what
-depends on that, ``drift_of``, which reads those of a drift, and ``stage``, a kick and a drift.
+depends on that, ``drift_of`` and ``drift_at``, which read those of a drift, ``columns_of`` and ``first_coefficients``
+of a table, and ``stage``, a kick and a drift.
 Where `SCHEDULED`, kicks and ``drifted`` run in an order of operations that is fast, and ``fill_coefficients`` prepares
 their coefficients.
 
-A table has a column for each stage; its first row holds the drifts, the others hold the numbers of the kicks, and with
-friction those of the drifts (`stages.DampedDrift`). A run executes the columns [opening, inner …, link, closing]. A
-step is the link (the first step, the opening) and the inner stages; consecutive steps share their common kick or drift
-in the link, and an output is the closing stage applied to a copy, so that what is saved never changes the trajectory.
+A table has a column for each stage, and may be the first of several arrays; its first row holds the drifts, the others
+hold the numbers of the kicks, and with friction those of the drifts (`stages.DampedDrift`). A run executes the columns
+[opening, inner …, link, closing]. A step is the link (the first step, the opening) and the inner stages; consecutive
+steps share their common kick or drift in the link, and an output is the closing stage applied to a copy, so that what
+is saved never changes the trajectory.
 A run may be cut: it then begins after `first` steps, from the `running` state (with the errors of compensated sums)
 that it left there, and counts on from `first`; where nobody asks for that, `running` is empty. It is left NaN where a
 run has ended in what is not finite.
@@ -32,11 +34,11 @@ CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where noth
 def prepared(table):
     """The workspace of the stages; where `SCHEDULED`, the products of their coefficients, which no state waits for."""
     if SCHEDULED:
-        work = np.empty((table.shape[1], N_COEFFICIENTS))
-        for j in range(table.shape[1]):
+        work = np.empty((columns_of(table), N_COEFFICIENTS))
+        for j in range(columns_of(table)):
             fill_coefficients(numbers_of(table, j), work[j])
         return work
-    return workspace()
+    return workspace(table)
 
 
 @njit(**OPTIONS)
@@ -49,7 +51,7 @@ def called_stage(q, p, q_error, p_error, numbers, a, j, work):
 def close(q, p, q_error, p_error, table, k, work):
     """The end of step k, from the running state before its last stage, which is left as it is."""
     q, p, q_error, p_error = copy(q), copy(p), copy(q_error), copy(p_error)
-    last = table.shape[1] - 1
+    last = columns_of(table) - 1
     q, p, _, _ = called_stage(q, p, q_error, p_error, numbers_of(table, last, k), drift_of(table, last), last, work)
     return q, p
 
@@ -57,7 +59,7 @@ def close(q, p, q_error, p_error, table, k, work):
 @njit(**OPTIONS)
 def first_non_finite(q, p, table, first, k, n_steps, work):
     """The first of `n_steps` steps from a running state, that of step k, whose end is not finite, or `n_steps`."""
-    link = table.shape[1] - 2
+    link = columns_of(table) - 2
     q_error, p_error = no_error(q), no_error(p)
     j = first
     for n in range(1, n_steps):
@@ -86,9 +88,10 @@ def opened(y0, first, running):
     q, p = unpack(y0)
     q_error, p_error = no_error(q), no_error(p)
     if first > 0:
-        q, p = unpack(running[: 2 * NDOF])
+        end = len(running) // (1 + COMPENSATED)
+        q, p = unpack(running[:end])
         if COMPENSATED:
-            q_error, p_error = unpack(running[2 * NDOF :])
+            q_error, p_error = unpack(running[end:])
     return q, p, q_error, p_error
 
 
@@ -96,9 +99,10 @@ def opened(y0, first, running):
 def keep(q, p, q_error, p_error, running):
     """Write the running state, if it is asked for."""
     if len(running) > 0:
-        pack(q, p, running[: 2 * NDOF])
+        end = len(running) // (1 + COMPENSATED)
+        pack(q, p, running[:end])
         if COMPENSATED:
-            pack(q_error, p_error, running[2 * NDOF :])
+            pack(q_error, p_error, running[end:])
 
 
 @njit(**OPTIONS)
@@ -108,7 +112,7 @@ def rollout(table, y0, n_steps, save, out, stop, first, running):
     Returns the index of the last step that ends in a finite state; rows of later steps are NaN. Ends early, with
     rows unset, when another thread sets ``stop[0]``.
     """
-    link = table.shape[1] - 2
+    link = columns_of(table) - 2
     work = prepared(table)
     q, p, q_error, p_error = opened(y0, first, running)
     n, saved, j = first, 0, link if first > 0 else 0
@@ -159,12 +163,12 @@ def step_each(table, x, h, t, y, out):
 
     The numbers (1 + n, m, K) of stage j are those for h = 1, polynomials Σ_k table[:, j, k] x^k of ``x[i]``.
     """
-    work = prepared(table[:, :, 0])
+    work = prepared(first_coefficients(table))
     for i in range(y.shape[0]):
         q, p = unpack(y[i])
         q_error, p_error = no_error(q), no_error(p)
-        for j in range(table.shape[1]):
-            numbers, a = numbers_at(table, j, x[i], h[i], t[i]), h[i] * polynomial(table[0, j], x[i])
+        for j in range(columns_of(table)):
+            numbers, a = numbers_at(table, j, x[i], h[i], t[i]), h[i] * drift_at(table, j, x[i])
             q, p, q_error, p_error = called_stage(q, p, q_error, p_error, numbers, a, j, work)
         pack(q, p, out[i])
 
@@ -177,7 +181,7 @@ def map_each(table, steps, y, out):
         q, p = unpack(y[i])
         k = steps[i % len(steps)]
         q_error, p_error = no_error(q), no_error(p)
-        for j in range(table.shape[1]):
+        for j in range(columns_of(table)):
             q, p, q_error, p_error = called_stage(
                 q, p, q_error, p_error, numbers_of(table, j, k), drift_of(table, j), j, work
             )

@@ -6,6 +6,7 @@ instead of states. A step is a list of maps, a code and a row of coefficients ea
 [opening, inner …, link, closing]: a step is the link (the first step, the opening) and the inner maps, so that
 consecutive steps share their common map; an output is the closing map applied to a copy. A run may be cut: it then
 begins after `first` steps from the `running` modes that it left there; where nobody asks for them, `running` is empty.
+A map of a part that depends on t reads the time of its row in step k, counted from the run's beginning.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -19,28 +20,28 @@ VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
 
 
 @njit(**OPTIONS, forceinline=True)  # called, it would take and give its states in memory
-def one_step(x, y, codes, table, first, link):
-    x, y = apply_map(x, y, codes[first], table, first)
+def one_step(x, y, codes, table, first, link, k):
+    x, y = apply_map(x, y, codes[first], table, first, k)
     for j in range(1, link):
-        x, y = apply_map(x, y, codes[j], table, j)
+        x, y = apply_map(x, y, codes[j], table, j, k)
     return x, y
 
 
 @njit(**OPTIONS, forceinline=True)
-def closed(x, y, codes, table, in_modes):
-    """The end of a step, from the running state before its last map."""
-    x, y = apply_map(x, y, codes[len(codes) - 1], table, len(codes) - 1)
+def closed(x, y, codes, table, in_modes, k):
+    """The end of step k, from the running state before its last map."""
+    x, y = apply_map(x, y, codes[len(codes) - 1], table, len(codes) - 1, k)
     return (x, y) if in_modes else from_modes(x, y)
 
 
 @njit(**OPTIONS)
-def first_non_finite(x, y, codes, table, first, n_steps, in_modes):
-    """The first of `n_steps` steps from a running state whose end is not finite; `n_steps` if none is."""
+def first_non_finite(x, y, codes, table, first, n_steps, in_modes, k):
+    """The first of `n_steps` steps, from step k on, whose end is not finite; `n_steps` if none is."""
     link = len(codes) - 2
     for n in range(1, n_steps):
-        x, y = one_step(x, y, codes, table, first, link)
+        x, y = one_step(x, y, codes, table, first, link, k + n - 1)
         first = link
-        end_x, end_y = closed(x, y, codes, table, in_modes)
+        end_x, end_y = closed(x, y, codes, table, in_modes, k + n - 1)
         if not is_finite(end_x, end_y):
             return n
     return n_steps
@@ -68,14 +69,14 @@ def rollout(codes, table, y0, in_modes, n_steps, save, out, stop, first, running
         if saved < len(save):
             block = min(block, save[saved] - n)
         start_x, start_y, start = x, y, begin
-        for _ in range(block):
-            x, y = one_step(x, y, codes, table, begin, link)
+        for k in range(n, n + block):
+            x, y = one_step(x, y, codes, table, begin, link, k)
             begin = link
-        end_x, end_y = closed(x, y, codes, table, in_modes)
+        end_x, end_y = closed(x, y, codes, table, in_modes, n + block - 1)
         if not is_finite(end_x, end_y):
             out[saved:] = np.nan
             running[:] = np.nan
-            return n - 1 + first_non_finite(start_x, start_y, codes, table, start, block, in_modes)
+            return n - 1 + first_non_finite(start_x, start_y, codes, table, start, block, in_modes, n)
         n += block
         while saved < len(save) and save[saved] == n:
             pack(end_x, end_y, out[saved])
@@ -93,7 +94,7 @@ def step_each(codes, tables, z, in_modes, out):
         if not in_modes:
             x, y = to_modes(x, y)
         for j in range(len(codes)):
-            x, y = apply_map(x, y, codes[j], tables[i], j)
+            x, y = apply_map(x, y, codes[j], tables[i], j, 0)
         if not in_modes:
             x, y = from_modes(x, y)
         pack(x, y, out[i])
@@ -201,10 +202,10 @@ def rollout_lanes(codes, table, y0, in_modes, n_steps, save, out, n_finite, stop
             block = min(CHECK_EVERY, n_steps - n)
             if saved < len(save):
                 block = min(block, save[saved] - n)
-            for _ in range(block):
-                for k in range(link):
-                    j = j0 if k == 0 else k
-                    apply_map_lanes(Z, width, codes[j], table, j)
+            for k in range(n, n + block):
+                for i in range(link):
+                    j = j0 if i == 0 else i
+                    apply_map_lanes(Z, width, codes[j], table, j, k)
                 j0 = link
             next_saved = saved
             while next_saved < len(save) and save[next_saved] == n + block:
@@ -214,10 +215,10 @@ def rollout_lanes(codes, table, y0, in_modes, n_steps, save, out, n_finite, stop
                 if n_finite[i] < n_steps:
                     continue
                 x, y = unpack_lane(Z, lane)
-                x, y = closed(x, y, codes, table, in_modes)
+                x, y = closed(x, y, codes, table, in_modes, n + block - 1)
                 if not is_finite(x, y):
                     x, y = unpack_lane(start, lane)
-                    n_finite[i] = n - 1 + first_non_finite(x, y, codes, table, begin, block, in_modes)
+                    n_finite[i] = n - 1 + first_non_finite(x, y, codes, table, begin, block, in_modes, n)
                     n_alive -= 1
                     out[i, saved:] = np.nan
                 else:

@@ -13,29 +13,13 @@ Vectors are scaled by powers of two only, which rounds nothing: a run has the sa
 import math
 
 import numpy as np
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 
 POOL = 32  # tiles whose states lie in the second-level cache
 ORBIT = NDOF // (1 + VECTORS)  # degrees of freedom of the orbit
 ALIGNMENT, VOLUME = 1, 2  # kinds of spread
 EXPONENT_BITS, BIAS = 52, 1023
 LOG_2 = 0.6931471805599453
-
-
-@intrinsic
-def widest_vectors(typing_context):
-    """Let loops over lanes take vectors of 512 bits where there are some, of which LLVM prefers half by itself.
-
-    These loops keep the multipliers busy, which are twice as many then: they run in two thirds of the time.
-    """
-
-    def generate(context, builder, signature, arguments):
-        # `add` of the attributes knows those without a value only
-        set.add(builder.function.attributes, '"prefer-vector-width"="512"')
-        return context.get_dummy_value()
-
-    return types.void(), generate
 
 
 @njit(**OPTIONS)

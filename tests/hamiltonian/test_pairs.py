@@ -1,0 +1,169 @@
+"""Bodies that interact in pairs: forces, conservation laws, cells, and bad input."""
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import HamiltonianSystem, solve
+
+GRAVITY, LENNARD_JONES = "-G*m1*m2/r", "4*(1/r**12 - 1/r**6)"
+
+
+def gravity(n, seed=0, **more):
+    rng = np.random.default_rng(seed)
+    y0 = np.concatenate([rng.standard_normal(3 * n), 0.3 * rng.standard_normal(3 * n)])
+    scene = {"params": {"G": 1 / n}, "softening": 0.2, "y0": y0, "dt": 0.02, "t_span": (0, 1)}
+    return HamiltonianSystem.pairs(GRAVITY, masses=rng.uniform(1, 2, n), **scene | more)
+
+
+def fluid(n_side=6, cutoff=2.0, box=True, **more):
+    """Atoms near the places of a cubic lattice."""
+    rng = np.random.default_rng(1)
+    places = np.stack(np.meshgrid(*[np.arange(n_side)] * 3), -1).reshape(-1, 3) * 1.2
+    q = places + rng.uniform(-0.1, 0.1, places.shape)
+    y0 = np.concatenate([q.ravel(), rng.standard_normal(q.size) * 0.5])
+    length = 1.2 * n_side if box else None
+    masses = np.ones(len(q))
+    return HamiltonianSystem.pairs(LENNARD_JONES, masses=masses, cutoff=cutoff, box=length, y0=y0, dt=0.002, **more)
+
+
+def angular_momentum(sol, n):
+    q, p = sol.y.reshape(2, n, 3, -1)
+    return np.cross(q, p, axis=1).sum(0)
+
+
+class TestFunctions:
+    def test_of_three_bodies_are_those_of_symbols(self):
+        three = gravity(3, softening=None)
+        m, places = three.local.masses.tolist(), [[f"q{3 * i + k + 1}" for k in range(3)] for i in range(3)]
+        V = []
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            r = " + ".join(f"({a} - {b})**2" for a, b in zip(places[i], places[j], strict=True))
+            V.append(f"-{m[i] * m[j] / 3!r}/sqrt({r})")
+        T = " + ".join(f"p{i + 1}**2/{2 * m[i // 3]!r}" for i in range(9))
+        written = HamiltonianSystem.from_sympy(f"{T} + {' + '.join(V)}")
+        Y = np.random.default_rng(3).standard_normal((4, 18))
+        q, v = Y[:, :9], Y[::-1, :9]
+        np.testing.assert_allclose(three.hamiltonian(Y), written.hamiltonian(Y), rtol=1e-12)
+        np.testing.assert_allclose(three.force(q), written.force(q), rtol=1e-10)
+        np.testing.assert_allclose(three.hessian_vector(q, v), written.hessian_vector(q, v), rtol=1e-9)
+        np.testing.assert_allclose(three.energy_density(Y).sum(-1), three.hamiltonian(Y), rtol=1e-12)
+
+    @pytest.mark.parametrize("system", [gravity(5), fluid(3, 1.5)], ids=["gravity", "Lennard-Jones"])
+    def test_of_tensors_are_derivatives_of_each_other(self, system):
+        q = torch.tensor(system.y0[: system.ndof], requires_grad=True)
+        v = torch.randn(system.ndof, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        (slope,) = torch.autograd.grad(system.potential(q), q, create_graph=True)
+        (product,) = torch.autograd.grad(slope @ v, q, create_graph=True)
+        (bent,) = torch.autograd.grad(product @ v, q)
+        for mine, theirs in (
+            (-system.force(q), slope),
+            (system.hessian_vector(q, v), product),
+            (system.third_derivative(q, v, v), bent),
+        ):
+            torch.testing.assert_close(mine, theirs, rtol=1e-9, atol=1e-9 * float(theirs.detach().abs().max()))
+
+    def test_a_cut_off_is_smooth(self):
+        two = HamiltonianSystem.pairs(LENNARD_JONES, masses=[1.0, 1.0], dim=1, cutoff=2.5)
+        q = np.array([[0, 2.5 - 1e-6], [0, 2.5 + 1e-6], [0, 3.0]])
+        assert np.abs(two.potential(q)).max() < 1e-12
+        assert np.abs(two.force(q)).max() < 1e-6
+
+
+class TestRuns:
+    @pytest.mark.parametrize("method", ["verlet", pytest.param("chin4a", marks=pytest.mark.slow)])
+    @pytest.mark.parametrize("n", [4, 40], ids=["few", "blocks"])
+    def test_compiled_and_by_arrays_agree_and_conserve_momenta(self, n, method):
+        """The loops are the same code for 4 and for 40 bodies, which are met one by one and in blocks."""
+        system = gravity(n)
+        sol = solve(system, method)
+        assert sol.stats["backend"] == "compiled"
+        np.testing.assert_allclose(sol.y, solve(system, method, backend="array").y, rtol=0, atol=1e-12)
+        p = sol.y[3 * n :].reshape(n, 3, -1).sum(0)
+        L = angular_momentum(sol, n)
+        steps, eps = len(sol.t), np.finfo(float).eps
+        size = np.abs(sol.y).max() ** 2 * n
+        assert np.abs(p - p[:, :1]).max() < 8 * steps * eps * size
+        assert np.abs(L - L[:, :1]).max() < 32 * steps * eps * size
+
+    def test_a_batch_and_a_cut_run_are_the_same_bits(self):
+        system = gravity(4)
+        Y = system.y0 * np.array([[1.0], [1.1], [0.9]])
+        together = solve(system, "verlet", y0=Y)
+        for row, y0 in zip(together.y, Y, strict=True):
+            np.testing.assert_array_equal(row, solve(system, "verlet", y0=y0).y)
+        back = solve(system, "verlet", (1, 0), solve(system, "verlet").y[:, -1])
+        np.testing.assert_allclose(back.y[:, -1], system.y0, atol=1e-12)
+
+    @pytest.mark.parametrize("n_side", [4, 6], ids=["all pairs", "cells"])
+    def test_atoms_in_a_box(self, n_side):
+        system = fluid(n_side)
+        sol = solve(system, "verlet", (0, 0.02))
+        np.testing.assert_allclose(sol.y, solve(system, "verlet", (0, 0.02), backend="array").y, rtol=0, atol=1e-11)
+        assert np.ptp(sol.energy()) < 1e-3 * np.abs(sol.energy()).max()
+        moved = system.y0.copy()
+        moved[0] += 1.2 * n_side  # an image of the first atom
+        np.testing.assert_allclose(
+            system.force(moved[: system.ndof]), system.force(system.y0[: system.ndof]), atol=1e-9
+        )
+
+    @pytest.mark.slow
+    def test_open_space_with_a_cut_off(self):
+        """The code of a plane is another one; a drop far away makes cells of most of the plane empty."""
+        rng = np.random.default_rng(2)
+        q = np.concatenate([rng.uniform(0, 5, (60, 2)), rng.uniform(300, 303, (20, 2))])
+        y0 = np.concatenate([q.ravel(), np.zeros(160)])
+        bodies = {"c": rng.uniform(1, 2, 80)}
+        system = HamiltonianSystem.pairs(
+            "c1*c2*exp(-r)", masses=np.ones(80), bodies=bodies, dim=2, cutoff=1.5, y0=y0, dt=0.05
+        )
+        sol = solve(system, "verlet", (0, 0.5))
+        assert sol.stats["backend"] == "compiled"
+        np.testing.assert_allclose(sol.y, solve(system, "verlet", (0, 0.5), backend="array").y, rtol=0, atol=1e-11)
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"masses": [1.0, -1.0]}, r"^`masses` must be positive; that of body 1 is -1"),
+            ({"masses": [1.0, np.nan]}, "^`masses` must be finite; that of body 1"),
+            ({"masses": [1.0]}, "^`masses` must be those of two bodies or more"),
+            ({"masses": [[1.0, 1.0]]}, r"^`masses` must have shape \(n,\)"),
+            ({"masses": "heavy"}, r"^`masses` must be an array \(n,\)"),
+            ({"masses": np.broadcast_to(1.0, 10**13)}, "^`masses` has 1e\\+13 degrees of freedom"),
+            ({"dim": 4}, "^`dim` must be 1, 2 or 3"),
+            ({"box": 4.0, "cutoff": 2.1}, "^`cutoff` 2.1 is longer than half the box, 2:"),
+            ({"box": [1.0, 2.0]}, "^`box` must be a length, or 3 of them"),
+            ({"box": -1.0}, "^`box` must have positive"),
+            ({"cutoff": 0.0}, "^`cutoff` must be a positive, finite length"),
+            ({"softening": -1.0}, "^`softening` must be a positive, finite length"),
+            ({"params": {"G": 1.0, "k": 2.0}}, "^`params` has 'k', which the potential does not use"),
+            ({"params": {}}, "^`potential` cannot be parsed|^`potential` holds G"),
+            ({"params": {"G": [1.0, 2.0]}}, "^`params` has G = .* goes to `bodies`"),
+            ({"bodies": {"c": [1.0, 2.0]}}, "^`bodies` has 'c', and V uses neither c1 nor c2"),
+            ({"bodies": {"c": [1.0, 2.0, 3.0]}}, "^`bodies` has c of 3 values, and there are 2 `masses`"),
+            ({"potential": "G*m1/r"}, "^`potential` must be the same with the two bodies exchanged"),
+            ({"potential": "G*m1*m2"}, "^`potential` must depend on r"),
+            ({"potential": 3.0, "params": {}}, "^`potential` must depend on r"),
+            ({"y0": np.zeros(5)}, r"^`y0` must have shape \(12,\)"),
+        ],
+    )
+    def test_is_refused_at_once(self, change, message):
+        given = {"potential": GRAVITY, "masses": [1.0, 2.0], "params": {"G": 1.0}} | change
+        with pytest.raises((ValueError, TypeError), match=message):
+            HamiltonianSystem.pairs(**given)
+
+    def test_bodies_at_one_place_are_named(self):
+        system = gravity(4, softening=None, y0=None)
+        y0 = gravity(4).y0.copy()
+        y0[3:6] = y0[9:12]
+        sol = solve(system, "verlet", (0.5, 1), y0)
+        assert sol.status == -1
+        assert "At t = 0.5 the bodies 1 and 3 are at one place, r = 0: pass `softening`" in sol.message
+
+    def test_friction_runs_by_arrays(self):
+        system = gravity(4, damping=0.1)
+        assert solve(system, "verlet").stats["backend"] != "compiled"
+        with pytest.raises(ValueError, match=r"`system` 'pairs' cannot be compiled: it has friction\."):
+            solve(system, "verlet", backend="compiled")

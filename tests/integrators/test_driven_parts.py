@@ -1,0 +1,136 @@
+"""Driven systems in exactly solvable parts, exact linear flows and coupled copies: with which part the time moves."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import CubicSpline
+
+import sympflow
+from sympflow import HamiltonianSystem, get, solve
+from sympflow.kernels.protocol import Carry
+
+made = HamiltonianSystem.from_sympy
+SCENE = {"time": "t", "t_span": (0.3, 2.3), "dt": 0.05}
+COPIES = made("(p**2 + 1)*(q**2 + 1)/2*(1 + 0.3*cos(1.3*t)) + 0.2*q*sin(t)", y0=[0.7, 0.3], **SCENE)
+LINEAR = made(
+    "p1**2/2 + p2**2/2 + 8*q1**2 + q2**2/2 + q1*q2*cos(1.3*t) + q1**4/4*(1 + sin(t)) + q2**4/4",
+    y0=[0.3, 0.5, 0.2, -0.1],
+    **SCENE,
+)
+POLAR = made(
+    "p1**2/2*(1 + 0.2*sin(t)) + p2**2/(2*(1 + q1**2)) + q1**2/2 + q2**2/2*(1 + a)",
+    params={"a": CubicSpline(np.arange(6), [0.0, 0.5, 0.2, -0.3, 0.1, 0.4])},
+    y0=[0.3, 0.5, 0.2, -0.1],
+    **SCENE,
+)
+TERMS = ("q1**2/2 + q2**2/2*(1 + a)", "p2**2/(2*(1 + q1**2))", "p1**2/2*(1 + 0.2*sin(t))")
+CASES = [
+    (COPIES, "tao2", {}),
+    (COPIES, "tao4", {}),
+    (COPIES, "tao8", {}),
+    (LINEAR, "impulse", {}),
+    (LINEAR, "mollified_impulse", {}),
+    (LINEAR, "linear_srkn6b", {}),
+    (LINEAR, "linear_omelyan4", {}),
+    (POLAR, "strang_parts", {}),
+    (POLAR, "kahan_li6_parts", {}),
+    (POLAR, "kahan_li6_parts", {"parts": TERMS}),
+    (POLAR, "kahan_li6_parts", {"parts": TERMS[::-1]}),
+]
+
+
+@pytest.mark.parametrize(("system", "method", "options"), CASES)
+def test_every_splitting_keeps_its_order(system, method, options):
+    order = get(method).order
+    assert order is not None
+    end = system.t_span[1]
+    if system is POLAR:  # the third derivative of its spline jumps at t = 1 and 2
+        end = 0.95
+    truth = solve(system, "dop853", (0.3, end), t_eval=[end], rtol=1e-13, atol=1e-15).y
+    steps = (end - 0.3) / np.array([5, 10] if order > 4 else [20, 40])
+    errors = [
+        np.abs(solve(system, method, (0.3, end), dt=dt, t_eval=[end], backend="array", **options).y - truth).max()
+        for dt in steps
+    ]
+    assert np.log2(errors[0] / errors[1]) > order - 0.35
+
+
+@pytest.mark.parametrize(
+    ("system", "method"),
+    [(COPIES, "tao4"), pytest.param(LINEAR, "linear_omelyan4", marks=pytest.mark.slow), (POLAR, "kahan_li6_parts")],
+)
+def test_compiled_runs_are_those_of_arrays_and_tensors(system, method):
+    times = np.append(np.linspace(0.33, 1.9, 17), 2.0)
+    start = np.asarray(system.y0)
+    found = solve(system, method, (0.3, 2.0), t_eval=times)
+    assert found.stats["backend"] == "compiled"
+    batch = solve(system, method, (0.3, 2.0), np.stack([1.1 * start, start]), t_eval=times)
+    arrays = solve(system, method, (0.3, 2.0), t_eval=times, backend="array")
+    tensors = solve(system, method, (0.3, 2.0), torch.from_numpy(start.copy()), t_eval=times)
+    for other in (batch.y[1], arrays.y, tensors.y.numpy()):
+        assert np.abs(other - found.y).max() < 1e-13
+    event = solve(system, method, (0.3, 2.0), events=lambda t, y: y[0] - 0.2 * t, dense_output=True)
+    t = event.t_events[0][0]
+    assert abs(event.sol(t)[0] - 0.2 * t) < 1e-12
+    assert sympflow.symplecticity_defect(found).max() < 1e-13
+
+
+def test_a_run_that_is_cut_goes_on_at_its_time():
+    method = get("tao4")()
+    composition = method.composed(COPIES)
+    kernel, start = composition.kernel(False), composition.lift(np.stack([COPIES.y0, 1.1 * COPIES.y0]))
+    whole = kernel.run_batch(0.05, start, 9, np.array([4, 9]), t0=0.3).states
+    carry = Carry()
+    pieces = [kernel.run_batch(0.05, start, n, np.array([n]), carry=carry, t0=0.3).states for n in (4, 9)]
+    np.testing.assert_array_equal(np.concatenate(pieces, axis=1), whole)
+    one, carry = kernel.run(0.05, start[0], 9, np.array([4, 9]), t0=0.3).states, Carry()
+    pieces = [kernel.run(0.05, start[0], n, np.array([n]), carry=carry, t0=0.3).states for n in (4, 9)]
+    np.testing.assert_array_equal(np.concatenate(pieces), one)
+
+
+@pytest.mark.parametrize(("system", "method"), [(LINEAR, "linear_omelyan4"), (POLAR, "strang_parts")])
+def test_a_step_has_its_inverse_at_its_time(system, method):
+    integrator, t = get(method)(), np.array([0.4, 1.3])
+    y = np.stack([system.y0, 1.1 * np.asarray(system.y0)])
+    end = integrator.step(system, t, y, 0.1)
+    assert np.abs(end[1] - integrator.step(system, 1.3, y[1], 0.1)).max() < 1e-15
+    assert np.abs(integrator.inverse(system, t, end, 0.1) - y).max() < 1e-15
+
+
+def test_functions_of_the_time():
+    def H(t, q, p):
+        return (p[..., 0] ** 2 + 1) * (q[..., 0] ** 2 + 1) / 2 * (1 + 0.3 * torch.cos(1.3 * t)) + 0.2 * q[
+            ..., 0
+        ] * torch.sin(t)
+
+    def V(t, q):
+        return 8 * q[..., 0] ** 2 + q[..., 0] ** 4 / 4 * (1 + torch.sin(t))
+
+    scene = {"ndof": 1, "y0": [0.7, 0.3], **SCENE, "time": True}
+    given = HamiltonianSystem(hamiltonian=H, **scene)
+    omega, arrays = get("tao4")(omega=2.0), {"backend": "array"}
+    np.testing.assert_allclose(solve(given, omega).y, solve(COPIES, omega, **arrays).y, rtol=0, atol=1e-12)
+    stiff = HamiltonianSystem(V, stiffness_matrix=[[16.0]], **scene)
+    symbols = made("p**2/2 + 8*q**2 + q**4/4*(1 + sin(t))", y0=[0.7, 0.3], **SCENE)
+    np.testing.assert_allclose(solve(stiff, "impulse").y, solve(symbols, "impulse", **arrays).y, rtol=0, atol=1e-12)
+
+
+def test_the_energy_balance_is_that_of_the_steps():
+    runs = [solve(LINEAR, "linear_srkn6b", dt=dt, backend="array") for dt in (0.05, 0.025)]
+    errors = [sympflow.energy_balance_error(sol).max() for sol in runs]
+    assert errors[0] / errors[1] > 2**3.5
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda: solve(made("p**2/2 + q**2*cos(t)/2", time="t", y0=[1, 0]), "impulse"), "do not depend on t"),
+        (lambda: made("p**2*cos(t) + q**2/2", time="t").linear_part, "do not depend on t"),
+        (lambda: solve(POLAR, "strang_parts", parts=TERMS[1:]), "^`parts` do not add up"),
+        (lambda: solve(LINEAR, "log_kahan_li8"), "'log_kahan_li8' does not take the time"),
+        (lambda: sympflow.SympFlow.split(LINEAR), "is driven, H depends on t, which trained flows take only"),
+    ],
+)
+def test_what_does_not_apply_says_why(ask, message):
+    with pytest.raises(ValueError, match=message):
+        ask()
