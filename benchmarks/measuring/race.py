@@ -99,7 +99,7 @@ def schemes(system: HamiltonianSystem) -> list[Runner]:
 class Measure:
     """An error over [0, t_end], the median over held-out states: of the energy, or of the state at the end.
 
-    The energy error of a driven system is that of the balance, E + H, over the system's energy scale or the largest |H|.
+    The energy error of a driven system is that of the balance, E + H, over its energy scale or the largest |H|.
     """
 
     system: HamiltonianSystem
@@ -120,7 +120,8 @@ class Measure:
         save = np.unique(np.linspace(0, n, INSTANTS + 1).round().astype(np.int64))
         with np.errstate(all="ignore"):  # too few steps overflow
             if self.name == "energy" and runner.balanced is not None:
-                return self._of_balance(runner.balanced(self.t_end / n, self._extended_y0, n, save)[0], self.t_end / n * save)
+                h = self.t_end / n
+                return self._of_balance(runner.balanced(h, self._extended_y0, n, save)[0], h * save)
             Y = runner.many(self.t_end / n, self.y0, n, save if self.name == "energy" else np.array([0, n]))[0]
             return self.of_states(Y)
 

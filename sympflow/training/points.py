@@ -231,7 +231,8 @@ class Labels:
             y, reached = [states[exists] for states in (*y, after)], time
             t0 = None if t0 is None else t0[exists]
         ends = np.stack(y[1:])
-        return cls(np.asarray(t), y[0][:, :width], ends[..., :width], t0, ends[..., width] if field is not system else None)
+        work = None if field is system else ends[..., width]
+        return cls(np.asarray(t), y[0][:, :width], ends[..., :width], t0, work)
 
     @classmethod
     def needed(

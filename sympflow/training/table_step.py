@@ -472,9 +472,7 @@ def _functions_in_time(system: HamiltonianSystem) -> tuple[Callable[[np.ndarray]
         by_time = (behind - 8 * ahead) / (12 * short)
         twice = (rate(q, t + short) - rate(q, t - short)) / (2 * short)
         of_rate = (by_time * v[..., :d]).sum(-1) + twice * v[..., d]
-        return np.concatenate(
-            [change + by_time * v[..., d : d + 1], 0 * t[..., None], of_rate[..., None]], axis=-1
-        )
+        return np.concatenate([change + by_time * v[..., d : d + 1], 0 * t[..., None], of_rate[..., None]], axis=-1)
 
     return slopes, product
 
