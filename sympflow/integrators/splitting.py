@@ -355,11 +355,14 @@ class Splitting(OwnStepper):
         for times, states, lengths in in_blocks(super().steps(system, t_span, composition.lift(y0))):
             yield differentiated(jacobian, times, states, lengths, system)
 
+    @property
+    def runs_on_cuda(self) -> bool:
+        return self.kicks_and_drifts is not None
+
     def own_stepper(self, problem: Problem) -> Stepper:
         composition = self.composed(problem.system)
-        kernel = compiled_loops(
-            lambda: composition.kernel(bool(self.compensated)), problem.y0, problem.backend, self.compensated
-        )
+        make = composition.cuda_kernel if problem.backend == "cuda" else composition.kernel
+        kernel = compiled_loops(lambda: make(bool(self.compensated)), problem.y0, problem.backend, self.compensated)
         if kernel is None:
             return ArrayComposition(self, problem, composition)
         if problem.letters is not None:

@@ -27,9 +27,19 @@ __all__ = [
     "statements",
     "tuple_algebra",
     "variations_source",
+    "vectorised",
 ]
 
 _MAX_POWER = 16  # integer powers up to this are written as products
+
+
+class fast_exp(sp.Function):  # as the compiled function of the text `elementary`
+    """exp as arithmetic, in loops that are to become vector instructions."""
+
+
+def vectorised(expressions: Sequence[sp.Expr]) -> list[sp.Expr]:
+    """Expressions for loops over sites, whose exponentials are arithmetic too."""
+    return [f.replace(sp.exp, fast_exp) for f in expressions]
 
 
 class _KernelPrinter(PythonCodePrinter):
@@ -55,6 +65,9 @@ class _KernelPrinter(PythonCodePrinter):
 
     def _print_tanh(self, expr: sp.tanh) -> str:
         return f"fast_tanh({self._print(expr.args[0])})"
+
+    def _print_fast_exp(self, expr: fast_exp) -> str:
+        return f"fast_exp({self._print(expr.args[0])})"
 
     def _print_sampled(self, expr: sampled) -> str:
         return f"{sampled_name(expr.name_of_samples, expr.order)}({self._print(expr.at)})"

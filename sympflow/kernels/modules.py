@@ -35,6 +35,7 @@ __all__ = [
     "run_one",
     "run_rows",
     "template",
+    "threads_for",
 ]
 
 T = TypeVar("T")
@@ -190,17 +191,22 @@ def run_one(call: Callable[[np.ndarray], T], work: int) -> T:
     return _run_in_threads([call])[0]
 
 
+def threads_for(n_pieces: int, work: int, threads: int | None) -> int:
+    """The number of threads for so many pieces and nanoseconds of work: that given, or as many as pay."""
+    threads = _most_threads.get() if threads is None else threads
+    if threads is None:
+        threads = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+        threads = min(threads, 1 + work // _WORTH_A_THREAD)
+    return max(1, min(threads, n_pieces))
+
+
 def run_rows(rows: Callable[[slice, np.ndarray], None], n_rows: int, work_per_row: int, threads: int | None) -> None:
     """Call ``rows(slice, stop)`` over 0 … n_rows, on several threads if the work is worth it.
 
     `rows` releases the GIL; for `stop` see `run_one`.
     """
     n_blocks = -(-n_rows // _BLOCK)
-    threads = _most_threads.get() if threads is None else threads
-    if threads is None:
-        threads = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
-        threads = min(threads, 1 + n_rows * work_per_row // _WORTH_A_THREAD)
-    threads = max(1, min(threads, n_blocks))
+    threads = threads_for(n_blocks, n_rows * work_per_row, threads)
     if threads == 1:
         run_one(partial(rows, slice(0, n_rows)), n_rows * work_per_row)
         return

@@ -121,9 +121,12 @@ class Kernel(Protocol):
     ----------
     saves_finite : bool
         True if all states that a run saves up to its last finite step are finite numbers.
+    backend : str
+        The name of what runs, of `stats["backend"]`.
     """
 
     saves_finite: bool
+    backend: str = "compiled"
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` steps from one state.

@@ -113,11 +113,14 @@ class SplittingLoops:
                 _array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, self.driven, damped
             )
         elif system.local is not None:
-            if system.local.loops != "pairs" or self.friction is not None:
-                what = "friction" if self.friction is not None else "no compiled loops"
-                raise ValueError(f"`system` {system.name!r} cannot be compiled: it has {what}. Use backend='array'.")
+            make, takes_rate = _LOCAL[system.local.loops]
+            if system.damping is not None and (system.damping.ndim or not takes_rate):
+                has = "one rate of friction for all momenta" if takes_rate else "no friction"
+                raise ValueError(
+                    f"`system` {system.name!r} has friction, and its loops take {has}: use backend='array'."
+                )
             self._has_force_gradient = system.quadratic_kinetic
-            self._compile = partial(_local_loops, system)
+            self._compile = partial(make, system)
         else:
             raise ValueError(
                 "`system` cannot be compiled: it is given by plain functions. Define it with "
@@ -461,7 +464,6 @@ def symbolic_module(
 
     In `varied` ones each lane has its own values of the parameters.
     """
-    from sympflow.kernels.codegen import curvature_kick_source, gradient_kick_source, polynomial_kick_source
     from sympflow.kernels.kicks import kicks_source
 
     kinds, scheduled = kicks_of(level, len(monomials)), not compensated
@@ -470,17 +472,23 @@ def symbolic_module(
     sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
     if scheduled:
         sources.append(kicks_source(symbols, level, monomials, varied=varied))
-    elif level == POLYNOMIAL:
-        sources.append(polynomial_kick_source(symbols, monomials))
-    elif level:
-        sources.append(gradient_kick_source(symbols))
-    if compensated and level == CURVATURE:
-        sources.append(curvature_kick_source(symbols))
+    else:
+        sources += plain_kicks_source(symbols, level, monomials)
     algebra = "\n\n\n".join(sources)
     before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
     n_values = n if varied else 0
     header = _header(compensated, cache=True, scheduled=scheduled, n_values=n_values, driven=driving is not None)
     return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
+
+
+def plain_kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> list[str]:
+    """The kicks of a level, beside that of the algebra, where they are not scheduled."""
+    from sympflow.kernels.codegen import curvature_kick_source, gradient_kick_source, polynomial_kick_source
+
+    if level == POLYNOMIAL:
+        return [polynomial_kick_source(symbols, monomials)]
+    sources = [gradient_kick_source(symbols)] if level else []
+    return [*sources, curvature_kick_source(symbols)] if level == CURVATURE else sources
 
 
 def _family_loops(
@@ -549,7 +557,7 @@ def apply_inverse_mass(v, out, work):
 """A table is (stages, numbers of the system, M⁻¹)."""
 
 
-def _local_loops(
+def _pair_loops(
     system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials, varied: bool = False
 ) -> LoopFunctions:
     """The loops of a system that is given by one piece, of any size: their code depends on the piece alone."""
@@ -632,3 +640,21 @@ def _array_loops(
     texts = map(template, ("array_states", "loops"))
     exec("\n\n\n".join([header, mass, given, stages, *texts]), functions)
     return _array_functions(functions)
+
+
+def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
+    """The loops of a lattice, of which only the structure, and not the size, is part of the code."""
+    from sympflow.hamiltonian.lattice import LatticeHamiltonian
+    from sympflow.kernels.lattice_loops import LatticeLoops
+
+    assert isinstance(system.local, LatticeHamiltonian)
+    loops = LatticeLoops(system.local, level, compensated, system.friction is not None)
+    processed = loops.rollout_processed, loops.rollout_processed_batch
+    return LoopFunctions(loops.rollout, loops.rollout_batch, *processed, loops.step_rows)
+
+
+_LOCAL: dict[str, tuple[Callable[..., LoopFunctions], bool]] = {
+    "lattice": (_lattice_loops, True),
+    "pairs": (_pair_loops, False),
+}
+"""Makers of the loops of systems that are given by one piece, and whether these take friction −γp."""

@@ -1,0 +1,769 @@
+"""Compiled loops of splitting schemes on lattices of any size: passes over sites, generated from one site and one bond.
+
+Their code does not depend on the size: shapes, and the values of parameters, are arguments.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from itertools import pairwise
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from sympflow.hamiltonian.lattice import LatticeHamiltonian
+from sympflow.kernels.codegen import statements, vectorised
+from sympflow.kernels.modules import NEVER, load_algebra, threads_for
+from sympflow.kernels.protocol import NOTHING
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
+
+__all__ = ["LatticeLoops"]
+
+TILE = 4096
+"""Sites of a tile of a lattice of one axis, whose vectors fit into the cache of a core."""
+LARGER_TILE = 16384
+"""Sites of a tile of other lattices."""
+MARGIN = 32
+"""A tile has so many times as many planes as one of its margins, so that little is computed twice."""
+FEWEST_TILES = 8
+"""Lattices of fewer tiles are executed in one piece."""
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """A pass over sites: the slopes of a potential, and what is done with them.
+
+    Attributes
+    ----------
+    vectors : tuple of str
+        The vectors of which differences along bonds are taken, of q, v and w.
+    slopes : callable
+        Of a potential and its letters, to one expression for each field.
+    keeps : int or None
+        The helper into which M⁻¹ times the slopes go.
+    """
+
+    vectors: tuple[str, ...]
+    slopes: Callable[[sp.Expr, Sequence[sp.Symbol], LatticeHamiltonian], list[sp.Expr]]
+    keeps: int | None = None
+
+
+def _slopes(f: sp.Expr, x: Sequence[sp.Symbol], lattice: LatticeHamiltonian) -> list[sp.Expr]:
+    return [sp.diff(f, s) for s in x]
+
+
+def _along(f: sp.Expr, x: Sequence[sp.Symbol], v: Sequence[sp.Symbol]) -> sp.Expr:
+    return sp.Add(*[s * sp.diff(f, z) for z, s in zip(x, v, strict=True)])
+
+
+def _product(f: sp.Expr, x: Sequence[sp.Symbol], lattice: LatticeHamiltonian) -> list[sp.Expr]:
+    return _slopes(_along(f, x, lattice.v), x, lattice)
+
+
+def _bent(f: sp.Expr, x: Sequence[sp.Symbol], lattice: LatticeHamiltonian) -> list[sp.Expr]:
+    """∇²V w + ½ ∇³V(v, v)."""
+    twice = _along(_along(f, x, lattice.v), x, lattice.v) / 2
+    return _slopes(_along(f, x, lattice.w) + twice, x, lattice)
+
+
+KICK = _Pass(("q",), _slopes)
+ACCELERATION = _Pass(("q",), _slopes, 0)
+PRODUCT = _Pass(("q", "v"), _product)
+TURN = _Pass(("q", "v"), _product, 1)
+BEND = _Pass(("q", "v", "w"), _bent)
+_LETTERS = {"q": "x", "v": "v", "w": "w"}
+_ARRAYS = {"q": "X[0]", "v": "A[0]", "w": "A[1]"}
+
+
+class LatticeLoops:
+    """The functions that `SplittingLoops` asks for, of one lattice and one kind of kicks.
+
+    Parameters
+    ----------
+    lattice : LatticeHamiltonian
+    level : int
+        See `Scheme`.
+    compensated : bool
+    rate : bool
+        True if there is friction −γp, whose numbers are the last two rows of a table.
+    """
+
+    def __init__(self, lattice: LatticeHamiltonian, level: int, compensated: bool, rate: bool) -> None:
+        if level == POLYNOMIAL:
+            raise ValueError(
+                "`scheme` has polynomials, which are of systems by their coordinates one by one: use backend='array'."
+            )
+        self._lattice, self._level, self._compensated = lattice, level, compensated
+        self._module = _module(_definition(lattice), level, compensated, rate)
+        self._reach = max(lattice.bonds, default=0)
+        self._values = np.array([v for v in lattice.params.values() if not isinstance(v, np.ndarray)], dtype=float)
+        planes = lattice.shape[0]
+        plane = math.prod(lattice.shape[1:])
+        of_a_stage = self._reach * {0: 1, FORCE_GRADIENT: 2, CURVATURE: 3}[level]
+        tile = max((TILE if len(lattice.shape) == 1 else LARGER_TILE) // plane, 8 * of_a_stage)
+        self._tiled = of_a_stage > 0 and planes >= FEWEST_TILES * tile
+        self._planes, self._n_tiles = tile, -(-planes // tile)
+        self._of_a_stage = of_a_stage
+        self._margin = max(of_a_stage, tile // MARGIN) if self._tiled else self._reach
+        self._padded = (planes + 2 * self._margin, *(n + 2 * self._reach for n in lattice.shape[1:]))
+        self._size = math.prod(self._padded)
+        last, row = lattice.shape[-1], self._padded[-1]
+        self._geometry = np.array(
+            [last, self._size // self._padded[0], row, self._padded_rows(), self._margin, planes], dtype=np.int64
+        )
+        self._sites = self._padded_parameters()
+
+    def _padded_rows(self) -> int:
+        return self._lattice.shape[1] if len(self._lattice.shape) == 3 else 1
+
+    def _padded_parameters(self) -> np.ndarray:
+        """The values of parameters of sites, with ghosts: at walls those of the first and last site."""
+        arrays = [v for v in self._lattice.params.values() if isinstance(v, np.ndarray)]
+        found = np.zeros((len(arrays), self._size))
+        for row, values in zip(found, arrays, strict=True):
+            padded = values
+            for axis, boundary in enumerate(self._lattice.boundary):
+                widths = [(0, 0)] * values.ndim
+                widths[axis] = (self._margin if axis == 0 else self._reach,) * 2
+                padded = np.pad(padded, widths, mode="wrap" if boundary == "periodic" else "edge")
+            row[:] = padded.ravel()
+        return found
+
+    # the functions of `SplittingLoops` ----------------------------------------------------------------------------
+
+    def rollout(
+        self,
+        table: np.ndarray,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        out: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        running: np.ndarray,
+        threads: int | None = None,
+    ) -> int:
+        """The steps of one state: see the text `loops`; of a lattice in tiles on several threads where that pays."""
+        if not self._tiled:
+            return self._module.rollout(table, y0, n_steps, save, out, stop, first, running, False, *self._arguments)
+        work = table.shape[1] * self._lattice.ndof * (n_steps - first)
+        with _Team(threads_for(self._n_tiles, work, threads)) as team:
+            return self._tiled_rollout(team, table, y0, n_steps, save, out, stop, first, running)
+
+    def rollout_batch(
+        self,
+        table: np.ndarray,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        out: np.ndarray,
+        n_finite: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        running: np.ndarray,
+    ) -> None:
+        """The same of every row of `y0` (N, 2d), each in one thread."""
+        for i in range(len(y0)):
+            own = running[i] if len(running) else NOTHING[0]
+            n_finite[i] = self.rollout(table, y0[i], n_steps, save, out[i], stop, first, own, 1)
+
+    def rollout_processed(
+        self,
+        before: np.ndarray,
+        run: np.ndarray,
+        after: np.ndarray,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        out: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        running: np.ndarray,
+        threads: int | None = None,
+    ) -> int:
+        """`rollout` in other coordinates, `before` into them and `after` out of them."""
+        start = np.zeros((1, len(y0)))
+        if first == 0:
+            self._map([before], y0[None], start)
+        n_finite = self.rollout(run, start[0], n_steps, save, out, stop, first, running, threads)
+        at_start = int(np.searchsorted(save, 0, "right"))
+        self._map([after] * (len(out) - at_start), out[at_start:], out[at_start:])
+        out[:at_start] = y0
+        finite = np.isfinite(out).all(-1) | (save > n_finite)
+        if finite.all():
+            return n_finite
+        row = int(np.argmin(finite))
+        out[row:] = math.nan
+        return int(save[row]) - 1
+
+    def rollout_processed_batch(
+        self,
+        before: np.ndarray,
+        run: np.ndarray,
+        after: np.ndarray,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        out: np.ndarray,
+        n_finite: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        running: np.ndarray,
+    ) -> None:
+        """The same of every row of `y0` (N, 2d)."""
+        tables = before, run, after
+        for i in range(len(y0)):
+            own = running[i] if len(running) else NOTHING[0]
+            n_finite[i] = self.rollout_processed(*tables, y0[i], n_steps, save, out[i], stop, first, own, 1)
+
+    def step_rows(
+        self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
+    ) -> None:
+        """One step of length ``h[i]`` from every row of `y` (N, 2d): see the text `loops`."""
+        numbers = np.zeros((*table.shape[:2], len(h)))
+        for k in range(table.shape[2] - 1, -1, -1):
+            numbers = numbers * x + table[:, :, k, None]
+        powers = np.array([1, 1, 3, 5])[: len(table)]
+        tables = np.ascontiguousarray((numbers * h ** powers[:, None, None]).transpose(2, 0, 1))
+        self._map(list(tables), y, out)
+
+    def _map(self, tables: Sequence[np.ndarray], y: np.ndarray, out: np.ndarray) -> None:
+        """The map of the columns of each table, of each row of `y`."""
+        nothing, none = np.empty(0, dtype=np.int64), NOTHING[0]
+        for i, (table, row) in enumerate(zip(tables, np.ascontiguousarray(y), strict=True)):
+            if not self._tiled:
+                to = out[i : i + 1]
+                self._module.rollout(table, row, 0, nothing, to, NEVER, 0, none, True, *self._arguments)
+                continue
+            with _Team(threads_for(self._n_tiles, table.size * len(row), None)) as team:
+                states = self._states(), self._states()
+                self._load(row, states[0], 0)
+                found, _ = self._advanced(team, states, table, 0, table.shape[1], True)
+                self._pack(found[0], 0, out[i])
+
+    @property
+    def _shared(self) -> tuple[Any, ...]:
+        return self._geometry, self._sites, self._values
+
+    @property
+    def _arguments(self) -> tuple[Any, ...]:
+        return self._geometry, self._size, self._sites, self._values
+
+    # lattices in tiles ----------------------------------------------------------------------------------------------
+
+    def _tiled_rollout(
+        self,
+        team: _Team,
+        table: np.ndarray,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        out: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        running: np.ndarray,
+    ) -> int:
+        link, width = table.shape[1] - 2, len(y0)
+        states = self._states(), self._states()
+
+        def opened() -> int:
+            """Load the running state after `first` steps; the column that comes next."""
+            states[0][2:] = 0.0
+            self._load(running[:width] if first else y0, states[0], 0)
+            if first and self._compensated:
+                self._load(running[width:], states[0], 2)
+            return link if first else 0
+
+        def closed() -> np.ndarray:
+            """The end of the present step, beside the running state."""
+            return self._advanced(team, states, table, link + 1, 1, False)[0][0]
+
+        n, j = first, opened()
+        saved = int(np.searchsorted(save, 0, "right"))
+        out[:saved] = y0
+        while n < n_steps and not stop[0]:
+            block = min(BLOCK, n_steps - n, *([int(save[saved]) - n] if saved < len(save) else []))
+            states, j = self._advanced(team, states, table, j, block * link, False)
+            end = closed()
+            if not _finite(end):
+                out[saved:] = math.nan
+                states, j = self._advanced(team, states, table, opened(), (n - first) * link, False)
+                for _ in range(block - 1):
+                    states, j = self._advanced(team, states, table, j, link, False)
+                    if not _finite(closed()):
+                        break
+                    n += 1
+                running[:] = math.nan
+                return n
+            n += block
+            while saved < len(save) and save[saved] == n:
+                self._pack(end, 0, out[saved])
+                saved += 1
+        if len(running):
+            self._pack(states[0], 0, running[:width])
+            if self._compensated:
+                self._pack(states[0], 2, running[width:])
+        return n_steps
+
+    def _advanced(
+        self, team: _Team, states: tuple[np.ndarray, np.ndarray], table: np.ndarray, j: int, count: int, single: bool
+    ) -> tuple[tuple[np.ndarray, np.ndarray], int]:
+        """The states after `count` stages from column j on, the first of them the present one; and the column after.
+
+        Of a run, or of a `single` map.
+        """
+        here, there = states
+        module, tiles = self._module, self._n_tiles
+        link, at_once = table.shape[1] - 2, self._margin // self._of_a_stage
+        while count:
+            n = min(count, at_once)
+            module.wrap_ends(here, self._geometry)
+            sweep = partial(module.sweep, here, there, table, j, n, single, self._planes)
+            team(lambda lo, hi, sweep=sweep: sweep(lo, hi, *self._shared), tiles)  # type: ignore[misc]
+            here, there, count = there, here, count - n
+            j = j + n if single else (j - 1 + n) % link + 1
+        return (here, there), j
+
+    def _states(self) -> np.ndarray:
+        return np.zeros((4 if self._compensated else 2, len(self._lattice.fields), self._size))
+
+    def _inner(self, X: np.ndarray, first: int) -> np.ndarray:
+        """A view of two sets without ghosts."""
+        n, shape = len(self._lattice.fields), self._lattice.shape
+        margins = (self._margin, *(self._reach,) * (len(shape) - 1))
+        inside = tuple(slice(m, m + k) for m, k in zip(margins, shape, strict=True))
+        return X[first : first + 2].reshape(2, n, *self._padded)[(slice(None), slice(None), *inside)]
+
+    def _load(self, y: np.ndarray, X: np.ndarray, first: int) -> None:
+        inner = self._inner(X, first)
+        inner[...] = y.reshape(inner.shape)
+
+    def _pack(self, X: np.ndarray, first: int, y: np.ndarray) -> None:
+        inner = self._inner(X, first)
+        y.reshape(inner.shape)[...] = inner
+
+
+BLOCK = 64
+"""Steps between two looks for a non-finite state, of a lattice in tiles."""
+
+
+def _finite(X: np.ndarray) -> bool:
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(X[:2].sum()) or np.isfinite(X[:2]).all())
+
+
+class _Team:
+    """Threads that share the tiles of a lattice, each the same ones in every sweep."""
+
+    def __init__(self, threads: int) -> None:
+        self._threads = threads
+        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+
+    def __enter__(self) -> _Team:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    def __call__(self, tiles: Callable[[int, int], None], n: int) -> None:
+        """``tiles(first, last)`` over 0 … n."""
+        if self._pool is None:
+            tiles(0, n)
+            return
+        bounds = [n * k // self._threads for k in range(self._threads + 1)]
+        others = [self._pool.submit(tiles, *ends) for ends in pairwise(bounds[1:])]
+        tiles(bounds[0], bounds[1])
+        for other in others:
+            other.result()
+
+
+# code -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Code:
+    """What the code of a lattice depends on."""
+
+    lattice: LatticeHamiltonian
+    key: tuple[Any, ...]
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Code) and self.key == other.key
+
+
+def _definition(lattice: LatticeHamiltonian) -> _Code:
+    bonds = tuple((k, lattice.bonds[k]) for k in sorted(lattice.bonds))
+    arrays = tuple(isinstance(value, np.ndarray) for value in lattice.params.values())
+    return _Code(lattice, (lattice.U, lattice.T, bonds, lattice.boundary, len(lattice.fields), arrays))
+
+
+@lru_cache(maxsize=64)
+def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleType:
+    lattice = code.lattice
+    return load_algebra(
+        "import numpy as np\n\n\n" + _stages_source(lattice, level, compensated, rate),
+        ("lattice",),
+        N_AXES=len(lattice.shape),
+        N_FIELDS=len(lattice.fields),
+        N_SETS=4 if compensated else 2,
+        N_HELPERS={0: 0, FORCE_GRADIENT: 1, CURVATURE: 2}[level],
+        N_BONDS=sum(k > 1 for k in lattice.bonds) * len(lattice.fields),
+        REACH=max(lattice.bonds, default=0),
+        PERIODIC=tuple(b == "periodic" for b in lattice.boundary),
+        COMPENSATED=compensated,
+    )
+
+
+class _Row:
+    """The places in vectors where the rows begin that a loop reads, each computed once.
+
+    They are unsigned: of an index that may be negative no loop of vector instructions is made.
+    """
+
+    def __init__(self, lattice: LatticeHamiltonian) -> None:
+        self.lines: list[str] = []
+        self._names: dict[str, str] = {}
+        self.arrays = [name for name, value in lattice.params.items() if isinstance(value, np.ndarray)]
+        self._letters = dict(zip(lattice.params, lattice.c, strict=True))
+
+    def at(self, array: str, start: str) -> str:
+        """Element j of a row of an array, such as "X[0, 1]", that begins at `start`."""
+        if start not in self._names:
+            self._names[start] = f"place_{len(self._names)}"
+            self.lines.append(f"{self._names[start]} = np.uint64({start})")
+        return f"{array[:-1]}, {self._names[start]} + j]"
+
+    def parameters(self, f: Sequence[sp.Expr], start: str) -> dict[sp.Symbol, str]:
+        """The elements that hold parameters of sites, for expressions at a place."""
+        used = set().union(*(each.free_symbols for each in f))
+        return {
+            self._letters[name]: self.at(f"sites[{i}]", f"offset + {start}")
+            for i, name in enumerate(self.arrays)
+            if self._letters[name] in used
+        }
+
+
+def _value_lines(lattice: LatticeHamiltonian) -> list[str]:
+    scalars = [s for s, v in zip(lattice.c, lattice.params.values(), strict=True) if not isinstance(v, np.ndarray)]
+    return [f"{s} = values[{i}]" for i, s in enumerate(scalars)]
+
+
+def _rows_source(lattice: LatticeHamiltonian, body: Sequence[str]) -> list[str]:
+    """A loop over rows: their first sites `s`, their lengths `n`, and the ends of the lattice along them."""
+    if len(lattice.shape) == 1:
+        return ["s, n, first, last = low, high - low, begin, end", *body]
+    reach = max(lattice.bonds, default=0)
+    row = [f"s = i * geometry[1] + {reach}", "n = geometry[0]", "first, last = s, s + n"]
+    if len(lattice.shape) == 2:
+        return ["for i in range(low, high):", *_indented([*row, *body])]
+    row[0] = f"s = i * geometry[1] + (k + {reach}) * geometry[2] + {reach}"
+    return ["for i in range(low, high):", "    for k in range(geometry[3]):", *_indented(_indented([*row, *body]))]
+
+
+def _indented(lines: Sequence[str]) -> list[str]:
+    return [f"    {line}" for line in lines]
+
+
+def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> list[str]:
+    """p −= b × the slopes of the sites of planes low … high; M⁻¹ × these are kept for the next pass.
+
+    The drift is a pass of its own: made in the same one, it keeps compilers from vector instructions.
+    """
+    body: list[str] = []
+    n_fields, fields = len(lattice.fields), range(len(lattice.fields))
+    places: dict[tuple[int, int], int] = {}
+    for k, V in lattice.bonds.items():
+        if k > 1:
+            body += _fluxes(lattice, kind, k, V, places)
+    row = _Row(lattice)
+    known: set[sp.Symbol] = set()
+    lines: list[str] = []
+    slopes: list[sp.Expr] = [sp.S.Zero] * n_fields
+
+    def read(symbol: sp.Symbol, element: str) -> sp.Symbol:
+        if symbol not in known:
+            known.add(symbol)
+            lines.append(f"{symbol} = {element}")
+        return symbol
+
+    if lattice.U != 0:
+        own = kind.slopes(lattice.U, lattice.x, lattice)
+        used = set().union(*(f.free_symbols for f in own))
+        for vector in kind.vectors:
+            for f, s in enumerate(getattr(lattice, _LETTERS[vector])):
+                if s in used:
+                    read(s, row.at(_field(vector, f), "s"))
+        for s, element in row.parameters(own, "s").items():
+            read(s, element)
+        slopes = [a + b for a, b in zip(slopes, own, strict=True)]
+    for (k, f), place in places.items():
+        forward = read(sp.Symbol(f"forward_{place}", real=True), row.at(f"T[{place}]", str(k)))
+        backward = read(sp.Symbol(f"backward_{place}", real=True), row.at(f"T[{place}]", "0"))
+        slopes[f] += backward - forward
+    for axis in range(len(lattice.shape) - 1):
+        for k, V in lattice.bonds.items():
+            more = _across(lattice, kind, axis, k, V, row, read, body)
+            slopes = [a + b for a, b in zip(slopes, more, strict=True)]
+    nearest = _Nearest.of(lattice, kind, row)
+    for f in nearest.fields:
+        slopes[f] += sp.Symbol(f"behind_{f}", real=True) - sp.Symbol(f"ahead_{f}", real=True)
+    lines += statements([f"g_{f}" for f in fields], vectorised(slopes))
+    lines += [f"behind_{f} = ahead_{f}" for f in nearest.fields]
+    momenta = [row.at(f"X[1, {f}]", "s") for f in fields]
+    errors = [row.at(f"X[3, {f}]", "s") for f in fields] if compensated else []
+    for f in fields:
+        lines += _moved(momenta[f], f"-b*g_{f}", errors[f] if compensated else None)
+    if kind.keeps is not None:
+        lines += _velocity(lattice, row, [f"g_{f}" for f in fields], "u")
+        lines += [f"{row.at(f'A[{kind.keeps}, {f}]', 's')} = u_{f}" for f in fields]
+    free = bool(nearest.fields) and lattice.boundary[-1] == "free"
+    loop = [*row.lines, *nearest.before, f"m = {'min(n, last - 1 - s)' if free else 'n'}"]
+    loop += ["for j in range(np.uint64(m)):", *_indented([*nearest.lines, *lines])]
+    if free:  # the last site has no bond ahead
+        none = [f"ahead_{f} = 0.0" for f in nearest.fields]
+        loop += ["for j in range(np.uint64(m), np.uint64(n)):", *_indented([*none, *lines])]
+    return _rows_source(lattice, [*body, *loop])
+
+
+@dataclass(frozen=True)
+class _Nearest:
+    """The bonds to the next site of a row: the slope of each is computed once, and kept for the site at its other end.
+
+    Attributes
+    ----------
+    fields : list of int
+        Those with slopes.
+    lines : list of str
+        For ``ahead_f``, those of the bond from the present site on.
+    before : list of str
+        For ``behind_f`` of the first site.
+    """
+
+    fields: list[int]
+    lines: list[str]
+    before: list[str]
+
+    @classmethod
+    def of(cls, lattice: LatticeHamiltonian, kind: _Pass, row: _Row) -> _Nearest:
+        if 1 not in lattice.bonds:
+            return cls([], [], [])
+        found = kind.slopes(lattice.bonds[1], lattice.r, lattice)
+        wanted = [f for f, slope in enumerate(found) if slope != 0]
+        slopes = vectorised([found[f] for f in wanted])
+
+        def lines(at: Callable[[str, str], str], parameters: dict[sp.Symbol, str], start: str, name: str) -> list[str]:
+            code = [
+                f"{s} = {at(_field(vector, f), f'{start} + 1')} - {at(_field(vector, f), start)}"
+                for vector, f, s in _differences(lattice, kind, found)
+            ]
+            code += [f"{s} = {element}" for s, element in parameters.items()]
+            return code + statements([f"{name}_{f}" for f in wanted], slopes)
+
+        ahead = lines(row.at, row.parameters(found, "s"), "s", "ahead")
+        other = _Row(lattice)
+        places = {s: text.replace(" + j]", "]") for s, text in other.parameters(found, "s - 1").items()}
+        first = [*other.lines, *lines(lambda array, at: f"{array[:-1]}, {at}]", places, "s - 1", "behind")]
+        if lattice.boundary[-1] == "free":
+            first = [
+                *(f"behind_{f} = 0.0" for f in wanted),
+                "if s > first:",
+                *_indented([line.replace("place_", "first_place_") for line in first]),
+            ]
+        else:
+            first = [line.replace("place_", "first_place_") for line in first]
+        return cls(wanted, ahead, first)
+
+
+def _differences(
+    lattice: LatticeHamiltonian, kind: _Pass, slopes: Sequence[sp.Expr]
+) -> Iterator[tuple[str, int, sp.Symbol]]:
+    """The differences along a bond that its slopes hold: of which vector and field, and their letter."""
+    used = set().union(*(slope.free_symbols for slope in slopes))
+    for vector in kind.vectors:
+        letters = lattice.r if vector == "q" else getattr(lattice, _LETTERS[vector])
+        for f, s in enumerate(letters):
+            if s in used:
+                yield vector, f, s
+
+
+def _field(vector: str, f: int) -> str:
+    return f"{_ARRAYS[vector][:-1]}, {f}]"
+
+
+def _fluxes(
+    lattice: LatticeHamiltonian, kind: _Pass, k: int, V: sp.Expr, places: dict[tuple[int, int], int]
+) -> list[str]:
+    """The slopes of the bonds of length k along a row into rows of T, the first of them that which ends at site s."""
+    found = kind.slopes(V, lattice.r, lattice)
+    wanted = [(f, slope) for f, slope in enumerate(found) if slope != 0]
+    if not wanted:
+        return []
+    free = lattice.boundary[-1] == "free"
+    row = _Row(lattice)
+    lines = [
+        f"{s} = {row.at(_field(vector, f), f'u + {k}')} - {row.at(_field(vector, f), 'u')}"
+        for vector, f, s in _differences(lattice, kind, found)
+    ]
+    lines += [f"{s} = {element}" for s, element in row.parameters(found, "u").items()]
+    lines += statements([f"g_{f}" for f, _ in wanted], vectorised([slope for _, slope in wanted]))
+    head = [f"u, m = s - {k}, n + {k}"]
+    if free:
+        head = [f"u = max(s - {k}, first)", f"m = min(s + n, last - {k}) - u"]
+    for f, _ in wanted:
+        places[k, f] = len(places)
+        start = f"u - s + {k}"
+        lines.append(f"{row.at(f'T[{places[k, f]}]', start)} = g_{f}")
+    body = [*head, *row.lines, "for j in range(np.uint64(m)):", *_indented(lines)]
+    if free:
+        for f, _ in wanted:
+            place = places[k, f]
+            body += [f"T[{place}, : u - s + {k}] = 0.0", f"T[{place}, u - s + {k} + m : n + {k}] = 0.0"]
+    return body
+
+
+def _across(
+    lattice: LatticeHamiltonian,
+    kind: _Pass,
+    axis: int,
+    k: int,
+    V: sp.Expr,
+    row: _Row,
+    read: Callable[[sp.Symbol, str], sp.Symbol],
+    body: list[str],
+) -> list[sp.Expr]:
+    """The slopes of sites by the bonds of length k to the rows before and behind, along another axis.
+
+    Where an end is free and a bond is missing, that of the other side stands for it, times 0.
+    """
+    stride = f"geometry[{1 if axis == 0 else 2}]"
+    free = lattice.boundary[axis] == "free"
+    total: list[sp.Expr] = [sp.S.Zero] * len(lattice.fields)
+    for side, sign in (("up", -1), ("down", 1)):
+        tag = f"{side}_{axis}_{k}"
+        start = "s" if side == "up" else f"s - {k} * {stride}"
+        factor: sp.Expr = sp.S.One
+        if free:
+            position, low, high = ("i", "begin", "end") if axis == 0 else ("k", "0", "geometry[3]")
+            there = f"{position} + {k} < {high}" if side == "up" else f"{position} - {k} >= {low}"
+            other = f"s - {k} * {stride}" if side == "up" else "s"
+            body += [f"start_{tag} = {start} if {there} else {other}", f"factor_{tag} = 1.0 if {there} else 0.0"]
+            start, factor = f"start_{tag}", sp.Symbol(f"factor_{tag}", real=True)
+        found = kind.slopes(V, lattice.r, lattice)
+        renamed: dict[sp.Symbol, sp.Symbol] = {}
+        for vector, f, s in _differences(lattice, kind, found):
+            far, near = row.at(_field(vector, f), f"{start} + {k} * {stride}"), row.at(_field(vector, f), start)
+            renamed[s] = read(sp.Symbol(f"{s}_{tag}", real=True), f"{far} - {near}")
+        for s, element in row.parameters(found, start).items():
+            renamed[s] = read(sp.Symbol(f"{s}_{tag}", real=True), element)
+        total = [a + sign * factor * slope.xreplace(renamed) for a, slope in zip(total, found, strict=True)]
+    return total
+
+
+def _velocity(lattice: LatticeHamiltonian, row: _Row, momenta: Sequence[str], name: str) -> list[str]:
+    """Lines for ∇T of one site at these momenta."""
+    slopes = [sp.diff(lattice.T, s) for s in lattice.p]
+    elements = row.parameters(slopes, "s")
+    lines = [f"{s}_mass = {element}" for s, element in elements.items()]
+    put = {s: sp.Symbol(m, real=True) for s, m in zip(lattice.p, momenta, strict=True)}
+    put |= {s: sp.Symbol(f"{s}_mass", real=True) for s in elements}
+    return lines + statements(
+        [f"{name}_{f}" for f in range(len(slopes))], vectorised([f.xreplace(put) for f in slopes])
+    )
+
+
+def _moved(x: str, change: str, error: str | None) -> list[str]:
+    if error is None:
+        return [f"{x} += {change}"]
+    return [
+        f"before = {x}",
+        f"corrected = {change} - {error}",
+        "total = before + corrected",
+        f"{error} = (total - before) - corrected",
+        f"{x} = total",
+    ]
+
+
+def _drift_lines(lattice: LatticeHamiltonian, compensated: bool) -> list[str]:
+    """q += b ∇T(p)."""
+    row, fields = _Row(lattice), range(len(lattice.fields))
+    lines = [f"old_{f} = {row.at(f'X[1, {f}]', 's')}" for f in fields]
+    lines += _velocity(lattice, row, [f"old_{f}" for f in fields], "u")
+    for f in fields:
+        lines += _moved(row.at(f"X[0, {f}]", "s"), f"b*u_{f}", row.at(f"X[2, {f}]", "s") if compensated else None)
+    return _rows_source(lattice, [*row.lines, "for j in range(np.uint64(n)):", *_indented(lines)])
+
+
+def _decay_lines(lattice: LatticeHamiltonian) -> list[str]:
+    """p *= b."""
+    row = _Row(lattice)
+    lines = [f"{row.at(f'X[1, {f}]', 's')} *= b" for f in range(len(lattice.fields))]
+    return _rows_source(lattice, [*row.lines, "for j in range(np.uint64(n)):", *_indented(lines)])
+
+
+def _stages_source(lattice: LatticeHamiltonian, level: int, compensated: bool, rate: bool) -> str:
+    """``stages``, the loop over kicks and drifts: see the text `lattice`.
+
+    All passes stand in it as they are: a function that is given arrays counts references to them, which takes as long
+    as a pass over a hundred sites.
+    """
+    inside = "low, high = max(lo, begin), min(hi, end)"
+
+    def passed(kind: _Pass, b: str, vector: str) -> list[str]:
+        return [
+            "if not whole:",
+            "    lo, hi = lo + REACH, hi - REACH",
+            f"b, {inside.replace(' = ', f' = {b}, ')}",
+            *_refreshed(lattice, vector),
+            *_pass_lines(lattice, kind, compensated),
+        ]
+
+    accelerated = passed(ACCELERATION, "table[1, column]", "X[0")
+    cases = [("table[1, column] != 0.0", passed(KICK, "table[1, column]", "X[0"))]
+    if level:
+        turned = [*accelerated, *passed(PRODUCT, "-table[2, column]", "A[0")]
+        cases.insert(0, ("table[2, column] != 0.0", turned))
+    if level == CURVATURE:
+        turned = [*accelerated, *passed(TURN, "-table[2, column]", "A[0"), *passed(BEND, "table[3, column]", "A[1")]
+        cases.insert(0, ("table[3, column] != 0.0", turned))
+    lines: list[str] = []
+    for condition, body in cases:
+        lines += [f"{'elif' if lines else 'if'} {condition}:", *_indented(body)]
+    row = 0
+    if rate:
+        row = {0: 2, FORCE_GRADIENT: 3, CURVATURE: 4}[level]
+    lines += [f"b, {inside.replace(' = ', f' = table[{row}, column], ')}"]
+    lines += ["if b != 0.0:", *_indented(_drift_lines(lattice, compensated))]
+    if rate:
+        lines += [f"b = table[{row + 1}, column]", *_decay_lines(lattice)]
+    lines += ["column = column + 1 if single or column < link else 1"]
+    arguments = "X, table, column, n_stages, single, work, whole, lo, hi, begin, end, geometry, sites, offset, values"
+    head = [f"@njit(**OPTIONS)\ndef stages({arguments}):", "link = table.shape[1] - 2", "A, T = work"]
+    return "\n    ".join(
+        [*head, *_value_lines(lattice), "for _ in range(n_stages):", *_indented(lines), "return column"]
+    )
+
+
+def _refreshed(lattice: LatticeHamiltonian, vector: str) -> list[str]:
+    """The ghosts of a vector, before a pass over planes low … high."""
+    if len(lattice.shape) > 1:
+        array, _, place = vector.partition("[")
+        return [f"refresh({array}, {place}, low, high, begin, end, whole, geometry)"]
+    if lattice.boundary[0] != "periodic":
+        return []
+    lines = [
+        f"{vector}, {f}, np.uint64({place})] = {vector}, {f}, np.uint64({other})]"
+        for f in range(len(lattice.fields))
+        for k in range(max(lattice.bonds, default=0))
+        for place, other in ((f"begin - {k + 1}", f"end - {k + 1}"), (f"end + {k}", f"begin + {k}"))
+    ]
+    return ["if whole:", *_indented(lines)] if lines else []

@@ -1,0 +1,168 @@
+"""Compiled loops of lattices: the steps of the array operations, whatever the size, the tiles and the threads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sympflow as sf
+from sympflow import HamiltonianSystem, solve
+from sympflow.kernels import lattice_loops
+from sympflow.kernels.modules import at_most
+from sympflow.kernels.splitting_loops import splitting_loops
+
+RNG = np.random.default_rng(21)
+
+
+def chain(n=40, **more):
+    """A disordered chain between walls, with bonds to second neighbours."""
+    values = np.random.default_rng(n).uniform(0.5, 1.5, (2, n))
+    definition = {
+        "onsite": "a*q**4/4",
+        "bond": {1: "exp(r) - r", 2: "b*r**3/3"},
+        "kinetic": "p**2/(2*m)",
+        "boundary": "fixed",
+        "params": {"a": values[0], "b": 0.3, "m": values[1]},
+    }
+    return HamiltonianSystem.lattice(shape=n, **{**definition, **more})
+
+
+def ring(n=48, **more):
+    return HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=n, **more)
+
+
+def sheet(boundary=("fixed", "free")):
+    return HamiltonianSystem.lattice(
+        onsite="1 - cos(q)", bond="k*r**2/2 + r**3/3", shape=(6, 5), boundary=boundary, params={"k": RNG.random((6, 5))}
+    )
+
+
+def start(system, n=None):
+    shape = 2 * system.ndof if n is None else (n, 2 * system.ndof)
+    return np.random.default_rng(3).uniform(-0.5, 0.5, shape)
+
+
+def compared(system, method, y0, **more):
+    """The run by loops and by array operations, at times on and off the grid."""
+    options = {"t_span": (0.0, 1.0), "y0": y0, "dt": 0.05, "t_eval": np.array([0.0, 0.5, 0.52, 1.0]), **more}
+    loops = solve(system, method, backend="compiled", **options)
+    arrays = solve(system, method, backend="array", **options)
+    np.testing.assert_allclose(loops.y, arrays.y, rtol=1e-12, atol=1e-13)
+    return loops
+
+
+@pytest.mark.parametrize("method", ["srkn6b", "chin4c"])
+def test_loops_make_the_steps_of_array_operations(method):
+    system = chain()
+    compared(system, method, start(system))
+    compared(system, method, start(system, 3))
+    compared(system, method, start(system), t_span=(1.0, 0.0), t_eval=np.array([1.0, 0.31, 0.0]))
+
+
+@pytest.mark.parametrize(
+    "boundary", [("fixed", "free"), pytest.param(("periodic", "periodic"), marks=pytest.mark.slow)]
+)
+def test_lattices_of_two_axes(boundary):
+    system = sheet(boundary)
+    compared(system, "verlet", start(system))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("boundary", ["periodic", "fixed", "free"])
+@pytest.mark.parametrize("method", ["verlet", "chin4c"])
+def test_several_fields_in_three_dimensions(boundary, method):
+    system = HamiltonianSystem.lattice(
+        onsite="u**2*v**2/2 + u**4/4",
+        bond="r_u**2/2 + r_v**2/2 + sin(r_u*r_v)",
+        fields=("u", "v"),
+        shape=(4, 3, 5),
+        boundary=boundary,
+    )
+    compared(system, method, start(system))
+
+
+@pytest.mark.parametrize("make", [ring, chain])
+def test_tiles_and_threads_change_nothing(make, monkeypatch):
+    """One module runs a lattice in one piece and in tiles; a site's arithmetic is the same up to fused products."""
+    n, y0, options = 230, start(make(230)), {"t_span": (0.0, 3.0), "dt": 0.05, "t_eval": np.array([0.0, 1.5, 3.0])}
+    whole = solve(make(n), "srkn6b", y0=y0, **options)
+    monkeypatch.setattr(lattice_loops, "TILE", 25)
+    monkeypatch.setattr(lattice_loops, "MARGIN", 5)
+    tiles = []
+    for threads in (1, 2, 3):
+        with at_most(threads):
+            tiles.append(solve(make(n), "srkn6b", y0=y0, backend="compiled", **options))
+    assert splitting_loops(tiles[0].system).functions(0, False).rollout.__self__._tiled
+    np.testing.assert_allclose(tiles[0].y, whole.y, rtol=1e-12, atol=1e-13)
+    for other in tiles[1:]:
+        np.testing.assert_array_equal(other.y, tiles[0].y)
+    batch = solve(make(n), "srkn6b", y0=np.stack([y0, y0]), **options)
+    np.testing.assert_array_equal(batch.y[1], tiles[0].y)
+
+
+@pytest.mark.parametrize("tile", [25, 4096])
+def test_a_run_that_becomes_infinite_keeps_what_it_has(tile, monkeypatch):
+    monkeypatch.setattr(lattice_loops, "TILE", tile)
+    monkeypatch.setattr(lattice_loops, "MARGIN", 5)
+    system = ring(230)
+    y0 = start(system)
+    y0[7] = 60.0
+    loops, arrays = (
+        solve(system, "srkn6b", t_span=(0.0, 10.0), y0=y0, dt=0.2, backend=backend) for backend in ("compiled", "array")
+    )
+    assert loops.status == arrays.status == -1
+    np.testing.assert_array_equal(loops.t, arrays.t)
+
+
+def test_a_run_in_pieces_has_the_bits_of_one(monkeypatch):
+    from sympflow.kernels.protocol import Carry
+    from sympflow.schemes import SCHEMES
+
+    for tile in (25, 4096):
+        monkeypatch.setattr(lattice_loops, "TILE", tile)
+        monkeypatch.setattr(lattice_loops, "MARGIN", 5)
+        system = ring(230)
+        y0, kernel = start(system), splitting_loops(system).kernel(SCHEMES["srkn6b"])
+        whole = kernel.run(0.05, y0, 90, np.array([20, 90])).states
+        carry = Carry()
+        pieces = [kernel.run(0.05, y0, n, np.array([n]), carry).states[0] for n in (20, 90)]
+        np.testing.assert_array_equal(np.stack(pieces), whole)
+
+
+def test_events_and_dense_output_go_by_the_one_driver():
+    system = ring()
+    sol = solve(
+        system, "srkn6b", t_span=(0.0, 5.0), y0=start(system), dt=0.05, events=lambda t, y: y[0], dense_output=True
+    )
+    assert sol.stats["backend"] == "compiled"
+    assert len(sol.t_events[0]) > 0
+    for t in sol.t_events[0]:
+        assert abs(sol.sol(t)[0]) < 1e-10
+
+
+def test_friction_is_the_same_in_loops():
+    system = ring(damping=0.2)
+    compared(system, "srkn6b", start(system))
+
+
+@pytest.mark.slow
+def test_compensated_sums_lower_the_rounding_of_the_energy():
+    system = ring()
+    errors = []
+    for compensated in (False, True):
+        sol = solve(
+            system, "srkn6b", t_span=(0, 4000.0), y0=start(system), dt=0.02, t_eval=[4000.0], compensated=compensated
+        )
+        errors.append(abs(sf.energy_error(sol)[-1]))
+    assert errors[1] < errors[0]
+
+
+def test_the_code_does_not_depend_on_the_size():
+    few, many = (splitting_loops(ring(n)).functions(0, False).rollout.__self__._module for n in (16, 100_000))
+    assert few is many
+
+
+def test_what_has_no_loops_runs_on_arrays():
+    rates = np.linspace(0.1, 0.2, 48)
+    sol = solve(ring(damping=rates), "verlet", t_span=(0, 0.5), y0=start(ring()), dt=0.05)
+    assert sol.stats["backend"] == "numpy"
