@@ -470,7 +470,8 @@ def _functions_in_time(system: HamiltonianSystem) -> tuple[Callable[[np.ndarray]
             change = _differences_of(slope)(q, v[..., :d])
         ahead, behind = (system.force(q, t + s) - system.force(q, t - s) for s in (short, 2 * short))
         by_time = (behind - 8 * ahead) / (12 * short)
-        twice = (rate(q, t + short) - rate(q, t - short)) / (2 * short)
+        ahead, behind = (rate(q, t + s) - rate(q, t - s) for s in (short, 2 * short))
+        twice = (8 * ahead - behind) / (12 * short)
         of_rate = (by_time * v[..., :d]).sum(-1) + twice * v[..., d]
         return np.concatenate([change + by_time * v[..., d : d + 1], 0 * t[..., None], of_rate[..., None]], axis=-1)
 
