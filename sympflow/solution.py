@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
     from sympflow.hamiltonian.system import HamiltonianSystem
     from sympflow.integrators.contract import Integrator
+    from sympflow.storage.runs import RunStore
 
 SMALLEST_SCALE = 1e-12
 """|H(y0)| below which an energy error is absolute, unless the system declares its `energy_scale`."""
@@ -267,6 +268,30 @@ class Solution:
         if not self.success:
             raise RuntimeError(self.message)
         return self
+
+
+class StoredSolution(Solution):
+    """A solution whose outputs are in a store, from which `t` and `y` are read whenever they are asked for.
+
+    Nothing is kept of them: hold on to ``y = sol.y`` where it is needed more than once.
+    """
+
+    store: RunStore | None = None
+
+    def _get_t(self) -> np.ndarray:
+        return self.store.times() if self.store is not None and self._t is None else self._t
+
+    def _set_t(self, t: np.ndarray | None) -> None:
+        self._t: Any = t
+
+    def _get_y(self) -> Array:
+        return self.store.states() if self.store is not None and self._y is None else self._y
+
+    def _set_y(self, y: Array | None) -> None:
+        self._y: Any = y
+
+    t = property(_get_t, _set_t)
+    y = property(_get_y, _set_y)
 
 
 COUNTS = ("backend", "dt", "n_steps", "force_evaluations", "hessian_evaluations", "newton_iterations", "difference")

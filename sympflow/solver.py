@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +32,7 @@ from sympflow.integrators.domain_exit import check_domain, check_system_along
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
 from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, naming_plugin
-from sympflow.solution import Solution, joined
+from sympflow.solution import Solution, StoredSolution, joined
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
@@ -58,6 +60,9 @@ def solve(
     backend: str = "auto",
     on_domain_exit: str | None = None,
     progress: Asked = False,
+    store: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    checkpoint_every: float | None = None,
     **options: Any,
 ) -> Solution:
     """Solve x' = J∇H(x), x(t0) = y0.
@@ -109,6 +114,15 @@ def solve(
     progress : bool or callable
         True for a bar on stderr; or a function of the time that is done and the whole one, called a few times a second.
         A method that is not run in pieces, such as one of a library, tells its end only.
+    store : path, optional
+        A folder, a zarr store, that takes the outputs as they come: fixed steps, NumPy states. Memory does not grow
+        with them: `t` and `y` of the solution are read from the store when they are asked for, and
+        ``xarray.open_zarr(store)`` reads it at any time.
+    resume : bool
+        Go on with the run that is in the store, if there is one: after a kill at any moment, or to a later end of
+        `t_span`, with later times in `t_eval`, the bits are those of a run that was never interrupted.
+    checkpoint_every : float, optional
+        Seconds of work, at most, that a kill loses; the default is 10. Outputs are chosen by `t_eval` and `save_every`.
     **options
         Options of the method: `dt` for fixed steps (default `system.dt`, or the flow's Δt), `rtol` and `atol` for
         adaptive ones, `flow` for "sympflow" and "mlp".
@@ -173,6 +187,14 @@ def solve(
     if search is not None:
         check_event_search(search, y_start, abs(t1 - t0))
     problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend, search)
+    if store is not None:
+        from sympflow.storage.runs import RunStore
+
+        kept = RunStore(store, resume, checkpoint_every)
+        check_stored(problem, action, rows)
+        problem = replace(problem, store=kept)
+    elif resume or checkpoint_every is not None:
+        raise ValueError("`resume` and `checkpoint_every` are for runs with a `store`: give one, or leave them out.")
     if progress is False:
         return _answered(integrator, problem, action, rows)
     sign = math.copysign(1.0, t1 - t0)
@@ -201,9 +223,11 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     integrator = integrator.resolved(system, y_start, abs(problem.t1 - problem.t0))
     check_applies(integrator, system, y_start)
     integrator.check_library(y_start)
-    run = _run
+    run: Callable[[Integrator, Problem], tuple[Outcome, Problem]] = _run
     if problem.t1 in (math.inf, -math.inf):
         run = _run_endless
+    elif problem.store is not None:
+        run = partial(_run_stored, action=action)
     else:
         check_memory(integrator, problem)
 
@@ -227,7 +251,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     if action != "ignore" and readable(outcome.y):
         check_domain(outcome, integrator, system, action)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
-    sol = Solution(
+    sol = (Solution if problem.store is None else StoredSolution)(
         t=outcome.t,
         y=y,
         status=outcome.status,
@@ -241,6 +265,8 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
         t_events=None if problem.events is None else problem.events.times(),
         y_events=None if problem.events is None else problem.events.states(y_start),
     )
+    if isinstance(sol, StoredSolution):
+        sol.store, sol.t, sol.y = problem.store, None, None
     if stopped is not None:
         raise Interrupted(outcome, sol) from None
     return sol
@@ -293,6 +319,55 @@ def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
     if search is None or integrator.finds_events:
         return integrator.run(problem), problem
     return run_and_search(integrator, problem, search), problem
+
+
+def _run_stored(integrator: Integrator, problem: Problem, action: str) -> tuple[Outcome, Problem]:
+    """The outcome of a run whose outputs a store takes, and the problem."""
+    from sympflow.integrators.provenance import provenance, run_identity
+
+    store, system, y0 = problem.store, problem.system, problem.y0
+    assert store is not None
+    integrator.check_store()
+    length = integrator.step_length(system)
+    known = run_identity(problem, integrator, length)
+    steps = 1.0 if length is None else abs(problem.t1 - problem.t0) / length / problem.save_every
+    expected = steps + 2 if problem.t_eval is None else problem.t_eval.size
+    store.prepare(known, provenance(system, integrator, (problem.t0, problem.t1)), y0, int(min(expected, 1e9)))
+    compiled = {"backend": "compiled"}  # by which states are looked at in a compiled pass
+
+    def look(t: np.ndarray, y: np.ndarray) -> None:
+        """What `_solved` does with all outputs, for those of a window."""
+        piece = Outcome(t, y, 0, "", compiled.copy() if y.dtype == np.float64 else {})
+        if system.functions_given:
+            system.check_functions_along(y)
+        if integrator.trained:
+            check_system_along(piece, integrator, system, y0)
+        if action != "ignore" and "domain_exit" not in store.noted:
+            check_domain(piece, integrator, system, action)
+            if "domain_exit" in piece.stats:
+                store.noted |= {"domain_exit": piece.stats["domain_exit"], "warning": piece.message}
+
+    store.look = look
+    return integrator.run(problem), problem
+
+
+def check_stored(problem: Problem, action: str, rows: ParameterRows | None) -> None:
+    """Refuse what a store does not take, with the reason."""
+    if is_tensor(problem.y0):
+        raise TypeError("`store` takes NumPy states, for it keeps no gradients: pass y0.detach().numpy().")
+    if problem.events is not None and problem.events.events:
+        raise ValueError(
+            "`store` takes no `events`, whose zeros are kept in memory: store the outputs, and look for the zeros in "
+            "them, or leave `store` out."
+        )
+    if problem.dense_output:
+        raise ValueError("`store` has no `dense_output`, which keeps every step in memory: choose times by `t_eval`.")
+    if action == "stop":
+        raise ValueError("`store` takes no `on_domain_exit` 'stop': use 'warn'.")
+    if rows is not None and not rows.uniform:
+        raise ValueError(
+            "`store` is for trajectories of the same `params`: use sympflow.ensemble(..., params=..., store=...)."
+        )
 
 
 def _run_endless(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:

@@ -102,7 +102,7 @@ def reporting(context: typer.Context) -> Iterator[None]:
         err.print(f"Failed: the memory is full ({error}): ask for less.", style="red", markup=False)
         raise typer.Exit(1) from error
     except KeyboardInterrupt as error:
-        err.print("Interrupted.", style="red")
+        err.print(f"Interrupted. {error}".strip(), style="red", markup=False)
         raise typer.Exit(130) from error
 
 

@@ -44,6 +44,16 @@ def solve(
     save_every: Annotated[int | None, typer.Option(help="Only every so many-th step is an output.")] = None,
     backend: Backend = "auto",
     to: Annotated[Path | None, typer.Option("--out", help="File for the solution: .csv or .npz.")] = None,
+    store: Annotated[
+        Path | None, typer.Option(help="Folder that takes the outputs as they come, a zarr store.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the run in --store, given the same options.")
+    ] = False,
+    checkpoint_every: Annotated[
+        float | None, typer.Option(help="Seconds of work that a kill loses at most. Default: 10.")
+    ] = None,
+    progress: Annotated[bool, typer.Option("--progress", help="Show a bar on stderr.")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Solve one system by one method.
@@ -63,6 +73,8 @@ def solve(
       sympflow solve own.py:spring --stiffness 4 --method kahan_li8
 
       sympflow solve --system quartic.toml --method gauss_legendre6 --out orbit.csv
+
+      sympflow solve kepler --method kahan_li8 --t-end 1e6 --save-every 1000 --store kepler.zarr --resume --progress
     """
     with reporting(ctx):
         from sympflow.metrics.energy import max_energy_error
@@ -76,9 +88,19 @@ def solve(
         times = None if n_outputs is None else _instants(*span, n_outputs)
         if to is not None:
             ready_file(to)
-        asked = {"dt": dt, "tol": tol, "save_every": save_every}
+        asked = {"dt": dt, "tol": tol, "save_every": save_every, "store": store, "checkpoint_every": checkpoint_every}
         options: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
-        sol = solve_system(scene.system, chosen, span, state(y0), t_eval=times, backend=backend, **options)
+        sol = solve_system(
+            scene.system,
+            chosen,
+            span,
+            state(y0),
+            t_eval=times,
+            backend=backend,
+            resume=resume,
+            progress=progress and not quiet,
+            **options,
+        )
         if to is not None:
             write_solution(sol, to)
         worst = ""
@@ -87,7 +109,7 @@ def solve(
         out.print(in_options(sol.message, ctx), markup=False)
         out.print(f"{len(sol.t)} outputs{worst}")
         out.print(", ".join(f"{k} = {v:.4g}" if isinstance(v, float) else f"{k} = {v}" for k, v in sol.stats.items()))
-        if len(sol.t):
+        if store is None and len(sol.t):
             show(f"y({sol.t[-1]:g}) = [{', '.join(f'{x:.12g}' for x in sol.y[:, -1])}]")
         if to is not None:
             out.print(f"Written: {to}")

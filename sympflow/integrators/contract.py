@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.fingerprint import Identity
     from sympflow.kernels.tangent_loops import TangentKernel
     from sympflow.schemes import Scheme
+    from sympflow.storage.runs import RunStore
 
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
 """Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
@@ -128,6 +129,8 @@ class Problem:
     """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
     progress: Progress | None = None
     """What is told how much of the time from t0 to t1 is done."""
+    store: RunStore | None = None
+    """The store that takes the outputs, and from which the run goes on; the outcome then has none."""
 
 
 @dataclass
@@ -224,6 +227,13 @@ class Integrator:
 
     def check(self, system: HamiltonianSystem) -> None:
         """Raise a ValueError with the reason if the method does not apply to the system."""
+
+    def check_store(self) -> None:
+        """Raise a ValueError with the reason where a run cannot go on from a store with the same bits."""
+        raise ValueError(
+            f"`store` keeps runs on a grid of equal steps in t, and method {self.name!r} chooses its steps: use a "
+            "fixed-step method, such as 'kahan_li8' or 'gauss_legendre6', or leave `store` out."
+        )
 
     def check_library(self, y0: Array) -> None:
         """Raise a TypeError with the reason if y0 is a tensor and the method takes NumPy arrays only."""

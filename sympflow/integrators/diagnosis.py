@@ -69,7 +69,9 @@ def _note_last_state(outcome: Outcome, problem: Problem) -> None:
     d = problem.system.ndof
     failed = (np.atleast_1d(np.asarray(outcome.status)) < 0).reshape(-1)
     row = int(np.argmax(failed))
-    outputs = to_numpy(outcome.y).reshape(len(outcome.t), -1, 2 * d)[:, row]
+    if problem.store is not None:  # which has the outputs
+        return
+    outputs = to_numpy(outcome.y).reshape(len(outcome.t), len(failed), 2 * d)[:, row]
     finite = np.flatnonzero(np.isfinite(outputs).all(-1))
     t, y = problem.t0, to_numpy(problem.y0).reshape(-1, 2 * d)[row]
     if finite.size:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from sympflow.arrays import Array, to_numpy
 from sympflow.events import EventSearch
 from sympflow.integrators.contract import Interrupted, Outcome, Problem
+
+if TYPE_CHECKING:
+    from sympflow.storage.runs import RunStore
 
 APART = 0.1
 """Distance of two copies, over the largest coordinate or momentum of the run, beyond which its states mean little."""
@@ -60,6 +63,9 @@ def extended_run(run: Callable[[Problem], Outcome], extension: Extension, proble
     """
     search = problem.events
     lifted = None if search is None else EventSearch(_of_projections(search, extension), search.max_interval)
+    store = problem.store
+    if store is not None:
+        store.project = lambda x: _noted(store, extension, x)
     stopped = None
     try:
         outcome = run(replace(problem, y0=extension.lift(problem.y0), events=lifted))
@@ -73,7 +79,12 @@ def extended_run(run: Callable[[Problem], Outcome], extension: Extension, proble
     outcome.y = extension.project(x)
     if outcome.sol is not None:
         outcome.sol = Projected(outcome.sol, extension)
-    if len(x):
+    if store is not None and "copy_distance" in store.noted:
+        apart, size = store.noted["copy_distance"], store.noted["size"]
+        outcome.stats["copy_distance"] = apart
+        if apart > APART * size and np.all(np.asarray(outcome.status) >= 0):
+            _warn(extension, apart, "")
+    elif len(x):
         _warn_of_distance(extension, to_numpy(x), outcome)
     if stopped is not None:
         raise stopped
@@ -87,6 +98,15 @@ def _of_projections(search: EventSearch, extension: Extension) -> Any:
     )
 
 
+def _noted(store: RunStore, extension: Extension, x: np.ndarray) -> np.ndarray:
+    """The states of those of the extended space; a store keeps how far these are from ones that stand for a state."""
+    with np.errstate(all="ignore"):
+        apart, size = np.asarray(extension.distance(x)), np.abs(x)
+    if not np.isnan(apart).all():
+        store.note(copy_distance=float(np.nanmax(apart)), size=float(np.nanmax(size)))
+    return np.asarray(extension.project(x))
+
+
 def _warn_of_distance(extension: Extension, x: np.ndarray, outcome: Outcome) -> None:
     with np.errstate(all="ignore"):
         apart, size = np.asarray(extension.distance(x)), np.abs(x).max(-1)
@@ -95,10 +115,13 @@ def _warn_of_distance(extension: Extension, x: np.ndarray, outcome: Outcome) -> 
     lost = (ratio > APART) & (np.asarray(outcome.status) >= 0)  # what has failed says more
     if lost.any():
         which = "" if lost.ndim == 0 else f" of {np.count_nonzero(lost)} of {lost.size} trajectories"
-        warnings.warn(
-            f"The two copies{which} that method {extension.method!r} keeps differ by up to "
-            f"{float(np.nanmax(apart)):.3g}: its states say little about the system. Reduce `dt`, or change `omega`, "
-            "the strength by which the copies are bound.",
-            RuntimeWarning,
-            stacklevel=4,
-        )
+        _warn(extension, float(np.nanmax(apart)), which)
+
+
+def _warn(extension: Extension, apart: float, which: str) -> None:
+    warnings.warn(
+        f"The two copies{which} that method {extension.method!r} keeps differ by up to {apart:.3g}: its states say "
+        "little about the system. Reduce `dt`, or change `omega`, the strength by which the copies are bound.",
+        RuntimeWarning,
+        stacklevel=5,
+    )

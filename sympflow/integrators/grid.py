@@ -97,3 +97,44 @@ class Grid:
         elif self.n_steps:
             t[-1] = self.t1
         return t, count, remainder
+
+
+class Outputs:
+    """The outputs of a run by their numbers 0 … n − 1: `Grid.outputs`, of which a part is made at a time.
+
+    Attributes
+    ----------
+    n : int
+        How many there are.
+    last : int
+        The steps that they need.
+    """
+
+    def __init__(self, grid: Grid, t_eval: np.ndarray | None, save_every: int) -> None:
+        self.grid, self.t_eval, self.every = grid, t_eval, save_every
+        if t_eval is not None:
+            _, self.count, self.remainder = grid.outputs(t_eval, save_every)
+            self.n, self.last = len(t_eval), int(self.count[-1]) if len(t_eval) else 0
+            return
+        whole, rest = divmod(grid.n_steps, save_every)
+        self.extra = int(bool(rest or grid.remainder))  # the end, which is none of the others
+        self.n, self.last = whole + 1 + self.extra, grid.n_steps
+
+    def up_to(self, k: int) -> int:
+        """Return how many there are at step k, within the step after it, and before."""
+        if self.t_eval is not None:
+            return int(self.count.searchsorted(k, "right"))
+        return self.n if k >= self.last else k // self.every + 1
+
+    def part(self, first: int, end: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the times, counts and remainders of the outputs from `first` to `end`."""
+        if self.t_eval is not None:
+            return self.t_eval[first:end], self.count[first:end], self.remainder[first:end]
+        grid = self.grid
+        count = np.arange(first, end, dtype=np.int64) * self.every
+        if end == self.n and end > first:
+            count[-1] = grid.n_steps
+        t, remainder = grid.t0 + count * grid.h, np.zeros(len(count))
+        if end == self.n and end > first and grid.n_steps + bool(grid.remainder):
+            t[-1], remainder[-1] = grid.t1, grid.remainder
+        return t, count, remainder

@@ -1,0 +1,307 @@
+"""Stores of single calls of `solve`: outputs as they come, and the place from which the run goes on.
+
+A store is that of `sympflow.storage.store`, in the layout of `sympflow.storage.layout`; `xarray.open_zarr` reads it
+while the run is under way too. Each commit holds the outputs up to the place that it holds, so that a program that is
+killed at any moment goes on from the last commit, with the same bits.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sympflow.storage.layout import DOF, NAMED, TIME, batch_dims, dofs, halves
+from sympflow.storage.store import Appender, Field, Store
+
+KNOWN = "sympflow_run"
+"""The attribute that says of which run a store is."""
+SECONDS = 10.0
+"""Between two commits, by default."""
+CHUNK = 2**17  # numbers in a chunk of q and p together, about
+TOLD = 90  # characters of what differs between two runs
+
+
+@dataclass
+class Place:
+    """The place that a run has reached.
+
+    Attributes
+    ----------
+    steps : int
+    running : ndarray
+        The running state of its loops: see `kernels.carry.Carry`.
+    finite : ndarray of int
+        The last finite step of each trajectory.
+    state : ndarray of shape (..., K)
+        The states after `steps` steps, of those that may be saved.
+    failed : ndarray of bool, shape (...)
+        True where an output within a step was not finite.
+    counts : dict
+        Numbers of outputs, of what was saved, and the statistics so far, as JSON.
+    """
+
+    steps: int
+    running: np.ndarray
+    finite: np.ndarray
+    state: np.ndarray
+    failed: np.ndarray
+    counts: dict[str, Any] = field(default_factory=dict)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the place as arrays."""
+        own = {name: np.asarray(getattr(self, name)) for name in ("steps", "running", "finite", "state", "failed")}
+        return own | {"counts": np.array(json.dumps(self.counts, default=np.ndarray.tolist))}
+
+    @classmethod
+    def read(cls, arrays: Mapping[str, np.ndarray]) -> Place:
+        """Return the place that arrays stand for."""
+        steps, counts = int(arrays["steps"]), json.loads(str(arrays["counts"]))
+        return cls(steps, arrays["running"], arrays["finite"], arrays["state"], arrays["failed"], counts)
+
+
+class RunStore:
+    """The store of one call of `solve`; made or opened by `opened`.
+
+    Parameters
+    ----------
+    path : str or path
+        Of a folder.
+    resume : bool
+        Whether to go on with the run that is there.
+    checkpoint_every : float, optional
+        Seconds between two commits, at most; the default is 10.
+
+    Attributes
+    ----------
+    length : int
+        The outputs that it holds, those among them that are not committed.
+    consistent : bool
+        False while outputs are being taken.
+    project : callable
+        The states (..., 2d) of those (..., K) on which steps are made.
+    noted : dict
+        The largest numbers that the method noted, and `domain_exit` and `warning` of an output outside the domain.
+    """
+
+    def __init__(self, path: Any, resume: Any = False, checkpoint_every: Any = None) -> None:
+        if isinstance(path, bytes) or not isinstance(path, str | os.PathLike):
+            raise TypeError(f"`store` must be the path of a folder; got {type(path).__name__}.")
+        if not isinstance(resume, bool | np.bool_):
+            raise TypeError(f"`resume` must be True or False; got {resume!r}.")
+        every = SECONDS if checkpoint_every is None else checkpoint_every
+        if isinstance(every, bool) or not isinstance(every, int | float | np.number) or not every > 0:
+            raise ValueError(f"`checkpoint_every` must be a positive number of seconds; got {every!r}.")
+        self.asked, self.path = str(path), Path(os.path.abspath(os.fspath(path)))
+        self.resume, self.every = bool(resume), float(every)
+        self.consistent, self.committed = True, time.perf_counter()
+        self.noted: dict[str, Any] = {}
+        self.attributes: dict[str, Any] = {}
+        self._made_of: tuple[dict[str, str], np.ndarray, int]
+        self.store: Store
+        self.appender: Appender
+        self.project: Callable[[Any], Any] = _itself
+        self.look: Callable[[np.ndarray, np.ndarray], None] = _nothing
+
+    # opening --------------------------------------------------------------------------------------
+
+    def prepare(self, known: Mapping[str, str], attributes: Mapping[str, Any], y0: np.ndarray, n_outputs: int) -> None:
+        """Take what the store is to be made of.
+
+        Parameters
+        ----------
+        known : mapping of str to str
+            What the run is known by, in words.
+        attributes : mapping
+            Those of the store, as JSON has them.
+        y0 : ndarray of shape (..., 2d)
+        n_outputs : int
+            That are expected.
+        """
+        self.attributes = dict(attributes)
+        self._made_of = dict(known), y0, n_outputs
+
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Make the store, or open the one that is there, which no other process can write then.
+
+        Raises
+        ------
+        ValueError
+            If there is something without `resume`, or a store of another run.
+        StoreError
+            If it cannot be made, or another process writes it.
+        """
+        known, y0, n_outputs = self._made_of
+        if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+            if not self.resume:
+                raise ValueError(
+                    f"`store` {self.asked!r} exists: pass resume=True to go on with it, or name another folder."
+                )
+            self.store = Store.open(self.path)
+            self._check(known)
+        else:
+            self._create(known, y0, n_outputs)
+        try:
+            with self.store.locked():
+                self.store = Store.open(self.path)  # as it is now that nobody else writes it
+                self.appender = Appender(self.store, TIME)
+                self.committed = time.perf_counter()
+                yield
+        finally:
+            self.look, self.project = _nothing, _itself
+            vars(self).pop("appender", None)
+
+    def _create(self, known: Mapping[str, str], y0: np.ndarray, n_outputs: int) -> None:
+        """Make the store beside its place, and move it there: it is whole, or it is not there."""
+        batch, d = y0.shape[:-1], y0.shape[-1] // 2
+        size = max(1, min(CHUNK // y0.size, n_outputs))
+        dims = batch_dims(batch)
+        made = {TIME: Field((TIME,), (0,), float, (size,)), DOF: Field((DOF,), (d,), int, attributes=NAMED[DOF])}
+        for letter, _ in halves(d):
+            made[letter] = Field((*dims, DOF, TIME), (*batch, d, 0), y0.dtype, (*batch, d, size), NAMED[letter])
+            made[f"{letter}0"] = Field((*dims, DOF), (*batch, d), y0.dtype, attributes=NAMED[f"{letter}0"])
+        made["status"] = Field(dims, batch, np.int8, attributes=NAMED["status"])
+        unfinished = self.path.with_name(f".{self.path.name}.new")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        told = {
+            **self.attributes,
+            KNOWN: json.dumps(dict(known)),
+            "status": -1,
+            "ended": 0,
+            "message": "The run has begun.",
+        }
+        store = Store.create(unfinished, made, told)
+        store.write(DOF, (0,), dofs(d))
+        for letter, rows in halves(d):
+            store.write(f"{letter}0", (0,) * y0.ndim, y0[..., rows])
+        store.write("status", (0,) * len(batch), np.full(batch, -1))
+        try:
+            os.rename(unfinished, self.path)
+        except OSError as error:
+            raise ValueError(
+                f"`store` {self.asked!r} cannot be made ({error.strerror}): name another folder."
+            ) from error
+        self.store = Store.open(self.path)
+
+    def _check(self, known: Mapping[str, str]) -> None:
+        theirs = json.loads(self.store.attributes.get(KNOWN, "{}"))
+        if not theirs:
+            raise ValueError(f"`store` {self.asked!r} is no store of a run: name another folder.")
+        for name, text in known.items():
+            if theirs.get(name) != text:
+                raise ValueError(
+                    f"`store` {self.asked!r} is of another run: its `{name}` is {str(theirs.get(name))[:TOLD]}, not "
+                    f"{text[:TOLD]}. Nothing of it was changed: name another folder, or make the same call."
+                )
+
+    # what is in it --------------------------------------------------------------------------------
+
+    @property
+    def length(self) -> int:
+        return self.appender.length
+
+    @property
+    def ended(self) -> bool:
+        """True if the run reached its end, or failed."""
+        return bool(self.store.attributes["ended"])
+
+    @property
+    def message(self) -> str:
+        """What became of the run."""
+        return str(self.store.attributes["message"])
+
+    def place(self) -> Place | None:
+        """Return the place from which the run goes on; None at its beginning."""
+        arrays = self.store.state()
+        if not arrays:
+            return None
+        place = Place.read(arrays)
+        self.noted = dict(place.counts["noted"])
+        return place
+
+    def times(self, first: int = 0) -> np.ndarray:
+        """Return the times of the committed outputs from a number on."""
+        return self._read((TIME,), (), first)
+
+    def states(self) -> np.ndarray:
+        """Return the states (..., 2d, n) of the committed outputs."""
+        return self._read(("q", "p"), self.store.fields["q0"].shape[:-1], 0)
+
+    def status(self) -> Any:
+        """Return the status of each trajectory."""
+        found = self.store.read("status").astype(int)
+        return found if found.ndim else int(found)
+
+    def _read(self, names: tuple[str, ...], batch: tuple[int, ...], first: int) -> np.ndarray:
+        fields = self.store.fields
+        n, size = fields[TIME].shape[0], fields[TIME].chunks[0]  # type: ignore[index]
+        width = () if names == (TIME,) else (sum(fields[name].shape[-2] for name in names),)
+        whole = np.empty((*batch, *width, n - first), fields[names[0]].dtype)
+        row = 0
+        for name in names:
+            rows = (slice(row, row + fields[name].shape[-2]),) if width else ()
+            for k in range(first // size, -(-n // size)):
+                part = self.store.read(name, (*(0,) * (fields[name].dims.index(TIME)), k))
+                a = k * size
+                skip = max(0, first - a)
+                whole[(..., *rows, slice(a + skip - first, a - first + part.shape[-1]))] = part[..., skip:]
+            row += fields[name].shape[-2] if width else 0
+        return whole
+
+    # writing --------------------------------------------------------------------------------------
+
+    def truncate(self, length: int) -> None:
+        """Leave out the last outputs, as those of an end that is no longer one."""
+        self.store.commit({TIME: length})
+        self.appender = Appender(self.store, TIME)
+
+    def append(self, t: np.ndarray, y: np.ndarray) -> None:
+        """Take outputs y (n, ..., K) at times t (n,)."""
+        if not len(t):
+            return
+        self.consistent = False
+        y = self.project(y)
+        self.look(t, y)
+        records = {TIME: t} | {v: np.moveaxis(y[..., rows], 0, -1) for v, rows in halves(y.shape[-1] // 2)}
+        self.appender.append(records)
+        self.consistent = True
+
+    def note(self, **numbers: float) -> None:
+        """Keep the largest of numbers by their names."""
+        for name, x in numbers.items():
+            self.noted[name] = max(x, self.noted.get(name, x))
+
+    @property
+    def due(self) -> bool:
+        """True if a commit is due."""
+        return time.perf_counter() - self.committed >= self.every
+
+    def commit(self, place: Place, attributes: Mapping[str, Any]) -> None:
+        """Write what is not written, with the place that the run has reached."""
+        place.counts["noted"] = self.noted
+        self.appender.commit({**self.attributes, **attributes}, place.arrays())
+        self.committed = time.perf_counter()
+
+    def finish(self, place: Place, status: Any, message: str) -> None:
+        """Commit the end of the run."""
+        known = self.store.fields["status"]
+        self.store.write("status", (0,) * len(known.shape), np.broadcast_to(status, known.shape))
+        worst = int(np.min(status))
+        self.commit(place, {"status": worst, "message": message, "ended": 1})
+
+
+def _itself(y: Any) -> Any:
+    return y
+
+
+def _nothing(t: np.ndarray, y: np.ndarray) -> None:
+    return None
