@@ -274,7 +274,7 @@ class SymbolicForces:
         import sympy as sp
 
         slope = sp.Matrix(symbols.slope)
-        self._samples = symbols.samples
+        self._samples = dict(symbols.samples)
         terms = [-slope]
         if level in (FORCE_GRADIENT, CURVATURE):
             v = symbols.inverse_mass * slope
