@@ -76,6 +76,7 @@ def test_gali_of_two_vectors_is_sali_times_the_other_diagonal(wells):
     np.testing.assert_allclose(g, s * np.sqrt(4 - s**2) / 2, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_exponent_of_a_ridge_with_friction():
     """λ of q'' = q − γq' is (−γ + √(γ² + 4))/2; the verlet step has this rate up to O(h²)."""
     y0 = [[1e-3, 0.0], [0.0, 1e-3]]
@@ -86,6 +87,7 @@ def test_the_exponent_of_a_ridge_with_friction():
     np.testing.assert_allclose(compiled.value, (-gamma + np.sqrt(gamma**2 + 4)) / 2, atol=0.02)
 
 
+@pytest.mark.slow
 def test_parameters_and_coupled_masses_are_those_of_the_system():
     for stiffness in (1.0, 2.5):  # one code for both values
         system = HamiltonianSystem.from_sympy(
