@@ -95,6 +95,7 @@ def test_a_grid_of_parameters():
     assert result.final.shape == (3, 2, 2, 2)
     assert list(result.params) == ["k", "a"]
     assert result.to_xarray().q.dims == ("k", "a", "orbit", "dof")
+    assert result.to_xarray().attrs["dt"] == 0.1
     for chunk in (1, 5):  # of one value of the parameters, or of several
         assert np.array_equal(swept(reduce="final", chunk=chunk, workers=2).final, result.final)
     for i, value in enumerate(k):
