@@ -7,7 +7,7 @@ Float64. In `large-fput` Verlet runs from one state to its end, by `solve` as a 
 Numba: one keeps the spring's force for the next site, the other computes both forces of each site. The faster one
 counts. It is process time. In `large-threads` two threads run in turn with Numba's `prange`, by the time of the clock,
 which other programs on the machine lengthen. In `large-compile` each number is that of a fresh process: its processor
-time from the call of `solve` to its return, after a run of the pendulum, which imports what every run needs.
+time from the call of `solve` to its return, after the libraries are imported.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ import sys, time
 import numpy as np, numba, scipy, sympy, sympflow
 system = sympflow.HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=int(sys.argv[2]))
 y0 = np.full(2 * system.ndof, 0.1)
-sympflow.solve(sympflow.systems.pendulum(), "verlet", t_span=(0.0, 1.0))  # what every compiled run imports
+import sympflow.solver, sympflow.integrators.splitting, sympflow.kernels.lattice_loops, sympflow.kernels.splitting_loops
 start = time.process_time()
 sympflow.solve(system, sys.argv[1], t_span=(0.0, 1.0), y0=y0, dt=0.05, t_eval=[1.0], backend="compiled")
 print(time.process_time() - start)
