@@ -199,10 +199,10 @@ def symplecticity_estimate(sol: Solution, directions: int = 8, seed: int = 0) ->
             x, step = torch.tensor(y), torch.as_tensor(h)
             u = U.to(x.dtype)
 
-            def moves(z: Any, t: Any = t, h: Any = step) -> Any:
-                return integrator.step(system, t, z, h)
+            def one_step(z: Any, t: float = t, step: Any = step) -> Any:
+                return integrator.step(system, t, z, step)
 
-            moved = [to_numpy(jvp(moves, x, v.expand_as(x))[1]) for v in u]
+            moved = [to_numpy(jvp(one_step, x, v.expand_as(x))[1]) for v in u]
             change = _form(np.stack(moved)[i], np.stack(moved)[j]) - _form(u.numpy()[i], u.numpy()[j]).reshape(
                 -1, *[1] * (y.ndim - 1)
             )
