@@ -14,7 +14,15 @@ import torch
 from numba import njit
 from watchdog import watched
 
-from sympflow import HamiltonianSystem, available, get, solve, systems
+from sympflow import (
+    HamiltonianSystem,
+    available,
+    energy_error,
+    get,
+    solve,
+    systems,
+    time_transformed,
+)
 from sympflow.integrators.base import FixedStep, Outcome
 from sympflow.integrators.methods import NAMES
 
@@ -444,6 +452,91 @@ def test_plugins(row, more):
     else:
         assert (np.asarray(got.status) == -1).all()
         assert re.search(message, got.message)
+
+
+# driven and damped systems --------------------------------------------------------------------------
+
+SCENE = {"y0": [1.0, 0.2], "t_span": (0.3, 0.8), "dt": 0.01}
+DRIVE = {"time": "t", "params": {"a": 0.3, "w": 1.7}}
+TEXT = "p**2/2 + 2*q**2 + a*q**4*cos(w*t)"
+DRIVEN = HamiltonianSystem.from_sympy(TEXT, **DRIVE, **SCENE, name="driven")
+DAMPED = HamiltonianSystem.from_sympy("p**2/2 + 2*q**2 + q**4/4", damping=0.2, **SCENE, name="damped")
+BOTH = HamiltonianSystem.from_sympy(TEXT, damping=0.2, **DRIVE, **SCENE, name="both")
+PENDULUM = systems.pendulum()
+TWO = "p1**2/2 + p2**2/2 + q1**2/2 + q2**2/2"
+made = HamiltonianSystem.from_sympy
+
+# what is asked, the error and how its message goes on after the argument
+SCENES = {
+    "t without a name": (
+        lambda: made(TEXT, params=DRIVE["params"]),
+        TypeError,
+        '`expression` depends on the time t.*"t"',
+    ),
+    "another period": (lambda: made(TEXT, **DRIVE, period=3.0), ValueError, "`period` 3.0 is none of H"),
+    "half a period": (lambda: made(TEXT, **DRIVE, period=math.pi / 1.7), ValueError, "`period` .* is none of H"),
+    "an infinite period": (lambda: made(TEXT, **DRIVE, period=math.inf), ValueError, "`period` must be positive"),
+    "a negative damping": (lambda: made(TWO, damping=-0.1), ValueError, "`damping` must be finite and not negative"),
+    "a damping of NaN": (lambda: made(TWO, damping=math.nan), ValueError, "`damping` must be finite"),
+    "a damping of text": (lambda: made(TWO, damping="0.1"), TypeError, "`damping` must be real numbers"),
+    "too many dampings": (lambda: made(TWO, damping=[0.1] * 3), ValueError, r"`damping` .* shape \(3,\)"),
+    "no symmetric damping": (lambda: made(TWO, damping=[[1, 0.1], [0, 1]]), ValueError, "`damping` .* symmetric"),
+    "an indefinite damping": (lambda: made(TWO, damping=[[1, 2], [2, 1]]), ValueError, "`damping` .* semi-definite"),
+    "energy of a drive": (lambda: energy_error(by_arrays(DRIVEN)), ValueError, "`system` 'driven' .*balance_error"),
+    "energy of friction": (lambda: energy_error(by_arrays(DAMPED)), ValueError, "`system` 'damped' .* energy is lost"),
+    "another time": (lambda: time_transformed(DRIVEN), ValueError, "`system` 'driven' is driven, .* no energy E"),
+    "a log clock": (lambda: solve(DRIVEN, "log_kahan_li8"), ValueError, "`system` 'driven' .*'log_kahan_li8' does not"),
+    "a flow of no drive": (lambda: solve(DRIVEN, shipped()), ValueError, "`system` 'driven' is driven"),
+    "a flow of no friction": (lambda: solve(damped_pendulum(), shipped()), ValueError, "`system` .* has friction"),
+    "no flow with friction": (lambda: solve(damped_pendulum(), "sympflow"), ValueError, "`system` .* friction, and no"),
+    "copies of a function of NumPy": (
+        lambda: solve(HamiltonianSystem(hamiltonian=of_numpy, ndof=1, **SCENE), "tao4"),
+        TypeError,
+        "`hamiltonian` (must return an array of the library|failed on a torch tensor)",
+    ),
+    "copies with friction": (lambda: solve(DAMPED, "tao4"), ValueError, "`system` 'damped' has friction, .*'tao4'"),
+    "Gauss with friction": (lambda: solve(DAMPED, "gauss_legendre4"), ValueError, "`system` 'damped' has friction"),
+    "the time of a state": (lambda: DRIVEN.vector_field(np.ones(2)), TypeError, "`t` is missing"),
+}
+
+
+def by_arrays(system):
+    return solve(system, "verlet", backend="array")
+
+
+def shipped():
+    return get("sympflow")().flow_for(PENDULUM)
+
+
+def damped_pendulum():
+    return made(PENDULUM.symbols.H, damping=0.1, y0=[1.0, 0.0], domain=PENDULUM.domain)
+
+
+def of_numpy(q, p):
+    return np.asarray(p)[..., 0] ** 2 * (1 + np.asarray(q)[..., 0] ** 2)
+
+
+@pytest.mark.parametrize("row", SCENES)
+def test_driven_and_damped(row):
+    ask, error, message = SCENES[row]
+    assert_each([(row, (None, None), caught(ask))], error, message)
+
+
+def test_every_method_solves_a_drive_and_friction_or_says_why_not():
+    """None leaves one of them out."""
+    wrong = {}
+    for system in (DRIVEN, DAMPED, BOTH):
+        truth = solve(system, "dop853", t_eval=[0.8], rtol=1e-10, atol=1e-12).y
+        for method in METHODS:
+            got = caught(lambda s=system, m=method: solve(s, m, t_eval=[0.8], backend="array"))
+            if isinstance(got, Exception):
+                says = re.match(r"`system` '\w+' (has friction|is driven|has no )", str(got))
+                named = isinstance(got, ValueError) and says and str(got).endswith(".")
+            else:
+                named = np.abs(got.y - truth).max() < (0.05 if get(method).order == 1 else 0.01)
+            if not named:
+                wrong[system.name, method] = repr(got)[:200]
+    assert not wrong, wrong
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -116,6 +116,9 @@ class HamiltonianSystem(Hamiltonian):
     array([-0.])
     """
 
+    _period: float | None = None
+    _former_period: float | None = None
+
     def __init__(
         self,
         potential: Callable[..., Array] | None = None,
@@ -377,7 +380,16 @@ class HamiltonianSystem(Hamiltonian):
         if not real_number(period) or not 0 < period < 1e100:
             raise ValueError(f"`period` must be positive and finite; got {period!r}.")
         check_period(self.hamiltonian, self.ndof, self.y0, float(period))
-        self.period = float(period)
+        self._period = float(period)
+
+    @property
+    def period(self) -> float | None:  # type: ignore[override]
+        """The period of H in t, where one was named, or was that of the system of other parameters and still is."""
+        if self._former_period is not None:
+            former, self._former_period = self._former_period, None
+            with suppress(ValueError):
+                self._set_period(former)
+        return self._period
 
     def _set_scene(
         self,
@@ -498,8 +510,7 @@ class HamiltonianSystem(Hamiltonian):
             dt=self.dt,
             energy_scale=self.energy_scale,
         )
-        with suppress(ValueError):  # values of the drive may have changed its period
-            made._set_period(self.period)
+        made._former_period = self.period  # values of the drive may have changed it: tested where it is asked for
         return made
 
     def check_functions(self, y0: Array | None = None) -> None:

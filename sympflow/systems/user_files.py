@@ -24,11 +24,12 @@ DOMAINS: dict[str, tuple[str, ...]] = {
     "Tube": ("orbit", "radius", "groups"),
 }
 """The kinds of domains in a TOML file, and the keys of each."""
-KEYS = {
+KEYS: dict[str, tuple[Any, str]] = {
     "hamiltonian": (str, "a formula in quotes, such as 'p**2/2 - cos(q)'"),
     "params": (dict, "a table of numbers, such as { omega = 2.0 }"),
     "time": (str, "the name of the time in the formula, such as 't'"),
     "period": (float, "a number"),
+    "damping": ((float, list), "a number, a list of one for each p, or a matrix as a list of its rows"),
     "name": (str, "a text in quotes"),
     "y0": (list, "a list of numbers, [q…, p…]"),
     "t_span": (list, "two numbers, such as [0, 100]"),
@@ -46,8 +47,8 @@ def from_toml(path: str | os.PathLike[str], **params: float) -> HamiltonianSyste
     ----------
     path : str or path
         The keys of the file are the arguments of `HamiltonianSystem.from_sympy`: `hamiltonian`, the formula, is needed;
-        `params`, `time`, `period`, `name`, `y0`, `t_span`, `dt`, `energy_scale` and `domain` are optional. A domain has
-        a `kind`, "Box", "Ball", "EnergySublevel" or "Tube", and the arguments of that class.
+        `params`, `time`, `period`, `damping`, `name`, `y0`, `t_span`, `dt`, `energy_scale` and `domain` are optional. A
+        domain has a `kind`, "Box", "Ball", "EnergySublevel" or "Tube", and the arguments of that class.
     **params
         Values of parameters of the file, instead of those in it.
 
@@ -172,9 +173,7 @@ def _table(file: Path) -> dict[str, Any]:
             hint = f"Did you mean {close[0]!r}? " if close else ""
             raise ValueError(f"`{key}` is no key of a system (in {str(file)!r}). {hint}The keys are {', '.join(KEYS)}.")
         kind, words = KEYS[key]
-        numbers = value if kind is list else value.values() if key == "params" and isinstance(value, dict) else ()
-        number = not isinstance(value, bool) and isinstance(value, int | float)
-        if not (number if kind is float else isinstance(value, kind)) or not all(map(_is_number, numbers)):
+        if not _fits(value, kind) or not all(map(_is_number, _numbers(key, value))):
             raise ValueError(f"`{key}` must be {words}; got {value!r} (in {str(file)!r}).")
     if "hamiltonian" not in table:
         raise ValueError(f"`hamiltonian` is missing in {str(file)!r}: add {KEYS['hamiltonian'][1]}.")
@@ -182,6 +181,23 @@ def _table(file: Path) -> dict[str, Any]:
     if reserved:
         raise ValueError(f"`{reserved[0]}` is no name of a parameter (in {str(file)!r}): choose another.")
     return table
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Return True for a value of a type, or of one of several; a whole number is a number too."""
+    if isinstance(kind, tuple):
+        return any(_fits(value, one) for one in kind)
+    return _is_number(value) if kind is float else isinstance(value, kind)
+
+
+def _numbers(key: str, value: Any) -> list[Any]:
+    """The entries of a value that must be numbers."""
+    if key == "params":
+        return list(value.values())
+    if not isinstance(value, list):
+        return []
+    rows = [row if key == "damping" and isinstance(row, list) else [row] for row in value]
+    return [entry for row in rows for entry in row]
 
 
 def _domain(table: dict[str, Any], file: Path) -> Ball | Box | EnergySublevel | Tube:

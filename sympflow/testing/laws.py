@@ -53,10 +53,10 @@ def run(
 
 
 @cache
-def exact(system: HamiltonianSystem, h: float = T_END, n: int = 0) -> np.ndarray:
-    """The states a time h after `states(system, n)`, or after y0 for n = 0, to 13 digits."""
+def exact(system: HamiltonianSystem, h: float = T_END, n: int = 0, t0: float = 0.0) -> np.ndarray:
+    """The states a time h after `states(system, n)`, or after y0 for n = 0, at t0, to 13 digits."""
     y0 = states(system, n) if n else start(system)
-    return solve(system, "dop853", (0.0, h), y0=y0, t_eval=[h], rtol=1e-13, atol=1e-15).y[..., 0]
+    return solve(system, "dop853", (t0, t0 + h), y0=y0, t_eval=[t0 + h], rtol=1e-13, atol=1e-15).y[..., 0]
 
 
 def assert_close(actual: Any, expected: Any, tolerance: float, what: str) -> None:
@@ -80,14 +80,16 @@ def bare_step(integrator: Integrator, system: HamiltonianSystem) -> str | None:
     return None
 
 
-def _step(integrator: Integrator, system: HamiltonianSystem) -> Callable[[np.ndarray, np.ndarray | float], np.ndarray]:
+def _step(
+    integrator: Integrator, system: HamiltonianSystem, t: float = 0.0
+) -> Callable[[np.ndarray, np.ndarray | float], np.ndarray]:
     reason = bare_step(integrator, system)
     if reason is not None:
         raise NotApplicable(reason)
 
     def step(y: np.ndarray, h: np.ndarray | float) -> np.ndarray:
         with np.errstate(all="ignore"):
-            return np.asarray(integrator.step(system, 0.0, y, h))
+            return np.asarray(integrator.step(system, t, y, h))
 
     return step
 
@@ -135,10 +137,10 @@ def the_order_is_the_slope(integrator: Integrator, system: HamiltonianSystem) ->
     assert -0.6 < excess < (0.6 if settled else 1.5), f"declared {integrator.order}, measured {slopes[-1]:.2f}"
 
 
-def _slopes_of_steps(integrator: Integrator, system: HamiltonianSystem) -> list[float]:
-    y, errors, step = states(system, 12), [], _step(integrator, system)
+def _slopes_of_steps(integrator: Integrator, system: HamiltonianSystem, t: float = 0.0) -> list[float]:
+    y, errors, step = states(system, 12), [], _step(integrator, system, t)
     for h in (1.6 / 2**k for k in range(12)):
-        errors.append(float(np.median(np.abs(step(y, np.full(len(y), h)) - exact(system, h, len(y))).max(-1))))
+        errors.append(float(np.median(np.abs(step(y, np.full(len(y), h)) - exact(system, h, len(y), t)).max(-1))))
     return [float(np.log2(a / b)) - 1 for a, b in pairwise(errors) if b > 1e-12]
 
 
@@ -517,7 +519,7 @@ def _damped() -> tuple[HamiltonianSystem, np.ndarray, float]:
 
 
 def friction_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """A method that says `takes_friction` solves a damped system: nearer to its solution than to that without."""
+    """A method that says `takes_friction` solves a damped system, to its order: nearer to it than to that without."""
     if not integrator.takes_friction:
         raise NotApplicable("it does not say that it takes friction, so damped systems are refused for it")
     damped, end, effect = _damped()
@@ -530,6 +532,17 @@ def friction_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem) 
     assert error < effect / 4, (
         f"the end of a damped system is wrong by {error:.1e}, and friction moves it by {effect:.1e}: take −Γp into "
         "every step, as system.vector_field does, or do not say `takes_friction`"
+    )
+    _the_order_is_kept(integrator, damped, "with friction")
+
+
+def _the_order_is_kept(integrator: Integrator, system: HamiltonianSystem, what: str, t: float = 0.0) -> None:
+    """The error of one step from t on falls as fast as declared, of a method that has a bare step and an order."""
+    if integrator.order is None or bare_step(integrator, system) is not None:
+        return
+    slopes = _slopes_of_steps(integrator, system, t)
+    assert not slopes or slopes[-1] - integrator.order > -0.6, (
+        f"{what} the order is {slopes[-1]:.2f}, and {integrator.order} is declared"
     )
 
 
@@ -552,7 +565,7 @@ def _driven() -> tuple[HamiltonianSystem, np.ndarray, float]:
 
 
 def the_drive_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """A method that says `takes_driving` solves a driven system: nearer to it than to one with H held fixed."""
+    """A method that says `takes_driving` solves a driven system, to its order: nearer to it than to one held fixed."""
     if not integrator.takes_driving:
         raise NotApplicable("it does not say that it takes H at its times, so driven systems are refused for it")
     driven, end, effect = _driven()
@@ -567,6 +580,7 @@ def the_drive_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem)
         f"the end of a driven system is wrong by {error:.1e}, and that the drive moves matters by {effect:.1e}: take H "
         "at t + c·h in every stage, as system.vector_field(y, t + c * h) does, or do not say `takes_driving`"
     )
+    _the_order_is_kept(integrator, driven, "with a drive", DRIVEN_FROM)
 
 
 def the_start_time_does_not_matter(integrator: Integrator, system: HamiltonianSystem) -> None:

@@ -46,6 +46,7 @@ def test_compare_writes_a_table_figures_and_files(tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_compare_takes_several_systems_with_their_parameters(tmp_path):
     words = ["harmonic-oscillator", "harmonic-oscillator:omega=10:t_end=1", "stiff-oscillator", "--methods", "verlet"]
     result = run("compare", *words, "--metrics", "energy", *FAST, "--out", tmp_path)
@@ -203,6 +204,7 @@ def test_wrong_usage_ends_with_a_remedy_and_not_with_a_traceback(words, message)
     assert "Traceback" not in result.output
 
 
+@pytest.mark.slow
 def test_train_makes_a_primed_flow_unless_told_otherwise(tmp_path):
     path = tmp_path / "flow.safetensors"
     small = ("--stages", 1, "--processor", 0, "--dt", 0.4, "--restarts", 1, "--steps", 3, "--points", 20)
@@ -223,6 +225,7 @@ def test_flows_are_listed():
     assert "henon_heiles" not in own
 
 
+@pytest.mark.slow
 def test_train_writes_a_flow_that_solve_takes(tmp_path):
     path = tmp_path / "flow.safetensors"
     small = ["--pairs", 1, "--hidden", "4", "--epochs", 3, "--points", 40, "--seed", 1, "--dt", 0.2]
@@ -364,6 +367,7 @@ def test_without_the_extra_the_message_says_what_to_install():
     assert 'pip install "sympflow[cli]"' in result.stderr
 
 
+@pytest.mark.slow
 def test_bench_writes_the_diagram(tmp_path):
     words = ["pendulum", "--methods", "verlet,kahan_li8", "--t-end", 5, "--batch", 5, "--n-outputs", 5, "--repeats", 1]
     result = run("bench", *words, "--out", tmp_path)

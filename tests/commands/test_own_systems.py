@@ -73,6 +73,42 @@ def test_a_formula_in_a_file_is_the_system_of_the_same_formula():
     assert one_scene(["quartic.toml", "--lam", "2"]).key == "quartic-lam=2"
 
 
+def test_driven_and_damped_systems_in_files(files):
+    text = (
+        'hamiltonian = "p**2/2 + q**4/4 - F*q*cos(t)"\ntime = "t"\nperiod = 6.283185307179586\ny0 = [1, 0]\ndt = 0.2\n'
+    )
+    (files / "driven.toml").write_text(text + "damping = 0.25\nparams = { F = 0.3 }", encoding="utf-8")
+    system = one_scene(["driven.toml", "--F", "0.4"]).system
+    assert (system.autonomous, system.period, system.damping, system.params) == (False, 2 * np.pi, 0.25, {"F": 0.4})
+    for words in (("solve",), ("section", "--since", 1), ("compare", "--n-outputs", 5, "--repeats", 1)):
+        method = "--methods" if words[0] == "compare" else "--method"
+        result = run(*words, "driven.toml", method, "rk4", "--t-end", 10)
+        assert result.exit_code == 0, result.output
+    assert "conf. defect" in result.stdout
+    oscillators = 'hamiltonian = "(p1**2 + p2**2 + q1**2 + q2**2)/2"\ndamping = '
+    for value, fits in (("[0.1, 0.2]", True), ("[[0.1, 0], [0, 0.2]]", True), ('"much"', False), ("[true, 1]", False)):
+        (files / "damped.toml").write_text(oscillators + value, encoding="utf-8")
+        if fits:
+            assert not systems.from_toml("damped.toml").conservative
+            continue
+        with pytest.raises(ValueError, match=r"^`damping` must be a number, a list of one for each p, or a matrix"):
+            systems.from_toml("damped.toml")
+    source = """
+from sympflow import HamiltonianSystem
+
+def shaken(a: float = 0.1) -> HamiltonianSystem:
+    return HamiltonianSystem.from_sympy(
+        "p**2/2 - cos(q)*(1 + a*cos(2*t))", params={"a": a}, time="t", period=3.141592653589793, y0=[1.0, 0.0]
+    )
+"""
+    (files / "shaken.py").write_text(source, encoding="utf-8")
+    words = ("shaken.py:shaken", "--a", "0.2", "--method", "rk4", "--t-end", 7)
+    assert "3.141593" in run("section", *words).stdout
+    solved = run("solve", *words)
+    assert solved.exit_code == 0
+    assert "energy error" not in solved.stdout
+
+
 def test_a_name_in_a_python_file_is_a_system_or_a_function_of_parameters():
     assert one_scene(["own.py:spring"]).system is factory("own.py", "spring")()
     made = one_scene(["own.py:chain:power=4:label=b", "--stiffness", "2"])
@@ -114,6 +150,7 @@ def test_every_command_that_takes_a_system_takes_it():
     assert "harmonic_oscillator-sympflow" in run("flows", "own.py:spring").stdout  # known by its H
 
 
+@pytest.mark.slow
 def test_a_flow_is_trained_on_it_certified_and_used(files):
     small = ("--stages", 1, "--processor", 0, "--dt", 0.4, "--restarts", 1, "--steps", 2, "--points", 20)
     trained = run("train", "quartic.toml", *small, "--out", "q.safetensors")

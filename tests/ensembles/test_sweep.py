@@ -44,6 +44,7 @@ def test_the_same_bits_where_python_runs(method, options):
         assert np.array_equal(final(chunk), reference)
 
 
+@pytest.mark.slow
 def test_a_chunk_of_one_orbit_of_a_flow():
     def final(chunk):
         return sympflow.ensemble(SYSTEM, "sympflow", (0, 1), STATES[:9], reduce="final", chunk=chunk).final

@@ -52,12 +52,14 @@ def test_the_bound_holds_along_orbits(name):
     assert found.bound(100.0) < 1e4 * found.energy_error.largest  # pessimistic, but it says something
 
 
+@pytest.mark.slow
 def test_the_bound_counts_steps():
     found = primed().certificate(HH, **QUICK)
     delta = found.delta.largest
     assert [found.bound(t) / delta for t in (0.0, 0.1, 0.5, 0.6, 100.0, -1.0)] == pytest.approx([0, 1, 1, 2, 200, 2])
 
 
+@pytest.mark.slow
 def test_delta_is_the_integral_of_the_rate():
     """Against H itself: the mean over x of d/dt H(ψ̄_t(x)), integrated, is what H gained."""
     flow = primed()
@@ -83,6 +85,7 @@ def test_delta_is_not_exceeded_by_states_that_are_drawn_later():
     assert gain.max() <= found.delta.largest < 3 * gain.max()
 
 
+@pytest.mark.slow
 def test_numba_functions_are_certified_like_their_symbols():
     """The third derivatives in a force gradient are differences there, good to ε^(2/3) of the defect's terms."""
     numba = pytest.importorskip("numba")

@@ -36,6 +36,7 @@ def end(system, method, x, **options):
     return solve(system, method, (0, 8.0), x, t_eval=[8.0], **options).y[..., -1]
 
 
+@pytest.mark.slow
 def test_a_flow_is_fitted_to_the_damped_system(system, flow, conservative):
     x = system.domain.sample(10, seed=1)
     truth = end(system, "dop853", x, rtol=1e-12, atol=1e-12)

@@ -69,7 +69,10 @@ def _own_registries(monkeypatch):
     torch.manual_seed(5)
 
 
-@pytest.mark.parametrize("activation", [nn.Tanh(), Swish(), nn.SiLU(), nn.Softplus(), nn.Sigmoid()])
+@pytest.mark.parametrize(
+    "activation",
+    [nn.Tanh(), Swish(), *(pytest.param(f, marks=pytest.mark.slow) for f in (nn.SiLU(), nn.Softplus(), nn.Sigmoid()))],
+)
 def test_networks_of_modules_give_the_map_of_the_modules(activation):
     theirs = PlainSympFlow(2, 3, 6, activation)
     flow = SympFlow.from_potentials(theirs.entries(), dt=1.0)

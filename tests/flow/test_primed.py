@@ -253,6 +253,7 @@ def test_compiled_runs_agree_with_the_flow_to_rounding(flow, span, rows):
     np.testing.assert_allclose(compiled.y, np.stack(direct, -1), rtol=1e-12, atol=1e4 * EPS)
 
 
+@pytest.mark.slow
 def test_the_kernel_steps_each_state_by_its_own_time(flow):
 
     y = flow.system.domain.sample(6, 2)
@@ -505,6 +506,7 @@ def test_flows_travel_to_other_processes():
 
 
 @pytest.mark.parametrize("rows", [(), (3,)])
+@pytest.mark.slow
 def test_compensated_sums_with_curvature(rows):
     """The same run but for rounding, and less of that: n steps and their inverses lead nearer to where it began."""
     flow, y0 = "pendulum-primed-3-0.6", np.broadcast_to([1.1, 0.3], (*rows, 2))

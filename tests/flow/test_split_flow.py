@@ -100,6 +100,7 @@ MIXED = "(p1**2 + p2**2)/2 + (q1**2 + q2**2 + 3*(q1 - q2)**2)/2 + q1**4/4"
     [double_well, lambda: HamiltonianSystem.from_sympy(FAST), lambda: HamiltonianSystem.from_sympy(MIXED)],
     ids=["hyperbolic", "turns_far", "mixed_modes"],
 )
+@pytest.mark.slow
 def test_compiled_steps_of_any_lengths_are_the_flow(make):
     """Lengths from nearly 0 to Δt, for which ωt is up to 300, that is known to its rounding, 3e-14; and back."""
     system = make()
@@ -172,6 +173,7 @@ def test_a_fit_lowers_the_error_at_all_times():
     assert all(torch.equal(a, b) for a, b in zip(flow.parameters(), again.parameters(), strict=True))
 
 
+@pytest.mark.slow
 def test_split_flows_train_as_all_others_do(tmp_path):
     """Resumed bit-identical, recorded, by other optimizers too; what they have no use for is refused."""
     system, path = harmonic_pair(), tmp_path / "run.ckpt"
@@ -211,6 +213,7 @@ def test_the_shipped_flow_of_fput_reaches_its_figures():
     assert np.abs(between.energy_error()).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_the_shipped_flow_of_the_spring_pendulum_beats_its_parts():
     system = spring_pendulum(1e6, coordinates="polar")
     flow, parts = solve(system), solve(system, "strang_parts", dt=0.01)

@@ -159,6 +159,7 @@ class TestPhysicalSolution:
             solve(systems.pendulum(), "projected", (0, 1), of="verlet")
 
 
+@pytest.mark.slow
 def test_a_function_is_a_force_as_its_symbols_are(pendulum):
     import torch
 

@@ -21,6 +21,7 @@ TURNING = HamiltonianSystem.from_sympy(
 
 
 @pytest.mark.parametrize("method", METHODS)
+@pytest.mark.slow
 def test_the_contract_holds_where_h_does_not_split(method):
     names = check_integrator(get(method), TURNING)
     assert {"the_order_is_the_slope", "symplecticity_as_declared", "the_inverse_undoes_the_step"} <= set(names)
@@ -131,6 +132,7 @@ def test_events_and_failure_beside_them(method):
     assert "Newton's iteration did not converge after t = 5" in sol.message
 
 
+@pytest.mark.slow
 def test_compensated_sums_need_compiled_loops_and_lower_the_rounding():
     pendulum = systems.pendulum()
     rms = []

@@ -197,6 +197,7 @@ def test_force_evaluations_on_arrays_are_bounded_before_a_singularity(method):
 
 
 @pytest.mark.parametrize("backend", ["array", "auto"])
+@pytest.mark.slow
 def test_states_of_an_infinite_energy(backend):
     """V that overflows is refused; T that does is a run that fails at its start, whatever is asked of it."""
     system, still = systems.henon_heiles(), [0.0, 0.0, 0.0]
@@ -299,6 +300,7 @@ def test_it_is_right_in_the_physical_time(clocked):
     np.testing.assert_allclose(dense.sol(times).T, kepler_ellipse(e, anomaly), rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_tolerance_takes_it_where_it_is_the_faster_one():
     kepler = systems.kepler()
     assert choose(kepler, tol=1e-8, transformed=True).shift == 0.0

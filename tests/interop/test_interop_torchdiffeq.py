@@ -94,6 +94,7 @@ def test_gradients_of_a_flow_to_y0_t_and_weights(t):
 
 
 @pytest.mark.parametrize("make", [lambda: SympFlow.primed(PENDULUM), lambda: MLPFlow(1, hidden=(4,))])
+@pytest.mark.slow
 def test_gradients_of_other_flows(make):
     """Through states and event times, to y0, t and all weights."""
     psi = make().requires_grad_(True)
@@ -162,6 +163,7 @@ class TestEvents:
         torch.testing.assert_close(ours[1], theirs[1], rtol=0, atol=1e-8)
 
     @pytest.mark.parametrize("reverse", [False, True])
+    @pytest.mark.slow
     def test_gradients_of_time_and_state(self, reverse):
         y0 = times(1.0, 0.2).requires_grad_(True)
         t0 = times(0.1)[0].requires_grad_(True)

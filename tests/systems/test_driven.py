@@ -1,9 +1,11 @@
 """The driven scenes: the truths that their docstrings tell."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
+from conftest import load_example
 from scipy.interpolate import CubicSpline, PPoly
 from scipy.special import mathieu_a, mathieu_b, mathieu_cem
 
@@ -45,9 +47,16 @@ def test_small_deviations_of_the_driven_pendulum_follow_mathieu(upright, drive):
 
 
 def test_the_paul_trap_holds_the_ion_up_to_the_first_boundary():
-    for q, stable in ((0.9080, True), (0.9081, False)):
-        assert floquet_multipliers(systems.paul_trap(0.0, q), np.zeros(4)).stable is stable
+    """q = 0.9080463337 at a = 0, where b₁(q) = 0, by bisection; the tip of the region where both planes are stable."""
+    trap, low, high = SCENES["paul-trap"], 0.9, 0.92
+    while high - low > 1e-5:
+        q = (low + high) / 2
+        stable = floquet_multipliers(trap.with_params(drive=q), np.zeros(4)).stable
+        low, high = (q, high) if stable else (low, q)
+    assert low == pytest.approx(0.9080463337, abs=2e-5)
     assert mathieu_b(1, 0.9080463337) == pytest.approx(0.0, abs=1e-9)
+    for a, stable in ((0.2365, True), (0.2375, False)):
+        assert floquet_multipliers(systems.paul_trap(a, 0.7060), np.zeros(4)).stable is stable
 
 
 def test_a_periodic_orbit_of_the_paul_trap_is_a_mathieu_function():
@@ -59,12 +68,20 @@ def test_a_periodic_orbit_of_the_paul_trap_is_a_mathieu_function():
 
 
 def test_the_multipliers_of_duffings_oscillator_have_the_product_of_the_friction():
-    system = SCENES["duffing"]
-    y = solve(system, "kahan_li8", (0, 5 * system.period), [0.2, 0.1], dt=system.period / 60, backend="array").y[:, -1]
-    with pytest.warns(RuntimeWarning, match="not periodic"):  # the truth is one of all orbits
-        found = floquet_multipliers(system, y, dt=system.period / 60)
-    assert np.prod(found.multipliers).real == pytest.approx(math.exp(-0.25 * system.period), rel=1e-12)
-    assert found.pairing < 1e-14
+    """Of an orbit of the period of the drive, found by Newton's method, by 60 steps a period."""
+    system, y = SCENES["duffing"], np.array([-0.148, 0.018])  # of the linear equation
+    T, dt = system.period, system.period / 60
+    for _ in range(8):
+        end = solve(system, "kahan_li8", (0, T), y, dt=dt, t_eval=[T], backend="array").y[:, -1]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # not periodic yet
+            M = floquet_multipliers(system, y, dt=dt).monodromy
+        y = y - np.linalg.solve(M - np.eye(2), end - y)
+    found = floquet_multipliers(system, y, dt=dt)
+    assert found.mismatch < 1e-10
+    assert not found.stable  # it is part of the strange attractor
+    assert np.prod(found.multipliers).real == pytest.approx(math.exp(-0.25 * T), rel=1e-10)
+    assert found.pairing < 1e-13
     assert systems.duffing(damping=0).conservative
 
 
@@ -142,3 +159,14 @@ def test_steps_of_the_kicked_scene_are_the_standard_map():
 def test_bad_parameters(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+@pytest.mark.slow
+def test_the_pictures_are_drawn(tmp_path, capsys):
+    load_example("driven_maps").main(["--quick", "--out", str(tmp_path)])
+    assert "Duffing: 620 states" in capsys.readouterr().out
+    assert {p.stem for p in tmp_path.glob("*.png")} == {
+        "duffing_attractor",
+        "driven_pendulum_section",
+        "mathieu_stability",
+    }

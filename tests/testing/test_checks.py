@@ -340,6 +340,58 @@ def test_the_sound_method_passes():
     assert len(check_integrator(SoundVerlet).passed) == len(CHECKS) - 3  # it says nothing of friction and drive
 
 
+class Rk4(FixedStep):
+    """The classical Runge–Kutta method, with each stage by `slope(system, t, y, c, h)`."""
+
+    name: ClassVar[str] = "own_rk4"
+    order: ClassVar[int | None] = 4
+    takes_driving = takes_friction = True
+
+    @staticmethod
+    def slope(system, t, y, c, h):
+        return system.vector_field(y, t + c * h)
+
+    def step(self, system, t, y, h):
+        s = per_state(h, y)
+        k = self.slope(system, t, y, 0.0, h)
+        total = k
+        for c, weight in ((0.5, 2), (0.5, 2), (1.0, 1)):
+            k = self.slope(system, t, y + c * s * k, c, h)
+            total = total + weight * k
+        return y + s / 6 * total
+
+
+class LateDrive(Rk4):
+    """One that takes the drive at the beginning of every step."""
+
+    @staticmethod
+    def slope(system, t, y, c, h):
+        return system.vector_field(y, t + 0 * h)
+
+
+class HalfFriction(Rk4):
+    """One that adds friction after a step without it."""
+
+    takes_friction = True
+
+    def step(self, system, t, y, h):
+        d, s = system.ndof, per_state(h, y)
+        end = get("rk4")().step(laws.default_system() if system.friction is not None else system, t, y, h)
+        if system.friction is None:
+            return end
+        return concatenate([end[..., :d], (1 - s * system.friction.largest) * end[..., d:]])
+
+
+def test_the_order_with_a_drive_or_friction_is_measured():
+    check = {check.name: check for check in CHECKS}
+    for name in ("the_drive_is_in_the_steps", "friction_is_in_the_steps"):
+        check[name](Rk4(dt=0.01))
+    with pytest.raises(AssertionError, match=r"with a drive the order is 1\.\d\d, and 4 is declared"):
+        check["the_drive_is_in_the_steps"](LateDrive(dt=0.01))
+    with pytest.raises(AssertionError, match=r"with friction the order is [01]\.\d\d, and 4 is declared"):
+        check["friction_is_in_the_steps"](HalfFriction(dt=0.01))
+
+
 def test_a_start_time_that_matters_is_seen_by_its_own_check():
     with pytest.raises(AssertionError, match=r"^the_start_time_does_not_matter of .*a run from t0 = 5.25 differs"):
         {check.name: check for check in CHECKS}["the_start_time_does_not_matter"](unsound(step=clock_in_the_step)())
