@@ -59,18 +59,14 @@ def windows(n_steps: int, rounds: int) -> list[list[str]]:
 def stores(n_steps: int, rounds: int) -> list[list[str]]:
     """Rows of wall times in memory and with a store."""
     rows = []
-    for every in (100, 10_000):
+    for every in (n_steps // 1_000_000, n_steps // 10_000):
+        how: dict[str, Any] = {"save_every": every}
         memory, stored = [], []
         for _ in range(rounds):
-            memory.append(seconds(lambda every=every: run(SYSTEM.y0, n_steps, save_every=every), time.perf_counter))
+            memory.append(seconds(lambda how=how: run(SYSTEM.y0, n_steps, **how), time.perf_counter))
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / "run.zarr"
-                stored.append(
-                    seconds(
-                        lambda every=every, p=path: run(SYSTEM.y0, n_steps, save_every=every, store=p),
-                        time.perf_counter,
-                    )
-                )
+                stored.append(seconds(lambda h=how, p=path: run(SYSTEM.y0, n_steps, store=p, **h), time.perf_counter))
                 size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
         least, kept = min(memory), min(stored)
         outputs = n_steps // every + 1
