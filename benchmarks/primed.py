@@ -3,6 +3,7 @@
     python benchmarks/primed.py                        four scenes: energy error over T = 1000, state error at T = 100
     python benchmarks/primed.py --system pendulum      one of them
     python benchmarks/primed.py --fit --flows folder   flows that are fitted first, and kept in a folder
+    python benchmarks/primed.py --driven               flows of driven systems, fitted first; kept with --fit --flows
     python benchmarks/primed.py --ablation             what of a flow and its training pays, on Hénon–Heiles
     python benchmarks/primed.py --quick                the same in miniature
     python benchmarks/primed.py --out docs/measured    with the fragments of docs/primed.md
@@ -23,6 +24,8 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import tempfile
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -56,6 +59,21 @@ FLOWS = {
     "kepler": ((Primed(0.15, 2), 24), (Primed(0.1, 3), 24), (Primed(0.045, 3), 48)),
 }  # fmt: skip
 """Starts of trainings, and how many tables their searches begin from."""
+
+
+DRIVEN: dict[str, tuple[Callable[[], HamiltonianSystem], dict[str, float], tuple[Primed, ...]]] = {
+    "driven_pendulum": (
+        systems.driven_pendulum,
+        MEASURES,
+        tuple(Primed(dt, 3, curvature=True) for dt in (0.8, 0.6, 0.4, 0.25)),
+    ),
+    "duffing": (
+        partial(systems.duffing, damping=0.0, force=0.1, frequency=2.7, alpha=1.0),
+        MEASURES,
+        (Primed(0.5, 3),),
+    ),
+}
+"""Driven systems, what is measured, and the starts of trainings, 8 tables each."""
 
 
 def fitted(system: HamiltonianSystem, start: Primed, tables: int, folder: Path, **options: Any) -> PrimedFlow:
@@ -111,7 +129,14 @@ def table(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
-SCENES = {"henon_heiles": "Hénon–Heiles", "pendulum": "pendulum", "quartic": "quartic", "kepler": "Kepler, e = 0.6"}
+SCENES = {
+    "henon_heiles": "Hénon–Heiles",
+    "pendulum": "pendulum",
+    "quartic": "quartic",
+    "kepler": "Kepler, e = 0.6",
+    "driven_pendulum": "driven pendulum",
+    "duffing": "Duffing, δ = 0",
+}
 
 
 def fragment(rows: list[Row]) -> str:
@@ -190,7 +215,9 @@ def ablation(system: HamiltonianSystem, dt: float, variants: tuple[Variant, ...]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--system", action="append", choices=list(FLOWS), help="all four if not given")
+    known = [*FLOWS, *DRIVEN]
+    parser.add_argument("--system", action="append", choices=known, help="all four, or of --driven two, if not given")
+    parser.add_argument("--driven", action="store_true", help="driven systems")
     parser.add_argument("--ablation", action="store_true")
     parser.add_argument("--quick", action="store_true", help="small fits, short intervals")
     parser.add_argument(
@@ -205,11 +232,43 @@ def main() -> None:
     print(run(parser.parse_args()))
 
 
+def driven(options: argparse.Namespace, quick: dict[str, Any]) -> str:
+    """The race of flows of driven systems; they are fitted, or taken from the folder that is given."""
+    rows: list[Row] = []
+    targets = (1e-2,) if options.quick else TARGETS
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = options.flows if options.fit else Path(scratch)
+        for name in options.system or DRIVEN:
+            make, measures, starts = DRIVEN[name]
+            system = make()
+            system.name = name
+            flows = [fitted(system, start, 8, folder, **quick) for start in starts[: 1 if options.quick else None]]
+            for measure, t_end in measures.items():
+                for target in targets:
+                    row = race(
+                        Measure(system, measure, 20.0 if options.quick else t_end),
+                        target,
+                        flows,
+                        None,
+                        options.repeats,
+                        options.batch,
+                    )
+                    if row is None:
+                        print(f"{name}: no flow reaches {measure} {target:g}", flush=True)
+                        continue
+                    rows.append(row)
+                    print(table([row]).splitlines()[-1], flush=True)
+    fragments.write(options.out, "primed-driven", fragment(rows))
+    return "\n" + table(rows)
+
+
 def run(options: argparse.Namespace) -> str:
     quick: dict[str, Any] = {"restarts": 2, "steps": 10, "points": 60, "reference_states": 20} if options.quick else {}
     if options.fit_seconds:
         quick["time_budget"] = options.fit_seconds
     targets, measures = (TARGETS, MEASURES) if not options.quick else ((1e-2,), {"energy": 20.0, "state": 5.0})
+    if options.driven:
+        return driven(options, quick)
     if options.ablation:
         system = getattr(systems, (options.system or ["henon_heiles"])[0])()
         found = ablation(system, 0.6, ABLATION[:3] if options.quick else ABLATION, **quick)

@@ -121,10 +121,22 @@ def peers(n: int) -> list[list[object]]:
         ended = hy.ensemble_propagate_until(taylor, T, len(y0), start, max_workers=cores())
         return np.array([row[0].state for row in ended])
 
+    def in_turn() -> np.ndarray:
+        states = np.empty_like(y0)
+        for i in range(len(y0)):
+            start(taylor, i)
+            taylor.propagate_until(T)
+            states[i] = taylor.state
+        return states
+
     def error(states: np.ndarray) -> float:
         return float(np.abs(system.hamiltonian(states) - H0).max())
 
-    runs: dict[str, Run] = {"heyoka's ensemble": ensemble, "diffrax, vmap": _diffrax(y0)}
+    runs: dict[str, Run] = {
+        "heyoka's ensemble, a copy of its integrator for each orbit": ensemble,
+        "heyoka, one integrator, one orbit after the other": in_turn,
+        "diffrax, vmap": _diffrax(y0),
+    }
     errors = {name: error(run()) for name, run in runs.items()}
     worst = min(errors.values())
     dt = next(h for h in 0.8 * 0.9 ** np.arange(60) if error(final(system, y0, "srkn14a", h)) <= worst)

@@ -43,6 +43,7 @@ _HOME = {
     "energy_balance_error": "metrics.energy_balance",
     "volume_error": "metrics.symplectic",
     "symplecticity_defect": "metrics.symplectic",
+    "symplecticity_estimate": "metrics.symplectic",
     "conformal_defect": "metrics.symplectic",
     "loop_area_error": "metrics.symplectic",
     "floquet_multipliers": "metrics.floquet",
@@ -96,6 +97,7 @@ if TYPE_CHECKING:
     from sympflow.metrics.symplectic import conformal_defect as conformal_defect
     from sympflow.metrics.symplectic import loop_area_error as loop_area_error
     from sympflow.metrics.symplectic import symplecticity_defect as symplecticity_defect
+    from sympflow.metrics.symplectic import symplecticity_estimate as symplecticity_estimate
     from sympflow.metrics.symplectic import volume_error as volume_error
     from sympflow.schemes import Scheme as Scheme
     from sympflow.solution import Solution as Solution

@@ -482,16 +482,15 @@ def _scattered(pieces: Sequence[tuple[np.ndarray, Any]], shape: tuple[int, ...])
     """Arrays (k, ...) of some trajectories each as one, (*shape, ...)."""
     whole: Any
     order = np.concatenate([index for index, _ in pieces])
-    back = np.argsort(order)
     if is_tensor(pieces[0][1]):
         import torch
 
-        whole = torch.cat([values for _, values in pieces])[torch.as_tensor(back)]
+        whole = torch.cat([values for _, values in pieces])[torch.as_tensor(np.argsort(order))]
         return whole.reshape(*shape, *whole.shape[1:])
     if len(pieces) == 1 and (order == np.arange(len(order))).all():
         whole = np.asarray(pieces[0][1])
     else:
-        whole = np.concatenate([np.asarray(values) for _, values in pieces])[back]
+        whole = np.concatenate([np.asarray(values) for _, values in pieces])[np.argsort(order)]
     return whole.reshape(*shape, *whole.shape[1:])
 
 

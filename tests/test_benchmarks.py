@@ -268,6 +268,7 @@ def test_fewest_steps_are_the_fewest():
 
 def arguments(**options):
     given = {"system": ["pendulum"], "ablation": False, "quick": True, "fit": True, "json": None, "out": None}
+    given["driven"] = False
     return argparse.Namespace(**{**given, "fit_seconds": None, "repeats": 1, "batch": 16, **options})
 
 
@@ -285,6 +286,15 @@ def test_a_tiny_race_of_primed_flows(tmp_path, monkeypatch):
     system = pendulum()
     again = primed.fitted(system, *primed.FLOWS["pendulum"][0], tmp_path)  # not fitted again, but read
     assert again.recipe["stages"][0]["restarts"] == 2
+
+
+@pytest.mark.slow
+def test_a_tiny_race_of_driven_flows(tmp_path, monkeypatch):
+    monkeypatch.setattr(at_equal_error, "TIMED_SPAN", 20.0)
+    system = ["driven_pendulum"]
+    text = primed.run(arguments(driven=True, system=system, flows=tmp_path, out=tmp_path / "measured"))
+    assert text.count("| driven_pendulum, ") == 2
+    assert (tmp_path / "measured" / "primed-driven.md").read_text(encoding="utf-8").count("| driven pendulum, ") == 2
 
 
 def test_a_tiny_ablation():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -50,12 +51,12 @@ class _Indicator(Reduction):
 
     name: ClassVar[str]
 
+    @abstractmethod
     def follow(self, chunk: Chunk, rows: np.ndarray) -> Indicator:
         """The indicator of some rows."""
-        raise NotImplementedError
 
-    def vectors(self) -> int:
-        raise NotImplementedError
+    @abstractmethod
+    def vectors(self) -> int: ...
 
     def fields(self, problem: Chunk) -> Fields:
         check_followed(_orbits(problem))

@@ -202,9 +202,14 @@ def _axes(
     for name, given in params.items():
         system.check_parameters([name])
         values = floats("params", given)
-        if values.ndim > 1 or values.size == 0 or not np.isfinite(values).all():
+        if not np.isfinite(values).all():
+            where = int(np.flatnonzero(~np.isfinite(np.ravel(values)))[0])
             raise ValueError(
-                f"`params` must give {name!r} a finite number, or a list of them; got shape {values.shape}. For "
+                f"`params` has {name} = {np.ravel(values)[where]} at {where}: give finite numbers, or leave it out."
+            )
+        if values.ndim > 1 or values.size == 0:
+            raise ValueError(
+                f"`params` must give {name!r} a number, or a list of them; got shape {values.shape}. For "
                 "parameters that vary together call `solve` with arrays of the length of the batch."
             )
         if values.ndim:

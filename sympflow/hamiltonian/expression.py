@@ -72,8 +72,9 @@ def read(text: str, names: Collection[str] = ()) -> sp.Expr:
     """
     if len(text) > MAX_TEXT:
         raise Unreadable(
-            f"it has {len(text):,} characters, more than {MAX_TEXT:,}: a system that large is better given by Numba "
-            "functions, HamiltonianSystem(V, ndof=…, gradient=…)"
+            f"it has {len(text):,} characters, more than {MAX_TEXT:,}: a system that large is better given by one site "
+            "and one bond, HamiltonianSystem.lattice, by one pair, HamiltonianSystem.pairs, or by Numba functions, "
+            "HamiltonianSystem(V, ndof=…, gradient=…)"
         )
     _check_brackets(text)
     try:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import reprlib
 from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import sympy as sp
@@ -64,6 +65,18 @@ class LatticeHamiltonian(LocalHamiltonian):
         self._read(onsite, bond, kinetic)
         self._check_sizes()
         self._set_mass()
+
+    def with_params(self, values: Mapping[str, Any]) -> Self:
+        for name in values:
+            if name not in self.params:
+                raise ValueError(
+                    f"`params` has {name!r}, and those of the lattice are {', '.join(self.params) or 'none'}."
+                )
+        other = copy.copy(self)
+        vars(other).pop("_functions", None)
+        other.params = _checked_params({**self.params, **values}, self.shape)
+        other._set_mass()
+        return other
 
     def _set_letters(self) -> None:
         fields = self.fields
@@ -304,7 +317,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return tuple(self.params.values())
 
     def _of_bonds(self, axis: int, k: int) -> list[Any]:
-        """The same for the bonds along an axis: those at its first end, or where that is a wall at its other."""
+        """The same for the bonds along an axis: those at its first end, or of the first site where that is a wall."""
         return [self._of_first_ends(c, axis, k) if isinstance(c, np.ndarray) else c for c in self._sites]
 
     def _of_first_ends(self, values: np.ndarray, axis: int, k: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import sympy as sp
@@ -49,6 +49,18 @@ class LocalHamiltonian(Definition):
     inverse_mass: np.ndarray | None
     quadratic_kinetic: bool
     params: Mapping[str, Any]
+
+    def with_params(self, values: Mapping[str, Any]) -> Self:
+        """Return the definition with other values of some parameters.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there is none, or values are bad.
+        """
+        raise TypeError(
+            "`params` of pairs cannot be changed: make a system for each value, by HamiltonianSystem.pairs."
+        )
 
     def potential_hessian(self, q: Array, *t: Array) -> Array:
         """∇²V(q), dense: (..., d) to (..., d, d).

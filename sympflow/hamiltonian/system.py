@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.local import LocalHamiltonian
 
 MOST_DEGREES = 1_000_000
+MOST_WRITTEN_OUT = 400
+"""Coordinates of an expression before a warning: 512 of a chain take 2 s to define, and a step 14 times as long."""
 
 
 class Parameters(dict[str, Any]):
@@ -215,6 +217,13 @@ class HamiltonianSystem(Hamiltonian):
 
         params = checked_params(params)
         symbols = SymbolicHamiltonian(expression, params, time)
+        if symbols.ndof > MOST_WRITTEN_OUT:
+            warnings.warn(
+                f"`expression` has {symbols.ndof} coordinates: written out, H takes seconds to define, and a step ten "
+                "times as long as by HamiltonianSystem.lattice, from one site and one bond, or by "
+                "HamiltonianSystem.pairs, from one pair. Use one of these.",
+                stacklevel=2,
+            )
         self = cls.__new__(cls)
         M = symbols.inverse_mass
         inverse_mass = None if M is None else matrices.simplest(np.array(M.tolist(), dtype=float))
@@ -269,7 +278,7 @@ class HamiltonianSystem(Hamiltonian):
             Names of the fields at a site.
         params : mapping of str to float or array of the lattice's shape, optional
             Values of the other symbols; an array has one for each site, and for each bond that of its lower end, or of
-            its other end where the lower one is a wall.
+            the first site where the lower end is a wall.
         damping, name, domain, y0, t_span, dt, energy_scale
             As for the class.
 
@@ -456,6 +465,11 @@ class HamiltonianSystem(Hamiltonian):
         ValueError
             With the names that it has.
         """
+        if self.local is not None:
+            raise TypeError(
+                f"`params` of {self.name!r} are arrays and numbers of all runs: make a system for each value, by "
+                "system.with_params."
+            )
         if self.symbols is None:
             raise TypeError(
                 f"`params` are of symbolic systems, and {self.name!r} is given by functions, which hold their values: "
@@ -495,6 +509,9 @@ class HamiltonianSystem(Hamiltonian):
         >>> system.with_params(k=2.5).params
         {'k': 2.5}
         """
+        if self.local is not None:
+            scene = self.domain, self.y0, self.t_span, self.dt, self.energy_scale
+            return HamiltonianSystem._of_pieces(self.local.with_params(values), self.damping, self.name, *scene)
         self.check_parameters(values)
         assert self.symbols is not None
         H, time = self.symbols.written[0], self.symbols.time

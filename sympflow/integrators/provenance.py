@@ -45,8 +45,8 @@ def provenance(
     -------
     dict
         `sympflow_version`, `system` (its name), `hamiltonian` (H as it was written, of a symbolic system), `params`
-        (JSON), `damping` (JSON, of a damped system), `method`, `options`, `t_span`, `flow_checksum` (of a trained
-        flow), and `units`, which are those of the system.
+        (JSON), `damping` (JSON, of a damped system), `method`, `options`, `t_span`, `dt` (of fixed steps),
+        `flow_checksum` (of a trained flow), and `units`, which are those of the system.
     """
     told: dict[str, Any] = {"sympflow_version": __version__, "system": system.name}
     if system.symbols is not None and len(system.symbols.text) <= LONGEST_EXPRESSION:
@@ -55,6 +55,9 @@ def provenance(
     if system.friction is not None:
         told["damping"] = json.dumps(system.friction.damping.tolist())
     told |= {"method": name_of(integrator), "options": option_text(integrator), "t_span": list(t_span)}
+    step = integrator.step_length(system)
+    if step is not None:
+        told["dt"] = float(step)
     checksum = flow_checksum(integrator, system)
     if checksum is not None:
         told["flow_checksum"] = checksum

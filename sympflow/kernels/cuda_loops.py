@@ -59,7 +59,7 @@ def cuda_kernel(system: HamiltonianSystem, scheme: Scheme, compensated: bool) ->
     """
     reason = None
     if system.symbols is None:
-        reason = "is given by functions: define it with HamiltonianSystem.from_sympy"
+        reason = "is not symbolic: define it with HamiltonianSystem.from_sympy"
     elif not system.separable:
         reason = "is not separable"
     elif system.friction is not None:

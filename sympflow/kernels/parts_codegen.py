@@ -280,7 +280,7 @@ def _dispatch_each(flows: Sequence[PartFlow]) -> str:
     """
     lines = ["@njit(**OPTIONS, inline='always')", "def apply_map_each(Z, width, code):"]
     if any(flow.letters for flow in flows):
-        return "\n".join([*lines, "    raise NotImplementedError"])
+        return "\n".join([*lines, "    raise ValueError('a part depends on t')"])
     for number, flow in enumerate(flows):
         lines += [f"    {'elif' if number else 'if'} code == {flow.code}:", "        for lane in range(width):"]
         lines += ["            " + re.sub(r"row\[(\d+)\]", r"Z[TABLE + \1, lane]", line) for line in flow.stored]

@@ -9,14 +9,19 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arrays import to_numpy
+from sympflow.arguments import check_counts
+from sympflow.arrays import jvp, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.energy import failed
 from sympflow.solution import Solution, check_solution, gathered
+
+MOST_DENSE = 200
+"""Degrees of freedom of lattices and pairs whose steps have Jacobians as matrices."""
 
 
 def step_tangents(sol: Solution) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -113,7 +118,9 @@ def symplecticity_defect(
 
     A symplectic step has defect 0 up to the rounding of A, in the precision of the run, which is proportional to ‖A‖².
     The Jacobian A is taken in the variables (s q, p/s), which keep the form J and remove the imbalance of a stiff
-    oscillator. The defect is inf for a trajectory that became non-finite or could not be continued.
+    oscillator. The defect is inf for a trajectory that became non-finite or could not be continued. Of lattices and
+    pairs of more than 200 degrees of freedom it is the value of `symplecticity_estimate`, which says the error too,
+    unless it is to be `relative` or a `scale` is given.
 
     Parameters
     ----------
@@ -135,7 +142,84 @@ def symplecticity_defect(
     )
     if sol.varied:
         return gathered(sol, lambda part: symplecticity_defect(part, relative, scale))
+    if sol.system.local is not None and sol.system.ndof > MOST_DENSE and not relative and scale is None:
+        return symplecticity_estimate(sol).value
     return _form_defect(sol, 0.0, relative, scale)
+
+
+class Estimate(NamedTuple):
+    """A norm that is estimated by random directions, and its standard error: (...) each."""
+
+    value: np.floating | np.ndarray
+    error: np.floating | np.ndarray
+
+
+def symplecticity_estimate(sol: Solution, directions: int = 8, seed: int = 0) -> Estimate:
+    """max over the executed steps of an estimate of ‖AᵀJA − J‖_F / √(2d), for systems too large for their Jacobians.
+
+    For random vectors u and v of independent standard normal numbers (uᵀEv)² has the mean ‖E‖_F² of any matrix E. Every
+    step is differentiated along `directions` vectors, at the cost of as many steps by array operations, and the mean is
+    taken over their pairs. ‖E‖_F/√(2d) is the mean defect of a direction; ‖E‖₂, which `symplecticity_defect` is of
+    small systems, is between it and √(2d) times it.
+
+    Parameters
+    ----------
+    sol : Solution
+    directions : int
+        At least 3.
+    seed : int
+
+    Returns
+    -------
+    Estimate
+        Its `value` and the standard error, found from the differences among the pairs at the step of the maximum.
+
+    Raises
+    ------
+    TypeError
+        If `sol` is not a Solution, or its method runs on NumPy arrays alone.
+    ValueError
+        If there are fewer than 3 directions, or the system has friction.
+    """
+    check_solution(sol)
+    check_counts(directions=directions)
+    if directions < 3:
+        raise ValueError(f"`directions` must be at least 3, whose pairs tell the error; got {directions}.")
+    sol.system.check_conservative("by which its flow is not symplectic", "use sympflow.conformal_defect(sol)")
+    import torch
+
+    system, integrator = sol.system, sol.integrator
+    d = system.ndof
+    U = torch.from_numpy(np.random.default_rng(seed).standard_normal((directions, 2 * d)))
+    i, j = np.triu_indices(directions, 1)
+    worst = np.zeros(sol.y.shape[:-2])
+    error = np.zeros(sol.y.shape[:-2])
+    for times, states, lengths in integrator.steps(system, sol.t_span, sol.y0):
+        for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
+            x, step = torch.tensor(y), torch.as_tensor(h)
+            u = U.to(x.dtype)
+            moved = [
+                to_numpy(jvp(lambda z, t=t, step=step: integrator.step(system, t, z, step), x, v.expand_as(x))[1])
+                for v in u
+            ]
+            change = _form(np.stack(moved)[i], np.stack(moved)[j]) - _form(u.numpy()[i], u.numpy()[j]).reshape(
+                -1, *[1] * (y.ndim - 1)
+            )
+            squares = change.astype(float) ** 2 / (2 * d)
+            mean = np.where(np.isfinite(squares).all(0), squares.mean(0), np.inf)
+            value = np.sqrt(mean)
+            with np.errstate(all="ignore"):
+                spread = np.nan_to_num(squares.std(0, ddof=1) / np.sqrt(len(i)) / (2 * value))
+            error = np.where(value > worst, spread, error)
+            worst = np.maximum(worst, value)
+    lost = failed(sol)
+    return Estimate(np.where(lost, np.inf, worst)[()], np.where(lost, np.inf, error)[()])
+
+
+def _form(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """uᵀJv: (..., 2d), each, to (...)."""
+    d = u.shape[-1] // 2
+    return (u[..., :d] * v[..., d:] - u[..., d:] * v[..., :d]).sum(-1)
 
 
 def conformal_defect(sol: Solution, relative: bool = False, scale: ArrayLike | None = None) -> np.floating | np.ndarray:

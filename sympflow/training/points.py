@@ -165,6 +165,17 @@ class PointSource:
 
 
 @dataclass(frozen=True)
+class _WithWork:
+    """The vector field of a driven system, with ∂H/∂t as one more component."""
+
+    system: HamiltonianSystem
+
+    def vector_field(self, y: np.ndarray, t: np.ndarray) -> np.ndarray:
+        x = y[:, :-1]
+        return np.concatenate([self.system.vector_field(x, t), self.system.time_derivative(x, t)[:, None]], axis=1)
+
+
+@dataclass(frozen=True)
 class Labels:
     """φ_H,t(x) of N states at J times.
 
@@ -175,12 +186,15 @@ class Labels:
     y : (J, N, 2d)
     t0 : (N,) or None
         The times of the states x, of a driven system: then y are the states at t0 + t.
+    work : (J, N) or None
+        ∫ ∂H/∂t dt from t0 to t0 + t, of a driven system without friction.
     """
 
     t: np.ndarray
     x: np.ndarray
     y: np.ndarray
     t0: np.ndarray | None = None
+    work: np.ndarray | None = None
 
     @classmethod
     def of(
@@ -200,12 +214,15 @@ class Labels:
         OutOfTime
             At the deadline; it says how far the labels got.
         """
+        width, field = x.shape[1], system
+        if t0 is not None and system.conservative:
+            x, field = np.concatenate([x, np.zeros((len(x), 1))], axis=1), _WithWork(system)  # type: ignore[assignment]
         y, reached = [x], 0.0
         for time in t:
             check = (lambda: None) if deadline is None else deadline.check
             try:
                 begun = None if t0 is None else t0 + reached
-                after = reference_step(system, y[-1], float(time - reached), LABEL_TOLERANCE, check, begun)
+                after = reference_step(field, y[-1], float(time - reached), LABEL_TOLERANCE, check, begun)
             except OutOfTime:
                 raise OutOfTime(
                     f"the exact solution was followed from {len(y[-1])} states to t = {reached:.3g} of {t[-1]:.3g} only"
@@ -213,7 +230,9 @@ class Labels:
             exists = np.isfinite(after).all(-1)
             y, reached = [states[exists] for states in (*y, after)], time
             t0 = None if t0 is None else t0[exists]
-        return cls(np.asarray(t), y[0], np.stack(y[1:]), t0)
+        ends = np.stack(y[1:])
+        work = None if field is system else ends[..., width]
+        return cls(np.asarray(t), y[0][:, :width], ends[..., :width], t0, work)
 
     @classmethod
     def needed(
@@ -240,11 +259,12 @@ class Labels:
 
     def at(self, j: int) -> Labels:
         """The labels at the j-th time alone."""
-        return Labels(self.t[[j]], self.x, self.y[[j]], self.t0)
+        return Labels(self.t[[j]], self.x, self.y[[j]], self.t0, None if self.work is None else self.work[[j]])
 
     def first(self, n: int) -> Labels:
         """The labels of the first n states."""
-        return Labels(self.t, self.x[:n], self.y[:, :n], None if self.t0 is None else self.t0[:n])
+        t0, work = (None if a is None else a[..., :n] for a in (self.t0, self.work))
+        return Labels(self.t, self.x[:n], self.y[:, :n], t0, work)
 
     @property
     def times(self) -> np.ndarray | None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from sympflow.training.checkpoint import check_writable
 from sympflow.training.options import is_number
-from sympflow.workers import Crew
+from sympflow.workers import Crew, Unpicklable
 
 Path = str | os.PathLike[str]
 Callback = Callable[[int, dict[str, float]], None]
@@ -146,6 +146,11 @@ class Session:
                 armed, interruption.armed = interruption.armed, False
                 try:
                     answer = next(answers)
+                except Unpicklable as error:
+                    raise TypeError(
+                        f"`system` cannot be sent to `workers` ({error}): define its functions in a module, or leave "
+                        "`workers` out."
+                    ) from error
                 finally:
                     interruption.armed = armed
                 self.crew_is_busy = left > 0

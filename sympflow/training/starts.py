@@ -155,8 +155,8 @@ def potential_hessian(system: HamiltonianSystem, q: np.ndarray, t: np.ndarray | 
 
 
 def _with_times(q: np.ndarray, t: np.ndarray | None) -> np.ndarray:
-    """Positions (n, d) as `forces_of` takes them, with the times of a driven system."""
-    return q if t is None else np.concatenate([q, t[:, None]], axis=1)
+    """Positions (n, d) as `forces_of` takes them, with t and s of a driven system."""
+    return q if t is None else np.concatenate([q, t[:, None], 0 * t[:, None]], axis=1)
 
 
 def _largest_eigenvalues(system: HamiltonianSystem, q: np.ndarray, t: np.ndarray | None = None) -> np.ndarray:

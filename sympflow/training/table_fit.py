@@ -302,11 +302,17 @@ def _check_memory(points: int, options: TableOptions, numbers: int, ndof: int) -
 
 
 def energy_slope(system: HamiltonianSystem, labels: Labels, weight: float) -> np.ndarray | None:
-    """∇H at the labels (J, N, 2d), divided by the spread of H over Ω: `TableFit`; None if it is to count nothing."""
+    """∇H at the labels (J, N, 2d), divided by the spread of H over Ω: `TableFit`; None if it is to count nothing.
+
+    Of a driven system the gradient of E + H, (J, N, 2d + 1), where there is E: the error of the balance counts.
+    """
     spread = float(np.std(system.hamiltonian(labels.x, labels.t0)))
     if not (weight > 0 and 0 < spread < math.inf):
         return None
-    return math.sqrt(weight) / spread * system.gradient(labels.y, labels.times)
+    slope = system.gradient(labels.y, labels.times)
+    if labels.work is not None:
+        slope = np.concatenate([slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
+    return math.sqrt(weight) / spread * slope
 
 
 def _with_and_without(
@@ -431,7 +437,8 @@ class TableFit(Fit):
         self.times, self.count = len(labels.t), len(labels.x)
         self._x = np.tile(labels.x.T, (1, self.times))
         self._t0 = None if labels.t0 is None else np.tile(labels.t0, self.times)
-        self._y = np.ascontiguousarray(labels.y.reshape(-1, labels.x.shape[1]).T)
+        y = labels.y if labels.work is None else np.concatenate([labels.y, -labels.work[..., None]], axis=-1)
+        self._y = np.ascontiguousarray(y.reshape(-1, y.shape[-1]).T)
         # The sum of squares is a mean over states and times.
         each = np.repeat(weight, self.count) / math.sqrt(self.times * self.count)
         self._scale = each / unit[:, None]
@@ -464,7 +471,7 @@ class TableFit(Fit):
 
     def _errors(self, change: np.ndarray) -> np.ndarray:
         """The errors of each coordinate and, with a slope, of the energy: (..., 2d + 1, P), else (..., 2d, P)."""
-        scaled = change * self._scale
+        scaled = change[..., : len(self._scale), :] * self._scale
         if self._slope is None:
             return scaled
         return np.concatenate([scaled, (change * self._slope).sum(-2, keepdims=True)], axis=-2)
@@ -641,7 +648,8 @@ def differences(flow: PrimedFlow, step: TableStep, labels: Labels) -> np.ndarray
     table = Table(flow)
     offset, design = table.polynomial(labels.t)
     coefficients = offset + design @ table.parameters()
-    return np.stack([step(c[:, None], labels.x.T, t0=labels.t0).T for c in coefficients]) - labels.y
+    width = labels.x.shape[1]
+    return np.stack([step(c[:, None], labels.x.T, t0=labels.t0)[:width].T for c in coefficients]) - labels.y
 
 
 @np.errstate(all="ignore")

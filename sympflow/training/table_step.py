@@ -3,8 +3,9 @@
 The step needs the forces of a system and their Jacobians: F = −∇V, G = ∇²V v and C = −∇(½ v·∇²V v), with v = M⁻¹∇V; or
 after F the −∇q^m of each monomial. Arrays are feature-major: q and F, G, C are (d, P), Jacobians (d, d, P).
 
-A driven system is the autonomous one of positions (q, t) and momenta (p, 1), with M⁻¹ extended by 1 for the velocity of
-t in drifts, by 0 in v, and the force (−∂V/∂q, 0). So the derivatives by the drifts hold those by the times of kicks.
+A driven system is the autonomous one of positions (q, t, s) and momenta (p, 1, E), with V(q, t + s), M⁻¹ extended by 1
+for the velocity of t in drifts, by 0 in v and for s, which stays 0, and the forces (−∂V/∂q, 0, −∂V/∂t). So the
+derivatives by the drifts hold those by the times of kicks, and E is less the work of the drive.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ class TableStep:
     """The map of kicks p += w F(q) + g ∇²V v − c ∇(½ v·∇²V v), v = M⁻¹∇V(q), and drifts q += a M⁻¹p of a system.
 
     Arrays are feature-major: states y (2d, P). A coefficient is a row of P numbers, one a state, so that states may
-    be at different times: c (n, P), or (n, 1). The states of a driven system begin at times t0 (P,).
+    be at different times: c (n, P), or (n, 1). The states of a driven system begin at times t0 (P,); those at the end
+    have a row more, E, unless there is friction.
 
     Parameters
     ----------
@@ -46,6 +48,11 @@ class TableStep:
         What the kicks have beside the force: nothing, g, g and c, or a polynomial.
     monomials
         Of the polynomial.
+
+    Attributes
+    ----------
+    balanced : bool
+        True if E is a row of the states at the end.
     """
 
     def __init__(
@@ -57,6 +64,7 @@ class TableStep:
                 "Gauss–Newton steps: use optimizer='bfgs'."
             )
         self.ndof, self.sequence, self._driven = system.ndof, tuple(sequence), not system.autonomous
+        self.balanced = self._driven and system.friction is None
         self._inverse_mass = _inverse_mass(system, 1.0)
         self._times_inverse_mass, self._friction = _velocities(system, 1.0), system.friction
         if self._driven and system.friction is not None:
@@ -71,16 +79,19 @@ class TableStep:
         }
 
     def _opened(self, y: np.ndarray, t0: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """The positions and momenta on which maps are applied, with the time among them: (D, P) each."""
+        """The positions and momenta on which maps are applied, (q, t, s) and (p, 1, E) in time: (D, P) each."""
         q, p = y[: self.ndof], y[self.ndof :]
         if not self._driven:
             return q, p
         assert t0 is not None
-        return np.concatenate([q, t0[None]]), np.concatenate([p, np.ones((1, p.shape[1]))])
+        zero = np.zeros((1, p.shape[1]))
+        return np.concatenate([q, t0[None], zero]), np.concatenate([p, zero + 1, zero])
 
     def _closed(self, q: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """The states (2d, P) of these."""
-        return np.concatenate([q[: self.ndof], p[: self.ndof]])
+        """The states (..., 2d, P) of these, and E where the step is `balanced`."""
+        d = self.ndof
+        E = [p[..., d + 1 :, :]] if self.balanced else []
+        return np.concatenate([q[..., :d, :], p[..., :d, :], *E], axis=-2)
 
     def __call__(
         self, c: np.ndarray, y: np.ndarray, check: Check = lambda: None, t0: np.ndarray | None = None
@@ -141,8 +152,7 @@ class TableStep:
                     by_p[place] += F
                     p = p + c[place] * F
                 moved += self._places[i]
-        d = self.ndof
-        return self._closed(q, p), np.concatenate([by_q[:, :d], by_p[:, :d]], axis=1)
+        return self._closed(q, p), self._closed(by_q, by_p)
 
     def _velocity(self, p: np.ndarray) -> np.ndarray:
         """M⁻¹p: (..., d, P)."""
@@ -170,10 +180,11 @@ class TableStep:
                 weights = [c[place] for place in self._places[i]]
                 passed.append((sum(w * D for w, D in zip(weights, jacobians, strict=True)), *forces))
                 p = p + sum(w * F for w, F in zip(weights, forces, strict=True))
-        J = np.empty((self.n_coefficients, *y.shape))
-        after_q, after_p = np.zeros((2, 2 * d, width, y.shape[1]))  # of the states that `_closed` gives
+        after_q, after_p = np.zeros((2, 2 * d + self.balanced, width, y.shape[1]))  # of the rows that `_closed` gives
+        J = np.empty((self.n_coefficients, len(after_q), y.shape[1]))
         after_q[np.arange(d), np.arange(d)] = 1.0
         after_p[np.arange(d, 2 * d), np.arange(d)] = 1.0
+        after_p[2 * d :, d + 1 :] = 1.0  # E
         for i in reversed(range(len(self.sequence))):
             if self.sequence[i] == "drift":
                 velocity, slowing = passed[i]
@@ -194,13 +205,16 @@ class TableStep:
         return self._closed(q, p), J
 
 
-def _extended(matrix: np.ndarray, corner: float) -> np.ndarray:
-    """A matrix with one more row and column, 0 but for the corner."""
-    return np.block([[matrix, np.zeros((len(matrix), 1))], [np.zeros((1, len(matrix))), np.full((1, 1), corner)]])
+def _extended(matrix: np.ndarray, of_time: float) -> np.ndarray:
+    """A matrix (d, d) with rows and columns of t and s, 0 but for one entry."""
+    d = len(matrix)
+    extended = np.zeros((d + 2, d + 2))
+    extended[:d, :d], extended[d, d] = matrix, of_time
+    return extended
 
 
 def _inverse_mass(system: HamiltonianSystem, of_time: float) -> np.ndarray:
-    """M⁻¹, of a driven system extended by that of the time."""
+    """M⁻¹, of a driven system extended by those of t and s."""
     M = system.kinetic_hessian(np.zeros(system.ndof))
     return M if system.autonomous else _extended(M, of_time)
 
@@ -210,7 +224,9 @@ def _velocities(system: HamiltonianSystem, of_time: float) -> Callable[[np.ndarr
     if system.autonomous:
         return system.velocity
     d = system.ndof
-    return lambda p: np.concatenate([system.velocity(p[..., :d]), of_time * p[..., d:]], axis=-1)
+    return lambda p: np.concatenate(
+        [system.velocity(p[..., :d]), of_time * p[..., d : d + 1], 0 * p[..., d + 1 :]], axis=-1
+    )
 
 
 def _same(v: np.ndarray) -> np.ndarray:
@@ -251,14 +267,14 @@ def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = ()) 
 class SymbolicForces:
     """All derivatives in closed form, generated from the symbols when first asked for.
 
-    Positions of a driven system are (d + 1, P), with the time, on which no force acts.
+    Positions of a driven system are (d + 2, P), with t and s.
     """
 
     def __init__(self, symbols: Any, level: int, monomials: Monomials) -> None:
         import sympy as sp
 
         slope = sp.Matrix(symbols.slope)
-        self._samples = symbols.samples
+        self._samples = dict(symbols.samples)
         terms = [-slope]
         if level in (FORCE_GRADIENT, CURVATURE):
             v = symbols.inverse_mass * slope
@@ -267,9 +283,18 @@ class SymbolicForces:
             terms.append(sp.Matrix([-sp.diff(symbols.W, s) for s in symbols.q]))
         products = [sp.Mul(*map(sp.Pow, symbols.q, m)) for m in monomials]
         terms += [sp.Matrix([-sp.diff(product, s) for s in symbols.q]) for product in products]
-        time = () if symbols.time is None else (symbols.time,)
-        terms = [term.col_join(sp.zeros(len(time), 1)) for term in terms]
-        self._d, self._n, self._q, self._terms = symbols.ndof + len(time), len(terms), (*symbols.q, *time), terms
+        self._q = symbols.q
+        if symbols.time is not None:
+            t, s = symbols.time, sp.Dummy("s")
+            by_time = [-sp.diff(symbols.V, t)]
+            if level in (FORCE_GRADIENT, CURVATURE):
+                by_time.append(_derivative(-by_time[0], symbols.q, v))
+            if level == CURVATURE:
+                by_time.append(-sp.diff(symbols.W, t))
+            by_time += [sp.S.Zero] * len(products)
+            terms = [term.col_join(sp.Matrix([0, f])) for term, f in zip(terms, by_time, strict=True)]
+            self._q = (*symbols.q, t, s)
+        self._d, self._n, self._terms = len(self._q), len(terms), terms
 
     def __getstate__(self) -> dict[str, Any]:
         """The expressions: functions are generated where they are used."""
@@ -322,7 +347,7 @@ class ArrayForces:
     The Jacobian of G(q) = ∇²V(q) v(q), v = M⁻¹∇V, is ∇²V M⁻¹ ∇²V and the derivative of ∇²V along v, a central
     difference of two Hessians: third derivatives of V are never asked for, so there is no C.
 
-    Positions of a driven system are (d + 1, P), with the time, on which no force acts.
+    Positions of a driven system are (d + 2, P), with t and s.
     """
 
     def __init__(self, system: HamiltonianSystem, level: int) -> None:
@@ -421,12 +446,16 @@ def _row_functions(system: HamiltonianSystem) -> tuple[Callable[[np.ndarray], np
 
 
 def _functions_in_time(system: HamiltonianSystem) -> tuple[Callable[[np.ndarray], np.ndarray], Product]:
-    """The same of a driven system, rows being (..., P, d + 1); by the time from differences."""
+    """The same of a driven system, rows being (..., P, d + 2), with t and s; by the time from differences."""
     d = system.ndof
     short = PRODUCT * (1.0 if system.period is None else system.period / (2 * np.pi))
 
+    def rate(q: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return system.time_derivative(np.concatenate([q, 0 * q], axis=-1), t)
+
     def slopes(rows: np.ndarray) -> np.ndarray:
-        return np.concatenate([-system.force(rows[..., :d], rows[..., d]), np.zeros_like(rows[..., d:])], axis=-1)
+        q, t = rows[..., :d], rows[..., d]
+        return np.concatenate([-system.force(q, t), 0 * t[..., None], rate(q, t)[..., None]], axis=-1)
 
     def product(rows: np.ndarray, v: np.ndarray) -> np.ndarray:
         rows, v = np.broadcast_arrays(rows, v)
@@ -441,7 +470,10 @@ def _functions_in_time(system: HamiltonianSystem) -> tuple[Callable[[np.ndarray]
             change = _differences_of(slope)(q, v[..., :d])
         ahead, behind = (system.force(q, t + s) - system.force(q, t - s) for s in (short, 2 * short))
         by_time = (behind - 8 * ahead) / (12 * short)
-        return np.concatenate([change + by_time * v[..., d:], np.zeros_like(v[..., d:])], axis=-1)
+        ahead, behind = (rate(q, t + s) - rate(q, t - s) for s in (short, 2 * short))
+        twice = (8 * ahead - behind) / (12 * short)
+        of_rate = (by_time * v[..., :d]).sum(-1) + twice * v[..., d]
+        return np.concatenate([change + by_time * v[..., d : d + 1], 0 * t[..., None], of_rate[..., None]], axis=-1)
 
     return slopes, product
 

@@ -52,7 +52,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     """The flow that gains most: that of `default_primed`, or one with a longer Δt or curvature terms.
 
     Of each the table at Δt is fitted for a few seconds, and followed along held-out orbits. Where its energy error (of
-    a system with friction or a drive: the difference from the energy along the exact orbit) is
+    a system with friction: the difference from the energy along the exact orbit) is
     e, the work of a classical scheme of order p is in proportion to e^(−1/p); so the flow gains most whose kicks take
     the fewest cycles in a unit of time, times e^(1/p), p = 8. Curvature terms are tried with the best Δt, unless they
     make kicks twice as dear. Where all errors are above 1e-5 it is the flow with the smallest, or of those with up to
@@ -160,16 +160,16 @@ def trial(start: Primed, system: HamiltonianSystem, domain: Domain, deadline: De
     scale = np.abs(H) if system.energy_scale is None else system.energy_scale
     labels = run.held_out
     with np.errstate(all="ignore"):
-        missed = run.step(table, labels.x.T, t0=labels.t0).T - labels.y[-1]
+        missed = run.step(table, labels.x.T, t0=labels.t0)[: len(y)].T - labels.y[-1]
         if not shares_missed(missed, labels, np.array(scaling.x))[1] < USELESS:
             return Trial(start, math.inf)
-        kept = system.conservative and system.autonomous
-        for _ in range(LENGTH if kept else FEWER):
-            y = run.step(table, y, t0=t)
-            if not kept:  # the energy that the exact flow has
+        for _ in range(LENGTH if system.conservative else FEWER):
+            end = run.step(table, y, t0=t)
+            y, E = end[: len(y)], end[len(y) :].sum(0)  # less the work of a drive, where there is one
+            if not system.conservative:  # the energy that the exact flow has left
                 exact = reference_step(system, exact, start.dt, REFERENCE, deadline.check, t)
-                t = None if t is None else t + start.dt
-                H = system.hamiltonian(exact, t)
+            t = None if t is None else t + start.dt
+            H = H - E if system.conservative else system.hamiltonian(exact, t)
             worst = np.maximum(worst, np.abs(system.hamiltonian(y.T, t) - H))
         worst /= scale
     error = float(np.median(np.where(np.isnan(worst), np.inf, worst)))

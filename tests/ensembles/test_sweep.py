@@ -95,6 +95,7 @@ def test_a_grid_of_parameters():
     assert result.final.shape == (3, 2, 2, 2)
     assert list(result.params) == ["k", "a"]
     assert result.to_xarray().q.dims == ("k", "a", "orbit", "dof")
+    assert result.to_xarray().attrs["dt"] == 0.1
     for chunk in (1, 5):  # of one value of the parameters, or of several
         assert np.array_equal(swept(reduce="final", chunk=chunk, workers=2).final, result.final)
     for i, value in enumerate(k):
@@ -110,6 +111,9 @@ def test_a_grid_of_parameters():
 
 def test_values_without_a_system_fail_their_orbits():
     system = sympflow.HamiltonianSystem.from_sympy("p**2/(2*m) + q**2/2", params={"m": 1.0})
+    for values, message in (([1.0, np.nan], "m = nan at 1"), ([[1.0]], r"a list of them; got shape \(1, 1\)")):
+        with pytest.raises(ValueError, match=f"`params` .*{message}"):
+            sympflow.ensemble(system, "verlet", (0, 1), [1.0, 0.0], params={"m": values}, dt=0.1)
     for backend in ("auto", "array"):
         how = {"params": {"m": [2.0, 0.0, 3.0]}, "dt": 0.1, "reduce": "final", "backend": backend}
         result = sympflow.ensemble(system, "verlet", (0, 1), [[1.0, 0.0], [0.0, 1.0]], **how)
@@ -123,6 +127,7 @@ def test_values_without_a_system_fail_their_orbits():
     [
         ({"params": {"lam": [1.0]}}, ValueError, "`params` has 'lam', no parameter of 'henon_heiles', which has none"),
         ({"params": 3}, TypeError, "`params` must map names"),
+        ({"workers": 0}, ValueError, "`workers` must be a positive number"),
         ({"reduce": "finall"}, ValueError, "Did you mean 'final'"),
         ({"reduce": 3}, TypeError, "`reduce` must be a name"),
         (

@@ -7,7 +7,7 @@ import torchdiffeq
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
-from sympflow import HamiltonianSystem, solve
+from sympflow import HamiltonianSystem, SympFlow, solve
 from sympflow.interop import torchdiffeq as ours
 from sympflow.interop.scipy import as_scipy
 
@@ -114,6 +114,25 @@ def test_torchdiffeqs_own_table_and_its_callback_have_the_time():
 
 def as_function(system):
     return lambda t, y: 1 * system(t, y)
+
+
+def test_a_flow_of_a_driven_system_is_told_the_time():
+    system = HamiltonianSystem.from_sympy(
+        "p**2/2 - cos(q)*(1 + a*cos(w*t))", time="t", params={"a": 0.3, "w": 1.7}, period=2 * np.pi / 1.7, y0=[1, 0.2]
+    )
+    flow = SympFlow.primed(system, 2, processor=3, dt=0.8)
+    times = np.array([2.9, 1.75, 1.35])
+    expected = solve(system, flow, (2.9, 1.35), t_eval=times).y
+    scipy = solve_ivp(system, (2.9, 1.35), [1, 0.2], method=as_scipy(flow), t_eval=times)
+    np.testing.assert_allclose(scipy.y, expected, **CLOSE)
+    t, gradients = torch.tensor(times, requires_grad=True), []
+    for ask in (ours.odeint, ours.odeint_adjoint):
+        y = ask(system, Y, t, method=flow)
+        np.testing.assert_allclose(y.detach().T, expected, **CLOSE)
+        gradients += torch.autograd.grad(y[1:].square().sum(), t)
+    ends = [solve(system, flow, (s, 1.35), t_eval=times[1:]).y for s in (2.9 + 1e-5, 2.9 - 1e-5)]
+    slope = ((ends[0] ** 2).sum() - (ends[1] ** 2).sum()) / 2e-5
+    np.testing.assert_allclose([float(g[0]) for g in gradients], slope, rtol=1e-8)
 
 
 def test_another_drive_is_refused_whoever_asks():

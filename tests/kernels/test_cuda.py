@@ -99,7 +99,7 @@ def by_functions():
         (SYSTEM, "verlet", {"clock": "logarithmic"}, "'verlet \\(logarithmic\\)' is none: use backend='auto'"),
         (SYSTEM, "sympflow", {}, "'sympflow' is none"),
         (SYSTEM, "verlet", {"dtype": "float32"}, "`backend` 'cuda' does not apply. `y0` is float32"),
-        (by_functions(), "verlet", {}, "`system` 'custom' is given by functions"),
+        (by_functions(), "verlet", {}, "`system` 'custom' is not symbolic: define it"),
         (
             sympflow.HamiltonianSystem.from_sympy("(p1**2 + p2**2 + q1**2 + q2**2)/2", damping=0.1),
             "verlet",

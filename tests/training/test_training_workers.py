@@ -124,6 +124,14 @@ def test_rungs_come_after_those_that_they_start_from():
         list(made([rung("b", "a")], progress=False))
 
 
+def test_what_cannot_be_pickled_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cloudpickle", None)
+    system = HamiltonianSystem(potential=lambda q: (q**4).sum(-1) / 4, ndof=1, domain=PENDULUM.domain)
+    flow = SympFlow.primed(system, 2, dt=0.1, processor=0)
+    with pytest.raises(TypeError, match=r"`system` cannot be sent to `workers` .*define its functions in a module"):
+        train(system, flow=flow, workers=2, **QUICK)
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
