@@ -26,7 +26,7 @@ KNOWN = "sympflow_run"
 """The attribute that says of which run a store is."""
 SECONDS = 10.0
 """Between two commits, by default."""
-CHUNK = 2**17  # numbers in a chunk of q and p together, about
+CHUNK = 2**19  # numbers in a chunk of q and p together, about
 TOLD = 90  # characters of what differs between two runs
 
 
