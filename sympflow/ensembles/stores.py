@@ -35,7 +35,6 @@ MESSAGES = "messages"
 """The folder of the messages of orbits that failed, a file for each chunk with some; readers of zarr pass over it."""
 KNOWN = "sympflow_ensemble"
 """The attribute that says of which ensemble a store is."""
-TOLD = 90  # characters of what differs between two ensembles
 
 
 # what an ensemble is known by ----------------------------------------------------------------------------------------
@@ -222,13 +221,5 @@ class _Read(Mapping[str, np.ndarray]):
 
 def _same(store: Store, path: str, attributes: Mapping[str, Any]) -> Index:
     """Return the shape of the chunks of a store, if it is of the same ensemble."""
-    theirs, mine = (json.loads(a.get(KNOWN, "{}")) for a in (store.attributes, attributes))
-    if not theirs:
-        raise ValueError(f"`store` {path!r} is no store of an ensemble: name another folder.")
-    for name, text in mine.items():
-        if theirs.get(name) != text:
-            raise ValueError(
-                f"`store` {path!r} is of another ensemble: its `{name}` is {str(theirs.get(name))[:TOLD]}, not "
-                f"{text[:TOLD]}. Name another folder."
-            )
+    store.check_same(KNOWN, json.loads(attributes[KNOWN]), path, "ensemble", "Name another folder.")
     return tuple(store.attributes["chunk_shape"])

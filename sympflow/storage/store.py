@@ -34,6 +34,7 @@ __all__ = ["Appender", "Field", "Store", "StoreError"]
 METADATA, ATTRIBUTES, ARRAY = ".zmetadata", ".zattrs", ".zarray"
 KEPT = "sympflow_state"
 """The attribute that names the file of the state which was kept at the last commit."""
+TOLD = 90  # characters of what differs between two calls
 LARGEST_CHUNK = 2**20
 """Numbers in a chunk of an array that grows."""
 
@@ -181,6 +182,37 @@ class Store:
             raise FileNotFoundError(f"`store` {str(place)!r} does not exist.") from None
         except (ValueError, KeyError, TypeError, AttributeError, NotADirectoryError):
             raise ValueError(f"`store` {str(place)!r} is no store of sympflow: give another place.") from None
+
+    def check_same(self, key: str, mine: Mapping[str, str], asked: str, kind: str, remedy: str) -> None:
+        """Check that a store is of the call that asks for it.
+
+        Parameters
+        ----------
+        key : str
+            The attribute that says of which call a store is, as JSON.
+        mine : mapping of str to str
+            What the call is known by, in words.
+        asked : str
+            The path as it was given.
+        kind : str
+            "run" or "ensemble".
+        remedy : str
+
+        Raises
+        ------
+        ValueError
+            If it is of another call, or of none of this kind.
+        """
+        theirs = json.loads(self.attributes.get(key, "{}"))
+        if not theirs:
+            article = "an" if kind[0] in "aeiou" else "a"
+            raise ValueError(f"`store` {asked!r} is no store of {article} {kind}: name another folder.")
+        for name, text in mine.items():
+            if theirs.get(name) != text:
+                raise ValueError(
+                    f"`store` {asked!r} is of another {kind}: its `{name}` is {str(theirs.get(name))[:TOLD]}, not "
+                    f"{text[:TOLD]}. {remedy}"
+                )
 
     # chunks ---------------------------------------------------------------------------------------
 
