@@ -320,14 +320,15 @@ class FlowMap(nn.Module):
         """
         if self.drive_times is None or t0 is None:
             return
-        seen = [values(each) if is_tensor(each) else np.asarray(each) for each in (t0, passed)]
-        if any(each is None or each.dtype.kind not in "fiu" or not each.size for each in seen):
-            return  # hidden by a transform, or refused elsewhere
-        start, length = (each.astype(float) for each in seen)
+        start, length = (values(each) if is_tensor(each) else np.asarray(each) for each in (t0, passed))
+        if start is None or length is None:  # in a graph that torch.compile traces
+            return
+        if not (start.size and length.size and start.dtype.kind in "fiu"):
+            return  # refused where it is used
         low, high = self.drive_times
         slack = 1e-9 * (high - low)
-        first = min(start.min(), start.min() + length.min())
-        last = max(start.max(), start.max() + length.max())
+        first = float(start.min() + min(length.min(), 0.0))
+        last = float(start.max() + max(length.max(), 0.0))
         if first < low - slack or last > high + slack:
             warnings.warn(
                 f"The flow was fitted to a drive without a period for t from {low:g} to {high:g}, its system's "
