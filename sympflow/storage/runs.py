@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.storage.layout import DOF, NAMED, TIME, batch_dims, dofs, halves
+from sympflow.storage.layout import DOF, NAMED, TIME, batch_dims, difference, dofs, halves
 from sympflow.storage.store import Appender, Field, Store
 
 KNOWN = "sympflow_run"
@@ -27,7 +27,6 @@ KNOWN = "sympflow_run"
 SECONDS = 10.0
 """Between two commits, by default."""
 CHUNK = 2**17  # numbers in a chunk of q and p together, about
-TOLD = 90  # characters of what differs between two runs
 
 
 @dataclass
@@ -196,12 +195,12 @@ class RunStore:
         theirs = json.loads(self.store.attributes.get(KNOWN, "{}"))
         if not theirs:
             raise ValueError(f"`store` {self.asked!r} is no store of a run: name another folder.")
-        for name, text in known.items():
-            if theirs.get(name) != text:
-                raise ValueError(
-                    f"`store` {self.asked!r} is of another run: its `{name}` is {str(theirs.get(name))[:TOLD]}, not "
-                    f"{text[:TOLD]}. Nothing of it was changed: name another folder, or make the same call."
-                )
+        other = difference(theirs, known)
+        if other:
+            raise ValueError(
+                f"`store` {self.asked!r} is of another run: {other}. Nothing of it was changed: name another folder, "
+                "or make the same call."
+            )
 
     # what is in it --------------------------------------------------------------------------------
 
@@ -250,7 +249,7 @@ class RunStore:
         for name in names:
             rows = (slice(row, row + fields[name].shape[-2]),) if width else ()
             for k in range(first // size, -(-n // size)):
-                part = self.store.read(name, (*(0,) * (fields[name].dims.index(TIME)), k))
+                part = self.store.committed(name, (*(0,) * (fields[name].dims.index(TIME)), k))
                 a = k * size
                 skip = max(0, first - a)
                 whole[(..., *rows, slice(a + skip - first, a - first + part.shape[-1]))] = part[..., skip:]

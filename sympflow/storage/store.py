@@ -18,6 +18,7 @@ import json
 import os
 import shutil
 import tempfile
+import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -252,6 +253,19 @@ class Store:
             raise StoreError(f"`store` {str(self.path)!r} is damaged: {file.name} of {name!r} ({error}).") from None
         return np.frombuffer(data, known.dtype).reshape(known.chunks)[tuple(map(slice, shape))]
 
+    def committed(self, name: str, index: tuple[int, ...]) -> np.ndarray:
+        """Return a chunk that a commit has counted; see `read`.
+
+        Raises
+        ------
+        StoreError
+            If it is damaged, or not there.
+        """
+        if not self.has(name, index):
+            file = self._file(name, index)
+            raise StoreError(f"`store` {str(self.path)!r} is damaged: {file.name} of {name!r} is missing.")
+        return self.read(name, index)
+
     # commits --------------------------------------------------------------------------------------
 
     def commit(
@@ -315,9 +329,9 @@ class Store:
         if name is None:
             return {}
         try:
-            with np.load(self.path / name, allow_pickle=False) as kept:
+            with open(self.path / name, "rb") as file, np.load(file, allow_pickle=False) as kept:
                 return dict(kept)
-        except (OSError, ValueError, zlib.error) as error:
+        except (OSError, ValueError, zlib.error, zipfile.BadZipFile) as error:
             raise StoreError(f"`store` {str(self.path)!r} is damaged: its state cannot be read ({error}).") from None
 
     @contextmanager
@@ -373,7 +387,7 @@ class Appender:
         if self.held:  # the last chunk, up to what was committed
             for name in self.axes:
                 index = self._index(name, self.length // self.size)
-                self.tails[name].append(store.read(name, index))
+                self.tails[name].append(store.committed(name, index))
 
     def _index(self, name: str, k: int) -> tuple[int, ...]:
         """The chunk k along the dimension; along the others there is one."""
