@@ -46,6 +46,7 @@ bench: .venv/installed  ## The benchmarks that the docs quote, into docs/measure
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
 	$(BIN)/python benchmarks/training_step.py
 	$(BIN)/python benchmarks/kernels.py
+	$(BIN)/python benchmarks/large_pairs.py --out docs/measured
 	$(BIN)/python benchmarks/interop.py --out docs/measured
 	$(BIN)/python benchmarks/plugins.py --out docs/measured
 	$(BIN)/python benchmarks/primed.py --out docs/measured

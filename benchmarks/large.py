@@ -1,12 +1,13 @@
 """Large systems: a step of the FPUT-β ring against loops written by hand, and the time that compiling takes.
 
     python benchmarks/large.py [--out docs/measured]
-    python benchmarks/large.py --only large-fput,large-compile
+    python benchmarks/large.py --only large-fput,large-threads,large-compile
 
 Float64. In `large-fput` Verlet runs from one state to its end, by `solve` as a user calls it, in turn with two loops in
 Numba: one keeps the spring's force for the next site, the other computes both forces of each site. The faster one
-counts. One thread is process time, two are the time of the clock, which other programs on the machine lengthen. In
-`large-compile` each number is that of a fresh process: its processor time from the call of `solve` to its return.
+counts. It is process time. In `large-threads` two threads run in turn with Numba's `prange`, by the time of the clock,
+which other programs on the machine lengthen. In `large-compile` each number is that of a fresh process: its processor
+time from the call of `solve` to its return, after the libraries are imported.
 """
 
 from __future__ import annotations
@@ -94,9 +95,11 @@ def run_threaded(q, p, h, n):
                 q[i] += h * p[i]
 
 
-def fput(rounds: int) -> str:
-    rows, runs = [], {"once": run_of(kick_once), "twice": run_of(kick_twice), "threaded": run_threaded}
-    for size, n in ((100, 20_000), (10_000, 500), (1_000_000, 40)):
+def fput(rounds: int, threads: int) -> str:
+    """On one thread, or on several."""
+    rows, clock = [], time.process_time if threads == 1 else time.perf_counter
+    runs = {"once": run_of(kick_once), "twice": run_of(kick_twice)} if threads == 1 else {"threaded": run_threaded}
+    for size, n in ((100, 100_000), (10_000, 2_000), (1_000_000, 60)):
         system = HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=size)
         y0 = np.random.default_rng(0).normal(scale=0.3, size=2 * size)
 
@@ -109,28 +112,21 @@ def fput(rounds: int) -> str:
             run(q, p, H, n)
             return np.concatenate([q, p])
 
-        calls: dict[str, tuple[Callable[[], Any], Callable[[], float]]] = {
-            "ours": (lambda f=ours: f(1), time.process_time),
-            "once": (lambda f=by_hand: f(runs["once"]), time.process_time),
-            "twice": (lambda f=by_hand: f(runs["twice"]), time.process_time),
-            "ours, two threads": (lambda f=ours: f(2), time.perf_counter),
-            "threaded": (lambda f=by_hand: f(runs["threaded"]), time.perf_counter),
+        calls: dict[str, Callable[[], Any]] = {
+            "ours": lambda f=ours: f(threads),
+            **{name: (lambda f=by_hand, run=run: f(run)) for name, run in runs.items()},
         }
-        np.testing.assert_allclose(ours(1), by_hand(runs["once"]), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(ours(1), by_hand(next(iter(runs.values()))), rtol=0, atol=1e-9)
         least = dict.fromkeys(calls, np.inf)
-        for _ in range(rounds):
-            for name, (call, clock) in calls.items():
+        for _ in range(rounds * (10 if size < 100_000 else 1)):
+            for name, call in calls.items():
                 start = clock()
                 call()
                 least[name] = min(least[name], clock() - start)
         unit = 1e9 / (n * size)
-        hand = min(least["once"], least["twice"])
-        cells = [least["ours"], hand, least["ours, two threads"], least["threaded"]]
-        ratios = least["ours"] / hand, least["ours, two threads"] / least["threaded"]
-        rows.append([f"{size:,}", *(f"{x * unit:.3f}" for x in cells[:2]), f"{ratios[0]:.2f}"])
-        rows[-1] += [*(f"{x * unit:.3f}" for x in cells[2:]), f"{ratios[1]:.2f}"]
-    titles = ["sites", "ns a site and step", "by hand", "ratio", "two threads", "by hand", "ratio"]
-    return fragments.table(titles, rows)
+        hand = min(least[name] for name in runs)
+        rows.append([f"{size:,}", f"{least['ours'] * unit:.3f}", f"{hand * unit:.3f}", f"{least['ours'] / hand:.2f}"])
+    return fragments.table(["sites", "ns a site and step", "by hand", "ratio"], rows)
 
 
 CODE = """
@@ -138,6 +134,7 @@ import sys, time
 import numpy as np, numba, scipy, sympy, sympflow
 system = sympflow.HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=int(sys.argv[2]))
 y0 = np.full(2 * system.ndof, 0.1)
+import sympflow.solver, sympflow.integrators.splitting, sympflow.kernels.lattice_loops, sympflow.kernels.splitting_loops
 start = time.process_time()
 sympflow.solve(system, sys.argv[1], t_span=(0.0, 1.0), y0=y0, dt=0.05, t_eval=[1.0], backend="compiled")
 print(time.process_time() - start)
@@ -145,7 +142,7 @@ print(time.process_time() - start)
 
 
 def compiling() -> str:
-    """Of one site more or less the second process finds the code in the cache."""
+    """Times of compiling: for one site more or less the second process finds the code in the cache."""
     rows = []
     for method in ("verlet", "chin4c"):
         with tempfile.TemporaryDirectory() as folder:
@@ -165,7 +162,11 @@ def main() -> None:
     parser.add_argument("--only", default="large-fput,large-compile")
     parser.add_argument("--rounds", type=int, default=9)
     arguments = parser.parse_args()
-    parts = {"large-fput": lambda: fput(arguments.rounds), "large-compile": compiling}
+    parts: dict[str, Callable[[], str]] = {
+        "large-fput": lambda: fput(arguments.rounds, 1),
+        "large-threads": lambda: fput(arguments.rounds, 2),
+        "large-compile": compiling,
+    }
     for name in arguments.only.split(","):
         body = parts[name]()
         print(body)

@@ -23,7 +23,7 @@ from sympflow.arguments import (
     check_t_eval,
     check_t_span,
 )
-from sympflow.arrays import Array, finite_states, is_tensor, lanes, readable
+from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, readable
 from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import report_lanes, run_and_search
@@ -279,19 +279,28 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
     those of equal values.
     """
     states = problem.y0.reshape(-1, problem.y0.shape[-1])
-    pieces = []
+    groups = []
     for group in rows.by_form() if action == "ignore" else rows.distinct():
         together = replace(problem, system=group.system, y0=states[group.places], letters=group.letters)
         if group.letters is None or integrator.takes_letters(together):
-            sol = _solved(integrator, together, action)
-            pieces.append((group.places, sol))
-            if group.letters is not None and not sol.success:
-                _note_singularities(sol, integrator, together, rows.taken(group.places))
+            groups.append((group.places, together))
             continue
         for few, system, _ in rows.taken(group.places).distinct():
             index = group.places[few]
-            alone = replace(problem, system=system, y0=states[index])
-            pieces.append((index, _solved(integrator, alone, action)))
+            groups.append((index, replace(problem, system=system, y0=states[index])))
+    pieces: list[tuple[np.ndarray, Solution]] = []
+    try:
+        for index, part in groups:
+            sol = _solved(integrator, part, action)
+            pieces.append((index, sol))
+            if part.letters is not None and not sol.success:
+                _note_singularities(sol, integrator, part, rows.taken(index))
+    except Interrupted as stop:
+        pieces.append((index, stop.solution))
+        whole = max((sol for _, sol in pieces), key=lambda sol: len(sol.t))
+        pieces += [(index, _not_begun(stop.solution, part)) for index, part in groups[len(pieces) :]]
+        pieces = [(index, _up_to(sol, whole.t)) for index, sol in pieces]
+        raise Interrupted(stop.outcome, joined(pieces, problem.system, problem.y0, rows)) from None
     return joined(pieces, problem.system, problem.y0, rows)
 
 
@@ -311,6 +320,24 @@ def _note_singularities(sol: Solution, integrator: Integrator, problem: Problem,
         sol.stats["blow_up_time"] = times
         first = int(np.argmax(np.isfinite(times)))
         sol.message += f" A solution itself becomes infinite, at about t = {times[first]:.10g}: end `t_span` before."
+
+
+def _not_begun(sol: Solution, problem: Problem) -> Solution:
+    """The solution of trajectories that were to run after those of `sol`, which Ctrl-C ended."""
+    batch, y0 = tuple(problem.y0.shape[:-1]), problem.y0
+    empty = y0[..., None][..., :0]
+    return replace(sol, t=sol.t[:0], y=empty, status=np.full(batch, -1), system=problem.system, y0=y0, sol=None)
+
+
+def _up_to(sol: Solution, t: np.ndarray) -> Solution:
+    """A solution of which the outputs at the last ones of the times t are unknown, NaN."""
+    unknown = full_of_nan(sol.y0)[..., None]
+    width = len(t) - len(sol.t)
+    if is_tensor(sol.y):
+        import torch
+
+        return replace(sol, t=t, y=torch.cat([sol.y, *[unknown] * width], dim=-1), sol=None)
+    return replace(sol, t=t, y=np.concatenate([sol.y, np.repeat(unknown, width, axis=-1)], axis=-1), sol=None)
 
 
 def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
@@ -336,7 +363,7 @@ def _run_stored(integrator: Integrator, problem: Problem, action: str) -> tuple[
     compiled = {"backend": "compiled"}  # by which states are looked at in a compiled pass
 
     def look(t: np.ndarray, y: np.ndarray) -> None:
-        """What `_solved` does with all outputs, for those of a window."""
+        """Check the outputs of a window, as `_solved` checks all outputs."""
         piece = Outcome(t, y, 0, "", compiled.copy() if y.dtype == np.float64 else {})
         if system.functions_given:
             system.check_functions_along(y)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sympflow as sf
-from sympflow import HamiltonianSystem, solve
+from sympflow import HamiltonianSystem, SympFlow, solve
 from sympflow.kernels import lattice_loops
 from sympflow.kernels.modules import at_most
 from sympflow.kernels.splitting_loops import splitting_loops
@@ -166,3 +166,17 @@ def test_what_has_no_loops_runs_on_arrays():
     rates = np.linspace(0.1, 0.2, 48)
     sol = solve(ring(damping=rates), "verlet", t_span=(0, 0.5), y0=start(ring()), dt=0.05)
     assert sol.stats["backend"] == "numpy"
+
+
+def test_a_primed_flow_of_a_piece_serves_the_large_lattice():
+    """A periodic state of a ring, repeated, moves on the larger ring as it does on the small one."""
+    piece, large = ring(6), ring(12)
+    flow = SympFlow.primed(piece, stages=3, dt=0.2)
+    carried = flow.transferred(large)
+    y0 = start(piece)
+    options = {"t_span": (0.0, 2.0), "t_eval": [2.0], "backend": "array"}
+    small = solve(piece, flow, y0=y0, **options).y[:, 0].reshape(2, 6)
+    repeated = solve(large, carried, y0=np.tile(y0.reshape(2, 6), 2).ravel(), **options).y[:, 0].reshape(2, 12)
+    np.testing.assert_allclose(repeated, np.tile(small, 2), rtol=0, atol=1e-13)
+    with pytest.raises(ValueError, match="the same site and bond"):
+        flow.transferred(HamiltonianSystem.lattice(bond="r**2/2 + r**4/5", shape=12))

@@ -111,3 +111,27 @@ def test_what_was_computed_before_ctrl_c_is_kept(short_windows, monkeypatch, y0,
         np.testing.assert_array_equal(sol.sol(3.3), whole.sol(3.3))
     if sol.t_events is not None:
         np.testing.assert_array_equal(sol.t_events[0], whole.t_events[0][whole.t_events[0] <= until])
+
+
+def test_groups_of_parameters_are_kept_up_to_where_they_were(short_windows, monkeypatch):
+    """The first values have ended, the second ones are interrupted, the last ones have not begun."""
+    monkeypatch.setattr(progress, "BETWEEN", 0.0)
+    system = sympflow.HamiltonianSystem.from_sympy("p**2/2 + k*q**2/2", params={"k": 1.0}, y0=[1.0, 0.0], dt=0.1)
+    options = {"params": {"k": [1.0, 2.0, 3.0]}, "backend": "array"}
+    whole, seen = solve(system, "verlet", (0, 20), **options), []
+
+    def told(done, total):
+        seen.append(done)
+        if seen.count(seen[0]) == 2 and done > 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted) as caught:
+        solve(system, "verlet", (0, 20), progress=told, **options)
+    sol = caught.value.solution
+    known = np.isfinite(sol.y).all(1)
+    assert sol.y.shape == whole.y.shape
+    assert known[0].all()
+    assert 100 < known[1].sum() < 150
+    assert not known[2].any()
+    assert sol.status.tolist() == [0, -1, -1]
+    np.testing.assert_array_equal(sol.y[:2][..., known[1]], whole.y[:2][..., known[1]])

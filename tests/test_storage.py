@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from sympflow.storage import store as module
-from sympflow.storage.layout import difference
-from sympflow.storage.store import Appender, Field, Store, StoreError
+from sympflow.storage.store import Appender, Field, Store, StoreError, difference
 
 FIELDS = {
     "time": Field(("time",), (0,), float, (4,)),

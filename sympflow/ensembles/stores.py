@@ -22,7 +22,7 @@ from sympflow.ensembles.orbits import Drawn, Given
 from sympflow.ensembles.results import Block, Done, Index, Layout
 from sympflow.integrators.provenance import digest, flow_checksum, option_text
 from sympflow.integrators.registry import name_of
-from sympflow.storage.layout import difference, halves, imported
+from sympflow.storage.layout import halves, imported
 from sympflow.storage.store import Store
 
 if TYPE_CHECKING:
@@ -210,10 +210,5 @@ class _Read(Mapping[str, np.ndarray]):
 
 def _same(store: Store, path: str, attributes: Mapping[str, Any]) -> Index:
     """Return the shape of the chunks of a store, if it is of the same ensemble."""
-    theirs, mine = (json.loads(a.get(KNOWN, "{}")) for a in (store.attributes, attributes))
-    if not theirs:
-        raise ValueError(f"`store` {path!r} is no store of an ensemble: name another folder.")
-    other = difference(theirs, mine)
-    if other:
-        raise ValueError(f"`store` {path!r} is of another ensemble: {other}. Name another folder.")
+    store.check_same(KNOWN, json.loads(attributes[KNOWN]), path, "ensemble", "Name another folder.")
     return tuple(store.attributes["chunk_shape"])

@@ -274,7 +274,7 @@ class FlowMap(nn.Module):
         return None
 
     def at_time(self, z: Tensor, time: Any) -> Tensor:
-        """Such states of a driven system with another time, a number or (...)."""
+        """Replace the time in states of a driven system, by a number or (...)."""
         d = self.ndof
         time = torch.as_tensor(time, dtype=z.dtype, device=z.device).expand(z.shape[:-1])
         return torch.cat([z[..., :d], time[..., None], z[..., d + 1 :]], dim=-1)

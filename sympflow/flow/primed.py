@@ -676,17 +676,24 @@ class PrimedFlow(SympFlow):
         """Return an untrained flow of another system, with the numbers of this one.
 
         They are a start for ``train(system, flow=flow.transferred(system))``. As they are they need not be near the
-        exact flow of that system, with friction for instance.
+        exact flow of that system, with friction for instance. The numbers know the potential and dt, not the size: of a
+        lattice they serve any other one of the same site and bond.
 
         Raises
         ------
         ValueError
-            If the system has not as many degrees of freedom, or no such flow.
+            If the system has not as many degrees of freedom and is no lattice of the same site and bond, or has no
+            such flow.
         """
         check_system(system)
         check_for_flows(system, self.takes_friction, self.takes_driving)
-        if system.ndof != self.ndof:
-            raise ValueError(f"`system` has {system.ndof} degrees of freedom, the flow {self.ndof}: give one of those.")
+        mine = None if self.system is None else self.system.local
+        same_piece = mine is not None and not self.monomials and mine.is_piece_of(system.local)
+        if system.ndof != self.ndof and not same_piece:
+            raise ValueError(
+                f"`system` has {system.ndof} degrees of freedom, the flow {self.ndof}: give one of those, or a lattice "
+                "of the same site and bond."
+            )
         if not system.separable or (self.terms and not (system.quadratic_kinetic and system.has_hessian_vector)):
             raise ValueError(
                 f"`system` {system.name!r} has no kicks and drifts such as the flow's: it must be H = ½ pᵀM⁻¹p + V(q), "

@@ -78,6 +78,16 @@ class LatticeHamiltonian(LocalHamiltonian):
         other._set_mass()
         return other
 
+    def is_piece_of(self, other: LocalHamiltonian | None) -> bool:
+        """Return True for a lattice of the same site and bond: the same terms, fields, axes and numbers in `params`."""
+        return isinstance(other, LatticeHamiltonian) and self._piece() == other._piece() is not None
+
+    def _piece(self) -> tuple[Any, ...] | None:
+        """All but the size and the boundary; None if values differ from site to site."""
+        if any(isinstance(value, np.ndarray) for value in self.params.values()):
+            return None
+        return self.U, self.T, self.bonds, self.fields, len(self.shape), self.params
+
     def _set_letters(self) -> None:
         fields = self.fields
         self.x, self.p, self.r, self.v, self.w = (letters(kind, fields) for kind in "xprvw")
@@ -85,7 +95,7 @@ class LatticeHamiltonian(LocalHamiltonian):
 
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
-        """How the positions, momenta and differences of the fields are written."""
+        """Names of the positions, momenta and differences of the fields."""
         if len(self.fields) == 1:
             return {"x": self.fields, "p": ("p",), "r": ("r",)}
         return {"x": self.fields, **{kind: tuple(f"{kind}_{f}" for f in self.fields) for kind in "pr"}}

@@ -62,6 +62,10 @@ class LocalHamiltonian(Definition):
             "`params` of pairs cannot be changed: make a system for each value, by HamiltonianSystem.pairs."
         )
 
+    def is_piece_of(self, other: LocalHamiltonian | None) -> bool:
+        """Return True if the other has the same terms, however many of them."""
+        return False
+
     def potential_hessian(self, q: Array, *t: Array) -> Array:
         """∇²V(q), dense: (..., d) to (..., d, d).
 

@@ -307,16 +307,13 @@ class KernelStepper(Stepper):
     """A run in compiled loops."""
 
     compiled = True
+    takes_carry = True
 
     def __init__(self, integrator: FixedStep, problem: Problem, kernel: Kernel) -> None:
         self.integrator, self.system, self.problem = integrator, problem.system, problem
         self.kernel, self.backend, self.saves_finite = kernel, kernel.backend, kernel.saves_finite
         self.driven = self.system is not None and not self.system.autonomous  # a flow alone steps without a system
         self.iterations = 0
-
-    @property
-    def takes_carry(self) -> bool:
-        return True
 
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.integrate import DOP853
 
@@ -131,9 +129,7 @@ def _tail_states(
         times = np.array(sorted(set(goal[again].tolist()), key=lambda x: sign * x))
         times = times[:: max(1, -(-len(times) * len(again) * d2 // MOST_STORED))]
         start = y0 if y0.ndim == 1 else y0.reshape(-1, d2)[rows[again]]
-        piece = replace(
-            problem, t1=float(times[-1]), y0=start, t_eval=times, save_every=1, dense_output=False, events=None
-        )
+        piece = Problem(problem.system, problem.t0, float(times[-1]), start, times, backend=problem.backend)
         found = np.asarray(integrator.run(piece).y, dtype=float).reshape(len(times), len(again), d2)
         index = np.searchsorted(sign * times, sign * goal[again], "right") - 1
         t[again], y[again] = times[index], found[index, np.arange(len(again))]

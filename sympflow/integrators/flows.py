@@ -200,13 +200,11 @@ class FlowIntegrator(OwnStepper):
 class FlowStepper(Stepper):
     """A run of a flow by tensor operations: of ψ̄ = χ ∘ K ∘ χ⁻¹ the χ between two steps cancel."""
 
+    takes_carry = True
+
     def __init__(self, integrator: FlowIntegrator, problem: Problem, flow: FlowMap) -> None:
         super().__init__(integrator, problem)
         self.flow, self.backend = flow, "torch"
-
-    @property
-    def takes_carry(self) -> bool:
-        return True
 
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -198,10 +198,11 @@ def symplecticity_estimate(sol: Solution, directions: int = 8, seed: int = 0) ->
         for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
             x, step = torch.tensor(y), torch.as_tensor(h)
             u = U.to(x.dtype)
-            moved = [
-                to_numpy(jvp(lambda z, t=t, step=step: integrator.step(system, t, z, step), x, v.expand_as(x))[1])
-                for v in u
-            ]
+
+            def one_step(z: Any, t: float = t, step: Any = step) -> Any:
+                return integrator.step(system, t, z, step)
+
+            moved = [to_numpy(jvp(one_step, x, v.expand_as(x))[1]) for v in u]
             change = _form(np.stack(moved)[i], np.stack(moved)[j]) - _form(u.numpy()[i], u.numpy()[j]).reshape(
                 -1, *[1] * (y.ndim - 1)
             )

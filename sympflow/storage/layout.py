@@ -7,7 +7,6 @@ attribute "units", by which xarray would take it for dates. The attributes of th
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -31,8 +30,6 @@ NAMED = {
     DOF: {"long_name": "i of q_i and p_i"},
 }
 """The attributes of arrays, by their names."""
-TOLD = 90
-"""Characters of what differs between two stores."""
 UNITS = "those of the system's definition"
 """The units of all numbers, which no system states."""
 
@@ -121,15 +118,3 @@ def _spread(values: np.ndarray, own: list[Any], dims: list[str], shape: tuple[in
     """Values along some of the dimensions, for each row."""
     wide = values.reshape([n if dim in own else 1 for dim, n in zip(dims, shape, strict=True)])
     return np.broadcast_to(wide, shape).ravel()
-
-
-def difference(theirs: Mapping[str, str], mine: Mapping[str, str]) -> str:
-    """Return what differs first between the texts of a store and of a call, cut to where it does; "" if nothing."""
-    for name, text in mine.items():
-        other = theirs.get(name, text)
-        if other != text:
-            same = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(other, text, strict=False)))
-            start = max(0, same - TOLD // 2) if max(len(other), len(text)) > TOLD else 0
-            told = (f"{'...' * (start > 0)}{x[start : start + TOLD]}" for x in (other, text))
-            return f"its `{name}` is {', not '.join(told)}"
-    return ""

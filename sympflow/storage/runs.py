@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.storage.layout import DOF, NAMED, TIME, batch_dims, difference, dofs, halves
+from sympflow.storage.layout import DOF, NAMED, TIME, batch_dims, dofs, halves
 from sympflow.storage.store import Appender, Field, Store
 
 KNOWN = "sympflow_run"
 """The attribute that says of which run a store is."""
 SECONDS = 10.0
 """Between two commits, by default."""
-CHUNK = 2**17  # numbers in a chunk of q and p together, about
+CHUNK = 2**19  # numbers in a chunk of q and p together, about
 
 
 @dataclass
@@ -146,7 +146,8 @@ class RunStore:
                     f"`store` {self.asked!r} exists: pass resume=True to go on with it, or name another folder."
                 )
             self.store = Store.open(self.path)
-            self._check(known)
+            remedy = "Nothing of it was changed: name another folder, or make the same call."
+            self.store.check_same(KNOWN, known, self.asked, "run", remedy)
         else:
             self._create(known, y0, n_outputs)
         try:
@@ -191,17 +192,6 @@ class RunStore:
             ) from error
         self.store = Store.open(self.path)
 
-    def _check(self, known: Mapping[str, str]) -> None:
-        theirs = json.loads(self.store.attributes.get(KNOWN, "{}"))
-        if not theirs:
-            raise ValueError(f"`store` {self.asked!r} is no store of a run: name another folder.")
-        other = difference(theirs, known)
-        if other:
-            raise ValueError(
-                f"`store` {self.asked!r} is of another run: {other}. Nothing of it was changed: name another folder, "
-                "or make the same call."
-            )
-
     # what is in it --------------------------------------------------------------------------------
 
     @property
@@ -215,7 +205,7 @@ class RunStore:
 
     @property
     def message(self) -> str:
-        """What became of the run."""
+        """Message of the run: how it ended, or where it is."""
         return str(self.store.attributes["message"])
 
     def place(self) -> Place | None:

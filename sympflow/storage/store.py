@@ -14,6 +14,7 @@ A store is written here and not by the zarr library because of three guarantees:
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import shutil
@@ -35,6 +36,7 @@ __all__ = ["Appender", "Field", "Store", "StoreError"]
 METADATA, ATTRIBUTES, ARRAY = ".zmetadata", ".zattrs", ".zarray"
 KEPT = "sympflow_state"
 """The attribute that names the file of the state which was kept at the last commit."""
+TOLD = 90  # characters of what differs between two calls
 LARGEST_CHUNK = 2**20
 """Numbers in a chunk of an array that grows."""
 
@@ -182,6 +184,34 @@ class Store:
             raise FileNotFoundError(f"`store` {str(place)!r} does not exist.") from None
         except (ValueError, KeyError, TypeError, AttributeError, NotADirectoryError):
             raise ValueError(f"`store` {str(place)!r} is no store of sympflow: give another place.") from None
+
+    def check_same(self, key: str, mine: Mapping[str, str], asked: str, kind: str, remedy: str) -> None:
+        """Check that a store is of the call that asks for it.
+
+        Parameters
+        ----------
+        key : str
+            The attribute that says of which call a store is, as JSON.
+        mine : mapping of str to str
+            What the call is known by, in words.
+        asked : str
+            The path as it was given.
+        kind : str
+            "run" or "ensemble".
+        remedy : str
+
+        Raises
+        ------
+        ValueError
+            If it is of another call, or of none of this kind.
+        """
+        theirs = json.loads(self.attributes.get(key, "{}"))
+        if not theirs:
+            article = "an" if kind[0] in "aeiou" else "a"
+            raise ValueError(f"`store` {asked!r} is no store of {article} {kind}: name another folder.")
+        other = difference(theirs, mine)
+        if other:
+            raise ValueError(f"`store` {asked!r} is of another {kind}: {other}. {remedy}")
 
     # chunks ---------------------------------------------------------------------------------------
 
@@ -429,6 +459,18 @@ class Appender:
                 self.tails[name] = [tail]
                 self.store.write(name, self._index(name, k), tail)
         self.store.commit({self.dim: self.length}, attributes, state)
+
+
+def difference(theirs: Mapping[str, str], mine: Mapping[str, str]) -> str:
+    """Return what differs first between the texts of a store and of a call, cut to where it does; "" if nothing."""
+    for name, text in mine.items():
+        other = theirs.get(name, text)
+        if other != text:
+            same = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(other, text, strict=False)))
+            start = max(0, same - TOLD // 2) if max(len(other), len(text)) > TOLD else 0
+            told = (f"{'...' * (start > 0)}{x[start : start + TOLD]}" for x in (other, text))
+            return f"its `{name}` is {', not '.join(told)}"
+    return ""
 
 
 def _json(value: Any) -> bytes:

@@ -83,6 +83,29 @@ def test_solve_writes_csv_and_npz(tmp_path):
         assert data["y"][:, 0].tolist() == [-1, 0.5]
 
 
+def test_solve_goes_on_from_a_store_to_a_later_end(tmp_path):
+    words = [
+        "henon-heiles",
+        "--method",
+        "verlet",
+        "--dt",
+        0.1,
+        "--store",
+        tmp_path / "run.zarr",
+        "--checkpoint-every",
+        5,
+    ]
+    first = run("solve", *words, "--t-end", 1, "--progress")
+    assert first.exit_code == 0, first.output
+    assert "11 outputs in" in " ".join(first.output.split())
+    assert "100 %  t = 1 of 1" in first.stderr
+    refused = run("solve", *words, "--t-end", 2)
+    assert refused.exit_code == 2
+    assert "exists: pass" in " ".join(refused.output.split())
+    later = run("solve", *words, "--t-end", 2, "--resume")
+    assert "21 outputs in" in " ".join(later.output.split()), later.output
+
+
 def test_solve_that_fails_ends_with_status_one():
     result = run("solve", "henon-heiles", "--method", "verlet", "--y0", "0,0,0,0.7", "--t-end", 20)
     assert result.exit_code == 1

@@ -20,8 +20,7 @@ TURNING = HamiltonianSystem.from_sympy(
 )
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.slow
+@pytest.mark.parametrize("method", [METHODS[0], *(pytest.param(m, marks=pytest.mark.slow) for m in METHODS[1:])])
 def test_the_contract_holds_where_h_does_not_split(method):
     names = check_integrator(get(method), TURNING)
     assert {"the_order_is_the_slope", "symplecticity_as_declared", "the_inverse_undoes_the_step"} <= set(names)

@@ -136,6 +136,7 @@ def test_a_warning_names_the_door_for_systems_of_very_many_kinds_of_terms(monkey
         terms.warn_if_long(SYSTEM.symbols.V, SYSTEM.symbols.q, SYSTEM.name)
 
 
+@pytest.mark.slow
 def test_the_logarithmic_clock_of_many_degrees_of_freedom():
     solution = solve(SYSTEM, "log_leapfrog", (0, 0.1), dt=0.05)
     arrays = solve(SYSTEM, "log_leapfrog", (0, 0.1), dt=0.05, backend="array")

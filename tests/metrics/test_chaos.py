@@ -80,6 +80,7 @@ def test_gali_of_two_vectors_is_sali_times_the_other_diagonal(wells):
     np.testing.assert_allclose(g, s * np.sqrt(4 - s**2) / 2, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_exponent_of_a_ridge_with_friction():
     """λ of q'' = q − γq' is (−γ + √(γ² + 4))/2; the verlet step has this rate up to O(h²)."""
     y0, gamma = [1e-3, 2e-3], 0.4
