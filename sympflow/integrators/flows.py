@@ -170,6 +170,7 @@ class FlowIntegrator(OwnStepper):
 
     def own_stepper(self, problem: Problem) -> FlowStepper | CompiledFlowStepper:
         flow = self.flow_for(problem.system)
+        flow.warn_of_drive(problem.t0, problem.t1 - problem.t0)
         if type(problem.y0) is np.ndarray and problem.y0.dtype == np.float64:  # a kernel tells the flow's own dtype
             kernel = self.kernel(flow, problem)
             if kernel is not None:
