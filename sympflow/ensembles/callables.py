@@ -30,7 +30,7 @@ def fingerprint(function: Any) -> str:
 
 
 class _Contents:
-    """What values are made of, as JSON has it: each function or object once."""
+    """Parts of values, as JSON has them: each function or object once."""
 
     def __init__(self, module: str) -> None:
         self.module = module
