@@ -142,7 +142,7 @@ print(time.process_time() - start)
 
 
 def compiling() -> str:
-    """Of one site more or less the second process finds the code in the cache."""
+    """Times of compiling: for one site more or less the second process finds the code in the cache."""
     rows = []
     for method in ("verlet", "chin4c"):
         with tempfile.TemporaryDirectory() as folder:

@@ -145,7 +145,7 @@ def linear_limit(figures: Path) -> Fragments:
 
 
 def _linear_windows() -> str:
-    """Where each scheme is unstable on the oscillator, in z = dt·ω."""
+    """Windows in z = dt·ω where each scheme is unstable on the oscillator."""
     rows = []
     for name, scheme in SCHEMES.items():
         found = linear_stability(scheme)

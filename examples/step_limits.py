@@ -1,4 +1,4 @@
-"""Where the step of a method ends: the harmonic oscillator at z = dt·ω, whatever ω is.
+"""The largest step of a method: the harmonic oscillator at z = dt·ω, whatever ω is.
 
 From q = 1, p = 0 the relative energy error of Störmer–Verlet (kick–drift–kick) is bounded by z²/4, that of leapfrog
 (drift–kick–drift) by (z²/4)/(1 − z²/4), and both diverge for z > 2. The flow shipped for ω = 100 has z = 1.

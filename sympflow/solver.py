@@ -363,7 +363,7 @@ def _run_stored(integrator: Integrator, problem: Problem, action: str) -> tuple[
     compiled = {"backend": "compiled"}  # by which states are looked at in a compiled pass
 
     def look(t: np.ndarray, y: np.ndarray) -> None:
-        """What `_solved` does with all outputs, for those of a window."""
+        """Check the outputs of a window, as `_solved` checks all outputs."""
         piece = Outcome(t, y, 0, "", compiled.copy() if y.dtype == np.float64 else {})
         if system.functions_given:
             system.check_functions_along(y)

@@ -132,7 +132,7 @@ class Measure:
         return np.concatenate([q, zero, p, zero], axis=1)
 
     def _of_balance(self, Y: np.ndarray, t: np.ndarray) -> float:
-        """Of states (N, n, 2d + 2) of the extended system at times t (n,)."""
+        """Energy errors of states (N, n, 2d + 2) of the extended system at times t (n,)."""
         H = self.system.hamiltonian(np.delete(Y, [self.system.ndof, -1], axis=-1), np.broadcast_to(t, Y.shape[:-1]))
         error = np.abs(H + Y[..., -1] - H[:, :1]).max(1) / (self.system.energy_scale or np.abs(H).max(1))
         return float(np.median(np.where(np.isnan(error), np.inf, error)))

@@ -1,8 +1,9 @@
 """Files of flows: safetensors with a JSON record, never pickle. A file is taken for hostile until all of it is checked.
 
 The metadata entry "sympflow" is a JSON object: format, version (of the package), kind, architecture, dt, domain,
-system, fingerprint, recipe, figures, checksum (of the tensors), and, where there are any, certificate and identity
-(the H of the system, at states of the domain and as an expression) and unfitted (intervals of t without labels).
+system, fingerprint, recipe, figures, checksum (of the tensors), and, where there are any, certificate, identity
+(the H of the system, at states of the domain and as an expression), unfitted (intervals of t without labels)
+and drive_times (where a drive without a period was fitted).
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class Description:
     ----------
     domain, system, fingerprint, recipe, figures, certificate
         `FlowMap`'s domain, system_name, fingerprint, recipe, figures, certified.
-    identity, unfitted
+    identity, unfitted, drive_times
         `FlowMap`'s own.
     """
 
@@ -92,6 +93,7 @@ class Description:
     certificate: Certificate | None = None
     identity: Identity | None = None
     unfitted: tuple[tuple[float, float], ...] = ()
+    drive_times: tuple[float, float] | None = None
 
     @classmethod
     def of_record(cls, record: dict[str, Any], ndof: int) -> Self:
@@ -118,8 +120,13 @@ class Description:
         domain = None if record["domain"] is None else _domain(record["domain"], ndof)
         if fingerprint is not None:
             fingerprint = tuple(math.nan if v is None else float(v) for v in fingerprint)
-        unfitted = _intervals(record.get("unfitted", []))
-        return cls(domain, system, fingerprint, record["recipe"], record["figures"], certificate, identity, unfitted)
+        unfitted = _intervals(record.get("unfitted", []), "unfitted times")
+        driven = _intervals(record.get("drive_times", []), "times of its drive")
+        if len(driven) > 1 or any(low >= high for low, high in driven):
+            raise Refused("its times of the drive are not one interval")
+        return cls(
+            domain, system, fingerprint, record["recipe"], record["figures"], certificate, identity, unfitted, *driven
+        )
 
 
 # writing ---------------------------------------------------------------------------------------------------
@@ -154,6 +161,8 @@ def write(
     }
     if description.unfitted:
         record["unfitted"] = description.unfitted
+    if description.drive_times is not None:
+        record["drive_times"] = [description.drive_times]
     if description.identity is not None:
         record["identity"] = description.identity.to_dict()
     if description.certificate is not None:
@@ -419,12 +428,12 @@ def _identity(record: dict[str, Any], ndof: int) -> Identity | None:
         raise Refused(f"its identity of the system is not admissible: {error}") from None
 
 
-def _intervals(pairs: Any) -> tuple[tuple[float, float], ...]:
+def _intervals(pairs: Any, what: str) -> tuple[tuple[float, float], ...]:
     """Return the intervals of times in a record; else they are refused."""
     if not isinstance(pairs, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in pairs):
-        raise Refused("its unfitted times are not a list of pairs")
+        raise Refused(f"its {what} are not a list of pairs")
     if not all(_is_number(v) for pair in pairs for v in pair):
-        raise Refused("its unfitted times are not numbers")
+        raise Refused(f"its {what} are not numbers")
     return tuple((float(low), float(high)) for low, high in pairs)
 
 

@@ -82,6 +82,8 @@ class FlowMap(nn.Module):
     unfitted : tuple of (float, float)
         Open intervals of t in which it was never compared with anything: those between the times of labels, if these
         were few and it was fitted to nothing else. Results there come with a warning.
+    drive_times : (float, float) or None
+        The interval of t0 + t that the flow of a drive without a period was fitted in: beyond it there is a warning.
     recipe, figures : dict
         How it was trained, and what it achieved.
     history : list of dict
@@ -100,6 +102,7 @@ class FlowMap(nn.Module):
     """True if the maps of the family take the time, of a driven system that they are made for."""
     identity: Identity | None = None  # these two of flows in pickles of earlier versions, which did not have them
     unfitted: tuple[tuple[float, float], ...] = ()
+    drive_times: tuple[float, float] | None = None
 
     def __init__(self, ndof: int, dt: float) -> None:
         super().__init__()
@@ -116,7 +119,7 @@ class FlowMap(nn.Module):
         self.domain: Domain | None = None
         self.fingerprint: tuple[float, ...] | None = None
         self.system_name: str | None = None
-        self.identity, self.unfitted = None, ()
+        self.identity, self.unfitted, self.drive_times = None, (), None
         self._origin: tuple[dict[str, Any], Origin] | None = None
         self.recipe: dict[str, Any] = {}
         self.figures: dict[str, Any] = {}
@@ -214,6 +217,7 @@ class FlowMap(nn.Module):
         """
         t = self._checked_time(t, x)
         self.warn_of_times(t)
+        self.warn_of_drive(t0, t)
         x = self.lift(x, t0)
         if isinstance(t, float):
             return self.project(self._whole(whole_steps(abs(t), self.dt), t < 0, x))
@@ -226,6 +230,7 @@ class FlowMap(nn.Module):
         """The exact inverse of ψ_t, for every t: arguments as for the call, x being at the time t0 + t."""
         t = self._checked_time(t, x)
         self.warn_of_times(t)
+        self.warn_of_drive(t0, t)
         x = self.lift(x, t0, t)
         if isinstance(t, float):
             return self.project(self._whole(whole_steps(abs(t), self.dt), t >= 0, x, remainder_first=True))
@@ -274,7 +279,7 @@ class FlowMap(nn.Module):
         return None
 
     def at_time(self, z: Tensor, time: Any) -> Tensor:
-        """Such states of a driven system with another time, a number or (...)."""
+        """Replace the time in states of a driven system, by a number or (...)."""
         d = self.ndof
         time = torch.as_tensor(time, dtype=z.dtype, device=z.device).expand(z.shape[:-1])
         return torch.cat([z[..., :d], time[..., None], z[..., d + 1 :]], dim=-1)
@@ -305,6 +310,33 @@ class FlowMap(nn.Module):
                     stacklevel=3,
                 )
                 return
+
+    def warn_of_drive(self, t0: Any, passed: Any) -> None:
+        """Warn where a run over `passed` from t0 leaves the times for which a drive without a period was fitted.
+
+        Warns
+        -----
+        UserWarning
+        """
+        if self.drive_times is None or t0 is None:
+            return
+        start, length = (values(each) if is_tensor(each) else np.asarray(each) for each in (t0, passed))
+        if start is None or length is None:  # in a graph that torch.compile traces
+            return
+        if not (start.size and length.size and start.dtype.kind in "fiu"):
+            return  # refused where it is used
+        low, high = self.drive_times
+        slack = 1e-9 * (high - low)
+        first = float(start.min() + min(length.min(), 0.0))
+        last = float(start.max() + max(length.max(), 0.0))
+        if first < low - slack or last > high + slack:
+            warnings.warn(
+                f"The flow was fitted to a drive without a period for t from {low:g} to {high:g}, its system's "
+                "`t_span`, and the run leaves these times: its figures do not hold there. Train it for a system with "
+                "a longer `t_span`, give the system the `period` of its drive, or use a scheme such as 'kahan_li8'.",
+                UserWarning,
+                stacklevel=3,
+            )
 
     def _whole(self, count: tuple[int, float], back: bool, x: Tensor, remainder_first: bool = False) -> Tensor:
         """k steps and the remainder of one time for all states."""
@@ -428,6 +460,7 @@ class FlowMap(nn.Module):
             certificate=self.certified,
             identity=self.identity,
             unfitted=self.unfitted,
+            drive_times=self.drive_times,
         )
 
     def describe(self, description: Description) -> None:
@@ -437,6 +470,7 @@ class FlowMap(nn.Module):
         )  # fmt: skip
         self.recipe, self.figures, self.certified = description.recipe, description.figures, description.certificate
         self.identity, self.unfitted = description.identity, description.unfitted
+        self.drive_times = description.drive_times
 
     # its system ---------------------------------------------------------------------------------------------
 

@@ -76,7 +76,7 @@ class Definition:
         return (self.potential_hessian(q, *t) @ v[..., None])[..., 0]
 
     def remark(self, q: np.ndarray) -> str:
-        """What is to be said of the last positions (d,) of a run that could not go on: a clause, or nothing."""
+        """Remark on the last positions (d,) of a run that could not go on: a clause, or nothing."""
         return ""
 
     def third_derivative(self, q: Array, v: Array, w: Array, *t: Array) -> Array:

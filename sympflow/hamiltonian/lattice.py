@@ -95,7 +95,7 @@ class LatticeHamiltonian(LocalHamiltonian):
 
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
-        """How the positions, momenta and differences of the fields are written."""
+        """Names of the positions, momenta and differences of the fields."""
         if len(self.fields) == 1:
             return {"x": self.fields, "p": ("p",), "r": ("r",)}
         return {"x": self.fields, **{kind: tuple(f"{kind}_{f}" for f in self.fields) for kind in "pr"}}

@@ -685,7 +685,7 @@ def _integer_power(x: np.ndarray, n: int) -> np.ndarray:
 
 
 def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
-    """Where the generated code finds its functions; SciPy is brought in for special functions only."""
+    """Modules of the functions in the generated code; SciPy is brought in for special functions only."""
     from sympy.printing.numpy import NumPyPrinter
 
     known = NumPyPrinter().known_functions

@@ -170,6 +170,7 @@ class FlowIntegrator(OwnStepper):
 
     def own_stepper(self, problem: Problem) -> FlowStepper | CompiledFlowStepper:
         flow = self.flow_for(problem.system)
+        flow.warn_of_drive(problem.t0, problem.t1 - problem.t0)
         if type(problem.y0) is np.ndarray and problem.y0.dtype == np.float64:  # a kernel tells the flow's own dtype
             kernel = self.kernel(flow, problem)
             if kernel is not None:
@@ -200,13 +201,11 @@ class FlowIntegrator(OwnStepper):
 class FlowStepper(Stepper):
     """A run of a flow by tensor operations: of ψ̄ = χ ∘ K ∘ χ⁻¹ the χ between two steps cancel."""
 
+    takes_carry = True
+
     def __init__(self, integrator: FlowIntegrator, problem: Problem, flow: FlowMap) -> None:
         super().__init__(integrator, problem)
         self.flow, self.backend = flow, "torch"
-
-    @property
-    def takes_carry(self) -> bool:
-        return True
 
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None

@@ -217,13 +217,11 @@ class CompiledGauss(_Counts, KernelStepper):
 class ArrayGauss(_Counts, Stepper):
     """A run of a Gauss method by array operations."""
 
+    takes_carry = True
+
     def __init__(self, gauss: Gauss, problem: Problem) -> None:
         super().__init__(gauss, problem)
         self.gauss, self.iterations = gauss, 0
-
-    @property
-    def takes_carry(self) -> bool:
-        return True
 
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None

@@ -16,7 +16,7 @@ WIDTH = 24  # characters of the bar
 
 
 class Progress:
-    """What is done of a total, as it is told.
+    """Progress of one call: the part of a total that is done, as it is told.
 
     Parameters
     ----------

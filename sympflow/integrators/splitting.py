@@ -388,13 +388,11 @@ class Splitting(OwnStepper):
 class ArrayComposition(Stepper):
     """A run of a composition by array operations."""
 
+    takes_carry = True
+
     def __init__(self, integrator: FixedStep, problem: Problem, composition: Composition) -> None:
         super().__init__(integrator, problem)
         self.composition = composition
-
-    @property
-    def takes_carry(self) -> bool:
-        return True
 
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None

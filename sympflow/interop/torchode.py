@@ -70,7 +70,7 @@ def step_method(method: Any, system: HamiltonianSystem, **options: Any) -> Sympl
 
 
 class Beginning(NamedTuple):
-    """Where a step began: what the states within it are computed from."""
+    """Beginning of a step: the states within it are computed from there."""
 
     t0: Tensor
     y0: Tensor

@@ -389,7 +389,7 @@ class _Team:
 
 @dataclass(frozen=True)
 class _Code:
-    """What the code of a lattice depends on."""
+    """Key of the code of a lattice: all that the code depends on."""
 
     lattice: LatticeHamiltonian
     key: tuple[Any, ...]

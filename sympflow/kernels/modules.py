@@ -58,7 +58,7 @@ def template(name: str) -> str:
 
 
 def cache_folder() -> Path:
-    """Where generated modules live.
+    """Folder of the generated modules.
 
     The first that is set of $SYMPFLOW_CACHE_DIR, $NUMBA_CACHE_DIR/sympflow, $XDG_CACHE_HOME/sympflow and the
     platform's folder for caches.

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import as_float, check_counts, check_t_eval, floats
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import compiled_loops
-from sympflow.integrators.contract import FINISHED, differentiated, in_blocks
+from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
@@ -407,19 +407,8 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, times: np.ndarray, kind: int, bel
 
 def _each_step(orbits: Orbits) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Steps one by one: times and lengths (N,), Jacobians (N, 2d, 2d)."""
-    integrator, system = orbits.integrator, orbits.system
-    if system.autonomous:
-        for t, h, A in integrator.executed(system, orbits.t_span, orbits.rows):
-            yield from zip(t, h, A, strict=True)
-        return
-
-    def jacobian(t: float, y: np.ndarray, h: np.ndarray) -> np.ndarray:
-        return integrator.tangent(system, t, y, h)[1]
-
-    for chunk in in_blocks(integrator.steps(system, orbits.t_span, orbits.rows)):
-        for time, y, length in zip(*chunk, strict=True):  # each at its own time
-            t, h, A = differentiated(jacobian, np.atleast_1d(time), y[None], np.atleast_1d(length))
-            yield t[0], h[0], A[0]
+    for t, h, A in orbits.integrator.executed(orbits.system, orbits.t_span, orbits.rows):
+        yield from zip(t, h, A, strict=True)
 
 
 def _spread(W: np.ndarray, kind: int) -> np.ndarray:

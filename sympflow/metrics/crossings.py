@@ -87,7 +87,7 @@ def stroboscopic(
 
 
 def whole_periods(t_span: tuple[float, float], period: float) -> int:
-    """How many periods an interval holds; one of them short by no more than rounding is whole."""
+    """Number of periods that an interval holds; one of them short by no more than rounding is whole."""
     return int(np.floor(abs(t_span[1] - t_span[0]) / period * (1 + 1e-12)))
 
 

@@ -28,6 +28,8 @@ from sympflow.solver import check_y0, solve
 
 GROWS = 1e-5
 """Excess of a multiplier over 1 that is more than the rounding of a double eigenvalue, √ε."""
+UNPAIRED = 1e-3
+"""A worse pairing of the multipliers than this is warned of."""
 CLOSED = 1e-6
 """Distance of the end of a period from its start, over 1 + |y0|, up to which an orbit is periodic."""
 
@@ -103,7 +105,8 @@ def floquet_multipliers(
     Warns
     -----
     RuntimeWarning
-        If the orbit is not periodic: its end is farther than 1e-6 from y0. The eigenvalues then mean little.
+        If the orbit is not periodic: its end is farther than 1e-6 from y0; and if the multipliers are not in pairs, to
+        1e-3, as by an adaptive method on an equilibrium. The eigenvalues then mean little.
 
     Examples
     --------
@@ -131,6 +134,11 @@ def floquet_multipliers(
         integrator = build(method, {**options, "dt": dividing_step(T, system.dt)})
     integrator = integrator.resolved(system, start, float(T))
     check_applies(integrator, system, start)
+    if integrator.keeps:
+        raise ValueError(
+            f"`method` {integrator.name!r} keeps {integrator.keeps}, so that its Jacobians are not those of states: "
+            "use a splitting method such as 'kahan_li8', or an implicit one such as 'gauss_legendre6'."
+        )
     t_span = (float(t0), float(t0 + T))
     end = solve(system, integrator, t_span, start, t_eval=[t_span[1]]).raise_for_status().y[:, -1]
     mismatch = float(np.linalg.norm(to_numpy(end) - start))
@@ -147,7 +155,16 @@ def floquet_multipliers(
             M = A @ M
     found = np.linalg.eigvals(M)
     found = found[np.argsort(-np.abs(found), kind="stable")].astype(complex)
-    return FloquetMultipliers(found, M, float(T), mismatch, _pairing(system, M, float(T)))
+    pairing = _pairing(system, M, float(T))
+    if pairing > UNPAIRED:
+        warnings.warn(
+            f"The multipliers are not in pairs, to {pairing:.2g}: steps of {integrator.name!r} are too long for "
+            "deviations from the orbit, of which adaptive steps know nothing. Use a splitting method such as "
+            "'kahan_li8', or a smaller `dt`.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return FloquetMultipliers(found, M, float(T), mismatch, pairing)
 
 
 def _pairing(system: HamiltonianSystem, M: np.ndarray, T: float) -> float:

@@ -27,7 +27,6 @@ KNOWN = "sympflow_run"
 SECONDS = 10.0
 """Between two commits, by default."""
 CHUNK = 2**19  # numbers in a chunk of q and p together, about
-TOLD = 90  # characters of what differs between two runs
 
 
 @dataclass
@@ -147,7 +146,8 @@ class RunStore:
                     f"`store` {self.asked!r} exists: pass resume=True to go on with it, or name another folder."
                 )
             self.store = Store.open(self.path)
-            self._check(known)
+            remedy = "Nothing of it was changed: name another folder, or make the same call."
+            self.store.check_same(KNOWN, known, self.asked, "run", remedy)
         else:
             self._create(known, y0, n_outputs)
         try:
@@ -192,17 +192,6 @@ class RunStore:
             ) from error
         self.store = Store.open(self.path)
 
-    def _check(self, known: Mapping[str, str]) -> None:
-        theirs = json.loads(self.store.attributes.get(KNOWN, "{}"))
-        if not theirs:
-            raise ValueError(f"`store` {self.asked!r} is no store of a run: name another folder.")
-        for name, text in known.items():
-            if theirs.get(name) != text:
-                raise ValueError(
-                    f"`store` {self.asked!r} is of another run: its `{name}` is {str(theirs.get(name))[:TOLD]}, not "
-                    f"{text[:TOLD]}. Nothing of it was changed: name another folder, or make the same call."
-                )
-
     # what is in it --------------------------------------------------------------------------------
 
     @property
@@ -216,7 +205,7 @@ class RunStore:
 
     @property
     def message(self) -> str:
-        """What became of the run."""
+        """Message of the run: how it ended, or where it is."""
         return str(self.store.attributes["message"])
 
     def place(self) -> Place | None:
@@ -250,7 +239,7 @@ class RunStore:
         for name in names:
             rows = (slice(row, row + fields[name].shape[-2]),) if width else ()
             for k in range(first // size, -(-n // size)):
-                part = self.store.read(name, (*(0,) * (fields[name].dims.index(TIME)), k))
+                part = self.store.committed(name, (*(0,) * (fields[name].dims.index(TIME)), k))
                 a = k * size
                 skip = max(0, first - a)
                 whole[(..., *rows, slice(a + skip - first, a - first + part.shape[-1]))] = part[..., skip:]

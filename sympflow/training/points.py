@@ -77,6 +77,13 @@ def states(domain: Domain, n: int, seed: int, stream: Stream, block: int = 0) ->
     return domain.sample(n, stream_seed(seed, stream, block))
 
 
+def drive_times(system: HamiltonianSystem) -> tuple[float, float] | None:
+    """The times of labels where the drive has no period, those of its `t_span`; None for another system."""
+    if system.autonomous or system.period is not None:
+        return None
+    return min(system.t_span), max(system.t_span)
+
+
 def times_of(system: HamiltonianSystem, dt: float) -> tuple[float, float]:
     """The interval of the times at which steps of a driven system begin: its period, or else its `t_span` less Δt.
 

@@ -18,7 +18,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.least_squares import STOPPED, Minimum
 from sympflow.training.options import LossOptions, SearchOptions
-from sympflow.training.points import USELESS
+from sympflow.training.points import USELESS, drive_times
 from sympflow.training.session import Deadline, Path, Session
 
 OUT_OF_TIME = "the time budget was used up"
@@ -156,6 +156,7 @@ class Run(ABC):
         flow.zero_grad(set_to_none=True)
         flow.domain = self.domain
         flow.identify(self.system, self.domain)
+        flow.drive_times = drive_times(self.system)
         earlier = float(flow.figures.get("training_seconds", 0.0))
         stage = {**self.options.to_dict(), **self.remarks(reason)}
         if self.done and not stage.get("kept_start"):

@@ -1,5 +1,7 @@
 """Primed flows of driven systems: fitted with their drive, exactly symplectic, refused for any other."""
 
+import pickle
+import warnings
 from math import pi
 
 import numpy as np
@@ -205,3 +207,40 @@ def test_bad_times(system, flow):
     aperiodic = driven(period=None)
     with pytest.raises(TypeError, match=r"^`x` is torch.float32, in which times are rounded"):
         flow.transferred(aperiodic).to(torch.float32)(1.0, x.float(), 1e6)
+
+
+def test_runs_beyond_the_times_of_a_drive_without_a_period_warn(tmp_path):
+    text = "p**2/2 - cos(q)*(1 + exp(-(t - 2)**2)/2)"
+    once = HamiltonianSystem.from_sympy(text, time="t", y0=[0.5, 0.1], t_span=(0, 5), domain=Box([-1, -1], [1, 1]))
+    few = {"restarts": 1, "steps": 3, "points": 10, "label_times": 1, "reference_states": 5, "progress": False}
+    made = sympflow.train(once, flow=SympFlow.primed(once, 2, dt=DT), **few)
+    made.save(tmp_path / "flow.safetensors")
+    loaded = sympflow.load(tmp_path / "flow.safetensors", system=once)
+    x = torch.tensor(states(once))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        solve(once, made, (5, 0))
+        made(2.0, x, torch.tensor([0.0, 1.0, 2.0, 3.0]))
+    for flow in (made, loaded, pickle.loads(pickle.dumps(made))):
+        assert flow.drive_times == (0.0, 5.0)
+        for use in (
+            lambda flow=flow: solve(once, flow, (4, 6)),
+            lambda flow=flow: solve(once, flow, (0, -1), backend="array"),
+            lambda flow=flow: flow(2.0, x, t0=4.0),
+            lambda flow=flow: flow.inverse(2.0, x, t0=-1.0),
+        ):
+            with pytest.warns(UserWarning, match=r"for t from 0 to 5, its system's `t_span`, and the run leaves"):
+                use()
+
+
+def test_deviations_and_multipliers_by_a_trained_flow(system, flow):
+    """The Jacobians of all steps are made together, each at its own time."""
+    y0 = [0.7, 0.2]
+    ours, scheme = (
+        sympflow.lyapunov(system, method, (T0, T0 + 40.0), y0, deviations=[1.0, 0.0], **more).value
+        for method, more in ((flow, {}), ("kahan_li8", {"dt": DT / 4}))
+    )
+    assert ours == pytest.approx(scheme, abs=1e-4)
+    found = sympflow.floquet_multipliers(system, np.zeros(2), method=flow)
+    truth = sympflow.floquet_multipliers(system, np.zeros(2))
+    np.testing.assert_allclose(found.multipliers, truth.multipliers, atol=1e-4)

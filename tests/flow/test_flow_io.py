@@ -302,7 +302,7 @@ def test_the_domain_of_a_file_is_a_domain(tmp_path):
 
 def test_a_pickle_of_a_version_without_identities_is_read():
     flow = SympFlow.primed(henon_heiles(), 3, dt=0.5)
-    for name in ("identity", "unfitted"):
+    for name in ("identity", "unfitted", "drive_times"):
         vars(flow).pop(name, None)
     again = pickle.loads(pickle.dumps(flow))
     assert again.identity is None

@@ -39,6 +39,12 @@ def test_an_orbit_that_is_not_periodic_is_told():
         floquet_multipliers(systems.pendulum(), period=1.0)
 
 
+def test_steps_that_are_too_long_for_deviations_are_told():
+    """At rest the orbit has no error by which an adaptive method would choose its steps."""
+    with pytest.warns(RuntimeWarning, match=r"not in pairs, to 0\..* 'rk45' are too long"):
+        floquet_multipliers(systems.pendulum(), [0.0, 0.0], period=6.0, method="rk45")
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
@@ -46,6 +52,7 @@ def test_an_orbit_that_is_not_periodic_is_told():
         ({"period": -1.0}, ValueError, "`period` must be positive"),
         ({"period": 1.0, "t0": math.inf}, ValueError, "`t0` must be a finite number"),
         ({"period": 1.0, "y0": [[0.0, 0.0]]}, ValueError, "`y0` must be one state"),
+        ({"period": 1.0, "method": "tao4"}, ValueError, "^`method` 'tao4' keeps the second copy"),
         ({"period": 1.0, "method": "verlett"}, ValueError, "Did you mean 'verlet'"),
     ],
 )

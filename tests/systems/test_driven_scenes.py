@@ -38,7 +38,7 @@ def test_the_default_step_is_sensible(name):
 
 @pytest.mark.parametrize(("upright", "drive"), [(False, 0.5), (True, 0.7)])
 def test_small_deviations_of_the_driven_pendulum_follow_mathieu(upright, drive):
-    """Where α is a characteristic value a multiplier is −1, of b₁ about q = 0, or 1, of a₀ about q = π."""
+    """At a characteristic value α a multiplier is −1, of b₁ about q = 0, or 1, of a₀ about q = π."""
     alpha = -mathieu_a(0, drive) if upright else mathieu_b(1, drive)
     w = 2 / math.sqrt(alpha)
     system = systems.driven_pendulum(drive * w**2 / 2, w)
@@ -68,7 +68,7 @@ def test_a_periodic_orbit_of_the_paul_trap_is_a_mathieu_function():
 
 
 def test_the_multipliers_of_duffings_oscillator_have_the_product_of_the_friction():
-    """Of an orbit of the period of the drive, found by Newton's method, by 60 steps a period."""
+    """An orbit of the period of the drive, found by Newton's method, by 60 steps a period."""
     system, y = SCENES["duffing"], np.array([-0.148, 0.018])  # of the linear equation
     T, dt = system.period, system.period / 60
     for _ in range(8):
