@@ -134,16 +134,26 @@ def _sent(packed: bytes) -> Parcel:
 
 
 def _pickled(value: Any) -> bytes:
-    """Return the pickle of an object; where Python's refuses functions that are in no module, cloudpickle's."""
-    try:
-        return pickle.dumps(value)
-    except Exception as error:
-        try:
-            import cloudpickle
+    """Return the pickle of an object.
 
-            return cloudpickle.dumps(value)
-        except Exception:
-            raise Unpicklable(f"{type(error).__name__}: {error}") from error
+    It is cloudpickle's, if that is installed, where Python's refuses functions that are in no module, or finds some in
+    the script that runs, which the workers of an engine do not import.
+    """
+    refused, data = None, b""
+    try:
+        data = pickle.dumps(value)
+        if b"__main__" not in data:
+            return data
+    except Exception as error:
+        refused = error
+    try:
+        import cloudpickle
+
+        return cloudpickle.dumps(value)
+    except Exception:
+        if refused is not None:
+            raise Unpicklable(f"{type(refused).__name__}: {refused}") from refused
+        return data
 
 
 @lru_cache(maxsize=4)

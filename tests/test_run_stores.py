@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators import base, progress, windows
+from sympflow.integrators import progress, stored_runs, windows
 from sympflow.integrators.contract import Interrupted
 from sympflow.solver import solve
 from sympflow.storage import store as storage
@@ -42,8 +42,8 @@ CASES = {
 
 @pytest.fixture(autouse=True)
 def short_windows(monkeypatch):
-    monkeypatch.setattr(base, "ONE", 100)
-    monkeypatch.setattr(base, "ARRAY_STEPS", 30)
+    monkeypatch.setattr(stored_runs, "ONE", 100)
+    monkeypatch.setattr(stored_runs, "ARRAY_STEPS", 30)
     monkeypatch.setattr(windows.Pace, "took", lambda self, n: None)
     monkeypatch.setattr(progress, "BETWEEN", 0.0)
 
@@ -97,11 +97,11 @@ def test_a_run_that_goes_on_to_a_later_end_is_the_longer_run(tmp_path, case):
 
 KILLED = """
 import os, signal, sys
-from sympflow.integrators import base, progress, windows
+from sympflow.integrators import progress, stored_runs, windows
 from sympflow.solver import solve
 from sympflow.systems import henon_heiles
 
-base.ONE, progress.BETWEEN, windows.Pace.took = 100, 0.0, lambda self, n: None
+stored_runs.ONE, progress.BETWEEN, windows.Pace.took = 100, 0.0, lambda self, n: None
 
 def kill(done, total):
     if done >= 12:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sympflow.storage import store as module
-from sympflow.storage.store import Appender, Field, Store, StoreError
+from sympflow.storage.store import Appender, Field, Store, StoreError, difference
 
 FIELDS = {
     "time": Field(("time",), (0,), float, (4,)),
@@ -94,6 +94,20 @@ def test_damage_is_told(tmp_path):
     chunk.write_bytes(b"")
     with pytest.raises(StoreError, match="is damaged"):
         store.read("dof")
+    chunk.unlink()
+    with pytest.raises(StoreError, match="is damaged: 0 of 'dof' is missing"):
+        store.committed("dof", (0,))
+    store.commit(state={"place": np.ones(3)})
+    (state,) = (tmp_path / "run.zarr").glob(".state-*")
+    state.write_bytes(state.read_bytes()[:40])
+    with pytest.raises(StoreError, match="is damaged: its state"):
+        store.state()
+
+
+def test_what_differs_is_told_where_it_does():
+    other = difference({"a": "x" * 300 + "1", "old": "kept"}, {"new": "of a later version", "a": "x" * 300 + "2"})
+    assert other == f"its `a` is ...{'x' * 45}1, not ...{'x' * 45}2"
+    assert difference({"a": "1"}, {"a": "1"}) == ""
 
 
 def test_places_that_are_no_store(tmp_path):

@@ -6,7 +6,6 @@ statuses are there is done, and is not run again.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -17,9 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sympflow._version import __version__
+from sympflow.ensembles.callables import fingerprint
 from sympflow.ensembles.orbits import Drawn, Given
 from sympflow.ensembles.results import Block, Done, Index, Layout
-from sympflow.integrators.provenance import flow_checksum, option_text
+from sympflow.integrators.provenance import digest, flow_checksum, option_text
 from sympflow.integrators.registry import name_of
 from sympflow.storage.layout import halves, imported
 from sympflow.storage.store import Store
@@ -53,38 +54,24 @@ def identity(
     """The identity of an ensemble, each part as a text; two are the same if all parts are."""
     states = orbits.y0 if isinstance(orbits, Given) else orbits.states(0, min(len(orbits), 64))
     return {
-        "system": f"{system.name} {_digest([system.expression, dict(system.params), list(system.fingerprint)])}",
+        "version": __version__,
+        "system": f"{system.name} {digest([system.expression, dict(system.params), list(system.fingerprint)])}",
         "method": f"{name_of(integrator)}, {option_text(integrator)}, flow={flow_checksum(integrator, system)}",
+        "dt": repr(integrator.step_length(system)),
         "t_span": f"{t_span[0]!r} to {t_span[1]!r}",
-        "t_eval": "every step" if t_eval is None else f"{len(t_eval)} times {_digest(t_eval)}",
-        "y0": f"{len(orbits)} states{'' if isinstance(orbits, Given) else f' by seed {orbits.seed}'} {_digest(states)}",
-        "params": ", ".join(f"{len(v)} values of {name} {_digest(v)}" for name, v in axes.items()) or "none",
+        "t_eval": "every step" if t_eval is None else f"{len(t_eval)} times {digest(t_eval)}",
+        "y0": f"{len(orbits)} states{'' if isinstance(orbits, Given) else f' by seed {orbits.seed}'} {digest(states)}",
+        "params": ", ".join(f"{len(v)} values of {name} {digest(v)}" for name, v in axes.items()) or "none",
         "reduce": _described(reduction),
         "backend": backend,
     }
 
 
 def _described(reduction: Reduction) -> str:
-    """A reduction with its options; a user's function by its name and a digest of its code."""
-    parts = []
-    for name, value in reduction.settings().items():
-        code = getattr(value, "__code__", None)
-        told = (
-            repr(value) if code is None else f"{value.__qualname__} {_digest([code.co_code.hex(), _constants(code)])}"
-        )
-        parts.append(f"{name}={told}")
-    return f"{type(reduction).__name__}({', '.join(parts)})"
-
-
-def _constants(code: Any) -> list[Any]:
-    """The names and constants of a function's code, those of functions within it too."""
-    inner = [_constants(c) if isinstance(c, type(code)) else repr(c) for c in code.co_consts]
-    return [list(code.co_names), inner]
-
-
-def _digest(value: Any) -> str:
-    data = value.tobytes() if isinstance(value, np.ndarray) else json.dumps(value, default=repr).encode()
-    return hashlib.sha256(data).hexdigest()[:16]
+    """A reduction with its options; a user's function by its fingerprint."""
+    settings = reduction.settings().items()
+    told = (f"{name}={fingerprint(value) if callable(value) else repr(value)}" for name, value in settings)
+    return f"{type(reduction).__name__}({', '.join(told)})"
 
 
 # the store -----------------------------------------------------------------------------------------------------------
@@ -128,9 +115,11 @@ class EnsembleStore:
                 raise ValueError(
                     f"`store` {str(path)!r} exists: pass resume=True to go on with it, or name another folder."
                 ) from None
-            return cls(str(place), layout, _same(Store.open(place), str(path), attributes))
+            store = Store.open(place)
+            sizes = _same(store, str(path), attributes)
         for name, values in layout.coordinates().items():
-            store.write(name, (0,), values)
+            if not store.has(name, (0,)):  # as in one that was made just before a kill
+                store.write(name, (0,), values)
         (place / MESSAGES).mkdir(exist_ok=True)
         return cls(str(place), layout, sizes)
 

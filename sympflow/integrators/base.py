@@ -21,7 +21,6 @@ from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
 from sympflow.integrators.contract import (
     ENDED,
     FINISHED,
-    INTERRUPTED,
     Failure,
     Integrator,
     Outcome,
@@ -30,13 +29,13 @@ from sympflow.integrators.contract import (
     finished,
     interrupted,
 )
-from sympflow.integrators.grid import EPS, Grid, Outputs
-from sympflow.integrators.windows import ARRAY_STEPS, MOST_SAVED, ONE, Pace, Pieces, Saved, first_window
+from sympflow.integrators.grid import EPS, Grid, distinct
+from sympflow.integrators.windows import MOST_SAVED, Pace, Pieces, Saved, first_window
 from sympflow.kernels.carry import Carry
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
-    from sympflow.storage.runs import Place, RunStore
+    from sympflow.storage.runs import RunStore
 
 __all__ = [
     "FINISHED",
@@ -485,17 +484,6 @@ def shorter_steps(stepper: Stepper, grid: Grid, y: Array, count: np.ndarray, rem
 
 # the driver ----------------------------------------------------------------------------------------
 
-COUNTED = ("force_evaluations", "hessian_evaluations", "curvature_evaluations", "newton_iterations")
-"""Statistics of which those of a run that goes on are added to the earlier ones, where it counts them itself."""
-DONE = ("saved", "within", "counted", "last")
-"""Counts of a stored run: states that were saved, outputs within steps, the step of the last, and whether within it."""
-UNDER_WAY = "The run had reached t = {t:.17g}: make the same call with resume=True to go on."
-
-
-def nothing(problem: Problem) -> tuple[np.ndarray, Array]:
-    """Return no times and no states, as of an outcome whose outputs are in a store."""
-    return np.empty(0), problem.y0[None][:0]
-
 
 class GridRun:
     """One run on the grid: the steps, the outputs among and within them, the events, and what is not finite."""
@@ -534,12 +522,12 @@ class GridRun:
         end = len(save) if n_steps == last else int(save.searchsorted(n_steps, "right"))
         n_saved = end - int(save.searchsorted(0, "right") if end and save[0] <= 0 else 0)
         at_end = int(bool(extra.size) and extra[-1] == len(t) - 1 and t[-1] == grid.t1)
-        outcome = Outcome(t, y, 0, finished(problem), self._stats(n_steps + at_end, n_steps, n_saved, int(extra.size)))
+        outcome = Outcome(t, y, 0, finished(problem), self.stats(n_steps + at_end, n_steps, n_saved, int(extra.size)))
         if problem.dense_output:
             reached = grid if last == asked else Grid(grid.t0, grid.time(last), abs(grid.h))
             outcome.sol = GridSolution(stepper, reached, saved)
         outcome.finite = stepper.compiled and stepper.saves_finite and not extra.size
-        self._report_failures(outcome, finite, last)
+        self.report_failures(outcome, finite, last)
         if last < asked:
             raise interrupted(outcome, grid.time(last))
         return outcome
@@ -569,110 +557,18 @@ class GridRun:
     # a store: windows whose outputs are written --------------------------------------------------------------------
 
     def _stored(self, store: RunStore) -> Outcome:
-        """The same outputs, taken by a store; the outcome has none. A run that was stored before goes on."""
+        """The same outputs, taken by a store: see `StoredRun`."""
         if not self.stepper.takes_carry:
             raise ValueError(
                 f"`store` needs a run that can be cut, and the loops of method {self.integrator.name!r} cannot: use "
                 "another fixed-step method, or leave `store` out."
             )
+        from sympflow.integrators.stored_runs import StoredRun
+
         with store.opened():
-            return self._stored_in(store)
+            return StoredRun(self, store).outcome()
 
-    def _stored_in(self, store: RunStore) -> Outcome:
-        """`_stored`, in a store that is open."""
-        from sympflow.storage.runs import Place
-
-        problem, grid, stepper = self.problem, self.grid, self.stepper
-        place = store.place()
-        if place is not None and store.ended and problem.y0.ndim == 1 and store.status() < 0:
-            return self._read(store, place)  # it cannot go on
-        outputs = Outputs(grid, problem.t_eval, problem.save_every)
-        n_before = store.length
-        row = self._agreed(store, outputs, place)
-        if place is None:
-            state, carry, finite = problem.y0, Carry(), None
-            failed, done = np.zeros(problem.y0.shape[:-1], dtype=bool), dict.fromkeys(DONE, 0)
-        else:
-            if place.steps == outputs.last and row == outputs.n and store.ended:
-                return self._read(store, place)
-            state, carry, finite = place.state, Carry(), None
-            if place.steps:
-                carry, finite = Carry(place.steps, place.running), place.finite
-            failed, done = place.failed, {name: place.counts[name] for name in DONE}
-            if row < n_before:  # it was within a step
-                done["within"] -= done["last"]
-        earlier = {} if place is None or not stepper.counts_itself else place.counts["stats"]
-        pieces = Pieces(stepper, problem, grid.h, carry, finite)
-        pace = Pace(ARRAY_STEPS if not stepper.compiled else max(1, ONE // math.prod(problem.y0.shape)))
-        most = max(2, MOST_SAVED // math.prod(problem.y0.shape))
-        piece = Outcome(problem.y0[:0], problem.y0[:0], 0, finished(problem), {})
-
-        def reached() -> Place:
-            k = pieces.carry.steps
-            last = k if pieces.finite is None else min(k, int(np.max(pieces.finite)) + 1)
-            at_end = int(row == outputs.n > 0 and bool(grid.remainder) and outputs.part(row - 1, row)[0][0] == grid.t1)
-            stats = self._stats(last + at_end, last, done["saved"], done["within"])
-            stats |= {name: stats[name] + earlier[name] for name in COUNTED if name in earlier}
-            if pieces.finite is None:
-                return Place(
-                    0, problem.y0, np.zeros(problem.y0.shape[:-1], int), state, failed, done | {"stats": stats}
-                )
-            return Place(k, pieces.carry.running, pieces.finite, state, failed, done | {"stats": stats})
-
-        try:
-            while row < outputs.n or pieces.carry.steps < outputs.last:
-                k = pieces.carry.steps
-                to = k + pace.steps(outputs.last - k)
-                end = outputs.up_to(to)
-                if end - row > most:
-                    end = row + most
-                    to = max(k, int(outputs.part(end - 1, end)[1][0]))
-                t, count, remainder = outputs.part(row, end)
-                save, _ = distinct(np.append(count[count > k], to) if to > k else count[:0])
-                states = pieces.to(to, save) if to > k else state[None][:0]
-                pace.took(to - k)
-                y = np.concatenate([state[None], states])[np.append(k, save).searchsorted(count)]
-                y = self._within(y, count, remainder)
-                piece = Outcome(t, y, 0, finished(problem), {})
-                if problem.y0.ndim == 1:
-                    self._report_failures(piece, np.asarray(to) if pieces.finite is None else pieces.finite, to)
-                else:
-                    failed = failed | ~finite_states(y).all(0)
-                store.append(piece.t, piece.y)
-                if pieces.finite is not None:  # what was saved, up to where the last trajectory ends
-                    count = count[count <= int(np.max(pieces.finite)) + 1]
-                done = {
-                    "saved": done["saved"] + len(distinct(count[count > done["counted"]])[0]),
-                    "within": done["within"] + int(np.count_nonzero(remainder)),
-                    "counted": int(count[-1]) if len(count) else done["counted"],
-                    "last": int(remainder[-1] != 0) if len(count) else done["last"],
-                }
-                row, state = end, states[-1] if to > k else state
-                if piece.status:
-                    break
-                if store.due:
-                    store.commit(reached(), {"message": UNDER_WAY.format(t=grid.time(to)), "ended": 0, "status": -1})
-                if problem.progress is not None:
-                    problem.progress(abs(to * grid.h))
-        except KeyboardInterrupt:
-            end_time = grid.time(pieces.carry.steps)
-            if store.consistent:
-                store.commit(reached(), {"message": INTERRUPTED.format(t=end_time), "ended": 0, "status": -1})
-            raise interrupted(Outcome(*nothing(problem), -1, "", reached().counts["stats"]), end_time) from None
-        place = reached()
-        if problem.y0.ndim > 1:
-            piece.t, piece.y = np.zeros(1), np.where(failed[..., None], np.nan, 0.0)[None]
-            self._report_failures(piece, place.finite, place.steps)
-        stats = {**place.counts["stats"], **piece.stats}
-        message = piece.message
-        if "domain_exit" in store.noted:
-            stats["domain_exit"] = store.noted["domain_exit"]
-            message += store.noted["warning"]
-        place.counts["stats"] = stats
-        store.finish(place, piece.status, message)
-        return Outcome(*nothing(problem), piece.status, message, stats, finite=True)
-
-    def _within(self, y: Array, count: np.ndarray, remainder: np.ndarray) -> Array:
+    def within(self, y: Array, count: np.ndarray, remainder: np.ndarray) -> Array:
         """`shorter_steps`, none of which depends on how many there are in a window, as those of arrays do."""
         if self.stepper.compiled:
             return shorter_steps(self.stepper, self.grid, y, count, remainder)
@@ -681,32 +577,7 @@ class GridRun:
             shorter_steps(self.stepper, self.grid, y[one], count[one], remainder[one])
         return y
 
-    def _read(self, store: RunStore, place: Place) -> Outcome:
-        """The outcome of a run that has ended, from its store."""
-        stats = {name: np.array(x) if isinstance(x, list) else x for name, x in place.counts["stats"].items()}
-        return Outcome(*nothing(self.problem), store.status(), store.message, stats, finite=True)
-
-    def _agreed(self, store: RunStore, outputs: Outputs, place: Place | None) -> int:
-        """The number of outputs of a store that are those of this run; the end of a shorter one is left out there."""
-        n, k = store.length, 0 if place is None else place.steps
-        if self.problem.t_eval is not None:
-            if n > outputs.n or not np.array_equal(store.times(), self.problem.t_eval[:n]):
-                raise ValueError(
-                    f"`t_eval` does not begin with the {n} times that `store` {store.asked!r} holds: give them, and "
-                    "later ones after them, or name another folder."
-                )
-            return n
-        if k > outputs.last:
-            raise ValueError(
-                f"`t_span` ends at t = {self.grid.t1:.17g}, and `store` {store.asked!r} has reached t = "
-                f"{self.grid.t0 + k * self.grid.h:.17g}: give an end at that or later."
-            )
-        if n and not (n <= outputs.n and store.times(n - 1)[0] == outputs.part(n - 1, n)[0][0]):
-            n -= 1
-            store.truncate(n)
-        return n
-
-    def _stats(self, n_told: int, n_steps: int, n_saved: int, n_extra: int) -> dict[str, Any]:
+    def stats(self, n_told: int, n_steps: int, n_saved: int, n_extra: int) -> dict[str, Any]:
         stepper = self.stepper
         return {
             "dt": abs(self.grid.h),
@@ -790,7 +661,7 @@ class GridRun:
             t, y_out = np.append(t, t_end), _join([y_out, search.end[1][None]])
 
         n_extra = search.n_dense + int(np.count_nonzero(remainder[:delivered]))
-        stats = self._stats(k + shorter, k, k, n_extra)
+        stats = self.stats(k + shorter, k, k, n_extra)
         outcome = Outcome(t, y_out, int(search.end is not None), ENDED if search.end else FINISHED, stats)
         if failed and not search.end:
             outcome.status = -1
@@ -858,7 +729,7 @@ class GridRun:
         what, remedy = self.integrator.breakdown.value
         return f"{what} after t = {t:.17g} (step {step + 1} of {self.grid.n_steps}). {remedy}, or end `t_span` earlier."
 
-    def _report_failures(self, outcome: Outcome, finite: np.ndarray, n_run: int) -> None:
+    def report_failures(self, outcome: Outcome, finite: np.ndarray, n_run: int) -> None:
         """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there.
 
         `stats["failed_at"]` is the time of the last finite state on the grid, in a batch an array with NaN for those
@@ -946,16 +817,6 @@ class GridSolution:
         y = shorter_steps(self.stepper, self.grid, self.states[count], count, remainder)
         y = y.movedim(0, -1) if is_tensor(y) else np.moveaxis(y, 0, -1)
         return y[..., 0] if np.ndim(t) == 0 else y
-
-
-def distinct(count: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """The distinct ones of sorted counts, and where among them each is; None where all are distinct."""
-    if len(count) < 2:
-        return count, None
-    new = np.empty(len(count), dtype=bool)
-    new[0] = True
-    np.not_equal(count[1:], count[:-1], out=new[1:])
-    return (count, None) if new.all() else (count[new], np.cumsum(new) - 1)
 
 
 def _all_finite(y: Array, compiled: bool) -> bool:

@@ -138,3 +138,13 @@ class Outputs:
         if end == self.n and end > first and grid.n_steps + bool(grid.remainder):
             t[-1], remainder[-1] = grid.t1, grid.remainder
         return t, count, remainder
+
+
+def distinct(count: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """The distinct ones of sorted counts, and where among them each is; None where all are distinct."""
+    if len(count) < 2:
+        return count, None
+    new = np.empty(len(count), dtype=bool)
+    new[0] = True
+    np.not_equal(count[1:], count[:-1], out=new[1:])
+    return (count, None) if new.all() else (count[new], np.cumsum(new) - 1)

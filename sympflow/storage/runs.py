@@ -239,7 +239,7 @@ class RunStore:
         for name in names:
             rows = (slice(row, row + fields[name].shape[-2]),) if width else ()
             for k in range(first // size, -(-n // size)):
-                part = self.store.read(name, (*(0,) * (fields[name].dims.index(TIME)), k))
+                part = self.store.committed(name, (*(0,) * (fields[name].dims.index(TIME)), k))
                 a = k * size
                 skip = max(0, first - a)
                 whole[(..., *rows, slice(a + skip - first, a - first + part.shape[-1]))] = part[..., skip:]

@@ -14,10 +14,12 @@ A store is written here and not by the zarr library because of three guarantees:
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import shutil
 import tempfile
+import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -207,12 +209,9 @@ class Store:
         if not theirs:
             article = "an" if kind[0] in "aeiou" else "a"
             raise ValueError(f"`store` {asked!r} is no store of {article} {kind}: name another folder.")
-        for name, text in mine.items():
-            if theirs.get(name) != text:
-                raise ValueError(
-                    f"`store` {asked!r} is of another {kind}: its `{name}` is {str(theirs.get(name))[:TOLD]}, not "
-                    f"{text[:TOLD]}. {remedy}"
-                )
+        other = difference(theirs, mine)
+        if other:
+            raise ValueError(f"`store` {asked!r} is of another {kind}: {other}. {remedy}")
 
     # chunks ---------------------------------------------------------------------------------------
 
@@ -284,6 +283,19 @@ class Store:
             raise StoreError(f"`store` {str(self.path)!r} is damaged: {file.name} of {name!r} ({error}).") from None
         return np.frombuffer(data, known.dtype).reshape(known.chunks)[tuple(map(slice, shape))]
 
+    def committed(self, name: str, index: tuple[int, ...]) -> np.ndarray:
+        """Return a chunk that a commit has counted; see `read`.
+
+        Raises
+        ------
+        StoreError
+            If it is damaged, or not there.
+        """
+        if not self.has(name, index):
+            file = self._file(name, index)
+            raise StoreError(f"`store` {str(self.path)!r} is damaged: {file.name} of {name!r} is missing.")
+        return self.read(name, index)
+
     # commits --------------------------------------------------------------------------------------
 
     def commit(
@@ -347,9 +359,9 @@ class Store:
         if name is None:
             return {}
         try:
-            with np.load(self.path / name, allow_pickle=False) as kept:
+            with open(self.path / name, "rb") as file, np.load(file, allow_pickle=False) as kept:
                 return dict(kept)
-        except (OSError, ValueError, zlib.error) as error:
+        except (OSError, ValueError, zlib.error, zipfile.BadZipFile) as error:
             raise StoreError(f"`store` {str(self.path)!r} is damaged: its state cannot be read ({error}).") from None
 
     @contextmanager
@@ -405,7 +417,7 @@ class Appender:
         if self.held:  # the last chunk, up to what was committed
             for name in self.axes:
                 index = self._index(name, self.length // self.size)
-                self.tails[name].append(store.read(name, index))
+                self.tails[name].append(store.committed(name, index))
 
     def _index(self, name: str, k: int) -> tuple[int, ...]:
         """The chunk k along the dimension; along the others there is one."""
@@ -447,6 +459,18 @@ class Appender:
                 self.tails[name] = [tail]
                 self.store.write(name, self._index(name, k), tail)
         self.store.commit({self.dim: self.length}, attributes, state)
+
+
+def difference(theirs: Mapping[str, str], mine: Mapping[str, str]) -> str:
+    """Return what differs first between the texts of a store and of a call, cut to where it does; "" if nothing."""
+    for name, text in mine.items():
+        other = theirs.get(name, text)
+        if other != text:
+            same = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(other, text, strict=False)))
+            start = max(0, same - TOLD // 2) if max(len(other), len(text)) > TOLD else 0
+            told = (f"{'...' * (start > 0)}{x[start : start + TOLD]}" for x in (other, text))
+            return f"its `{name}` is {', not '.join(told)}"
+    return ""
 
 
 def _json(value: Any) -> bytes:
