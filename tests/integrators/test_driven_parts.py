@@ -57,7 +57,11 @@ def test_every_splitting_keeps_its_order(system, method, options):
 
 @pytest.mark.parametrize(
     ("system", "method"),
-    [(COPIES, "tao4"), pytest.param(LINEAR, "linear_omelyan4", marks=pytest.mark.slow), (POLAR, "kahan_li6_parts")],
+    [
+        (COPIES, "tao4"),
+        pytest.param(LINEAR, "linear_omelyan4", marks=pytest.mark.slow),
+        pytest.param(POLAR, "kahan_li6_parts", marks=pytest.mark.slow),
+    ],
 )
 def test_compiled_runs_are_those_of_arrays_and_tensors(system, method):
     times = np.append(np.linspace(0.33, 1.9, 17), 2.0)
@@ -73,6 +77,11 @@ def test_compiled_runs_are_those_of_arrays_and_tensors(system, method):
     t = event.t_events[0][0]
     assert abs(event.sol(t)[0] - 0.2 * t) < 1e-12
     assert sympflow.symplecticity_defect(found).max() < 1e-13
+
+
+def test_loops_over_parts_take_the_time():
+    found, arrays = (solve(POLAR, "strang_parts", (0.3, 2.0), backend=each).y for each in ("compiled", "array"))
+    np.testing.assert_allclose(found, arrays, rtol=0, atol=1e-13)
 
 
 def test_a_run_that_is_cut_goes_on_at_its_time():

@@ -37,10 +37,14 @@ def same(flow, other):
 
 def test_searches_are_the_same_whatever_the_workers():
     alone = train(PENDULUM, flow=FLOW, **QUICK)
-    assert same(train(PENDULUM, flow=FLOW, workers=2, **QUICK), alone)
     with ThreadPoolExecutor(2) as threads:
         assert same(train(PENDULUM, flow=FLOW, workers=threads, **QUICK), alone)
     assert len(alone.history) == QUICK["restarts"] + 1
+
+
+@pytest.mark.slow
+def test_searches_are_the_same_in_processes():
+    assert same(train(PENDULUM, flow=FLOW, workers=2, **QUICK), train(PENDULUM, flow=FLOW, **QUICK))
 
 
 def test_trials_are_the_same_whatever_the_workers(monkeypatch):
