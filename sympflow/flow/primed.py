@@ -677,7 +677,7 @@ class PrimedFlow(SympFlow):
 
         They are a start for ``train(system, flow=flow.transferred(system))``. As they are they need not be near the
         exact flow of that system, with friction for instance. The numbers know the potential and dt, not the size: of a
-        lattice they serve any other one of the same site and bond; one from a file is bound to its own first, by `bind`.
+        lattice they serve any other one of the same site and bond; one from a file is bound first, by `bind`.
 
         Raises
         ------
