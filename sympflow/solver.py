@@ -546,7 +546,12 @@ def check_params(
 
 
 def check_own_parameters(system: HamiltonianSystem, values: Mapping[str, ArrayLike], integrator: Integrator) -> None:
-    """Refuse a trained flow for other parameters than those of its system."""
+    """Refuse a trained flow for other parameters than its system's, and a sweep from where H is constant in time."""
+    if system.autonomous and system.symbols is not None and system.symbols.named_time is not None and values:
+        raise ValueError(
+            "`params` are those of a driven system, and the values that `system` has make it constant in time: pass "
+            "one whose H depends on t, as by system.with_params(...)."
+        )
     if not integrator.trained:
         return
     other = [name for name, value in values.items() if np.any(np.asarray(value) != system.params[name])]

@@ -75,9 +75,9 @@ DISORDERED = {
 SHEET = {"onsite": "1 - cos(q)", "bond": "k*r**2/2 + r**3/3", "shape": (3, 4), "params": {"k": RNG.random((3, 4))}}
 FIELDS = {
     "onsite": "u**2*v**2/2 + u**4/4",
-    "bond": "r_u**2/2 + r_v**2/2 + sin(r_u*r_v)",
+    "bond": "r_u**2/2 + r_v**2/2 + r_u**2*r_v",
     "fields": ("u", "v"),
-    "shape": (3, 2, 3),
+    "shape": (3, 2, 1),
 }
 MIXED_MASSES = {
     "onsite": "u*v",
@@ -170,6 +170,12 @@ def test_a_dense_hessian_of_a_large_lattice_is_refused_before_it_is_made():
         system.potential_hessian(np.zeros(10**6))
 
 
+def test_methods_of_a_linear_part_refuse_lattices():
+    system = HamiltonianSystem.lattice(**RING)
+    with pytest.raises(ValueError, match="made of sites or pairs, of which no linear part can be read"):
+        sf.solve(system, "linear_srkn6b", t_span=(0, 1), y0=np.zeros(12), dt=0.1)
+
+
 def test_only_lattices_have_an_energy_density():
     with pytest.raises(ValueError, match="no energy density"):
         sf.systems.pendulum().energy_density(np.zeros(2))
@@ -191,8 +197,8 @@ def test_symplecticity_by_random_directions_is_that_of_the_jacobians():
 
 
 def test_large_systems_are_judged_by_directions():
-    system = HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=300)
-    y0 = np.random.default_rng(2).uniform(-0.5, 0.5, 600)
+    system = HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=201)
+    y0 = np.random.default_rng(2).uniform(-0.5, 0.5, 402)
     sol = sf.solve(system, "verlet", t_span=(0.0, 0.2), y0=y0, dt=0.1, backend="array")
     assert sf.symplecticity_defect(sol) < 1e-14
     with pytest.raises(ValueError, match="`directions` must be at least 3"):

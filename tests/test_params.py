@@ -175,3 +175,22 @@ def test_a_driven_system_keeps_its_period_with_its_driving():
     assert driven.with_params(k=2.0).period == np.pi  # the strength of the drive
     still = HamiltonianSystem.from_sympy("p**2/2 - k*cos(q) + q*cos(2*t)", time="t", period=np.pi, params={"k": 1.5})
     assert still.with_params(k=2.0).period == np.pi
+
+
+def test_a_drive_of_amplitude_zero_is_none():
+    driven = HamiltonianSystem.from_sympy(
+        "p**2/2 + q**2/2 + a*q*cos(w*t)", time="t", params={"a": 0.3, "w": 2.0}, period=np.pi, y0=[1.0, 0.0]
+    )
+    free = HamiltonianSystem.from_sympy("p**2/2 + q**2/2", y0=[1.0, 0.0])
+    still = pickle.loads(pickle.dumps(driven.with_params(a=0)))
+    assert still.autonomous
+    assert still.period is None
+    again = still.with_params(a=0.3)
+    assert again.period == driven.period
+    assert again.hamiltonian(driven.y0, 0.7) == driven.hamiltonian(driven.y0, 0.7)
+    sol = solve(driven, "gauss_legendre4", (0, 1), driven.y0, params={"a": [0.0, 0.3]}, dt=0.1)
+    np.testing.assert_array_equal(sol.y[0], solve(free, "gauss_legendre4", (0, 1), [free.y0], dt=0.1).y[0])
+    with pytest.raises(ValueError, match="the values that `system` has make it constant in time"):
+        solve(still, "verlet", (0, 1), params={"a": [0.0, 0.3]}, dt=0.1)
+    with pytest.raises(ValueError, match="`time` is 't', which H does not depend on"):
+        HamiltonianSystem.from_sympy("p**2/2 + q**2/2", time="t")

@@ -677,7 +677,7 @@ class PrimedFlow(SympFlow):
 
         They are a start for ``train(system, flow=flow.transferred(system))``. As they are they need not be near the
         exact flow of that system, with friction for instance. The numbers know the potential and dt, not the size: of a
-        lattice they serve any other one of the same site and bond.
+        lattice they serve any other one of the same site and bond; one from a file is bound first, by `bind`.
 
         Raises
         ------
@@ -692,7 +692,7 @@ class PrimedFlow(SympFlow):
         if system.ndof != self.ndof and not same_piece:
             raise ValueError(
                 f"`system` has {system.ndof} degrees of freedom, the flow {self.ndof}: give one of those, or a lattice "
-                "of the same site and bond."
+                "of the same site and bond; a flow from a file first needs its own, flow.bind(piece)."
             )
         if not system.separable or (self.terms and not (system.quadratic_kinetic and system.has_hessian_vector)):
             raise ValueError(

@@ -293,7 +293,12 @@ class Hamiltonian:
         return self._definition.learns(y)
 
     def __call__(self, t: float, y: Array) -> Array:
-        """The right-hand side fun(t, y) of `scipy.integrate.solve_ivp` and `torchdiffeq.odeint`."""
+        """The right-hand side fun(t, y) of `scipy.integrate.solve_ivp` and `torchdiffeq.odeint`.
+
+        Beyond the samples of a parameter it goes on as SciPy's spline does, for solvers may look past the end of a run.
+        """
+        if isinstance(y, int | float):
+            raise TypeError(f"`y` must be a state; got the number {y}: the time comes first, as in system(t, y).")
         return self.vector_field(y, t)
 
     def _check_width(self, y: Array) -> None:

@@ -33,6 +33,9 @@ class Scene(Protocol):
     separable: bool
     autonomous: bool
 
+    @property
+    def local(self) -> Any: ...
+
     def potential(self, q: Any, t: Any = None) -> Any: ...
 
     def force(self, q: Any, t: Any = None) -> Any: ...
@@ -187,6 +190,11 @@ def linear_part(system: Scene) -> LinearPart:
         part = LinearPart(inverse_mass(system), K, _equilibrium(system, K), None, _interval(system))
     elif system.symbols is not None:
         part = read_off(system.symbols.H, system.symbols.q, system.symbols.p, _interval(system))
+    elif system.local is not None:
+        raise ValueError(
+            f"`system` {system.name!r} is made of sites or pairs, of which no linear part can be read: take a method "
+            "that splits into T and V, such as 'srkn6b'."
+        )
     else:
         raise ValueError(
             f"`system` {system.name!r} is given by functions, from which no linear part can be read: pass "

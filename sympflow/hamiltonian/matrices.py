@@ -42,6 +42,8 @@ def damping(values: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
     """Γ in its simplest form, () for one rate, (d,) or (d, d), of a number, (d,) or (d, d); None for no friction."""
     if values is None:
         return None
+    if isinstance(values, bool | np.bool_):
+        raise TypeError(f"`damping` must be a rate, or several; got {values!r}: pass a number such as 0.1.")
     G = _real("damping", values)
     if G.shape not in ((), (ndof,), (ndof, ndof)):
         raise ValueError(

@@ -79,6 +79,8 @@ class SymbolicHamiltonian(Definition):
     """H as it was written, and the values of its parameters; None without any."""
 
     time: sp.Symbol | None = None
+    named_time: sp.Symbol | None = None
+    """The time as it was given; `time` is None where H, by the values of its parameters, does not depend on it."""
     samples: Mapping[str, Samples] = MappingProxyType({})
 
     def __init__(
@@ -88,9 +90,11 @@ class SymbolicHamiltonian(Definition):
         time: str | sp.Symbol | None = None,
     ) -> None:
         params = checked_params(params)
-        self.time = named_time(time, params)
+        self.time = self.named_time = named_time(time, params)
         written, values = _read(expression, params, self.time)
         H = _valued(written, values, self.time)
+        if self.time is not None and self.time in written.free_symbols - H.free_symbols:
+            self.time = None
         if self.time is not None:
             if self.time not in H.free_symbols:
                 raise ValueError(f"`time` is {self.time.name!r}, which H does not depend on: leave it out.")
@@ -123,6 +127,7 @@ class SymbolicHamiltonian(Definition):
         """Another H in the same coordinates and time, and with the same samples."""
         form = SymbolicHamiltonian.__new__(SymbolicHamiltonian)
         form.ndof, form.q, form.p, form.time = self.ndof, self.q, self.p, self.time
+        form.named_time = self.named_time
         if self.samples:
             form.samples = self.samples
         form._set(H)

@@ -394,7 +394,7 @@ class HamiltonianSystem(Hamiltonian):
     @property
     def period(self) -> float | None:  # type: ignore[override]
         """The period of H in t, where one was named, or was that of the system of other parameters and still is."""
-        if self._former_period is not None:
+        if self._former_period is not None and not self.autonomous:
             former, self._former_period = self._former_period, None
             with suppress(ValueError):
                 self._set_period(former)
@@ -514,7 +514,7 @@ class HamiltonianSystem(Hamiltonian):
             return HamiltonianSystem._of_pieces(self.local.with_params(values), self.damping, self.name, *scene)
         self.check_parameters(values)
         assert self.symbols is not None
-        H, time = self.symbols.written[0], self.symbols.time
+        H, time = self.symbols.written[0], self.symbols.named_time
         made = HamiltonianSystem.from_sympy(
             H,
             params={**self.params, **values},
@@ -527,7 +527,9 @@ class HamiltonianSystem(Hamiltonian):
             dt=self.dt,
             energy_scale=self.energy_scale,
         )
-        made._former_period = self.period  # values of the drive may have changed it: tested where it is asked for
+        made._former_period = (
+            self._former_period if self.autonomous else self.period
+        )  # values of the drive may have changed it: tested where it is asked for
         return made
 
     def check_functions(self, y0: Array | None = None) -> None:

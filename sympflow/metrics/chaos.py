@@ -264,8 +264,9 @@ class _Run:
 
 
 def check_followed(orbits: Orbits) -> None:
-    """Raise a ValueError with the reason where deviation vectors of states are not known."""
+    """Raise a ValueError with the reason where deviation vectors of states, or H at these times, are not known."""
     integrator, system = orbits.integrator, orbits.system
+    system.check_times(*orbits.t_span)
     if integrator.keeps or integrator.tangent_holds:
         what = (
             f"keeps {integrator.keeps}"

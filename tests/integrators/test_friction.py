@@ -55,6 +55,7 @@ def oscillator(t, omega, rate, q0, p0):
         ([[1.0, 2.0], [2.0, 1.0]], ValueError, "positive semi-definite"),
         ([[1.0, np.nan], [np.nan, 1.0]], ValueError, "finite"),
         (np.eye(3), ValueError, "shape"),
+        (True, TypeError, "a rate"),
     ],
 )
 def test_a_wrong_damping_is_refused(damping, error, says):

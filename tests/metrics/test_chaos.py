@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from conftest import load_example
+from scipy.interpolate import CubicSpline
 
 import sympflow
 from sympflow import HamiltonianSystem
@@ -111,6 +112,15 @@ def test_vectors_of_a_driven_system_are_those_of_neighbouring_orbits():
     assert found.value == pytest.approx(rate, abs=1e-7)
     with pytest.raises(ValueError, match="`y0` is a batch, whose steps"):
         sympflow.lyapunov(system, "dop853", (0, 1), [y0, y0])
+
+
+def test_deviations_end_where_the_samples_of_a_drive_do():
+    drive = CubicSpline([0, 1, 2, 3], [0.1, 0.0, 0.2, 0.1])
+    system = HamiltonianSystem.from_sympy("p**2/2 - cos(q)*(1 + a)", params={"a": drive}, y0=[0.5, 0.1])
+    with pytest.raises(ValueError, match=r"^`t_span` \(0, 4\) leaves the samples"):
+        sympflow.lyapunov(system, "verlet", (0, 4), dt=0.1)
+    with pytest.raises(ValueError, match=r"^`t_span` \(0, 4\) leaves the samples"):
+        sympflow.ensemble(system, "verlet", (0, 4), [[0.5, 0.1]], dt=0.1, reduce="sali")
 
 
 @pytest.mark.slow

@@ -252,6 +252,8 @@ def sweep(X, to, table, j, n_stages, single, planes, first, last, geometry, site
         begin, end = -size, 2 * size
         if not PERIODIC[0]:
             begin, end = margin - low, margin - low + n_planes
+            for vector in work[0]:  # at a wall they are 0, where another tile had sites
+                vector[:, max(end, 0) * stride :] = 0.0
         hi, offset = n + 2 * margin, low * stride
         stages(local, table, j, n_stages, single, work, False, 0, hi, begin, end, geometry, sites, offset, values)
         copy_tile(local, margin * stride, to, (low + margin) * stride, n * stride)
