@@ -533,6 +533,9 @@ class FlowMap(nn.Module):
                 "sympflow.train(system, flow=flow.transferred(system))."
             )
         if system.ndof != self.ndof:
+            if system.local is not None:
+                remedy += " A primed flow of a smaller lattice of the same piece is carried over by "
+                remedy += "flow.transferred(system)."
             raise ValueError(
                 f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: {remedy}"
             )

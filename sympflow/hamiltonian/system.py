@@ -527,9 +527,8 @@ class HamiltonianSystem(Hamiltonian):
             dt=self.dt,
             energy_scale=self.energy_scale,
         )
-        made._former_period = (
-            self._former_period if self.autonomous else self.period
-        )  # values of the drive may have changed it: tested where it is asked for
+        # Values of the drive may have changed the period: it is tested where it is asked for.
+        made._former_period = self._former_period if self.autonomous else self.period
         return made
 
     def check_functions(self, y0: Array | None = None) -> None:
