@@ -157,8 +157,10 @@ class EnsembleStore:
         """Nothing: the worker has written it."""
 
     def is_done(self, block: Block) -> bool:
-        """True if the orbits of a block have been run."""
-        return self._store.has("status", self._number(block))
+        """True if the orbits of a block have been run, and all that was kept of them is there."""
+        store, number = self._store, self._number(block)
+        kept = ((v.name, (*number, *(0,) * len(v.shape))) for v in self.layout.variables())
+        return store.has("status", number) and all(store.has(*chunk) for chunk in kept)
 
     def finish(self) -> None:
         """Note that all orbits have been run."""

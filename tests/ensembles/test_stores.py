@@ -66,6 +66,8 @@ def test_a_run_goes_on_where_it_ended(tmp_path, monkeypatch):
     assert np.array_equal(run(store=path, resume=True, chunk=7).y, run().y, equal_nan=True)
     assert all((path / "status" / name).stat().st_mtime_ns == when for name, when in done.items())
     assert len(os.listdir(path / "q")) > len(done)
+    os.remove(path / "p" / "1.0.0")  # lost by the disk: the chunk is run again
+    assert np.array_equal(run(store=path, resume=True).y, run().y, equal_nan=True)
 
 
 KILLED = """
