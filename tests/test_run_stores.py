@@ -80,6 +80,36 @@ def test_a_stored_run_is_the_run(tmp_path, case):
     assert_same(solve(system, method, (0, END), store=tmp_path / "b", resume=True, **options), whole)
 
 
+@pytest.mark.parametrize("where", ["distinct", "finite_states", "append", "pieces"])
+@pytest.mark.parametrize("case", ["batch at times", "thinned"])
+def test_ctrl_c_between_the_steps_and_their_outputs(tmp_path, monkeypatch, case, where):
+    """The steps of a window are made and its outputs not stored, or stored and not yet noted."""
+    system, method, options = CASES[case]
+    whole = solve(system, method, (0, END), **options)
+    owner, name = {
+        "append": (stored_runs.RunStore, "append"),
+        "pieces": (windows.Pieces, "to"),
+    }.get(where, (stored_runs, where))
+    done, calls = getattr(owner, name), []
+
+    def struck(*given):
+        answer = done(*given)
+        calls.append(name)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return answer
+
+    monkeypatch.setattr(owner, name, struck)
+    for _ in range(2):
+        calls.clear()
+        try:
+            solve(system, method, (0, END), store=tmp_path / "a", resume=True, checkpoint_every=1e-9, **options)
+        except Interrupted as stop:
+            np.testing.assert_array_equal(stop.solution.y, whole.y[..., : len(stop.solution.t)])
+    calls.extend([name] * 4)
+    assert_same(solve(system, method, (0, END), store=tmp_path / "a", resume=True, **options), whole)
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_a_run_that_goes_on_to_a_later_end_is_the_longer_run(tmp_path, case):
     """The last output of the shorter run, which may be none of the longer one, is left out."""

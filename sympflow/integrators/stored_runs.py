@@ -76,6 +76,8 @@ class StoredRun:
         self.done: dict[str, int] = dict.fromkeys(DONE, 0)
         self.earlier: dict[str, Any] = {}
         self.pieces: Pieces
+        self.before: tuple[Any, ...] | None = None
+        """Where the window that is under way began; None between windows."""
 
     def outcome(self) -> Outcome:
         """Run up to the end, a failure or Ctrl-C."""
@@ -101,8 +103,10 @@ class StoredRun:
                 if problem.progress is not None:
                     problem.progress(abs(self.pieces.carry.steps * grid.h))
         except KeyboardInterrupt:
+            if self.before is not None:  # the steps of a window without their outputs are of no use
+                self.pieces.carry, self.pieces.finite, self.failed = self.before
             t = grid.time(self.pieces.carry.steps)
-            if store.consistent:
+            if store.consistent and store.length == self.row:  # else what was committed last stands
                 store.commit(self._reached(), {"message": INTERRUPTED.format(t=t), "ended": 0, "status": -1})
             raise interrupted(Outcome(*self._nothing, -1, "", self._reached().counts["stats"]), t) from None
         return self._finished(piece)
@@ -129,6 +133,7 @@ class StoredRun:
     def _window(self, pace: Pace) -> Outcome:
         """Make the steps of a window, and store the outputs in it."""
         problem, outputs, pieces, done = self.problem, self.outputs, self.pieces, self.done
+        self.before = (pieces.carry, pieces.finite, self.failed)
         k = pieces.carry.steps
         to = k + pace.steps(outputs.last - k)
         end = outputs.up_to(to)
@@ -149,13 +154,14 @@ class StoredRun:
         self.store.append(piece.t, piece.y)
         if pieces.finite is not None:  # what was saved, up to where the last trajectory ends
             count = count[count <= int(np.max(pieces.finite)) + 1]
-        self.done = {
+        done = {
             "saved": done["saved"] + len(distinct(count[count > done["counted"]])[0]),
             "within": done["within"] + int(np.count_nonzero(remainder)),
             "counted": int(count[-1]) if len(count) else done["counted"],
             "last": int(remainder[-1] != 0) if len(count) else done["last"],
         }
-        self.row, self.state = end, states[-1] if to > k else self.state
+        last = states[-1] if to > k else self.state
+        self.row, self.state, self.done, self.before = end, last, done, None
         return piece
 
     def _reached(self) -> Place:
