@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import sympflow as sf
 from sympflow import HamiltonianSystem, SympFlow, solve
 from sympflow.kernels import lattice_loops
 from sympflow.kernels.modules import at_most
