@@ -10,7 +10,7 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache, cached_property, lru_cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 from weakref import WeakKeyDictionary
 
@@ -478,6 +478,7 @@ class SolvableParts(ExactMaps):
                 "of: use 'kahan_li8', 'kahan_li6', 'suzuki4' or 'verlet'."
             )
         self.weights: tuple[float, ...] = weights
+        self._moments = [*itertools.accumulate(weights[:-1], initial=0.0), 1.0]  # where Strang steps begin, and the end
         self.parts = self._parts(system, parts)
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
@@ -501,11 +502,6 @@ class SolvableParts(ExactMaps):
                     m = replace(m, length=maps.pop().length + m.length)  # noqa: PLW2901
                 maps.append(m)
         return maps
-
-    @cached_property
-    def _moments(self) -> list[float]:
-        """The beginnings of the Strang steps in a step, and its end."""
-        return [*itertools.accumulate(self.weights[:-1], initial=0.0), 1.0]
 
     def _map(self, k: int, h: Any, at: float) -> Map:
         return Map(k, _each_class(h, self.parts) if k == LINEAR else h, at=at)

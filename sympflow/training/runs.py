@@ -297,10 +297,11 @@ class SearchRun(Run):
     options: SearchOptions
     minima: list[Minimum] = field(default_factory=list, kw_only=True)
     coming: Generator[Minimum] | None = field(default=None, init=False, repr=False)
-    """The minima of the starts that are left, as the crew finds them."""
+    """The minima of a round of starts, as the crew finds them."""
 
     UNIT: ClassVar[str] = "starts"
     SEARCH_SHARE: ClassVar[float] = 0.5  # of a time budget
+    ROUND: ClassVar[int] = 200  # starts that are drawn at once: a time budget may be given any number
 
     @abstractmethod
     def searched(self) -> Searched:
@@ -317,11 +318,13 @@ class SearchRun(Run):
 
     def next_minimum(self, session: Session, deadline: Deadline) -> Minimum:
         """The minimum of the next start, of number len(minima)."""
-        if self.coming is None:
-            common = (self.searched(), self.search_steps, deadline, False)
-            starts = [self.start_of(k) for k in range(len(self.minima), self.planned)]
+        minimum = None if self.coming is None else next(self.coming, None)
+        if minimum is None:
+            common, n = (self.searched(), self.search_steps, deadline, False), self.done
+            starts = [self.start_of(k) for k in range(n, min(n + self.ROUND, self.planned))]
             self.coming = session.each(descended, common, starts)
-        return next(self.coming)
+            minimum = next(self.coming)
+        return minimum
 
     @abstractmethod
     def found(self, minimum: Minimum) -> dict[str, float]:

@@ -32,9 +32,9 @@ def not_applicable(integrator):
         skipped |= {*NO_STEP, "the_run_is_its_steps", "states_within_a_step_belong_to_it"}
     if integrator.tangent_holds or name in ("adaptive_heun", "fehlberg2"):
         skipped.add("the_tangent_is_the_derivative_of_the_step")
-    if not integrator.takes_friction or integrator.trained:  # no flow of the default system has friction
+    if not integrator.takes_friction or integrator.trained:  # no flow of the default system has friction or a drive
         skipped.add("friction_is_in_the_steps")
-    if not integrator.takes_driving:
+    if not integrator.takes_driving or integrator.trained:
         skipped.add("the_drive_is_in_the_steps")
     return skipped
 

@@ -108,7 +108,7 @@ def test_the_defaults_of_the_options_are_those_of_train():
     for asked in (NewFlow(), NewFit()):
         assert {name: arguments[name].default for name in vars(asked)} == vars(asked)
     surroundings = {"system", "dt", "flow", "domain", "checkpoint", "resume", "time_budget", "progress", "callback"}
-    assert set(arguments) == {*vars(NewFlow()), *vars(NewFit()), *surroundings, "unknown"}
+    assert set(arguments) == {*vars(NewFlow()), *vars(NewFit()), *surroundings, "workers", "unknown"}
 
 
 class Started(Exception):
