@@ -59,7 +59,8 @@ class LocalHamiltonian(Definition):
             If there is none, or values are bad.
         """
         raise TypeError(
-            "`params` of pairs cannot be changed: make a system for each value, by HamiltonianSystem.pairs."
+            f"`params` of {self.loops} cannot be changed: make a system for each value, by "
+            f"HamiltonianSystem.{self.loops}."
         )
 
     def is_piece_of(self, other: LocalHamiltonian | None) -> bool:

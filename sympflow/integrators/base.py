@@ -59,7 +59,7 @@ FEW = 8
 """Outputs that are placed on the grid by NumPy: a compiled pass is worth its loading for more."""
 FIRST_CHUNK, LAST_CHUNK = 8, 1024  # steps between two looks at the events
 COMPILED = ("compiled", "cuda")
-"""What compiled loops say in `stats["backend"]`."""
+"""The values of `stats["backend"]` of compiled loops."""
 MOST_SAMPLES = 65536  # of the events, in a chunk
 
 

@@ -128,7 +128,7 @@ class Problem:
     letters: np.ndarray | None = None
     """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
     progress: Progress | None = None
-    """What is told how much of the time from t0 to t1 is done."""
+    """Told how much of the time from t0 to t1 is done."""
     store: RunStore | None = None
     """The store that takes the outputs, and from which the run goes on; the outcome then has none."""
 

@@ -259,7 +259,8 @@ class SplittingKernel(Kernel):
         t0: float = 0.0,
     ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
-        rollout, table, start = self._functions().rollout_batch, self.table(h, t0), self._rows(y0)
+        goes_on = carry is not None and carry.running is not None
+        rollout, table, start = self._functions().rollout_batch, self.table(h, t0), self._rows(y0, goes_on)
 
         def rows(i: slice, _: np.ndarray, *rest: Any) -> None:
             rollout(table, start[i], *rest)
@@ -277,8 +278,8 @@ class SplittingKernel(Kernel):
         """The loops of batches whose trajectories have these values (k, N) of `SplittingLoops.values`."""
         return VariedKernel(self.loops, self.scheme, self.compensated, values)
 
-    def _rows(self, y: np.ndarray) -> np.ndarray:
-        """The states of a batch (N, 2d) as the loops read them."""
+    def _rows(self, y: np.ndarray, goes_on: bool = False) -> np.ndarray:
+        """The states of a batch (N, 2d) as the loops read them; a run that goes on reads no states from them."""
         return np.ascontiguousarray(y, dtype=np.float64)
 
     def _functions(self) -> LoopFunctions:
@@ -296,6 +297,7 @@ class VariedKernel(SplittingKernel):
     def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool, values: np.ndarray) -> None:
         super().__init__(loops, scheme, compensated)
         self._values = np.ascontiguousarray(values.T, dtype=np.float64)
+        self._latest = np.empty((0, 0))
 
     def run(
         self,
@@ -313,8 +315,13 @@ class VariedKernel(SplittingKernel):
         scheme, rows = self.scheme, self._rows(y)
         return Steps(self.loops.step_rows(step_table(scheme), lengths, lengths, rows, scheme.monomials, varied=True))
 
-    def _rows(self, y: np.ndarray) -> np.ndarray:
-        return np.concatenate([y, np.tile(self._values, (len(y) // len(self._values), 1))], axis=1)
+    def _rows(self, y: np.ndarray, goes_on: bool = False) -> np.ndarray:
+        if not (goes_on and len(self._latest) == len(y)):
+            self._latest = np.empty((len(y), y.shape[1] + self._values.shape[1]))
+            self._latest[:, : y.shape[1]] = y
+            values = self._latest[:, y.shape[1] :].reshape(-1, *self._values.shape)
+            values[:] = self._values
+        return self._latest
 
     def _functions(self) -> LoopFunctions:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, varied=True)
