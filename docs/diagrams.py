@@ -16,9 +16,10 @@ INK, SOFT, RULE, FILL = "#1d2433", "#5b6478", "#8a93a8", "#eef1fb"
 ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("commands",), "the command line"),
     (
-        ("studies", "training", "testing", "ensembles"),
-        "several runs; fits and what ships; checks of integrators; many orbits",
+        ("studies", "learning", "testing", "ensembles"),
+        "several runs; trajectories in, flows out; checks of integrators; many orbits",
     ),
+    (("training",), "fits of flows to a known H, and what ships"),
     (("metrics",), "energy, symplecticity, accuracy: of the map as executed"),
     (("solver",), "solve(): checks, picks the integrator, returns a Solution"),
     (

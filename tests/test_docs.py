@@ -102,6 +102,9 @@ def test_every_public_name_is_in_the_reference():
         assert home is None or any(f"::: sympflow.{home}{end}" in reference for end in (f".{name}", "\n")), name
 
 
+RAW_TEX = re.compile(r"\$[^$\n]*[\\_^][^$\n]*\$|\\(frac|bar|nabla|partial|mathcal|sum|int)(?![a-z])|\\[()\[\]]")
+
+
 class Page(HTMLParser):
     """A page of the site as a reader gets it: its words without code, and where its links, images and scripts lead."""
 
@@ -147,7 +150,9 @@ def test_the_site_is_whole(tmp_path):
     assert "__index = " in (site / "search" / "search_index.js").read_text(encoding="utf-8")
     reached = set()
     for path, page in pages.items():
-        raw = re.search(r"\$[^$\n]*[\\_^][^$\n]*\$|\\(frac|bar|nabla|partial|mathcal|sum|int)(?![a-z])|\\[()\[\]]", page.words)
+        raw = re.search(
+            r"\$[^$\n]*[\\_^][^$\n]*\$|\\(frac|bar|nabla|partial|mathcal|sum|int)(?![a-z])|\\[()\[\]]", page.words
+        )
         assert raw is None, f"{path.name} shows TeX: {raw[0]}"
         assert not page.nameless, f"{path.name} shows {page.nameless} without a description"
         for target in page.targets:
