@@ -7,14 +7,18 @@ import math
 import reprlib
 from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import sympy as sp
 
 from sympflow.arguments import plain, real_number
-from sympflow.arrays import Array, is_tensor, library
+from sympflow.arrays import Array, concatenate, is_tensor, library
+from sympflow.hamiltonian.linear_part import quadratic_terms
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.normal_modes import SpectralPart
 
 BOUNDARIES = "periodic", "fixed", "free"
 MOST_AXES = 3
@@ -54,13 +58,13 @@ class LatticeHamiltonian(LocalHamiltonian):
         fields: Any,
         params: Mapping[str, Any] | None,
     ) -> None:
-        self.shape = _checked_shape(shape)
+        self.shape = checked_shape(shape)
         self.boundary = _checked_boundary(boundary, len(self.shape))
         self.fields = _checked_fields(fields)
         n_sites = math.prod(self.shape)
         check_memory(float(n_sites) * len(self.fields), "`shape`")
         self.ndof = n_sites * len(self.fields)
-        self.params = _checked_params(params, self.shape)
+        self.params = checked_params(params, self.shape)
         self._set_letters()
         self._read(onsite, bond, kinetic)
         self._check_sizes()
@@ -74,7 +78,7 @@ class LatticeHamiltonian(LocalHamiltonian):
                 )
         other = copy.copy(self)
         vars(other).pop("_functions", None)
-        other.params = _checked_params({**self.params, **values}, self.shape)
+        other.params = checked_params({**self.params, **values}, self.shape)
         other._set_mass()
         return other
 
@@ -169,6 +173,61 @@ class LatticeHamiltonian(LocalHamiltonian):
         if not np.isfinite(inverse_mass).all() or not (inverse_mass != 0).all():
             raise ValueError("`kinetic` has a mass that is 0 or infinite with the values in `params`: change them.")
         self.inverse_mass = inverse_mass
+
+    # the linear part ------------------------------------------------------------------------------------------------
+
+    def linear_and_rest(self, interval: float) -> tuple[SpectralPart, list[Any]]:
+        """The quadratic terms of sites and bonds as they are written, in normal modes, and U(q), the rest of V.
+
+        Parameters of sites enter the linear part by their mean. At ends that are not periodic only bonds to the next
+        site have known modes, so that longer ones belong to the rest.
+        """
+        from sympflow.hamiltonian.normal_modes import SpectralPart, Transform, dispersion
+
+        F, n_sites = len(self.fields), math.prod(self.shape)
+        inverse_mass = np.ones(F)
+        if self.inverse_mass is not None:
+            by_field = self.inverse_mass.reshape(F, n_sites)
+            inverse_mass = by_field.mean(-1)
+            if np.ptp(by_field, axis=-1).any():
+                inverse_mass[0] = math.nan
+        if not self.quadratic_kinetic or not (inverse_mass > 0).all():
+            raise ValueError(
+                "`kinetic` must be ½ p²/m with a positive mass that is the same at all sites, for normal modes to be "
+                "known: take a method that splits into T and V, such as 'srkn6b'."
+            )
+        onsite, U = self._quadratic(self.U, self.x)
+        periodic = all(name == "periodic" for name in self.boundary)
+        couplings, bonds = {}, {}
+        for k, V in self.bonds.items():
+            if k == 1 or periodic:
+                couplings[k], V = self._quadratic(V, self.r)  # noqa: PLW2901
+            if V.free_symbols & set(self.r):
+                bonds[k] = V
+        if not onsite.any() and not any(kappa.any() for kappa in couplings.values()):
+            raise ValueError(
+                "`onsite` and `bond` have no quadratic terms that are written as such, so that there is no linear "
+                "part: take a method that splits into T and V, such as 'srkn6b'."
+            )
+        transform = Transform(self.shape, self.boundary)
+        waves = [dispersion(couplings, transform.angles(axis)) for axis in range(len(self.shape))] if couplings else []
+        K = transform.total(waves) + onsite if waves else np.broadcast_to(onsite, (*self.shape, F, F))
+        linear = SpectralPart.of_matrices(transform, inverse_mass, np.ascontiguousarray(K), interval)
+        rest = copy.copy(self)
+        vars(rest).pop("_functions", None)
+        rest.U, rest.bonds = U if U.free_symbols & set(self.x) else sp.S.Zero, bonds
+        return linear, [RestOfLattice(rest)] if rest.U != 0 or bonds else []
+
+    def _quadratic(self, f: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[np.ndarray, sp.Expr]:
+        """K (F, F) of the terms ½ xᵀKx of a piece, with its numbers and the means of its arrays; and what remains."""
+        values = dict(zip(self.c, self.params.values(), strict=True))
+        numbers = {s: v for s, v in values.items() if not isinstance(v, np.ndarray)}
+        means = {s: float(v.mean()) for s, v in values.items() if isinstance(v, np.ndarray)}
+        with_numbers = f.xreplace(numbers)
+        quadratic, _ = quadratic_terms(with_numbers.xreplace(means), (*variables, *self.p))
+        K = sp.hessian(quadratic, variables)
+        own = sp.Add(*[K[i, j] * a * b / 2 for i, a in enumerate(variables) for j, b in enumerate(variables)])
+        return np.array(K.tolist(), dtype=float), sp.expand(with_numbers - own) if own != 0 else with_numbers
 
     # array functions, positions (..., d) ------------------------------------------------------------------------------
 
@@ -338,6 +397,26 @@ class LatticeHamiltonian(LocalHamiltonian):
         return _join([*before, values], at)
 
 
+class RestOfLattice:
+    """U(q) of a lattice, the potential without its linear part, as `sympflow.hamiltonian.parts` has them."""
+
+    of_positions, turns, timed = True, False, False
+
+    def __init__(self, lattice: LatticeHamiltonian) -> None:
+        self.lattice, self.ndof = lattice, lattice.ndof
+
+    def hamiltonian(self, y: Array) -> Array:
+        return self.lattice.potential(y[..., : self.ndof])
+
+    def gradient(self, y: Array) -> Array:
+        q = y[..., : self.ndof]
+        return concatenate([self.lattice.potential_gradient(q), 0 * q])
+
+    def hessian_vector(self, y: Array, v: Array) -> Array:
+        """∇²U(q)·v: (..., 2d), (..., d) to (..., d)."""
+        return self.lattice.hessian_vector(y[..., : self.ndof], v)
+
+
 def _along(f: sp.Expr, x: Sequence[sp.Symbol], v: Sequence[sp.Symbol]) -> sp.Expr:
     """The derivative of f along v."""
     return sp.Add(*[s * sp.diff(f, z) for z, s in zip(x, v, strict=True)])
@@ -382,7 +461,8 @@ def _joined(fields: Sequence[Array], n_axes: int) -> Array:
     return flat[0] if len(flat) == 1 else _join(flat, -1)
 
 
-def _checked_shape(shape: Any) -> tuple[int, ...]:
+def checked_shape(shape: Any) -> tuple[int, ...]:
+    """The sites along each axis, of an argument `shape`."""
     sizes = tuple(shape) if isinstance(shape, Sequence | np.ndarray) and not isinstance(shape, str) else (shape,)
     sizes = tuple(map(plain, sizes))
     if not 1 <= len(sizes) <= MOST_AXES or not all(
@@ -424,7 +504,8 @@ def _checked_distance(k: Any) -> int:
     return k
 
 
-def _checked_params(params: Any, shape: tuple[int, ...]) -> dict[str, float | np.ndarray]:
+def checked_params(params: Any, shape: tuple[int, ...]) -> dict[str, float | np.ndarray]:
+    """The values of parameters, numbers or one for each site, of an argument `params`."""
     if not isinstance(params, Mapping | None):
         raise TypeError(
             f"`params` must be a mapping of names to numbers or arrays; got {type(params).__name__}: pass a dict."

@@ -63,6 +63,28 @@ class LocalHamiltonian(Definition):
             f"HamiltonianSystem.{self.loops}."
         )
 
+    def linear_and_rest(self, interval: float) -> tuple[Any, list[Any]]:
+        """The quadratic part of H, in its normal modes, and the part that remains, if there is one.
+
+        Parameters
+        ----------
+        interval : float
+            The length of the default one: see `LinearPart`.
+
+        Returns
+        -------
+        SpectralPart, and a list of one part as `sympflow.hamiltonian.parts` has them, or none
+
+        Raises
+        ------
+        ValueError
+            If there is no quadratic part whose modes are known.
+        """
+        raise ValueError(
+            f"`system` is made of {self.loops}, of which no linear part is known: take a method that splits into T and "
+            "V, such as 'srkn6b'."
+        )
+
     def is_piece_of(self, other: LocalHamiltonian | None) -> bool:
         """Return True if the other has the same terms, however many of them."""
         return False

@@ -377,6 +377,67 @@ class HamiltonianSystem(Hamiltonian):
         return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale, exact)
 
     @classmethod
+    def schroedinger(
+        cls,
+        onsite: str | sympy.Expr | None = "-rho**2/2",
+        *,
+        shape: int | Sequence[int],
+        length: float | Sequence[float] | None = None,
+        dispersion: str | sympy.Expr = "k**2/2",
+        params: Mapping[str, Any] | None = None,
+        name: str = "schroedinger",
+        domain: Domain | None = None,
+        y0: ArrayLike | None = None,
+        t_span: tuple[float, float] = (0.0, 100.0),
+        dt: float = 0.01,
+        energy_scale: float | None = None,
+        exact: Callable[[Any], Array] | None = None,
+    ) -> HamiltonianSystem:
+        """A complex field on a periodic grid of any size, i ∂ψ/∂t = ω(−i∇)ψ + f'(|ψ|²)ψ: Schrödinger equations.
+
+        A state is y = [q, p] with ψ = (q + ip)/√2, each of the grid's shape, so that ρ = |ψ|² = (q² + p²)/2 and
+
+            H = Σ [ψ̄ ω(−i∇)ψ + f(ρ)]
+
+        over the sites: the energy divided by the volume of a cell. Derivatives are spectral. The methods with the exact
+        linear flow (`impulse`, `linear_kahan_li6`, `linear_aba864`, …) turn the phases of waves by ω, by fast Fourier
+        transforms, and those of sites by f': both parts keep the norm Σ ρ to rounding. Runs are made by arrays.
+
+        Parameters
+        ----------
+        onsite : str or sympy.Expr, optional
+            f in `rho`, such as "-rho**2/2", the focusing cubic equation, or "V*rho + g*rho**2/2"; None for the free
+            field.
+        shape : int or sequence of up to three ints
+            Sites along each axis.
+        length : float or sequence of floats, optional
+            Of each axis; by default one for each site.
+        dispersion : str or sympy.Expr
+            ω of a wave number `k`, an even function, added up over the axes: "k**2/2", or "1 - cos(k)" for a chain
+            whose neighbours are coupled.
+        params : mapping of str to float or array of the grid's shape, optional
+            Values of the other names; arrays in `onsite`, such as a potential V or disorder.
+        name, domain, y0, t_span, dt, energy_scale, exact
+            As for the class.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If an expression cannot be read, holds other names or is not finite; if shapes do not fit each other; or if
+            a run would need more memory than the machine has.
+
+        Examples
+        --------
+        >>> system = HamiltonianSystem.schroedinger("-rho**2/2", shape=256, length=40.0)
+        >>> system.separable
+        False
+        """
+        from sympflow.hamiltonian.wave_functions import WaveFunctionHamiltonian
+
+        local = WaveFunctionHamiltonian(onsite, dispersion, shape, length, params)
+        return cls._of_pieces(local, None, name, domain, y0, t_span, dt, energy_scale, exact)
+
+    @classmethod
     def _of_pieces(
         cls, local: LocalHamiltonian, damping: float | ArrayLike | None, name: str, *scene: Any
     ) -> HamiltonianSystem:
