@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -47,6 +47,11 @@ class Part(ABC):
     of: str
     n: int
 
+    @property
+    def quadratic(self) -> bool:
+        """True if it is known to be a quadratic form."""
+        return False
+
     @abstractmethod
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
         """The gradient at columns x (m, N), with its derivatives."""
@@ -79,6 +84,10 @@ class Polynomial(Part):
         self.of, self.exponents, self.scales = of, np.asarray(exponents, dtype=int), np.asarray(scales, dtype=float)
         self.n = len(self.exponents)
 
+    @property
+    def quadratic(self) -> bool:
+        return bool((self.exponents.sum(axis=1) == 2).all())
+
     @classmethod
     def up_to(cls, degree: int, of: str, scales: Any) -> Polynomial:
         """All monomials of degree 1 to `degree`."""
@@ -89,7 +98,7 @@ class Polynomial(Part):
     @cached_property
     def _derivatives(self) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
         """For each list of coordinates, of one or two: the factors and exponents of the derivatives by them."""
-        made = {}
+        made: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
         m = self.exponents.shape[1]
         for places in [(i,) for i in range(m)] + [(i, j) for i in range(m) for j in range(i, m)]:
             factor, left = np.ones(self.n), self.exponents.copy()
@@ -138,6 +147,10 @@ class Polynomial(Part):
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
         return theta @ self._monomials(self._powers(x), self.exponents)
 
+    def subset(self, kept: np.ndarray) -> Polynomial:
+        """The polynomial of some of the monomials (n,)."""
+        return Polynomial(self.of, self.exponents[kept], self.scales)
+
     def coefficients(self, theta: np.ndarray) -> np.ndarray:
         """The coefficients of the monomials in x itself."""
         return theta / np.prod(self.scales**self.exponents, axis=1)
@@ -152,31 +165,27 @@ class Polynomial(Part):
 
 
 class Kinetic(Polynomial):
-    """½ pᵀM⁻¹p, M⁻¹ symmetric, θ its entries on and above the diagonal."""
+    """½ pᵀM⁻¹p, M⁻¹ symmetric, θ its entries on and above the diagonal; or on the diagonal alone."""
 
-    def __init__(self, scales: Any) -> None:
+    def __init__(self, scales: Any, mixed: bool = True) -> None:
         d = len(scales)
-        pairs = [(i, j) for i in range(d) for j in range(i, d)]
+        pairs = [(i, j) for i in range(d) for j in range(i, d if mixed else i + 1)]
         exponents = np.zeros((len(pairs), d), dtype=int)
         for row, pair in zip(exponents, pairs, strict=True):
             for i in pair:
                 row[i] += 1
         super().__init__("p", exponents, scales)
 
-    def inverse_mass(self, theta: np.ndarray) -> np.ndarray:
-        """M⁻¹ (d, d)."""
-        made = np.zeros((len(self.scales),) * 2)
-        for c, e in zip(self.coefficients(theta), self.exponents, strict=True):
-            places = np.repeat(np.arange(len(e)), e)
-            made[places[0], places[1]] = made[places[1], places[0]] = c * (2 if places[0] == places[1] else 1)
-        return made
 
-
-class Known(Part):
-    """A part without numbers, ½ pᵀM⁻¹p of a mass matrix that is given."""
+class FixedKinetic(Part):
+    """½ pᵀM⁻¹p of a mass matrix that is given."""
 
     def __init__(self, inverse_mass: np.ndarray) -> None:
         self.of, self.n, self.inverse_mass = "p", 0, inverse_mass
+
+    @property
+    def quadratic(self) -> bool:
+        return True
 
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
         W = self.inverse_mass
@@ -222,15 +231,16 @@ class Model:
     @property
     def nystrom(self) -> bool:
         """True if T is quadratic."""
-        return self.separable and all(isinstance(part, Kinetic | Known) for part in self.parts if part.of == "p")
+        return self.separable and all(part.quadratic for part in self.parts if part.of == "p")
 
     def _columns(self, of: str) -> slice:
         return {"q": slice(0, self.ndof), "p": slice(self.ndof, None), "y": slice(None)}[of]
 
-    def shares(self, theta: np.ndarray) -> list[np.ndarray]:
-        """The numbers of each part."""
-        ends = np.cumsum([part.n for part in self.parts])
-        return np.split(theta, ends)[: len(self.parts)]
+    @cached_property
+    def places(self) -> tuple[slice, ...]:
+        """The places of the numbers of each part in θ."""
+        ends = np.cumsum([0, *(part.n for part in self.parts)]).tolist()
+        return tuple(slice(*pair) for pair in pairwise(ends))
 
     def gradient(self, theta: np.ndarray, x: np.ndarray, of: str, slope: bool, by_parameters: bool) -> Linear:
         """∇ of the sum of the parts of q alone, or of p alone, or of all of H."""
@@ -238,17 +248,15 @@ class Model:
         value = np.zeros((m, N))
         slopes = np.zeros((m, m, N)) if slope else None
         columns = np.zeros((m, self.n, N)) if by_parameters else None
-        at = 0
-        for part, own in zip(self.parts, self.shares(theta), strict=True):
+        for part, place in zip(self.parts, self.places, strict=True):
             if of in (part.of, "y"):
                 rows = self._columns(part.of) if of == "y" else slice(None)
-                found = part.gradient(own, x[rows], slope, by_parameters)
+                found = part.gradient(theta[place], x[rows], slope, by_parameters)
                 value[rows] += found.value
                 if slopes is not None and found.slope is not None:
                     slopes[rows, rows] += found.slope
                 if columns is not None and found.by_parameters is not None:
-                    columns[rows, at : at + part.n] += found.by_parameters
-            at += part.n
+                    columns[rows, place] += found.by_parameters
         return Linear(value, slopes, columns)
 
     def field(self, theta: np.ndarray, y: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
@@ -272,8 +280,8 @@ class Model:
 
     def hamiltonian(self, theta: np.ndarray, y: np.ndarray) -> np.ndarray:
         """H (N,)."""
-        shares = zip(self.parts, self.shares(theta), strict=True)
-        return np.sum([part.value(own, y[self._columns(part.of)]) for part, own in shares], axis=0)
+        shares = zip(self.parts, self.places, strict=True)
+        return np.sum([part.value(theta[own], y[self._columns(part.of)]) for part, own in shares], axis=0)
 
     def expression(self, theta: np.ndarray) -> sympy.Expr:
         """H in q1 … qd, p1 … pd, or q and p."""
@@ -281,8 +289,16 @@ class Model:
 
         names = [f"{c}{i + 1}" if self.ndof > 1 else c for c in "qp" for i in range(self.ndof)]
         y = sympy.symbols(names, real=True)
-        shares = zip(self.parts, self.shares(theta), strict=True)
-        return sympy.Add(*(part.expression(own, y[self._columns(part.of)]) for part, own in shares))
+        shares = zip(self.parts, self.places, strict=True)
+        return sympy.Add(*(part.expression(theta[own], y[self._columns(part.of)]) for part, own in shares))
+
+    def without(self, dropped: np.ndarray) -> Model:
+        """The model without some of the numbers (n,), which are those of polynomials."""
+        kept = [
+            part.subset(~dropped[place]) if isinstance(part, Polynomial) else part
+            for part, place in zip(self.parts, self.places, strict=True)
+        ]
+        return replace(self, parts=tuple(kept))
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
         """θ before anything is known; friction 0."""

@@ -85,12 +85,12 @@ class Splitting(Stepper):
             return
         first = 2 * len(f.value)
         by = X[of]
-        for i, row in enumerate(X[moved]):
+        for i, rows in enumerate(X[moved]):
             for j, slope in enumerate(f.slope[i]):
                 if slope.any():
-                    row += (w * slope) * by[j]
+                    rows[:] += (w * slope) * by[j]
             if f.by_parameters is not None:
-                row[first:] += w * f.by_parameters[i]
+                rows[first:] += w * f.by_parameters[i]
 
 
 @dataclass(frozen=True)
@@ -366,23 +366,34 @@ class Problem:
         return total
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-    def residuals(self, theta: np.ndarray, states: np.ndarray) -> list[np.ndarray]:
-        """Observation less orbit of each piece, (2d, k), NaN where nothing was observed."""
+    def orbits(self, theta: np.ndarray, states: np.ndarray) -> list[np.ndarray]:
+        """The orbit of each piece at its times, (2d, k)."""
         made: list[Any] = [None] * len(self.data.runs)
         for batch in self.batches:
             orbit = np.stack([x.copy() for _, x, _ in self._orbits(batch, theta, states, False)])
-            left = np.where(batch.seen > 0, batch.y - orbit, np.nan)
             for column, i in enumerate(batch.index):
-                made[i] = left[: self.data.runs[i].n_points, :, column].T
+                made[i] = orbit[: self.data.runs[i].n_points, :, column].T
+        return made
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
+    def growth(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray, limit: float) -> np.ndarray:
+        """The times (N,) after which an error of the initial state has grown by a limit; infinite where it has not."""
+        made = np.full(len(states), np.inf)
+        m = len(scales)
+        for batch in self.batches:
+            for k, _, X in self._orbits(batch, theta, states, True):
+                assert X is not None
+                size = np.abs(X[:, :m] * (scales / scales[:, None])[..., None]).max(axis=(0, 1))
+                passed = batch.gaps[: k + 1].sum(axis=0)
+                grown = ~(size <= limit) & np.isinf(made[batch.index])
+                made[batch.index[grown]] = passed[grown]
         return made
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def normal(self, theta: np.ndarray, states: np.ndarray) -> Normal:
         """The normal equations at a point."""
         N, m, n = len(states), 2 * self.model.ndof, 0 if self.frozen else self.model.n
-        made = Normal(
-            np.empty((N, m, m)), np.empty((N, m, n)), np.zeros((n, n)), np.empty((N, m)), np.zeros(n), 0.0
-        )
+        made = Normal(np.empty((N, m, m)), np.empty((N, m, n)), np.zeros((n, n)), np.empty((N, m)), np.zeros(n), 0.0)
         for batch in self.batches:
             size = len(batch.index)
             A, B, a = np.zeros((m, m, size)), np.zeros((m, n, size)), np.zeros((m, size))
@@ -436,9 +447,15 @@ class Fit:
     costs: list[float] = field(default_factory=list)
     reason: str = ""
 
+    @cached_property
+    def orbits(self) -> list[np.ndarray]:
+        """The orbit of each piece at its times, (2d, k)."""
+        return self.problem.orbits(self.theta, self.states)
+
     @property
     def residuals(self) -> list[np.ndarray]:
-        return self.problem.residuals(self.theta, self.states)
+        """Observation less orbit of each piece, (2d, k), NaN where nothing was observed."""
+        return [run.y - orbit for run, orbit in zip(self.problem.data.runs, self.orbits, strict=True)]
 
     def noise(self) -> np.ndarray:
         """σ of each coordinate (2d,) by the residuals, with the share that the fit took of them given back."""
@@ -503,7 +520,7 @@ def _stepped(
         solved = normal.solved(level.value, scale)
         if solved is not None:
             step, moved, promised = solved
-            trial = theta + step, states + moved
+            trial = theta if problem.frozen else theta + step, states + moved
             after = problem.cost(*trial)
             gain = (before - after) / promised if promised > 0 and math.isfinite(after) else -1.0
             if gain > 0:
@@ -554,7 +571,9 @@ def _gaps(data: Trajectories, most: int = 400) -> tuple[np.ndarray, np.ndarray]:
         found = [(x, float(np.diff(run.t).max())) for x, run in zip(first_states(data), data.runs, strict=True)]
     gaps = np.array([gap for _, gap in found])
     chosen = np.unique(
-        np.concatenate([np.argsort(gaps)[-most // 4 :], np.linspace(0, len(gaps) - 1, min(most, len(gaps))).astype(int)])
+        np.concatenate(
+            [np.argsort(gaps)[-most // 4 :], np.linspace(0, len(gaps) - 1, min(most, len(gaps))).astype(int)]
+        )
     )
     return np.stack([found[i][0] for i in chosen], axis=1), gaps[chosen]
 
