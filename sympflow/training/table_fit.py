@@ -206,11 +206,11 @@ class TableRun(SearchRun):
         if frozen is not None:
             for fit in filter(None, (frozen, self.weighted)):
                 common = (fit, steps, self._frozen_end, True)
-                finalists = list(session.each(descended, common, [m.x for m in finalists]))
+                finalists = list(session.each(descended, common, [m.x for m in finalists], self._frozen_end))
         starts = [self._continued(m) for m in _distinct(finalists)[:FITTED]]
         if not finalists or frozen is None or self._frozen_cost(self.given) < HOPELESS * min(m.cost for m in finalists):
             starts.insert(0, self.given)
-        fitted = list(session.each(descended, (self.whole, steps, self.whole_end, True), starts))
+        fitted = list(session.each(descended, (self.whole, steps, self.whole_end, True), starts, self.whole_end))
         best = min(fitted, key=lambda m: m.cost)
         if not math.isfinite(best.cost):
             raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
