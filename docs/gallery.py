@@ -1,4 +1,4 @@
-"""Pictures of the gallery: runs the code on docs/gallery.md and saves what each block has drawn under its picture's name.
+"""Pictures of the gallery: runs the code on docs/gallery.md and saves what each block has drawn.
 
 python docs/gallery.py              all pictures, in a minute or two
 python docs/gallery.py pendulum     one of them
