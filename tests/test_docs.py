@@ -59,16 +59,16 @@ def test_the_code_on_a_page_runs(page, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_code_of_the_gallery_draws(tmp_path, monkeypatch):
-    """A two-hundredth of each run, by array operations; `python docs/gallery.py` runs them in full."""
+    """A hundredth of each run, by array operations; `python docs/gallery.py` runs them in full."""
 
     def briefly(function):
         def run(system, method, t_span, y0=None, **options):
             if "t_eval" in options:
-                times = np.asarray(options["t_eval"]) / 200
+                times = np.asarray(options["t_eval"]) / 100
                 options["t_eval"] = times[:: 1 + len(times) // 20]
             if function is solve and method != "rk45":
                 options["backend"] = "array"
-            return function(system, method, (0, t_span[1] / 200), y0, **options)
+            return function(system, method, (0, t_span[1] / 100), y0, **options)
 
         return run
 
