@@ -252,7 +252,7 @@ class _Form(NamedTuple):
 def nested(
     first: sp.Symbol | None, terms: Iterable[sp.Expr], known: dict[sp.Symbol, float], last: bool = False
 ) -> sp.Expr:
-    """`first`, if given, + Σ `terms` as nested sums of products m·A + B, of all such forms the one that is known soonest.
+    """`first`, if any, + Σ `terms` as nested sums of products m·A + B, of all such forms the one that is known soonest.
 
     m is a product of arguments, A what is left of terms that it divides, B the other terms. Forms are compared by the
     latencies of these operations, then by their operations.
