@@ -35,8 +35,11 @@ class TestTrajectories:
         assert sol.success
         assert sol.system is system
         for i in range(len(LAM)):
-            alone = own(system, method, y0, i, **options).y[0]
-            np.testing.assert_allclose(sol.y[i], alone, rtol=0, atol=1e-14 if method == "chin4c" else 0)
+            if method == "chin4c":  # to rounding
+                alone = own(system, method, y0, i, backend="array", **options).y[0]
+                np.testing.assert_allclose(sol.y[i], alone, rtol=0, atol=1e-14)
+            else:
+                np.testing.assert_array_equal(sol.y[i], own(system, method, y0, i, **options).y[0])
 
     def test_arrays_compiled_or_not_agree(self, system, y0):
         compiled, arrays = (
@@ -56,9 +59,7 @@ class TestTrajectories:
         values = {"k": np.array([0.4, 2.0, 0.7]), "m": 1.3 + np.arange(3), ("c" if damping else "w"): [0.2, 0.3, 0.6]}
         y0, options = 0.2 * np.random.default_rng(1).normal(size=(3, 4)), {"dt": 0.25, "t_eval": [0, 0.55, 2.9, 3]}
         made, whole = [], HamiltonianSystem.with_params
-        monkeypatch.setattr(
-            HamiltonianSystem, "with_params", lambda self, **new: made.append(new) or whole(self, **new)
-        )
+        monkeypatch.setattr(HamiltonianSystem, "with_params", lambda self, **x: made.append(x) or whole(self, **x))
         sol = solve(system, "verlet", (0, 3), y0, params=values, backend="compiled", **options)
         assert len(made) == 1  # for the form of all
         for i in range(3):
