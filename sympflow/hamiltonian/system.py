@@ -96,6 +96,9 @@ class HamiltonianSystem(Hamiltonian):
         Default step of the fixed-step classical methods.
     energy_scale : float, optional
         What energy errors are relative to; the default is |H(y0)|.
+    exact : callable, optional
+        The solution that starts from `y0` at the beginning of `t_span`, where it is known: exact(t), times (...) to
+        states (..., 2d). Nothing computes with it; it is there to compare with.
     check : bool
         False leaves out the test of the functions, see `check_functions`, that the first use of the system makes.
 
@@ -111,6 +114,8 @@ class HamiltonianSystem(Hamiltonian):
         The symbolic definition, if there is one.
     autonomous : bool
         False if H depends on t.
+    exact : callable or None
+        The exact solution, of scenes that have one.
 
     Examples
     --------
@@ -121,6 +126,7 @@ class HamiltonianSystem(Hamiltonian):
 
     _period: float | None = None
     _former_period: float | None = None
+    exact: Callable[[Any], Array] | None = None
 
     def __init__(
         self,
@@ -141,6 +147,7 @@ class HamiltonianSystem(Hamiltonian):
         t_span: tuple[float, float] = (0.0, 100.0),
         dt: float = 0.05,
         energy_scale: float | None = None,
+        exact: Callable[[Any], Array] | None = None,
         check: bool = True,
     ) -> None:
         from sympflow.hamiltonian.callables import CallableHamiltonian, DrivenCallables
@@ -167,7 +174,7 @@ class HamiltonianSystem(Hamiltonian):
             self.stiffness_matrix = matrices.stiffness_matrix(stiffness_matrix, definition.ndof)
             self.stiffness_matrix.setflags(write=False)
         self._set_friction(damping)
-        self._set_scene({}, domain, y0, t_span, dt, energy_scale)
+        self._set_scene({}, domain, y0, t_span, dt, energy_scale, exact)
         self._set_period(period)
 
     @classmethod
@@ -185,6 +192,7 @@ class HamiltonianSystem(Hamiltonian):
         t_span: tuple[float, float] = (0.0, 100.0),
         dt: float = 0.05,
         energy_scale: float | None = None,
+        exact: Callable[[Any], Array] | None = None,
     ) -> HamiltonianSystem:
         """A system from one symbolic definition of H in q1 … qd, p1 … pd (or q, p).
 
@@ -204,7 +212,7 @@ class HamiltonianSystem(Hamiltonian):
             The symbol that is the time, "t", of a driven system H(t, q, p).
         period : float, optional
             The period of H in t; other values than its own are a ValueError.
-        damping, name, domain, y0, t_span, dt, energy_scale
+        damping, name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
 
         Raises
@@ -231,7 +239,7 @@ class HamiltonianSystem(Hamiltonian):
         Hamiltonian.__init__(self, name, symbols, inverse_mass, M is not None)
         self.symbols = symbols
         self._set_friction(damping)
-        self._set_scene(params, domain, y0, t_span, dt, energy_scale)
+        self._set_scene(params, domain, y0, t_span, dt, energy_scale, exact)
         self._set_period(period)
         return self
 
@@ -253,6 +261,7 @@ class HamiltonianSystem(Hamiltonian):
         t_span: tuple[float, float] = (0.0, 100.0),
         dt: float = 0.05,
         energy_scale: float | None = None,
+        exact: Callable[[Any], Array] | None = None,
     ) -> HamiltonianSystem:
         """A lattice of any size, H = Σ_sites [T(p) + U(q)] + Σ_bonds V(r), by expressions for one site and one bond.
 
@@ -280,7 +289,7 @@ class HamiltonianSystem(Hamiltonian):
         params : mapping of str to float or array of the lattice's shape, optional
             Values of the other symbols; an array has one for each site, and for each bond that of its lower end, or of
             the first site where the lower end is a wall.
-        damping, name, domain, y0, t_span, dt, energy_scale
+        damping, name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
 
         Raises
@@ -298,7 +307,7 @@ class HamiltonianSystem(Hamiltonian):
         from sympflow.hamiltonian.lattice import LatticeHamiltonian
 
         local = LatticeHamiltonian(onsite, bond, shape, boundary, kinetic, fields, params)
-        return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale)
+        return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale, exact)
 
     @classmethod
     def pairs(
@@ -319,6 +328,7 @@ class HamiltonianSystem(Hamiltonian):
         t_span: tuple[float, float] = (0.0, 1.0),
         dt: float = 0.001,
         energy_scale: float | None = None,
+        exact: Callable[[Any], Array] | None = None,
     ) -> HamiltonianSystem:
         """Bodies that interact in pairs, any number of them: H = Σ_i |p_i|²/(2 m_i) + Σ_{i<j} V(r_ij).
 
@@ -346,7 +356,7 @@ class HamiltonianSystem(Hamiltonian):
             Values of names in V that are the same for all pairs.
         bodies : mapping of str to array_like of shape (n,), optional
             Values that differ from body to body: of "c" the values are c1 and c2 in V.
-        damping, name, domain, y0, t_span, dt, energy_scale
+        damping, name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
 
         Raises
@@ -365,7 +375,7 @@ class HamiltonianSystem(Hamiltonian):
         from sympflow.hamiltonian.bodies import PairsHamiltonian
 
         local = PairsHamiltonian(potential, masses, dim, box, cutoff, softening, params, bodies)
-        return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale)
+        return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale, exact)
 
     def piece(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
@@ -482,8 +492,12 @@ class HamiltonianSystem(Hamiltonian):
         t_span: tuple[float, float],
         dt: float,
         energy_scale: float | None,
+        exact: Callable[[Any], Array] | None = None,
     ) -> None:
         self._params = Parameters(params)
+        if exact is not None and not callable(exact):
+            raise TypeError(f"`exact` must be a function of the time; got {type(exact).__name__}.")
+        self.exact = exact
         if not real_number(dt) or not 0 < dt < 1e100:
             raise ValueError(f"`dt` must be positive and finite; got {dt!r}.")
         try:

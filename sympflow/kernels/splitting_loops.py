@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +32,7 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    from sympflow.kernels.approximations import Ranges
     from sympflow.kernels.stage_times import Driving
 
 __all__ = [
@@ -85,6 +86,7 @@ class SplittingLoops:
     def __init__(self, system: HamiltonianSystem) -> None:
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
+        self._has_ranges = False
         self.driven = not system.autonomous
         if not system.separable:
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
@@ -105,6 +107,7 @@ class SplittingLoops:
                 damped = damped_drift(system, False)
                 self.values = () if damped else system.symbols.parametric.values
                 self._compile = partial(_symbolic_loops, system.symbols, algebra_source(system.symbols), damped)
+                self._has_ranges = True
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
@@ -126,10 +129,11 @@ class SplittingLoops:
                 "`system` cannot be compiled: it is given by plain functions. Define it with "
                 "HamiltonianSystem.from_sympy or by Numba functions, or use backend='array'."
             )
+        self._system = ref(system)  # which keeps these loops
         self._has_curvature = system.symbols is not None or system.local is not None
-        self._variants: dict[tuple[int, bool, Monomials, bool], LoopFunctions] = {}
+        self._variants: dict[tuple[int, bool, Monomials, bool, Ranges], LoopFunctions] = {}
 
-    def kernel(self, scheme: Scheme, compensated: bool = False) -> SplittingKernel:
+    def kernel(self, scheme: Scheme, compensated: bool = False, ranges: Ranges = ()) -> SplittingKernel:
         """The loops of one scheme.
 
         Parameters
@@ -137,8 +141,10 @@ class SplittingLoops:
         scheme : Scheme
         compensated : bool
             Sum with Kahan's compensation, which lowers the growth of round-off, in runs.
+        ranges
+            Of positions: see `functions`.
         """
-        return SplittingKernel(self, scheme, compensated)
+        return SplittingKernel(self, scheme, compensated, ranges)
 
     def damped_kernel(self, scheme: Scheme, step: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> DampedKernel:
         """The loops of one scheme on a system with friction; single steps are made by `step(y, h)` on arrays."""
@@ -149,16 +155,18 @@ class SplittingLoops:
         return bool(self.values) and not self.driven and takes_values(level)
 
     def functions(
-        self, level: int, compensated: bool, monomials: Monomials = (), varied: bool = False
+        self, level: int, compensated: bool, monomials: Monomials = (), varied: bool = False, ranges: Ranges = ()
     ) -> LoopFunctions:
         """The compiled functions for kicks of a level, see `Scheme`; `varied` for `VariedKernel`.
+
+        `ranges` of positions are for kicks that are faster there, see `kicks_source`, and equal but for rounding.
 
         Raises
         ------
         ValueError
             If the system has no such kicks.
         """
-        variant = (level, compensated, monomials, varied)
+        variant = (level, compensated, monomials, varied, ranges)
         if variant not in self._variants:
             if level in (FORCE_GRADIENT, CURVATURE) and not self._has_force_gradient:
                 raise ValueError(
@@ -168,9 +176,25 @@ class SplittingLoops:
             if level > FORCE_GRADIENT and not self._has_curvature:
                 what = "curvature terms" if level == CURVATURE else "polynomials"
                 raise ValueError(f"`scheme` has {what}, which need a symbolic system: take one without them.")
-            more = {"varied": True} if varied else {}
+            more: dict[str, Any] = {"varied": True} if varied else {}
+            more |= {"ranges": ranges} if ranges else {}
             self._variants[variant] = self._compile(level, compensated, monomials, **more)
         return self._variants[variant]
+
+    def ranges(self, level: int, compensated: bool) -> Ranges:
+        """The positions of the system's domain, for `functions` of a flow: none where they would change nothing."""
+        if compensated or level not in (FORCE_GRADIENT, CURVATURE):
+            return ()
+        return self._ranges
+
+    @cached_property
+    def _ranges(self) -> Ranges:
+        system = self._system()
+        if not self._has_ranges or system is None or system.symbols is None or system.domain is None:
+            return ()
+        from sympflow.kernels.approximations import position_ranges
+
+        return position_ranges(system.symbols, system.domain)
 
     def rows(self, table: StageTable, h: float = 1.0, t0: float = 0.0) -> np.ndarray:
         """The numbers of a table that the loops read, with the values of the system's parameters where they take these.
@@ -195,6 +219,7 @@ class SplittingLoops:
         monomials: Monomials = (),
         t: ArrayLike = 0.0,
         varied: bool = False,
+        ranges: Ranges = (),
     ) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
 
@@ -212,12 +237,15 @@ class SplittingLoops:
             When the steps of a driven system begin.
         varied : bool
             True if the values of its parameters follow each state in its row.
+        ranges
+            Of positions: see `functions`.
         """
         y = np.ascontiguousarray(y, dtype=np.float64)
         out = np.empty((len(y), 2 * self.ndof))
         x, h = np.ascontiguousarray(x), np.ascontiguousarray(h)
         t = np.ascontiguousarray(np.broadcast_to(np.asarray(t, dtype=np.float64), h.shape)) if self.driven else h
-        self.functions(table.level, False, monomials, varied).step_rows(self.rows(table), x, h, t, y, out)
+        functions = self.functions(table.level, False, monomials, varied, ranges)
+        functions.step_rows(self.rows(table), x, h, t, y, out)
         return out
 
 
@@ -226,8 +254,8 @@ class SplittingKernel(Kernel):
 
     saves_finite = True
 
-    def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool = False) -> None:
-        self.loops, self.scheme, self.compensated = loops, scheme, compensated
+    def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool = False, ranges: Ranges = ()) -> None:
+        self.loops, self.scheme, self.compensated, self._ranges = loops, scheme, compensated, ranges
         self._width = 2 * loops.ndof * (1 + compensated)
 
     def table(self, h: float, t0: float = 0.0) -> np.ndarray:
@@ -283,7 +311,7 @@ class SplittingKernel(Kernel):
         return np.ascontiguousarray(y, dtype=np.float64)
 
     def _functions(self) -> LoopFunctions:
-        return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials)
+        return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, ranges=self._ranges)
 
 
 class VariedKernel(SplittingKernel):
@@ -431,6 +459,7 @@ def _symbolic_loops(
     compensated: bool,
     monomials: Monomials,
     varied: bool = False,
+    ranges: Ranges = (),
 ) -> LoopFunctions:
     if friction is None and takes_values(level) and symbols.parametric is not symbols:
         from sympflow.kernels.codegen import algebra_source
@@ -438,7 +467,9 @@ def _symbolic_loops(
         symbols = symbols.parametric
         algebra = algebra_source(symbols)
     after = ("loops", "aligned", "lanes")
-    loops = symbolic_module(symbols, algebra, level, compensated, after, monomials, friction, varied=varied)
+    loops = symbolic_module(
+        symbols, algebra, level, compensated, after, monomials, friction, varied=varied, ranges=ranges
+    )
     processed = loops.rollout_processed, loops.rollout_processed_rows
     return LoopFunctions(loops.rollout, loops.rollout_lanes, *processed, loops.step_lanes)
 
@@ -466,6 +497,7 @@ def symbolic_module(
     friction: DampedDrift | None = None,
     driving: Driving | None = None,
     varied: bool = False,
+    ranges: Ranges = (),
 ) -> ModuleType:
     """The algebra of a symbolic system, its kicks and the texts of loops `after` them, as a module.
 
@@ -478,7 +510,7 @@ def symbolic_module(
     lanes = lanes_source(kinds, scheduled, friction, n, varied)
     sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
     if scheduled:
-        sources.append(kicks_source(symbols, level, monomials, varied=varied))
+        sources.append(kicks_source(symbols, level, monomials, varied=varied, ranges=ranges))
     else:
         sources += plain_kicks_source(symbols, level, monomials)
     algebra = "\n\n\n".join(sources)

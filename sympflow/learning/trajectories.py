@@ -1,0 +1,585 @@
+"""Trajectories as they are measured: each with its own times, some values missing, from arrays, tables and Datasets."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.arrays import is_tensor, to_numpy
+from sympflow.flow.scaling import Scaling
+from sympflow.storage.layout import DOF, ORBIT, TIME, imported
+
+UNITS = {
+    "1": 1.0, "rad": 1.0, "deg": np.pi / 180, "rev": 2 * np.pi,
+    "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0,
+    "m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9,
+    "kg": 1.0, "g": 1e-3, "mg": 1e-6, "N": 1.0, "J": 1.0,
+}  # fmt: skip
+"""Units in those of the SI, angles in radians."""
+TIMES = ("t", "time")
+RUNS = (ORBIT, "run", "run_id", "trajectory", "trajectory_id", "traj", "id")
+"""Names of the columns of times and of trajectories that are recognized, in lower case."""
+BESIDE = ("energy", "status")
+"""Columns of tables of sympflow that are no states."""
+ORDERS = ("halves", "pairs")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One trajectory: ascending times t (n,) and states y (2d, n), NaN where a value is missing."""
+
+    t: np.ndarray
+    y: np.ndarray
+
+    @property
+    def n_points(self) -> int:
+        return len(self.t)
+
+    @property
+    def span(self) -> float:
+        return float(self.t[-1] - self.t[0])
+
+    def part(self, start: int, stop: int) -> Run:
+        """The points from start to stop."""
+        return Run(self.t[start:stop], np.ascontiguousarray(self.y[:, start:stop]))
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Trajectories of one system, from which it is learned; made by `Trajectories.read`.
+
+    Attributes
+    ----------
+    runs : tuple of Run
+    names : tuple of str, length 2d
+        The names of q1 … qd, p1 … pd in the data.
+    """
+
+    runs: tuple[Run, ...]
+    names: tuple[str, ...]
+
+    @classmethod
+    def read(
+        cls,
+        data: Any,
+        ndof: int | None = None,
+        *,
+        order: str | Sequence[int] = "halves",
+        time: str | None = None,
+        run: str | None = None,
+        q: str | Sequence[str] | None = None,
+        p: str | Sequence[str] | None = None,
+        units: Mapping[str, str | float] | None = None,
+        velocity_mass: ArrayLike | None = None,
+    ) -> Trajectories:
+        """Read trajectories.
+
+        Parameters
+        ----------
+        data : Trajectories, sequence, DataFrame, Dataset, Solution or path
+            - A list of (t, y), t (n,) and y (2d, n), each with its own times and length.
+            - A pair of arrays: t (n,) and y (N, 2d, n), or (2d, n).
+            - Three arrays, x (N, 2d), t (N,) or a number, y (N, 2d): the states y a time t after x.
+            - An object with `t` and `y`: a solution, an ensemble, the result of `scipy.integrate.solve_ivp`; a list
+              of these.
+            - A table of pandas with a row for each time, or a CSV or Parquet file of one: columns for the trajectory,
+              the time and the coordinates.
+            - A Dataset of xarray as `to_xarray` makes it, or a NetCDF file or zarr store of one.
+
+            NaN marks a value that is missing. Points without any value are left out. A trajectory whose times all
+            descend is turned around.
+        ndof : int, optional
+            Degrees of freedom d; else read off the data. With it a table's columns may bear any names, q's first.
+        order : {"halves", "pairs"} or sequence of int
+            The order of the rows of y where these have no names: q1 … qd, p1 … pd; q1, p1, q2, p2, …; or the places of
+            q1 … qd, p1 … pd.
+        time, run : str, optional
+            Columns of the time and of the trajectory; else those of common names ("t", "time"; "orbit", "run", …).
+        q, p : str or sequence of str, optional
+            Columns of the coordinates and momenta; else q1 … qd, p1 … pd, or q and p.
+        units : mapping of str to str or float, optional
+            The units of columns by their names, of all "q" or "p", and of the time, "t": {"t": "ms", "q": "deg",
+            "p": "deg/ms"}, or factors. The data are converted to those of the SI, and to radians.
+        velocity_mass : float or array_like of shape (d,) or (d, d), optional
+            M where the data have velocities in place of momenta: then p = M v.
+
+        Raises
+        ------
+        ValueError
+            If times repeat or go back, widths differ or are odd, a trajectory or a coordinate has no values, or
+            columns are not recognized.
+        TypeError
+            If `data` is of no kind listed above.
+        ImportError
+            If a file needs pandas or xarray and it is not installed.
+
+        Examples
+        --------
+        >>> t = np.linspace(0, 1, 5)
+        >>> Trajectories.read((t, np.stack([np.cos(t), -np.sin(t)]))).ndof
+        1
+        """
+        if isinstance(data, Trajectories):
+            found, names = list(_labelled(data.runs)), data.names
+            order = "halves"
+        elif _is_a("pandas", "DataFrame", data):
+            found, names = _of_table(data, ndof, time, run, q, p, velocity_mass is not None)
+            order = "halves"
+        elif _is_a("xarray", "Dataset", data):
+            found, names = _of_dataset(data), ()
+            order = "halves"
+        elif isinstance(data, str | Path):
+            given = {"order": order, "time": time, "run": run, "q": q, "p": p}
+            return cls.read(_opened(Path(data)), ndof, units=units, velocity_mass=velocity_mass, **given)  # type: ignore[arg-type]
+        else:
+            found, names = list(_of_arrays(data)), ()
+        if not found:
+            raise ValueError("`data` has no trajectories: give at least one, (t, y).")
+        width = _width(found, ndof)
+        rows = _rows(order, width)
+        names = names or tuple(f"{letter}{i + 1}" for letter in "qp" for i in range(width // 2))
+        factors, of_time = _factors(units, names)
+        runs = []
+        for label, times, states in found:
+            t, y = _checked(label, times, states)
+            y = y[rows] * factors[:, None]
+            if velocity_mass is not None:
+                y = np.concatenate([y[: width // 2], _momenta(velocity_mass, y[width // 2 :])])
+            runs.append(Run(np.ascontiguousarray(t) * of_time, np.ascontiguousarray(y)))
+        for i, name in enumerate(names):
+            if all(np.isnan(one.y[i]).all() for one in runs):
+                raise ValueError(
+                    f"`data` has no value of {name} in any trajectory: drop the degree of freedom, or add it."
+                )
+        return cls(tuple(runs), names)
+
+    @property
+    def ndof(self) -> int:
+        return len(self.names) // 2
+
+    @property
+    def n_points(self) -> int:
+        return sum(run.n_points for run in self.runs)
+
+    @property
+    def n_values(self) -> int:
+        """The numbers that are not missing."""
+        return int(sum(np.isfinite(run.y).sum() for run in self.runs))
+
+    @cached_property
+    def states(self) -> np.ndarray:
+        """The states of all points of which nothing is missing: (n, 2d)."""
+        points = np.concatenate([run.y.T for run in self.runs])
+        return points[np.isfinite(points).all(1)]
+
+    @cached_property
+    def scales(self) -> np.ndarray:
+        """The spread of each coordinate, (2d,): its standard deviation, 1 where it does not change."""
+        spread = np.nanstd(np.concatenate([run.y for run in self.runs], axis=1), axis=1)
+        return np.where(spread > 0, spread, 1.0)
+
+    @cached_property
+    def time_scale(self) -> float:
+        """The median time from one point to the next."""
+        return float(np.median(np.concatenate([np.diff(run.t) for run in self.runs])))
+
+    @property
+    def scaling(self) -> Scaling:
+        """Units in which states and steps are of size one, and dq∧dp is a multiple of what it was.
+
+        All products of the units of q_i and p_i agree, so that the equations stay Hamiltonian.
+        """
+        d = self.ndof
+        q, p = self.scales[:d], self.scales[d:]
+        action = np.exp(np.mean(np.log(q * p)))
+        ratio = np.sqrt(q / p)
+        return Scaling(tuple(np.sqrt(action) * ratio), tuple(np.sqrt(action) / ratio), self.time_scale)
+
+    def scaled(self, scaling: Scaling) -> Trajectories:
+        """The trajectories in other units, without a shift of the origin."""
+        units = np.array(scaling.x)[:, None]
+        return replace(self, runs=tuple(Run(run.t / scaling.t, run.y / units) for run in self.runs))
+
+    def split(self, share: float = 0.2, seed: int = 0) -> tuple[Trajectories, Trajectories]:
+        """Two disjoint sets of whole trajectories, the second with that share of them, drawn at random.
+
+        Points of one trajectory are never divided: a model that knows the ends of an orbit would be tested on its
+        middle.
+
+        Raises
+        ------
+        ValueError
+            If there is one trajectory only, or `share` is not between 0 and 1.
+        """
+        if not 0 < share < 1:
+            raise ValueError(f"`share` must lie between 0 and 1; got {share!r}: 0.2 keeps a fifth for the test.")
+        if len(self.runs) < 2:
+            raise ValueError(
+                "`data` has one trajectory only, of which none can be held out: add others, or cut it by `.pieces`, "
+                "which shows less, for its pieces lie on one orbit."
+            )
+        count = min(max(round(share * len(self.runs)), 1), len(self.runs) - 1)
+        drawn = set(np.random.default_rng(seed).permutation(len(self.runs))[:count].tolist())
+        return self.subset(i for i in range(len(self.runs)) if i not in drawn), self.subset(sorted(drawn))
+
+    def subset(self, index: Any) -> Trajectories:
+        """The trajectories of some places, which may repeat, as a bootstrap draws them."""
+        return replace(self, runs=tuple(self.runs[i] for i in index))
+
+    def pieces(self, points: int | None = None, span: float = np.inf) -> Trajectories:
+        """Trajectories cut into pieces, each of them a trajectory of its own; no point is in two of them.
+
+        Parameters
+        ----------
+        points : int, optional
+            The most points of a piece, at least 2. A last piece of one point goes to the piece before.
+        span : float
+            The longest time of a piece, which holds two points at least. Of chaotic orbits this is one or two
+            Lyapunov times.
+        """
+        most = sys.maxsize if points is None else points
+        if most < 2:
+            raise ValueError(f"`points` must be 2 or more; got {points!r}.")
+        if not span > 0:
+            raise ValueError(f"`span` must be positive; got {span!r}.")
+        return replace(self, runs=tuple(piece for run in self.runs for piece in _cut(run, most, span)))
+
+    def __repr__(self) -> str:
+        spans = [run.span for run in self.runs]
+        return (
+            f"<{len(self.runs)} trajectories, ndof {self.ndof}, {self.n_points} points, "
+            f"{min(spans):.3g} to {max(spans):.3g} long>"
+        )
+
+
+def _cut(run: Run, points: int, span: float) -> Iterator[Run]:
+    start, n = 0, run.n_points
+    while start < n:
+        reached = int(np.searchsorted(run.t, run.t[start] + span * (1 + 1e-12), "right"))
+        stop = min(max(reached, start + 2), start + points, n)
+        if n - stop == 1:
+            stop = n
+        yield run.part(start, stop)
+        start = stop
+
+
+# the kinds of data ----------------------------------------------------------------------------------------------------
+
+Found = tuple[str, np.ndarray, np.ndarray]
+"""The name of a trajectory for messages, its times and states, not checked yet."""
+
+
+def _labelled(runs: Sequence[Run]) -> Iterator[Found]:
+    for i, run in enumerate(runs):
+        yield f"trajectory {i}", run.t, run.y
+
+
+def _is_a(library: str, kind: str, data: Any) -> bool:
+    """True of an object of a library, which then is imported already."""
+    return library in sys.modules and isinstance(data, getattr(sys.modules[library], kind))
+
+
+def _numbers(values: Any, name: str) -> np.ndarray:
+    """Real numbers as a float64 array of NumPy, NaN where they are masked."""
+    try:
+        array = to_numpy(values) if is_tensor(values) else values
+        if isinstance(array, np.ma.MaskedArray):
+            array = np.ma.filled(array.astype(float), np.nan)
+        array = np.asarray(array)
+        if array.dtype.kind in "mM":
+            array = (array - array.ravel()[0]) / np.timedelta64(1, "s")
+        if array.dtype.kind == "c":
+            raise TypeError("complex numbers")
+        return array.astype(float)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"`data` has {name} that are no real numbers ({error}): give arrays of numbers.") from error
+
+
+def _is_array(values: Any, ndim: int) -> bool:
+    """True of an array, or nested list, of that many axes."""
+    if isinstance(values, str | bytes | Mapping) or values is None:
+        return False
+    try:
+        return np.ndim(to_numpy(values) if is_tensor(values) else values) == ndim
+    except ValueError:  # lists of different lengths
+        return False
+
+
+def _of_arrays(data: Any) -> Iterator[Found]:
+    result = _of_result(data)
+    if result is not None:
+        yield from result
+        return
+    if not isinstance(data, Sequence) or isinstance(data, str | bytes):
+        raise TypeError(
+            f"`data` is of the type {type(data).__name__}: give a list of (t, y), a pair of arrays t (n,) and "
+            "y (N, 2d, n), three arrays (x, t, y), a solution, a table or a Dataset."
+        )
+    if len(data) == 2 and _is_array(data[0], 1):
+        yield from _of_pair(*data)
+    elif len(data) == 3 and _is_array(data[0], 2):
+        yield from _of_ends(*data)
+    else:
+        for i, one in enumerate(data):
+            for _, t, y in _of_result(one) or [_of_one(i, one)]:
+                yield f"trajectory {i}", t, y
+
+
+def _of_result(data: Any) -> list[Found] | None:
+    """The orbits of a solution, an ensemble or SciPy's result that have states; None of anything else."""
+    try:
+        t, y = data.t, data.y
+    except AttributeError:
+        return None
+    return [one for one in _of_pair(t, y) if np.isfinite(one[2]).any()]
+
+
+def _of_one(i: int, one: Any) -> Found:
+    if isinstance(one, Run):
+        return "", one.t, one.y
+    if not (isinstance(one, Sequence) and len(one) == 2):
+        raise TypeError(f"`data[{i}]` is no trajectory: give a pair (t, y) of arrays, t (n,) and y (2d, n).")
+    return "", _numbers(one[0], "times"), _numbers(one[1], "states")
+
+
+def _of_pair(t: Any, y: Any) -> Iterator[Found]:
+    t, y = _numbers(t, "times"), _numbers(y, "states")
+    if y.ndim < 2:
+        raise ValueError(f"`data` has states of shape {y.shape}: give y (2d, n), or (N, 2d, n), with the time last.")
+    if y.ndim == 2:
+        yield "the trajectory", t, y
+        return
+    for i, one in enumerate(y.reshape(-1, *y.shape[-2:])):
+        yield f"trajectory {i}", t, one
+
+
+def _of_ends(x: Any, t: Any, y: Any) -> Iterator[Found]:
+    x, y = _numbers(x, "states"), _numbers(y, "states")
+    t = _numbers(t, "times")
+    if x.shape != y.shape or t.shape not in ((), (1,), (len(x),)):
+        raise ValueError(
+            f"`data` is (x, t, y) of shapes {x.shape}, {t.shape}, {y.shape}: give x (N, 2d), t (N,) and y (N, 2d)."
+        )
+    for i, (start, later, end) in enumerate(zip(x, np.broadcast_to(t, len(x)), y, strict=True)):
+        yield f"pair {i}", np.array([0.0, later]), np.stack([start, end], 1)
+
+
+def _of_dataset(data: Any) -> list[Found]:
+    missing = [name for name in ("q", "p") if name not in data] + [TIME] * (TIME not in data.variables)
+    if missing:
+        raise ValueError(
+            f"`data` has no {' and no '.join(missing)}: a Dataset needs q and p of dimensions (…, {DOF}, {TIME}) and "
+            f"the coordinate {TIME}, as to_xarray() makes them; rename its variables."
+        )
+    outer = [dim for dim in data.q.dims if dim not in (DOF, TIME)]
+    q, p = (
+        _numbers((part if DOF in part.dims else part.expand_dims(DOF)).transpose(*outer, DOF, TIME).values, "states")
+        for part in (data.q, data.p)
+    )
+    lengths = q.shape[:-2]
+    times = data[TIME].transpose(*[dim for dim in outer if dim in data[TIME].dims], ...).values
+    times = np.broadcast_to(_numbers(times, "times"), (*lengths, q.shape[-1])).reshape(-1, q.shape[-1])
+    y = np.concatenate([q, p], axis=-2)
+    y = y.reshape(-1, *y.shape[-2:])
+    labels = [", ".join(f"{dim} {k}" for dim, k in zip(outer, at, strict=True)) for at in np.ndindex(*lengths)]
+    found = []
+    for label, t, one in zip(labels, times, y, strict=True):
+        kept = np.isfinite(t)  # ragged trajectories are padded
+        found.append((label or "the trajectory", t[kept], one[:, kept]))
+    return found
+
+
+def _opened(path: Path) -> Any:
+    """The table or Dataset of a file."""
+    ending = path.suffix.lower()
+    if not path.exists():
+        raise FileNotFoundError(f"`data` names the file {str(path)!r}, which does not exist: check the path.")
+    if ending in (".csv", ".tsv", ".txt"):
+        pandas = imported("pandas", "Reading a table")
+        return pandas.read_csv(path, sep=None if ending == ".txt" else "\t" if ending == ".tsv" else ",", comment="#")
+    if ending in (".parquet", ".pq"):
+        return imported("pandas", "Reading a table").read_parquet(path)
+    xarray = imported("xarray", "Reading a Dataset")
+    if ending == ".zarr":
+        return xarray.open_zarr(path).load()
+    if ending in (".nc", ".netcdf"):
+        return xarray.load_dataset(path)
+    raise ValueError(f"`data` names a file {ending or 'without an ending'}: .csv, .parquet, .nc and .zarr are read.")
+
+
+def _of_table(
+    table: Any, ndof: int | None, time: str | None, run: str | None, q: Any, p: Any, velocities: bool
+) -> tuple[list[Found], tuple[str, ...]]:
+    columns = [str(c) for c in table.columns]
+    table = table.set_axis(columns, axis=1)
+    of_time = _column(columns, time, TIMES, "time")
+    if of_time is None:
+        raise ValueError(f"`data` has no column of the time among {', '.join(columns)}: name it by `time`.")
+    ids = [c for c in columns if re.fullmatch(rf"{ORBIT}_\d+", c)] if run is None else []
+    one = _column(columns, run, RUNS, "run")
+    ids = ids or ([] if one is None else [one])
+    rest = [c for c in columns if c not in (*ids, of_time, *BESIDE)]
+    names = _coordinates(rest, ndof, q, p, velocities)
+    groups = [("the trajectory", table)]
+    if ids:
+        grouped = table.groupby(ids if len(ids) > 1 else ids[0], sort=False, dropna=False)
+        groups = [(f"{', '.join(ids)} {key}", rows) for key, rows in grouped]
+    found = []
+    for label, rows in groups:
+        y = np.stack([_numbers(rows[name].to_numpy(), f"values of {name}") for name in names])
+        found.append((label, _numbers(rows[of_time].to_numpy(), "times"), y))
+    if not ids and (np.diff(found[0][1]) <= 0).any():
+        raise ValueError(
+            "`data` has times that repeat or go back, and no column of the trajectory is recognized: name it by `run`, "
+            "or sort the rows."
+        )
+    return found, names
+
+
+def _column(columns: list[str], given: str | None, known: Sequence[str], argument: str) -> str | None:
+    if given is None:
+        return next((c for word in known for c in columns if c.lower() == word), None)
+    if given not in columns:
+        raise ValueError(f"`{argument}` is {given!r}, which is no column: there are {', '.join(columns)}.")
+    return given
+
+
+def _coordinates(rest: list[str], ndof: int | None, q: Any, p: Any, velocities: bool) -> tuple[str, ...]:
+    """The columns of q1 … qd, p1 … pd."""
+    if (q is None) != (p is None):
+        raise ValueError("`q` and `p` go together: name the columns of both.")
+    if q is not None:
+        qs, ps = ([one] if isinstance(one, str) else list(one) for one in (q, p))
+        missing = [name for name in (*qs, *ps) if name not in rest]
+        if missing or len(qs) != len(ps):
+            raise ValueError(f"`q` and `p` must name as many columns each, of {', '.join(rest)}; got {qs} and {ps}.")
+        return (*qs, *ps)
+    found: dict[str, list[str]] = {letter: _numbered(rest, letter) for letter in "qpv"}
+    if found["q"] and len(found["q"]) == len(found["p"]):
+        return (*found["q"], *found["p"])
+    if found["q"] and len(found["q"]) == len(found["v"]):
+        if velocities:
+            return (*found["q"], *found["v"])
+        raise ValueError(
+            f"`data` has velocities, {', '.join(found['v'])}, and no momenta: give the mass matrix as "
+            "`velocity_mass`, by which p = M v, or columns p1 …"
+        )
+    if ndof is not None and len(rest) == 2 * ndof:
+        return tuple(rest)
+    raise ValueError(
+        f"`data` has columns {', '.join(rest)}, of which the coordinates and momenta are not recognized: name them by "
+        "`q` and `p`, or give `ndof` if they are all, q's first."
+    )
+
+
+def _numbered(columns: list[str], letter: str) -> list[str]:
+    """The columns letter1, letter2, … in order, or letter alone."""
+    numbers = {int(m[1] or 1): c for c in columns if (m := re.fullmatch(rf"{letter}_?(\d*)", c.lower()))}
+    return [numbers[i] for i in range(1, len(numbers) + 1)] if sorted(numbers) == [*range(1, len(numbers) + 1)] else []
+
+
+# checks ---------------------------------------------------------------------------------------------------------------
+
+
+def _width(found: list[Found], ndof: int | None) -> int:
+    widths: dict[int, str] = {}
+    for label, t, y in found:
+        if y.ndim != 2 or t.ndim != 1:
+            raise ValueError(f"`data` has times of shape {t.shape}, states {y.shape} ({label}): give (n,) and (2d, n).")
+        if y.shape[1] != len(t):
+            turned = "pass y.T, for time comes last" if y.shape[0] == len(t) else "each time has a state"
+            raise ValueError(f"`data` has {len(t)} times and states of shape {y.shape} ({label}): {turned}.")
+        widths.setdefault(y.shape[0], label)
+    if len(widths) > 1:
+        said = ", ".join(f"{width} ({label})" for width, label in widths.items())
+        raise ValueError(f"`data` has trajectories of different widths, {said}: give q1 … qd, p1 … pd of one system.")
+    (width,) = widths
+    if width % 2:
+        raise ValueError(
+            f"`data` has states of {width} numbers, which is odd: give q1 … qd, p1 … pd; the time stands apart."
+        )
+    if ndof is not None and 2 * ndof != width:
+        raise ValueError(f"`ndof` is {ndof}, but states have {width} numbers: give ndof={width // 2}, or drop columns.")
+    return width
+
+
+def _rows(order: str | Sequence[int], width: int) -> list[int]:
+    """The places of q1 … qd, p1 … pd."""
+    if isinstance(order, str):
+        if order not in ORDERS:
+            raise ValueError(f'`order` must be "halves", "pairs" or the places of q1 … pd; got {order!r}.')
+        return [*range(width)] if order == "halves" else [*range(0, width, 2), *range(1, width, 2)]
+    rows = [int(i) for i in order]
+    if sorted(rows) != [*range(width)]:
+        raise ValueError(f"`order` must have each of 0 … {width - 1} once; got {rows}.")
+    return rows
+
+
+def _factors(units: Mapping[str, str | float] | None, names: tuple[str, ...]) -> tuple[np.ndarray, float]:
+    """What the coordinates and the times are multiplied by."""
+    d, factors, of_time = len(names) // 2, np.ones(len(names)), 1.0
+    for name, unit in (units or {}).items():
+        factor = _factor(name, unit)
+        if name in names:
+            factors[names.index(name)] = factor
+        elif name in ("q", "p"):
+            factors[slice(0, d) if name == "q" else slice(d, None)] = factor
+        elif name in TIMES:
+            of_time = factor
+        else:
+            raise ValueError(f'`units` names {name!r}, which is no coordinate: "t", "q", "p", {", ".join(names)} are.')
+    return factors, of_time
+
+
+def _factor(name: str, unit: str | float) -> float:
+    """A unit such as "deg/ms" or "kg*m^2/s" as a number."""
+    if isinstance(unit, str):
+        value = 1.0
+        for sign, text, power in re.findall(r"([*/·]?)\s*([^\s*/·^]+)(?:\s*(?:\^|\*\*)\s*(-?\d+))?", unit):
+            if text not in UNITS:
+                raise ValueError(f"`units[{name!r}]` is {unit!r}: {', '.join(UNITS)} are known; else give a factor.")
+            value *= UNITS[text] ** (int(power or 1) * (-1 if sign == "/" else 1))
+        return value
+    if isinstance(unit, bool) or not 0 < float(unit) < np.inf:
+        raise ValueError(f"`units[{name!r}]` must be a unit or a positive factor; got {unit!r}.")
+    return float(unit)
+
+
+def _momenta(mass: ArrayLike, v: np.ndarray) -> np.ndarray:
+    """M v."""
+    M, d = np.asarray(mass, dtype=float), len(v)
+    if M.shape not in ((), (d,), (d, d)):
+        raise ValueError(f"`velocity_mass` must be a number, ({d},) or ({d}, {d}); got the shape {M.shape}.")
+    return M @ v if M.ndim == 2 else (M if M.ndim == 0 else M[:, None]) * v
+
+
+def _checked(label: str, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times and states of the points with values, in ascending order."""
+    if not np.isfinite(t).all():
+        raise ValueError(f"`data` has times that are not finite ({label}): drop these points.")
+    if np.isinf(y).any():
+        raise ValueError(f"`data` has infinite values ({label}): mark what is missing by NaN.")
+    if len(t) > 1 and (np.diff(t) < 0).all():
+        t, y = t[::-1], y[:, ::-1]
+    steps = np.diff(t)
+    if (steps <= 0).any():
+        i = int(np.argmax(steps <= 0))
+        kind = "repeat" if steps[i] == 0 else "go back"
+        raise ValueError(
+            f"`data` has times that {kind} ({label}: {t[i + 1]:g} follows {t[i]:g} at point {i + 1}): sort the points, "
+            "average those of one time, and give each trajectory apart."
+        )
+    kept = np.isfinite(y).any(0)
+    if not kept.any():
+        raise ValueError(f"`data` has no value but NaN ({label}): leave this trajectory out.")
+    if kept.sum() < 2:
+        raise ValueError(f"`data` has a trajectory with one point only ({label}): two are needed; leave it out.")
+    return t[kept], y[:, kept]

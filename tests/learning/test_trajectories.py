@@ -1,0 +1,161 @@
+"""Trajectories from arrays, tables, Datasets and results: read alike, and refused by name."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import sympflow
+from sympflow.learning.trajectories import Trajectories
+from sympflow.systems import henon_heiles, pendulum
+
+t = np.linspace(0.0, 1.0, 6)
+RUN = np.stack([np.cos(t), -np.sin(t)])
+FOUR = np.arange(24.0).reshape(4, 6)
+
+
+def same(read, runs):
+    assert len(read.runs) == len(runs)
+    for one, (times, states) in zip(read.runs, runs, strict=True):
+        np.testing.assert_array_equal(one.t, times)
+        np.testing.assert_array_equal(one.y, states)
+
+
+def test_lists_pairs_and_ends_are_the_same_trajectories():
+    irregular = [(t, RUN), (t[:3], RUN[:, :3])]
+    same(Trajectories.read(irregular), irregular)
+    same(Trajectories.read([irregular[0]]), irregular[:1])
+    same(Trajectories.read((t, RUN)), [(t, RUN)])
+    same(Trajectories.read((t, np.stack([RUN, 2 * RUN]))), [(t, RUN), (t, 2 * RUN)])
+    x, y = np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[5.0, 6.0], [7.0, 8.0]])
+    ends = Trajectories.read((x, [0.5, -0.5], y))
+    same(ends, [([0, 0.5], [[1, 5], [2, 6]]), ([-0.5, 0], [[7, 3], [8, 4]])])  # the second runs backward
+    same(Trajectories.read(ends), [(run.t, run.y) for run in ends.runs])
+    assert "2 trajectories, ndof 1, 4 points" in repr(ends)
+
+
+def test_missing_values_stay_missing_and_empty_points_go():
+    y = RUN.copy()
+    y[0, 1] = np.nan
+    y[:, 3] = np.nan
+    read = Trajectories.read((t, y))
+    same(read, [(t[[0, 1, 2, 4, 5]], y[:, [0, 1, 2, 4, 5]])])
+    assert (read.n_values, read.n_points, len(read.states)) == (9, 5, 4)
+    masked = Trajectories.read((t, np.ma.masked_invalid(y)))
+    np.testing.assert_array_equal(masked.runs[0].y, read.runs[0].y)
+
+
+def test_results_of_solvers_are_read():
+    system = pendulum()
+    states = np.array([[1.0, 0.0], [0.5, 0.2]])
+    sol = sympflow.solve(system, "verlet", (0, 1), states, t_eval=t)
+    same(Trajectories.read(sol), [(t, sol.y[0]), (t, sol.y[1])])
+    same(Trajectories.read([sol, sol]), [(t, y) for y in (*sol.y, *sol.y)])
+    result = sympflow.ensemble(system, "verlet", (0, 1), states, t_eval=t)
+    same(Trajectories.read(result), [(t, y) for y in result.y])
+    scipy = solve_ivp(system, (0, 1), [1.0, 0.0], t_eval=t)
+    same(Trajectories.read(scipy), [(t, scipy.y)])
+
+
+def test_tables_and_datasets_are_read_by_their_names(tmp_path):
+    pd, xr = pytest.importorskip("pandas"), pytest.importorskip("xarray")
+    sol = sympflow.solve(henon_heiles(), "verlet", (0, 1), np.full((2, 4), 0.1) * [[1], [2]], t_eval=t)
+    runs = [(t, y) for y in sol.y]
+    same(Trajectories.read(sol.to_xarray()), runs)
+    table = sol.to_dataframe()
+    same(Trajectories.read(table), runs)
+    same(Trajectories.read(table[["p2", "q1", "time", "q2", "orbit", "p1"]]), runs)  # the order does not count
+    table.to_csv(tmp_path / "runs.csv", index=False)
+    read = Trajectories.read(tmp_path / "runs.csv", ndof=2)
+    np.testing.assert_allclose([run.y for run in read.runs], sol.y, rtol=1e-15)
+    assert read.names == ("q1", "q2", "p1", "p2")
+    other = pd.DataFrame({"t": t, "theta": RUN[0], "w": RUN[1]})
+    same(Trajectories.read(other, q="theta", p="w"), [(t, RUN)])
+    same(Trajectories.read(other, ndof=1), [(t, RUN)])
+    dated = other.assign(t=pd.to_timedelta(t, "s"))
+    np.testing.assert_allclose(Trajectories.read(dated, ndof=1).runs[0].t, t)
+    padded = xr.Dataset({"q": (("orbit", "time"), [RUN[0], RUN[0]]), "p": (("orbit", "time"), [RUN[1], RUN[1]])})
+    padded["time"] = ("time", t)
+    same(Trajectories.read(padded), [(t, RUN), (t, RUN)])
+    with pytest.raises(ValueError, match=r"coordinates and momenta are not recognized: name them by `q`"):
+        Trajectories.read(other)
+    with pytest.raises(ValueError, match=r"velocities, v1, and no momenta: give the mass matrix as `velocity_mass`"):
+        Trajectories.read(other.set_axis(["t", "q1", "v1"], axis=1))
+    moving = Trajectories.read(other.set_axis(["t", "q1", "v1"], axis=1), velocity_mass=2.0)
+    same(moving, [(t, RUN * [[1], [2]])])
+    with pytest.raises(ValueError, match=r"no column of the trajectory is recognized: name it by `run`"):
+        Trajectories.read(pd.concat([other, other]), ndof=1)
+    with pytest.raises(ValueError, match=r"no column of the time among theta, w: name it by `time`"):
+        Trajectories.read(other.drop(columns="t"), ndof=1)
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        Trajectories.read(tmp_path / "none.csv")
+
+
+def test_units_and_orders():
+    degrees = Trajectories.read(
+        (1e3 * t, np.rad2deg(RUN) * [[1], [1e-3]]), units={"t": "ms", "q": "deg", "p": "deg/ms"}
+    )
+    np.testing.assert_allclose(degrees.runs[0].t, t)
+    np.testing.assert_allclose(degrees.runs[0].y, RUN)
+    assert Trajectories.read((t, RUN), units={"p1": "g*cm^2/s"}).runs[0].y[1, 1] == pytest.approx(RUN[1, 1] * 1e-7)
+    pairs = Trajectories.read((t, FOUR), order="pairs")
+    same(pairs, [(t, FOUR[[0, 2, 1, 3]])])
+    same(Trajectories.read((t, FOUR), order=[0, 2, 1, 3]), [(t, FOUR[[0, 2, 1, 3]])])
+    same(
+        pairs.scaled(sympflow.flow.scaling.Scaling((2, 1), (1, 2), 0.5)),
+        [(2 * t, FOUR[[0, 2, 1, 3]] / [[2], [1], [1], [2]])],
+    )
+    units = np.array(pairs.scaling.x)
+    np.testing.assert_allclose(units[:2] * units[2:], pairs.scaling.action)  # dq∧dp is scaled alike
+
+
+def test_sets_are_divided_by_trajectory_and_long_runs_into_pieces():
+    many = Trajectories.read((t, np.arange(120.0).reshape(10, 2, 6)))
+    kept, held = many.split(0.3, seed=1)
+    firsts = [run.y[0, 0] for run in (*kept.runs, *held.runs)]
+    assert (len(kept.runs), len(held.runs), sorted(firsts)) == (7, 3, [12.0 * i for i in range(10)])
+    again = many.split(0.3, seed=1)[1]
+    assert [run.y[0, 0] for run in again.runs] == [run.y[0, 0] for run in held.runs]
+    one = Trajectories.read((t, RUN))
+    assert [run.n_points for run in one.pieces(points=4).runs] == [4, 2]
+    assert [run.n_points for run in one.pieces(points=5).runs] == [6]  # no piece of one point
+    assert [run.n_points for run in one.pieces(span=0.4).runs] == [3, 3]
+    assert [run.n_points for run in one.pieces(span=1e-9).runs] == [2, 2, 2]
+    assert np.array_equal(np.concatenate([run.y for run in one.pieces(span=0.4).runs], 1), RUN)
+    with pytest.raises(ValueError, match="one trajectory only"):
+        one.split()
+    with pytest.raises(ValueError, match="`points` must be 2 or more"):
+        one.pieces(points=1)
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "message"),
+    [
+        ([], {}, "has no trajectories"),
+        ((t[[0, 1, 1, 2, 3, 4]], RUN), {}, r"times that repeat \(the trajectory: 0.2 follows 0.2 at point 2\): sort"),
+        ([(t, RUN), (t[[0, 2, 1, 3, 4, 5]], RUN)], {}, r"times that go back \(trajectory 1"),
+        ((t, RUN * np.nan), {}, "no value but NaN"),
+        ((t, RUN * [[1], [np.nan]]), {}, "no value of p1 in any trajectory"),
+        ((t, RUN + np.inf), {}, "infinite values"),
+        ((t * np.nan, RUN), {}, "times that are not finite"),
+        ([(t, RUN), (t, FOUR)], {}, r"different widths, 2 \(trajectory 0\), 4 \(trajectory 1\)"),
+        ((t, FOUR[:3]), {}, "states of 3 numbers, which is odd"),
+        ((t, RUN.T), {}, "pass y.T, for time comes last"),
+        ((t[:1], RUN[:, :1]), {}, "one point only"),
+        ((t, RUN), {"ndof": 2}, "`ndof` is 2, but states have 2 numbers"),
+        ((t, FOUR), {"order": "rows"}, "`order` must be"),
+        ((t, FOUR), {"order": [0, 1, 2, 2]}, "each of 0 … 3 once"),
+        ((t, RUN), {"units": {"p": "furlong"}}, "are known; else give a factor"),
+        ((t, RUN), {"units": {"x": "m"}}, "`units` names 'x'"),
+        ((t, RUN), {"velocity_mass": [1, 2]}, "`velocity_mass` must be"),
+        ((np.eye(2), [1, 2, 3], np.eye(2)), {}, r"give x \(N, 2d\), t \(N,\)"),
+    ],
+)  # fmt: skip
+def test_bad_data_are_refused_with_the_remedy(data, options, message):
+    with pytest.raises(ValueError, match=message):
+        Trajectories.read(data, **options)
+
+
+@pytest.mark.parametrize("data", [None, 3.0, "no.such.kind", [1, 2], [(t,)], (t, RUN * 1j)])
+def test_what_is_no_data_is_refused(data):
+    with pytest.raises((TypeError, FileNotFoundError), match="`data"):
+        Trajectories.read(data)
