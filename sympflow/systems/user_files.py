@@ -22,7 +22,6 @@ DOMAINS: dict[str, tuple[str, ...]] = {
     "Ball": ("center", "radius"),
     "Box": ("low", "high"),
     "EnergySublevel": ("energy", "box", "above", "angular_momentum"),
-    "LatticeStates": ("density",),
     "Tube": ("orbit", "radius", "groups"),
 }
 """The kinds of domains in a TOML file, and the keys of each."""
