@@ -235,7 +235,7 @@ def load(
     path
     system : HamiltonianSystem, optional
         The system of the flow, which is checked. A primed flow needs its V and T: given here, or later by
-        `flow.bind(system)`; `solve` gives them as well.
+        `flow.bind(system)`; `solve` gives them as well. A flow that was learned from data brings its own.
     device : torch.device or str, optional
 
     Returns
@@ -265,6 +265,8 @@ def load(
     if system is not None:
         flow.check_system(system)
         flow = flow.bound(system)
+    else:
+        flow.take_learned()
     return flow.to(device) if device is not None else flow
 
 

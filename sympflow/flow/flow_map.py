@@ -108,6 +108,8 @@ class FlowMap(nn.Module):
     lattice_terms: Mapping[str, str] = MappingProxyType({})
     unfitted: tuple[tuple[float, float], ...] = ()
     drive_times: tuple[float, float] | None = None
+    learned: HamiltonianSystem | None = None
+    """The system that `sympflow.learn` found, of the flow that it made."""
 
     def __init__(self, ndof: int, dt: float) -> None:
         super().__init__()
@@ -483,8 +485,11 @@ class FlowMap(nn.Module):
 
     @property
     def system(self) -> HamiltonianSystem | None:
-        """The system whose functions the flow evaluates; None for networks, and for a flow loaded without it."""
-        return None
+        """The system whose functions the flow evaluates, or which was learned with it; None for other networks.
+
+        None too for a flow that was loaded without its system, unless that was learned.
+        """
+        return self.learned
 
     @property
     def origin(self) -> Origin | None:
@@ -583,6 +588,18 @@ class FlowMap(nn.Module):
                 f"`system` {system.name!r} is not the one that this flow was trained for ({self.system_name!r}, or its "
                 f"parameters differ): {remedy}"
             )
+
+    def take_learned(self, system: HamiltonianSystem | None = None) -> None:
+        """Bind the system that was learned with the flow: as it was found, or as the file tells that has the flow."""
+        told = self.recipe.get("learned")
+        if system is None and told is not None and self.identity is not None and self.identity.expression is not None:
+            expression, damping = self.identity.expression, told.get("damping")
+            name = self.system_name or "learned"
+            system = HamiltonianSystem.from_sympy(expression, damping=damping, name=name, domain=self.domain)
+            self.check_system(system)
+        if system is not None:
+            self.learned = system
+            self.bound(system)
 
     def is_without_friction_of(self, system: HamiltonianSystem) -> bool:
         """Return True if the flow is that of a damped system without its friction."""
