@@ -41,10 +41,16 @@ class LocalHamiltonian(Definition):
         M⁻¹ of T = ½ pᵀM⁻¹p; None if it is the identity or T is not quadratic.
     quadratic_kinetic : bool
     params : mapping of str to float or ndarray
+    shape : tuple of int
+        Sites along the axes of a lattice; () of another system.
+    ends : tuple of str
+        How each axis of a lattice ends.
     """
 
     separable = True
     has_third_derivative = True
+    shape: tuple[int, ...] = ()
+    ends: tuple[str, ...] = ()
     loops: str
     inverse_mass: np.ndarray | None
     quadratic_kinetic: bool
@@ -85,9 +91,32 @@ class LocalHamiltonian(Definition):
             "V, such as 'srkn6b'."
         )
 
-    def is_piece_of(self, other: LocalHamiltonian | None) -> bool:
-        """Return True if the other has the same terms, however many of them."""
+    def piece(self, sites: Any = None, boundary: Any = "periodic") -> Self:
+        """Return the definition with the same terms on a few sites: see `HamiltonianSystem.piece`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there is none.
+        """
+        raise TypeError(
+            f"`system` is no lattice, of which a few sites are a piece: make a smaller one by HamiltonianSystem."
+            f"{self.loops}."
+        )
+
+    @property
+    def uniform(self) -> bool:
+        """True if all sites are alike, so that a few of them tell all of the rest."""
         return False
+
+    @property
+    def terms(self) -> dict[str, str]:
+        """The terms by name, as texts, for messages; {} where there are no pieces."""
+        return {}
+
+    def written_out(self) -> sp.Expr:
+        """H of a lattice by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters."""
+        raise NotImplementedError(f"{type(self).__name__} must define written_out().")
 
     def potential_hessian(self, q: Array, *t: Array) -> Array:
         """∇²V(q), dense: (..., d) to (..., d, d).
