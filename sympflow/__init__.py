@@ -32,6 +32,7 @@ _HOME = {
     "load": "flow.files",
     "shipped_flows": "flow.shipped",
     "train": "training.trainer",
+    "discover": "learning.discovery",
     "Trajectories": "learning.trajectories",
     "compare": "studies.comparison",
     "work_precision": "studies.precision",
@@ -81,6 +82,7 @@ if TYPE_CHECKING:
     from sympflow.integrators.registry import get as get
     from sympflow.integrators.registry import register as register
     from sympflow.integrators.splitting import splitting_method as splitting_method
+    from sympflow.learning.discovery import discover as discover
     from sympflow.learning.trajectories import Trajectories as Trajectories
     from sympflow.metrics.accuracy import reference_error as reference_error
     from sympflow.metrics.accuracy import time_reversal_error as time_reversal_error
