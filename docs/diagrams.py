@@ -22,7 +22,10 @@ ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("training",), "fits of flows to a known H, and what ships"),
     (("metrics",), "energy, symplecticity, accuracy: of the map as executed"),
     (("solver",), "solve(): checks, picks the integrator, returns a Solution"),
-    (("solution", "interop"), "the result; SciPy, torchdiffeq, torchode: our methods there"),
+    (
+        ("solution", "interop"),
+        "the result; SciPy, torchdiffeq, torchode: our methods there",
+    ),
     (("integrators",), "scheme × splitting × clock; the driver; the registry"),
     (("flow",), "trained maps ψ̄ and their families; files; certificates"),
     (("kernels",), "compiled loops behind one protocol"),
@@ -38,12 +41,23 @@ ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
 """The rooms from the top down, as the layers of import-linter: each row imports from the rows below it only."""
 
 SOLVE: tuple[tuple[str, str, tuple[str, ...]], ...] = (
-    ("solve(system, method, t_span, y0, …)", "", ("checks every argument before anything runs",)),
-    ("registry.build(method)", "a name, a class, an instance or a flow", ("the only place where names are looked up",)),
+    (
+        "solve(system, method, t_span, y0, …)",
+        "",
+        ("checks every argument before anything runs",),
+    ),
+    (
+        "registry.build(method)",
+        "a name, a class, an instance or a flow",
+        ("the only place where names are looked up",),
+    ),
     (
         "Integrator",
         "",
-        ("immutable: scheme × splitting × clock, dt, options", "order, symplectic, check(system)"),
+        (
+            "immutable: scheme × splitting × clock, dt, options",
+            "order, symplectic, check(system)",
+        ),
     ),
     (
         "Stepper",
@@ -61,12 +75,23 @@ SOLVE: tuple[tuple[str, str, tuple[str, ...]], ...] = (
             "finds what is not finite, places outputs, finds events",
         ),
     ),
-    ("Solution", "", ("t, y, status, message, stats, sol(t); each failure names its remedy",)),
+    (
+        "Solution",
+        "",
+        ("t, y, status, message, stats, sol(t); each failure names its remedy",),
+    ),
 )
 """The way of y0 through `solve`: the box, the word on the arrow to it, and what happens there."""
 
 
-def text(x: float, y: float, words: str, size: int = 14, colour: str = INK, weight: str = "normal") -> str:
+def text(
+    x: float,
+    y: float,
+    words: str,
+    size: int = 14,
+    colour: str = INK,
+    weight: str = "normal",
+) -> str:
     """A line of text that begins at (x, y)."""
     return f'<text x="{x:g}" y="{y:g}" font-size="{size}" fill="{colour}" font-weight="{weight}">{escape(words)}</text>'
 
@@ -92,7 +117,12 @@ def picture(title: str, height: float, parts: list[str]) -> str:
         f'<path d="M 0 0 L 8 4 L 0 8 z" fill="{RULE}"/></marker></defs>'
     )
     ground = f'<rect width="{WIDTH}" height="{height:g}" rx="8" fill="#ffffff"/>'
-    return "\n".join([head, f"<title>{escape(title)}</title>", marker, ground, *parts, "</svg>"]) + "\n"
+    return (
+        "\n".join(
+            [head, f"<title>{escape(title)}</title>", marker, ground, *parts, "</svg>"]
+        )
+        + "\n"
+    )
 
 
 def rooms() -> str:
@@ -118,7 +148,10 @@ def solve() -> str:
         height = 20 + LINE * len(lines)
         parts.append(box(MARGIN, y, left, height))
         parts.append(text(MARGIN + 12, y + height / 2 + 5, name, 14, INK, "600"))
-        parts += [text(MARGIN + left + 22, y + 24 + LINE * k, line, 14, SOFT) for k, line in enumerate(lines)]
+        parts += [
+            text(MARGIN + left + 22, y + 24 + LINE * k, line, 14, SOFT)
+            for k, line in enumerate(lines)
+        ]
         if i < len(SOLVE) - 1:
             parts.append(arrow(MARGIN + 60, y + height + 2, GAP + 2))
             following = SOLVE[i + 1][1]

@@ -325,6 +325,11 @@ _OMELYAN = (
     "integration of motion in classical and quantum systems, Phys. Rev. E 66 (2002) 026701"
 )
 
+_NEARLY_INTEGRABLE = (
+    "S. Blanes, F. Casas, A. Farrés, J. Laskar, J. Makazaga and A. Murua, New families of symplectic splitting methods "
+    "for numerical integration in dynamical astronomy, Appl. Numer. Math. 68 (2013) 58–72"
+)
+
 _YOSHIDA4_WEIGHT = 1.0 / (2.0 - 2.0 ** (1.0 / 3.0))
 _SUZUKI4_WEIGHT = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 _ROOT19 = sqrt(19.0)
@@ -480,6 +485,70 @@ _TABLE = (
         ),
         f"{_BLANES_MOAN}, table 3, SRKN 14a",
         nystrom=True,
+    ),
+    _scheme(
+        "aba104",
+        4,
+        _drift_first(
+            _even_palindrome(
+                (
+                    0.04706710064597250612947887637243678556564,
+                    0.1847569354170881069247376193702560968574,
+                    0.2827060056798362053243616565541452479160,
+                )
+            ),
+            _palindrome(
+                (
+                    0.1188819173681970199453503950853885936957,
+                    0.2410504605515015657441667865901651105675,
+                    -0.2732866667053238060543113981664559460630,
+                )
+            ),
+        ),
+        f"{_NEARLY_INTEGRABLE}, ABA (10, 4): errors of order εh¹⁰ + ε²h⁴ where kicks are small, of order ε",
+    ),
+    _scheme(
+        "aba864",
+        4,
+        _drift_first(
+            _even_palindrome(
+                (
+                    0.0711334264982231177779387300061549964174,
+                    0.241153427956640098736487795326289649618,
+                    0.521411761772814789212136078067994229991,
+                )
+            ),
+            _palindrome(
+                (
+                    0.183083687472197221961703757166430291072,
+                    0.310782859898574869507522291054262796375,
+                    -0.0265646185119588006972121379164987592663,
+                )
+            ),
+        ),
+        f"{_NEARLY_INTEGRABLE}, ABA (8, 6, 4): errors of order εh⁸ + ε²h⁶ + ε³h⁴ where kicks are small, of order ε",
+    ),
+    _scheme(
+        "aba1064",
+        4,
+        _drift_first(
+            _palindrome(
+                (
+                    0.03809449742241219545697532230863756534060,
+                    0.1452987161169137492940200726606637497442,
+                    0.2076276957255412507162056113249882065158,
+                    0.4359097036515261592231548624010651844006,
+                )
+            ),
+            _even_palindrome(
+                (
+                    0.09585888083707521061077150377145884776921,
+                    0.2044461531429987806805077839164344779763,
+                    0.2170703479789911017143385924306336714532,
+                )
+            ),
+        ),
+        f"{_NEARLY_INTEGRABLE}, ABA (10, 6, 4): errors of order εh¹⁰ + ε²h⁶ + ε³h⁴ where kicks are small, of order ε",
     ),
     _scheme(
         "chin4a",

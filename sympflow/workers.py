@@ -10,9 +10,11 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import reprlib
 import signal
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
@@ -205,6 +207,16 @@ class _Call:
 Numbered = tuple[int, int, Any]
 
 
+class _Clock:
+    """The seconds that are left to wait for answers: None without an end."""
+
+    def __init__(self, timeout: float | None) -> None:
+        self.end = None if timeout is None else time.monotonic() + timeout
+
+    def left(self) -> float | None:
+        return None if self.end is None else max(0.0, self.end - time.monotonic())
+
+
 def mapped(
     function: Callable[[Any, Any], Any],
     common: Any,
@@ -212,6 +224,7 @@ def mapped(
     workers: Any = 1,
     *,
     processes: bool = False,
+    timeout: float | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """Yield the index of each item and `function(common, item)`, in the order in which they are ready.
 
@@ -226,19 +239,25 @@ def mapped(
         See the module's docstring.
     processes : bool
         True if a number of workers is one of processes, because Python code runs for long; else they are threads.
+    timeout : float, optional
+        Seconds to wait for answers in all, where they come from an `Executor`, from futures, or a number of workers.
 
     Raises
     ------
     LostWorkers
         If workers die again and again.
+    TimeoutError
+        After `timeout` seconds: what is not begun is cancelled, what is under way is not waited for.
+    TypeError
+        If the `.map` of `workers` does not return the results.
     Unpicklable
         If processes cannot be sent `common`.
     Exception
         What `function` raises, at the first item for which it does.
     """
     workers = checked_workers(workers)
-    call, left = _Call(function, Parcel(common)), dict(enumerate(items))
-    answers = _rounds(1 if isinstance(workers, int) and len(left) < 2 else workers, call, processes)
+    call, left, clock = _Call(function, Parcel(common)), dict(enumerate(items)), _Clock(timeout)
+    answers = _rounds(1 if isinstance(workers, int) and len(left) < 2 else workers, call, processes, clock)
     attempt = idle = 0
     while left:
         done = 0
@@ -246,9 +265,12 @@ def mapped(
             for answer in answers([(attempt, index, item) for index, item in left.items()]):
                 if answer.error is not None:
                     raise answer.error
-                del left[answer.index]
+                if left.pop(answer.index, _Lost) is _Lost:  # some engines do a call twice
+                    continue
                 done += 1
                 yield answer.index, answer.value
+            if left and not done:
+                raise _no_results(len(left), "nothing")
         except _Lost as loss:
             attempt, idle = attempt + 1, 0 if done else idle + 1
             if idle >= TRIES:
@@ -265,7 +287,7 @@ def mapped(
                     RuntimeWarning,
                     stacklevel=2,
                 )
-                workers, answers = n, _rounds(n, call, processes=True)
+                workers, answers = n, _rounds(n, call, True, clock)
 
 
 class Crew:
@@ -288,7 +310,9 @@ class Crew:
         """True if all is done on this thread."""
         return isinstance(self.workers, int) and self.workers == 1
 
-    def map(self, function: Callable[[Any, Any], Any], common: Any, items: Sequence[Any]) -> Iterator[Any]:
+    def map(
+        self, function: Callable[[Any, Any], Any], common: Any, items: Sequence[Any], timeout: float | None = None
+    ) -> Iterator[Any]:
         """Yield `function(common, item)` of each item, in their order; raises as `mapped` does."""
         workers = self.workers
         if isinstance(workers, int) and workers > 1 and len(items) > 1:
@@ -297,7 +321,7 @@ class Crew:
             workers = self._pool
         early: dict[int, Any] = {}
         following = 0
-        for index, value in mapped(function, common, items, workers):
+        for index, value in mapped(function, common, items, workers, timeout=timeout):
             early[index] = value
             while following in early:
                 yield early.pop(following)
@@ -320,18 +344,18 @@ def _leave_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _rounds(workers: Any, call: _Call, processes: bool) -> Callable[[list[Numbered]], Iterable[Answer]]:
+def _rounds(workers: Any, call: _Call, processes: bool, clock: _Clock) -> Callable[[list[Numbered]], Iterable[Answer]]:
     """Return the function that gives the answers of numbered items, as they come, by such workers."""
     if not isinstance(workers, int):
         if isinstance(workers, ProcessPoolExecutor):
             call.common.pack()
-        return partial(_by_map, workers, call)
+        return partial(_by_map, workers, call, clock)
     if workers == 1:
         return partial(map, call)
     if not processes:
-        return partial(_in_pool, partial(ThreadPoolExecutor, workers), call, 2 * workers)
+        return partial(_in_pool, partial(ThreadPoolExecutor, workers), call, 2 * workers, clock)
     call.common.pack()
-    return partial(_in_pool, partial(ProcessPoolExecutor, workers, _context()), call, 2 * workers)
+    return partial(_in_pool, partial(ProcessPoolExecutor, workers, _context()), call, 2 * workers, clock)
 
 
 class _Lost(Exception):
@@ -347,7 +371,9 @@ def _context() -> Any:
     return multiprocessing.get_context("spawn")
 
 
-def _in_pool(make: Callable[[], Executor], call: _Call, most: int, todo: list[Numbered]) -> Iterator[Answer]:
+def _in_pool(
+    make: Callable[[], Executor], call: _Call, most: int, clock: _Clock, todo: list[Numbered]
+) -> Iterator[Answer]:
     """Answers as they come, from a pool that is closed afterwards; never more than `most` calls are under way."""
     pool = make()
     waiting = iter(todo)
@@ -360,7 +386,9 @@ def _in_pool(make: Callable[[], Executor], call: _Call, most: int, todo: list[Nu
                     break
             if not under_way:
                 break
-            ready, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+            ready, under_way = wait(under_way, clock.left(), return_when=FIRST_COMPLETED)
+            if not ready:
+                raise TimeoutError
             lost = None
             for future in ready:
                 try:
@@ -377,18 +405,23 @@ def _in_pool(make: Callable[[], Executor], call: _Call, most: int, todo: list[Nu
         pool.shutdown(wait=isinstance(pool, ThreadPoolExecutor), cancel_futures=True)
 
 
-def _by_map(workers: Any, call: _Call, todo: list[Numbered]) -> Iterator[Answer]:
+def _by_map(workers: Any, call: _Call, clock: _Clock, todo: list[Numbered]) -> Iterator[Answer]:
     """Answers by the `.map` of an engine, in the order of the calls; of futures, of all that were not lost."""
     lost: BaseException | None = None
     try:
-        for given in _map_of(workers)(call, todo):
+        answers = _map_of(workers, clock)(call, todo)
+        if not isinstance(answers, Iterable):
+            raise _no_results(len(todo), reprlib.repr(answers))
+        for given in answers:
             try:
-                answer = given if isinstance(given, Answer) else given.result()
+                answer = given if isinstance(given, Answer) else _result_of(given, clock)
             except Exception as error:
                 if not _is_loss(error):
                     raise
                 lost = error
                 continue
+            if not isinstance(answer, Answer):
+                raise _no_results(len(todo), f"{reprlib.repr(given)} among others")
             yield answer
     except Exception as error:
         if not _is_loss(error):
@@ -398,7 +431,23 @@ def _by_map(workers: Any, call: _Call, todo: list[Numbered]) -> Iterator[Answer]
         raise _Lost(f"{type(lost).__name__}: {lost}") from lost
 
 
-def _map_of(workers: Any) -> Callable[[_Call, list[Numbered]], Iterable[Any]]:
+def _result_of(future: Any, clock: _Clock) -> Any:
+    """The result of a future, None of what is none."""
+    result = getattr(future, "result", None)
+    if not callable(result):
+        return None
+    left = clock.left()
+    return result() if left is None else result(timeout=left)
+
+
+def _no_results(n: int, got: str) -> TypeError:
+    return TypeError(
+        f"`workers` must return the results of the {n} calls of its .map, or futures of them; it returns {got}. An "
+        "engine has the signature of Python's map: .map(function, items)."
+    )
+
+
+def _map_of(workers: Any, clock: _Clock) -> Callable[[_Call, list[Numbered]], Iterable[Any]]:
     """Return the map of an engine."""
     joblib = sys.modules.get("joblib")
     if joblib is not None and isinstance(workers, joblib.Parallel):
@@ -406,6 +455,8 @@ def _map_of(workers: Any) -> Callable[[_Call, list[Numbered]], Iterable[Any]]:
     pools = sys.modules.get("multiprocessing.pool")
     if pools is not None and isinstance(workers, pools.Pool) and not isinstance(workers, pools.ThreadPool):
         return lambda call, todo: _watched(workers, call, todo)
+    if isinstance(workers, Executor) and (left := clock.left()) is not None:
+        return partial(workers.map, timeout=left)
     return getattr(workers, "map", workers)
 
 

@@ -7,10 +7,13 @@ import runpy
 import subprocess
 import sys
 import tomllib
+from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import sympflow
 from sympflow import shipped_flows
 from sympflow.integrators import registry
 
@@ -28,7 +31,9 @@ def blocks(page):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if blocks(page) and page.stem != "gallery"], ids=lambda page: page.stem
+)
 @pytest.mark.filterwarnings("default")
 def test_the_code_on_a_page_runs(page, tmp_path, monkeypatch):
     """In a namespace of its own and an empty folder; the README in an interpreter of its own, as its reader has it."""
@@ -52,6 +57,34 @@ def test_the_code_on_a_page_runs(page, tmp_path, monkeypatch):
     runpy.run_path(str(script), run_name="page")
 
 
+@pytest.mark.slow
+def test_the_code_of_the_gallery_draws(tmp_path, monkeypatch):
+    """A hundredth of each run, by array operations; `python docs/gallery.py` runs them in full."""
+
+    def briefly(function):
+        def run(system, method, t_span, y0=None, **options):
+            if "t_eval" in options:
+                times = np.asarray(options["t_eval"]) / 100
+                options["t_eval"] = times[:: 1 + len(times) // 20]
+            if function is solve and method != "rk45":
+                options["backend"] = "array"
+            return function(system, method, (0, t_span[1] / 100), y0, **options)
+
+        return run
+
+    solve = sympflow.solve
+    for name in ("solve", "poincare_section", "sali", "escape_times"):
+        monkeypatch.setattr(sympflow, name, briefly(getattr(sympflow, name)))
+    gallery = runpy.run_path(str(ROOT / "docs" / "gallery.py"))
+    monkeypatch.setitem(gallery["draw"].__globals__, "PICTURES", tmp_path)
+    gallery["draw"](set())
+    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"\(figures/gallery/(.+?)\)", page))
+    assert shown == {path.name for path in tmp_path.iterdir()}
+    assert shown == {path.name for path in (ROOT / "docs" / "figures" / "gallery").iterdir()}
+    assert len(shown) == page.count("\n### ")
+
+
 def test_the_table_of_flows_is_that_of_the_package():
     assert shipped_flows().table() in (MEASURED / "flows.md").read_text(encoding="utf-8")
 
@@ -62,6 +95,30 @@ def test_relative_links_lead_somewhere():
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
+def test_every_image_says_what_it_shows():
+    for page in PAGES:
+        for words in re.findall(r"!\[([^\]]*)\]\(", page.read_text(encoding="utf-8")):
+            assert len(words) > 10, f"{page.name} has an image without a description"
+
+
+def test_the_code_on_a_page_is_not_wider_than_it():
+    for page in PAGES[1:]:
+        for code in re.findall(r"^```\w*\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+            assert max(map(len, code.splitlines())) <= 88, f"{page.name}:\n{code}"
+
+
+def test_formulas_are_tex_that_can_be_typeset():
+    pytest.importorskip("math_core", reason='formulas need pip install "sympflow[docs]"')
+    mathml = runpy.run_path(str(ROOT / "docs" / "typeset.py"))["mathml"]
+    assert "<mfrac>" in mathml(r"\frac{1}{2}")
+    with pytest.raises(ValueError, match="frca"):
+        mathml(r"\frca{1}{2}")
+    for page in PAGES[1:]:
+        text = re.sub(r"^```.*?^```$|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+        for display, inline in re.findall(r"\$\$(.+?)\$\$|\$([^$]+)\$", text, re.DOTALL):
+            assert mathml(display or inline).startswith("<math")
+
+
 def test_every_page_is_in_the_navigation():
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     for page in PAGES[1:]:
@@ -69,24 +126,75 @@ def test_every_page_is_in_the_navigation():
 
 
 def test_every_public_name_is_in_the_reference():
-    import sympflow
-
     reference = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference").glob("*.md"))
     for name in sympflow.__all__:
         home = sympflow._HOME.get(name)
         assert home is None or any(f"::: sympflow.{home}{end}" in reference for end in (f".{name}", "\n")), name
 
 
+RAW_TEX = re.compile(r"\$[^$\n]*[\\_^][^$\n]*\$|\\(frac|bar|nabla|partial|mathcal|sum|int)(?![a-z])|\\[()\[\]]")
+
+
+class Page(HTMLParser):
+    """A page of the site as a reader gets it: its words without code, and where its links, images and scripts lead."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.words, self.targets, self.navigation, self.ids, self.nameless, self.open = "", [], [], set(), [], []
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.ids |= {values.get("id"), values.get("name")}
+        target = values.get("href") if tag in ("a", "link") else values.get("src")
+        if target:
+            self.targets.append(target)
+            if "md-nav__link" in (values.get("class") or ""):
+                self.navigation.append(target)
+        if tag == "img" and not values.get("alt"):
+            self.nameless.append(target)
+        if tag in ("code", "pre", "script", "style", "math"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if self.open and tag == self.open[-1]:
+            self.open.pop()
+
+    def handle_data(self, data):
+        if not self.open:
+            self.words += data
+
+
 @pytest.mark.slow
-def test_the_site_builds_without_warnings(tmp_path):
+def test_the_site_is_whole(tmp_path):
+    """No warning, raw TeX, dead link, page that no list leads to, image without words, or script from the network."""
     pytest.importorskip("mkdocs", reason='the site needs pip install "sympflow[docs]"')
     pytest.importorskip("mkdocstrings", reason='the site needs pip install "sympflow[docs]"')
-    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path / "site")]
+    site = tmp_path / "site"
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(site)]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
     run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stdout + run.stderr
-    page = (tmp_path / "site" / "reference" / "solve" / "index.html").read_text(encoding="utf-8")
-    assert "poincare_section" in page
+    pages = {path: Page(path) for path in sorted(site.rglob("*.html")) if path.name != "404.html"}
+    assert "poincare_section" in pages[site / "reference" / "solve.html"].words
+    assert "__index = " in (site / "search" / "search_index.js").read_text(encoding="utf-8")
+    reached = set()
+    for path, page in pages.items():
+        raw = re.search(
+            r"\$[^$\n]*[\\_^][^$\n]*\$|\\(frac|bar|nabla|partial|mathcal|sum|int)(?![a-z])|\\[()\[\]]", page.words
+        )
+        assert raw is None, f"{path.name} shows TeX: {raw[0]}"
+        assert not page.nameless, f"{path.name} shows {page.nameless} without a description"
+        for target in page.targets:
+            address, _, anchor = target.partition("#")
+            if re.match(r"(https?|mailto|data|javascript):", address):
+                assert not target.endswith((".js", ".css")), f"{path.name} loads {target}"
+                continue
+            there = (path.parent / address).resolve() if address else path
+            assert there.exists(), f"{path.name} leads to {target}"
+            assert not anchor or there not in pages or anchor in pages[there].ids, f"{path.name} leads to {target}"
+        reached |= {(path.parent / target.partition("#")[0]).resolve() for target in page.navigation}
+    assert reached >= {path.resolve() for path in pages}
 
 
 # figures ----------------------------------------------------------------------------------------------

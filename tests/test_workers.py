@@ -60,6 +60,31 @@ def test_engines_of_one_process():
                 collected(fail, 3, workers)
 
 
+class Returns:
+    """An engine that does the calls, and returns something else."""
+
+    def __init__(self, returned):
+        self.returned = returned
+
+    def map(self, function, items):
+        return self.returned([function(item) for item in items])
+
+
+def test_engines_that_do_not_return_the_results():
+    for returned, got in ((lambda _: None, "None"), (lambda _: [], "nothing"), (lambda a: [a[0], 7], "7 among others")):
+        with pytest.raises(TypeError, match=rf"`workers` must return the results .*; it returns {got}\."):
+            collected(plus_square, 3, Returns(returned))
+    few = Returns(lambda answers: [answers[0], *answers[:4]])
+    assert collected(plus_square, 3, few) == EXPECTED
+    with ThreadPoolExecutor(1) as pool:
+        ended = threading.Event()
+        pool.submit(ended.wait)
+        for workers in (pool, Futures(pool)):
+            with pytest.raises(TimeoutError):
+                collected(plus_square, 3, workers, timeout=0.05)
+        ended.set()
+
+
 def test_joblib():
     joblib = pytest.importorskip("joblib")
     assert collected(plus_square, 3, joblib.Parallel(2, backend="threading")) == EXPECTED

@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.ensembles.chunks import Chunk
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.solution import SMALLEST_SCALE
 
 Fields = dict[str, tuple[tuple[int, ...], np.dtype]]
@@ -49,6 +50,11 @@ class Reduction(ABC):
     """The field that holds states [q, p] along its first axis, which a Dataset has as q and p."""
     takes_params: ClassVar[bool] = False
     """True if the orbits of a chunk may have different parameters, those of `chunk.params`."""
+    own_loops: ClassVar[bool] = False
+    """True if it walks along the orbits by loops of its own, from `chunk.y0`."""
+
+    def check(self, system: HamiltonianSystem) -> None:  # noqa: B027
+        """Raise ValueError if it has no meaning for a system; of a grid of parameters each value is asked."""
 
     @abstractmethod
     def fields(self, problem: Chunk) -> Fields:
@@ -101,9 +107,11 @@ class EnergyError(Reduction):
     It is absolute where |H(y0)| is below 1e-12, and relative to the system's `energy_scale` if it has one.
     """
 
+    def check(self, system: HamiltonianSystem) -> None:
+        system.check_conservative("so its energy is lost and no error", "use another `reduce`, such as 'final'")
+        system.check_autonomous("so its energy is not kept", "use another `reduce`, such as 'final'")
+
     def fields(self, problem: Chunk) -> Fields:
-        problem.system.check_conservative("so its energy is lost and no error", "use another `reduce`, such as 'final'")
-        problem.system.check_autonomous("so its energy is not kept", "use another `reduce`, such as 'final'")
         return {"energy_error": ((), np.dtype(float))}
 
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,7 @@ from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.provenance import provenance
 from sympflow.integrators.registry import build, check_applies
 from sympflow.kernels.modules import at_most, compiling_alone
-from sympflow.solver import BACKENDS, check_own_parameters
+from sympflow.solver import check_backend, check_own_parameters
 from sympflow.workers import LostWorkers, Parcel, Unpicklable, checked_workers, mapped
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def ensemble(
         Go on with the store of the same ensemble, if there is one: what is there is not done again.
     progress : bool or callable
         True prints how far the ensemble is; a callable is called with the numbers of orbits done and in all.
-    backend : "auto", "compiled" or "array"
+    backend : "auto", "compiled", "array" or "cuda"
         As for `solve`.
     **options
         Options of the method.
@@ -132,13 +132,17 @@ def ensemble(
     integrator = build(method, options)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
-    if not isinstance(backend, str) or backend not in BACKENDS:
-        raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
+    check_backend(backend, integrator)
     workers = checked_workers(workers)
     check_flag("resume", resume)
     if resume and store is None:
         raise ValueError("`resume` goes on with a `store`: name one.")
     kept = reduction(reduce)
+    if backend == "cuda" and kept.own_loops:
+        raise ValueError(
+            f"`backend` 'cuda' is for a `reduce` of states; {type(kept).__name__} runs loops of its own, which are "
+            "those of the CPU: use backend='auto'."
+        )
     orbits = initial_states(system, y0, n, seed)
     fixed, axes = _axes(system, params)
     check_own_parameters(system, {**fixed, **axes}, integrator)
@@ -147,6 +151,8 @@ def ensemble(
     first = orbits.states(0, min(len(orbits), SHORTEST_CHUNK))
     integrator = integrator.resolved(system, first, abs(t1 - t0))
     check_applies(integrator, system, first)
+    for system_of in _telling(system, axes):
+        kept.check(system_of)
     varied = kept.takes_params and _runs_together(system, integrator, (t0, t1), axes, first, backend)
     task = Task(system, integrator, (t0, t1), times, axes, kept, backend, varied=varied)
     problem = task.problem(first)
@@ -219,6 +225,23 @@ def _axes(
     return fixed, axes
 
 
+def _general(axes: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Values of the parameters of which none makes its part of H vanish, or simpler, if there are such."""
+    return {name: float(values[np.argmax(~np.isin(values, (0, 1, -1)))]) for name, values in axes.items()}
+
+
+def _telling(system: HamiltonianSystem, axes: Mapping[str, np.ndarray]) -> Iterator[HamiltonianSystem]:
+    """The systems that tell at once what a reduction is not for: with the first values, and with general ones."""
+    if not axes:
+        yield system
+        return
+    for values in ({name: float(values[0]) for name, values in axes.items()}, _general(axes)):
+        try:
+            yield system.with_params(**values)
+        except (ValueError, TypeError):  # orbits of values without a system are rows that fail
+            continue
+
+
 def _runs_together(
     system: HamiltonianSystem,
     integrator: Integrator,
@@ -236,9 +259,9 @@ def _runs_together(
 
     if not axes or system.symbols is None:
         return False
-    general = {name: values[np.argmax(~np.isin(values, (0, 1, -1)))] for name, values in axes.items()}
+    general = {name: np.array([value]) for name, value in _general(axes).items()}
     try:
-        (rows,) = ParameterRows(system, {name: np.array([value]) for name, value in general.items()}).by_form()
+        (rows,) = ParameterRows(system, general).by_form()
     except ValueError:
         return False
     problem = Problem(rows.system, *t_span, y0[:1], backend=backend, letters=rows.letters)
@@ -353,6 +376,7 @@ def run_piece(task: Task, item: tuple[Block, Given | Drawn]) -> Done:
                 named, start = dict(zip(task.axes, map(float, values), strict=True)), i * len(y0)
                 try:
                     chunk = task.chunk(named, y0, block.first + start)
+                    task.reduction.check(chunk.system)
                 except (ValueError, TypeError) as error:
                     parts.append(_without_a_system(task, len(y0), start, named, error))
                 else:
@@ -370,10 +394,10 @@ def _reduced(task: Task, chunk: Chunk, start: int) -> Done:
 
 
 def _without_a_system(task: Task, n: int, start: int, values: Mapping[str, float], error: Exception) -> Done:
-    """The orbits of values of the parameters for which there is no system: all failed."""
+    """The orbits of values of the parameters for which there is no system, or no such reduction: all failed."""
     fields = {name: np.full((n, *shape), np.nan, dtype) for name, (shape, dtype) in task.fields.items()}
     shown = ", ".join(f"{name} = {value:.9g}" for name, value in values.items())
-    text = f"`params` has {shown}, for which there is no system: {error}"[:LONGEST_MESSAGE]
+    text = f"`params` has {shown}: {error}"[:LONGEST_MESSAGE]
     return Done(fields, np.full(n, FAILED, dtype=np.int8), dict.fromkeys(range(start, start + n), text))
 
 

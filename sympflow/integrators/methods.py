@@ -54,6 +54,12 @@ def _of(name: str, addition: str) -> str:
     return SCHEMES[name].source + addition
 
 
+LINEAR = (
+    *("srkn6b", "srkn11b", "srkn14a", "omelyan4", "aba104", "aba864", "aba1064"),
+    *("blanes_moan4", "kahan_li6", "kahan_li8"),
+)
+"""The schemes that have a name with the exact linear flow."""
+
 TRIPLES: dict[str, Triple] = {
     **{name: Triple(name, source=scheme.source) for name, scheme in SCHEMES.items()},
     "impulse": Triple("verlet", "linear", source=_IMPULSE),
@@ -61,7 +67,7 @@ TRIPLES: dict[str, Triple] = {
     "implicit_explicit": Triple("verlet", "midpoint", source=_MIDPOINT),
     **{
         f"linear_{name}": Triple(name, "linear", source=_of(name, f", with the exact linear flow; {_LINEAR}"))
-        for name in ("srkn6b", "srkn11b", "srkn14a", "omelyan4")
+        for name in LINEAR
     },
     "strang_parts": Triple(
         "verlet", "parts", source="G. Strang, SIAM J. Numer. Anal. 5 (1968) 506–517, for any number of parts"

@@ -46,8 +46,8 @@ def hint(library: Library, smooth: Smooth, data: Trajectories) -> str:
         (
             rest,
             f"Friction p' = -γp with γ = {', '.join(f'{g:.3g}' for g in rates)} would leave much less: the data are "
-            "dissipative, areas of phase space shrink as exp(-γt), and no symplectic map explains them. Learn a flow with "
-            "damping.",
+            "dissipative, areas of phase space shrink as exp(-γt), and no symplectic map explains them. Learn a flow "
+            "with damping.",
         )
     )
     if d > 1:

@@ -36,6 +36,15 @@ from sympflow.systems.textbook import (
     spring_pendulum,
 )
 from sympflow.systems.user_files import from_toml
+from sympflow.systems.waves import (
+    fput_beta,
+    grid,
+    nonlinear_schroedinger,
+    phi4,
+    sine_gordon,
+    toda_chain,
+    wave_equation,
+)
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -70,6 +79,12 @@ SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {
     "duffing": duffing,
     "fodo-cell": fodo_cell,
     "kicked": kicked,
+    "wave-equation": wave_equation,
+    "sine-gordon": sine_gordon,
+    "phi4": phi4,
+    "nonlinear-schroedinger": nonlinear_schroedinger,
+    "toda-chain": toda_chain,
+    "fput-beta": fput_beta,
 }
 """The built-in scenes by the name that the command line uses."""
 
@@ -178,6 +193,6 @@ def _key(name: str) -> str:
 
 
 __all__ = ["SYSTEMS", "available", "from_toml", "get", "register"]
-__all__ += ["fodo_matrices", "kepler_ellipse", "lax_eigenvalues", "magnetic_moment", "oscillatory_energies"]
+__all__ += ["fodo_matrices", "grid", "kepler_ellipse", "lax_eigenvalues", "magnetic_moment", "oscillatory_energies"]
 __all__ += ["perihelion_angle"]
 __all__ += [factory.__name__ for factory in SYSTEMS.values()]

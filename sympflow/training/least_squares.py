@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.linalg import solve_triangular
 from torch import Tensor
 
 from sympflow.flow.flow_map import FlowMap
+from sympflow.kernels.gauss_newton import gauss_newton_loops
 from sympflow.training.losses import Objective
 from sympflow.training.options import LossOptions
 from sympflow.training.session import OutOfTime
@@ -73,23 +73,15 @@ class Linearized(ABC):
         """The s that minimizes ‖J s + r‖² + λ‖D s‖², and the decrease of ‖r‖² that the linear model predicts."""
 
     @abstractmethod
-    def solve(self, w: Any) -> Any:
-        """(JᵀJ + λD²)⁻¹ w."""
+    def bend(self, residuals: Callable[[Any], Any], step: Any) -> Any:
+        """The geodesic acceleration of [3]_, by which a step follows a curved valley; 0 where it would lead astray.
 
-    @abstractmethod
-    def norm(self, v: Any) -> Any:
-        """‖v‖."""
+        That of the last damping.
+        """
 
     @abstractmethod
     def moved(self, step: Any, bend: Any) -> Any:
         """x + step + bend."""
-
-    def bend(self, residuals: Callable[[Any], Any], step: Any) -> Any:
-        """The geodesic acceleration of [3]_, by which a step follows a curved valley; 0 where it would lead astray."""
-        curvature = (residuals(self.x + PROBE * step) - self.r - PROBE * (self.J @ step)) / PROBE**2
-        bend = -self.solve(self.J.T @ curvature)
-        small = 2 * self.norm(self.D * bend) <= CURVED * self.norm(self.D * step)
-        return bend if small else 0 * step  # NaN is not small
 
 
 def damped_step(
@@ -206,47 +198,27 @@ def levenberg_marquardt(
 
 
 class _Factored(Linearized):
-    """A linear model in NumPy, by QR factorizations of [J r] and, for each λ, of [R; √λ D]."""
+    """A linear model in compiled code, by QR factorizations of [J r] and, for each λ, of [R; √λ D]."""
 
     def __init__(self, x: np.ndarray, r: np.ndarray, J: np.ndarray, scale: np.ndarray) -> None:
         self.x, self.r, self.J = x, r, J
-        R = _qr(np.column_stack([J, r]), "r")[1]
-        self._R, self._projected = R[: len(x), : len(x)], R[: len(x), -1]
-        self.scale = np.maximum(scale, np.linalg.norm(self._R, axis=0))
+        self._loops, self._columns = gauss_newton_loops(), np.ascontiguousarray(J.T)
+        self._R, self.scale = self._loops.factored(self._columns, r, scale)
         self.D = np.where(self.scale > 0, self.scale, 1.0)
 
     def damp(self, damping: float) -> None:
-        Q, self._damped = _qr(np.concatenate([self._R, np.diag(np.sqrt(damping) * self.D)]), "reduced")
-        self._Q = Q[: len(self._R)]
+        self._damped, *self._newton = self._loops.damped(self._R, self.D, damping)
 
     def newton(self) -> tuple[np.ndarray, float]:
-        projected = self._projected
-        step = -self._back(self._Q.T @ projected)
-        linear = projected + self._R @ step
-        return step, projected @ projected - linear @ linear
+        step, decrease = self._newton
+        return step, decrease
 
-    def solve(self, w: np.ndarray) -> np.ndarray:
-        return self._back(self._back(w, "T"))
-
-    def norm(self, v: np.ndarray) -> Any:
-        return np.linalg.norm(v)
+    def bend(self, residuals: Callable[[np.ndarray], np.ndarray], step: np.ndarray) -> Any:
+        probed = residuals(self.x + PROBE * step)
+        return self._loops.bent(self._columns, self.r, probed, PROBE, step, self._damped, self.D, CURVED)
 
     def moved(self, step: np.ndarray, bend: np.ndarray) -> np.ndarray:
         return self.x + step + bend
-
-    def _back(self, v: np.ndarray, trans: str = "N") -> np.ndarray:
-        return solve_triangular(self._damped, v, trans=trans, check_finite=False)
-
-
-def _qr(A: np.ndarray, mode: str) -> tuple[np.ndarray, np.ndarray]:
-    """Q and R, on one thread: where others are at work too, several wait for each other a hundred times as long."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        Q, R = torch.linalg.qr(torch.from_numpy(A), mode=mode)
-    finally:
-        torch.set_num_threads(threads)
-    return Q.numpy(), R.numpy()
 
 
 # the weights of a flow --------------------------------------------------------------------------------------------
@@ -384,10 +356,14 @@ class _Normal(Linearized):
         return s, -float(s @ (self._G @ s + 2 * self._g))
 
     def solve(self, w: Tensor) -> Tensor:
+        """(JᵀJ + λD²)⁻¹ w."""
         return torch.cholesky_solve((w / self.D)[:, None], self._R, upper=True)[:, 0] / self.D
 
-    def norm(self, v: Tensor) -> Tensor:
-        return torch.linalg.vector_norm(v)
+    def bend(self, residuals: Callable[[Tensor], Tensor], step: Tensor) -> Tensor:
+        curvature = (residuals(self.x + PROBE * step) - self.r - PROBE * (self.J @ step)) / PROBE**2
+        bend = -self.solve(self.J.T @ curvature)
+        small = 2 * torch.linalg.vector_norm(self.D * bend) <= CURVED * torch.linalg.vector_norm(self.D * step)
+        return bend if small else 0 * step  # NaN is not small
 
     def moved(self, step: Tensor, bend: Tensor) -> Tensor:
         return self.x + (step + bend)

@@ -322,7 +322,7 @@ class SearchRun(Run):
         if minimum is None:
             common, n = (self.searched(), self.search_steps, deadline, False), self.done
             starts = [self.start_of(k) for k in range(n, min(n + self.ROUND, self.planned))]
-            self.coming = session.each(descended, common, starts)
+            self.coming = session.each(descended, common, starts, deadline)
             minimum = next(self.coming)
         return minimum
 

@@ -20,6 +20,7 @@ from sympflow.workers import Crew, Unpicklable
 Path = str | os.PathLike[str]
 Callback = Callable[[int, dict[str, float]], None]
 
+GRACE = 1.0  # seconds that workers have for the step that is under way when their time is up
 LEAST_PART = 1.0  # seconds that a part of a budget has at least: what is compiled and imported takes as long
 
 
@@ -129,23 +130,30 @@ class Session:
         """The moment by which all that the session does has to end."""
         return Deadline(self, math.inf if self.time_budget is None else self._began + self.time_budget)
 
-    def each(self, function: Callable[[Any, Any], Any], common: Any, items: Sequence[Any]) -> Generator[Any]:
+    def each(
+        self, function: Callable[[Any, Any], Any], common: Any, items: Sequence[Any], deadline: Deadline
+    ) -> Generator[Any]:
         """Yield `function(common, item)` of each item in order, done by the crew; the function is one of a module.
 
         What a piece of work does itself by `each` it does alone. While others work Ctrl-C raises KeyboardInterrupt
-        here. Once it has asked for the end this thread does the rest.
+        here. Once it has asked for the end, or when workers do not answer soon after the deadline, as while they start,
+        this thread does the rest.
         """
-        if self.crew.alone or self.crew_is_busy or self.interruption.asked or len(items) < 2:
+        ended = self.interruption.asked or deadline.left <= 0
+        if self.crew.alone or self.crew_is_busy or ended or len(items) < 2:
             for item in items:
                 yield function(common, item)
             return
-        answers, interruption = self.crew.map(function, common, items), self.interruption
+        patience = None if deadline.end == math.inf else deadline.left + GRACE
+        answers, interruption = self.crew.map(function, common, items, patience), self.interruption
         self.crew_is_busy = True
         try:
             for left in reversed(range(len(items))):
                 armed, interruption.armed = interruption.armed, False
                 try:
                     answer = next(answers)
+                except TimeoutError:
+                    break
                 except Unpicklable as error:
                     raise TypeError(
                         f"`system` cannot be sent to `workers` ({error}): define its functions in a module, or leave "
@@ -155,8 +163,12 @@ class Session:
                     interruption.armed = armed
                 self.crew_is_busy = left > 0
                 yield answer
+            else:
+                return
         finally:
             self.crew_is_busy = False
+        for item in items[-left - 1 :]:
+            yield function(common, item)
 
     def bar(self, total: int, label: str, start: int = 0) -> Silent:
         """The display of so many steps, as a context."""

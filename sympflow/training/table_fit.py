@@ -17,7 +17,7 @@ import copy
 import math
 import warnings
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -47,6 +47,9 @@ from sympflow.training.runs import LABEL_SHARE, SearchRun, descended
 from sympflow.training.session import Deadline, Session
 from sympflow.training.table_step import Check, TableStep
 
+if TYPE_CHECKING:
+    from sympflow.kernels.table_loops import LabelErrors
+
 SPREAD = 0.25  # of random coefficients about those of equal steps
 WIDE_SPREAD = 2.0  # without force gradients, where an order above 2 needs negative ones
 PROCESSOR_SPREAD = 0.1
@@ -58,6 +61,7 @@ SEARCH_STEPS = 60  # iterations from each start
 FROZEN_SHARE = 0.7  # of a time budget, that all work on frozen tables may use
 FRACTIONAL_TIMES = 50  # of the held-out labels; as many as of the fit where these would take longer than
 HELD_OUT_SHARE = 0.1  # of the time left
+WORTH_COMPILING = 250  # iterations of a fit, which take longer without
 LAST_EVALUATIONS = 3  # times what the held-out figures take, for what is left to do when the time is up
 CLOSE = 1.1  # held-out errors that differ by less are the same for a warning
 FEWEST_POINTS, MOST_POINTS, COORDINATES = 16, 250, 1000
@@ -124,7 +128,10 @@ class TableRun(SearchRun):
         """
         deadline = Session().deadline if deadline is None else deadline
         fractions = FRACTIONAL_TIMES
-        step, table = TableStep(system, flow.sequence, flow.tables.level, flow.monomials), Table(flow)
+        iterations = options.restarts * min(SEARCH_STEPS, options.steps) + options.steps
+        compiled = iterations >= WORTH_COMPILING
+        step = TableStep(system, flow.sequence, flow.tables.level, flow.monomials, compiled)
+        table = Table(flow)
         unit = np.array(scaling.x)
         if options.residual_weight or options.matching_weight or data is not None:
             system.check_autonomous(
@@ -199,11 +206,11 @@ class TableRun(SearchRun):
         if frozen is not None:
             for fit in filter(None, (frozen, self.weighted)):
                 common = (fit, steps, self._frozen_end, True)
-                finalists = list(session.each(descended, common, [m.x for m in finalists]))
+                finalists = list(session.each(descended, common, [m.x for m in finalists], self._frozen_end))
         starts = [self._continued(m) for m in _distinct(finalists)[:FITTED]]
         if not finalists or frozen is None or self._frozen_cost(self.given) < HOPELESS * min(m.cost for m in finalists):
             starts.insert(0, self.given)
-        fitted = list(session.each(descended, (self.whole, steps, self.whole_end, True), starts))
+        fitted = list(session.each(descended, (self.whole, steps, self.whole_end, True), starts, self.whole_end))
         best = min(fitted, key=lambda m: m.cost)
         if not math.isfinite(best.cost):
             raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
@@ -443,6 +450,11 @@ class TableFit(Fit):
         each = np.repeat(weight, self.count) / math.sqrt(self.times * self.count)
         self._scale = each / unit[:, None]
         self._slope = None if slope is None else each * slope.reshape(-1, slope.shape[-1]).T
+        self._compiled: LabelErrors | None = None
+        if step.loops is not None:
+            weights = np.empty((0, self._x.shape[1])) if self._slope is None else self._slope
+            at_start = labels.x.T, labels.t0
+            self._compiled = step.loops.errors(*at_start, self._y, self._scale, weights, design[:, step.order])
 
     def __getstate__(self) -> dict[str, Any]:
         """With the order of `design` in memory, by which its products are rounded."""
@@ -458,12 +470,18 @@ class TableFit(Fit):
         return np.repeat((self.offset + self.design @ theta).T, self.count, axis=1)
 
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
+        if self._compiled is not None:
+            return self._compiled((self.offset + self.design @ theta)[:, self.step.order], check)[0]
         with np.errstate(all="ignore"):
             y = self.step(self.coefficients(theta), self._x, check, self._t0)
             return self._rows(self._errors(y - self._y)).ravel()
 
     @np.errstate(all="ignore")  # as in the residuals: what is not finite is rejected
     def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
+        if self._compiled is not None:
+            numbers = (self.offset + self.design @ theta)[:, self.step.order]
+            r, transposed = self._compiled(numbers, check, linearized=True)
+            return r, transposed.T
         y, J = self.step.with_jacobian(self.coefficients(theta), self._x, check, self._t0)
         by_table = self._rows(self._errors(J))  # (J, (2d + 1) N, n)
         J = (by_table @ self.design).reshape(-1, self.design.shape[-1])

@@ -11,9 +11,9 @@ derivatives by the drifts hold those by the times of kicks, and E is less the wo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,6 +23,9 @@ from sympflow.hamiltonian.hamiltonian import derivative
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
+
+if TYPE_CHECKING:
+    from sympflow.kernels.table_loops import TableLoops
 
 ALONG = 1e-4  # length of the difference, relative to q, that gives the third derivative of V along M⁻¹∇V
 DENSE = 16  # degrees of freedom up to which third derivatives of a symbolic V are generated
@@ -48,15 +51,27 @@ class TableStep:
         What the kicks have beside the force: nothing, g, g and c, or a polynomial.
     monomials
         Of the polynomial.
+    compiled : bool
+        Compile the step and its derivatives, where the system has symbols: that takes two seconds, and pays for a
+        hundred evaluations.
 
     Attributes
     ----------
     balanced : bool
         True if E is a row of the states at the end.
+    order : ndarray of int
+        Where the coefficients of one map after the other stand.
+    loops : TableLoops or None
+        What is compiled.
     """
 
     def __init__(
-        self, system: HamiltonianSystem, sequence: Sequence[str], level: int, monomials: Monomials = ()
+        self,
+        system: HamiltonianSystem,
+        sequence: Sequence[str],
+        level: int,
+        monomials: Monomials = (),
+        compiled: bool = False,
     ) -> None:
         if not system.quadratic_kinetic:
             raise ValueError(
@@ -77,6 +92,13 @@ class TableStep:
         self._places = {
             kick: [kick, *(n + term * len(kicks) + j for term in range(terms))] for j, kick in enumerate(kicks)
         }
+        self.order = np.concatenate([self._places.get(i, [i]) for i in range(n)])
+        self.loops: TableLoops | None = None
+        if compiled and system.symbols is not None:
+            from sympflow.kernels.table_loops import table_loops
+
+            each = [kind == "kick" for kind in self.sequence]
+            self.loops = table_loops(system.symbols, each, int(level), monomials, system.friction)
 
     def _opened(self, y: np.ndarray, t0: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """The positions and momenta on which maps are applied, (q, t, s) and (p, 1, E) in time: (D, P) each."""
@@ -98,8 +120,11 @@ class TableStep:
     ) -> np.ndarray:
         """The step: coefficients c in the order of the sequence, then of each further term those of the kicks.
 
-        `check` is called at each kick, and may raise to end the step.
+        `check` is called at each kick, or once where the step is compiled, and may raise to end it.
         """
+        if self.loops is not None and c.shape[1] == 1:
+            check()
+            return self.loops.step(c[self.order, 0], y, t0, 2 * self.ndof + self.balanced)
         q, p = self._opened(y, t0)
         for i, kind in enumerate(self.sequence):
             if kind == "drift":
@@ -221,12 +246,12 @@ def _inverse_mass(system: HamiltonianSystem, of_time: float) -> np.ndarray:
 
 def _velocities(system: HamiltonianSystem, of_time: float) -> Callable[[np.ndarray], np.ndarray]:
     """M⁻¹p of rows (..., D), extended likewise."""
-    if system.autonomous:
-        return system.velocity
+    return system.velocity if system.autonomous else partial(_extended_velocity, system, of_time)
+
+
+def _extended_velocity(system: HamiltonianSystem, of_time: float, p: np.ndarray) -> np.ndarray:
     d = system.ndof
-    return lambda p: np.concatenate(
-        [system.velocity(p[..., :d]), of_time * p[..., d : d + 1], 0 * p[..., d + 1 :]], axis=-1
-    )
+    return np.concatenate([system.velocity(p[..., :d]), of_time * p[..., d : d + 1], 0 * p[..., d + 1 :]], axis=-1)
 
 
 def _same(v: np.ndarray) -> np.ndarray:

@@ -92,7 +92,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     with session.bar(len(starts) + bends, f"{system.name} trials") as bar:
 
         def attempt(wanted: list[Primed]) -> None:
-            answers = session.each(_trial_of, (system, domain, deadline), wanted)
+            answers = session.each(_trial_of, (system, domain, deadline), wanted, deadline)
             for start in wanted:
                 if deadline.over():
                     return

@@ -122,6 +122,23 @@ def test_values_without_a_system_fail_their_orbits():
         assert np.isfinite(result.final).all(axis=-1).tolist() == (result.status == 0).tolist()
 
 
+def test_energy_errors_where_some_values_drive_the_system():
+    H = "p**2/2 + q**2/2 - (a - b)*q*cos(t)"
+    system = sympflow.HamiltonianSystem.from_sympy(H, time="t", params={"a": 0.3, "b": 0.0})
+
+    def swept(**params):
+        how = {"params": params, "dt": 0.1, "reduce": "energy_error", "backend": "array"}
+        return sympflow.ensemble(system, "verlet", (0, 1), [[1.0, 0.0], [0.0, 1.0]], **how)
+
+    for values in ([0.0, 0.1], [0.1, 0.0]):
+        with pytest.raises(ValueError, match=r"`system` .* is driven, H depends on t, so its energy is not kept"):
+            swept(a=values)
+    result = swept(a=[0.3, 0.2], b=[0.3])
+    assert result.status.tolist() == [[[0, 0]], [[-1, -1]]]
+    assert "`params` has a = 0.2, b = 0.3: `system`" in result.messages[1, 0, 1]
+    assert np.isfinite(result.energy_error).all(axis=(1, 2)).tolist() == [True, False]
+
+
 @pytest.mark.parametrize(
     ("how", "error", "message"),
     [
@@ -138,6 +155,9 @@ def test_values_without_a_system_fail_their_orbits():
         ({"reduce": lambda t, y: "text"}, TypeError, "`reduce` must return numbers"),
         ({"reduce": lambda t, y: {"status": 1.0}}, ValueError, "`reduce` returns 'status', a name that"),
         ({"workers": "two"}, TypeError, "`workers` must be a number"),
+        ({"backend": "gpu"}, ValueError, "`backend` must be one of 'auto'"),
+        ({"backend": "cuda", "method": "dop853"}, ValueError, "`backend` 'cuda' is for splitting methods"),
+        ({"backend": "cuda", "reduce": "sali"}, ValueError, "`backend` 'cuda' is for a `reduce` of states; Sali"),
         ({"chunk": 0}, ValueError, "`chunk` must be a positive integer"),
         ({"n": 3}, ValueError, "`n` is for drawing states"),
         ({"seed": -1}, ValueError, "`seed` must be an integer"),

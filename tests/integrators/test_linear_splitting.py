@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sympflow import HamiltonianSystem, get, solve, symplecticity_defect
+from sympflow import HamiltonianSystem, get, max_energy_error, solve, symplecticity_defect
 from sympflow.hamiltonian.parts import sheared, shears
 from sympflow.integrators.methods import TRIPLES
 from sympflow.systems import fput, harmonic_oscillator, henon_heiles, spring_pendulum
@@ -158,3 +158,19 @@ def test_the_turn_is_differentiable_in_its_angle_at_whole_quarters_too(theta):
     x, y = sheared(X, Y, shears(["oscillator"], rate, angle))
     slopes = [torch.autograd.grad(value.sum(), angle, retain_graph=True)[0] for value in (x, y)]
     torch.testing.assert_close(torch.stack(slopes), torch.stack([y, -x]).detach(), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(("name", "of_step", "of_kicks"), [("aba864", 8, 1), ("aba1064", 6, 2), ("aba104", 4, 2)])
+def test_schemes_for_nearly_integrable_systems(name, of_step, of_kicks):
+    """The terms that lead at these steps, in the energy: εh⁸ of ABA (8, 6, 4), ε²h⁶ of (10, 6, 4), ε²h⁴ of (10, 4)."""
+    nearly = "p1**2/2 + p2**2/2 + q1**2/2 + 0.7*q2**2 + e*(q1**2*q2 - q2**3/3 + q1**4)"
+    strong = {"aba864": 1e-3, "aba1064": 1e-2, "aba104": 1e-3}[name]
+
+    def error(strength, h):
+        system = HamiltonianSystem.from_sympy(nearly, params={"e": strength})
+        y0 = np.array([0.5, 0.4, 0.1, 0.3])
+        return max_energy_error(solve(system, f"linear_{name}", (0, 24), y0, dt=h, backend="array"))
+
+    errors = error(strong, 0.5), error(strong, 0.375), error(strong / 4, 0.5)
+    assert np.log(errors[0] / errors[1]) / np.log(4 / 3) == pytest.approx(of_step, abs=0.8)
+    assert np.log(errors[0] / errors[2]) / np.log(4) == pytest.approx(of_kicks, abs=0.3)

@@ -87,6 +87,22 @@ def test_order_conditions_hold_up_to_the_order_and_not_beyond(scheme):
     assert defects[-1] > 1e-8, defects
 
 
+@pytest.mark.parametrize(
+    ("name", "degrees"),
+    [("aba104", {1: 10, 2: 4}), ("aba864", {1: 8, 2: 6, 3: 4}), ("aba1064", {1: 10, 2: 6, 3: 4})],
+)
+def test_a_scheme_for_nearly_integrable_systems_is_of_higher_order_where_kicks_are_few(name, degrees):
+    """With kicks of order ε the terms of degree n with k letters B are of order εᵏhⁿ: they hold up to degree n_k."""
+    highest = max(degrees.values()) + 1
+    exact = [np.ones(())] + [np.zeros((2,) * n) for n in range(1, highest + 1)]
+    exact = times_exponential(exact, [(1, A + B)])
+    difference = add(scheme_series(SCHEMES[name], highest), exact, -1.0)
+    for kicks, degree in degrees.items():
+        largest = [abs(term[np.indices(term.shape).sum(0) == kicks]).max(initial=0.0) for term in difference[1:]]
+        assert max(largest[:degree]) < 1e-15
+        assert largest[degree] > 1e-12
+
+
 def test_order_conditions_see_a_coefficient_changed_in_the_tenth_digit():
     good = SCHEMES["kahan_li8"]
     kicks = (*good.kicks[:3], good.kicks[3] + 1e-10, *good.kicks[4:])
@@ -179,6 +195,9 @@ def test_symplectic_euler_is_neither_symmetric_nor_shared_between_steps():
         ("srkn6b", 6, 0),
         ("srkn11b", 11, 0),
         ("srkn14a", 14, 0),
+        ("aba104", 7, 0),
+        ("aba864", 7, 0),
+        ("aba1064", 8, 0),
         ("chin4a", 2, 1),
         ("chin4c", 3, 1),
         ("omelyan4", 3, 1),

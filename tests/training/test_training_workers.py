@@ -4,6 +4,7 @@ import os
 import pickle
 import signal
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -110,6 +111,21 @@ def test_ctrl_c_does_not_wait_for_workers(monkeypatch):
     finally:
         signal.signal(signal.SIGINT, before)
     assert flow.recipe["stages"][-1]["restarts_taken"] < 50
+
+
+def in_main_thread(event, item):
+    """The item; other threads wait for the event."""
+    return item if threading.current_thread() is threading.main_thread() or event.wait() else None
+
+
+def test_a_time_budget_does_not_wait_for_workers_that_start():
+    event = threading.Event()
+    with ThreadPoolExecutor(2) as threads:
+        session = Session(time_budget=0.05, crew=Crew(threads))
+        try:
+            assert list(session.each(in_main_thread, event, range(5), session.deadline)) == [*range(5)]
+        finally:
+            event.set()
 
 
 def test_rungs_come_after_those_that_they_start_from():

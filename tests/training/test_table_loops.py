@@ -1,0 +1,69 @@
+"""The compiled errors of labels, beside those of arrays."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from sympflow import HamiltonianSystem
+from sympflow.training.points import Labels
+from sympflow.training.table_fit import TableFit
+from sympflow.training.table_step import TableStep
+
+SEQUENCE = ("kick", "drift") * 3 + ("kick",)
+PLAIN = HamiltonianSystem.from_sympy(
+    "p1**2/2 + p2**2 + p1*p2/5 + exp(q1)*cos(q2) + a*q1**2*q2**2 + tanh(q2)", params={"a": 0.7}
+)
+DRIVEN = "p**2/2 - cos(q)*(1 + a*cos(w*t))", {"time": "t", "params": {"a": 0.3, "w": 1.7}, "period": 2 * np.pi / 1.7}
+CASES = {
+    "curvature": (PLAIN, 2, ()),
+    "polynomial": (PLAIN, 3, ((2, 0), (1, 1), (0, 4))),
+    "driven": (HamiltonianSystem.from_sympy(DRIVEN[0], **DRIVEN[1]), 2, ()),
+    "driven and damped": (HamiltonianSystem.from_sympy(DRIVEN[0], **DRIVEN[1], damping=0.3), 0, ()),
+    "damped by a matrix": (
+        HamiltonianSystem.from_sympy("p1**2/2 + p2**2 + q1**2 + q2**4/4 + q1*q2", damping=[[0.3, 0.1], [0.1, 0.2]]),
+        1,
+        (),
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def fits(request):
+    """Fits of one system at two times to random labels: by arrays and compiled, without and with a weight of H."""
+    system, level, of = CASES[request.param]
+    d, rng = system.ndof, np.random.default_rng(0)
+    states, times = 70, np.array([0.3, 0.5])
+    t0 = None if system.autonomous else rng.uniform(0, 3, states)
+    steps = [TableStep(system, SEQUENCE, level, of, compiled) for compiled in (False, True)]
+    assert steps[1].loops is not None
+    n, width = steps[0].n_coefficients, 2 * d + steps[0].balanced
+    x, y = 0.5 * rng.normal(size=(states, 2 * d)), rng.normal(size=(2, states, width))
+    work = y[..., 2 * d] if steps[0].balanced else None
+    labels = Labels(times, x, y[..., : 2 * d], t0, work)
+    offset, design = 0.1 * rng.normal(size=(2, n)), 0.1 * rng.normal(size=(2, n, 5))
+    design[:, :, 2] = 0.0
+    slope = rng.normal(size=(2, states, width))
+    common = labels, offset, design, rng.uniform(1, 2, 2 * d), np.array([1.0, 3.0])
+    return [TableFit(step, *common, of_energy) for of_energy in (None, slope) for step in steps]
+
+
+def test_errors_and_their_derivatives_are_those_of_arrays(fits):
+    theta = np.random.default_rng(2).normal(size=5)
+    for arrays, compiled in (fits[:2], fits[2:]):
+        (r, J), (r_compiled, J_compiled) = arrays.linearized(theta), compiled.linearized(theta)
+        np.testing.assert_allclose(r_compiled, r, atol=1e-12 * np.abs(r).max(), rtol=0)
+        np.testing.assert_allclose(J_compiled, J, atol=1e-12 * np.abs(J).max(), rtol=0)
+        assert not J[:, 2].any()
+        assert not J_compiled[:, 2].any()
+        np.testing.assert_allclose(compiled.residuals(theta), r_compiled, atol=1e-14)
+        again = pickle.loads(pickle.dumps(compiled))
+        assert all(np.array_equal(a, b) for a, b in zip(again.linearized(theta), (r_compiled, J_compiled), strict=True))
+
+
+def test_steps_are_those_of_arrays(fits):
+    rng = np.random.default_rng(3)
+    arrays, compiled = (fit.step for fit in fits[:2])
+    c, y = 0.1 * rng.normal(size=(arrays.n_coefficients, 1)), 0.5 * rng.normal(size=(2 * arrays.ndof, 9))
+    t0 = rng.uniform(0, 3, 9)  # of a driven system
+    np.testing.assert_allclose(compiled(c, y, t0=t0), arrays(c, y, t0=t0), atol=1e-13)
