@@ -25,7 +25,8 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
 
     Attributes
     ----------
-    shape : tuple of int
+    grid : tuple of int
+        Sites along each axis.
     length : tuple of float
         Of each axis.
     params : dict of str to float or ndarray of that shape
@@ -45,11 +46,11 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         length: Any,
         params: Mapping[str, Any] | None,
     ) -> None:
-        self.shape = checked_shape(shape)
-        self.ndof = math.prod(self.shape)
+        self.grid = checked_shape(shape)
+        self.ndof = math.prod(self.grid)
         check_memory(float(self.ndof), "`shape`")
-        self.length = _checked_length(length, self.shape)
-        self.params = checked_params(params, self.shape)
+        self.length = _checked_length(length, self.grid)
+        self.params = checked_params(params, self.grid)
         self.c = letters("c", tuple(self.params))
         self.rho, self.k = (sp.Symbol(name, real=True) for name in ("rho", "k"))
         values = dict(zip(self.params, self.c, strict=True))
@@ -67,11 +68,11 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         self._set_rates()
 
     def _set_rates(self) -> None:
-        self.transform = Transform(self.shape, ("periodic",) * len(self.shape))
+        self.transform = Transform(self.grid, ("periodic",) * len(self.grid))
         values = {s: v for s, v in zip(self.c, self.params.values(), strict=True) if not isinstance(v, np.ndarray)}
         w = sp.lambdify(self.k, self.w.xreplace(values), "numpy")
         waves = []
-        for axis, (n, length) in enumerate(zip(self.shape, self.length, strict=True)):
+        for axis, (n, length) in enumerate(zip(self.grid, self.length, strict=True)):
             with np.errstate(all="ignore"):
                 of_axis = w(self.transform.angles(axis) * (n / length))
             waves.append(np.broadcast_to(np.asarray(of_axis, dtype=float), (n,)))
@@ -87,12 +88,12 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
                 )
         other = copy.copy(self)
         vars(other).pop("_functions", None)
-        other.params = checked_params({**self.params, **values}, self.shape)
+        other.params = checked_params({**self.params, **values}, self.grid)
         other._set_rates()
         return other
 
     def hamiltonian(self, y: Array) -> Array:
-        return self.energy_density(y).sum(tuple(range(-len(self.shape), 0)))
+        return self.energy_density(y).sum(tuple(range(-len(self.grid), 0)))
 
     def energy_density(self, y: Array, *t: Array) -> Array:
         q, p = self._fields(y)
@@ -122,7 +123,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         slope, bend = (self._of_density(k, q, p).reshape(*y.shape[:-1], d) for k in (1, 2))
         q, p = y[..., :d], y[..., d:]
         basis = like(np.eye(d), y)
-        L = self._linear(basis.reshape(d, *self.shape)).reshape(d, d)
+        L = self._linear(basis.reshape(d, *self.grid)).reshape(d, d)
         diagonals = [[slope + bend * q * q, bend * q * p], [bend * q * p, slope + bend * p * p]]
         rows = [
             concatenate([x[..., None] * basis + (L if i == j else 0 * L) for j, x in enumerate(row)])
@@ -152,7 +153,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         return concatenate([q + t * p, p])
 
     def _fields(self, y: Array) -> tuple[Array, Array]:
-        shape = (*y.shape[:-1], *self.shape)
+        shape = (*y.shape[:-1], *self.grid)
         return y[..., : self.ndof].reshape(shape), y[..., self.ndof :].reshape(shape)
 
     def _linear(self, x: Array) -> Array:

@@ -35,7 +35,7 @@ def grid(system: HamiltonianSystem) -> np.ndarray:
     from sympflow.hamiltonian.wave_functions import WaveFunctionHamiltonian
 
     local, n = system.local, system.ndof
-    if isinstance(local, WaveFunctionHamiltonian) and local.shape == (n,):
+    if isinstance(local, WaveFunctionHamiltonian) and local.grid == (n,):
         return _grid(n, local.length[0] / n)
     if isinstance(local, LatticeHamiltonian) and local.shape == (n,):
         return _grid(n, float(system.params.get("h", 1.0)))
