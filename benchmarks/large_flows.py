@@ -66,11 +66,11 @@ def lattice(name: str, sites: int) -> HamiltonianSystem:
     return HamiltonianSystem.lattice(**terms, shape=(n,) * axes, name=name, domain=LatticeStates(DENSITY))
 
 
-def flows_of(system: HamiltonianSystem, folder: Path, fit: bool) -> list[PrimedFlow]:
+def flows_of(system: HamiltonianSystem, folder: Path, fit: bool, steps: tuple[float, ...]) -> list[PrimedFlow]:
     """The flows of a lattice in a folder, fitted first if asked."""
     if fit:
         folder.mkdir(parents=True, exist_ok=True)
-        for dt in STEPS:
+        for dt in steps:
             start = Primed(round(dt * LATTICES[system.name][3], 2), KICKS, PROCESSOR, force_gradient=False)
             path = folder / f"{system.name}-primed-{start.stages}-{start.dt:g}.safetensors"
             if not path.exists():
@@ -91,11 +91,13 @@ def error(system: HamiltonianSystem, y0: np.ndarray, runner: Runner, n: int) -> 
     return float(np.median(np.where(np.isnan(largest), np.inf, largest)))
 
 
-def race(name: str, sites: int, folder: Path, fit: bool, rounds: int) -> list[dict[str, Any]]:
+def race(
+    name: str, sites: int, folder: Path, fit: bool, lengths: tuple[float, ...], rounds: int
+) -> list[dict[str, Any]]:
     """A row for each target."""
     system = lattice(name, sites)
     assert system.domain is not None
-    flows = flows_of(system, folder, fit)
+    flows = flows_of(system, folder, fit, lengths)
     own = {Runner.of_flow(flow, system): flow for flow in flows}
     y0 = system.domain.sample(STATES, SEED)
     rows = []
@@ -165,13 +167,16 @@ def main() -> None:
     parser.add_argument("--only", help=f"some of {', '.join(LATTICES)}, with commas")
     parser.add_argument("--flows", type=Path, default=SHIPPED, help="folder of the flows; the package's if left out")
     parser.add_argument("--fit", action="store_true", help="fit the flows that are not there, and keep them")
+    parser.add_argument("--steps", help="with --fit: some of the steps Δt, with commas")
     parser.add_argument("--sites", type=int, default=1024)
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--json", type=Path, help="file for the rows")
     fragments.add_out(parser)
     options = parser.parse_args()
     names = list(LATTICES) if options.only is None else options.only.split(",")
-    rows = [row for name in names for row in race(name, options.sites, options.flows, options.fit, options.rounds)]
+    lengths = STEPS if options.steps is None else tuple(map(float, options.steps.split(",")))
+    common = (options.sites, options.flows, options.fit, lengths, options.rounds)
+    rows = [row for name in names for row in race(name, *common)]
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
     fragments.write(options.out, "large-flows", fragment(rows))
