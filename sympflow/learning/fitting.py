@@ -24,6 +24,7 @@ from sympflow.learning.trajectories import Run, Trajectories
 
 FIRST_POINTS = 10  # of the pieces that a fit begins with
 MATCHED_POINTS = 24  # of those whose increments give its start
+MATCHED_STEPS = 60
 ROUNDS = 4  # of longer pieces, or of another noise
 SETTLED = 0.05  # change of the noise, relative, that ends them
 GROWTH = 1e3  # most that an error of an initial state may grow along a piece
@@ -102,7 +103,7 @@ def fitted(
     scales = data.scales
     if theta is None:
         theta = model.start(np.random.default_rng(seed))
-        theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales)
+        theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales, 1 if model.linear else MATCHED_STEPS)
     given = None if setting.noise is None else np.maximum(setting.noise, FINEST * scales)
     sigma = 1e-2 * scales if given is None else given
     pieces, span = data.pieces(FIRST_POINTS), 0.0

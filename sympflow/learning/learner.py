@@ -19,6 +19,7 @@ from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.families import FAMILIES, Candidate, Said, families, pruned, with_unit_mass
 from sympflow.learning.fitting import Fitted, Held, Setting, fitted, gains, judged
+from sympflow.learning.models import Formula
 from sympflow.learning.trajectories import Trajectories
 from sympflow.training.session import Path, Session
 from sympflow.training.trainer import train
@@ -43,6 +44,8 @@ def learn(
     separable: bool | None = None,
     mass: float | ArrayLike | None = None,
     damping: bool | str = False,
+    period: float | ArrayLike | None = None,
+    known: HamiltonianSystem | None = None,
     family: str | None = None,
     loss: str = "squares",
     seed: int = 0,
@@ -78,6 +81,10 @@ def learn(
         M of T = ½ pᵀM⁻¹p; learned if not given.
     damping : {False, True, "each"}
         True to learn one rate γ of friction, p' = −∂H/∂q − γp; "each" for one rate for each p.
+    period : float or array_like of shape (d,), optional
+        Of H in each q, of angles: 2π, or 360 for degrees; infinite or NaN for coordinates that are none.
+    known : HamiltonianSystem, optional
+        A part of H, symbolic; the rest is learned. Its kinetic energy, if it has one, is taken for the whole.
     family : str, optional
         The only family to be tried, see `sympflow.learning.families.FAMILIES`.
     loss : {"squares", "huber"}
@@ -103,7 +110,7 @@ def learn(
         model has, or an argument is not admissible.
     """
     data = Trajectories.read(trajectories, ndof)
-    said = _said(data, separable, mass, damping)
+    said = _said(data, separable, mass, damping, period, known)
     if loss not in LOSSES:
         raise ValueError(f"`loss` must be one of {', '.join(LOSSES)}; got {loss!r}.")
     dt = plain(dt)
@@ -119,7 +126,7 @@ def learn(
         return search.flow(dt, name, session)
 
 
-def _said(data: Trajectories, separable: Any, mass: Any, damping: Any) -> Said:
+def _said(data: Trajectories, separable: Any, mass: Any, damping: Any, period: Any, known: Any) -> Said:
     if separable is not None:
         check_flag("separable", separable)
     if damping not in (False, True, "each"):
@@ -131,7 +138,40 @@ def _said(data: Trajectories, separable: Any, mass: Any, damping: Any) -> Said:
     if mass is not None:
         found = matrices.inverse_mass(mass, d)
         inverse = np.eye(d) if found is None else np.diag(found) if found.ndim == 1 else found
-    return Said(data.scales, separable, inverse, 0 if damping is False else 1 if damping is True else d)
+    parts = () if known is None else _formulas(known, d)
+    if inverse is not None and any(part.of != "q" for part in parts):
+        raise ValueError("`known` has a kinetic energy, and so has `mass`: leave out one of them.")
+    rates = 0 if damping is False else 1 if damping is True else d
+    return Said(data.scales, separable, inverse, rates, _periods(period, d), parts)
+
+
+def _periods(period: Any, d: int) -> np.ndarray:
+    """The period of each coordinate (2d,), infinite where there is none."""
+    periods = np.full(2 * d, np.inf)
+    if period is not None:
+        given = np.asarray(period, dtype=float)
+        if given.shape not in ((), (d,)) or (given <= 0).any():
+            raise ValueError(f"`period` must be positive, one for all q or one for each of {d}; got {period!r}.")
+        periods[:d] = np.where(np.isnan(given), np.inf, given)
+    return periods
+
+
+def _formulas(known: Any, d: int) -> tuple[Formula, ...]:
+    """The parts of a system that is a part of H."""
+    if not isinstance(known, HamiltonianSystem):
+        raise TypeError(f"`known` must be a HamiltonianSystem, a part of H; got {known!r}.")
+    symbols = known.symbols
+    if symbols is None or known.ndof != d or not known.autonomous or known.friction is not None:
+        raise ValueError(
+            f"`known` must be a symbolic system of {d} degrees of freedom that depends on no time and has no friction: "
+            "define it by HamiltonianSystem.from_sympy."
+        )
+    q, p = symbols.q, symbols.p
+    parts = [("y", symbols.H, (*q, *p))]
+    if symbols.V is not None and symbols.T is not None:
+        parts = [("q", symbols.V, q), ("p", symbols.T, p)]
+    values = {v: known.params[v.name] for v in symbols.H.free_symbols if v.name in known.params}
+    return tuple(Formula(of, f.subs(values), names) for of, f, names in parts if f.free_symbols & set(names))
 
 
 def _noise(noise: Any, data: Trajectories) -> np.ndarray | None:

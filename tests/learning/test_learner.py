@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import sympy
 from scipy.integrate import solve_ivp
 
 import sympflow
 from sympflow.learning.families import Candidate, pruned
-from sympflow.learning.models import FixedKinetic, Kinetic, Model, Polynomial
+from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Network, Pairs, Polynomial, Waves
 from sympflow.learning.shooting import Gauss, Method, Problem, chosen_method, first_states, matched, minimized
 from sympflow.learning.trajectories import Trajectories
 
@@ -135,6 +136,36 @@ def test_terms_without_evidence_are_left_out():
     left = pruned(Candidate("V", model), theta, precision, values=100)
     assert left.model.parts[0].exponents.tolist() == [[2], [4]]  # 0.01 is one standard error
     assert pruned(Candidate("V", model), np.ones(3), precision, values=100) is None
+
+
+Q = sympy.symbols("q1:3", real=True)
+PARTS = [
+    Polynomial.up_to(3, "q", [1.3, 0.9]),
+    Waves.up_to(2, 2, "q", np.array([1.3, 0.9]), np.array([2 * np.pi, np.inf])),
+    Network("q", 4, [1.0, 2.0], np.array([4.0, np.inf])),
+    Pairs(np.array([[0], [1]]), (-2, 0, 1), 1.3, shared=False),
+    Formula("q", sympy.sin(Q[0]) * Q[1] ** 2, Q),
+]
+
+
+@pytest.mark.parametrize("part", PARTS, ids=lambda part: type(part).__name__)
+def test_parts_of_h_are_what_their_derivatives_say(part):
+    """By differences at three states; the expression is the value but for a constant."""
+    rng = np.random.default_rng(0)
+    x, theta, h = rng.normal(size=(2, 3)) + np.array([[0], [3]]), rng.normal(size=part.n), 1e-6
+    found = part.gradient(theta, x, True, True)
+    for i, e in enumerate(h * np.eye(2)[:, :, None]):
+        assert (part.value(theta, x + e) - part.value(theta, x - e)) / (2 * h) == pytest.approx(
+            found.value[i], abs=1e-6
+        )
+        ahead, behind = (part.gradient(theta, x + s * e, False, False).value for s in (1, -1))
+        assert (ahead - behind) / (2 * h) == pytest.approx(found.slope[:, i], abs=1e-6)
+    for i, e in enumerate(h * np.eye(part.n)):
+        ahead, behind = (part.gradient(theta + s * e, x, False, False).value for s in (1, -1))
+        assert (ahead - behind) / (2 * h) == pytest.approx(found.by_parameters[:, i], abs=1e-6)
+    formula = part.expression(theta, Q)
+    values = [float(formula.subs(dict(zip(Q, column, strict=True)))) for column in x.T]
+    assert np.ptp(values - part.value(theta, x)) < 1e-12
 
 
 # learn ----------------------------------------------------------------------------------------------------------------
