@@ -24,7 +24,7 @@ class Linear(NamedTuple):
     Attributes
     ----------
     value : ndarray of shape (m, N)
-    slope : ndarray of shape (m, m, N) or None
+    slope : ndarray of shape (m, m, N) or (m, m, 1), or None
         ∂f/∂x.
     by_parameters : ndarray of shape (m, n, N) or None
         ∂f/∂θ.
@@ -193,6 +193,21 @@ class Kinetic(Polynomial):
             for i in pair:
                 row[i] += 1
         super().__init__("p", exponents, scales)
+        self._pairs = np.array(pairs)
+        self._units = 1 / np.array([self.scales[i] * self.scales[j] for i, j in pairs])
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        i, j = self._pairs.T
+        W = np.zeros((m, m))
+        np.add.at(W, (i, j), theta * self._units)
+        W += W.T  # an entry of the diagonal is twice its coefficient
+        by = None
+        if by_parameters:
+            by, places = np.zeros((m, self.n, N)), np.arange(self.n)
+            by[i, places] += self._units[:, None] * x[j]
+            by[j, places] += self._units[:, None] * x[i]
+        return Linear(W @ x, W[:, :, None] if slope else None, by)
 
 
 class FixedKinetic(Part):
@@ -207,8 +222,9 @@ class FixedKinetic(Part):
 
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
         W = self.inverse_mass
-        slopes = np.broadcast_to(W[:, :, None], (*W.shape, x.shape[1])) if slope else None
-        return Linear(W @ x, slopes, np.empty((len(x), 0, x.shape[1])) if by_parameters else None)
+        return Linear(
+            W @ x, W[:, :, None] if slope else None, np.empty((len(x), 0, x.shape[1])) if by_parameters else None
+        )
 
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
         return 0.5 * np.einsum("in,ij,jn->n", x, self.inverse_mass, x)
@@ -593,18 +609,24 @@ class Model:
     def gradient(self, theta: np.ndarray, x: np.ndarray, of: str, slope: bool, by_parameters: bool) -> Linear:
         """∇ of the sum of the parts of q alone, or of p alone, or of all of H."""
         m, N = x.shape
+        chosen = [(part, place) for part, place in zip(self.parts, self.places, strict=True) if of in (part.of, "y")]
+        columns = np.zeros((m, self.n, N)) if by_parameters else None
+        if len(chosen) == 1 and chosen[0][0].of == of:
+            part, place = chosen[0]
+            found = part.gradient(theta[place], x, slope, by_parameters)
+            if columns is not None and found.by_parameters is not None:
+                columns[:, place] = found.by_parameters
+            return Linear(found.value, found.slope, columns)
         value = np.zeros((m, N))
         slopes = np.zeros((m, m, N)) if slope else None
-        columns = np.zeros((m, self.n, N)) if by_parameters else None
-        for part, place in zip(self.parts, self.places, strict=True):
-            if of in (part.of, "y"):
-                rows = self._columns(part.of) if of == "y" else slice(None)
-                found = part.gradient(theta[place], x[rows], slope, by_parameters)
-                value[rows] += found.value
-                if slopes is not None and found.slope is not None:
-                    slopes[rows, rows] += found.slope
-                if columns is not None and found.by_parameters is not None:
-                    columns[rows, place] += found.by_parameters
+        for part, place in chosen:
+            rows = self._columns(part.of) if of == "y" else slice(None)
+            found = part.gradient(theta[place], x[rows], slope, by_parameters)
+            value[rows] += found.value
+            if slopes is not None and found.slope is not None:
+                slopes[rows, rows] += found.slope
+            if columns is not None and found.by_parameters is not None:
+                columns[rows, place] += found.by_parameters
         return Linear(value, slopes, columns)
 
     def field(self, theta: np.ndarray, y: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
@@ -653,3 +675,48 @@ class Model:
     def start(self, rng: np.random.Generator) -> np.ndarray:
         """θ before anything is known; friction 0."""
         return np.concatenate([part.start(rng) for part in self.parts] + [np.zeros(self.rates)])
+
+
+class FreeField:
+    """A vector field of polynomials that need not be Hamiltonian, to be compared with those that are.
+
+    Parameters
+    ----------
+    scales : array_like of shape (2d,)
+    degree : int
+    """
+
+    separable = nystrom = False
+    linear = True
+
+    def __init__(self, scales: Any, degree: int) -> None:
+        m = len(scales)
+        self.ndof, self.scales = m // 2, np.asarray(scales, dtype=float)
+        self.polynomial = Polynomial("y", [(0,) * m, *Polynomial.up_to(degree, "y", scales).exponents.tolist()], scales)
+        self.n = m * self.polynomial.n
+
+    def start(self, rng: np.random.Generator) -> np.ndarray:
+        return np.zeros(self.n)
+
+    def field(self, theta: np.ndarray, y: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        """The vector field."""
+        m, N = y.shape
+        rows = theta.reshape(m, -1)
+        powers, K = self.polynomial.tables(y), self.polynomial.n
+        terms = self.polynomial.monomials(powers, self.polynomial.exponents)
+        slopes = np.empty((m, m, N)) if slope else None
+        if slopes is not None:
+            for j in range(m):
+                factor, left = self.polynomial.derivatives[j,]
+                slopes[:, j] = (rows * factor) @ self.polynomial.monomials(powers, left)
+        columns = np.zeros((m, self.n, N)) if by_parameters else None
+        if columns is not None:
+            for i in range(m):
+                columns[i, i * K : (i + 1) * K] = terms
+        return Linear(rows @ terms, slopes, columns)
+
+    def divergence(self, theta: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """The rate (N,) at which volumes of phase space grow."""
+        slopes = self.field(theta, y, True, False).slope
+        assert slopes is not None
+        return np.einsum("iin->n", slopes)
