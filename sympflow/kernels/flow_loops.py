@@ -97,7 +97,8 @@ class PrimedFlowKernel(Kernel):
             raise ValueError(
                 "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
             )
-        if tables.level >= CURVATURE and system.symbols is None:
+        known = system.symbols is not None or (tables.level == CURVATURE and system.local is not None)
+        if tables.level >= CURVATURE and not known:
             raise ValueError(
                 f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled: "
                 "use backend='array'."
@@ -105,6 +106,7 @@ class PrimedFlowKernel(Kernel):
         self.system = system
         self._tables, self._splitting, self._compensated = tables, splitting_loops(system), compensated
         self._step = None if system.friction is None else step
+        self._ranges = self._splitting.ranges(tables.level, compensated)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         """Count those of the numbers that the kernel has: see `Kernel`."""
@@ -176,18 +178,21 @@ class PrimedFlowKernel(Kernel):
 
     def _stepped(self, h: np.ndarray, y: np.ndarray, back: bool, t: ArrayLike) -> np.ndarray:
         tables = self._tables
-        return self._splitting.step_rows(tables.polynomials(back), tables.variable(h), h, y, tables.monomials, t)
+        return self._splitting.step_rows(
+            tables.polynomials(back), tables.variable(h), h, y, tables.monomials, t, ranges=self._ranges
+        )
 
     def _kernel(self, h: float) -> SplittingKernel:
         """K_h, or for h < 0 its inverse."""
         scheme = self._tables.scheme("primed kernel", abs(h), back=h < 0)
         if (step := self._step) is not None:
             return self._splitting.damped_kernel(scheme, partial(_stepped_by, step))
-        return self._splitting.kernel(scheme, self._compensated)
+        return self._splitting.kernel(scheme, self._compensated, self._ranges)
 
     def _functions(self) -> LoopFunctions:
         """The compiled functions for the kicks of the flow."""
-        return self._splitting.functions(self._tables.level, self._compensated, self._tables.monomials)
+        tables = self._tables
+        return self._splitting.functions(tables.level, self._compensated, tables.monomials, ranges=self._ranges)
 
     def _processed(self, h: float, t0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The tables of χ⁻¹, of a run of K, and of χ, of steps |h|, or for h < 0 of their inverse.

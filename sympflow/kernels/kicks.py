@@ -5,15 +5,17 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import sympy as sp
 
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
-from sympflow.kernels.codegen import as_factor, parameter_lines, printed
-from sympflow.kernels.scheduling import FUSED, PRODUCTS, Schedule, nested
+from sympflow.kernels.approximations import Letters, OnInterval, Ranges, on_interval, range_of
+from sympflow.kernels.codegen import as_factor, parameter_lines, printed, vectorised
+from sympflow.kernels.scheduling import ADD, FUSED, PRODUCTS, Schedule, nested
 from sympflow.kernels.stages import kicks_of
 from sympflow.kernels.variations import Variations
 
@@ -44,10 +46,17 @@ class _Kick:
     results: list[str]
     cycles: float
     operations: float
+    condition: str = ""
+    """Where the shape holds, of one that holds for some positions only."""
 
 
 def kicks_source(
-    symbols: SymbolicHamiltonian, level: int, monomials: Monomials = (), vectors: int = 0, varied: bool = False
+    symbols: SymbolicHamiltonian,
+    level: int,
+    monomials: Monomials = (),
+    vectors: int = 0,
+    varied: bool = False,
+    ranges: Ranges = (),
 ) -> str:
     """The new p after each kind of kick of a level, each in two shapes, equal but for rounding: see `Kick`.
 
@@ -64,16 +73,19 @@ def kicks_source(
     and on no state from a table: ``fill_own(numbers, own, lane)`` computes `N_OWN` numbers for a lane, and
     ``kicked_by_own(q, p, numbers, own, lane)`` is ``kicked_lane`` with them. There is one kind of kick then.
 
+    With `ranges` of positions functions in V are written as letters, whose powers and products are shared, and those of
+    one trajectory may be polynomials that are exact to rounding in these ranges; beyond, ``kicked`` is ``kicked_lane``.
+
     Raises
     ------
     ValueError
         If a function in H has no counterpart in compiled code.
     """
-    key = symbols.H, symbols.parameters, level, monomials, vectors
+    key = symbols.H, symbols.parameters, level, monomials, vectors, ranges
     if key not in _SOURCES:
         if len(_SOURCES) >= MOST_KEPT:
             del _SOURCES[next(iter(_SOURCES))]
-        _SOURCES[key] = _source(Variations(symbols, vectors) if vectors else symbols, level, monomials)
+        _SOURCES[key] = _source(Variations(symbols, vectors) if vectors else symbols, level, monomials, ranges)
     source, own = _SOURCES[key]
     return f"{source}\n\n{own}" if varied else source
 
@@ -99,11 +111,13 @@ def kick_cycles(symbols: SymbolicHamiltonian, level: int) -> float:
     return min(_scheduled(symbols, shape, "kick_", common).cycles for common in (True, False))
 
 
-_SOURCES: dict[tuple[sp.Expr, tuple[sp.Symbol, ...], int, Monomials, int], tuple[str, str]] = {}
+_SOURCES: dict[tuple[sp.Expr, tuple[sp.Symbol, ...], int, Monomials, int, Ranges], tuple[str, str]] = {}
 """Sources, and those of varied lanes, by H: systems are often made again, and the search takes a tenth of a second."""
 
 
-def _source(symbols: SymbolicHamiltonian | Variations, level: int, monomials: Monomials) -> tuple[str, str]:
+def _source(
+    symbols: SymbolicHamiltonian | Variations, level: int, monomials: Monomials, ranges: Ranges
+) -> tuple[str, str]:
     functions: list[str] = []
     fill: list[str] = []
     stored: list[str] = []
@@ -111,16 +125,24 @@ def _source(symbols: SymbolicHamiltonian | Variations, level: int, monomials: Mo
     kept = [*kinds[0].numbers, *(s.name for s in symbols.parameters)]
     for kick in reversed(kinds):
         name, terms = kick.name, len(kick.numbers)
-        tried = _tried(symbols, terms, f"{name[0]}_", monomials)
+        if ranges and isinstance(symbols, SymbolicHamiltonian):
+            tried = _tried_in(symbols, terms, f"{name[0]}_", ranges if kick is kinds[0] else ())
+        else:
+            tried = _tried(symbols, terms, f"{name[0]}_", monomials)
         one = min(tried, key=lambda kick: (kick.cycles, kick.operations))
-        many = min(tried, key=lambda kick: (kick.operations, kick.cycles))
+        many = min((k for k in tried if not k.condition), key=lambda kick: (kick.operations, kick.cycles))
         used = [n for n in _names(one.coefficients) if any(_mentions(line, n) for line in [*one.lines, *one.results])]
         loads = [f"{n} = table[j, {len(stored) + i}]" for i, n in enumerate(used)]
         fill += one.coefficients
         stored += used
         taken = [v for v in kept if any(_mentions(line, v) for line in [*one.lines, *one.results])]
         loads += [f"{v} = table[j, -{len(kept) - kept.index(v)}]" for v in taken]
-        functions.append(_function(symbols, name, "q, p, table, j", [*loads, *one.lines], one.results))
+        lines = [*loads, *one.lines]
+        if one.condition:
+            beyond = f"{name}_lane(q, p, ({''.join(f'table[j, -{n}], ' for n in range(len(kept), 0, -1))}))"
+            functions.append(f"@njit(**OPTIONS)\ndef {name}_beyond(q, p, table, j):\n    return {beyond}")
+            lines = [f"if not ({one.condition}):", f"    return {name}_beyond(q, p, table, j)", *lines]
+        functions.append(_function(symbols, name, "q, p, table, j", lines, one.results))
         numbers = [f"{v} = numbers[{i}]" for i, v in enumerate(kick.numbers)]
         lines = [*many.coefficients, *many.lines]
         lines = [*numbers, *parameter_lines(symbols, [*lines, *many.results]), *lines]
@@ -190,7 +212,12 @@ def _function(
 
 
 def _scheduled(
-    symbols: SymbolicHamiltonian | Variations, shape: Sequence[sp.Expr], prefix: str, common: bool = True
+    symbols: SymbolicHamiltonian | Variations,
+    shape: Sequence[sp.Expr],
+    prefix: str,
+    common: bool = True,
+    letters: Mapping[sp.Symbol, sp.Expr] = MappingProxyType({}),
+    condition: str = "",
 ) -> _Kick:
     """The shape as code. Momenta are known before positions, whose drift waited for them.
 
@@ -199,7 +226,9 @@ def _scheduled(
     known = {**dict.fromkeys(symbols.q, 0.0), **dict.fromkeys(symbols.p, -FUSED)}
     schedule = Schedule(known, printed, prefix, PRODUCT)
     numbers: dict[sp.Expr, sp.Symbol] = {}
-    states = {*symbols.q, *symbols.p}
+    states = {*symbols.q, *symbols.p, *letters}
+    for letter, function in letters.items():
+        schedule.define(letter, function)
     d = len(shape)
     slopes = _linearised(shape, symbols) if isinstance(symbols, Variations) else {}
     shape = [_numbered(f, states, numbers) for f in (*shape, *slopes.values())]
@@ -222,7 +251,7 @@ def _scheduled(
                 results.append(schedule.value(sp.Add(s, *terms, evaluate=False))[1])
     schedule.busy[PRODUCTS] += sum(sp.diff(symbols.T, p).has(s) or s == p for p in symbols.p for s in symbols.p)
     cycles = schedule.cycles(results) + FUSED  # the drift waits for the kick
-    return _Kick(schedule.early, schedule.lines, results, cycles, schedule.operations)
+    return _Kick(schedule.early, schedule.lines, results, cycles, schedule.operations, condition)
 
 
 def _linearised(shape: Sequence[sp.Expr], symbols: Variations) -> dict[tuple[int, int], sp.Expr]:
@@ -253,6 +282,101 @@ def _numbered(f: sp.Expr, states: set[sp.Symbol], numbers: dict[sp.Expr, sp.Symb
                 symbol = numbers.setdefault(coefficient, sp.Symbol(f"number_{len(numbers)}", real=True))
                 f = sp.Mul(symbol, *[a for a in f.args if a.free_symbols & states], evaluate=False)
     return f.func(*[_numbered(a, states, numbers) for a in f.args], evaluate=False)
+
+
+# kicks in ranges of positions -------------------------------------------------------------------------------------
+
+
+def _tried_in(symbols: SymbolicHamiltonian, terms: int, prefix: str, ranges: Ranges) -> list[_Kick]:
+    """Shapes by letters for functions, of arithmetic alone, and in ranges of positions as polynomials.
+
+    Without ranges the first shape alone, of kicks that a flow hardly has.
+    """
+    tried = [_scheduled(symbols, next(shapes(symbols, terms)), prefix)]
+    if not ranges:
+        return tried
+    parts = _parts(symbols, terms)
+    if symbols.ndof == 1:
+        tried += _whole_polynomials(symbols, parts, prefix, ranges)
+    letters = Letters(symbols.q)
+    columns = [letters.put_into(part) for part in parts]
+    if not letters.functions:
+        return tried
+    changes = [
+        sp.Add(*[a * f for a, f in zip((-B, G, -C), column, strict=False)]) for column in zip(*columns, strict=True)
+    ]
+    exact = dict(zip(letters.functions, vectorised(list(letters.functions.values())), strict=True))
+    ways = [(exact, "")]
+    if len(tried) == 1:  # not in one piece
+        ways += filter(None, [_as_polynomials(symbols, letters, ranges)])
+    schedule = Schedule(dict.fromkeys(symbols.q, 0.0), printed)
+    for letter, function in ways[-1][0].items():
+        schedule.define(letter, function)
+    known = {**dict.fromkeys(symbols.q, 0.0), **{x: schedule.value(x)[0] for x in letters.symbols}}
+    for shape in _forms(symbols, changes, known):
+        for meaning, condition in ways:
+            tried += [_scheduled(symbols, shape, prefix, common, meaning, condition) for common in (True, False)]
+    return tried
+
+
+def _parts(symbols: SymbolicHamiltonian, terms: int) -> list[list[sp.Expr]]:
+    """∇V, ∇²V v and ∇(½ v·∇²V v), as many of them as a kick has terms."""
+    parts = [-symbols.force_gradient, symbols.W][: terms - 1]
+    return [list(symbols.slope), *([sp.diff(f, s) for s in symbols.q] for f in parts)]
+
+
+def _whole_polynomials(
+    symbols: SymbolicHamiltonian, parts: Sequence[Sequence[sp.Expr]], prefix: str, ranges: Ranges
+) -> list[_Kick]:
+    """The kick of one degree of freedom as one polynomial, whatever V is."""
+    (q,), (p,) = symbols.q, symbols.p
+    found = on_interval([f for (f,) in parts], q, *ranges[0])
+    if found is None:
+        return []
+    x, letters = _argument(q, found, "position")
+    sums = [
+        sp.Add(*[a * sp.Float(c) for a, c in zip((-B, G, -C), column, strict=False) if c])
+        for column in found.coefficients.T.tolist()
+    ]
+    change = sp.Add(*[_times(c, x**k) for k, c in enumerate(sums) if c != 0], evaluate=False)
+    known, condition = {x: 0.0 if x == q else ADD}, _within(q, found)
+    return [
+        _scheduled(symbols, [_nested(known, p, change, False, last)], prefix, False, letters, condition)
+        for last in (False, True)
+    ]
+
+
+def _as_polynomials(
+    symbols: SymbolicHamiltonian, letters: Letters, ranges: Ranges
+) -> tuple[dict[sp.Symbol, sp.Expr], str] | None:
+    """The letters by polynomials in their arguments, and where these hold; None unless they all have one."""
+    meaning: dict[sp.Symbol, sp.Expr] = {}
+    conditions: dict[str, None] = {}  # a set in order
+    for letter, function in letters.functions.items():
+        u = function.args[0]
+        between = range_of(u, symbols.q, ranges)
+        argument = sp.Dummy(real=True)
+        found = None if between is None else on_interval([function.func(argument)], argument, *between)
+        if found is None:
+            return None
+        x, more = _argument(u, found, f"argument_of_{letter}")
+        meaning.update(more)
+        terms = [sp.Float(c) * x**k for k, c in enumerate(found.coefficients[0].tolist()) if c]
+        meaning[letter] = nested(None, terms, {x: 0.0})
+        conditions[_within(u, found)] = None
+    return meaning, " and ".join(conditions)
+
+
+def _argument(u: sp.Expr, found: OnInterval, name: str) -> tuple[sp.Symbol, dict[sp.Symbol, sp.Expr]]:
+    """The variable of a polynomial, and what it stands for where it is no position."""
+    if found.center == 0 and u.is_Symbol:
+        return u, {}
+    x = sp.Symbol(name, real=True)
+    return x, {x: printable(u - sp.Float(found.center))}
+
+
+def _within(u: sp.Expr, found: OnInterval) -> str:
+    return f"{found.low!r} <= {printed(printable(u))} <= {found.high!r}"
 
 
 # the shapes of a kick ---------------------------------------------------------------------------------------------
@@ -294,6 +418,14 @@ def shapes(symbols: SymbolicHamiltonian, terms: int, monomials: Monomials = ()) 
         changes = [
             -B * slope[i] + sp.Add(*[c * sp.diff(f, q[i]) for c, f in zip((G, -C), W, strict=False)]) for i in range(d)
         ]
+    yield from _forms(symbols, changes, dict.fromkeys(q, 0.0))
+
+
+def _forms(
+    symbols: SymbolicHamiltonian, changes: Sequence[sp.Expr], known: dict[sp.Symbol, float]
+) -> Iterator[list[sp.Expr]]:
+    """Ways to write p and its changes, functions of arguments that are known at these times."""
+    p, q = symbols.p, tuple(known)
     if any(f.has(*UNTOUCHED) or sp.count_ops(f) > MOST_OPERATIONS for f in changes):
         return
     yield [printable(p[i] + f) for i, f in enumerate(changes)]
@@ -307,7 +439,7 @@ def shapes(symbols: SymbolicHamiltonian, terms: int, monomials: Monomials = ()) 
         yield [printable(p[i] + _by_common_factors(f, q)) for i, f in enumerate(expanded)]
         if max(len(f.args) for f in expanded) <= MOST_NESTED:
             for sums, last in itertools.product((False, True), repeat=2):
-                yield [_nested(symbols, p[i], f, sums, last) for i, f in enumerate(expanded)]
+                yield [_nested(known, p[i], f, sums, last) for i, f in enumerate(expanded)]
 
 
 def _with_products_of_both(symbols: SymbolicHamiltonian, W: sp.Expr) -> Iterator[list[sp.Expr]]:
@@ -339,23 +471,23 @@ def _with_products_of_both(symbols: SymbolicHamiltonian, W: sp.Expr) -> Iterator
     yield shape
 
 
-def _nested(symbols: SymbolicHamiltonian, p: sp.Symbol, f: sp.Expr, sums: bool, last: bool) -> sp.Expr:
+def _nested(known: Mapping[sp.Symbol, float], p: sp.Symbol, f: sp.Expr, sums: bool, last: bool) -> sp.Expr:
     """p + f, an expanded sum, in the form that is known soonest; with `sums`, terms of one coefficient c as c·m·(Σ)."""
     groups: dict[sp.Expr, list[sp.Expr]] = {}
     for term in sp.Add.make_args(f):
-        coefficient, function = term.as_independent(*symbols.q, as_Add=False)
+        coefficient, function = term.as_independent(*known, as_Add=False)
         number, letters = coefficient.as_content_primitive() if coefficient.free_symbols else (sp.S.One, coefficient)
         groups.setdefault(letters, []).append(number * function)
     if sums:
         groups = {letters: [sp.gcd_terms(sp.Add(*functions))] for letters, functions in groups.items()}
-    times = dict.fromkeys(symbols.q, 0.0)
+    times = dict(known)
     schedule = Schedule(dict(times), printed)
     stand_ins: dict[sp.Expr, sp.Dummy] = {}
 
     def stand_in(factor: sp.Expr) -> sp.Expr:
         """A symbol for what is no power of a position."""
         base, exponent = factor.as_base_exp()
-        if base in symbols.q and exponent.is_Integer and exponent > 0:
+        if base in known and exponent.is_Integer and exponent > 0:
             return factor
         if factor not in stand_ins:
             symbol = stand_ins[factor] = sp.Dummy(real=True)
@@ -380,7 +512,9 @@ def _dot(x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
     return sp.Add(*[a * b for a, b in zip(x, y, strict=True)])
 
 
-def _number(value: float) -> sp.Expr:
+def _number(value: float | sp.Expr) -> sp.Expr:
+    if isinstance(value, sp.Expr) and value.free_symbols:  # of a parameter
+        return value
     return sp.Integer(int(value)) if value == int(value) else sp.Float(value)
 
 

@@ -249,15 +249,17 @@ class _Form(NamedTuple):
     split: tuple[_Powers, _Sum] | None = None
 
 
-def nested(first: sp.Symbol, terms: Iterable[sp.Expr], known: dict[sp.Symbol, float], last: bool = False) -> sp.Expr:
-    """`first` + Σ `terms` as nested sums of products m·A + B, of all such forms the one that is known soonest.
+def nested(
+    first: sp.Symbol | None, terms: Iterable[sp.Expr], known: dict[sp.Symbol, float], last: bool = False
+) -> sp.Expr:
+    """`first`, if any, + Σ `terms` as nested sums of products m·A + B, of all such forms the one that is known soonest.
 
     m is a product of arguments, A what is left of terms that it divides, B the other terms. Forms are compared by the
     latencies of these operations, then by their operations.
 
     Parameters
     ----------
-    first : Symbol
+    first : Symbol or None
     terms : iterable of Expr
         Products of a coefficient and powers of the arguments, whose exponents are positive integers.
     known : dict of Symbol to float
@@ -286,7 +288,7 @@ def nested(first: sp.Symbol, terms: Iterable[sp.Expr], known: dict[sp.Symbol, fl
 
     def forms(terms: _Sum, with_first: bool) -> Iterator[_Form]:
         if not any(any(powers) for powers, _ in terms):
-            yield _Form(known[first] if with_first else ALWAYS, float(len(terms)))
+            yield _Form(known[first] if with_first and first is not None else ALWAYS, float(len(terms)))
         elif len(terms) == 1 and not with_first:
             ((powers, _),) = terms
             yield _Form(_product_known(times, powers, ALWAYS), sum(powers))
@@ -314,7 +316,7 @@ def nested(first: sp.Symbol, terms: Iterable[sp.Expr], known: dict[sp.Symbol, fl
             return product
         return sp.Add(*sp.Add.make_args(built(terms - inside, with_first)), product, evaluate=False)
 
-    return built(frozenset(zip(exponents, range(len(exponents)), strict=True)), True)
+    return built(frozenset(zip(exponents, range(len(exponents)), strict=True)), first is not None)
 
 
 def _splits(terms: _Sum, few: bool) -> Iterator[tuple[_Powers, _Sum]]:

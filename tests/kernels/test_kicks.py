@@ -9,9 +9,11 @@ import sympy as sp
 
 from sympflow import SympFlow, systems
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.approximations import on_interval
 from sympflow.kernels.codegen import printed
-from sympflow.kernels.kicks import _function, _scheduled, shapes
+from sympflow.kernels.kicks import _function, _scheduled, kicks_source, shapes
 from sympflow.kernels.scheduling import ADD, FUSED, MULTIPLY, Schedule, nested
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 SCENES = {
     "henon_heiles": systems.henon_heiles,
@@ -59,6 +61,57 @@ def test_every_shape_gives_the_same_momenta(name, terms):
                 expected = expected - c * system.curvature_gradient(q)
             found = functions["kick"](q.tolist(), p.tolist(), float(b), float(g), float(c))
             np.testing.assert_allclose(found, expected, rtol=0, atol=3e-14 * (1 + np.abs(expected).max()))
+
+
+RANGED = {
+    "pendulum": (systems.pendulum, ((-2.7, 2.7),)),
+    "well": (lambda: HamiltonianSystem.from_sympy("p**2/2 + sqrt(1 + q**2) + exp(-q)/3"), ((-0.4, 0.9),)),
+    "bonds": (
+        lambda: HamiltonianSystem.from_sympy(
+            "p1**2/2 + p2**2/3 + (1 - exp(-q1))**2 + exp(q1/2 - 3*q2)/2 + tanh(q1 - q2) + q1**2*q2"
+        ),
+        ((-0.4, 0.9), (-0.3, 0.5)),
+    ),
+}
+
+
+@pytest.mark.parametrize("level", [FORCE_GRADIENT, CURVATURE])
+@pytest.mark.parametrize("name", RANGED)
+def test_kicks_in_ranges_of_positions_are_the_same_but_for_rounding(name, level):
+    """Those of a trajectory and of lanes, in the ranges and beyond."""
+    make, ranges = RANGED[name]
+    system = make()
+    functions = ELEMENTARY | {"fast_exp": math.exp, "fast_tanh": math.tanh}
+    exec(kicks_source(system.symbols, level, ranges=ranges), functions)
+    rng = np.random.default_rng(2)
+    low, high = np.transpose(ranges)
+    numbers = rng.normal(size=level + 1) * [0.5, 0.05, 0.005][: level + 1]
+    table = np.empty((1, functions["N_COEFFICIENTS"]))
+    functions["fill_coefficients"](numbers, table[0])
+    kind = {FORCE_GRADIENT: "gradient", CURVATURE: "curvature"}[level]
+    inside, beyond = rng.uniform(low, high, (10, system.ndof)), rng.uniform(high, high + 0.3, (3, system.ndof))
+    for q in (*inside, *beyond):
+        p, F = rng.normal(size=system.ndof), system.force(q)
+        expected = p + numbers[0] * F - numbers[1] * system.potential_hessian(q) @ system.velocity(F)
+        if level == CURVATURE:
+            expected = expected - numbers[2] * system.curvature_gradient(q)
+        alone = functions[f"{kind}_kicked"](q, p, table, 0)
+        lane = functions[f"{kind}_kicked_lane"](q, p, numbers)
+        np.testing.assert_allclose(alone, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
+        np.testing.assert_allclose(lane, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
+
+
+def test_functions_are_polynomials_where_few_powers_are_exact():
+    x = sp.Symbol("x", real=True)
+    sine = on_interval([sp.sin(x)], x, -2.5, 2.4)
+    assert sine is not None
+    assert (sine.low, sine.high, sine.center) == (-2.5, 2.5, 0.0)
+    assert not sine.coefficients[0, ::2].any()  # odd
+    at = np.linspace(-2.5, 2.5, 201)
+    np.testing.assert_allclose(np.polyval(sine.coefficients[0, ::-1], at), np.sin(at), rtol=0, atol=2e-15)
+    assert on_interval([sp.sin(40 * x)], x, -1.0, 1.0) is None  # too long
+    assert on_interval([1 / x**2], x, 0.01, 1.0) is None
+    assert on_interval([sp.log(x)], x, -1.0, 2.0) is None  # not defined everywhere
 
 
 @pytest.mark.parametrize("name", SCENES)

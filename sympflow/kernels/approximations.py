@@ -1,0 +1,200 @@
+"""Functions in a potential as polynomials on an interval, exact to rounding, and as letters that kicks share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
+
+__all__ = ["Letters", "OnInterval", "Ranges", "on_interval", "position_ranges", "range_of"]
+
+Ranges = tuple[tuple[float, float], ...]
+"""Intervals of q1 … qd in which kicks are computed by polynomials; none for none."""
+
+NODES = 48  # of the interpolants whose coefficients say which degree is enough
+DIGITS = 40
+HIGHEST = 34  # degree: a longer polynomial takes as long as the function
+EXACT = 2.0**-54  # of the largest value
+AMPLIFIED = 16.0  # by so much rounding errors may grow
+STATES, MARGIN = 1000, 0.05  # of a domain whose positions, with a margin on both sides, are a range
+
+
+def position_ranges(symbols: SymbolicHamiltonian, domain: Domain) -> Ranges:
+    """The intervals of the positions in a domain; none for a V of which kicks make no use of them."""
+    assert symbols.V is not None
+    if symbols.V.is_polynomial(*symbols.q):
+        return ()
+    if symbols.ndof > 1 and not any(len(f.args) == 1 for f in symbols.V.atoms(sp.Function)):
+        return ()
+    q = domain.sample(STATES, 0)[:, : symbols.ndof]
+    margin = MARGIN * (q.max(0) - q.min(0))
+    return tuple(zip((q.min(0) - margin).tolist(), (q.max(0) + margin).tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class OnInterval:
+    """Functions of x as polynomials in x − center on [low, high].
+
+    Attributes
+    ----------
+    low, high, center : float
+    coefficients : ndarray of shape (n, K)
+        One row for each function, the coefficients of the powers 0 … K−1.
+    """
+
+    low: float
+    high: float
+    center: float
+    coefficients: np.ndarray
+
+
+def on_interval(functions: Sequence[sp.Expr], x: sp.Symbol, low: float, high: float) -> OnInterval | None:
+    """Functions of x as polynomials on [low, high] whose errors are below rounding; None where there are none.
+
+    Each function is to enter with a factor at least `AMPLIFIED` times less than that before, as the terms of a kick do
+    (with g about (ω Δt)²/100 of b and c as much of g): its errors may be larger by that.
+
+    The coefficients are those of Chebyshev interpolants, cut where what follows is below rounding, in powers of x less
+    the middle (of an interval that is nearly symmetric about 0: in powers of x on a symmetric one). Where the powers
+    cancel so that rounding would be amplified, there is none either.
+    """
+    from mpmath import mp
+
+    if abs(low + high) < 0.1 * (high - low):
+        low, high = -max(-low, high), max(-low, high)
+    center, half = 0.5 * (low + high), 0.5 * (high - low)
+    with mp.workdps(DIGITS):
+        values = sp.lambdify(x, [printable(f) for f in functions], "mpmath")
+        cosines = _cosines()
+        try:
+            rows = [values(mp.mpf(center) + mp.mpf(half) * c) for c in cosines[1]]
+            found = [
+                _powers([mp.mpf(row[k]) for row in rows], cosines, half, AMPLIFIED**k) for k in range(len(functions))
+            ]
+        except (ArithmeticError, TypeError, ValueError, NameError):  # not defined, or not real, everywhere
+            return None
+    if any(c is None for c in found):
+        return None
+    kept = [c for c in found if c is not None]
+    length = max(map(len, kept))
+    return OnInterval(low, high, center, np.array([[*c, *[0.0] * (length - len(c))] for c in kept]))
+
+
+@cache
+def _cosines() -> list[list[Any]]:
+    """cos(k a) of the angles a of the nodes, for k = 0, 1, …"""
+    from mpmath import mp
+
+    angles = [(mp.mpf(2 * i + 1) / (2 * NODES)) * mp.pi for i in range(NODES)]
+    return [[mp.cos(k * a) for a in angles] for k in range(NODES)]
+
+
+def _powers(values: Sequence[Any], cosines: Sequence[Sequence[Any]], half: float, less: float) -> list[float] | None:
+    """The coefficients in powers of x of a function by its values at the nodes; None of one that is too long.
+
+    `less` times its errors count.
+    """
+    from mpmath import mp
+
+    largest = max(abs(v) for v in values)
+    if largest == 0:
+        return [0.0]
+    n = len(values)
+    chebyshev = [(2 if k else 1) * mp.fdot(values, cosines[k]) / n for k in range(n)]
+    tails, tail = [], mp.mpf(0)
+    for c in reversed(chebyshev):
+        tail += abs(c)
+        tails.append(tail)
+    tails.reverse()  # tails[k] = |c_k| + |c_{k+1}| + …
+    degree = next((k for k in range(n - 1) if tails[k + 1] <= EXACT * less * largest), n)
+    if degree > HIGHEST:
+        return None
+    powers = [mp.mpf(0)] * (degree + 1)
+    before, current = [mp.mpf(1)], [mp.mpf(0), mp.mpf(1)]
+    for k in range(degree + 1):
+        T = before if k == 0 else current
+        for i, t in enumerate(T):
+            powers[i] += chebyshev[k] * t
+        if k >= 1:
+            following = [mp.mpf(0), *(2 * t for t in current)]
+            for i, t in enumerate(before):
+                following[i] -= t
+            before, current = current, following
+    powers = [c if abs(c) > EXACT * less * largest / n else mp.mpf(0) for c in powers]
+    if sum(map(abs, powers)) > AMPLIFIED * less * largest:
+        return None
+    return [float(c / mp.mpf(half) ** i) for i, c in enumerate(powers)]
+
+
+class Letters:
+    """Symbols for the functions of positions in expressions: one for each, and powers of it for exp(n·u).
+
+    Attributes
+    ----------
+    functions : dict of Symbol to Expr
+        What the symbols stand for, each a function of one argument.
+    """
+
+    def __init__(self, q: Sequence[sp.Symbol]) -> None:
+        self.functions: dict[sp.Symbol, sp.Expr] = {}
+        self._q = set(q)
+        self._exponents: dict[tuple[sp.Expr, bool], list[sp.Rational]] = {}
+
+    def put_into(self, expressions: Sequence[sp.Expr]) -> list[sp.Expr]:
+        """The expressions with symbols in place of functions."""
+        split = [f.replace(lambda e: isinstance(e, sp.exp), _split_exponential) for f in expressions]
+        atoms = {a for f in split for a in f.atoms(sp.Function) if len(a.args) == 1 and a.free_symbols & self._q}
+        outer = [a for a in atoms if not a.args[0].atoms(sp.Function)]
+        for a in outer:
+            if isinstance(a, sp.exp):
+                number, u = a.args[0].as_coeff_Mul()
+                if number.is_Rational:
+                    self._exponents.setdefault((u, bool(number > 0)), []).append(number)
+        places = {a: self._letter(a) for a in sorted(outer, key=sp.default_sort_key)}
+        return [f.xreplace(places) for f in split]
+
+    def _letter(self, atom: sp.Expr) -> sp.Expr:
+        if isinstance(atom, sp.exp):
+            number, u = atom.args[0].as_coeff_Mul()
+            if number.is_Rational:
+                unit = sp.gcd_list([abs(n) for n in self._exponents[u, bool(number > 0)]])
+                unit = unit if number > 0 else -unit
+                return self._symbol(sp.exp(unit * u)) ** (number / unit)
+        return self._symbol(atom)
+
+    def _symbol(self, function: sp.Expr) -> sp.Symbol:
+        for symbol, known in self.functions.items():
+            if known == function:
+                return symbol
+        symbol = sp.Symbol(f"function_{len(self.functions)}", real=True)
+        self.functions[symbol] = function
+        return symbol
+
+    @cached_property
+    def symbols(self) -> tuple[sp.Symbol, ...]:
+        return tuple(self.functions)
+
+
+def _split_exponential(f: sp.Expr) -> sp.Expr:
+    """exp(u + v) as exp(u)·exp(v)."""
+    terms = sp.Add.make_args(sp.expand(f.args[0]))
+    return sp.Mul(*[sp.exp(u) for u in terms], evaluate=False) if len(terms) > 1 else f
+
+
+def range_of(u: sp.Expr, q: Sequence[sp.Symbol], ranges: Ranges) -> tuple[float, float] | None:
+    """The values of u on a box of positions, where it is affine in them; else None."""
+    slopes = [sp.diff(u, s) for s in q]
+    if any(slope.free_symbols for slope in slopes):
+        return None
+    start = float(u.xreplace(dict.fromkeys(q, sp.S.Zero)))
+    ends = [
+        sorted((float(slope) * low, float(slope) * high)) for slope, (low, high) in zip(slopes, ranges, strict=True)
+    ]
+    return start + sum(low for low, _ in ends), start + sum(high for _, high in ends)
