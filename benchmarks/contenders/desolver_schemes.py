@@ -40,7 +40,7 @@ def outputs(scene: Scene, method: str, dt: float, t_end: float) -> Outputs:
 
 
 def contenders(scene: Scene) -> list[Contender]:
-    guesses = {"ABAs5o6H": {1e-3: 1.0, 1e-6: 0.25}, "BABs9o7H": {1e-3: 1.4, 1e-6: 0.4}}
+    guesses = {"ABAs5o6H": {1e-3: 0.75, 1e-6: 0.145}, "BABs9o7H": {1e-3: 1.8, 1e-6: 0.82, 1e-9: 0.28}}
     return [
         Contender(
             method,

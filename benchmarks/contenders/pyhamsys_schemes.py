@@ -53,8 +53,8 @@ def outputs(scene: Scene, method: str, trajectories: int, dt: float, t_end: floa
 
 def contenders(scene: Scene) -> list[Contender]:
     guesses = {
-        "BM4": {1e-3: 0.9, 1e-6: 0.25, 1e-9: 0.045},
-        "RKN6b": {1e-3: 1.4, 1e-6: 0.8, 1e-9: 0.32},
+        "BM4": {1e-3: 1.1, 1e-6: 0.204, 1e-9: 0.0364},
+        "RKN6b": {1e-3: 1.69, 1e-6: 0.84, 1e-9: 0.32},
     }
     return [
         Contender(
