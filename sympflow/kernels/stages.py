@@ -27,6 +27,7 @@ __all__ = [
     "step_table",
     "time_lines",
     "two_stages_source",
+    "with_last_stage",
 ]
 
 
@@ -193,6 +194,25 @@ def run_table(scheme: Scheme, h: float) -> StageTable:
     times = [0.0, *before_inner[: len(inner)].tolist(), -last.drift, -last.drift]
     direction = float(round(sum(s.drift for s in stages)))
     return _table(scheme, [opening, *inner, link, last], times, direction).scaled(h)
+
+
+def with_last_stage(run: StageTable, after: StageTable) -> StageTable:
+    """The stages of a map of the ends of a run, whose last stage is before them; two drifts in a row are one."""
+    assert run.times is not None
+    of_kicks = np.cumsum(after.drifts) - after.drifts if after.times is None else after.times
+    names = ("kicks", "drifts", "gradients", "curvatures", "polynomials")
+    last, first = (
+        [np.array(getattr(table, name)[place]) for name in names] for table, place in ((run, -1), (after, 0))
+    )
+    merged = not any(numbers.any() for name, numbers in zip(names, first, strict=True) if name != "drifts")
+    if merged:
+        last[1] = last[1] + first[1]
+    columns = [
+        np.concatenate([numbers[None], getattr(after, name)[int(merged) :]])
+        for name, numbers in zip(names, last, strict=True)
+    ]
+    times = np.concatenate([run.times[-1:], of_kicks[int(merged) :]])
+    return StageTable(after.level, *columns, times, after.direction)
 
 
 # kinds of kick as code --------------------------------------------------------------------------------------------
