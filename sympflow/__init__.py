@@ -15,6 +15,7 @@ _HOME = {
     "Ball": "hamiltonian.domain",
     "Box": "hamiltonian.domain",
     "EnergySublevel": "hamiltonian.domain",
+    "LatticeStates": "hamiltonian.lattice_states",
     "Tube": "hamiltonian.domain",
     "time_transformed": "hamiltonian.time_transformation",
     "doubled": "hamiltonian.doubling",
@@ -32,6 +33,7 @@ _HOME = {
     "load": "flow.files",
     "shipped_flows": "flow.shipped",
     "train": "training.trainer",
+    "learn": "learning.learner",
     "Trajectories": "learning.trajectories",
     "compare": "studies.comparison",
     "work_precision": "studies.precision",
@@ -81,6 +83,7 @@ if TYPE_CHECKING:
     from sympflow.integrators.registry import get as get
     from sympflow.integrators.registry import register as register
     from sympflow.integrators.splitting import splitting_method as splitting_method
+    from sympflow.learning.learner import learn as learn
     from sympflow.learning.trajectories import Trajectories as Trajectories
     from sympflow.metrics.accuracy import reference_error as reference_error
     from sympflow.metrics.accuracy import time_reversal_error as time_reversal_error

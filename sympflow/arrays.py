@@ -291,3 +291,12 @@ def _set_up() -> None:
         warnings.simplefilter("ignore", DeprecationWarning)
         x = torch.zeros(1)
         torch.func.jvp(torch.sin, (x,), (x,))
+
+
+def like(constant: np.ndarray, x: Array) -> Array:
+    """A constant array in the library, dtype and device of `x`."""
+    if is_tensor(x):
+        import torch
+
+        return torch.as_tensor(np.array(constant), dtype=x.dtype, device=x.device)
+    return constant.astype(x.dtype, copy=False)

@@ -37,7 +37,7 @@ from sympflow.solution import Solution, StoredSolution, joined
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
 
-BACKENDS = ("auto", "compiled", "array")
+BACKENDS = ("auto", "compiled", "array", "cuda")
 MAX_EVENT_SAMPLES = 100_000_000
 MOST_DIAGNOSED = 16  # sets of values of parameters
 FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite end
@@ -81,8 +81,8 @@ def solve(
     params : mapping of str to array_like, optional
         Values of parameters of the system for each trajectory: numbers, or arrays that broadcast with the batch of y0;
         of one state y0 they make a batch. The others keep the system's values. Splitting methods on the splitting
-        "kinetic", but for those with force gradients and with friction, take them as numbers of one compiled run, and
-        each trajectory is that of a batch on ``system.with_params(...)``, with compensated sums up to rounding.
+        "kinetic" take them as numbers of one compiled run, and each trajectory is that of a batch on
+        ``system.with_params(...)``, up to rounding with compensated sums, force gradients, friction or a drive.
         Elsewhere trajectories of equal values run together, one set of values after the other. A trained flow holds for
         its own parameters alone.
     t_eval : array_like of shape (n,), optional
@@ -165,15 +165,7 @@ def solve(
             system = rows.system_of(0)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
     every = check_save_every(save_every, times)
-    if not isinstance(backend, str) or backend not in (*BACKENDS, "cuda"):
-        raise ValueError(f"`backend` must be one of {', '.join(map(repr, (*BACKENDS, 'cuda')))}; got {backend!r}.")
-    if backend == "cuda" and not integrator.runs_on_cuda:
-        raise ValueError(
-            f"`backend` 'cuda' is for splitting methods on the splitting 'kinetic' and the clock 'physical'; "
-            f"{integrator.label!r} is none: use backend='auto'."
-        )
-    if backend == "compiled" and not integrator.compiles:
-        raise ValueError(f"`backend` 'compiled' does not apply to method {integrator.name!r}: use 'auto'.")
+    check_backend(backend, integrator)
     if not isinstance(dense_output, bool | np.bool_):
         raise TypeError(f"`dense_output` must be True or False; got {dense_output!r}.")
     action = ("warn" if integrator.trained else "ignore") if on_domain_exit is None else on_domain_exit
@@ -206,6 +198,19 @@ def solve(
     finally:
         bar.end()
     return sol
+
+
+def check_backend(backend: Any, integrator: Integrator) -> None:
+    """Raise ValueError if it is none, or none of the method."""
+    if not isinstance(backend, str) or backend not in BACKENDS:
+        raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
+    if backend == "cuda" and not integrator.runs_on_cuda:
+        raise ValueError(
+            f"`backend` 'cuda' is for splitting methods on the splitting 'kinetic' and the clock 'physical'; "
+            f"{integrator.label!r} is none: use backend='auto'."
+        )
+    if backend == "compiled" and not integrator.compiles:
+        raise ValueError(f"`backend` 'compiled' does not apply to method {integrator.name!r}: use 'auto'.")
 
 
 def _answered(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None) -> Solution:

@@ -10,8 +10,10 @@ import tomllib
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import sympflow
 from sympflow import shipped_flows
 from sympflow.integrators import registry
 
@@ -29,7 +31,9 @@ def blocks(page):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if blocks(page) and page.stem != "gallery"], ids=lambda page: page.stem
+)
 @pytest.mark.filterwarnings("default")
 def test_the_code_on_a_page_runs(page, tmp_path, monkeypatch):
     """In a namespace of its own and an empty folder; the README in an interpreter of its own, as its reader has it."""
@@ -51,6 +55,34 @@ def test_the_code_on_a_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "examples")
     monkeypatch.setattr(registry, "_registered", dict(registry._registered))
     runpy.run_path(str(script), run_name="page")
+
+
+@pytest.mark.slow
+def test_the_code_of_the_gallery_draws(tmp_path, monkeypatch):
+    """A hundredth of each run, by array operations; `python docs/gallery.py` runs them in full."""
+
+    def briefly(function):
+        def run(system, method, t_span, y0=None, **options):
+            if "t_eval" in options:
+                times = np.asarray(options["t_eval"]) / 100
+                options["t_eval"] = times[:: 1 + len(times) // 20]
+            if function is solve and method != "rk45":
+                options["backend"] = "array"
+            return function(system, method, (0, t_span[1] / 100), y0, **options)
+
+        return run
+
+    solve = sympflow.solve
+    for name in ("solve", "poincare_section", "sali", "escape_times"):
+        monkeypatch.setattr(sympflow, name, briefly(getattr(sympflow, name)))
+    gallery = runpy.run_path(str(ROOT / "docs" / "gallery.py"))
+    monkeypatch.setitem(gallery["draw"].__globals__, "PICTURES", tmp_path)
+    gallery["draw"](set())
+    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"\(figures/gallery/(.+?)\)", page))
+    assert shown == {path.name for path in tmp_path.iterdir()}
+    assert shown == {path.name for path in (ROOT / "docs" / "figures" / "gallery").iterdir()}
+    assert len(shown) == page.count("\n### ")
 
 
 def test_the_table_of_flows_is_that_of_the_package():
@@ -94,8 +126,6 @@ def test_every_page_is_in_the_navigation():
 
 
 def test_every_public_name_is_in_the_reference():
-    import sympflow
-
     reference = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference").glob("*.md"))
     for name in sympflow.__all__:
         home = sympflow._HOME.get(name)

@@ -170,12 +170,6 @@ def test_a_dense_hessian_of_a_large_lattice_is_refused_before_it_is_made():
         system.potential_hessian(np.zeros(10**6))
 
 
-def test_methods_of_a_linear_part_refuse_lattices():
-    system = HamiltonianSystem.lattice(**RING)
-    with pytest.raises(ValueError, match="made of sites or pairs, of which no linear part can be read"):
-        sf.solve(system, "linear_srkn6b", t_span=(0, 1), y0=np.zeros(12), dt=0.1)
-
-
 def test_only_lattices_have_an_energy_density():
     with pytest.raises(ValueError, match="no energy density"):
         sf.systems.pendulum().energy_density(np.zeros(2))

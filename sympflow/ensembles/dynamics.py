@@ -50,6 +50,7 @@ class _Indicator(Reduction):
     """A chaos indicator, and the time at which it was read."""
 
     name: ClassVar[str]
+    own_loops: ClassVar[bool] = True
 
     @abstractmethod
     def follow(self, chunk: Chunk, rows: np.ndarray) -> Indicator:
@@ -181,6 +182,7 @@ class Escape(Reduction):
     """
 
     outside: Any = None
+    own_loops: ClassVar[bool] = True
 
     def fields(self, problem: Chunk) -> Fields:
         escapes(
@@ -209,6 +211,7 @@ class PlaneCrossings(Reduction):
     level: float = 0.0
     direction: int = 1
     most: int = 100
+    own_loops: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_counts(most=self.most)

@@ -50,6 +50,8 @@ class Reduction(ABC):
     """The field that holds states [q, p] along its first axis, which a Dataset has as q and p."""
     takes_params: ClassVar[bool] = False
     """True if the orbits of a chunk may have different parameters, those of `chunk.params`."""
+    own_loops: ClassVar[bool] = False
+    """True if it walks along the orbits by loops of its own, from `chunk.y0`."""
 
     def check(self, system: HamiltonianSystem) -> None:  # noqa: B027
         """Raise ValueError if it has no meaning for a system; of a grid of parameters each value is asked."""

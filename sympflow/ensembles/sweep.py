@@ -26,7 +26,7 @@ from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.provenance import provenance
 from sympflow.integrators.registry import build, check_applies
 from sympflow.kernels.modules import at_most, compiling_alone
-from sympflow.solver import BACKENDS, check_own_parameters
+from sympflow.solver import check_backend, check_own_parameters
 from sympflow.workers import LostWorkers, Parcel, Unpicklable, checked_workers, mapped
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def ensemble(
         Go on with the store of the same ensemble, if there is one: what is there is not done again.
     progress : bool or callable
         True prints how far the ensemble is; a callable is called with the numbers of orbits done and in all.
-    backend : "auto", "compiled" or "array"
+    backend : "auto", "compiled", "array" or "cuda"
         As for `solve`.
     **options
         Options of the method.
@@ -132,13 +132,17 @@ def ensemble(
     integrator = build(method, options)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
-    if not isinstance(backend, str) or backend not in BACKENDS:
-        raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
+    check_backend(backend, integrator)
     workers = checked_workers(workers)
     check_flag("resume", resume)
     if resume and store is None:
         raise ValueError("`resume` goes on with a `store`: name one.")
     kept = reduction(reduce)
+    if backend == "cuda" and kept.own_loops:
+        raise ValueError(
+            f"`backend` 'cuda' is for a `reduce` of states; {type(kept).__name__} runs loops of its own, which are "
+            "those of the CPU: use backend='auto'."
+        )
     orbits = initial_states(system, y0, n, seed)
     fixed, axes = _axes(system, params)
     check_own_parameters(system, {**fixed, **axes}, integrator)

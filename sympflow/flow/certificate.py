@@ -25,6 +25,7 @@ QUANTILE, CONFIDENCE = 0.95, 0.99  # of the energy errors, and that its limit is
 SAVED_VALUES = 1_000_000  # of a piece of the measured runs, which are never held whole
 WORST = 16  # states of a time from which the largest rate is searched
 OFFSPRING, ROUNDS = 16, 16  # new states of each, and how often
+SEARCHED = 4_000_000  # numbers of these states, of many degrees of freedom
 GOLDEN = (math.sqrt(5) - 1) / 2
 FIRST_STEP, SHRINK = 0.2, 0.65  # how far these are, in standard deviations of Ω, and how much nearer each time
 
@@ -269,7 +270,7 @@ def _largest_nearby(
     if not np.isfinite(found).all():
         return found.max(1)
     length, times = FIRST_STEP * x.std(0), np.broadcast_to(t[:, None], (OFFSPRING, *found.shape))
-    for _ in range(ROUNDS):
+    for _ in range(min(ROUNDS, SEARCHED // (OFFSPRING * best.size))):
         new = best + rng.normal(size=(OFFSPRING, *best.shape)) * length
         inside = domain.contains(new)
         rates = np.full(inside.shape, -math.inf)

@@ -3,7 +3,7 @@
 The metadata entry "sympflow" is a JSON object: format, version (of the package), kind, architecture, dt, domain,
 system, fingerprint, recipe, figures, checksum (of the tensors), and, where there are any, certificate, identity
 (the H of the system, at states of the domain and as an expression), unfitted (intervals of t without labels)
-and drive_times (where a drive without a period was fitted).
+drive_times (where a drive without a period was fitted), and lattice_terms (the terms of a lattice, as texts).
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Description:
     ----------
     domain, system, fingerprint, recipe, figures, certificate
         `FlowMap`'s domain, system_name, fingerprint, recipe, figures, certified.
-    identity, unfitted, drive_times
+    identity, unfitted, drive_times, lattice_terms
         `FlowMap`'s own.
     """
 
@@ -94,6 +94,7 @@ class Description:
     identity: Identity | None = None
     unfitted: tuple[tuple[float, float], ...] = ()
     drive_times: tuple[float, float] | None = None
+    lattice_terms: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of_record(cls, record: dict[str, Any], ndof: int) -> Self:
@@ -125,7 +126,16 @@ class Description:
         if len(driven) > 1 or any(low >= high for low, high in driven):
             raise Refused("its times of the drive are not one interval")
         return cls(
-            domain, system, fingerprint, record["recipe"], record["figures"], certificate, identity, unfitted, *driven
+            domain,
+            system,
+            fingerprint,
+            record["recipe"],
+            record["figures"],
+            certificate,
+            identity,
+            unfitted,
+            driven[0] if driven else None,
+            _texts(record.get("lattice_terms", {})),
         )
 
 
@@ -163,6 +173,8 @@ def write(
         record["unfitted"] = description.unfitted
     if description.drive_times is not None:
         record["drive_times"] = [description.drive_times]
+    if description.lattice_terms:
+        record["lattice_terms"] = dict(description.lattice_terms)
     if description.identity is not None:
         record["identity"] = description.identity.to_dict()
     if description.certificate is not None:
@@ -223,7 +235,7 @@ def load(
     path
     system : HamiltonianSystem, optional
         The system of the flow, which is checked. A primed flow needs its V and T: given here, or later by
-        `flow.bind(system)`; `solve` gives them as well.
+        `flow.bind(system)`; `solve` gives them as well. A flow that was learned from data brings its own.
     device : torch.device or str, optional
 
     Returns
@@ -252,7 +264,9 @@ def load(
         raise _refusal(file, "a number in its record is too large", Refused("").remedy) from None
     if system is not None:
         flow.check_system(system)
-        flow.bound(system)
+        flow = flow.bound(system)
+    else:
+        flow.take_learned()
     return flow.to(device) if device is not None else flow
 
 
@@ -437,6 +451,13 @@ def _intervals(pairs: Any, what: str) -> tuple[tuple[float, float], ...]:
     return tuple((float(low), float(high)) for low, high in pairs)
 
 
+def _texts(table: Any) -> dict[str, str]:
+    """Return a table of texts in a record, which are shown and never read; else it is refused."""
+    if not isinstance(table, dict) or not all(isinstance(text, str) for text in table.values()):
+        raise Refused("its terms of a lattice are not a table of texts")
+    return table
+
+
 def _check_system(name: Any, fingerprint: Any, ndof: int) -> None:
     """Refuse all but a fingerprint, or, of a flow that never had a system, None as its system and fingerprint."""
     if not isinstance(name, str | None):
@@ -484,7 +505,7 @@ def _domain(description: Any, ndof: int) -> Domain:
         domain = domain_from_dict(description)
     except (ValueError, TypeError, AttributeError) as error:
         raise Refused(f"its domain is not admissible ({error})") from None
-    if domain.width != 2 * ndof:
+    if domain.width not in (None, 2 * ndof):
         raise Refused(f"its domain has states of length {domain.width}, not {2 * ndof}")
     return domain
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
+from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -22,6 +23,7 @@ from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import Identity, check_for_flows, same_system, without_friction
+from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 
@@ -82,6 +84,8 @@ class FlowMap(nn.Module):
     unfitted : tuple of (float, float)
         Open intervals of t in which it was never compared with anything: those between the times of labels, if these
         were few and it was fitted to nothing else. Results there come with a warning.
+    lattice_terms : mapping of str to str
+        The terms of a lattice, for messages; {} of another system.
     drive_times : (float, float) or None
         The interval of t0 + t that the flow of a drive without a period was fitted in: beyond it there is a warning.
     recipe, figures : dict
@@ -100,9 +104,12 @@ class FlowMap(nn.Module):
     """True if the maps of the family hold the friction of a damped system that they are made for."""
     takes_driving: ClassVar[bool] = False
     """True if the maps of the family take the time, of a driven system that they are made for."""
-    identity: Identity | None = None  # these two of flows in pickles of earlier versions, which did not have them
+    identity: Identity | None = None  # these of flows in pickles of earlier versions, which did not have them
+    lattice_terms: Mapping[str, str] = MappingProxyType({})
     unfitted: tuple[tuple[float, float], ...] = ()
     drive_times: tuple[float, float] | None = None
+    learned: HamiltonianSystem | None = None
+    """The system that `sympflow.learn` found, of the flow that it made."""
 
     def __init__(self, ndof: int, dt: float) -> None:
         super().__init__()
@@ -120,6 +127,7 @@ class FlowMap(nn.Module):
         self.fingerprint: tuple[float, ...] | None = None
         self.system_name: str | None = None
         self.identity, self.unfitted, self.drive_times = None, (), None
+        self.lattice_terms = {}
         self._origin: tuple[dict[str, Any], Origin] | None = None
         self.recipe: dict[str, Any] = {}
         self.figures: dict[str, Any] = {}
@@ -461,6 +469,7 @@ class FlowMap(nn.Module):
             identity=self.identity,
             unfitted=self.unfitted,
             drive_times=self.drive_times,
+            lattice_terms=self.lattice_terms,
         )
 
     def describe(self, description: Description) -> None:
@@ -470,14 +479,17 @@ class FlowMap(nn.Module):
         )  # fmt: skip
         self.recipe, self.figures, self.certified = description.recipe, description.figures, description.certificate
         self.identity, self.unfitted = description.identity, description.unfitted
-        self.drive_times = description.drive_times
+        self.drive_times, self.lattice_terms = description.drive_times, dict(description.lattice_terms)
 
     # its system ---------------------------------------------------------------------------------------------
 
     @property
     def system(self) -> HamiltonianSystem | None:
-        """The system whose functions the flow evaluates; None for networks, and for a flow loaded without it."""
-        return None
+        """The system whose functions the flow evaluates, or which was learned with it; None for other networks.
+
+        None too for a flow that was loaded without its system, unless that was learned.
+        """
+        return self.learned
 
     @property
     def origin(self) -> Origin | None:
@@ -500,23 +512,45 @@ class FlowMap(nn.Module):
             If the system has friction, and the family of the flow has not.
         """
         check_for_flows(system, self.takes_friction, self.takes_driving)
-        self.fingerprint, self.system_name = system.fingerprint, system.name
-        self.identity = Identity.of(system, domain)
+        small = self.known_by(system)
+        self.fingerprint, self.system_name = small.fingerprint, system.name
+        self.identity = Identity.of(small, domain)
+        self.lattice_terms = {} if system.local is None else dict(system.local.terms)
+
+    def known_by(self, system: HamiltonianSystem) -> HamiltonianSystem:
+        """The system whose H the flow keeps to know another: of a lattice, where its size is no part of the flow, few
+        of its sites; else that system itself."""
+        return system
+
+    @property
+    def kept_ndof(self) -> int:
+        """The degrees of freedom of the system that the flow is known by, and that its file tells of."""
+        return self.ndof
 
     def matches(self, system: HamiltonianSystem) -> bool:
         """Return True if the flow is of this system, and in its time; a bare flow fits any of its size."""
         mine = self.fingerprint
-        if system.ndof != self.ndof:
-            return False
         if mine is None:
-            return True
-        return same_system(mine, system.fingerprint) and (self.identity is None or self.identity.agrees(system))
+            return system.ndof == self.ndof
+        small = self.known_by(system)
+        if small.ndof != self.kept_ndof:
+            return False
+        return same_system(mine, small.fingerprint) and (self.identity is None or self.identity.agrees(small))
+
+    def check_ends(self, system: HamiltonianSystem) -> None:
+        """Refuse a lattice with ends of a kind at which the numbers of the flow do not hold.
+
+        Raises
+        ------
+        ValueError
+        """
 
     def check_system(self, system: HamiltonianSystem) -> None:
         """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
         check_system(system)
         check_for_flows(system, self.takes_friction, self.takes_driving)
         if self.fingerprint is not None and self.matches(system):
+            self.check_ends(system)
             return
         origin = self.origin
         if origin is not None and origin.is_of(system):
@@ -532,10 +566,13 @@ class FlowMap(nn.Module):
                 "accurate. Fit one to the damped system by sympflow.train(system), or from these numbers by "
                 "sympflow.train(system, flow=flow.transferred(system))."
             )
+        if system.local is not None and self.lattice_terms:
+            reason = _difference(self.lattice_terms, system.local.terms)
+            raise ValueError(
+                f"`system` {system.name!r} is another lattice than that of this flow{reason}: its numbers cancel the "
+                f"errors of its own terms alone. {remedy[0].upper()}{remedy[1:]}"
+            )
         if system.ndof != self.ndof:
-            if system.local is not None:
-                remedy += " A primed flow of a smaller lattice of the same piece is carried over by "
-                remedy += "flow.transferred(system)."
             raise ValueError(
                 f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: {remedy}"
             )
@@ -552,9 +589,24 @@ class FlowMap(nn.Module):
                 f"parameters differ): {remedy}"
             )
 
+    def take_learned(self, system: HamiltonianSystem | None = None) -> None:
+        """Bind the system that was learned with the flow: as it was found, or as the file tells that has the flow."""
+        told = self.recipe.get("learned")
+        if system is None and told is not None and self.identity is not None and self.identity.expression is not None:
+            expression, damping = self.identity.expression, told.get("damping")
+            name = self.system_name or "learned"
+            system = HamiltonianSystem.from_sympy(expression, damping=damping, name=name, domain=self.domain)
+            self.check_system(system)
+        if system is not None:
+            self.learned = system
+            self.bound(system)
+
     def is_without_friction_of(self, system: HamiltonianSystem) -> bool:
         """Return True if the flow is that of a damped system without its friction."""
-        return self.fingerprint is not None and without_friction(self.fingerprint, self.identity, system)
+        small = self.known_by(system)
+        if self.fingerprint is None or small.ndof != self.kept_ndof:
+            return False
+        return without_friction(self.fingerprint, self.identity, small)
 
     def bound(self, system: HamiltonianSystem) -> Self:
         """Return this flow, ready to be used on `system`: one that is made of the system's functions takes them."""
@@ -563,6 +615,8 @@ class FlowMap(nn.Module):
     def domain_for(self, system: HamiltonianSystem) -> Domain | None:
         """Return Ω of the flow, or else of its system, ready to be asked for states; None if neither has one."""
         domain = self.domain or system.domain
+        if isinstance(domain, LatticeStates):
+            return domain.of(system)
         if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
             return system.domain if domain == system.domain else domain.attach(system.hamiltonian)
         return domain
@@ -713,6 +767,14 @@ class FlowMap(nn.Module):
     def __repr__(self) -> str:
         system = f" of {self.system_name}" if self.system_name else ""
         return f"<{type(self).__name__}{system}: ndof={self.ndof}, dt={self.dt:g}, {self.n_parameters} parameters>"
+
+
+def _difference(mine: Mapping[str, str], theirs: Mapping[str, str]) -> str:
+    """The first term in which the lattice of a flow and another differ, as a clause; nothing where the texts agree."""
+    for name in [*mine, *theirs]:
+        if mine.get(name) != theirs.get(name):
+            return f" (its {name} is {theirs.get(name, 'none')}, and not {mine.get(name, 'none')})"
+    return ""
 
 
 def start_time(t0: Any, x: Tensor, period: float | None) -> Tensor:

@@ -44,6 +44,7 @@ from sympflow.flow.primed_potentials import (
 from sympflow.flow.sympflow import SympFlow
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.fingerprint import check_for_flows
+from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 from sympflow.hamiltonian.monomials import MOST_MONOMIALS, Monomials, monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE as CURVATURE_LEVEL
@@ -56,6 +57,8 @@ if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
 
 Kind = Literal["kick", "drift"]
 
+WORSE = 2.0
+"""Times the energy error of a ring that a lattice with ends may have for the numbers of a flow to hold there."""
 MOST_KEPT = 256  # a flow with a processor has five for each step length
 
 
@@ -75,7 +78,7 @@ class PrimedShape:
     processor : int
         Number C of pairs of χ, 2C + 1 maps; 0 for none.
     curvature : bool
-        True if kicks with force gradients have curvature terms too, for symbolic systems.
+        True if kicks with force gradients have curvature terms too, for symbolic systems and lattices.
     monomials : tuple of tuple of int
         The exponents m of polynomials that stand in place of both, for symbolic systems; none for none.
     timed : bool
@@ -258,6 +261,7 @@ class Tables:
         self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
         self.dt, self.processed = dt, outer > 0
         self.kernel: PrimedFlowKernel | None = None  # the compiled loops that were made of these last
+        self.carried: Any = None  # the flow of another shape of a lattice that was made of these last
         self.monomials = monomials
         self.level = POLYNOMIAL_LEVEL if monomials else max(len(s.more) for s in substeps)
         numbers = [c.table for c in columns_of(substeps)]
@@ -523,7 +527,7 @@ class PrimedFlow(SympFlow):
         return cls(ndof, PrimedShape.from_dict(plan["primed"], ndof), dt, dtype=dtype)
 
     def architecture(self) -> dict[str, Any]:
-        return {"ndof": self.ndof, "primed": self.shape.to_dict()}
+        return {"ndof": self.kept_ndof, "primed": self.shape.to_dict()}
 
     @property
     def palindromic(self) -> bool:
@@ -660,8 +664,17 @@ class PrimedFlow(SympFlow):
         """The system whose V and T the flow uses, None for one loaded without it."""
         return self._binding.system if self._binding.known else None
 
+    def known_by(self, system: HamiltonianSystem) -> HamiltonianSystem:
+        return system if self.monomials else system.few_sites
+
+    @property
+    def kept_ndof(self) -> int:
+        return self.ndof if self.system is None else self.known_by(self.system).ndof
+
     def bind(self, system: HamiltonianSystem) -> Self:
         """Give a flow that was loaded from a file the V and T of its system; itself.
+
+        The flow of a lattice takes the size of the one that it is given.
 
         Raises
         ------
@@ -670,6 +683,11 @@ class PrimedFlow(SympFlow):
         """
         self.check_system(system)
         self._binding.bind(system)
+        if system.ndof != self.ndof:
+            self.ndof = system.ndof
+            self.layers = tuple(map(self._layer, range(len(self.substeps))))  # type: ignore[assignment]
+        if isinstance(self.domain, LatticeStates):
+            self.domain = self.domain.of(system)
         return self
 
     def transferred(self, system: HamiltonianSystem) -> Self:
@@ -677,29 +695,31 @@ class PrimedFlow(SympFlow):
 
         They are a start for ``train(system, flow=flow.transferred(system))``. As they are they need not be near the
         exact flow of that system, with friction for instance. The numbers know the potential and dt, not the size: of a
-        lattice they serve any other one of the same site and bond; one from a file is bound first, by `bind`.
+        lattice they serve any other one of the same terms, for which `solve` takes the flow as it is.
 
         Raises
         ------
         ValueError
-            If the system has not as many degrees of freedom and is no lattice of the same site and bond, or has no
-            such flow.
+            If the system has not as many degrees of freedom and is no lattice of the same terms, or has no such flow.
         """
         check_system(system)
         check_for_flows(system, self.takes_friction, self.takes_driving)
-        mine = None if self.system is None else self.system.local
-        same_piece = mine is not None and not self.monomials and mine.is_piece_of(system.local)
-        if system.ndof != self.ndof and not same_piece:
-            raise ValueError(
-                f"`system` has {system.ndof} degrees of freedom, the flow {self.ndof}: give one of those, or a lattice "
-                "of the same site and bond; a flow from a file first needs its own, flow.bind(piece)."
-            )
+        if system.ndof != self.ndof:
+            if system.local is None:
+                raise ValueError(
+                    f"`system` has {system.ndof} degrees of freedom, the flow {self.ndof}: give one of those."
+                )
+            self.check_system(system)
         if not system.separable or (self.terms and not (system.quadratic_kinetic and system.has_hessian_vector)):
             raise ValueError(
                 f"`system` {system.name!r} has no kicks and drifts such as the flow's: it must be H = ½ pᵀM⁻¹p + V(q), "
                 "with `hessian_vector` where V is a function."
             )
         return self._of(system, replace(self.shape, timed=_is_timed(system)))
+
+    def of_lattice(self, system: HamiltonianSystem) -> Self:
+        """Return the flow of a lattice with the numbers of this one, of a few sites of it by their coordinates."""
+        return self._of(system, self.shape).requires_grad_(False)
 
     def on_extended(self, extended: HamiltonianSystem) -> Self:
         monomials = tuple((*m, *[0] * (extended.ndof - self.ndof)) for m in self.monomials)
@@ -714,7 +734,40 @@ class PrimedFlow(SympFlow):
         return other
 
     def bound(self, system: HamiltonianSystem) -> Self:
-        return self if self._binding.known else self.bind(system)
+        if not self._binding.known:
+            return self.bind(system)
+        mine, theirs = self._binding.system.local, system.local
+        if mine is theirs or mine is None or theirs is None or (mine.shape, mine.ends) == (theirs.shape, theirs.ends):
+            return self
+        tables = self.tables
+        if tables.carried is None or tables.carried.system is not system:
+            tables.carried = self._carried(system)
+        return tables.carried
+
+    def check_ends(self, system: HamiltonianSystem) -> None:
+        if system.local is None:
+            return
+        ring = self.figures.get("ends_periodic")
+        for end in dict.fromkeys(system.local.ends):
+            error = self.figures.get(f"ends_{end}")
+            if ring is None or error is None or error <= WORSE * ring:
+                continue
+            raise ValueError(
+                f"`system` {system.name!r} has {end} ends, at which bonds are missing and the numbers of this "
+                f"flow hold less: a relative energy error of {error:.1e} was measured on a few sites with such "
+                f"ends, {ring:.1e} on a ring. Fit one by sympflow.train(system)."
+            )
+
+    def _carried(self, system: HamiltonianSystem) -> Self:
+        """This flow of a lattice, of another shape of it, with what is known of it."""
+        other = self._of(system, self.shape).requires_grad_(False)
+        other.describe(self.description)
+        if isinstance(self.domain, LatticeStates):
+            other.domain = self.domain.of(system)
+        elif self.domain is not None:
+            assert self.system is not None
+            other.domain = LatticeStates.of_states(self.system, self.domain.sample(DRAWN)).of(system)
+        return other
 
     @property
     def driven(self) -> bool:
@@ -769,13 +822,16 @@ def _force_gradient_of(system: HamiltonianSystem, asked: bool | None, curvature:
         asked = system.quadratic_kinetic and system.has_hessian_vector
     elif asked and not system.quadratic_kinetic:
         raise ValueError("`force_gradient` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
-    if curvature and not (asked and system.symbols is not None):
+    known = system.symbols is not None or system.local is not None
+    if curvature and not (asked and known):
         remedy = "leave it out"
-        if system.symbols is None:
+        if not known:
             remedy += ", or define the system with HamiltonianSystem.from_sympy"
         elif system.quadratic_kinetic:
             remedy = "leave out `force_gradient`, or `curvature`"
-        raise ValueError(f"`curvature` goes with force gradients of a symbolic system, H = ½ pᵀM⁻¹p + V(q): {remedy}.")
+        raise ValueError(
+            f"`curvature` goes with force gradients of a symbolic system or a lattice, H = ½ pᵀM⁻¹p + V(q): {remedy}."
+        )
     return asked
 
 

@@ -49,7 +49,7 @@ class Coupling(LinearPart):
 class FunctionsOfCopies:
     """H(q, y), or H(x, p), of a system that is given by functions."""
 
-    of_positions = False
+    of_positions, turns = False, False
 
     def __init__(self, system: HamiltonianSystem, first: bool) -> None:
         self.system, self.first, self.ndof = system, first, 2 * system.ndof

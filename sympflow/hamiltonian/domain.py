@@ -6,13 +6,17 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_number, checked_states, floats, sample_count, vector
 from sympflow.arrays import Array, to_numpy
+from sympflow.hamiltonian.lattice_states import LatticeStates
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.hamiltonian import Hamiltonian
 
 
 @runtime_checkable
@@ -180,6 +184,11 @@ class EnergySublevel:
         """The same domain with the H of a system."""
         return replace(self, hamiltonian=hamiltonian)
 
+    def of(self, system: Hamiltonian) -> EnergySublevel:
+        """The same domain, of a system."""
+        system.check_autonomous("so that no energy bounds a set of states", "take a Box or a Ball as `domain`")
+        return self.attach(system.hamiltonian)
+
     def _within(self, x: np.ndarray, slack: float) -> np.ndarray:
         """True where the energy, and the angular momentum if it is bounded, are within their bounds."""
         if self.hamiltonian is None:
@@ -242,7 +251,12 @@ class EnergySublevel:
         return description | {name: bound for name, bound in more.items() if bound is not None}
 
 
-def domain_from_dict(description: dict[str, Any]) -> Ball | Box | EnergySublevel | Tube:
+def domain_of(domain: Domain, system: Hamiltonian) -> Domain:
+    """The domain of a system, ready to be asked for states: one that depends on H gets that of the system."""
+    return domain.of(system) if isinstance(domain, EnergySublevel | LatticeStates) else domain
+
+
+def domain_from_dict(description: dict[str, Any]) -> Ball | Box | EnergySublevel | LatticeStates | Tube:
     """The domain that `to_dict` described.
 
     Raises
@@ -262,6 +276,8 @@ def domain_from_dict(description: dict[str, Any]) -> Ball | Box | EnergySublevel
                 if not isinstance(box, Box):
                     raise ValueError(f"the box of an EnergySublevel is a {type(box).__name__}")
                 return EnergySublevel(box=box, **_numbers(fields))
+            case "LatticeStates":
+                return LatticeStates(**_numbers(fields))
             case "Tube":
                 return Tube(**_numbers(fields))
     except (KeyError, TypeError, ValueError) as error:

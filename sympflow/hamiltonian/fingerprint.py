@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary, ref
 import numpy as np
 
 from sympflow.arrays import to_numpy
-from sympflow.hamiltonian.domain import Domain, EnergySublevel
+from sympflow.hamiltonian.domain import Domain, domain_of
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
@@ -294,8 +294,7 @@ def _spread_states(system: Hamiltonian, domain: Domain, seed: int) -> np.ndarray
     n = min(MOST_STATES, max(FEWEST_STATES, MOST_NUMBERS // width))
     if FEWEST_STATES * width > 8 * MOST_NUMBERS:
         return np.empty((0, width))
-    if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
-        domain = domain.attach(system.hamiltonian)
+    domain = domain_of(domain, system)
     drawn = domain.sample(DRAWN, seed)
     ends = np.stack([drawn.argmin(0), drawn.argmax(0)], axis=-1).ravel()[: n // 2]
     chosen = list(dict.fromkeys([*ends.tolist(), *range(len(drawn))]))[:n]

@@ -465,6 +465,11 @@ class Hamiltonian:
         return None if self.symbols is None else self.symbols.text
 
     @property
+    def few_sites(self) -> Self:
+        """The system by which a flow that knows no size knows a lattice: a few of its sites. Else the system itself."""
+        return self
+
+    @property
     def has_hessian_vector(self) -> bool:
         """False if ∇²V·v of arrays is not to be had, as for a gradient that was given without it."""
         return self._definition.has_hessian_vector

@@ -6,18 +6,27 @@ import copy
 import math
 import reprlib
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from itertools import product
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import sympy as sp
 
 from sympflow.arguments import plain, real_number
-from sympflow.arrays import Array, is_tensor, library
+from sympflow.arrays import Array, concatenate, is_tensor, library
+from sympflow.hamiltonian.linear_part import quadratic_terms
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.normal_modes import SpectralPart
 
 BOUNDARIES = "periodic", "fixed", "free"
 MOST_AXES = 3
+FEW = 6, 4, 3
+"""Sites along each axis of a piece, of lattices of one, two and three axes."""
+WELLS, FAR = 8, 100.0
+"""Starts from which minima of U are looked for, for each field, and how far they may be."""
 
 
 class LatticeHamiltonian(LocalHamiltonian):
@@ -54,13 +63,13 @@ class LatticeHamiltonian(LocalHamiltonian):
         fields: Any,
         params: Mapping[str, Any] | None,
     ) -> None:
-        self.shape = _checked_shape(shape)
+        self.shape = checked_shape(shape)
         self.boundary = _checked_boundary(boundary, len(self.shape))
         self.fields = _checked_fields(fields)
-        n_sites = math.prod(self.shape)
+        n_sites = self.sites
         check_memory(float(n_sites) * len(self.fields), "`shape`")
         self.ndof = n_sites * len(self.fields)
-        self.params = _checked_params(params, self.shape)
+        self.params = checked_params(params, self.shape)
         self._set_letters()
         self._read(onsite, bond, kinetic)
         self._check_sizes()
@@ -73,20 +82,129 @@ class LatticeHamiltonian(LocalHamiltonian):
                     f"`params` has {name!r}, and those of the lattice are {', '.join(self.params) or 'none'}."
                 )
         other = copy.copy(self)
-        vars(other).pop("_functions", None)
-        other.params = _checked_params({**self.params, **values}, self.shape)
+        for name in ("_functions", "terms"):
+            vars(other).pop(name, None)
+        other.params = checked_params({**self.params, **values}, self.shape)
         other._set_mass()
         return other
 
-    def is_piece_of(self, other: LocalHamiltonian | None) -> bool:
-        """Return True for a lattice of the same site and bond: the same terms, fields, axes and numbers in `params`."""
-        return isinstance(other, LatticeHamiltonian) and self._piece() == other._piece() is not None
+    def piece(self, sites: Any = None, boundary: Any = "periodic") -> Self:
+        shape = self.few() if sites is None else checked_shape(sites)
+        if len(shape) == 1:
+            shape *= len(self.shape)
+        if len(shape) != len(self.shape):
+            raise ValueError(
+                f"`sites` must be a number of sites along every axis, or {len(self.shape)} of them, one for each axis; "
+                f"got {sites!r}."
+            )
+        shape = tuple(min(n, m) for n, m in zip(shape, self.shape, strict=True)) if not self.uniform else shape
+        other = copy.copy(self)
+        vars(other).pop("terms", None)
+        other._functions = self._functions  # of sites and bonds, whatever their number
+        other.shape, other.boundary = shape, _checked_boundary(boundary, len(shape))
+        other.ndof = math.prod(shape) * len(self.fields)
+        first = tuple(slice(n) for n in shape)
+        other.params = checked_params(
+            {name: value[first] if isinstance(value, np.ndarray) else value for name, value in self.params.items()},
+            shape,
+        )
+        other._check_sizes("sites")
+        other._set_mass()
+        return other
 
-    def _piece(self) -> tuple[Any, ...] | None:
-        """All but the size and the boundary; None if values differ from site to site."""
-        if any(isinstance(value, np.ndarray) for value in self.params.values()):
-            return None
-        return self.U, self.T, self.bonds, self.fields, len(self.shape), self.params
+    def few(self) -> tuple[int, ...]:
+        """The sites along each axis of a piece of which nothing else is said."""
+        least = 2 * max(self.bonds, default=0) + 1
+        return (max(FEW[len(self.shape) - 1], least),) * len(self.shape)
+
+    @property
+    def uniform(self) -> bool:
+        return not any(isinstance(value, np.ndarray) for value in self.params.values())
+
+    @property
+    def ends(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.boundary
+
+    @property
+    def sites(self) -> int:
+        return math.prod(self.shape)
+
+    @property
+    def moves(self) -> bool:
+        """True if nothing holds the lattice at its place."""
+        return self.U == 0 and "fixed" not in self.boundary
+
+    @cached_property
+    def terms(self) -> dict[str, str]:
+        """The terms by name, as texts with the values of the parameters in them: what does not depend on the size."""
+        names = self.names
+        rows = zip((self.x, self.p, self.r), (names["x"], names["p"], names["r"]), strict=True)
+        put: dict[Any, Any] = {s: sp.Symbol(name) for row, own in rows for s, name in zip(row, own, strict=True)}
+        arrays = {name: v for name, v in self.params.items() if isinstance(v, np.ndarray)}
+        for s, (name, value) in zip(self.c, self.params.items(), strict=True):
+            put[s] = sp.Symbol(name) if name in arrays else sp.sympify(value)
+        found = {"onsite term": self.U, "kinetic energy": self.T}
+        found |= {"bond" if k == 1 else f"bond over {k} sites": V for k, V in self.bonds.items()}
+        texts = {name: str(f.xreplace(put)) for name, f in found.items()}
+        texts |= {"number of axes": str(len(self.shape)), "list of fields": ", ".join(self.fields)}
+        return texts | {
+            f"array {name!r}": f"one of shape {v.shape} with sum {v.sum():.9g}" for name, v in arrays.items()
+        }
+
+    def wells(self) -> list[np.ndarray]:
+        """The values of the fields (F,) at which all sites are at rest: the lowest minima of U, 0 without U."""
+        n = len(self.fields)
+        if self.U == 0:
+            return [np.zeros(n)]
+        from scipy.optimize import minimize
+
+        values = {s: float(np.mean(v)) for s, v in zip(self.c, self.params.values(), strict=True)}
+        U = sp.lambdify([self.x], self.U.xreplace(values), "numpy")
+        starts = [np.zeros(n), *np.random.default_rng(0).uniform(-3, 3, (WELLS * n, n))]
+        with np.errstate(all="ignore"):
+            found = [minimize(U, start) for start in starts if np.isfinite(U(start))]
+        found = [m for m in found if np.isfinite(m.fun) and np.abs(m.x).max() < FAR]
+        if not found:
+            return [np.zeros(n)]
+        least = min(m.fun for m in found)
+        room = 1e-6 * max(1.0, abs(least))
+        lowest = sorted((m.x for m in found if m.fun <= least + room), key=lambda x: float(np.linalg.norm(x)))
+        near = 1.5 * float(np.linalg.norm(lowest[0])) + 1e-3  # of a periodic U those about 0
+        kept: list[np.ndarray] = []
+        for x in lowest:
+            if np.linalg.norm(x) <= near and all(np.linalg.norm(x - y) > 1e-2 for y in kept):
+                kept.append(x)
+        return kept
+
+    def written_out(self) -> sp.Expr:
+        """H by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters."""
+        index, n = np.arange(self.sites).reshape(self.shape), self.sites
+        q, p = ([sp.Symbol(f"{kind}{i + 1}") for i in range(self.ndof)] for kind in "qp")
+        values = [np.broadcast_to(v, self.shape) for v in self.params.values()]
+
+        def at(x: Sequence[sp.Symbol], own: Sequence[Any], site: int) -> dict[Any, Any]:
+            numbers = {s: sp.Float(float(v.flat[site])) for s, v in zip(self.c, values, strict=True)}
+            numbers |= {s: sp.Integer(int(v)) for s, v in numbers.items() if float(v).is_integer()}
+            return {**dict(zip(x, own, strict=True)), **numbers}
+
+        def fields(of: Sequence[sp.Symbol], site: int | None) -> list[Any]:
+            return [sp.S.Zero if site is None else of[f * n + site] for f in range(len(self.fields))]
+
+        terms = [self.T.xreplace(at(self.p, fields(p, i), i)) for i in range(n)]
+        if self.U != 0:
+            terms += [self.U.xreplace(at(self.x, fields(q, i), i)) for i in range(n)]
+        for axis, k in self._kinds():
+            lines = np.moveaxis(index, axis, -1).reshape(-1, self.shape[axis])
+            m, boundary = self.shape[axis], self.boundary[axis]
+            for line in lines.tolist():
+                for i in range(-k if boundary == "fixed" else 0, m):
+                    first = line[i] if i >= 0 else None
+                    last = line[i + k] if i + k < m else line[(i + k) % m] if boundary == "periodic" else None
+                    if boundary == "free" and last is None:
+                        continue
+                    r = [b - a for a, b in zip(fields(q, first), fields(q, last), strict=True)]
+                    terms.append(self.bonds[k].xreplace(at(self.r, r, line[0] if first is None else first)))
+        return sp.Add(*terms)
 
     def _set_letters(self) -> None:
         fields = self.fields
@@ -137,14 +255,14 @@ class LatticeHamiltonian(LocalHamiltonian):
             if s not in used:
                 raise ValueError(f"`params` has {name!r}, which no expression uses: remove it.")
 
-    def _check_sizes(self) -> None:
+    def _check_sizes(self, argument: str = "shape") -> None:
         reach = max(self.bonds, default=0)
         for n, boundary in zip(self.shape, self.boundary, strict=True):
             least = {"periodic": 2 * reach + 1, "free": reach + 1, "fixed": reach}[boundary]
             if reach and n < least:
                 raise ValueError(
-                    f"`shape` has an axis of {n} sites, and bonds over a distance of {reach} need at least {least} "
-                    f"where the boundary is {boundary!r}: each pair of sites then has one bond."
+                    f"`{argument}` has an axis of {n} sites, and bonds over a distance of {reach} need at least "
+                    f"{least} where the boundary is {boundary!r}: each pair of sites then has one bond."
                 )
 
     def _set_mass(self) -> None:
@@ -169,6 +287,62 @@ class LatticeHamiltonian(LocalHamiltonian):
         if not np.isfinite(inverse_mass).all() or not (inverse_mass != 0).all():
             raise ValueError("`kinetic` has a mass that is 0 or infinite with the values in `params`: change them.")
         self.inverse_mass = inverse_mass
+
+    # the linear part ------------------------------------------------------------------------------------------------
+
+    def linear_and_rest(self, interval: float) -> tuple[SpectralPart, list[Any]]:
+        """The quadratic terms of sites and bonds as they are written, in normal modes, and U(q), the rest of V.
+
+        Parameters of sites enter the linear part by their mean. At ends that are not periodic only bonds to the next
+        site have known modes, so that longer ones belong to the rest.
+        """
+        from sympflow.hamiltonian.normal_modes import SpectralPart, Transform, dispersion
+
+        F, n_sites = len(self.fields), math.prod(self.shape)
+        inverse_mass = np.ones(F)
+        if self.inverse_mass is not None:
+            by_field = self.inverse_mass.reshape(F, n_sites)
+            inverse_mass = by_field.mean(-1)
+            if np.ptp(by_field, axis=-1).any():
+                inverse_mass[0] = math.nan
+        if not self.quadratic_kinetic or not (inverse_mass > 0).all():
+            raise ValueError(
+                "`kinetic` must be ½ p²/m with a positive mass that is the same at all sites, for normal modes to be "
+                "known: take a method that splits into T and V, such as 'srkn6b'."
+            )
+        onsite, U = self._quadratic(self.U, self.x)
+        periodic = all(name == "periodic" for name in self.boundary)
+        couplings, bonds = {}, {}
+        for k, V in self.bonds.items():
+            if k == 1 or periodic:
+                couplings[k], V = self._quadratic(V, self.r)  # noqa: PLW2901
+            if V.free_symbols & set(self.r):
+                bonds[k] = V
+        if not onsite.any() and not any(kappa.any() for kappa in couplings.values()):
+            raise ValueError(
+                "`onsite` and `bond` have no quadratic terms that are written as such, so that there is no linear "
+                "part: take a method that splits into T and V, such as 'srkn6b'."
+            )
+        transform = Transform(self.shape, self.boundary)
+        waves = [dispersion(couplings, transform.angles(axis)) for axis in range(len(self.shape))] if couplings else []
+        K = transform.total(waves) + onsite if waves else np.broadcast_to(onsite, (*self.shape, F, F))
+        linear = SpectralPart.of_matrices(transform, inverse_mass, np.ascontiguousarray(K), interval)
+        rest = copy.copy(self)
+        for name in ("_functions", "terms"):
+            vars(rest).pop(name, None)
+        rest.U, rest.bonds = U if U.free_symbols & set(self.x) else sp.S.Zero, bonds
+        return linear, [RestOfLattice(rest)] if rest.U != 0 or bonds else []
+
+    def _quadratic(self, f: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[np.ndarray, sp.Expr]:
+        """K (F, F) of the terms ½ xᵀKx of a piece, with its numbers and the means of its arrays; and what remains."""
+        values = dict(zip(self.c, self.params.values(), strict=True))
+        numbers = {s: v for s, v in values.items() if not isinstance(v, np.ndarray)}
+        means = {s: float(v.mean()) for s, v in values.items() if isinstance(v, np.ndarray)}
+        with_numbers = f.xreplace(numbers)
+        quadratic, _ = quadratic_terms(with_numbers.xreplace(means), (*variables, *self.p))
+        K = sp.hessian(quadratic, variables)
+        own = sp.Add(*[K[i, j] * a * b / 2 for i, a in enumerate(variables) for j, b in enumerate(variables)])
+        return np.array(K.tolist(), dtype=float), sp.expand(with_numbers - own) if own != 0 else with_numbers
 
     # array functions, positions (..., d) ------------------------------------------------------------------------------
 
@@ -338,6 +512,26 @@ class LatticeHamiltonian(LocalHamiltonian):
         return _join([*before, values], at)
 
 
+class RestOfLattice:
+    """U(q) of a lattice, the potential without its linear part, as `sympflow.hamiltonian.parts` has them."""
+
+    of_positions, turns, timed = True, False, False
+
+    def __init__(self, lattice: LatticeHamiltonian) -> None:
+        self.lattice, self.ndof = lattice, lattice.ndof
+
+    def hamiltonian(self, y: Array) -> Array:
+        return self.lattice.potential(y[..., : self.ndof])
+
+    def gradient(self, y: Array) -> Array:
+        q = y[..., : self.ndof]
+        return concatenate([self.lattice.potential_gradient(q), 0 * q])
+
+    def hessian_vector(self, y: Array, v: Array) -> Array:
+        """∇²U(q)·v: (..., 2d), (..., d) to (..., d)."""
+        return self.lattice.hessian_vector(y[..., : self.ndof], v)
+
+
 def _along(f: sp.Expr, x: Sequence[sp.Symbol], v: Sequence[sp.Symbol]) -> sp.Expr:
     """The derivative of f along v."""
     return sp.Add(*[s * sp.diff(f, z) for z, s in zip(x, v, strict=True)])
@@ -382,7 +576,8 @@ def _joined(fields: Sequence[Array], n_axes: int) -> Array:
     return flat[0] if len(flat) == 1 else _join(flat, -1)
 
 
-def _checked_shape(shape: Any) -> tuple[int, ...]:
+def checked_shape(shape: Any) -> tuple[int, ...]:
+    """The sites along each axis, of an argument `shape`."""
     sizes = tuple(shape) if isinstance(shape, Sequence | np.ndarray) and not isinstance(shape, str) else (shape,)
     sizes = tuple(map(plain, sizes))
     if not 1 <= len(sizes) <= MOST_AXES or not all(
@@ -424,7 +619,8 @@ def _checked_distance(k: Any) -> int:
     return k
 
 
-def _checked_params(params: Any, shape: tuple[int, ...]) -> dict[str, float | np.ndarray]:
+def checked_params(params: Any, shape: tuple[int, ...]) -> dict[str, float | np.ndarray]:
+    """The values of parameters, numbers or one for each site, of an argument `params`."""
     if not isinstance(params, Mapping | None):
         raise TypeError(
             f"`params` must be a mapping of names to numbers or arrays; got {type(params).__name__}: pass a dict."

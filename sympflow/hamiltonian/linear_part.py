@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
+
+from sympflow.arrays import Array, like
 
 if TYPE_CHECKING:
     import sympy as sp
@@ -76,6 +78,9 @@ class LinearPart:
     potential: sp.Expr | None = None
     interval: float = 0.0
 
+    dense: ClassVar[bool] = True
+    """False of modes by fast transforms, which have no loops."""
+
     @property
     def ndof(self) -> int:
         return len(self.center)
@@ -121,6 +126,32 @@ class LinearPart:
     def inverse_modes(self) -> np.ndarray:
         """C⁻¹: (d, d)."""
         return self._spectrum[2]
+
+    @cached_property
+    def diagonal(self) -> bool:
+        """True if each mode is a coordinate."""
+        return not np.count_nonzero(self.modes - np.diag(np.diag(self.modes)))
+
+    def positions(self, X: Array) -> Array:
+        """C X: (..., d), each."""
+        return self._times(self.modes, X)
+
+    def coordinates(self, x: Array) -> Array:
+        """C⁻¹x, of positions less c: (..., d), each."""
+        return self._times(self.inverse_modes, x)
+
+    def momenta(self, Y: Array) -> Array:
+        """C⁻ᵀY: (..., d), each."""
+        return self._times(self.inverse_modes.T, Y)
+
+    def slopes(self, g: Array) -> Array:
+        """Cᵀg: (..., d), each."""
+        return self._times(self.modes.T, g)
+
+    def _times(self, A: np.ndarray, x: Array) -> Array:
+        if self.diagonal:
+            return x * like(np.diag(A), x)
+        return x @ like(A.T, x)
 
     @cached_property
     def kinds(self) -> tuple[str, ...]:
@@ -191,10 +222,7 @@ def linear_part(system: Scene) -> LinearPart:
     elif system.symbols is not None:
         part = read_off(system.symbols.H, system.symbols.q, system.symbols.p, _interval(system))
     elif system.local is not None:
-        raise ValueError(
-            f"`system` {system.name!r} is made of sites or pairs, of which no linear part can be read: take a method "
-            "that splits into T and V, such as 'srkn6b'."
-        )
+        return system.local.linear_and_rest(_interval(system))[0]
     else:
         raise ValueError(
             f"`system` {system.name!r} is given by functions, from which no linear part can be read: pass "

@@ -41,10 +41,16 @@ class LocalHamiltonian(Definition):
         M⁻¹ of T = ½ pᵀM⁻¹p; None if it is the identity or T is not quadratic.
     quadratic_kinetic : bool
     params : mapping of str to float or ndarray
+    shape : tuple of int
+        Sites along the axes of a lattice; () of another system.
+    ends : tuple of str
+        How each axis of a lattice ends.
     """
 
     separable = True
     has_third_derivative = True
+    shape: tuple[int, ...] = ()
+    ends: tuple[str, ...] = ()
     loops: str
     inverse_mass: np.ndarray | None
     quadratic_kinetic: bool
@@ -63,9 +69,54 @@ class LocalHamiltonian(Definition):
             f"HamiltonianSystem.{self.loops}."
         )
 
-    def is_piece_of(self, other: LocalHamiltonian | None) -> bool:
-        """Return True if the other has the same terms, however many of them."""
+    def linear_and_rest(self, interval: float) -> tuple[Any, list[Any]]:
+        """The quadratic part of H, in its normal modes, and the part that remains, if there is one.
+
+        Parameters
+        ----------
+        interval : float
+            The length of the default one: see `LinearPart`.
+
+        Returns
+        -------
+        SpectralPart, and a list of one part as `sympflow.hamiltonian.parts` has them, or none
+
+        Raises
+        ------
+        ValueError
+            If there is no quadratic part whose modes are known.
+        """
+        raise ValueError(
+            f"`system` is made of {self.loops}, of which no linear part is known: take a method that splits into T and "
+            "V, such as 'srkn6b'."
+        )
+
+    def piece(self, sites: Any = None, boundary: Any = "periodic") -> Self:
+        """Return the definition with the same terms on a few sites: see `HamiltonianSystem.piece`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there is none.
+        """
+        raise TypeError(
+            f"`system` is no lattice, of which a few sites are a piece: make a smaller one by HamiltonianSystem."
+            f"{self.loops}."
+        )
+
+    @property
+    def uniform(self) -> bool:
+        """True if all sites are alike, so that a few of them tell all of the rest."""
         return False
+
+    @property
+    def terms(self) -> dict[str, str]:
+        """The terms by name, as texts, for messages; {} where there are no pieces."""
+        return {}
+
+    def written_out(self) -> sp.Expr:
+        """H of a lattice by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters."""
+        raise NotImplementedError(f"{type(self).__name__} must define written_out().")
 
     def potential_hessian(self, q: Array, *t: Array) -> Array:
         """∇²V(q), dense: (..., d) to (..., d, d).

@@ -95,9 +95,6 @@ class ParameterRows:
         """
         symbols = self.system.symbols
         assert symbols is not None
-        if not self.system.autonomous:  # the values of its letters depend on t too
-            yield from self.distinct()
-            return
         try:
             parts, replaced = symbols.parametric_parts
         except (TypeError, OverflowError):

@@ -2,7 +2,8 @@
 
 A part is solved exactly if it is quadratic, ½ pᵀBp + ½ (q − c)ᵀK(q − c) (the *linear* part, in its normal modes), or
 if no two of the variables that it depends on are conjugate to each other: then these variables do not move, and its
-flow over a time s is x + s J∇H_k(x). V(q) and T(p) are of this kind, and so is p_θ²/(2r²).
+flow over a time s is x + s J∇H_k(x). V(q) and T(p) are of this kind, and so is p_θ²/(2r²). A part may also bring a flow
+of its own, `turned`, and says so by `turns`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, stack
+from sympflow.arrays import Array, concatenate, is_tensor, like, stack
 from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative, linear_part, read_off
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, parse
 from sympflow.hamiltonian.times import probe_times, stage_time
@@ -67,6 +68,8 @@ class PartFunctions(SymbolicHamiltonian):
         With the time and the samples that H may hold.
     """
 
+    turns = False
+
     def __init__(
         self, H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...], whole: SymbolicHamiltonian
     ) -> None:
@@ -90,7 +93,7 @@ class PartFunctions(SymbolicHamiltonian):
 class RestOfPotential:
     """U(q) = V(q) − ½ (q − c)ᵀK(q − c) of a system given by functions."""
 
-    of_positions = True
+    of_positions, turns = True, False
 
     def __init__(self, system: HamiltonianSystem, linear: LinearPart) -> None:
         self.system, self.K, self.center, self.ndof = system, linear.stiffness_matrix, linear.center, system.ndof
@@ -129,12 +132,23 @@ class ExactParts:
         self.sequence = tuple(range(1, len(self.rest) + 1)) + (LINEAR,) * (linear is not None)
         if sequence is not None:
             self.sequence = tuple(sequence)
-        self.C: np.ndarray = linear.modes if linear else np.eye(ndof)
-        self.inverse_C: np.ndarray = linear.inverse_modes if linear else np.eye(ndof)
         self.center = linear.center if linear else np.zeros(ndof)
         self.classes = linear.classes if linear else np.zeros(ndof, dtype=int)
         self.n_classes = linear.n_classes if linear else 1
-        self.diagonal = not np.count_nonzero(self.C - np.diag(np.diag(self.C)))
+
+    @cached_property
+    def C(self) -> np.ndarray:
+        """The modes as a matrix (d, d)."""
+        return self.linear.modes if self.linear else np.eye(self.ndof)
+
+    @cached_property
+    def inverse_C(self) -> np.ndarray:
+        return self.linear.inverse_modes if self.linear else np.eye(self.ndof)
+
+    @property
+    def diagonal(self) -> bool:
+        """True if each mode is a coordinate."""
+        return self.linear is None or self.linear.diagonal
 
     def __len__(self) -> int:
         return len(self.rest) + (self.linear is not None)
@@ -157,17 +171,15 @@ class ExactParts:
 
     def to_modes(self, y: Array) -> tuple[Array, Array]:
         """X = C⁻¹(q − c), Y = Cᵀp."""
-        d = self.ndof
-        return self._times(self.inverse_C, y[..., :d] - like(self.center, y)), self._times(self.C.T, y[..., d:])
+        linear, q, p = self.linear, y[..., : self.ndof], y[..., self.ndof :]
+        return (q, p) if linear is None else (linear.coordinates(q - like(self.center, y)), linear.slopes(p))
 
     def from_modes(self, X: Array, Y: Array) -> Array:
         """[c + C X, C⁻ᵀY]."""
-        return concatenate([like(self.center, X) + self._times(self.C, X), self._times(self.inverse_C.T, Y)])
+        return concatenate([self._positions(X), Y if self.linear is None else self.linear.momenta(Y)])
 
-    def _times(self, A: np.ndarray, x: Array) -> Array:
-        if self.diagonal:
-            return x * like(np.diag(A), x)
-        return x @ like(A.T, x)
+    def _positions(self, X: Array) -> Array:
+        return X if self.linear is None else like(self.center, X) + self.linear.positions(X)
 
     def by_class(self, values: Array) -> Array:
         """Values for each frequency (..., F) as values for each mode (..., d)."""
@@ -182,12 +194,24 @@ class ExactParts:
                 X, Y = self.linear_flow(X, Y, m.length)
                 continue
             time = (stage_time(t, m.at, h),) if self.timed(m.part) else ()
+            if self.rest[m.part - 1].turns:
+                X, Y = self._turned(m, X, Y)
+                continue
             dX, dY = self.slopes(m.part, X, Y, m.filters, *time)
             length = each_mode(m.length)
             X, Y = (X, Y - length * dX) if dY is None else (X + length * dY, Y - length * dX)
             if not (isinstance(m.gradient, float) and m.gradient == 0.0):
                 Y = Y + each_mode(m.gradient) * self.force_gradient(m.part, X, m.filters, *time)
         return X, Y
+
+    def _turned(self, m: Map, X: Array, Y: Array) -> tuple[Array, Array]:
+        """The flow of a part that brings its own: its change alone is transformed, so that transforms add no drift."""
+        y = self.from_modes(X, Y)
+        change = self.rest[m.part - 1].turned(y, each_mode(m.length)) - y
+        dX, dY = change[..., : self.ndof], change[..., self.ndof :]
+        if self.linear is None:
+            return X + dX, Y + dY
+        return X + self.linear.coordinates(dX), Y + self.linear.slopes(dY)
 
     def linear_flow(self, X: Array, Y: Array, s: Any) -> tuple[Array, Array]:
         """The linear part over the times s (..., F), or by the shears that `prepared` has put in their place."""
@@ -211,32 +235,41 @@ class ExactParts:
 
     def value(self, part: int, X: Array, Y: Array, filters: Array | None) -> Array:
         """H_k: (...)."""
-        return self.rest[part - 1].hamiltonian(self._state(X, Y, filters))
+        return self.rest[part - 1].hamiltonian(self._state(part, X, Y, filters))
 
     def slopes(self, part: int, X: Array, Y: Array, filters: Array | None, *t: Any) -> tuple[Array, Array | None]:
         """∂H_k/∂X and ∂H_k/∂Y, (..., d) each; None for what is zero. `t` follows for a part that depends on it."""
         functions, d = self.rest[part - 1], self.ndof
-        g = functions.gradient(self._state(X, Y, filters), *t)
-        dX = self._times(self.C.T, g[..., :d])
+        g = functions.gradient(self._state(part, X, Y, filters), *t)
+        linear = self.linear
+        dX = g[..., :d] if linear is None else linear.slopes(g[..., :d])
         dX = dX if filters is None else self.by_class(matching(filters, X)) * dX
-        return dX, None if functions.of_positions else self._times(self.inverse_C, g[..., d:])
+        if functions.of_positions:
+            return dX, None
+        return dX, g[..., d:] if linear is None else linear.coordinates(g[..., d:])
 
     def force_gradient(self, part: int, X: Array, filters: Array | None, *t: Any) -> Array:
         """½ ∇|∇U|²_{M⁻¹} of U(X) = H_k(c + C φ X): (..., d)."""
-        functions, d = self.rest[part - 1], self.ndof
-        y = self._state(X, 0 * X, filters)
+        functions, d, linear = self.rest[part - 1], self.ndof, self.linear
+        assert linear is not None
+        y = self._state(part, X, 0 * X, filters)
         phi = 1.0 if filters is None else self.by_class(matching(filters, X))
-        v = self.inverse_masses(X) * phi * self._times(self.C.T, functions.gradient(y, *t)[..., :d])
-        v = self._times(self.C, phi * v)
-        return phi * self._times(self.C.T, functions.hessian_vector(y, v, *t))
+        v = self.inverse_masses(X) * phi * linear.slopes(functions.gradient(y, *t)[..., :d])
+        v = linear.positions(phi * v)
+        return phi * linear.slopes(functions.hessian_vector(y, v, *t))
 
     def inverse_masses(self, X: Array) -> Array:
         """The diagonal M⁻¹ of the modes: Ω of each."""
         assert self.linear is not None
         return like(self.linear.rates, X)
 
-    def _state(self, X: Array, Y: Array, filters: Array | None) -> Array:
-        return self.from_modes(X if filters is None else self.by_class(matching(filters, X)) * X, Y)
+    def _state(self, part: int, X: Array, Y: Array, filters: Array | None) -> Array:
+        """[q, p] at which a part acts; of one of positions with p = 0, which it does not see."""
+        X = X if filters is None else self.by_class(matching(filters, X)) * X
+        if not self.rest[part - 1].of_positions:
+            return self.from_modes(X, Y)
+        q = self._positions(X)
+        return concatenate([q, 0 * q])
 
     @cached_property
     def has_force_gradient(self) -> bool:
@@ -251,15 +284,6 @@ class ExactParts:
 def each_mode(value: Any) -> Any:
     """A number for each state as one that broadcasts against (..., d)."""
     return value[..., None] if getattr(value, "ndim", 0) else value
-
-
-def like(constant: np.ndarray, x: Array) -> Array:
-    """A constant array in the library, dtype and device of `x`."""
-    if is_tensor(x):
-        import torch
-
-        return torch.as_tensor(np.array(constant), dtype=x.dtype, device=x.device)
-    return constant.astype(x.dtype, copy=False)
 
 
 def matching(value: Any, x: Array) -> Array:
@@ -300,7 +324,7 @@ def shears(kinds: Sequence[str], rates: Array, s: Array) -> tuple[Array, Array, 
         "idle": lambda: (zero, zero),
     }
     for kind in set(kinds) & set(others):
-        here = np.array([other == kind for other in kinds])
+        here = np.asarray(kinds) == kind
         here = here if module is np else module.as_tensor(here, device=s.device)
         own_t, own_sigma = others[kind]()
         t, sigma = module.where(here, own_t, t), module.where(here, own_sigma, sigma)
@@ -350,7 +374,7 @@ def linear_and_rest(system: HamiltonianSystem) -> ExactParts:
     """
     linear = system.linear_part
     parts = exact_parts(system)
-    if any(not functions.of_positions for functions in parts.rest) or len(parts.rest) > 1:
+    if len(parts.rest) > 1 or any(not (functions.of_positions or functions.turns) for functions in parts.rest):
         raise ValueError(
             f"`system` {system.name!r} has {len(parts)} parts, not just a linear one and U(q): use 'strang_parts'."
         )
@@ -377,6 +401,9 @@ def exact_parts(system: HamiltonianSystem, expressions: Sequence[str] | None = N
     if system.symbols is None:
         if expressions is not None:
             raise ValueError("`parts` are read as symbols, which the system has not: define it with from_sympy.")
+        if system.local is not None:
+            local, rest = system.local.linear_and_rest(abs(system.t_span[1] - system.t_span[0]))
+            return ExactParts(local, rest, system.ndof)
         linear = system.linear_part
         return ExactParts(linear, [RestOfPotential(system, linear)], system.ndof)
     if expressions is None:

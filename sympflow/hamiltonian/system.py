@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import check_flag, floats, real_number
 from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian import matrices
-from sympflow.hamiltonian.domain import Domain, EnergySublevel
+from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
@@ -27,6 +27,7 @@ from sympflow.hamiltonian.times import check_period, probe_times
 if TYPE_CHECKING:
     import sympy
 
+    from sympflow.hamiltonian.lattice_states import LatticeStates
     from sympflow.hamiltonian.linear_part import LinearPart
     from sympflow.hamiltonian.local import LocalHamiltonian
 
@@ -376,6 +377,140 @@ class HamiltonianSystem(Hamiltonian):
         local = PairsHamiltonian(potential, masses, dim, box, cutoff, softening, params, bodies)
         return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale, exact)
 
+    def piece(
+        self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
+    ) -> HamiltonianSystem:
+        """A few sites of a lattice, with the same terms: what a flow for the lattice is fitted on.
+
+        A ring has as many bonds for each site as the inside of a large lattice, whatever the ends of that are.
+
+        Parameters
+        ----------
+        sites : int or sequence of ints, optional
+            Sites along each axis; the default is 6 of a lattice of one axis, 4 by 4 of one of two and 3 by 3 by 3 of
+            one of three, more where bonds reach farther.
+        boundary : str, or one for each axis
+            As in `lattice`.
+
+        Returns
+        -------
+        HamiltonianSystem
+            With `sympflow.LatticeStates` of the same energy density as its domain, where the system has a domain or a
+            `y0` from which that is found. Arrays in `params` are cut to the first sites.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the system is no lattice, or has a rate of friction for each site, or the shape does not fit its bonds.
+
+        Examples
+        --------
+        >>> HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=1024).piece(8).ndof
+        8
+        """
+        if self.local is None:
+            raise TypeError(
+                f"`system` {self.name!r} is no lattice, of which a few sites are a piece: define it by "
+                "HamiltonianSystem.lattice."
+            )
+        local = self.local.piece(sites, boundary)
+        if self.damping is not None and self.damping.ndim:
+            raise ValueError(
+                f"`damping` of {self.name!r} differs from site to site, and a piece is of a lattice whose sites are "
+                "alike: give one rate."
+            )
+        domain = None
+        with suppress(ValueError):  # of states at rest none follow
+            domain = self.lattice_states()
+        scene = None, self.t_span, self.dt, None
+        return HamiltonianSystem._of_pieces(local, self.damping, self.name, domain, *scene)
+
+    def lattice_states(self) -> LatticeStates | None:
+        """The states of a lattice at the energy density of its domain, or else of its `y0`; None without both."""
+        domain = self.domain
+        if domain is None and self.y0 is None:
+            return None
+        from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
+
+        if isinstance(domain, LatticeStates):
+            return domain
+        states = self.y0 if domain is None else domain.sample(DRAWN)
+        assert states is not None
+        return LatticeStates.of_states(self, states)
+
+    @cached_property
+    def _few_sites(self) -> HamiltonianSystem:
+        assert self.local is not None
+        return HamiltonianSystem._of_pieces(
+            self.local.piece(), self.damping, self.name, None, None, self.t_span, self.dt, None
+        )
+
+    @property
+    def few_sites(self) -> HamiltonianSystem:
+        alike = self.local is not None and self.local.uniform and (self.damping is None or not self.damping.ndim)
+        return self._few_sites if alike else self
+
+    @classmethod
+    def schroedinger(
+        cls,
+        onsite: str | sympy.Expr | None = "-rho**2/2",
+        *,
+        shape: int | Sequence[int],
+        length: float | Sequence[float] | None = None,
+        dispersion: str | sympy.Expr = "k**2/2",
+        params: Mapping[str, Any] | None = None,
+        name: str = "schroedinger",
+        domain: Domain | None = None,
+        y0: ArrayLike | None = None,
+        t_span: tuple[float, float] = (0.0, 100.0),
+        dt: float = 0.01,
+        energy_scale: float | None = None,
+        exact: Callable[[Any], Array] | None = None,
+    ) -> HamiltonianSystem:
+        """A complex field on a periodic grid of any size, i ∂ψ/∂t = ω(−i∇)ψ + f'(|ψ|²)ψ: Schrödinger equations.
+
+        A state is y = [q, p] with ψ = (q + ip)/√2, each of the grid's shape, so that ρ = |ψ|² = (q² + p²)/2 and
+
+            H = Σ [ψ̄ ω(−i∇)ψ + f(ρ)]
+
+        over the sites: the energy divided by the volume of a cell. Derivatives are spectral. The methods with the exact
+        linear flow (`impulse`, `linear_kahan_li6`, `linear_aba864`, …) turn the phases of waves by ω, by fast Fourier
+        transforms, and those of sites by f': both parts keep the norm Σ ρ to rounding. Runs are made by arrays.
+
+        Parameters
+        ----------
+        onsite : str or sympy.Expr, optional
+            f in `rho`, such as "-rho**2/2", the focusing cubic equation, or "V*rho + g*rho**2/2"; None for the free
+            field.
+        shape : int or sequence of up to three ints
+            Sites along each axis.
+        length : float or sequence of floats, optional
+            Of each axis; by default one for each site.
+        dispersion : str or sympy.Expr
+            ω of a wave number `k`, an even function, added up over the axes: "k**2/2", or "1 - cos(k)" for a chain
+            whose neighbours are coupled.
+        params : mapping of str to float or array of the grid's shape, optional
+            Values of the other names; arrays in `onsite`, such as a potential V or disorder.
+        name, domain, y0, t_span, dt, energy_scale, exact
+            As for the class.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If an expression cannot be read, holds other names or is not finite; if shapes do not fit each other; or if
+            a run would need more memory than the machine has.
+
+        Examples
+        --------
+        >>> system = HamiltonianSystem.schroedinger("-rho**2/2", shape=256, length=40.0)
+        >>> system.separable
+        False
+        """
+        from sympflow.hamiltonian.wave_functions import WaveFunctionHamiltonian
+
+        local = WaveFunctionHamiltonian(onsite, dispersion, shape, length, params)
+        return cls._of_pieces(local, None, name, domain, y0, t_span, dt, energy_scale, exact)
+
     @classmethod
     def _of_pieces(
         cls, local: LocalHamiltonian, damping: float | ArrayLike | None, name: str, *scene: Any
@@ -439,10 +574,7 @@ class HamiltonianSystem(Hamiltonian):
         self.y0 = None if y0 is None else self._checked_y0(y0)
         if domain is not None and not isinstance(domain, Domain):
             raise TypeError(f"`domain` must be a domain such as sympflow.Box(low, high); got {type(domain).__name__}.")
-        if isinstance(domain, EnergySublevel):
-            self.check_autonomous("so that no energy bounds a set of states", "take a Box or a Ball as `domain`")
-            domain = domain.attach(self.hamiltonian)
-        self.domain = domain
+        self.domain = None if domain is None else domain_of(domain, self)
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
 

@@ -16,10 +16,10 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, library, per_state, to_numpy
+from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_state, to_numpy
 from sympflow.hamiltonian.copies import both, coupling_strength, distance, mean, two_copies
 from sympflow.hamiltonian.monomials import Monomials, gradient
-from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, like, linear_and_rest, map_evaluations
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, linear_and_rest, map_evaluations
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.base import rollout
@@ -394,6 +394,11 @@ class LinearRest(ExactMaps):
         if "linear" not in known:
             known["linear"] = linear_and_rest(system)
         self.parts = known["linear"]
+        if scheme.nystrom and any(part.turns for part in self.parts.rest):
+            raise ValueError(
+                f"`method` {method!r} has a Nyström scheme, which needs a rest of H that is a potential U(q), and that "
+                f"of {system.name!r} depends on p too: use 'linear_kahan_li6', 'linear_aba864' or 'impulse'."
+            )
         if scheme.level > FORCE_GRADIENT:
             raise ValueError(
                 f"`splitting` {self.label!r} has no curvature terms, which the scheme of method {method!r} needs: use "
@@ -428,6 +433,12 @@ class MollifiedLinearRest(LinearRest):
 
     def filters(self, h: Any) -> Any:
         assert self.parts.linear is not None
+        for part in self.parts.rest:
+            if part.turns:
+                raise ValueError(
+                    "`splitting` 'mollified' filters the positions at which a potential acts, and the rest of H "
+                    "depends on momenta too: use the splitting 'linear'."
+                )
         representatives = self.parts.linear.representatives
         times = _each_class(h, self.parts)
         return library(times).sinc(like(self.parts.linear.frequencies[representatives], times) * times / np.pi)

@@ -280,15 +280,14 @@ class Splitting(OwnStepper):
         return self if SPLITTINGS[self.splitting].takes_extended else None
 
     def takes_letters(self, problem: Problem) -> bool:
-        system, composition = problem.system, self.composed(problem.system)
+        composition = self.composed(problem.system)
         asked = any(map(self.overrides, ("step", "rollout", "substep", "evaluations")))
-        plain = system.friction is None and system.autonomous
-        if self.clock != "physical" or asked or not composition.takes_values or not plain:
+        if self.clock != "physical" or asked or not composition.takes_values:
             return False
         kernel = compiled_loops(
             lambda: composition.kernel(bool(self.compensated)), problem.y0, problem.backend, self.compensated
         )
-        return kernel is not None and kernel.loops.takes_values(self.scheme.level)
+        return kernel is not None and bool(kernel.loops.values)
 
     def check(self, system: HamiltonianSystem) -> None:
         if self.clock != "physical":

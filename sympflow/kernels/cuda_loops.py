@@ -20,7 +20,7 @@ from sympflow.kernels.codegen import algebra_source
 from sympflow.kernels.modules import load_module, template
 from sympflow.kernels.protocol import Carry, Run, Steps
 from sympflow.kernels.splitting_loops import SplittingKernel, plain_kicks_source, splitting_loops, takes_values
-from sympflow.kernels.stages import kicks_of, stages_source
+from sympflow.kernels.stages import kicks_of, run_table, stages_source
 from sympflow.kernels.terms import is_large
 from sympflow.schemes import Scheme
 
@@ -144,6 +144,9 @@ class CudaKernel(SplittingKernel):
         kernel = self.loops.kernel(self.scheme, self.compensated)
         return (kernel if self._values is None else kernel.varied(self._values)).step(h, y, t)
 
+    def table(self, h: float, t0: float = 0.0) -> np.ndarray:
+        return self.loops.rows(run_table(self.scheme, h), h, t0, varied=self._values is not None)
+
     def varied(self, values: np.ndarray) -> Any:
         return CudaKernel(self.system, self.scheme, self.compensated, values)
 
@@ -160,7 +163,8 @@ class CudaKernel(SplittingKernel):
     def _module(self) -> ModuleType:
         symbols = self.system.symbols
         assert symbols is not None
-        form = symbols.parametric if takes_values(self.scheme.level) else symbols
+        takes = self._values is not None or takes_values(self.scheme.level)
+        form = symbols.parametric if takes else symbols
         return cuda_module(form, self.scheme.level, self.scheme.monomials, self.compensated)
 
 

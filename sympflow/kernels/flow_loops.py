@@ -97,7 +97,8 @@ class PrimedFlowKernel(Kernel):
             raise ValueError(
                 "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
             )
-        if tables.level >= CURVATURE and system.symbols is None:
+        known = system.symbols is not None or (tables.level == CURVATURE and system.local is not None)
+        if tables.level >= CURVATURE and not known:
             raise ValueError(
                 f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled: "
                 "use backend='array'."
@@ -194,6 +195,10 @@ class PrimedFlowKernel(Kernel):
         return self._splitting.functions(tables.level, self._compensated, tables.monomials, ranges=self._ranges)
 
     def _processed(self, h: float, t0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The tables of χ⁻¹, of a run of K, and of χ, of steps |h|, or for h < 0 of their inverse.
+
+        That of χ begins with the last stage of K, unless the loops close their outputs. In a driven system the time
+        moves with the drifts of χ⁻¹ too: K begins before t0 by those of χ.
         """The tables of χ⁻¹, of a run of K, and of χ, of steps |h|, or for h < 0 of their inverse.
 
         That of χ begins with the last stage of K, unless the loops close their outputs. In a driven system the time moves with the drifts of χ⁻¹ too: K begins before t0 by those of χ.

@@ -512,7 +512,9 @@ def _dot(x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
     return sp.Add(*[a * b for a, b in zip(x, y, strict=True)])
 
 
-def _number(value: float) -> sp.Expr:
+def _number(value: float | sp.Expr) -> sp.Expr:
+    if isinstance(value, sp.Expr) and value.free_symbols:  # of a parameter
+        return value
     return sp.Integer(int(value)) if value == int(value) else sp.Float(value)
 
 

@@ -78,7 +78,8 @@ class SplittingLoops:
     ----------
     values : tuple of float
         Of what depends on parameters of H alone: arguments of the loops, so that systems which differ in them share
-        these. With friction, and in kicks with force gradients, the values are part of the code, unless H depends on t.
+        these. With friction, and in kicks with force gradients, the values are part of the code, unless H depends on t
+        or each trajectory of a batch has its own.
     driven : bool
         True if H depends on t.
     closes : bool
@@ -106,8 +107,8 @@ class SplittingLoops:
                 self.values = driving.form.values
                 self._compile = partial(_driven_loops, driving, damped_drift(system, False))
             else:
+                self.values = system.symbols.parametric.values
                 damped = damped_drift(system, False)
-                self.values = () if damped else system.symbols.parametric.values
                 self._compile = partial(_symbolic_loops, system.symbols, algebra_source(system.symbols), damped)
                 self._has_ranges = True
         elif system.numba_functions is not None:
@@ -154,7 +155,7 @@ class SplittingLoops:
 
     def takes_values(self, level: int) -> bool:
         """True if the values of the system's parameters are numbers of the kicks of a level, not of their code."""
-        return bool(self.values) and not self.driven and takes_values(level)
+        return bool(self.values) and self.friction is None and takes_values(level)
 
     def functions(
         self, level: int, compensated: bool, monomials: Monomials = (), varied: bool = False, ranges: Ranges = ()
@@ -198,19 +199,17 @@ class SplittingLoops:
 
         return position_ranges(system.symbols, system.domain)
 
-    def rows(self, table: StageTable, h: float = 1.0, t0: float = 0.0) -> np.ndarray:
+    def rows(self, table: StageTable, h: float = 1.0, t0: float = 0.0, varied: bool = False) -> np.ndarray:
         """The numbers of a table that the loops read, with the values of the system's parameters where they take these.
 
         With friction the maps of the drifts are among them, of numbers for one h. Those of a driven system read the
-        time too, that of a step h that begins at t0.
+        time too, that of a step h that begins at t0. Those of `varied` loops have room for the values of any kicks.
         """
         if self.friction is not None:
             table = _with_friction(table, self.friction)
         if self.driven:
             return table.timed_rows(self.values, h, t0)
-        if self.friction is not None:
-            return table.packed
-        return table.rows(self.values if takes_values(table.level) else ())
+        return table.rows(self.values if varied or self.takes_values(table.level) else ())
 
     def step_rows(
         self,
@@ -247,7 +246,7 @@ class SplittingLoops:
         x, h = np.ascontiguousarray(x), np.ascontiguousarray(h)
         t = np.ascontiguousarray(np.broadcast_to(np.asarray(t, dtype=np.float64), h.shape)) if self.driven else h
         functions = self.functions(table.level, False, monomials, varied, ranges)
-        functions.step_rows(self.rows(table), x, h, t, y, out)
+        functions.step_rows(self.rows(table, varied=varied), x, h, t, y, out)
         return out
 
 
@@ -319,9 +318,9 @@ class SplittingKernel(Kernel):
 class VariedKernel(SplittingKernel):
     """The loops of batches of N trajectories that have their own values (k, N) of `SplittingLoops.values`.
 
-    Each takes the steps of `SplittingKernel` on a system with its values, with compensated sums up to rounding:
-    products of values, which the compiler takes out of loops there, it may fuse with sums here. A batch may be several
-    of such ones, one after the other.
+    Each takes the steps of `SplittingKernel` on a system with its values; with compensated sums, force gradients,
+    friction and driving up to rounding: products of values, which are part of the code there, or taken out of loops,
+    may be fused with sums here. A batch may be several of such ones, one after the other.
     """
 
     def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool, values: np.ndarray) -> None:
@@ -340,10 +339,28 @@ class VariedKernel(SplittingKernel):
     ) -> Run:
         raise TypeError("`y0` must be a batch (N, 2d): trajectories have their own parameters.")
 
+    def table(self, h: float, t0: float = 0.0) -> np.ndarray:
+        return self.loops.rows(run_table(self.scheme, h), h, t0, varied=True)
+
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
-        lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), len(y))
+        lengths, times = (np.broadcast_to(np.asarray(x, dtype=np.float64), len(y)) for x in (h, t))
         scheme, rows = self.scheme, self._rows(y)
-        return Steps(self.loops.step_rows(step_table(scheme), lengths, lengths, rows, scheme.monomials, varied=True))
+        if self.loops.friction is not None:
+            return Steps(self._damped_step(lengths, rows, times))
+        table, given = step_table(scheme), (scheme.monomials, times)
+        return Steps(self.loops.step_rows(table, lengths, lengths, rows, *given, varied=True))
+
+    def _damped_step(self, h: np.ndarray, rows: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Runs of one step: numbers with friction are no polynomials in h, and most rows have one h and t."""
+        rollout, out = self._functions().rollout_batch, np.empty((len(rows), 1, 2 * self.loops.ndof))
+        once, stop = np.ones(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
+        moments, which = np.unique(np.stack([h, t]), axis=1, return_inverse=True)
+        for k, (length, time) in enumerate(moments.T.tolist()):
+            index = np.flatnonzero(which.reshape(-1) == k)
+            states, finite, nothing = out[index], np.empty(len(index), dtype=np.int64), np.empty((len(index), 0))
+            rollout(self.table(length, time), rows[index], 1, once, states, finite, stop, 0, nothing)
+            out[index] = states
+        return out[:, 0]
 
     def _rows(self, y: np.ndarray, goes_on: bool = False) -> np.ndarray:
         if not (goes_on and len(self._latest) == len(y)):
@@ -463,7 +480,7 @@ def _symbolic_loops(
     varied: bool = False,
     ranges: Ranges = (),
 ) -> LoopFunctions:
-    if friction is None and takes_values(level) and symbols.parametric is not symbols:
+    if (varied or (friction is None and takes_values(level))) and symbols.parametric is not symbols:
         from sympflow.kernels.codegen import algebra_source
 
         symbols = symbols.parametric
@@ -477,14 +494,19 @@ def _symbolic_loops(
 
 
 def _driven_loops(
-    driving: Driving, friction: DampedDrift | None, level: int, compensated: bool, monomials: Monomials
+    driving: Driving,
+    friction: DampedDrift | None,
+    level: int,
+    compensated: bool,
+    monomials: Monomials,
+    varied: bool = False,
 ) -> LoopFunctions:
     """The loops of a symbolic system whose H depends on t; single steps, each at a time of its own, without lanes."""
     from sympflow.kernels.codegen import algebra_source
 
     form, after = driving.form, ("loops", "aligned", "lanes")
     algebra = algebra_source(form)
-    loops = symbolic_module(form, algebra, level, compensated, after, monomials, friction, driving)
+    loops = symbolic_module(form, algebra, level, compensated, after, monomials, friction, driving, varied)
     processed = loops.rollout_processed, loops.rollout_processed_rows
     return LoopFunctions(loops.rollout, loops.rollout_lanes, *processed, loops.step_each)
 
@@ -509,7 +531,7 @@ def symbolic_module(
 
     kinds, scheduled = kicks_of(level, len(monomials)), not compensated
     n = len(symbols.parameters)
-    lanes = lanes_source(kinds, scheduled, friction, n, varied)
+    lanes = lanes_source(kinds, scheduled, friction, n, varied, driving)
     sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
     if scheduled:
         sources.append(kicks_source(symbols, level, monomials, varied=varied, ranges=ranges))
@@ -517,7 +539,7 @@ def symbolic_module(
         sources += plain_kicks_source(symbols, level, monomials)
     algebra = "\n\n\n".join(sources)
     before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
-    n_values = n if varied else 0
+    n_values = len(symbols.values) if varied else 0
     header = _header(compensated, cache=True, scheduled=scheduled, n_values=n_values, driven=driving is not None)
     return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
 

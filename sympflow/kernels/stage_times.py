@@ -74,6 +74,22 @@ class Driving:
         ]
         return "\n\n\n".join(sources)
 
+    def lane_source(self, kinds: Sequence[Kick], n_rows: int) -> str:
+        """``common_of(table, j, k)`` and ``numbers_of_lane(Y, common, lane)``: see `stages.LaneNumbers`."""
+        numbers, _ = numbers_of_kicks(kinds)
+        fixed = self.form.parameters[: len(self.form.values)]
+        run, _ = time_lines(n_rows + len(fixed))
+        given = [f"common_{i}" for i in range(len(numbers))]
+        letters = [s.name for s in (*self.letters, *self.means)]
+        lines = [
+            f"{', '.join([*given, 'time', 'length'])} = common",
+            *(f"{s} = Y[2 * NDOF + {i}, lane]" for i, s in enumerate(fixed)),
+            f"{', '.join(letters)}, = letters_at({', '.join(['time', 'length', *map(str, fixed)])})",
+        ]
+        common = _function("common_of(table, j, k=0)", [run], [*numbers, "time", "table[0, j]"])
+        names = [s.name for s in self.form.parameters]
+        return f"{common}\n\n\n{_function('numbers_of_lane(Y, common, lane)', lines, [*given, *names])}"
+
     @cached_property
     def _letter_lines(self) -> list[str]:
         """The letters at `time`, and their means over the `length` from there."""

@@ -201,18 +201,12 @@ def with_last_stage(run: StageTable, after: StageTable) -> StageTable:
     assert run.times is not None
     of_kicks = np.cumsum(after.drifts) - after.drifts if after.times is None else after.times
     names = ("kicks", "drifts", "gradients", "curvatures", "polynomials")
-    last, first = (
-        [np.array(getattr(table, name)[place]) for name in names] for table, place in ((run, -1), (after, 0))
-    )
-    merged = not any(numbers.any() for name, numbers in zip(names, first, strict=True) if name != "drifts")
+    last = {name: np.array(getattr(run, name)[-1]) for name in names}
+    merged = int(not any(getattr(after, name)[0].any() for name in names if name != "drifts"))
     if merged:
-        last[1] = last[1] + first[1]
-    columns = [
-        np.concatenate([numbers[None], getattr(after, name)[int(merged) :]])
-        for name, numbers in zip(names, last, strict=True)
-    ]
-    times = np.concatenate([run.times[-1:], of_kicks[int(merged) :]])
-    return StageTable(after.level, *columns, times, after.direction)
+        last["drifts"] = last["drifts"] + after.drifts[0]
+    columns = {name: np.concatenate([last[name][None], getattr(after, name)[merged:]]) for name in names}
+    return replace(after, **columns, times=np.concatenate([run.times[-1:], of_kicks[merged:]]))
 
 
 # kinds of kick as code --------------------------------------------------------------------------------------------
@@ -391,6 +385,14 @@ class TimedNumbers(Protocol):
         ...
 
 
+class LaneNumbers(Protocol):
+    """The numbers of varied lanes as code, where they depend on the time."""
+
+    def lane_source(self, kinds: Sequence[Kick], n_rows: int) -> str:
+        """``common_of(table, j, k)`` and ``numbers_of_lane(Y, common, lane)`` of `lanes_source`."""
+        ...
+
+
 class TimeAlone:
     """The numbers of kicks, and after them the time, of a system whose functions take that."""
 
@@ -440,10 +442,10 @@ def numbers_of_kicks(kinds: Sequence[Kick], stages: str = "table") -> tuple[list
     return [f"{stages}[{i}, j]" for i in rows], values
 
 
-def _numbers_source(kinds: Sequence[Kick], n_parameters: int) -> str:
+def _numbers_source(kinds: Sequence[Kick], n_parameters: int, n_rows: int) -> str:
     """``numbers_of`` and ``numbers_at`` of `stages_source`, of a system that does not depend on the time."""
     numbers, values = numbers_of_kicks(kinds)
-    constant = range(1 + len(numbers), 1 + len(numbers) + n_parameters)
+    constant = range(n_rows, n_rows + n_parameters)
     numbers += [f"table[{i}, j]" for i in constant]
     values += [f"table[{i}, j, 0]" for i in constant]
     return f"""@njit(**OPTIONS)
@@ -467,9 +469,9 @@ def stages_source(
     """The functions of the text `loops` that depend on the kinds of kick, on friction and on the time.
 
     ``numbers_of(table, j, k)`` are the numbers of kick j of step k, ``numbers_at(table, j, x, h, t)`` those of a step h
-    by polynomials in x that begins at the time t; the values of the parameters of H, which are taken where there is no
-    friction, come after them. ``drift_of(table, j)`` are those of a drift. `stages` is the array of these numbers, by
-    the `table` that the loops are given. ``stage`` is a kick and a drift of one trajectory.
+    by polynomials in x that begins at the time t; the values of the parameters of H come after them. ``drift_of(table,
+    j)`` are those of a drift. `stages` is the array of these numbers, by the `table` that the loops are given.
+    ``stage`` is a kick and a drift of one trajectory. `FIRST_VALUE` is the row of a table with the first of the values.
     """
     given = "numbers, " if n_parameters else ""
     drifted = f"return move(q, q_error, drift(p, a, {given}work))"
@@ -479,10 +481,13 @@ def stages_source(
     moved = [move.format(p="p", a="a")] if friction is None else friction.drifted(move)
     end = [*moved, "return q, p, q_error, p_error"]
     begin = ["fill_coefficients(numbers, work[j])"] if driving is not None and scheduled else []
-    first = 1 + len(kinds[0].numbers)
-    n_rows = first + (0 if friction is None else 2 * friction.size)
+    first, n_rows = 1 + len(kinds[0].numbers), _rows_before_values(kinds, friction)
     table = {"stages": stages, "first": "table[:, :, 0]" if stages == "table" else "table"}
-    return f"""{_numbers_source(kinds, n_parameters) if driving is None else driving.source(kinds, n_rows)}
+    numbers = _numbers_source(kinds, n_parameters, n_rows) if driving is None else driving.source(kinds, n_rows)
+    return f"""FIRST_VALUE = {n_rows}
+
+
+{numbers}
 
 
 {_TABLE.format(**table)}
@@ -499,6 +504,11 @@ def drift_by(q, p, q_error, {given}a, work):
 @njit(**OPTIONS, forceinline=True)
 def stage(q, p, q_error, p_error, numbers, a, j, work):
     {_cases(kinds, "numbers[{0}] != 0.0", [[*begin, *kick.application(scheduled, False), *end] for kick in kinds])}"""
+
+
+def _rows_before_values(kinds: Sequence[Kick], friction: DampedDrift | None) -> int:
+    """The rows of a table before those of the values of a system's parameters."""
+    return 1 + len(kinds[0].numbers) + (0 if friction is None else 2 * friction.size)
 
 
 def two_stages_source(kinds: Sequence[Kick], friction: DampedDrift | None = None, n_parameters: int = 0) -> str:
@@ -527,12 +537,14 @@ def lanes_source(
     friction: DampedDrift | None = None,
     n_parameters: int = 0,
     varied: bool = False,
+    driving: LaneNumbers | None = None,
 ) -> str:
     """The functions of the text `lanes` that depend on the kinds of kick; not scheduled, sums are compensated.
 
     ``stage_lanes`` is a kick and a drift of all lanes by the same numbers, ``stage_each`` of each lane by its own, by
-    column j of a table. `varied` lanes have their own values of the parameters in both; scheduled ones take what
-    depends on these from a table in ``own_stages``, which makes two stages.
+    column j of a table. `varied` lanes have their own values of the parameters in both, and take the rest from
+    ``common_of(table, j, k)``; where there is one kind of kick and no time, scheduled ones take what depends on these
+    values from a table in ``own_stages``, which makes two stages: `OWN`.
     """
 
     given = "numbers, " if n_parameters else ""
@@ -551,7 +563,7 @@ def lanes_source(
         steps, places = {1: "H", 3: "H3", 5: "H5"}, range(len(kick.numbers))
         filled = [f"fill_lanes(Y, width, NUMBERS + {i}, table[{i + 1}, j], {steps[kick.powers[i]]})" for i in places]
         if not varied:
-            filled += [f"value_{i} = table[{1 + n_numbers + i}, j, 0]" for i in values]
+            filled += [f"value_{i} = table[FIRST_VALUE + {i}, j, 0]" for i in values]
         value = "Y[NUMBERS + N_NUMBERS + {0}, lane], " if varied else "value_{0}, "
         numbers = "".join([f"Y[NUMBERS + {i}, lane], " for i in places] + [value.format(i) for i in values])
         drifted = f"q, _ = move(q, None, drift(p, Y[A, lane], {given}None))"
@@ -560,14 +572,21 @@ def lanes_source(
     # Kinds are told apart outside the loops: a loop with a branch in it, once it is long, is no longer made of vector
     # instructions.
     passed = "common" if varied else "numbers"
-    before = _own_source(n_numbers, n_parameters) if varied else ""
+    own = varied and scheduled and driving is None and len(kinds) == 1
+    before = f"OWN = {own}\n\n\n"
+    if not varied or driving is None:
+        before += "common_of = numbers_of\n\n\n"
+    if varied:
+        n_rows = _rows_before_values(kinds, friction)
+        of_lane = _lane_source(n_numbers, n_parameters) if driving is None else driving.lane_source(kinds, n_rows)
+        before += f"{of_lane}\n\n\n"
     source = f"""{before}@njit(**OPTIONS, inline="always")  # called, the loop over the lanes takes five times as long
 def stage_lanes(Y, error, width, {passed}, a):
     {_cases(kinds, passed + "[{0}] != 0.0", [together(kick) for kick in kinds])}"""
     if not scheduled:
         return source
-    if varied:
-        source += "\n\n\n" + _own_stages_source(n_parameters)
+    if own:
+        source += "\n\n\n" + _own_stages_source(friction, n_parameters)
     return f"""N_NUMBERS = {n_numbers}
 
 
@@ -579,19 +598,19 @@ def stage_each(Y, width, table, j):
     {_cases(kinds, "np.any(table[{1}, j] != 0.0)", [each(kick) for kick in kinds])}"""
 
 
-def _own_source(n_numbers: int, n_parameters: int) -> str:
+def _lane_source(n_numbers: int, n_parameters: int) -> str:
     """``numbers_of_lane``, those of a kick with the values of the parameters of a lane."""
     numbers = [f"common[{i}], " for i in range(n_numbers)]
     numbers += [f"Y[2 * NDOF + {i}, lane], " for i in range(n_parameters)]
-    return f"@njit(**OPTIONS)\ndef numbers_of_lane(Y, common, lane):\n    return ({''.join(numbers)})\n\n\n"
+    return f"@njit(**OPTIONS)\ndef numbers_of_lane(Y, common, lane):\n    return ({''.join(numbers)})"
 
 
-def _own_stages_source(n_parameters: int) -> str:
+def _own_stages_source(friction: DampedDrift | None, n_parameters: int) -> str:
     """``own_stages`` of `lanes_source`: one stage, and two in one pass, which loads and stores the states once."""
 
     def lines(numbers: str, a: str, own: str) -> list[str]:
         given = f"numbers, a = numbers_of_lane(Y, {numbers}, lane), {a}"
-        return [given, f"p = kicked_by_own(q, p, numbers, {own}, lane)", *_drifted_lane(None, n_parameters)]
+        return [given, f"p = kicked_by_own(q, p, numbers, {own}, lane)", *_drifted_lane(friction, n_parameters)]
 
     one, other = lines("common_1", "a_1", "own_1"), lines("common_2", "a_2", "own_2")
     head = '@njit(**OPTIONS, inline="always")\ndef '

@@ -12,7 +12,7 @@ import numpy as np
 
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import load_algebra, run_rows, template
-from sympflow.kernels.splitting_loops import damped_drift, damped_table, splitting_loops, takes_values
+from sympflow.kernels.splitting_loops import damped_drift, damped_table, splitting_loops
 from sympflow.kernels.stages import DampedDrift, kicks_of, lanes_source, run_table, stages_source, two_stages_source
 from sympflow.schemes import Scheme
 
@@ -69,7 +69,7 @@ class TangentKernel:
         self._scheme, self._friction = scheme, system.friction
         drift = damped_drift(system, False)
         damped = None if drift is None else replace(drift, copies=1 + vectors)
-        if loops.values and takes_values(scheme.level):
+        if loops.takes_values(scheme.level):
             symbols, self._values = symbols.parametric, loops.values
         self._make = partial(_rollout, symbols, scheme.level, scheme.monomials, vectors, damped)
 

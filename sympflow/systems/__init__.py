@@ -36,7 +36,15 @@ from sympflow.systems.textbook import (
     spring_pendulum,
 )
 from sympflow.systems.user_files import from_toml
-from sympflow.systems.waves import fput_beta, grid, phi4, sine_gordon, toda_chain, wave_equation
+from sympflow.systems.waves import (
+    fput_beta,
+    grid,
+    nonlinear_schroedinger,
+    phi4,
+    sine_gordon,
+    toda_chain,
+    wave_equation,
+)
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -74,6 +82,7 @@ SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {
     "wave-equation": wave_equation,
     "sine-gordon": sine_gordon,
     "phi4": phi4,
+    "nonlinear-schroedinger": nonlinear_schroedinger,
     "toda-chain": toda_chain,
     "fput-beta": fput_beta,
 }

@@ -19,11 +19,12 @@ from sympflow.flow.flow_map import FlowMap, check_system
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
-from sympflow.hamiltonian.domain import Domain, EnergySublevel
+from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
+from sympflow.training.lattice_fit import Piece, on_piece
 from sympflow.training.network_fit import LossRun
 from sympflow.training.options import (
     KINDS,
@@ -242,6 +243,10 @@ def fit_flow(
     untold = flow is None and asked.restarts is None and asked.steps is None
     kind = _kind_of(system, flow, new, asked)
     check_for_flows(system, takes_friction=kind == "primed", takes_driving=kind == "primed")
+    if kind == "primed" and asked.searches and asked.data is None and on_piece(system):
+        piece = Piece.of(system, domain)
+        start = None if flow is None else piece.small(flow)
+        return piece.whole(fit_flow(piece.system, dt, start, new, asked, piece.domain, session), session)
     hurried = untold and session.time_budget is None and session.resume is None and kind == "primed" and asked.searches
     if hurried:
         session.time_budget = BUDGET
@@ -309,6 +314,8 @@ def _is_data(value: Any) -> bool:
 def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
     """Ω of a training: the domain that is given, else that of the system; checked."""
     domain = system.domain if domain is None else domain
+    if domain is None and system.local is not None and system.local.shape and system.y0 is not None:
+        domain = system.lattice_states()
     if domain is None:
         raise ValueError(
             f"`domain` is not known for the system {system.name!r}: pass the states to train on, as by "
@@ -319,8 +326,7 @@ def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
             f"`domain` must be a domain of phase space; got {domain!r}: use sympflow.Box(low, high), "
             "sympflow.Ball(center, radius) or sympflow.EnergySublevel(energy, box)."
         )
-    if isinstance(domain, EnergySublevel):
-        domain = domain.attach(system.hamiltonian)
+    domain = domain_of(domain, system)
     width = domain.sample(1, 0).shape[-1]
     if width != 2 * system.ndof:
         raise ValueError(f"`domain` has states of length {width}, the system {2 * system.ndof}: give [q, p].")

@@ -4,7 +4,7 @@ Source text, pasted after the tuple algebra of a symbolic system, its kicks, `lo
 `LANES` trajectories, in a run `MANY_LANES`, component first, as an array (2d, LANES) that stays in the first-level
 cache; the compiler turns the loop over the lanes of a stage into vector instructions. Lanes never mix: one that
 overflows leaves the others as they are. `sympflow.kernels.stages` writes ``stage_lanes`` and ``stage_each``, a kick and
-a drift of all lanes.
+a drift of all lanes. Where they say `OWN`, what depends on the parameters of a lane alone is computed once for a run.
 
 Where `N_VALUES` is not 0, trajectories have parameters of their own: so many values of each stand after its state, in
 the rows of y0 (N, 2d + `N_VALUES`) as in those of the blocks.
@@ -19,7 +19,6 @@ from numba.extending import intrinsic
 
 LANES = 64
 MANY_LANES = max(LANES, min(256, 512 // NDOF // LANES * LANES))  # the more, the less goes for the start of a stage
-OWN = N_VALUES > 0 and SCHEDULED  # what depends on the parameters of a lane alone is computed once for a run
 VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
 
 
@@ -49,7 +48,7 @@ def take_values(table, work, Y, lane, first):
     if N_VALUES > 0:
         for j in range(first, table.shape[1]):
             for k in range(N_VALUES):
-                table[table.shape[0] - N_VALUES + k, j] = Y[2 * NDOF + k, lane]
+                table[FIRST_VALUE + k, j] = Y[2 * NDOF + k, lane]
             if SCHEDULED:
                 fill_coefficients(numbers_of(table, j), work[j])
 
@@ -158,12 +157,12 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running,
             if OWN:
                 advance_own(Y, width, table, own, begin, block * link)
             else:
-                numbers, a = numbers_of(table, begin, n), drift_of(table, begin)
+                numbers, a = common_of(table, begin, n), drift_of(table, begin)
                 for k in range(n, n + block):
                     stage_lanes(Y, error, width, numbers, a)
                     for j in range(1, link):
-                        stage_lanes(Y, error, width, numbers_of(table, j, k), drift_of(table, j))
-                    numbers, a = numbers_of(table, link, k + 1), drift_of(table, link)
+                        stage_lanes(Y, error, width, common_of(table, j, k), drift_of(table, j))
+                    numbers, a = common_of(table, link, k + 1), drift_of(table, link)
             next_saved = saved
             while next_saved < len(save) and save[next_saved] == n + block:
                 next_saved += 1

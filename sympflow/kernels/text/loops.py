@@ -166,8 +166,13 @@ def step_each(table, x, h, t, y, out):
 
     The numbers (1 + n, m, K) of stage j are those for h = 1, polynomials Σ_k table[:, j, k] x^k of ``x[i]``.
     """
+    if N_VALUES > 0:
+        table = table.copy()  # of this thread
     work = prepared(first_coefficients(table))
     for i in range(y.shape[0]):
+        if N_VALUES > 0:
+            for k in range(N_VALUES):
+                table[FIRST_VALUE + k, :, 0] = y[i, 2 * NDOF + k]
         q, p = unpack(y[i])
         q_error, p_error = no_error(q), no_error(p)
         for j in range(columns_of(table)):

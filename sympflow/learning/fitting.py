@@ -1,0 +1,237 @@
+"""The fit of one model to trajectories, from nothing to whole orbits, and what held-out trajectories say of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sympflow.learning.models import Model
+from sympflow.learning.shooting import (
+    FINEST,
+    Fit,
+    Method,
+    Problem,
+    Stop,
+    chosen_method,
+    first_states,
+    matched,
+    minimized,
+)
+from sympflow.learning.trajectories import Run, Trajectories
+
+FIRST_POINTS = 10  # of the pieces that a fit begins with
+MATCHED_POINTS = 24  # of those whose increments give its start
+ROUNDS = 4  # of longer pieces, or of another noise
+SETTLED = 0.05  # change of the noise, relative, that ends them
+GROWTH = 1e3  # most that an error of an initial state may grow along a piece
+LEAST_GROWTH = 10.0
+PER_NOISE = 0.3  # of the spread of the data, that such an error may reach
+EXACT = 1e-9  # residuals, relative to the spread of the data, that need no explanation
+CORRELATED = 0.1  # correlation of one residual with the next that chance is allowed to make, beside 3/√n
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a model is fitted.
+
+    Attributes
+    ----------
+    noise : ndarray of shape (2d,) or None
+        σ of each coordinate; None for estimated.
+    huber : float or None
+        Residuals of more than so many σ count by their size.
+    stop : callable
+        Asked between steps.
+    """
+
+    noise: np.ndarray | None = None
+    huber: float | None = None
+    stop: Stop = lambda: False
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A model with its numbers.
+
+    Attributes
+    ----------
+    fit : Fit
+        Of whole trajectories, or of pieces no longer than `span`; of a few points if that is 0.
+    sigma : ndarray of shape (2d,)
+        The noise, by the residuals or as it was given.
+    span : float
+    costs : list of float
+        χ² over the number of values after each step.
+    """
+
+    model: Model
+    theta: np.ndarray
+    sigma: np.ndarray
+    fit: Fit
+    span: float
+    costs: list[float]
+
+    @property
+    def method(self) -> Method:
+        return self.fit.problem.method
+
+    def loss(self, sigma: np.ndarray) -> float:
+        """Minus the log-likelihood of what it was fitted to, but for a constant, for noise σ (2d,)."""
+        r = np.concatenate(self.fit.residuals, axis=1)
+        return float(0.5 * np.nansum((r / sigma[:, None]) ** 2))
+
+    @property
+    def states(self) -> np.ndarray:
+        """States of all orbits, (n, 2d)."""
+        return np.concatenate(self.fit.orbits, axis=1).T
+
+
+def fitted(
+    model: Model, data: Trajectories, setting: Setting, theta: np.ndarray | None = None, seed: int = 0
+) -> Fitted:
+    """Fit a model: to increments, to orbits of a few points, and to orbits as long as their errors stay small.
+
+    Parameters
+    ----------
+    theta : ndarray, optional
+        A start; else one is made.
+    """
+    scales = data.scales
+    if theta is None:
+        theta = model.start(np.random.default_rng(seed))
+        theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales)
+    given = None if setting.noise is None else np.maximum(setting.noise, FINEST * scales)
+    sigma = 1e-2 * scales if given is None else given
+    pieces, span = data.pieces(FIRST_POINTS), 0.0
+    states = first_states(pieces)
+    costs: list[float] = []
+    for attempt in range(1 + ROUNDS):
+        tolerance = np.clip(0.02 * sigma, 1e-13 * scales, 1e-4 * scales)
+        method = chosen_method(model, theta, pieces, tolerance)
+        problem = Problem(model, pieces, method, sigma, huber=setting.huber)
+        fit = minimized(problem, theta, states, gain=1e-2 if attempt == 0 else 1e-4, stop=setting.stop)
+        theta, before = fit.theta, sigma
+        costs += [cost / data.n_values for cost in fit.costs]
+        if given is None:
+            sigma = np.maximum(fit.noise(), FINEST * scales)
+        if not math.isfinite(fit.cost) or setting.stop():
+            break
+        orbits = np.concatenate(fit.orbits, axis=1)
+        longer = _span(model, data, method, theta, orbits, scales, sigma)
+        if longer <= 1.5 * span and np.allclose(sigma, before, rtol=SETTLED, atol=EXACT * scales.min()):
+            break
+        if longer > 1.5 * span:
+            span, pieces = longer, data.pieces(span=longer)
+        states = orbits[:, _starts(pieces.runs)].T
+    return Fitted(model, theta, sigma, fit, span, costs)
+
+
+def _starts(runs: Sequence[Run]) -> np.ndarray:
+    """The places of the first points of runs among all points."""
+    return np.concatenate([[0], np.cumsum([run.n_points for run in runs])[:-1]])
+
+
+def _span(
+    model: Model,
+    data: Trajectories,
+    method: Method,
+    theta: np.ndarray,
+    orbits: np.ndarray,
+    scales: np.ndarray,
+    sigma: np.ndarray,
+) -> float:
+    """The longest time over which orbits are followed: whole trajectories, unless their errors grow too fast."""
+    limit = float(np.clip(PER_NOISE * np.min(scales / sigma), LEAST_GROWTH, GROWTH))
+    frozen = Problem(model, data, method, sigma, frozen=True)
+    times = frozen.growth(theta, orbits[:, _starts(data.runs)].T, scales, limit)
+    soonest = float(np.quantile(times, 0.1, method="lower"))
+    return soonest if math.isfinite(soonest) else max(run.span for run in data.runs)
+
+
+# held-out trajectories ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Held:
+    """How well a model explains trajectories that it was not fitted to; only their initial states are fitted.
+
+    Attributes
+    ----------
+    fit : Fit
+        Of the pieces of the trajectories.
+    losses : ndarray of shape (N,)
+        Minus the log-likelihood of each trajectory.
+    values : int
+        Numbers observed.
+    correlation : float
+        Of one residual with the next; NaN where there are none.
+    pairs : int
+        How many of them.
+    exact : bool
+        True if residuals are no more than rounding and the scheme leave.
+    """
+
+    fit: Fit
+    losses: np.ndarray
+    values: int
+    correlation: float
+    pairs: int
+    exact: bool
+
+    @property
+    def pieces(self) -> tuple[Run, ...]:
+        """What was followed in one piece."""
+        return self.fit.problem.data.runs
+
+    @property
+    def loss(self) -> float:
+        """Minus the log-likelihood of a number."""
+        return float(self.losses.sum() / self.values)
+
+    @property
+    def explained(self) -> bool:
+        """True if nothing but noise is left: residuals are exact, or one tells nothing of the next."""
+        return self.exact or abs(self.correlation) < CORRELATED + 3 / math.sqrt(max(self.pairs, 1))
+
+
+def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
+    """The likelihood of held-out trajectories."""
+    scales = held.scales
+    pieces = held.pieces(span=found.span) if found.span else held.pieces(FIRST_POINTS)
+    sigma = np.maximum(found.sigma, EXACT * scales)
+    problem = Problem(found.model, pieces, found.method, sigma, frozen=True, huber=setting.huber)
+    fit = minimized(problem, found.theta, first_states(pieces), iterations=20)
+    residuals = fit.residuals
+    ends = np.cumsum([run.n_points for run in held.runs])
+    owner = np.searchsorted(ends, _starts(pieces.runs), side="right")
+    losses = np.zeros(len(held.runs))
+    same = size = 0.0
+    values = pairs = 0
+    for i, left in zip(owner, residuals, strict=True):
+        r = left / sigma[:, None]
+        seen = np.isfinite(r)
+        losses[i] += 0.5 * np.nansum(r * r) + (seen * np.log(sigma * math.sqrt(2 * math.pi))[:, None]).sum()
+        values += int(seen.sum())
+        both = seen[:, 1:] & seen[:, :-1]
+        same += float(np.nansum(r[:, 1:] * r[:, :-1]))
+        size += float(np.nansum(r * r) * both.sum() / max(seen.sum(), 1))
+        pairs += int(both.sum())
+    exact = bool(all((np.abs(r)[np.isfinite(r)] < 100 * EXACT * scales.max()).all() for r in residuals))
+    losses = np.where(np.isfinite(losses), losses, np.inf)
+    return Held(fit, losses, values, same / size if size > 0 else math.nan, pairs, exact)
+
+
+def gains(simple: Held, rich: Held) -> bool:
+    """Return True if the richer of two models explains the held-out trajectories better than chance would have it."""
+    difference = simple.losses - rich.losses
+    with np.errstate(invalid="ignore"):
+        mean = float(np.mean(difference))
+    if not np.isfinite(simple.losses).all():
+        return bool(np.isfinite(rich.losses).all())
+    if not math.isfinite(mean):
+        return False
+    error = float(np.std(difference, ddof=1) / math.sqrt(len(difference))) if len(difference) > 1 else 1.0
+    return mean > max(error, 1e-6 * abs(simple.losses.mean()))

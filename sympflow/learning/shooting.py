@@ -1,0 +1,652 @@
+"""Shooting: the numbers θ of a vector field, and the initial states of trajectories, that explain noisy observations.
+
+Every trajectory, or piece of one, has a latent initial state x_i. Its orbit is followed by a symplectic scheme of high
+order together with its exact derivatives by x_i and θ, and least squares are solved by Levenberg–Marquardt steps. The
+normal equations have the shape of an arrow, a block for each x_i and one for θ; the x_i are eliminated first.
+
+Arrays of orbits are columns: states (2d, N), derivatives (2d, 2d + n, N).
+
+References
+----------
+.. [1] H. G. Bock, Recent advances in parameter identification techniques for O.D.E., in: Numerical Treatment of Inverse
+   Problems in Differential and Integral Equations (1983), for multiple shooting.
+.. [2] E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (2006), sections II.1 and VI.6, for the schemes.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.linalg import cho_factor, cho_solve
+
+from sympflow.learning.models import Linear, Model
+from sympflow.learning.trajectories import Run, Trajectories
+from sympflow.schemes import Scheme, scheme_named
+from sympflow.training.least_squares import Damping
+
+MOST_NUMBERS = 2**20  # of the derivatives of a batch, which then stay in the cache
+LEAST_DAMPING = 1e-15
+TRIES = 12
+FINEST = 1e-13  # of an observation, relative to the spread of the coordinate
+ROUNDING = 1e-12
+
+Stop = Callable[[], bool]
+
+
+# orbits with their derivatives ----------------------------------------------------------------------------------------
+
+
+class Stepper(ABC):
+    """One step of a scheme, with the derivatives of its end by the initial state and by θ."""
+
+    cost: float
+    """Of a step, in evaluations of the force with its derivatives."""
+
+    @abstractmethod
+    def step(self, model: Model, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
+        """The states (2d, N) and derivatives (2d, c, N) a time h (N,) after x and X, which may be overwritten.
+
+        The first 2d columns of X are those by the initial state, the others those by θ, if there are any.
+        """
+
+
+@dataclass(frozen=True)
+class Splitting(Stepper):
+    """Kicks and drifts of a scheme, for a separable H."""
+
+    scheme: Scheme
+
+    @property
+    def cost(self) -> float:  # type: ignore[override]
+        return float(self.scheme.force_evaluations)
+
+    def step(self, model: Model, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
+        d = model.ndof
+        q, p = slice(0, d), slice(d, 2 * d)
+        wanted = X is not None, X is not None and X.shape[1] > 2 * d
+        for b, a in zip(self.scheme.kicks, self.scheme.drifts, strict=True):
+            for weight, of, moved in ((-b, q, p), (a, p, q)):
+                if weight:
+                    self._push(model.gradient(theta, x[of], "qp"[of is p], *wanted), weight * h, x, X, of, moved)
+        return x, X
+
+    @staticmethod
+    def _push(f: Linear, w: np.ndarray, x: np.ndarray, X: np.ndarray | None, of: slice, moved: slice) -> None:
+        """Add w f of some coordinates to others, and its derivatives."""
+        x[moved] += w * f.value
+        if X is None or f.slope is None:
+            return
+        first = 2 * len(f.value)
+        by = X[of]
+        for i, rows in enumerate(X[moved]):
+            for j, slope in enumerate(f.slope[i]):
+                if slope.any():
+                    rows[:] += (w * slope) * by[j]
+            if f.by_parameters is not None:
+                rows[first:] += w * f.by_parameters[i]
+
+
+@dataclass(frozen=True)
+class Gauss(Stepper):
+    """Gauss collocation, symplectic for any H."""
+
+    stages: int
+    iterations: int = 60
+
+    @property
+    def cost(self) -> float:  # type: ignore[override]
+        return 4.0 * self.stages
+
+    @cached_property
+    def _table(self) -> tuple[np.ndarray, np.ndarray]:
+        return _gauss_table(self.stages)
+
+    def step(self, model: Model, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
+        A, b = self._table
+        m, N = x.shape
+        s = self.stages
+        K = np.repeat(model.field(theta, x, False, False).value[:, None], s, axis=1)  # (m, s, N)
+        before = math.inf
+        for _ in range(self.iterations):
+            inner = x[:, None] + h * np.einsum("ij,mjn->min", A, K)
+            new = model.field(theta, inner.reshape(m, s * N), False, False).value.reshape(m, s, N)
+            change = float(np.abs(h * (new - K)).max(initial=0.0))
+            K = new
+            if not math.isfinite(change) or change == 0 or (change >= before and change < 1e-9 * np.abs(x).max()):
+                break
+            before = change
+        end = x + h * np.einsum("j,mjn->mn", b, K)
+        if X is None:
+            return end, None
+        inner = x[:, None] + h * np.einsum("ij,mjn->min", A, K)
+        c = X.shape[1]
+        f = model.field(theta, inner.reshape(m, s * N), True, c > m)
+        assert f.slope is not None
+        S = f.slope.reshape(m, m, s, N)
+        rhs = np.einsum("klin,lcn->nikc", S, X, optimize=True)
+        if f.by_parameters is not None:
+            rhs[..., m:] += f.by_parameters.reshape(m, c - m, s, N).transpose(3, 2, 0, 1)
+        matrix = np.einsum("n,ij,klin->nikjl", -h, A, S, optimize=True).reshape(N, s * m, s * m)
+        matrix += np.eye(s * m)
+        if not np.isfinite(matrix).all():
+            return end * np.nan, X
+        slopes = np.linalg.solve(matrix, rhs.reshape(N, s * m, c)).reshape(N, s, m, c)
+        return end, X + h * np.einsum("j,njkc->kcn", b, slopes)
+
+
+@lru_cache
+def _gauss_table(s: int) -> tuple[np.ndarray, np.ndarray]:
+    """A and b of Gauss's collocation with s stages."""
+    nodes, weights = np.polynomial.legendre.leggauss(s)
+    c, b = (nodes + 1) / 2, weights / 2
+    powers = np.vander(c, s, increasing=True)
+    integrals = powers * c[:, None] / np.arange(1, s + 1)
+    return integrals @ np.linalg.inv(powers), b
+
+
+SPLITTINGS = ("blanes_moan4", "srkn11b", "kahan_li8")
+STAGES = (2, 3, 4)
+
+
+def steppers(model: Model) -> list[Stepper]:
+    """The schemes that can follow a model."""
+    if not model.separable:
+        return [Gauss(s) for s in STAGES]
+    schemes = map(scheme_named, SPLITTINGS)
+    return [Splitting(s) for s in schemes if model.nystrom or not s.nystrom]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A scheme, and its longest step."""
+
+    stepper: Stepper
+    longest: float
+
+    def steps(self, gaps: np.ndarray) -> int:
+        """How many steps lead over gaps (N,)."""
+        return max(1, math.ceil(float(np.max(np.abs(gaps), initial=0.0)) / self.longest * (1 - 1e-9)))
+
+    def over(self, model: Model, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray) -> Any:
+        """States and derivatives at the end of gaps."""
+        n = self.steps(gaps)
+        for _ in range(n):
+            x, X = self.stepper.step(model, theta, x, X, gaps / n)
+        return x, X
+
+
+# observations ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Pieces of trajectories of about one length, side by side.
+
+    Attributes
+    ----------
+    index : ndarray of int, shape (N,)
+        Their places among all pieces.
+    gaps : ndarray of shape (k, N)
+        Times from one point to the next, the first of them 0; 0 beyond a piece's end.
+    y : ndarray of shape (k, 2d, N)
+        0 where nothing was observed.
+    seen : ndarray of shape (k, 2d, N)
+        1 where there is an observation, 0 elsewhere.
+    """
+
+    index: np.ndarray
+    gaps: np.ndarray
+    y: np.ndarray
+    seen: np.ndarray
+
+
+def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
+    """The runs in batches, of lengths that differ by a third at most."""
+    order = np.argsort([run.n_points for run in runs], kind="stable")
+    m = len(runs[0].y)
+    most = max(1, MOST_NUMBERS // (m * columns))
+    made: list[Batch] = []
+    start = 0
+    while start < len(order):
+        least, stop = runs[order[start]].n_points, start
+        while stop < len(order) and stop - start < most and 3 * runs[order[stop]].n_points <= 4 * least + 3:
+            stop += 1
+        index = order[start:stop]
+        k = runs[index[-1]].n_points
+        gaps, y = np.zeros((k, len(index))), np.full((k, m, len(index)), np.nan)
+        for column, i in enumerate(index):
+            run = runs[i]
+            gaps[1 : run.n_points, column] = np.diff(run.t)
+            y[: run.n_points, :, column] = run.y.T
+        seen = np.isfinite(y)
+        made.append(Batch(index, gaps, np.where(seen, y, 0.0), seen.astype(float)))
+        start = stop
+    return made
+
+
+def first_states(data: Trajectories) -> np.ndarray:
+    """A guess of the initial states (N, 2d): what was observed first, interpolated where a value is missing."""
+    middle = np.nanmean(np.concatenate([run.y for run in data.runs], axis=1), axis=1)
+    states = np.empty((len(data.runs), 2 * data.ndof))
+    for state, run in zip(states, data.runs, strict=True):
+        for i, values in enumerate(run.y):
+            seen = np.isfinite(values)
+            state[i] = np.interp(run.t[0], run.t[seen], values[seen]) if seen.any() else middle[i]
+    return states
+
+
+# normal equations -----------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Normal:
+    """JᵀJ and Jᵀr with the shape of an arrow, and the cost |r|².
+
+    Attributes
+    ----------
+    A, B, C : ndarray of shape (N, m, m), (N, m, n), (n, n)
+        Blocks of the initial states, of them with θ, and of θ.
+    a, c : ndarray of shape (N, m), (n,)
+        −Jᵀr.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    a: np.ndarray
+    c: np.ndarray
+    cost: float
+
+    def solved(self, damping: float, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+        """The steps of θ and of the initial states, and the decrease that they promise; None if it cannot be solved."""
+        N, m, n = self.B.shape
+        diagonal = np.einsum("nii->ni", self.A)
+        floor = np.finfo(float).tiny + LEAST_DAMPING * diagonal.max(axis=1, keepdims=True)
+        damped = self.A + np.eye(m) * (damping * diagonal + floor)[:, None, :]
+        try:
+            found = np.linalg.solve(damped, np.concatenate([self.B, self.a[..., None]], axis=2))
+        except np.linalg.LinAlgError:
+            return None
+        Q, x = found[..., :n], found[..., n]
+        theta = np.zeros(n)
+        if n:
+            flat = self.B.reshape(N * m, n)
+            S = self.C - flat.T @ Q.reshape(N * m, n)
+            D = np.sqrt(np.where(scale > 0, scale, 1.0))
+            try:
+                factor = cho_factor(S / np.outer(D, D) + damping * np.eye(n), check_finite=False)
+            except np.linalg.LinAlgError:
+                return None
+            theta = cho_solve(factor, (self.c - flat.T @ x.reshape(-1)) / D, check_finite=False) / D
+            x = x - Q @ theta
+        model = 2 * (self.c @ theta + np.sum(self.a * x)) - theta @ self.C @ theta
+        model -= np.einsum("ni,nij,nj->", x, self.A, x, optimize=True) + 2 * np.sum(x * (self.B @ theta))
+        return theta, x, float(model)
+
+    def precision(self) -> np.ndarray:
+        """The matrix of θ when the initial states are eliminated, (n, n): its inverse is their covariance."""
+        n = self.C.shape[0]
+        flat = self.B.reshape(-1, n)
+        inverse = np.linalg.pinv(self.A, hermitian=True)
+        return self.C - flat.T @ (inverse @ self.B).reshape(-1, n)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Least squares of θ and the initial states of pieces of trajectories.
+
+    Parameters
+    ----------
+    model : Model
+    data : Trajectories
+        Its runs are the pieces.
+    method : Method
+    sigma : ndarray of shape (2d,)
+        The noise of each coordinate, by which residuals are divided.
+    frozen : bool
+        True if θ is not to change.
+    huber : float or None
+        Residuals of more than so many σ count by their size, not its square.
+    """
+
+    model: Model
+    data: Trajectories
+    method: Method
+    sigma: np.ndarray
+    frozen: bool = False
+    huber: float | None = None
+
+    @cached_property
+    def batches(self) -> list[Batch]:
+        return batches(self.data.runs, 2 * self.model.ndof + (0 if self.frozen else self.model.n))
+
+    def _orbits(
+        self, batch: Batch, theta: np.ndarray, states: np.ndarray, derivatives: bool
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
+        """States and derivatives at each point of a batch."""
+        m = 2 * self.model.ndof
+        x, X = np.ascontiguousarray(states[batch.index].T), None
+        if derivatives:
+            X = np.zeros((m, m + (0 if self.frozen else self.model.n), x.shape[1]))
+            X[np.arange(m), np.arange(m)] = 1.0
+        for k, gaps in enumerate(batch.gaps):
+            if k:
+                x, X = self.method.over(self.model, theta, x, X, gaps)
+            yield k, x, X
+
+    def _weighted(self, batch: Batch, k: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals in σ (2d, N), and their weights."""
+        r = (batch.y[k] - x) / self.sigma[:, None] * batch.seen[k]
+        if self.huber is None:
+            return r, batch.seen[k]
+        return r, batch.seen[k] * np.minimum(1.0, self.huber / np.maximum(np.abs(r), self.huber))
+
+    def _cost(self, r: np.ndarray) -> float:
+        if self.huber is None:
+            return float(np.sum(r * r))
+        size = np.abs(r)
+        return float(np.sum(np.where(size <= self.huber, r * r, self.huber * (2 * size - self.huber))))
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
+    def cost(self, theta: np.ndarray, states: np.ndarray) -> float:
+        """Σ ρ(r); not finite where an orbit is not."""
+        total = 0.0
+        for batch in self.batches:
+            for k, x, _ in self._orbits(batch, theta, states, False):
+                total += self._cost(self._weighted(batch, k, x)[0])
+                if not math.isfinite(total):
+                    return math.inf
+        return total
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
+    def orbits(self, theta: np.ndarray, states: np.ndarray) -> list[np.ndarray]:
+        """The orbit of each piece at its times, (2d, k)."""
+        made: list[Any] = [None] * len(self.data.runs)
+        for batch in self.batches:
+            orbit = np.stack([x.copy() for _, x, _ in self._orbits(batch, theta, states, False)])
+            for column, i in enumerate(batch.index):
+                made[i] = orbit[: self.data.runs[i].n_points, :, column].T
+        return made
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
+    def growth(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray, limit: float) -> np.ndarray:
+        """The times (N,) after which an error of the initial state has grown by a limit; infinite where it has not."""
+        made = np.full(len(states), np.inf)
+        m = len(scales)
+        for batch in self.batches:
+            for k, _, X in self._orbits(batch, theta, states, True):
+                assert X is not None
+                size = np.abs(X[:, :m] * (scales / scales[:, None])[..., None]).max(axis=(0, 1))
+                passed = batch.gaps[: k + 1].sum(axis=0)
+                grown = ~(size <= limit) & np.isinf(made[batch.index])
+                made[batch.index[grown]] = passed[grown]
+        return made
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
+    def normal(self, theta: np.ndarray, states: np.ndarray) -> Normal:
+        """The normal equations at a point."""
+        N, m, n = len(states), 2 * self.model.ndof, 0 if self.frozen else self.model.n
+        made = Normal(np.empty((N, m, m)), np.empty((N, m, n)), np.zeros((n, n)), np.empty((N, m)), np.zeros(n), 0.0)
+        for batch in self.batches:
+            size = len(batch.index)
+            A, B, a = np.zeros((m, m, size)), np.zeros((m, n, size)), np.zeros((m, size))
+            for k, x, X in self._orbits(batch, theta, states, True):
+                assert X is not None
+                r, weight = self._weighted(batch, k, x)
+                made.cost += self._cost(r)
+                for i in range(m):
+                    J = X[i] * (np.sqrt(weight[i]) / self.sigma[i])
+                    rest = np.sqrt(weight[i]) * r[i]
+                    by_state, by_theta = J[:m], J[m:]
+                    a += by_state * rest
+                    for j in range(m):
+                        A[j] += by_state[j] * by_state
+                        B[j] += by_state[j] * by_theta
+                    if n:
+                        made.C += by_theta @ by_theta.T
+                        made.c += by_theta @ rest
+            made.A[batch.index], made.B[batch.index] = A.transpose(2, 0, 1), B.transpose(2, 0, 1)
+            made.a[batch.index] = a.T
+        return made
+
+
+# the search -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A minimum.
+
+    Attributes
+    ----------
+    theta : ndarray of shape (n,)
+    states : ndarray of shape (N, 2d)
+        The latent initial state of each piece.
+    cost : float
+        Σ ρ(r) at the σ of the problem.
+    normal : Normal
+        The normal equations there.
+    costs : list of float
+        After each step.
+    reason : str
+        Why the search ended.
+    """
+
+    problem: Problem
+    theta: np.ndarray
+    states: np.ndarray
+    cost: float
+    normal: Normal
+    costs: list[float] = field(default_factory=list)
+    reason: str = ""
+
+    @cached_property
+    def orbits(self) -> list[np.ndarray]:
+        """The orbit of each piece at its times, (2d, k)."""
+        return self.problem.orbits(self.theta, self.states)
+
+    @property
+    def residuals(self) -> list[np.ndarray]:
+        """Observation less orbit of each piece, (2d, k), NaN where nothing was observed."""
+        return [run.y - orbit for run, orbit in zip(self.problem.data.runs, self.orbits, strict=True)]
+
+    def noise(self) -> np.ndarray:
+        """σ of each coordinate (2d,) by the residuals, with the share that the fit took of them given back."""
+        r = np.concatenate(self.residuals, axis=1)
+        seen = np.isfinite(r)
+        values, fitted = int(seen.sum()), self.states.size + len(self.theta)
+        free = max(1 - fitted / values, 0.1)
+        return np.sqrt(np.nansum(r * r, axis=1) / np.maximum(seen.sum(axis=1), 1) / free)
+
+    def covariance(self) -> np.ndarray:
+        """Of θ (n, n), where σ is the noise."""
+        return np.linalg.pinv(self.normal.precision(), hermitian=True)
+
+
+def minimized(
+    problem: Problem,
+    theta: np.ndarray,
+    states: np.ndarray,
+    *,
+    iterations: int = 50,
+    gain: float = 1e-3,
+    patience: int = 3,
+    damping: float = 1e-3,
+    stop: Stop = lambda: False,
+) -> Fit:
+    """Levenberg–Marquardt steps until `patience` of them together gain less than this share of the cost."""
+    level = Damping(damping, LEAST_DAMPING)
+    normal = problem.normal(theta, states)
+    scale = np.diagonal(normal.C).copy()
+    costs, reason = [normal.cost], "the iterations were used up"
+    for _ in range(iterations):
+        if not math.isfinite(costs[-1]):
+            reason = "the orbits are not finite at the start"
+            break
+        if stop():
+            reason = "it was stopped"
+            break
+        found = _stepped(problem, normal, theta, states, scale, level, costs[-1])
+        if found is None:
+            reason = "no step lowers the cost"
+            break
+        theta, states, cost = found
+        normal = problem.normal(theta, states)
+        scale = np.maximum(scale, np.diagonal(normal.C))
+        costs.append(cost)
+        if len(costs) > patience and cost > (1 - gain) * costs[-1 - patience]:
+            reason = "it has converged"
+            break
+    return Fit(problem, theta, states, costs[-1], normal, costs, reason)
+
+
+def _stepped(
+    problem: Problem,
+    normal: Normal,
+    theta: np.ndarray,
+    states: np.ndarray,
+    scale: np.ndarray,
+    level: Damping,
+    before: float,
+) -> tuple[np.ndarray, np.ndarray, float] | None:
+    for _ in range(TRIES):
+        solved = normal.solved(level.value, scale)
+        if solved is not None:
+            step, moved, promised = solved
+            trial = theta if problem.frozen else theta + step, states + moved
+            after = problem.cost(*trial)
+            gain = (before - after) / promised if promised > 0 and math.isfinite(after) else -1.0
+            if gain > 0:
+                level.accepted(gain)
+                return *trial, after
+        level.rejected()
+    return None
+
+
+# starts and methods ---------------------------------------------------------------------------------------------------
+
+
+def chosen_method(model: Model, theta: np.ndarray, data: Trajectories, tolerance: np.ndarray) -> Method:
+    """The cheapest scheme and step whose error over the gaps between points is below a tolerance (2d,).
+
+    The error is that over single gaps, from observed states, against half the step.
+    """
+    starts, gaps = _gaps(data)
+    widest = float(gaps.max())
+    best: tuple[float, Method] | None = None
+    for stepper in steppers(model):
+        method = Method(stepper, widest)
+        end = _ends(model, theta, method, starts, gaps)
+        for _ in range(12):
+            finer = replace(method, longest=method.longest / 2)
+            after = _ends(model, theta, finer, starts, gaps)
+            with np.errstate(invalid="ignore", over="ignore"):
+                error = np.nanquantile(np.abs(end - after) / tolerance[:, None], 0.99) if len(gaps) else 0.0
+            if error <= 1:
+                break
+            method, end = finer, after
+        cost = stepper.cost * float(np.mean([method.steps(gap[None]) for gap in gaps]))
+        if best is None or cost < best[0]:
+            best = cost, method
+    assert best is not None
+    return best[1]
+
+
+def _gaps(data: Trajectories, most: int = 400) -> tuple[np.ndarray, np.ndarray]:
+    """Some states (2d, N) with the times to the next points (N,), the widest gaps among them."""
+    found = [
+        (run.y[:, k], run.t[k + 1] - run.t[k])
+        for run in data.runs
+        for k in range(run.n_points - 1)
+        if np.isfinite(run.y[:, k]).all()
+    ]
+    if not found:  # never a whole state
+        found = [(x, float(np.diff(run.t).max())) for x, run in zip(first_states(data), data.runs, strict=True)]
+    gaps = np.array([gap for _, gap in found])
+    chosen = np.unique(
+        np.concatenate(
+            [np.argsort(gaps)[-most // 4 :], np.linspace(0, len(gaps) - 1, min(most, len(gaps))).astype(int)]
+        )
+    )
+    return np.stack([found[i][0] for i in chosen], axis=1), gaps[chosen]
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def _ends(model: Model, theta: np.ndarray, method: Method, x: np.ndarray, gaps: np.ndarray) -> np.ndarray:
+    return method.over(model, theta, x.copy(), None, gaps)[0]
+
+
+def matched(model: Model, theta: np.ndarray, data: Trajectories, weights: np.ndarray, steps: int = 1) -> np.ndarray:
+    """θ by which the observed increments are the integrals of the field along the observed states, by least squares.
+
+    No orbit is computed: y(t) − ∫ f_θ(y) dt is compared with a constant for each piece. That is linear where f is
+    linear in θ, and one step solves it.
+
+    Parameters
+    ----------
+    weights : ndarray of shape (2d,)
+        One over the scales of the coordinates.
+    steps : int
+        Of Gauss–Newton.
+    """
+    pieces = [run for run in map(_whole, data.runs) if run.n_points > 1]
+    if not pieces:
+        return theta
+    level = Damping(1e-10 if steps == 1 else 1e-3)
+    r, J = _increments(model, theta, pieces, weights)
+    for _ in range(steps):
+        scale = np.sqrt(np.sum(J * J, axis=0))
+        D = np.where(scale > 0, scale, 1.0)
+        normal = (J / D).T @ (J / D)
+        for _ in range(TRIES):
+            step = np.linalg.solve(normal + level.value * np.eye(len(D)), (J / D).T @ r) / D
+            after, K = _increments(model, theta + step, pieces, weights)
+            if after @ after < r @ r:
+                level.accepted(0.9)
+                theta, r, J = theta + step, after, K
+                break
+            level.rejected()
+        else:
+            break
+    return theta
+
+
+def _whole(run: Run) -> Run:
+    """The points at which all is observed."""
+    kept = np.isfinite(run.y).all(axis=0)
+    return Run(run.t[kept], run.y[:, kept])
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def _increments(
+    model: Model, theta: np.ndarray, pieces: Sequence[Run], weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What the field does not explain of the increments, and minus its derivative by θ."""
+    f = model.field(theta, np.concatenate([run.y for run in pieces], axis=1), False, True)
+    assert f.by_parameters is not None
+    at, rests, columns = 0, [], []
+    for run in pieces:
+        here = slice(at, at + run.n_points)
+        at += run.n_points
+        rates = np.concatenate([f.value[:, None, here], f.by_parameters[:, :, here]], axis=1)  # (m, 1 + n, k)
+        moved = _integrals(run.t, rates)
+        rest = run.y - moved[:, 0]
+        rests.append(((rest - rest.mean(axis=-1, keepdims=True)) * weights[:, None]).ravel())
+        J = (moved[:, 1:] - moved[:, 1:].mean(axis=-1, keepdims=True)) * weights[:, None, None]
+        columns.append(J.transpose(0, 2, 1).reshape(-1, model.n))
+    return np.concatenate(rests), np.concatenate(columns)
+
+
+def _integrals(t: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """The integrals of rates (…, k) from the first time on, by cubic splines where there are points for them."""
+    if len(t) < 4:
+        parts = np.diff(t) * (rates[..., 1:] + rates[..., :-1]) / 2
+        return np.concatenate([np.zeros((*rates.shape[:-1], 1)), np.cumsum(parts, axis=-1)], axis=-1)
+    return CubicSpline(t, rates, axis=-1).antiderivative()(t)

@@ -1,0 +1,197 @@
+"""A flow from trajectories: shooting recovers H to rounding, to what the noise allows, and says what it did."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import sympflow
+from sympflow.learning.families import Candidate, pruned
+from sympflow.learning.models import FixedKinetic, Kinetic, Model, Polynomial
+from sympflow.learning.shooting import Gauss, Method, Problem, chosen_method, first_states, matched, minimized
+from sympflow.learning.trajectories import Trajectories
+
+MASS, STIFF, QUARTIC, RATE = 2.0, 1.5, 0.7, 0.2
+
+
+def trajectories(n, points, rate=0.0, noise=0.0, span=2.0, seed=0):
+    """Of H = p²/4 + 0.75 q² + 0.175 q⁴ at irregular times, with friction."""
+    rng = np.random.default_rng(seed)
+
+    def field(t, y):
+        return [y[1] / MASS, -STIFF * y[0] - QUARTIC * y[0] ** 3 - rate * y[1]]
+
+    runs = []
+    for _ in range(n):
+        t = np.sort(rng.uniform(0, span, points))
+        y = solve_ivp(field, (0, span), rng.uniform(-1, 1, 2), t_eval=t, rtol=1e-12, atol=1e-13).y
+        runs.append((t, y + noise * rng.standard_normal(y.shape)))
+    return runs
+
+
+def quartic(data, rates=0):
+    q, p = data.scales
+    return Model(1, (Kinetic([p]), Polynomial.up_to(4, "q", [q])), rates)
+
+
+def problem(model, data, sigma, **options):
+    theta = matched(model, model.start(np.random.default_rng(0)), data, 1 / data.scales)
+    return theta, Problem(model, data, chosen_method(model, theta, data, 1e-12 * data.scales), sigma, **options)
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return Trajectories.read(trajectories(8, 15))
+
+
+# shooting -------------------------------------------------------------------------------------------------------------
+
+
+def test_shooting_finds_h_to_rounding(clean):
+    model = quartic(clean)
+    theta, fit = problem(model, clean, 1e-9 * clean.scales)
+    found = minimized(fit, theta, first_states(clean))
+    kinetic, potential = model.parts
+    assert kinetic.coefficients(found.theta[:1]) == pytest.approx([1 / (2 * MASS)], abs=1e-11)
+    assert potential.coefficients(found.theta[1:]) == pytest.approx([0, STIFF / 2, 0, QUARTIC / 4], abs=1e-10)
+
+
+@pytest.mark.parametrize("rates", [0, 1])
+def test_derivatives_are_those_of_the_orbits(clean, rates):
+    """Of a splitting scheme and of collocation, by the initial state and by θ, against differences."""
+    model = quartic(clean, rates)
+    theta, problem_ = problem(model, clean, clean.scales)
+    batch, states = problem_.batches[0], first_states(clean)
+    *_, (_, _, X) = problem_._orbits(batch, theta, states, True)
+
+    def end(theta, states):
+        *_, (_, x, _) = problem_._orbits(batch, theta, states, False)
+        return x
+
+    h = 1e-6
+    for i in range(2):
+        e = h * np.eye(2)[i]
+        assert (end(theta, states + e) - end(theta, states - e)) / (2 * h) == pytest.approx(X[:, i], abs=1e-7)
+    for i in range(model.n):
+        e = h * np.eye(model.n)[i]
+        assert (end(theta + e, states) - end(theta - e, states)) / (2 * h) == pytest.approx(X[:, 2 + i], abs=1e-7)
+
+
+def test_collocation_is_symplectic():
+    model = Model(1, (Polynomial("y", [[2, 0], [0, 2], [2, 2]], [1.0, 1.0]),))
+    x, X = np.array([[0.3], [0.8]]), np.eye(2)[..., None]
+    _, X = Method(Gauss(3), 0.5).over(model, np.array([0.5, 0.5, 0.4]), x, X, np.array([2.0]))
+    A, J = X[..., 0], np.array([[0.0, 1.0], [-1.0, 0.0]])
+    assert pytest.approx(J, abs=1e-12) == A.T @ J @ A
+
+
+def test_what_is_missing_is_left_out():
+    """The fit of data with gaps is the fit of the rest: as good, where every tenth number is missing."""
+    runs = trajectories(8, 15)
+    rng = np.random.default_rng(1)
+    for _, y in runs:
+        y[rng.random(y.shape) < 0.1] = np.nan
+    data = Trajectories.read(runs)
+    theta, fit = problem(quartic(data), data, 1e-9 * data.scales)
+    found = minimized(fit, theta, first_states(data))
+    assert quartic(data).parts[0].coefficients(found.theta[:1]) == pytest.approx([1 / (2 * MASS)], abs=1e-10)
+
+
+def test_noise_and_standard_errors_are_those_of_the_data():
+    """Over 6 samples of noise the errors of θ have the size that the covariance tells; σ is found to 5 %."""
+    deviations, sigmas = [], []
+    for seed in range(6):
+        data = Trajectories.read(trajectories(8, 15, noise=0.02, seed=seed))
+        model = Model(1, (FixedKinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
+        theta, fit = problem(model, data, np.full(2, 0.02))
+        found = minimized(fit, theta, first_states(data))
+        deviations.append((found.theta - [STIFF / 2, QUARTIC / 4]) / np.sqrt(np.diag(found.covariance())))
+        sigmas.append(found.noise())
+    assert 0.6 < np.std(deviations) < 1.5  # of 12 draws of a normal distribution
+    assert np.mean(sigmas) == pytest.approx(0.02, rel=0.05)
+
+
+def test_outliers_count_less_by_hubers_loss():
+    runs = trajectories(8, 15, noise=0.01)
+    for _, y in runs:
+        y[1, 7] += 1.0
+    data = Trajectories.read(runs)
+    errors = []
+    for huber in (None, 1.5):
+        theta, fit = problem(quartic(data), data, np.full(2, 0.01), huber=huber)
+        found = minimized(fit, theta, first_states(data))
+        errors.append(abs(quartic(data).parts[0].coefficients(found.theta[:1])[0] - 1 / (2 * MASS)))
+    assert errors[1] < errors[0] / 3
+
+
+def test_friction_is_learned():
+    data = Trajectories.read(trajectories(8, 15, rate=RATE))
+    theta, fit = problem(quartic(data, rates=1), data, 1e-9 * data.scales)
+    assert minimized(fit, theta, first_states(data)).theta[-1] == pytest.approx(RATE, abs=1e-9)
+
+
+def test_terms_without_evidence_are_left_out():
+    theta, precision = np.array([1.0, 0.01, 2.0]), np.diag([1e4, 1e4, 1e4])
+    model = Model(1, (Polynomial("q", [[2], [3], [4]], [1.0]),))
+    left = pruned(Candidate("V", model), theta, precision, values=100)
+    assert left.model.parts[0].exponents.tolist() == [[2], [4]]  # 0.01 is one standard error
+    assert pruned(Candidate("V", model), np.ones(3), precision, values=100) is None
+
+
+# learn ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    return sympflow.learn(trajectories(10, 25, noise=0.01), dt=0.5, time_budget=10)
+
+
+def test_learn_returns_a_flow_of_what_it_found(noisy):
+    """Its one-step error is what noise of 0.01 on 500 numbers leaves, its energy is conserved."""
+    x = np.array([[0.5, -0.4], [-0.7, 0.3]])
+    exact = [
+        solve_ivp(lambda t, y: [y[1] / MASS, -STIFF * y[0] - QUARTIC * y[0] ** 3], (0, 0.5), row, rtol=1e-10).y[:, -1]
+        for row in x
+    ]
+    import torch
+
+    assert noisy(0.5, torch.tensor(x)).numpy() == pytest.approx(np.array(exact), abs=0.01)
+    sol = sympflow.solve(noisy.system, noisy, t_span=(0, 50), y0=x[0], dt=0.5, backend="array")
+    assert sympflow.max_energy_error(sol) < 1e-3
+
+
+def test_learn_tells_what_it_did(noisy):
+    assert noisy.figures["noise"] == pytest.approx(0.01, rel=0.15)
+    assert noisy.figures["held_out_error_1"] == pytest.approx(0.01, rel=0.5)
+    assert "T = " in noisy.recipe["learned"]["model"]
+    assert "held-out trajectories" in noisy.recipe["learned"]["reason"]
+    assert len(noisy.history) >= 3
+
+
+def test_a_learned_flow_brings_its_system(noisy, tmp_path):
+    noisy.save(tmp_path / "flow.safetensors")
+    flow = sympflow.load(tmp_path / "flow.safetensors")
+    y = np.array([0.2, 0.3])
+    assert flow.system.hamiltonian(y) == pytest.approx(noisy.system.hamiltonian(y), rel=1e-12)
+    assert flow.figures == noisy.figures
+
+
+@pytest.mark.parametrize(
+    ("runs", "options", "match"),
+    [
+        (1, {}, "one trajectory only"),
+        (4, {"noise": -1.0}, "`noise`"),
+        (4, {"family": "unknown"}, "`family`"),
+        (4, {"loss": "absolute"}, "`loss`"),
+        (4, {"damping": 0.1}, "`damping`"),
+        (4, {"mass": 1.0, "separable": False}, "`mass`"),
+        (4, {"dt": -1.0}, "`dt`"),
+    ],
+)
+def test_what_cannot_be_learned_is_refused(runs, options, match):
+    with pytest.raises(ValueError, match=match):
+        sympflow.learn(trajectories(runs, 6), **options)
+
+
+def test_too_few_numbers_are_refused():
+    with pytest.raises(ValueError, match="fewer than the simplest model"):
+        sympflow.learn(trajectories(2, 2))

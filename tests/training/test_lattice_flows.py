@@ -1,0 +1,131 @@
+"""Flows of lattices: fitted on a few sites, judged on the lattice, known by the terms and not by the size."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sympflow
+from sympflow import Box, HamiltonianSystem, LatticeStates, SympFlow, solve, train
+
+BOND = "r**2/2 + r**4/4"
+FIT = {"restarts": 1, "steps": 8, "points": 20, "label_times": 3, "reference_states": 10, "progress": False}
+
+
+def ring(n=40, **options):
+    return HamiltonianSystem.lattice(shape=n, **{"bond": BOND, **options})
+
+
+@pytest.fixture(scope="module")
+def flow():
+    lattice = ring(domain=LatticeStates(0.2))
+    return train(lattice, flow=SympFlow.primed(lattice, 2, dt=0.25, processor=2), **FIT)
+
+
+def test_states_have_the_density_of_the_lattice_at_every_size():
+    large = ring(400, domain=LatticeStates(0.2)).domain
+    assert large is not None
+    many = large.sample(20)
+    few = ring(400, domain=LatticeStates(0.2)).piece(8).domain
+    of_large, of_few = (s.system.energy_density(x).mean(-1) for s, x in ((large, many), (few, few.sample(2000))))
+    # a gamma distribution of as many oscillators: relative spreads d^(-1/2), of the mean over n states (d n)^(-1/2)
+    for density, d in ((of_large, 400), (of_few, 8)):
+        assert abs(density.mean() / 0.2 - 1) < 5 / np.sqrt(d * len(density))
+        assert 0.6 < density.std() / 0.2 * np.sqrt(d) < 1.5
+    assert large.contains(many).all()
+    assert not large.contains(3 * many).any()
+    spike = many[0].copy()
+    spike[400] += 5.0  # one site alone
+    assert not large.contains(spike)
+
+
+def test_a_piece_has_the_states_of_the_lattice():
+    y0 = LatticeStates(0.3, ring(200)).sample(1)[0]
+    low, high = ring(200, y0=y0).piece(8).domain.bounds
+    assert low == pytest.approx(0.3, rel=0.3)
+    assert high == pytest.approx(low, rel=1.0)
+    of_box = ring(6, domain=Box([-0.5] * 12, [0.5] * 12)).piece().domain
+    assert 0.01 < of_box.bounds[0] < of_box.bounds[1] < 1
+    assert ring(200).piece(8).domain is None
+    with pytest.raises(TypeError, match=r"^`system` 'custom' is no lattice"):
+        HamiltonianSystem.from_sympy("p**2/2 + q**2/2").piece()
+    with pytest.raises(ValueError, match=r"^`density` must be positive"):
+        LatticeStates((0.3, 0.2))
+    with pytest.raises(ValueError, match="`domain` is not known"):
+        train(ring(200))
+
+
+@pytest.mark.parametrize("boundary", ["periodic", "fixed", "free"])
+def test_the_expression_by_coordinates_is_the_same_H(boundary):
+    lattice = HamiltonianSystem.lattice(
+        onsite="a*u**2/2 + u**2*v**2",
+        bond={1: "c*r_u**2/2 + r_v**2/2 + r_u**2*r_v", 2: "r_u**4/4"},
+        fields=("u", "v"),
+        shape=(5, 6),
+        boundary=(boundary, "fixed"),
+        params={"a": np.linspace(1, 2, 30).reshape(5, 6), "c": 0.5},
+    )
+    written = HamiltonianSystem.from_sympy(lattice.local.written_out())
+    y = np.random.default_rng(0).normal(size=(3, 120))
+    np.testing.assert_allclose(written.hamiltonian(y), lattice.hamiltonian(y), rtol=1e-12)
+
+
+def test_a_flow_serves_every_shape(flow, tmp_path):
+    assert flow.ndof == 40
+    assert flow.recipe["fitted_on"] == 6
+    assert flow.certified is not None
+    assert flow.certified.system == "lattice"
+    assert {"ends_periodic", "ends_fixed", "ends_free", "energy_error_95"} <= set(flow.figures)
+    flow.save(tmp_path / "flow.safetensors")
+    assert (tmp_path / "flow.safetensors").stat().st_size < 40_000
+    loaded = sympflow.load(tmp_path / "flow.safetensors")
+    assert loaded.ndof == 6
+    for n in (7, 40, 300):
+        lattice = ring(n, domain=LatticeStates(0.2))
+        y0, times = lattice.domain.sample(1)[0], [0.0, 2.5, 5.0]
+        runs = [solve(lattice, f, (0, 5), y0, t_eval=times, backend="array") for f in (flow, loaded)]
+        np.testing.assert_array_equal(runs[0].y, runs[1].y)
+        H = lattice.hamiltonian(runs[0].states)
+        assert np.ptp(H) / H[0] < 10 * flow.figures["energy_error_95"]
+    assert sympflow.load(tmp_path / "flow.safetensors", system=ring(12)).system.ndof == 12
+
+
+@pytest.mark.parametrize(
+    ("other", "reason"),
+    [
+        (ring(bond="r**2/2 + r**4/5"), r"its bond is r\*\*4/5"),
+        (ring(onsite="q**2/2"), r"its onsite term is q\*\*2/2"),
+        (ring(kinetic="p**2/4"), r"its kinetic energy is p\*\*2/4"),
+        (ring((6, 6)), "its number of axes is 2"),
+        (ring(kinetic="p**2/(2*m)", params={"m": np.linspace(1, 2, 40)}), "its kinetic energy is"),
+        (ring(damping=0.1), "has friction"),
+    ],
+)
+def test_another_lattice_is_refused_by_the_term_that_differs(flow, other, reason):
+    y0 = np.full(2 * other.ndof, 0.1)
+    with pytest.raises(ValueError, match=reason):
+        solve(other, flow, (0, 5), y0)
+    with pytest.raises(ValueError, match=r"has friction|is another lattice"):
+        flow.transferred(other if other.ndof != 40 else ring(41, bond="r**2/2 + r**4/5"))
+
+
+def test_ends_at_which_the_numbers_do_not_hold_are_refused(flow, monkeypatch):
+    free = ring(30, boundary="free")
+    y0 = LatticeStates(0.2, free).sample(1)[0]
+    assert solve(free, flow, (0, 5), y0, backend="array").success
+    monkeypatch.setitem(flow.figures, "ends_free", 3 * flow.figures["ends_periodic"])
+    with pytest.raises(ValueError, match=r"^`system` 'lattice' has free ends"):
+        solve(free, flow, (0, 5), y0)
+
+
+@pytest.mark.slow
+def test_curvature_terms_run_in_the_loops_of_a_lattice():
+    lattice = ring(12)
+    flow = SympFlow.primed(lattice, 2, dt=0.2, curvature=True)
+    flow.gradients.set_constant([1e-2, 1e-2])
+    flow.curvatures.set_constant([1e-2, 1e-2])
+    y0 = np.random.default_rng(1).normal(scale=0.3, size=24)
+    runs = [solve(lattice, flow, (0, 2), y0, t_eval=[2.0], backend=b).y for b in ("compiled", "array")]
+    np.testing.assert_allclose(*runs, rtol=0, atol=1e-12)
+    plain = solve(lattice, SympFlow.primed(lattice, 2, dt=0.2), (0, 2), y0, t_eval=[2.0]).y
+    assert np.abs(plain - runs[0]).max() > 1e-6
