@@ -199,9 +199,6 @@ class PrimedFlowKernel(Kernel):
 
         That of χ begins with the last stage of K, unless the loops close their outputs. In a driven system the time
         moves with the drifts of χ⁻¹ too: K begins before t0 by those of χ.
-        """The tables of χ⁻¹, of a run of K, and of χ, of steps |h|, or for h < 0 of their inverse.
-
-        That of χ begins with the last stage of K, unless the loops close their outputs. In a driven system the time moves with the drifts of χ⁻¹ too: K begins before t0 by those of χ.
         """
         loops = self._splitting
 
