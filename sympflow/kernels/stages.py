@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -205,7 +205,9 @@ def with_last_stage(run: StageTable, after: StageTable) -> StageTable:
     merged = int(not any(getattr(after, name)[0].any() for name in names if name != "drifts"))
     if merged:
         last["drifts"] = last["drifts"] + after.drifts[0]
-    columns = {name: np.concatenate([last[name][None], getattr(after, name)[merged:]]) for name in names}
+    columns: dict[str, Any] = {
+        name: np.concatenate([last[name][None], getattr(after, name)[merged:]]) for name in names
+    }
     return replace(after, **columns, times=np.concatenate([run.times[-1:], of_kicks[merged:]]))
 
 
