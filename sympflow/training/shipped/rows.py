@@ -112,7 +112,6 @@ def ladders() -> list[Recipe]:
         *(rung(kepler, 3, dt, fit=plain) for dt in (0.2, 0.15, 0.1, 0.08, 0.06, 0.045, 0.03)),
         Recipe("kepler", "log-1", SYSTEMS[kepler], Clock(1.0), ByClock()),
         *(rung(planets, 3, dt, fit=short, judge=along) for dt in (300.0, 200.0, 100.0)),
-        *(lattice_rung("fput-beta", dt) for dt in (0.5, 0.25)),
         *(lattice_rung("toda-chain", dt) for dt in (0.8, 0.5, 0.25)),
     ]
 
