@@ -4,7 +4,7 @@
     python benchmarks/large_waves.py --only large-breather,large-soliton,large-nearly-integrable
     python benchmarks/large_waves.py --only large-amangkurat
 
-Float64, one thread, process time of `solve` as a user calls it, the least of several runs made in turn; compiled before.
+Float64, one thread, process time of `solve` as a user calls it, the least of several runs; compiled before.
 In `large-amangkurat` both codes run the sine-Gordon breather for ten periods, with grids and steps of their own from a
 list; its error is against the wave on the line, at the sites. amangkurat (spectral, Verlet) is installed beside the
 package. Its progress bar and messages are off, and so is its adaptive step.

@@ -20,7 +20,14 @@ if TYPE_CHECKING:
     from contenders.contender import Contender, Scene, Skipped
     from contenders.measurement import Results
 
-PEERS = {"diffrax": "diffrax_solvers", "heyoka": "heyoka_taylor"}
+PEERS = {
+    "diffrax": "diffrax_solvers",
+    "heyoka": "heyoka_taylor",
+    "rebound": "rebound_particles",
+    "pyhamsys": "pyhamsys_schemes",
+    "desolver": "desolver_schemes",
+}
+"""Packages by the names under which they are imported, and the modules that run them."""
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
 
 

@@ -2,9 +2,9 @@
 
     python examples/space_time.py [--quick] [--out docs/figures]
 
-writes space_time.png: a breather and a kink of the sine-Gordon equation, kink and antikink of φ⁴ that collide, a soliton
-of Toda's chain, two solitons of the Schrödinger equation, and the energy of disordered oscillators, which stays where it
-is.
+writes space_time.png: a breather and a kink of the sine-Gordon equation, kink and antikink of φ⁴ that collide, a
+soliton of Toda's chain, two solitons of the Schrödinger equation, and the energy of disordered oscillators, which
+hardly leaves the sites where it started.
 """
 
 from __future__ import annotations

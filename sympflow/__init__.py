@@ -33,6 +33,7 @@ _HOME = {
     "load": "flow.files",
     "shipped_flows": "flow.shipped",
     "train": "training.trainer",
+    "discover": "learning.discovery",
     "learn": "learning.learner",
     "Trajectories": "learning.trajectories",
     "compare": "studies.comparison",
@@ -83,6 +84,7 @@ if TYPE_CHECKING:
     from sympflow.integrators.registry import get as get
     from sympflow.integrators.registry import register as register
     from sympflow.integrators.splitting import splitting_method as splitting_method
+    from sympflow.learning.discovery import discover as discover
     from sympflow.learning.learner import learn as learn
     from sympflow.learning.trajectories import Trajectories as Trajectories
     from sympflow.metrics.accuracy import reference_error as reference_error

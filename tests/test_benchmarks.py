@@ -204,19 +204,19 @@ def test_numbers_are_written_with_three_digits():
 def test_a_missing_peer_is_a_line_with_the_reason(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     contenders, skipped = peers.gather(TINY)
-    assert [s.package for s in skipped] == ["diffrax", "heyoka"]
+    assert [s.package for s in skipped] == ["diffrax", "heyoka", "rebound", "pyhamsys", "desolver"]
     assert {c.package for c in contenders} == {"sympflow", "Numba", "NumPy", "torch", "SciPy", "torchdiffeq"}
 
 
 def test_a_tiny_run_fills_the_fragments_and_survives_json(tmp_path):
-    chosen = [c for c in ours.contenders(TINY) if c.label in ("verlet", "kahan_li8")]
+    chosen = [c for c in ours.contenders(TINY) if c.label in ("verlet", "kahan_li8", ours.FLOW)]
     contenders = [*chosen, *(c for c in loops.contenders(TINY) if c.package == "Numba")]
     results = measure(TINY, contenders, [1e-3, 1e-6], 1, cap=0.05, step_counts=(1000, 100), note=lambda line: None)
     results.skipped = [Skipped("heyoka", "not installed")]
     results.environment = {"versions": {"python": "3"}, "minutes": 0.1, "repeats": 1, "load": 0.0, "load_after": 0.0}
     assert {(r.label, r.trajectories, r.target) for r in results.rows} == {
         (label, n, target)
-        for label in ("verlet", "kahan_li8", "Verlet loop")
+        for label in ("verlet", "kahan_li8", ours.FLOW, "Verlet loop")
         for n in (1, TINY.trajectories)
         for target in (1e-3, 1e-6)
     }

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +133,20 @@ def test_one_writer_at_a_time(tmp_path):
         pass
     with store.locked():
         pass
+
+
+def test_of_two_that_make_a_store_at_once_one_does(tmp_path, monkeypatch):
+    rename = module.os.rename
+
+    def late(made_by_us, place):
+        shutil.copytree(made_by_us, place)
+        rename(made_by_us, place)
+
+    monkeypatch.setattr(module.os, "rename", late)
+    with pytest.raises(FileExistsError, match=r"`store` '.*run.zarr' exists"):
+        made(tmp_path / "run.zarr")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.zarr"]
+    assert set(Store.open(tmp_path / "run.zarr").fields) == set(FIELDS)
 
 
 def test_chunks_and_their_values_must_fit(tmp_path):

@@ -103,8 +103,8 @@ class Contender:
     label, package : str
     trajectories : int
         How many one run integrates.
-    control : "dt" or "tol"
-        What its accuracy is set by.
+    control : "dt", "tol" or "flow"
+        What its accuracy is set by: a step, a tolerance, or the flow of a ladder, by its Δt.
     run : callable
         run(control, t_end): integrate to t_end, keeping the last state only; this is what is timed.
     outputs : callable or None
@@ -116,6 +116,8 @@ class Contender:
         Of the energy error as a function of the control.
     window : float
         The search ends at an error between window × target and the target.
+    choices : tuple of float
+        The settings that there are, the cheapest first; without them any number is one.
     short : tuple of targets
         Those that are calibrated over a tenth of the interval, since the energy error of a Runge–Kutta method grows
         linearly and a whole run would take minutes.
@@ -131,6 +133,7 @@ class Contender:
     guesses: Mapping[float, float] = field(default_factory=dict)
     order: float = 1.0
     window: float = 0.8
+    choices: tuple[float, ...] = ()
     short: tuple[float, ...] = ()
 
 

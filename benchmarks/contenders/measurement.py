@@ -17,7 +17,11 @@ from sympflow.studies.attempts import interleaved
 
 SHORT = 0.1  # part of the interval over which a `short` calibration runs
 PROBE = 0.01  # part of the interval that a run's duration is estimated from
-LEAST_PART = {"dt": 0.001, "tol": 0.05}  # adaptive steps differ along the orbit, so their average needs more of it
+LEAST_PART = {
+    "dt": 0.001,
+    "flow": 0.001,
+    "tol": 0.05,
+}  # adaptive steps differ along the orbit, so their average needs more of it
 AGREEMENT = 1e-10  # of two implementations of one scheme, over a short run: far above rounding, far below any error
 
 
@@ -139,6 +143,8 @@ def calibrate(scene: Scene, contender: Contender, target: float) -> Judged | Non
             )
         return Judged(control, energy_error, state_error, work)
 
+    if contender.choices:
+        return next((found for found in map(judge, contender.choices) if found.energy_error <= target), None)
     return largest_control(judge, target, contender.guesses[target], contender.order, contender.window)
 
 
@@ -200,7 +206,7 @@ def measure(
     steppers = {(c.label, c.trajectories): c for c in contenders if c.outputs}
     for contender in contenders:
         leader = steppers[contender.same_steps_as or contender.label, contender.trajectories]
-        control = leader.guesses[max(leader.guesses)]
+        control = (leader.choices or [leader.guesses[max(leader.guesses)]])[0]
         first, second = (seconds_of(partial(contender.run, control, PROBE * scene.t_end)) for _ in range(2))
         results.first_calls.append(
             FirstCall(contender.label, contender.package, contender.trajectories, first - second)

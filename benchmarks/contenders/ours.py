@@ -1,13 +1,15 @@
-"""sympflow's splitting methods, through `solve`: everything that a user's call costs is in the time."""
+"""sympflow's splitting methods and shipped flows, through `solve`: all that a user's call costs is in the time."""
 
 from __future__ import annotations
 
-from functools import partial
+import math
+from functools import cache, partial
 
 import numpy as np
 
 import sympflow
 from contenders.contender import Contender, Outputs, Scene, Work, whole_steps
+from sympflow.flow.primed import PrimedFlow
 from sympflow.schemes import SCHEMES
 
 GUESSES = {  # method: steps for energy errors of 1e-3, 1e-6, 1e-9 and 1e-12 over T = 1000
@@ -39,8 +41,49 @@ def outputs(scene: Scene, method: str, trajectories: int, dt: float, t_end: floa
     return Outputs(states, states[-1], Work(n, n * scheme.force_evaluations, n * scheme.hessian_evaluations))
 
 
+FLOW = "trained flow"
+
+
+@cache
+def ladder(scene: Scene) -> dict[float, PrimedFlow]:
+    """The primed flows that ship, by their Δt, those with the fewest forces in a unit of time first."""
+    loaded = (entry.load(scene.system) for entry in sympflow.shipped_flows(scene.system))
+    flows = [flow for flow in loaded if isinstance(flow, PrimedFlow)]
+    return {flow.dt: flow for flow in sorted(flows, key=lambda flow: flow.kernel_scheme().force_evaluations / flow.dt)}
+
+
+def run_flow(scene: Scene, trajectories: int, dt: float, t_end: float) -> np.ndarray:
+    """The state at t_end, in steps of the flow's own Δt."""
+    flow, y0 = ladder(scene)[dt], scene.start(trajectories)
+    return sympflow.solve(scene.system, flow, (0.0, t_end), y0, t_eval=[t_end]).y[..., 0]
+
+
+def flow_outputs(scene: Scene, trajectories: int, dt: float, t_end: float) -> Outputs:
+    flow, y0, times = ladder(scene)[dt], scene.sample(trajectories), scene.instants(t_end)
+    sol = sympflow.solve(scene.system, flow, (0.0, t_end), y0, t_eval=times)
+    alone = sympflow.solve(scene.system, flow, (0.0, t_end), scene.y0, t_eval=[t_end]).stats
+    n = round(t_end / dt)
+    kernel = flow.kernel_scheme()
+    work = Work(n, alone["force_evaluations"], n * kernel.hessian_evaluations)
+    return Outputs(np.moveaxis(sol.y, -1, 0), sol.y[..., -1], work)
+
+
 def contenders(scene: Scene) -> list[Contender]:
-    return [
+    """Schemes, and the ladder of flows as one method, whose setting is the flow."""
+    flows = [
+        Contender(
+            FLOW,
+            "sympflow",
+            n,
+            "flow",
+            partial(run_flow, scene, n),
+            partial(flow_outputs, scene, n),
+            guesses=dict.fromkeys(TARGETS, math.nan),
+            choices=tuple(ladder(scene)),
+        )
+        for n in (1, scene.trajectories)
+    ]
+    return flows + [
         Contender(
             method,
             "sympflow",

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from measuring.fragments import duration, table, three
 
 from contenders.measurement import Results, Row, find, goals
+from contenders.ours import FLOW
 
 LISTED = (1e-3, 1e-6, 1e-9, 1e-12)
-COLOURS = {
-    "Numba": "#000000",
-    "heyoka": "#c0392b",
-    "diffrax": "#e08e0b",
-    "SciPy": "#2e8b57",
-    "torchdiffeq": "#8e44ad",
-    "torch": "#b07aa1",
-    "NumPy": "#7f7f7f",
-}
-MARKERS = "osD^vP*X"
+SETTINGS = {"dt": "dt", "tol": "tol", "flow": "Δt"}
 
 
 def fragments(results: Results) -> dict[str, str]:
@@ -95,7 +88,7 @@ def work_table(results: Results, n: int) -> str:
             label,
             package,
             power(target),
-            f"{'dt' if row.control == 'dt' else 'tol'} {row.value:.2g}",
+            f"{SETTINGS[row.control]} {row.value:.2g}",
             f"{row.steps:,}",
             "—" if row.force_evaluations is None else f"{row.force_evaluations:,}",
             "—" if row.hessian_evaluations is None else f"{row.hessian_evaluations:,}",
@@ -113,7 +106,7 @@ def same_steps(package: str, label: str) -> bool:
     """True if the steps are those of another row: our Verlet's, or SciPy's with the other right-hand side."""
     if package == "SciPy":
         return "scalar" in label
-    return package in ("Numba", "NumPy", "torch") or label.startswith("leapfrog")
+    return package in ("Numba", "NumPy", "torch") or label.startswith("leapfrog, jit")
 
 
 def first_call_table(results: Results) -> str:
@@ -136,23 +129,25 @@ def left_out(results: Results) -> str:
 
 
 def fastest_table(results: Results) -> str:
-    """Our fastest scheme, the time of the fastest other package over its, and diffrax's leapfrog over our Verlet."""
+    """Our fastest scheme and flow, the fastest other package, and diffrax's leapfrog over our Verlet."""
     packages = sorted({row.package for row in results.rows} - {"sympflow", "Numba"})
     rows = []
     for n in sorted({row.trajectories for row in results.rows}):
         for target in LISTED:
-            mine, peer = fastest(results, n, target, ["sympflow"]), fastest(results, n, target, packages)
+            mine, peer = fastest(results, n, target, ["sympflow"], but=FLOW), fastest(results, n, target, packages)
             if not (mine and peer):
                 continue
-            same = leapfrog_ratio(results, n, target)
-            cells = [mine.label, f"{peer.package}: {peer.label}", f"{peer.seconds / mine.seconds:.2f}"]
+            flow, same = pick(results, "sympflow", FLOW, n, target), leapfrog_ratio(results, n, target)
+            faster = f"{mine.seconds / flow.seconds:.2f}" if flow else ""
+            cells = [mine.label, faster, f"{peer.package}: {peer.label}", f"{peer.seconds / mine.seconds:.2f}"]
             rows.append(["one" if n == 1 else n, power(target), *cells, "" if same is None else f"{same:.2f}"])
     titles = (
         "trajectories",
         "error",
-        "our fastest",
+        "our fastest scheme",
+        "the trained flow is faster, times",
         "fastest of the others",
-        "takes, times",
+        "takes longer than our scheme, times",
         "diffrax's Verlet over ours",
     )
     return table(titles, rows)
@@ -170,10 +165,13 @@ def order_table(results: Results) -> str:
     """Ratio of the times of our Verlet and our fastest scheme, one trajectory."""
     rows = []
     for target in LISTED:
-        verlet, best = pick(results, "sympflow", "verlet", 1, target), fastest(results, 1, target, ["sympflow"])
+        verlet, best = (
+            pick(results, "sympflow", "verlet", 1, target),
+            fastest(results, 1, target, ["sympflow"], but=FLOW),
+        )
         if verlet and best:
             rows.append((power(target), best.label, three(verlet.seconds / best.seconds)))
-    return table(("error", "our fastest", "times faster than our Verlet"), rows)
+    return table(("error", "our fastest scheme", "times faster than our Verlet"), rows)
 
 
 def pick(results: Results, package: str, label: str, n: int, target: float) -> Row | None:
@@ -181,8 +179,9 @@ def pick(results: Results, package: str, label: str, n: int, target: float) -> R
     return find(results, lambda r: (r.package, r.label, r.trajectories, r.target) == key)
 
 
-def fastest(results: Results, n: int, target: float, packages: list[str]) -> Row | None:
+def fastest(results: Results, n: int, target: float, packages: list[str], but: str = "") -> Row | None:
     rows = [r for r in results.rows if r.trajectories == n and r.target == target and r.package in packages]
+    rows = [r for r in rows if r.label != but]
     return min(rows, key=lambda r: r.seconds, default=None)
 
 
@@ -204,47 +203,74 @@ def grouped(results: Results, n: int) -> list[tuple[tuple[str, str], dict[float,
     return list(groups.items())
 
 
+SHOWN = {
+    "trained flow (sympflow)": ("#d62728", "o", "-"),
+    "best splitting scheme (sympflow)": ("#1f77b4", "s", "-"),
+    "Verlet (sympflow)": ("#17becf", "D", "-"),
+    "Verlet, hand-written in Numba": ("#808080", "D", ":"),
+    "heyoka": ("#9467bd", "^", "--"),
+    "REBOUND": ("#2ca02c", "v", "--"),
+    "diffrax": ("#e08e0b", "P", "--"),
+    "pyhamsys": ("#8c564b", "X", "--"),
+    "desolver": ("#e377c2", "<", "--"),
+    "SciPy": ("#bcbd22", ">", "--"),
+    "torchdiffeq": ("#7f7f7f", "*", "--"),
+}
+"""The curves of the figure: colour, marker, line. Of a package its fastest method at each target."""
+
+
+def curve_of(row: Row) -> str | None:
+    """The curve that a row may be on."""
+    if row.package == "sympflow":
+        return {FLOW: "trained flow (sympflow)", "verlet": "Verlet (sympflow)"}.get(
+            row.label, "best splitting scheme (sympflow)"
+        )
+    if row.package == "Numba":
+        return "Verlet, hand-written in Numba"
+    return row.package if row.package in SHOWN else None
+
+
 def draw(results: Results, path: Path) -> None:
+    """Error against run time, a panel for one trajectory and one for the batch; legible on white as on black."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
     from matplotlib.ticker import LogLocator
 
+    grey = "#808890"
     counts = sorted({row.trajectories for row in results.rows})
-    figure, panels = plt.subplots(
-        1, len(counts), figsize=(6.6 * len(counts), 6.4), squeeze=False, sharey=True, layout="constrained"
-    )
-    for axes, n in zip(panels[0], counts, strict=True):
-        seen: dict[str, int] = {}
-        curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
-        for row in results.rows:
-            if row.trajectories == n:
-                curves.setdefault((row.package, row.label), []).append((row.seconds, row.energy_error))
-        for (package, label), points in curves.items():
-            marker = MARKERS[seen.setdefault(package, 0) % len(MARKERS)]
-            seen[package] += 1
-            x, y = zip(*points, strict=True)
-            ours = package == "sympflow"
-            shade = plt.get_cmap("winter")(seen[package] / 8) if ours else COLOURS.get(package)
-            axes.loglog(
-                x,
-                y,
-                marker=marker,
-                markersize=5,
-                color=shade,
-                linewidth=1.6 if ours else 1.1,
-                linestyle="-" if ours else "--",
-                zorder=3 if ours else 2,
-                label=f"{label} ({package})",
-            )
-        axes.set_xlabel("run time of a trajectory, s")
-        axes.set_title("one trajectory" if n == 1 else f"batch of {n}")
-        axes.yaxis.set_major_locator(LogLocator(numticks=15))
-        axes.grid(True, which="major", alpha=0.3)
-        axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=2, frameon=False)
-    panels[0][0].set_ylabel("largest relative energy error")
-    figure.suptitle("Hénon–Heiles to T = 1000: lower left is better", fontsize=11)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+    names = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
+    with plt.rc_context(dict.fromkeys(names, grey)):
+        figure, panels = plt.subplots(
+            1, len(counts), figsize=(5.2 * len(counts), 5.0), squeeze=False, sharey=True, layout="constrained"
+        )
+        handles: dict[str, Any] = {}
+        for axes, n in zip(panels[0], counts, strict=True):
+            best: dict[str, dict[float, Row]] = {}
+            for row in results.rows:
+                name = curve_of(row)
+                if name and row.trajectories == n:
+                    fastest_yet = best.setdefault(name, {}).get(row.target)
+                    if fastest_yet is None or row.seconds < fastest_yet.seconds:
+                        best[name][row.target] = row
+            for name, (colour, marker, line) in SHOWN.items():
+                rows = sorted(best.get(name, {}).values(), key=lambda row: row.energy_error)
+                if rows:
+                    thick = 2.4 if name.endswith("(sympflow)") else 1.3
+                    x, y = [row.seconds for row in rows], [row.energy_error for row in rows]
+                    (handles[name],) = axes.loglog(x, y, line, marker=marker, color=colour, lw=thick, ms=6)
+            axes.set_xlabel("run time of a trajectory, s")
+            axes.set_title("one trajectory" if n == 1 else f"batch of {n}")
+            axes.yaxis.set_major_locator(LogLocator(numticks=15))
+            axes.grid(True, which="major", alpha=0.3)
+            axes.spines[["top", "right"]].set_visible(False)
+        panels[0][0].set_ylabel("largest relative energy error")
+        order = [name for name in SHOWN if name in handles]
+        figure.legend(
+            [handles[name] for name in order], order, loc="outside lower center", ncols=4, fontsize=9, frameon=False
+        )
+        figure.suptitle("Hénon–Heiles to T = 1000: further left is faster, further down more accurate", fontsize=11)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=130, transparent=True)
+        plt.close(figure)

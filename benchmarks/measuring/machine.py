@@ -11,7 +11,19 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("numpy", "scipy", "numba", "torch", "torchdiffeq", "jax", "diffrax", "heyoka")
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "numba",
+    "torch",
+    "torchdiffeq",
+    "jax",
+    "diffrax",
+    "heyoka",
+    "rebound",
+    "pyhamsys",
+    "desolver",
+)
 VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 

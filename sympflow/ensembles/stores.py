@@ -109,7 +109,7 @@ class EnsembleStore:
         place = Path(os.path.abspath(os.fspath(path)))
         made = layout.stored(sizes)
         try:
-            store = Store.create(place, made, attributes | {"chunk_shape": list(sizes)})
+            Store.create(place, made, attributes | {"chunk_shape": list(sizes)}, layout.coordinates())
         except FileExistsError:
             if not resume:
                 raise ValueError(
@@ -117,9 +117,9 @@ class EnsembleStore:
                 ) from None
             store = Store.open(place)
             sizes = _same(store, str(path), attributes)
-        for name, values in layout.coordinates().items():
-            if not store.has(name, (0,)):  # as in one that was made just before a kill
-                store.write(name, (0,), values)
+            for name, values in layout.coordinates().items():
+                if not store.has(name, (0,)):  # as in one of an earlier version that was killed as it made it
+                    store.write(name, (0,), values)
         (place / MESSAGES).mkdir(exist_ok=True)
         return cls(str(place), layout, sizes)
 

@@ -16,7 +16,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.parts_loops import parts_loops
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
 from sympflow.kernels.splitting_loops import LoopFunctions, SplittingKernel, splitting_loops
-from sympflow.kernels.stages import StageTable, run_table, single_table
+from sympflow.kernels.stages import StageTable, run_table, single_table, with_last_stage
 from sympflow.kernels.timed_loops import reach_times
 from sympflow.schemes import CURVATURE, Scheme
 
@@ -197,7 +197,8 @@ class PrimedFlowKernel(Kernel):
     def _processed(self, h: float, t0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The tables of χ⁻¹, of a run of K, and of χ, of steps |h|, or for h < 0 of their inverse.
 
-        In a driven system the time moves with the drifts of χ⁻¹ too: K begins before t0 by those of χ.
+        That of χ begins with the last stage of K, unless the loops close their outputs. In a driven system the time
+        moves with the drifts of χ⁻¹ too: K begins before t0 by those of χ.
         """
         loops = self._splitting
 
@@ -207,11 +208,11 @@ class PrimedFlowKernel(Kernel):
             before, after = (single_table(tables.scheme("primed processor", t, back=back), t) for back in (True, False))
             # The loops read the numbers of all terms, of maps that lack some too.
             before, kernel, after = (replace(table, level=tables.level) for table in (before, kernel, after))
-            return before, kernel, after
+            return before, kernel, after if loops.closes else with_last_stage(kernel, after)
 
         if loops.driven:
             before, kernel, after = self._tables.kept(("stages", h), stages)
-            start = t0 - float(after.drifts.sum())
+            start = t0 + float(before.drifts.sum())
             return loops.rows(before, h, t0), loops.rows(kernel, abs(h), start), loops.rows(after, h, start)
 
         def make() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -82,12 +82,14 @@ class SplittingLoops:
         or each trajectory of a batch has its own.
     driven : bool
         True if H depends on t.
+    closes : bool
+        True if runs in other coordinates hand closed outputs to χ, not those before the last stage of K.
     """
 
     def __init__(self, system: HamiltonianSystem) -> None:
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
-        self._has_ranges = False
+        self._has_ranges = self.closes = False
         self.driven = not system.autonomous
         if not system.separable:
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
@@ -117,7 +119,7 @@ class SplittingLoops:
                 _array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, self.driven, damped
             )
         elif system.local is not None:
-            make, takes_rate = _LOCAL[system.local.loops]
+            make, takes_rate, self.closes = _LOCAL[system.local.loops]
             if system.damping is not None and (system.damping.ndim or not takes_rate):
                 has = "one rate of friction for all momenta" if takes_rate else "no friction"
                 raise ValueError(
@@ -714,8 +716,8 @@ def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool, mon
     return LoopFunctions(loops.rollout, loops.rollout_batch, *processed, loops.step_rows)
 
 
-_LOCAL: dict[str, tuple[Callable[..., LoopFunctions], bool]] = {
-    "lattice": (_lattice_loops, True),
-    "pairs": (_pair_loops, False),
+_LOCAL: dict[str, tuple[Callable[..., LoopFunctions], bool, bool]] = {
+    "lattice": (_lattice_loops, True, True),
+    "pairs": (_pair_loops, False, False),
 }
-"""Makers of the loops of systems that are given by one piece, and whether these take friction −γp."""
+"""Makers of the loops of systems that are given by one piece, whether these take friction −γp, and `closes`."""

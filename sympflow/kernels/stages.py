@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -27,6 +27,7 @@ __all__ = [
     "step_table",
     "time_lines",
     "two_stages_source",
+    "with_last_stage",
 ]
 
 
@@ -193,6 +194,21 @@ def run_table(scheme: Scheme, h: float) -> StageTable:
     times = [0.0, *before_inner[: len(inner)].tolist(), -last.drift, -last.drift]
     direction = float(round(sum(s.drift for s in stages)))
     return _table(scheme, [opening, *inner, link, last], times, direction).scaled(h)
+
+
+def with_last_stage(run: StageTable, after: StageTable) -> StageTable:
+    """The stages of a map of the ends of a run, whose last stage is before them; two drifts in a row are one."""
+    assert run.times is not None
+    of_kicks = np.cumsum(after.drifts) - after.drifts if after.times is None else after.times
+    names = ("kicks", "drifts", "gradients", "curvatures", "polynomials")
+    last = {name: np.array(getattr(run, name)[-1]) for name in names}
+    merged = int(not any(getattr(after, name)[0].any() for name in names if name != "drifts"))
+    if merged:
+        last["drifts"] = last["drifts"] + after.drifts[0]
+    columns: dict[str, Any] = {
+        name: np.concatenate([last[name][None], getattr(after, name)[merged:]]) for name in names
+    }
+    return replace(after, **columns, times=np.concatenate([run.times[-1:], of_kicks[merged:]]))
 
 
 # kinds of kick as code --------------------------------------------------------------------------------------------

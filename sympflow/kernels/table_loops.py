@@ -28,6 +28,7 @@ Entry = str | None
 """The name or the text of a number; None for 0."""
 
 MOST_LINES = 600  # of a kick, beyond which compiling takes too long
+MOST_SHARED = 120  # of one with curvature terms that serves where there are none
 LANES = 64  # as in the text `table_rows`
 BLOCKS = 256  # of lanes, some milliseconds, between two looks at the clock
 
@@ -44,6 +45,15 @@ class TableLoops:
     level, monomials
         Of the kicks: see `sympflow.schemes.Scheme.level`.
     friction : Friction, optional
+
+    Attributes
+    ----------
+    n_numbers : int
+        Those that the loops take, which may have more terms in kicks than are asked for.
+    places : ndarray of int
+        Where the numbers that are asked for stand among these, in the order of the stages.
+    drifts : ndarray of int
+        Where those of drifts stand.
 
     Raises
     ------
@@ -66,8 +76,12 @@ class TableLoops:
         self.width, self._driven = d + (symbols.time is not None), symbols.time is not None
         self._inverse_mass = np.array(symbols.inverse_mass, dtype=np.float64)
         damping = None if friction is None else tuple(tuple(map(float, row)) for row in friction.matrix(d))
-        self.rows = _compiled(form, level, monomials, damping)
-        self.terms = 1 + (len(monomials) or level)
+        self.rows, terms = _compiled(form, level, monomials, damping)
+        ends = np.cumsum([terms if kick else 1 for kick in kicks])
+        given = [1 + (len(monomials) or level) if kick else 1 for kick in kicks]
+        starts = ends - [terms if kick else 1 for kick in kicks]
+        self.n_numbers, self.drifts = int(ends[-1]), starts[~self.kicks]
+        self.places = np.concatenate([start + np.arange(n) for start, n in zip(starts, given, strict=True)])
 
     def __reduce__(self) -> tuple[Any, ...]:
         return TableLoops, self._given
@@ -138,17 +152,11 @@ class LabelErrors:
         self._loops = loops
         self._labels = tuple(map(np.ascontiguousarray, (loops.opened(x, t0), y, scale, slope)))
         used = np.argwhere((design != 0).any(0))
-        self._places = np.ascontiguousarray(used[np.lexsort((used[:, 0], used[:, 1]))][:, ::-1])
-        self._design = np.ascontiguousarray(design[:, self._places[:, 1], self._places[:, 0]])
+        used = used[np.lexsort((used[:, 0], used[:, 1]))]
+        self._places = np.stack([used[:, 1], loops.places[used[:, 0]]], axis=1)
+        self._design = np.ascontiguousarray(design[:, used[:, 0], used[:, 1]])
         self._n_blocks = len(design) * -(-x.shape[1] // LANES)
         self._shape = design.shape[2], len(design) * x.shape[1] * (len(scale) + bool(len(slope)))
-        drifts, at = [], 0
-        terms = loops.terms
-        for kick in loops.kicks:
-            if not kick:
-                drifts.append(at)
-            at += terms if kick else 1
-        self._drifts = np.array(drifts, dtype=np.int64)
 
     def __call__(
         self, c: np.ndarray, check: Callable[[], None] = lambda: None, linearized: bool = False
@@ -159,9 +167,10 @@ class LabelErrors:
         """
         loops, (n_parameters, m) = self._loops, self._shape
         r, J = np.empty(m), np.empty((n_parameters if linearized else 0, m))
-        c = np.ascontiguousarray(c)
-        motions = loops.motions(c[:, self._drifts])
-        common = (loops.kicks, c, motions, loops.values, *self._labels, self._places, self._design)
+        numbers = np.zeros((len(c), loops.n_numbers))
+        numbers[:, loops.places] = c
+        motions = loops.motions(numbers[:, loops.drifts])
+        common = (loops.kicks, numbers, motions, loops.values, *self._labels, self._places, self._design)
         for first in range(0, self._n_blocks, BLOCKS):
             check()
             loops.rows(*common, first, min(first + BLOCKS, self._n_blocks), r, J)
@@ -183,12 +192,22 @@ def table_loops(
 @lru_cache(maxsize=64)
 def _compiled(
     form: SymbolicHamiltonian, level: int, monomials: Monomials, friction: tuple[tuple[float, ...], ...] | None
-) -> Any:
+) -> tuple[Any, int]:
+    """``table_rows`` and the terms of its kicks.
+
+    Loops for force gradients have curvature terms as well where these are short: `train` tries both, and the time that
+    it takes is for the most part that of compiling.
+    """
     source = _Source(form, level, monomials, friction)
+    text = source.text()
+    if level == FORCE_GRADIENT:
+        both = _Source(form, CURVATURE, monomials, friction)
+        if both.length() <= MOST_SHARED:
+            source, text = both, both.text()
     width, d = source.width, form.ndof
     outputs = (*range(d), *range(width, width + d), *range(width + d, 2 * width))
     constants = {"WIDTH": width, "TERMS": source.terms, "TAPE": source.tape, "OUTPUTS": outputs}
-    return load_algebra(source.text(), ("aligned", "table_rows"), **constants).table_rows
+    return load_algebra(text, ("aligned", "table_rows"), **constants).table_rows, source.terms
 
 
 class _Source:
@@ -207,6 +226,10 @@ class _Source:
         self.tape = max(self.terms * self.width + len(self.pairs), 2 * self.width)
         n = range(self.d)
         self.mass = [[_entry(form.inverse_mass[i, j]) for j in n] for i in n]
+
+    def length(self) -> int:
+        """Lines of the longest function."""
+        return len(self._kick(taped=True)[1])
 
     def text(self) -> str:
         functions = [

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -140,16 +139,16 @@ class RunStore:
             If it cannot be made, or another process writes it.
         """
         known, y0, n_outputs = self._made_of
-        if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+        try:
+            self.store = self._create(known, y0, n_outputs)
+        except FileExistsError:
             if not self.resume:
                 raise ValueError(
                     f"`store` {self.asked!r} exists: pass resume=True to go on with it, or name another folder."
-                )
+                ) from None
             self.store = Store.open(self.path)
             remedy = "Nothing of it was changed: name another folder, or make the same call."
             self.store.check_same(KNOWN, known, self.asked, "run", remedy)
-        else:
-            self._create(known, y0, n_outputs)
         try:
             with self.store.locked():
                 self.store = Store.open(self.path)  # as it is now that nobody else writes it
@@ -160,8 +159,8 @@ class RunStore:
             self.look, self.project = _nothing, _itself
             vars(self).pop("appender", None)
 
-    def _create(self, known: Mapping[str, str], y0: np.ndarray, n_outputs: int) -> None:
-        """Make the store beside its place, and move it there: it is whole, or it is not there."""
+    def _create(self, known: Mapping[str, str], y0: np.ndarray, n_outputs: int) -> Store:
+        """Make the store; a FileExistsError says that there is something in its place."""
         batch, d = y0.shape[:-1], y0.shape[-1] // 2
         size = max(1, min(CHUNK // y0.size, n_outputs))
         dims = batch_dims(batch)
@@ -170,8 +169,6 @@ class RunStore:
             made[letter] = Field((*dims, DOF, TIME), (*batch, d, 0), y0.dtype, (*batch, d, size), NAMED[letter])
             made[f"{letter}0"] = Field((*dims, DOF), (*batch, d), y0.dtype, attributes=NAMED[f"{letter}0"])
         made["status"] = Field(dims, batch, np.int8, attributes=NAMED["status"])
-        unfinished = self.path.with_name(f".{self.path.name}.new")
-        shutil.rmtree(unfinished, ignore_errors=True)
         told = {
             **self.attributes,
             KNOWN: json.dumps(dict(known)),
@@ -179,18 +176,9 @@ class RunStore:
             "ended": 0,
             "message": "The run has begun.",
         }
-        store = Store.create(unfinished, made, told)
-        store.write(DOF, (0,), dofs(d))
-        for letter, rows in halves(d):
-            store.write(f"{letter}0", (0,) * y0.ndim, y0[..., rows])
-        store.write("status", (0,) * len(batch), np.full(batch, -1))
-        try:
-            os.rename(unfinished, self.path)
-        except OSError as error:
-            raise ValueError(
-                f"`store` {self.asked!r} cannot be made ({error.strerror}): name another folder."
-            ) from error
-        self.store = Store.open(self.path)
+        values = {DOF: dofs(d), "status": np.full(batch, -1)}
+        values |= {f"{letter}0": y0[..., rows] for letter, rows in halves(d)}
+        return Store.create(self.path, made, told, values)
 
     # what is in it --------------------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ import json
 import os
 import shutil
 import tempfile
+import uuid
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -139,8 +140,16 @@ class Store:
         self.path, self.fields, self.attributes = path, fields, attributes
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], fields: Mapping[str, Field], attributes: Mapping[str, Any]) -> Store:
-        """Make a store of arrays without values.
+    def create(
+        cls,
+        path: str | os.PathLike[str],
+        fields: Mapping[str, Field],
+        attributes: Mapping[str, Any],
+        values: Mapping[str, np.ndarray] | None = None,
+    ) -> Store:
+        """Make a store, with the values of some arrays of one chunk; the others have none.
+
+        It is made beside its place, and moved there: it is whole, or it is not there.
 
         Raises
         ------
@@ -150,15 +159,28 @@ class Store:
             If it cannot be made there.
         """
         place = Path(path)
-        if place.exists() and (not place.is_dir() or any(place.iterdir())):
-            raise FileExistsError(f"`store` {str(place)!r} exists.")
-        store = cls(place, dict(fields), {})
-        with _told(place):
-            place.mkdir(parents=True, exist_ok=True)
-            for name in fields:
-                (place / name).mkdir(exist_ok=True)
-            _replace(place / ".zgroup", b'{"zarr_format": 2}')
-        store.commit(attributes=attributes)
+        exists = FileExistsError(f"`store` {str(place)!r} exists.")
+        if _is_taken(place):
+            raise exists
+        unfinished = place.with_name(f".{place.name}.{uuid.uuid4().hex[:8]}.new")
+        store = cls(unfinished, dict(fields), {})
+        try:
+            with _told(place):
+                unfinished.mkdir(parents=True)
+                for name in fields:
+                    (unfinished / name).mkdir()
+                _replace(unfinished / ".zgroup", b'{"zarr_format": 2}')
+                for name, array in (values or {}).items():
+                    store.write(name, (0,) * np.ndim(array), array)
+                store.commit(attributes=attributes)
+                os.rename(unfinished, place)
+        except OSError as error:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            if _is_taken(place):  # by another process, meanwhile
+                raise exists from None
+            with _told(place):
+                raise (error.__cause__ if isinstance(error.__cause__, OSError) else error) from None
+        store.path = place
         return store
 
     @classmethod
@@ -491,6 +513,10 @@ def _replace(path: Path, data: bytes, durable: bool = True) -> None:
     except BaseException:
         Path(unfinished).unlink(missing_ok=True)
         raise
+
+
+def _is_taken(place: Path) -> bool:
+    return place.exists() and (not place.is_dir() or any(place.iterdir()))
 
 
 @contextmanager

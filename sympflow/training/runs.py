@@ -277,6 +277,10 @@ class Unstarted(Run):
 class Searched(Protocol):
     """Least squares that are followed from many starts, by any workers."""
 
+    @property
+    def compiled(self) -> bool:
+        """True if most of the work is compiled code, so that threads can share it."""
+
     def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
         """The minimum that is found from θ."""
 
@@ -322,7 +326,7 @@ class SearchRun(Run):
         if minimum is None:
             common, n = (self.searched(), self.search_steps, deadline, False), self.done
             starts = [self.start_of(k) for k in range(n, min(n + self.ROUND, self.planned))]
-            self.coming = session.each(descended, common, starts, deadline)
+            self.coming = session.each(descended, common, starts, deadline, common[0].compiled)
             minimum = next(self.coming)
         return minimum
 

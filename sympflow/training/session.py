@@ -9,13 +9,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
 from sympflow.training.checkpoint import check_writable
 from sympflow.training.options import is_number
-from sympflow.workers import Crew, Unpicklable
+from sympflow.workers import Crew, Unpicklable, available_cores
 
 Path = str | os.PathLike[str]
 Callback = Callable[[int, dict[str, float]], None]
@@ -131,21 +132,45 @@ class Session:
         return Deadline(self, math.inf if self.time_budget is None else self._began + self.time_budget)
 
     def each(
-        self, function: Callable[[Any, Any], Any], common: Any, items: Sequence[Any], deadline: Deadline
+        self,
+        function: Callable[[Any, Any], Any],
+        common: Any,
+        items: Sequence[Any],
+        deadline: Deadline,
+        threads: bool = False,
     ) -> Generator[Any]:
         """Yield `function(common, item)` of each item in order, done by the crew; the function is one of a module.
 
-        What a piece of work does itself by `each` it does alone. While others work Ctrl-C raises KeyboardInterrupt
-        here. Once it has asked for the end, or when workers do not answer soon after the deadline, as while they start,
-        this thread does the rest.
+        Where the crew is this thread alone, and the work is compiled code for the most part, `threads` share it, as
+        many as there are cores. What a piece of work does itself by `each` it does alone. While others work Ctrl-C
+        raises KeyboardInterrupt here. Once it has asked for the end, or when workers do not answer soon after the
+        deadline, as while they start, this thread does the rest.
         """
         ended = self.interruption.asked or deadline.left <= 0
-        if self.crew.alone or self.crew_is_busy or ended or len(items) < 2:
+        n_threads = min(available_cores(), len(items)) if threads else 1
+        if self.crew_is_busy or ended or len(items) < 2 or (self.crew.alone and n_threads < 2):
             for item in items:
                 yield function(common, item)
             return
+        if not self.crew.alone:
+            yield from self._shared(self.crew, function, common, items, deadline)
+            return
+        pool = ThreadPoolExecutor(n_threads)
+        try:
+            yield from self._shared(Crew(pool), function, common, items, deadline)
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+    def _shared(
+        self,
+        crew: Crew,
+        function: Callable[[Any, Any], Any],
+        common: Any,
+        items: Sequence[Any],
+        deadline: Deadline,
+    ) -> Generator[Any]:
         patience = None if deadline.end == math.inf else deadline.left + GRACE
-        answers, interruption = self.crew.map(function, common, items, patience), self.interruption
+        answers, interruption = crew.map(function, common, items, patience), self.interruption
         self.crew_is_busy = True
         try:
             for left in reversed(range(len(items))):

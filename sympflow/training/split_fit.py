@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -97,6 +97,7 @@ class AtEnd:
     """The fit at Δt, of the numbers u."""
 
     fit: SplitFit
+    compiled: ClassVar[bool] = False
 
     def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
         """The minimum from the numbers θ = u; none of the searches is thorough."""

@@ -206,11 +206,13 @@ class TableRun(SearchRun):
         if frozen is not None:
             for fit in filter(None, (frozen, self.weighted)):
                 common = (fit, steps, self._frozen_end, True)
-                finalists = list(session.each(descended, common, [m.x for m in finalists], self._frozen_end))
+                found = [m.x for m in finalists]
+                finalists = list(session.each(descended, common, found, self._frozen_end, fit.compiled))
         starts = [self._continued(m) for m in _distinct(finalists)[:FITTED]]
         if not finalists or frozen is None or self._frozen_cost(self.given) < HOPELESS * min(m.cost for m in finalists):
             starts.insert(0, self.given)
-        fitted = list(session.each(descended, (self.whole, steps, self.whole_end, True), starts, self.whole_end))
+        whole = self.whole, steps, self.whole_end, True
+        fitted = list(session.each(descended, whole, starts, self.whole_end, self.whole.compiled))
         best = min(fitted, key=lambda m: m.cost)
         if not math.isfinite(best.cost):
             raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
@@ -349,6 +351,8 @@ def _tensors(data: tuple[np.ndarray, ...] | None) -> Any:
 class Fit:
     """Residuals of parameters θ whose sum of squares is to be small."""
 
+    compiled = False
+
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
         """(m,); `check` is called within, and may raise."""
         raise NotImplementedError
@@ -383,6 +387,7 @@ class StackedFit(Fit):
 
     def __init__(self, *parts: tuple[float, Fit]) -> None:
         self.parts = parts
+        self.compiled = all(fit.compiled for _, fit in parts)
 
     def own(self) -> Fit:
         return StackedFit(*((weight, fit.own()) for weight, fit in self.parts))
@@ -450,11 +455,12 @@ class TableFit(Fit):
         each = np.repeat(weight, self.count) / math.sqrt(self.times * self.count)
         self._scale = each / unit[:, None]
         self._slope = None if slope is None else each * slope.reshape(-1, slope.shape[-1]).T
-        self._compiled: LabelErrors | None = None
+        self._errors_at: LabelErrors | None = None
+        self.compiled = step.loops is not None
         if step.loops is not None:
             weights = np.empty((0, self._x.shape[1])) if self._slope is None else self._slope
             at_start = labels.x.T, labels.t0
-            self._compiled = step.loops.errors(*at_start, self._y, self._scale, weights, design[:, step.order])
+            self._errors_at = step.loops.errors(*at_start, self._y, self._scale, weights, design[:, step.order])
 
     def __getstate__(self) -> dict[str, Any]:
         """With the order of `design` in memory, by which its products are rounded."""
@@ -470,17 +476,17 @@ class TableFit(Fit):
         return np.repeat((self.offset + self.design @ theta).T, self.count, axis=1)
 
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
-        if self._compiled is not None:
-            return self._compiled((self.offset + self.design @ theta)[:, self.step.order], check)[0]
+        if self._errors_at is not None:
+            return self._errors_at((self.offset + self.design @ theta)[:, self.step.order], check)[0]
         with np.errstate(all="ignore"):
             y = self.step(self.coefficients(theta), self._x, check, self._t0)
             return self._rows(self._errors(y - self._y)).ravel()
 
     @np.errstate(all="ignore")  # as in the residuals: what is not finite is rejected
     def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
-        if self._compiled is not None:
+        if self._errors_at is not None:
             numbers = (self.offset + self.design @ theta)[:, self.step.order]
-            r, transposed = self._compiled(numbers, check, linearized=True)
+            r, transposed = self._errors_at(numbers, check, linearized=True)
             return r, transposed.T
         y, J = self.step.with_jacobian(self.coefficients(theta), self._x, check, self._t0)
         by_table = self._rows(self._errors(J))  # (J, (2d + 1) N, n)

@@ -14,4 +14,4 @@ def rollout_orbits(tables, y0, n_steps, save, out, n_finite, stop, first, runnin
     i = cuda.grid(1)
     if i < y0.shape[0]:
         table = tables[i % tables.shape[0]]
-        n_finite[i] = rollout(table, y0[i], n_steps, save, out[i], stop, first, running[i])
+        n_finite[i] = rollout(table, y0[i], n_steps, save, out[i], stop, first, running[i], True)

@@ -118,7 +118,7 @@ def keep_lanes(Y, error, running, block_start, count, n_finite, n_steps):
 
 
 @njit(**OPTIONS)
-def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running):
+def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running, closed=True):
     """`rollout` of every row of `y0` (N, 2d), `MANY_LANES` at a time; outputs as in `rollout_each`."""
     widest_vectors()
     if N_VALUES > 0:
@@ -171,7 +171,10 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running)
                 if n_finite[i] < n_steps:
                     continue
                 take_values(table, work, Y, lane, link + 1)
-                q, p = close_lane(Y, error, lane, table, n + block, work)
+                if closed:
+                    q, p = close_lane(Y, error, lane, table, n + block, work)
+                else:
+                    q, p = unpack_lane(Y, lane)
                 if not is_finite(q, p):
                     take_values(table, work, Y, lane, 0)
                     q, p = unpack_lane(start, lane)
@@ -244,6 +247,7 @@ def step_lanes(table, x, h, t, y, out):
 @njit(**OPTIONS)
 def map_lanes(table, steps, y, out):
     """`map_each`, `MANY_LANES` rows at a time, of systems that do not depend on the time."""
+    widest_vectors()
     Y, error = empty_lanes(), empty_lanes()
     for block_start in range(0, y.shape[0], MANY_LANES):
         count = min(MANY_LANES, y.shape[0] - block_start)

@@ -106,11 +106,11 @@ def keep(q, p, q_error, p_error, running):
 
 
 @njit(**OPTIONS)
-def rollout(table, y0, n_steps, save, out, stop, first, running):
+def rollout(table, y0, n_steps, save, out, stop, first, running, closed=True):
     """The steps from `first` to `n_steps` from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
 
     Returns the index of the last step that ends in a finite state; rows of later steps are NaN. Ends early, with
-    rows unset, when another thread sets ``stop[0]``.
+    rows unset, when another thread sets ``stop[0]``. Not `closed`, the states are those before the last stage.
     """
     link = columns_of(table) - 2
     work = prepared(table)
@@ -129,7 +129,10 @@ def rollout(table, y0, n_steps, save, out, stop, first, running):
             q, p, q_error, p_error = stage(q, p, q_error, p_error, numbers_of(table, j, k), drift_of(table, j), j, work)
             j = j + 1 if j < link else 1
             k = k + 1 if j == link else k
-        end_q, end_p = close(q, p, q_error, p_error, table, k, work)
+        if closed:
+            end_q, end_p = close(q, p, q_error, p_error, table, k, work)
+        else:
+            end_q, end_p = copy(q), copy(p)
         if not is_finite(end_q, end_p):
             fill_with_nan(out, saved)
             running[:] = math.nan
@@ -143,10 +146,10 @@ def rollout(table, y0, n_steps, save, out, stop, first, running):
 
 
 @njit(**OPTIONS)
-def rollout_each(table, y0, n_steps, save, out, n_finite, stop, first, running):
+def rollout_each(table, y0, n_steps, save, out, n_finite, stop, first, running, closed=True):
     """`rollout` of every row of `y0` (N, 2d) by itself."""
     for i in range(y0.shape[0]):
-        n_finite[i] = rollout(table, y0[i], n_steps, save, out[i], stop, first, running[i])
+        n_finite[i] = rollout(table, y0[i], n_steps, save, out[i], stop, first, running[i], closed)
 
 
 @njit(**OPTIONS)
@@ -197,7 +200,8 @@ map_rows, rollout_rows = map_each, rollout_each  # where there are lanes, theirs
 
 
 # Runs in other coordinates, χ ∘ Kⁿ ∘ χ⁻¹: χ⁻¹ is executed once, and χ for each output. The tables of χ⁻¹ and χ are
-# those of single maps, see `map_each`, that of K is that of a run.
+# those of single maps, see `map_each`, that of K is that of a run. The table of χ begins with the last stage of K: so
+# that is executed for many outputs at once, and the run does not wait for it.
 
 
 @njit(**OPTIONS)
@@ -225,7 +229,7 @@ def rollout_processed(before, run, after, y0, n_steps, save, out, stop, first, r
     start = np.empty((1, len(y0)))
     if first == 0:
         map_rows(before, np.zeros(1, np.int64), y0.reshape((1, len(y0))), start)
-    n_finite = rollout(run, start[0], n_steps, save, out, stop, first, running)
+    n_finite = rollout(run, start[0], n_steps, save, out, stop, first, running, False)
     at_start = 0
     while at_start < len(save) and save[at_start] <= 0:
         q, p = unpack(y0)
@@ -241,7 +245,7 @@ def rollout_processed_rows(before, run, after, y0, n_steps, save, out, n_finite,
     start = np.empty(y0.shape)
     if first == 0:
         map_rows(before, np.zeros(1, np.int64), y0, start)
-    rollout_rows(run, start, n_steps, save, out, n_finite, stop, first, running)
+    rollout_rows(run, start, n_steps, save, out, n_finite, stop, first, running, False)
     outputs = out.reshape((-1, y0.shape[1]))
     map_rows(after, save, outputs, outputs)
     for i in range(len(y0)):

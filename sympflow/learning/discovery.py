@@ -1,0 +1,657 @@
+"""`discover`: the Hamiltonian behind trajectories, or behind a trained flow, as a sparse sum of terms.
+
+A first model is a regression of smoothed derivatives. From there terms are added and dropped one at a time. Each model
+on the way is refined by shooting from latent initial states (`latent_states`), so that the noise of the states biases
+no coefficient; the linearized problem tells at once what each term that is missing would gain. The extended criterion
+of [2]_ decides, which counts how many terms there were to choose from.
+
+References
+----------
+.. [1] S. L. Brunton, J. L. Proctor, J. N. Kutz, Discovering governing equations from data by sparse identification of
+   nonlinear dynamical systems, PNAS 113 (2016) 3932–3937.
+.. [2] J. Chen, Z. Chen, Extended Bayesian information criteria for model selection with large model spaces,
+   Biometrika 95 (2008) 759–771.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import sympy as sp
+from numpy.typing import ArrayLike
+
+from sympflow.flow.flow_map import FlowMap
+from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.learning import diagnosis
+from sympflow.learning.latent_states import STEPS, Fit, Shooting
+from sympflow.learning.library import Library, library_for
+from sympflow.learning.regression import Regression
+from sympflow.learning.smoothing import smoothed
+from sympflow.learning.trajectories import Run, Trajectories
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RADIANS = 6.0
+"""Length of the pieces that are shot through, in the mean angular rate of the data: about one period."""
+FLOOR = 1e-6
+"""Least noise, over the spread of a coordinate: below it a formula would explain the errors of the scheme."""
+STEP_ERROR = 0.1
+"""Largest change of a prediction, over the noise, when the steps of the scheme are halved."""
+UNEXPLAINED = 1.3
+"""Residual over the noise from which a model does not explain the data."""
+BEYOND = 2
+"""Terms by which the path goes on beyond the model that is chosen."""
+WORTH = 0.5
+"""Gain of a term by the linear model, over its penalty, from which it is tried."""
+SKETCHED = 8
+"""Steps of the fits of models on the path with fewer terms than the one that was chosen."""
+HOPELESS = 10.0
+"""Criterion for each value, above that of the chosen model, at which the path ends: a residual 150 times as large."""
+MOST_VALUES = 20_000
+"""Values to which models are fitted on the way; the one that is chosen is fitted to all."""
+COMPARED = 2000
+"""States over which terms are compared, and of a flow's Hamiltonian."""
+OF_A_FLOW = 5.0
+"""Factor by which the last term of a flow's Hamiltonian lowers the residual at least: a flow's errors are no noise."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """One model of the path.
+
+    Attributes
+    ----------
+    terms : tuple of sympy.Expr
+    coefficients, errors : tuple of float
+        θ, and its standard errors.
+    residual : float
+        Root mean square of the residuals over the noise, of the trajectories that it was fitted to.
+    criterion : float
+        The extended Bayesian criterion: less is better.
+    held_out : float or None
+        The same residual of trajectories that no model was fitted to.
+    """
+
+    terms: tuple[sp.Expr, ...]
+    coefficients: tuple[float, ...]
+    errors: tuple[float, ...]
+    residual: float
+    criterion: float
+    held_out: float | None = None
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """How a system was discovered: `system.discovery`.
+
+    Attributes
+    ----------
+    terms : tuple of sympy.Expr
+    coefficients, errors : ndarray of shape (k,)
+        Their coefficients and standard errors.
+    noise : ndarray of shape (2d,)
+        The noise of each coordinate: the root mean square of what the model leaves. Of a flow (1,), in units of H.
+    expected_noise : ndarray of shape (2d,)
+        The noise as it was given, or seen in the data without a model; 0 where they cannot tell.
+    explains : bool
+        False if the model leaves more than noise.
+    remark : str
+        What the data say where no model explains them.
+    path : tuple of Model
+        The best model of each number of terms.
+    library : tuple of sympy.Expr
+        The terms there were to choose from.
+    superfluous : tuple of sympy.Expr
+        The terms of the library that others make up on the data, or that are not finite there.
+    """
+
+    terms: tuple[sp.Expr, ...]
+    coefficients: np.ndarray
+    errors: np.ndarray
+    noise: np.ndarray
+    expected_noise: np.ndarray
+    explains: bool
+    remark: str
+    path: tuple[Model, ...]
+    library: tuple[sp.Expr, ...]
+    superfluous: tuple[sp.Expr, ...] = field(repr=False)
+
+    def formula(self) -> str:
+        """H with its coefficients, rounded to their standard errors."""
+        parts: list[str] = []
+        for f, c, error in zip(self.terms, self.coefficients, self.errors, strict=True):
+            sign = "- " if c < 0 else "+ " if parts else ""
+            parts.append(f"{sign}{rounded(abs(c), error)}*{_in_product(f)}")
+        return " ".join(parts)
+
+    def table(self) -> str:
+        """The terms with their coefficients and errors, then the path, as text."""
+        width = max(len(str(f)) for f in self.terms)
+        lines = [f"H = {self.formula()}", "", f"{'term':<{width}}  coefficient   standard error"]
+        for f, c, error in zip(self.terms, self.coefficients, self.errors, strict=True):
+            lines.append(f"{f!s:<{width}}  {c:< 12.6g}  {error:.2g}")
+        lines += ["", "terms  residual/noise  held out  criterion"]
+        for model in self.path:
+            held = "" if model.held_out is None else f"{model.held_out:.4g}"
+            chosen = "  <- chosen" if len(model.terms) == len(self.terms) else ""
+            lines.append(f"{len(model.terms):>5}  {model.residual:<14.4g}  {held:<8}  {model.criterion:.6g}{chosen}")
+        return "\n".join([*lines, *([self.remark] if self.remark else [])])
+
+    def figure(self) -> Figure:
+        """The path of models: the residual over the noise against the number of terms."""
+        try:
+            from matplotlib.figure import Figure
+        except ImportError as error:
+            raise ImportError('Figures need matplotlib: pip install "sympflow[plot]".') from error
+        figure = Figure(figsize=(6.4, 3.6), layout="constrained", facecolor="white")
+        ax = figure.add_subplot()
+        counts = [len(model.terms) for model in self.path]
+        ax.plot(counts, [model.residual for model in self.path], "o-", color="#0072B2", label="fitted trajectories")
+        held = [math.nan if model.held_out is None else model.held_out for model in self.path]
+        if not np.isnan(held).any():
+            ax.plot(counts, held, "s--", color="#D55E00", label="held out")
+        ax.axvline(len(self.terms), color="#333333", lw=0.8, ls=":")
+        chosen = next(model for model in self.path if len(model.terms) == len(self.terms))
+        ax.annotate(
+            f"chosen: {len(self.terms)} terms",
+            (len(self.terms), chosen.residual),
+            (6, 18),
+            textcoords="offset points",
+        )
+        ax.axhline(1.0, color="#999999", lw=0.8)
+        ax.set(xlabel="number of terms", ylabel="residual / noise", yscale="log")
+        ax.set_xticks(counts)
+        ax.grid(alpha=0.3, which="both")
+        ax.legend(frameon=False)
+        return figure
+
+
+class DiscoveredSystem(HamiltonianSystem):
+    """A HamiltonianSystem that was found by `discover`; `discovery` is the record of it."""
+
+    discovery: Discovery
+
+
+def discover(
+    data: Any,
+    terms: str | sp.Expr | Sequence[str | sp.Expr] | None = None,
+    *,
+    ndof: int | None = None,
+    degree: int = 4,
+    noise: float | ArrayLike | None = None,
+    held_out: float = 0.2,
+    piece: float | None = None,
+    most_terms: int = 40,
+    domain: Domain | None = None,
+    seed: int = 0,
+    name: str = "discovered",
+    progress: Callable[[str], None] | None = None,
+    **reading: Any,
+) -> DiscoveredSystem:
+    """Find a sparse H(q, p) = Σ θ_k f_k(q, p) behind trajectories, or behind a trained flow.
+
+    Constants in H are left out, which move nothing. A dimensionless H of data in other units is that of these units.
+
+    Parameters
+    ----------
+    data : FlowMap, or anything that `Trajectories.read` takes
+        Of a flow its Hamiltonian 𝓗(ψ̄)(t, x) is used, averaged over t ∈ [0, Δt].
+    terms : str, sympy.Expr or sequence of these, optional
+        The library: expressions in q1 … qd, p1 … pd, and the names "polynomials", "trigonometric", "distances"; all
+        of the latter by default. Of three or more degrees of freedom polynomials are of each, and of pairs.
+    ndof : int, optional
+    degree : int
+        The highest degree of polynomials.
+    noise : float or array_like of shape (2d,), optional
+        The standard deviation of the noise of each coordinate; else it is estimated.
+    held_out : float
+        Share of trajectories that no model is fitted to until one is chosen; 0 for none.
+    piece : float, optional
+        The longest time that is shot through from one latent state: for chaotic data a Lyapunov time or two. The
+        default is about one period.
+    most_terms : int
+        The most terms of a model.
+    domain : Domain, optional
+        Where a flow's Hamiltonian is looked at; the default is the flow's own. Of the system that is made: the
+        default is a box around the data.
+    seed : int
+        Of the trajectories that are held out.
+    name : str
+        Of the system.
+    progress : callable, optional
+        It is called with a line for each model on the way.
+    **reading
+        Options of `Trajectories.read`, such as `units` and `order`.
+
+    Returns
+    -------
+    DiscoveredSystem
+        An ordinary system, to be solved and trained on; `system.discovery` has the coefficients with their standard
+        errors, the noise, and the path of models with its figure.
+
+    Warns
+    -----
+    UserWarning
+        If no model explains the data: its residuals are larger than their noise. The message says by how much, and
+        what the data rather look like: friction, velocities in place of momenta, columns in another order.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer values than terms, or data or terms cannot be read.
+    """
+    if isinstance(data, FlowMap):
+        if reading or noise is not None:
+            raise TypeError(f"`{next(iter(reading), 'noise')}` is of trajectories, and `data` is a flow: leave it out.")
+        return _of_flow(data, terms, degree, most_terms, domain, seed, name)
+    trajectories = Trajectories.read(data, ndof, **reading)
+    if not 0 <= held_out < 1:
+        raise ValueError(f"`held_out` must be at least 0 and less than 1; got {held_out!r}: 0.2 keeps a fifth.")
+    if piece is not None and not piece > 0:
+        raise ValueError(f"`piece` must be a positive time; got {piece!r}: leave it out for about one period.")
+    search = _Search(
+        trajectories, terms, degree, noise, held_out, piece, most_terms, seed, progress or (lambda _: None)
+    )
+    discovery = search.run()
+    box = np.array([trajectories.states.min(0), trajectories.states.max(0)])
+    first = max(trajectories.runs, key=lambda run: run.span)
+    scene = {"domain": domain or Box(box[0].tolist(), box[1].tolist()), "y0": trajectories.states[0]}
+    system = _system(discovery, trajectories.ndof, name=name, t_span=(0.0, first.span), dt=search.step, **scene)
+    if not discovery.explains:
+        warnings.warn(discovery.remark, stacklevel=2)
+    return system
+
+
+def _system(discovery: Discovery, ndof: int, **scene: Any) -> DiscoveredSystem:
+    H = Library(discovery.terms, ndof).hamiltonian(discovery.coefficients)
+    system = cast(DiscoveredSystem, DiscoveredSystem.from_sympy(H, **scene))
+    system.discovery = discovery
+    return system
+
+
+# from trajectories ----------------------------------------------------------------------------------------------------
+
+
+class _Search:
+    """The search for a model of trajectories."""
+
+    def __init__(
+        self,
+        data: Trajectories,
+        terms: Any,
+        degree: int,
+        noise: Any,
+        held_out: float,
+        piece: float | None,
+        most_terms: int,
+        seed: int,
+        say: Callable[[str], None],
+    ) -> None:
+        self.data, self.say, self.most_terms = data, say, most_terms
+        self.known = _noise(noise, 2 * data.ndof)
+        n = len(data.runs)
+        drawn = np.random.default_rng(seed).permutation(n).tolist()
+        count = min(round(held_out * n), n - 1) if n > 4 else 0
+        self.held, rest = sorted(drawn[:count]), drawn[count:]
+        values = np.cumsum([data.runs[i].y.size for i in rest])
+        self.fitted = sorted(rest[: max(int(np.searchsorted(values, MOST_VALUES)), 1)])
+        self.smooth = smoothed(data)
+        self.expected = self.smooth.sigma if self.known is None else self.known
+        points = self.smooth.points
+        if not len(points):
+            raise ValueError("`data` has no two successive points with all values: discover needs whole states.")
+        shown = points[np.random.default_rng(seed).permutation(len(points))[:COMPARED]]
+        self.library, self.superfluous = library_for(terms, data.ndof, degree, shown)
+        K = len(self.library)
+        if not K:
+            raise ValueError("`terms` has no term that changes over the data: give others.")
+        equations = data.n_values - 2 * data.ndof * n
+        asked = K + len(self.superfluous)
+        if equations < asked:
+            raise ValueError(
+                f"`data` has {data.n_values} values, {equations} beside the initial states, and the library {asked} "
+                "terms: give more data, or fewer `terms`, as by `degree=2` or a list of your own."
+            )
+        self.floor = FLOOR * data.scales
+        self.penalty = math.log(max(data.n_values, 3)) + 2 * math.log(K)
+        self.rate = float(np.sqrt(np.mean((self.smooth.slopes / data.scales) ** 2)))
+        longest = max(run.span for run in data.runs)
+        self.rate = max(self.rate, 1e-3 / longest)
+        self.piece = RADIANS / self.rate if piece is None else piece
+        tolerance = 0.02 * float((np.maximum(self.expected, self.floor) / data.scales).min())
+        self.step = float(np.clip((1000 * tolerance / RADIANS) ** 0.25, 0.02, 0.25)) / self.rate
+        self.fits: dict[frozenset[int], Fit | None] = {}
+        self.shooting = self._shooting(self.fitted)
+
+    def _shooting(self, index: list[int]) -> Shooting:
+        """Pieces of some trajectories, each from the smoothed state at its start."""
+        starts: list[np.ndarray] = []
+        pieces: list[Run] = []
+        for i in index:
+            run = self.data.runs[i]
+            one = Trajectories((run,), self.data.names).pieces(span=self.piece).runs
+            at = np.cumsum([0, *(piece.n_points for piece in one[:-1])])
+            pieces += one
+            starts += list(self.smooth.states[i][:, at].T)
+        return Shooting(replace(self.data, runs=tuple(pieces)), np.array(starts), self.step)
+
+    def run(self) -> Discovery:
+        sigma = self.known if self.known is not None else np.maximum(self.smooth.sigma, 1e-2 * self.data.scales)
+        self.sigma = np.maximum(sigma, self.floor)
+        chosen = self._steps(self._first())
+        for _ in range(3):  # steps short enough for the model that was found
+            if self._step_error(chosen) <= STEP_ERROR:
+                break
+            self.step /= 2
+            self.fits.clear()
+            self.shooting = self._shooting(self.fitted)
+            chosen = self._steps(chosen)
+        return self._record(chosen, self._path(chosen))
+
+    def _first(self) -> list[int]:
+        """The best model of several regressions whose predictions do not diverge; pieces are shortened until it is so.
+
+        Where terms are nearly alike, as the cosine of a difference and powers, adding them one at a time ends elsewhere
+        than among polynomials alone, or by dropping them.
+        """
+        regression = Regression.of_slopes(self.library, self.smooth, self.data.scales)
+        powers = [k for k, f in enumerate(self.library.expressions) if f.is_polynomial()]
+        ways = [regression.forward(self.most_terms), regression.backward(self.most_terms)]
+        if 0 < len(powers) < len(self.library):
+            ways.append(regression.forward(self.most_terms, powers))
+        for _ in range(8):
+            starts = []
+            for active in ways:
+                self.guess = dict(zip(active, regression.coefficients(active), strict=True))
+                if self._fit(sorted(active)) is not None:
+                    starts.append(sorted(active))
+            if starts:
+                return min(starts, key=self._criterion)
+            self.piece /= 2
+            self.fits.clear()
+            self.shooting = self._shooting(self.fitted)
+        raise ValueError(
+            "`data` cannot be followed by any model of the library, however short the pieces: give other `terms`, or "
+            "look whether the columns are q1 … qd, p1 … pd."
+        )
+
+    def _fit(self, active: Sequence[int], before: Fit | None = None, steps: int = STEPS) -> Fit | None:
+        """The fit of the terms, in ascending order, its noise estimated unless it is known; None if it diverges."""
+        key = frozenset(active)
+        if key in self.fits:
+            return self.fits[key]
+        library = self.library.subset(list(active))
+        theta = np.array([self.guess.get(k, 0.0) for k in active])
+        x0, sigma = (self.shooting.starts, self.sigma) if before is None else (before.x0, before.sigma)
+        fit = self.shooting.fit(library, theta, x0, sigma, steps=steps)
+        if fit is None and before is not None:
+            fit = self.shooting.fit(library, theta, self.shooting.starts, sigma, steps=steps)
+        for _ in range(0 if self.known is not None else 4 if steps == STEPS else 1):
+            if fit is None:
+                break
+            found = np.maximum(fit.noise, self.floor)
+            settled = np.abs(np.log(found / fit.sigma)).max() < 0.05
+            fit = self.shooting.fit(library, fit.theta, fit.x0, found, steps=steps)
+            if settled:
+                break
+        self.fits[key] = fit
+        if fit is not None:
+            self.guess = self.guess | dict(zip(active, fit.theta, strict=True))
+            said = " ".join(f"{c:+.4g}*{self.library.expressions[k]}" for k, c in zip(active, fit.theta, strict=True))
+            self.say(f"{len(active)} terms, criterion {self._criterion(active):.6g}: {said}")
+        return fit
+
+    def _criterion(self, active: Sequence[int]) -> float:
+        fit = self.fits[frozenset(active)]
+        if fit is None:
+            return math.inf
+        counts = np.maximum(self.shooting.counts - len(self.shooting.starts), 1)  # less the latent states
+        if self.known is not None:
+            sigma = np.maximum(self.known, self.floor)
+            misfit = float((fit.squares / sigma**2).sum())
+        else:
+            misfit = float(
+                (counts * np.log(np.maximum(fit.squares / counts, self.floor**2) / self.data.scales**2)).sum()
+            )
+        return misfit + len(active) * self.penalty
+
+    def _steps(self, active: list[int]) -> list[int]:
+        """Terms added and dropped while the criterion falls."""
+        self._fit(active)
+        for _ in range(4 * self.most_terms):
+            dropped = self._without_least(active)
+            if dropped is not None and self._criterion(dropped) < self._criterion(active):
+                active = dropped
+                continue
+            added = self._with_best(active)
+            if added is None or self._criterion(added) >= self._criterion(active):
+                return active
+            active = added
+        return active
+
+    def _without_least(self, active: list[int], steps: int = STEPS) -> list[int] | None:
+        """The model without its least significant term."""
+        fit = self.fits[frozenset(active)]
+        if fit is None or len(active) < 2:
+            return None
+        significance = fit.theta**2 / np.maximum(np.diag(fit.covariance), 1e-300)
+        for weakest in np.argsort(significance)[:2]:
+            rest = [k for i, k in enumerate(active) if i != weakest]
+            if self._fit(rest, fit, steps) is not None:
+                return rest
+        return None
+
+    def _with_best(self, active: list[int], anyhow: bool = False) -> list[int] | None:
+        """The model with the term that gains most by the linearized problem; None if none is worth it."""
+        fit = self.fits[frozenset(active)]
+        others = [k for k in range(len(self.library)) if k not in active]
+        if fit is None or not others or len(active) >= self.most_terms:
+            return None
+        gains = self.shooting.gains(self.library.subset(active), fit, self.library.subset(others))
+        least = 0.0 if anyhow else WORTH * self.penalty
+        best = [int(i) for i in np.argsort(gains)[::-1][: 1 if anyhow else 3] if gains[i] > least]
+        found: list[int] | None = None
+        for i in best:
+            self.guess = self.guess | {others[i]: 0.0}
+            wider = sorted([*active, others[i]])
+            if self._fit(wider, fit) is not None and (found is None or self._criterion(wider) < self._criterion(found)):
+                found = wider
+            if found is not None and self._criterion(found) < self._criterion(active):
+                break
+        return found
+
+    def _step_error(self, active: list[int]) -> float:
+        fit = self.fits[frozenset(active)]
+        assert fit is not None
+        library = self.library.subset(active)
+        fine = Shooting(self.data, self.shooting.starts, self.step / 2)
+        fine.spans, fine.y, fine.seen = self.shooting.spans, self.shooting.y, self.shooting.seen
+        difference = fine.predictions(library, fit.theta, fit.x0) - self.shooting.predictions(
+            library, fit.theta, fit.x0
+        )
+        return float((np.abs(difference) / fit.sigma).max())
+
+    # the path, and the record -----------------------------------------------------------------------------------
+
+    def _path(self, chosen: list[int]) -> list[list[int]]:
+        """The best model of each number of terms, among those met and those on the way from the chosen one."""
+        active = chosen
+        while (rest := self._without_least(active, SKETCHED)) is not None:
+            active = rest
+            if self._criterion(active) > self._criterion(chosen) + HOPELESS * self.shooting.n_values:
+                break
+        active = chosen
+        for _ in range(BEYOND):
+            wider = self._with_best(active, anyhow=True)
+            if wider is None:
+                break
+            active = wider
+        best: dict[int, list[int]] = {len(chosen): chosen}
+        for key, fit in self.fits.items():
+            if fit is None or len(key) > len(chosen) + BEYOND or len(key) == len(chosen):
+                continue
+            if len(key) not in best or self._criterion([*key]) < self._criterion(best[len(key)]):
+                best[len(key)] = sorted(key)
+        return [best[n] for n in sorted(best)]
+
+    def _record(self, chosen: list[int], path: list[list[int]]) -> Discovery:
+        fit = self._chosen_fit(chosen)
+        sigma = fit.sigma if self.known is None else np.maximum(self.known, self.floor)
+        noise = np.maximum(fit.noise, self.floor)
+        excess = noise / np.maximum(self.expected, self.floor)
+        windows = self.data.n_points / len(self.data.runs) >= 6
+        told = (self.expected > 0) & (windows or self.known is not None)
+        limit = UNEXPLAINED + 4 / math.sqrt(max(self.data.n_points, 1))
+        explains = not (told & (excess > limit)).any()
+        explains &= bool((noise < 0.5 * self.data.scales).all())
+        remark = "" if explains else self._remark(noise, excess)
+        models = tuple(self._model(active, sigma) for active in path)
+        order = np.argsort([str(self.library.expressions[k]) for k in chosen])
+        return Discovery(
+            tuple(self.library.expressions[chosen[i]] for i in order),
+            fit.theta[order],
+            np.sqrt(np.diag(fit.covariance))[order],
+            noise,
+            self.expected,
+            explains,
+            remark,
+            models,
+            self.library.expressions,
+            self.superfluous,
+        )
+
+    def _chosen_fit(self, chosen: list[int]) -> Fit:
+        """The chosen model, fitted to all trajectories."""
+        fit = self.fits[frozenset(chosen)]
+        assert fit is not None
+        if len(self.fitted) == len(self.data.runs):
+            return fit
+        part, fits = self.shooting, self.fits
+        self.shooting, self.fits = self._shooting([*range(len(self.data.runs))]), {}
+        whole = self._fit(chosen)
+        self.shooting, self.fits = part, fits
+        return fit if whole is None else whole
+
+    def _model(self, active: list[int], sigma: np.ndarray) -> Model:
+        fit = self.fits[frozenset(active)]
+        assert fit is not None
+        library = self.library.subset(active)
+        held = None
+        if self.held:
+            shooting = self._shooting(self.held)
+            followed = shooting.fit(library, fit.theta, shooting.starts, sigma, free=False)
+            held = math.inf if followed is None else _residual(followed, shooting, 0)
+        shown = replace(fit, cost=float((fit.squares / sigma**2).sum()))
+        return Model(
+            library.expressions,
+            tuple(fit.theta.tolist()),
+            tuple(np.sqrt(np.diag(fit.covariance)).tolist()),
+            _residual(shown, self.shooting, len(active)),
+            self._criterion(active),
+            held,
+        )
+
+    def _remark(self, noise: np.ndarray, excess: np.ndarray) -> str:
+        worst = int(np.argmax(excess))
+        hint = diagnosis.hint(self.library, self.smooth, self.data)
+        return (
+            f"No sparse Hamiltonian of the library's {len(self.library)} terms explains the data: of "
+            f"{self.data.names[worst]} it leaves {noise[worst]:.3g}, {excess[worst]:.1f} times the noise. {hint} The "
+            "best model and the path to it are in `system.discovery`."
+        )
+
+
+def _residual(fit: Fit, shooting: Shooting, n_terms: int) -> float:
+    return math.sqrt(fit.cost / max(shooting.n_values - fit.x0.size - n_terms, 1))
+
+
+def _noise(noise: Any, width: int) -> np.ndarray | None:
+    if noise is None:
+        return None
+    sigma = np.asarray(noise, dtype=float)
+    if sigma.shape not in ((), (width,)) or not (np.isfinite(sigma).all() and (sigma >= 0).all()):
+        raise ValueError(
+            f"`noise` must be a number, at least 0, or one for each of {width} coordinates; got {noise!r}."
+        )
+    return np.broadcast_to(sigma, (width,)).copy()
+
+
+def _in_product(f: sp.Expr) -> str:
+    return f"({f})" if f.is_Add else str(f)
+
+
+def rounded(value: float, error: float) -> str:
+    """A number to two digits of its error, at most six in all."""
+    if not (error > 0 and math.isfinite(error)) or value == 0:
+        return f"{value:.6g}"
+    digits = min(max(math.floor(math.log10(value)) - math.floor(math.log10(error)) + 2, 1), 8)
+    return f"{value:.{digits}g}"
+
+
+# from a flow ----------------------------------------------------------------------------------------------------------
+
+
+def _of_flow(
+    flow: FlowMap, terms: Any, degree: int, most_terms: int, domain: Domain | None, seed: int, name: str
+) -> DiscoveredSystem:
+    import torch
+
+    found = domain or (flow.domain_for(flow.system) if flow.system is not None else flow.domain)
+    if found is None:
+        raise ValueError("`domain` is needed, for the flow has none: give a Box of the states it was trained on.")
+    if isinstance(found, EnergySublevel) and found.hamiltonian is None:
+        raise ValueError("`domain` is needed, for the flow's own is by the energy of its system: pass system.domain.")
+    x = found.sample(COMPARED, seed)
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    with torch.no_grad():
+        at = torch.as_tensor(x, dtype=flow.dtype, device=flow.device)
+        values = sum(
+            w / 2 * flow.hamiltonian((1 + u) / 2 * flow.dt, at).double().cpu().numpy()
+            for u, w in zip(nodes.tolist(), weights.tolist(), strict=True)
+        )
+    library, superfluous = library_for(terms, flow.ndof, degree, x)
+    regression = Regression.of_values(library, x, np.asarray(values))
+    path = regression.nested(regression.forward(most_terms))
+    misfits = [regression.misfit(active) for active in path]
+    chosen = max((i for i in range(1, len(path)) if misfits[i - 1] > OF_A_FLOW * misfits[i]), default=len(path) - 1)
+    models = tuple(
+        Model(
+            library.subset(active).expressions,
+            tuple(regression.coefficients(active).tolist()),
+            tuple(regression.errors(active).tolist()),
+            r / max(misfits[chosen], 1e-300),
+            regression.criterion(active),
+        )
+        for active, r in zip(path, misfits, strict=True)
+    )
+    best = models[chosen]
+    order = np.argsort([str(f) for f in best.terms])
+    spread = float(np.std(values))
+    explains = misfits[chosen] < 0.05 * spread
+    remark = "" if explains else (
+        f"No sparse sum of the library's {len(library)} terms is the flow's Hamiltonian: {misfits[chosen]:.3g} is left "
+        f"of its spread {spread:.3g}. Give other `terms`, or a smaller `domain`."
+    )  # fmt: skip
+    discovery = Discovery(
+        tuple(best.terms[i] for i in order),
+        np.array(best.coefficients)[order],
+        np.array(best.errors)[order],
+        np.array([misfits[chosen]]),
+        np.zeros(1),
+        explains,
+        remark,
+        models,
+        library.expressions,
+        superfluous,
+    )
+    system = _system(discovery, flow.ndof, name=name, domain=found, y0=x[0], dt=flow.dt / 10)
+    if not explains:
+        warnings.warn(remark, stacklevel=3)
+    return system

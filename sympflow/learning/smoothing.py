@@ -1,0 +1,111 @@
+"""Smooth curves through noisy trajectories: states, their derivatives, and the noise; the first guess of a fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sympflow.learning.trajectories import Run, Trajectories
+
+FEWEST = 6
+"""Points of a coordinate from which a curve is made; with fewer there are differences."""
+WIDTHS = (5, 7, 9, 13, 19, 27, 39, 55)
+"""Points of the windows in which a polynomial is fitted, for the value and the slope in their middle."""
+WINDOW, DEGREE = 6, 3
+"""Points of a window from which the noise is estimated, and the degree of all polynomials."""
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """Curves of all trajectories.
+
+    Attributes
+    ----------
+    states : tuple of ndarray, shape (2d, n)
+        The curve of each trajectory at its times.
+    points, slopes : ndarray, shape (m, 2d)
+        States and their derivatives where both are known well.
+    sigma : ndarray, shape (2d,)
+        The noise of each coordinate, 0 if the trajectories are too short to tell it.
+    """
+
+    states: tuple[np.ndarray, ...]
+    points: np.ndarray
+    slopes: np.ndarray
+    sigma: np.ndarray
+
+
+def smoothed(data: Trajectories) -> Smooth:
+    """Local cubic polynomials through each coordinate, the width of their windows by leave-one-out cross-validation.
+
+    Of trajectories with fewer than six points the derivatives are differences, at the mean of two states.
+    """
+    made = [_curve(run) for run in data.runs]
+    middle = np.nanmean(np.concatenate([run.y for run in data.runs], axis=1), axis=1)
+    states = tuple(np.where(np.isfinite(one[0]), one[0], middle[:, None]) for one in made)
+    points, slopes = np.concatenate([one[1].T for one in made]), np.concatenate([one[2].T for one in made])
+    known = np.isfinite(points).all(1) & np.isfinite(slopes).all(1)
+    noise = np.concatenate([_roughness(run) for run in data.runs], axis=1)
+    sigma = np.zeros(2 * data.ndof) if noise.shape[1] == 0 else np.sqrt(_middle(noise))
+    return Smooth(states, points[known], slopes[known], sigma)
+
+
+def _curve(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The states of a trajectory, smooth; points and slopes there or between."""
+    seen = np.isfinite(run.y)
+    if seen.sum(1).min() < FEWEST:
+        states = np.full(run.y.shape, np.nan)
+        for i, (y, has) in enumerate(zip(run.y, seen, strict=True)):
+            if has.any():
+                states[i] = np.interp(run.t, run.t[has], y[has])
+        whole = seen.all(0)
+        t, y = run.t[whole], run.y[:, whole]
+        return states, (y[:, 1:] + y[:, :-1]) / 2, np.diff(y) / np.diff(t)
+    best = np.full(len(run.y), np.inf)
+    states, slopes = np.zeros(run.y.shape), np.zeros(run.y.shape)
+    for width in [w for w in WIDTHS if w <= run.n_points] or [run.n_points]:
+        values, rates, error = _windows(run.t, run.y, seen, width)
+        better = error < best
+        best = np.where(better, error, best)
+        states[better], slopes[better] = values[better], rates[better]
+    for i, has in enumerate(seen):
+        outside = (run.t < run.t[has][0]) | (run.t > run.t[has][-1])
+        slopes[i, outside] = np.nan
+    return states, states[:, 1:-1], slopes[:, 1:-1]
+
+
+def _windows(t: np.ndarray, y: np.ndarray, seen: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values and slopes (2d, n) by the polynomial through the nearest points, and the mean square left out (2d,)."""
+    n = len(t)
+    first = np.clip(np.arange(n) - width // 2, 0, n - width)
+    window = first[:, None] + np.arange(width)
+    half = np.abs(t[window] - t[:, None]).max(1)
+    V = ((t[window] - t[:, None]) / half[:, None])[..., None] ** np.arange(DEGREE + 1)
+    has = seen[:, window]
+    G = np.einsum("nwa,inw,nwb->inab", V, has.astype(float), V) + 1e-10 * np.eye(DEGREE + 1)
+    right = np.einsum("nwa,inw->ina", V, np.where(has, y[:, window], 0.0))
+    inverse = np.linalg.inv(G)
+    c = (inverse @ right[..., None])[..., 0]
+    share = np.minimum(inverse[:, :, 0, 0], 1 - 1e-6)
+    left_out = np.where(seen, (c[..., 0] - np.where(seen, y, 0.0)) / (1 - share), 0.0)
+    return c[..., 0], c[..., 1] / half, (left_out**2).sum(1)
+
+
+def _roughness(run: Run) -> np.ndarray:
+    """Mean squares of what cubic polynomials leave of six successive points: (2d, m)."""
+    if run.n_points < WINDOW:
+        return np.empty((len(run.y), 0))
+    left = []
+    for start in range(0, run.n_points - WINDOW + 1, WINDOW // 2):
+        t = run.t[start : start + WINDOW]
+        basis = np.linalg.qr(np.vander((t - t[0]) / (t[-1] - t[0]), DEGREE + 1))[0]
+        y = run.y[:, start : start + WINDOW]
+        rest = y - (y @ basis) @ basis.T
+        left.append((rest**2).sum(1) / (WINDOW - DEGREE - 1))
+    return np.array(left).T
+
+
+def _middle(squares: np.ndarray) -> np.ndarray:
+    """The variance of the noise, by the median of means of two squared normal numbers: that is ln 2 of the mean."""
+    return np.nanmedian(squares, axis=1) / np.log(2)

@@ -1,0 +1,153 @@
+"""`discover`: the true terms and no other, with errors that are those of the coefficients; and honest refusals."""
+
+import pickle
+
+import numpy as np
+import pytest
+import sympy as sp
+
+import sympflow
+from sympflow.learning.latent_states import Shooting
+from sympflow.learning.library import Library, coordinates, library_for
+from sympflow.learning.smoothing import smoothed
+from sympflow.learning.trajectories import Trajectories
+from sympflow.systems import damped_pendulum, pendulum
+
+t = np.linspace(0, 5, 41)
+(q,), (p,) = coordinates(1)
+
+
+def measured(system, sigma, n=8, seed=0):
+    starts = pendulum().domain.sample(n, seed)
+    sol = sympflow.solve(system, "kahan_li8" if system.conservative else "srkn11b", (0, 5), starts, t_eval=t, dt=0.05)
+    return t, sol.y + sigma * np.random.default_rng(seed).normal(size=sol.y.shape)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return sympflow.discover(measured(pendulum(), 0.01))
+
+
+def test_the_true_terms_and_no_other(found):
+    record = found.discovery
+    assert set(record.terms) == {sp.cos(q), p**2}
+    truth = {sp.cos(q): -1.0, p**2: 0.5}
+    for f, c, error in zip(record.terms, record.coefficients, record.errors, strict=True):
+        assert abs(c - truth[f]) < min(5 * error, 0.01 * abs(truth[f]))
+    np.testing.assert_allclose(record.noise, 0.01, rtol=0.15)
+    assert record.explains
+    assert not record.remark
+    assert record.formula().startswith("- 0.9") or record.formula().startswith("- 1.0")
+
+
+def test_the_path_shows_what_the_terms_are_worth(found):
+    path = found.discovery.path
+    counts = [len(model.terms) for model in path]
+    chosen = path[counts.index(2)]
+    assert counts == sorted(set(counts))
+    assert {1, 2} < set(counts)
+    assert path[0].residual > 10 * chosen.residual
+    assert chosen.criterion == min(model.criterion for model in path)
+    assert chosen.held_out == pytest.approx(1.0, abs=0.2)
+    assert "<- chosen" in found.discovery.table()
+    assert found.discovery.figure().axes[0].get_yscale() == "log"
+
+
+def test_the_system_is_ordinary(found):
+    sol = sympflow.solve(found, "verlet", (0, 1), [1.0, 0.0], dt=0.05)
+    assert sol.success
+    assert found.separable
+    assert found.domain.contains(found.y0[None]).all()
+    again = pickle.loads(pickle.dumps(found))
+    assert again.discovery.terms == found.discovery.terms
+
+
+def test_degrees_and_milliseconds_give_the_same_formula(found):
+    times, y = measured(pendulum(), 0.01)
+    units = {"t": "ms", "q": "deg", "p": "deg/ms"}
+    again = sympflow.discover((1e3 * times, np.rad2deg(y) * [[1], [1e-3]]), ["p**2", "cos(q)", "q**2"], units=units)
+    assert again.discovery.terms == found.discovery.terms
+    np.testing.assert_allclose(again.discovery.coefficients, found.discovery.coefficients, rtol=1e-4)
+
+
+def test_missing_values_irregular_times_and_one_trajectory():
+    _, y = measured(pendulum(), 0.01, n=1)
+    random = np.random.default_rng(1)
+    y[random.random(y.shape) < 0.2] = np.nan
+    kept = np.sort(random.permutation(len(t))[:35])
+    system = sympflow.discover([(t[kept], y[0][:, kept])], ["p**2", "cos(q)", "q**2", "q**4", "p**4"])
+    assert set(system.discovery.terms) == {sp.cos(q), p**2}
+    assert all(model.held_out is None for model in system.discovery.path)
+
+
+def test_friction_and_a_wrong_library_are_told():
+    with pytest.warns(UserWarning, match=r"No sparse Hamiltonian .* times the noise. Friction p' = -γp with γ = 0"):
+        system = sympflow.discover(measured(damped_pendulum(0.1), 0.01), ["p**2", "cos(q)"])
+    assert not system.discovery.explains
+    with pytest.warns(UserWarning, match="Terms outside of the library fit much better"):
+        sympflow.discover(measured(pendulum(), 0.01), ["p**2", "q**2"])
+
+
+def test_the_hamiltonian_behind_a_flow():
+    flow = next(f for f in sympflow.shipped_flows() if f.name == "pendulum-primed-3-0.4").load(pendulum())
+    record = sympflow.discover(flow).discovery
+    assert set(record.terms) == {sp.cos(q), p**2}
+    np.testing.assert_allclose(sorted(record.coefficients), [-1.0, 0.5], rtol=1e-3)
+
+
+def test_bad_arguments_are_refused():
+    data = measured(pendulum(), 0.01, n=1)
+    with pytest.raises(ValueError, match="`data` has 82 values, 80 beside the initial states, and the library"):
+        sympflow.discover(data, degree=12)
+    with pytest.raises(ValueError, match=r"`terms` has 'x\*\*2': `expression` holds x"):
+        sympflow.discover(data, ["x**2"])
+    with pytest.raises(ValueError, match=r"`terms` has 'q2', which holds q2: write it in q1 … q1"):
+        sympflow.discover(data, ["q2"])
+    with pytest.raises(ValueError, match="is a constant"):
+        sympflow.discover(data, ["3"])
+    with pytest.raises(ValueError, match="not finite at the data"):
+        sympflow.discover(data, ["sqrt(q - 100)"])
+    with pytest.raises(ValueError, match="`noise` must be"):
+        sympflow.discover(data, noise=-1.0)
+    with pytest.raises(ValueError, match="`held_out` must be"):
+        sympflow.discover(data, held_out=1.0)
+    with pytest.raises(ValueError, match="`piece` must be"):
+        sympflow.discover(data, piece=0.0)
+
+
+def test_the_slope_of_the_cost_is_that_of_differences():
+    """Of H(q, p) that is not separable, by a coefficient and an initial state."""
+    library = Library([p**2, q**2, p**2 * q**2, sp.cos(q)], 1)
+    theta, sigma = np.array([0.5, 0.4, 0.1, -0.2]), np.array([0.1, 0.2])
+    random = np.random.default_rng(0)
+    times = [np.cumsum(random.uniform(0.05, 0.4, n)) for n in (4, 3)]
+    data = Trajectories.read([(one, random.normal(size=(2, len(one)))) for one in times])
+    shooting = Shooting(data, random.normal(size=(2, 2)), 0.1)
+    x0 = shooting.starts
+    normal = shooting.normal(library, theta, x0, sigma)
+    cost = lambda th, x: float((shooting.squares(library, th, x) / sigma**2).sum())  # noqa: E731
+    for k in range(4):
+        e = 1e-5 * np.eye(4)[k]
+        assert (cost(theta + e, x0) - cost(theta - e, x0)) / 2e-5 == pytest.approx(2 * normal.gk[k], rel=1e-5)
+    e = np.zeros((2, 2))
+    e[1, 0] = 1e-5
+    assert (cost(theta, x0 + e) - cost(theta, x0 - e)) / 2e-5 == pytest.approx(2 * normal.gx[1, 0], rel=1e-5)
+
+
+def test_noise_and_slopes_are_seen_without_a_model():
+    _, y = measured(pendulum(), 0.02, n=20)
+    curves = smoothed(Trajectories.read((t, y)))
+    np.testing.assert_allclose(curves.sigma, 0.02, rtol=0.25)
+    field = pendulum().vector_field(curves.points)
+    assert np.std(curves.slopes - field) < 0.1 * np.std(field)
+
+
+def test_libraries_leave_out_what_the_data_cannot_tell():
+    states = np.random.default_rng(0).uniform(-1, 1, (200, 2))
+    library, superfluous = library_for(["q**2", "2*q**2 + 1", "polynomials", "distances"], 1, 2, states)
+    assert library.expressions == (q**2, q, p, p * q, p**2)  # r comes near 0, so no power of it is a term
+    assert superfluous == (2 * q**2 + 1,)
+    four = library_for("polynomials", 4, 4, np.random.default_rng(0).normal(size=(500, 8)))[0]
+    (a, b, *_), _ = coordinates(4)
+    assert (a - b) ** 4 in four.expressions
+    assert a * b not in four.expressions
