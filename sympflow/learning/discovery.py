@@ -534,6 +534,7 @@ class _Search:
         if len(self.fitted) == len(self.data.runs):
             return fit
         part, fits = self.shooting, self.fits
+        self.guess = dict(zip(chosen, fit.theta, strict=True))  # not that of a poor model of the path
         self.shooting, self.fits = self._shooting([*range(len(self.data.runs))]), {}
         whole = self._fit(chosen)
         self.shooting, self.fits = part, fits
