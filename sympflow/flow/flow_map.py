@@ -110,6 +110,8 @@ class FlowMap(nn.Module):
     drive_times: tuple[float, float] | None = None
     learned: HamiltonianSystem | None = None
     """The system that `sympflow.learn` found, of the flow that it made."""
+    replicas: Any = None
+    """The `Replicas` of `sympflow.learn`, if it was asked for them; not saved."""
 
     def __init__(self, ndof: int, dt: float) -> None:
         super().__init__()

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from sympflow.learning.models import FixedKinetic, Kinetic, Model, Part, Polynomial
+from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Network, Pairs, Part, Polynomial, Waves
 
-DEGREES = (2, 3, 4, 5, 6, 8)
-MOST_TERMS = 500
+DEGREES = (2, 3, 4, 5, 6, 8, 10)
+HARMONICS = (1, 2, 3, 4, 6, 8)
+WIDTHS = (6, 12, 24)
+WHOLE_WIDTHS = (12, 24, 40)
+POWERS = ((-1,), (-2, -1, 0, 1, 2))
+"""Of the distances of pairs, 0 for the logarithm."""
+MOST_TERMS = 400
 
 
 @dataclass(frozen=True)
@@ -27,24 +32,45 @@ class Said:
     inverse_mass : ndarray of shape (d, d) or None
     rates : int
         How many rates of friction are to be learned.
+    periods : ndarray of shape (2d,)
+        Of the coordinates that are angles, infinite for the others.
+    known : tuple of Formula
+        Parts of H.
     """
 
     scales: np.ndarray
-    separable: bool | None = None
-    inverse_mass: np.ndarray | None = None
-    rates: int = 0
+    separable: bool | None
+    inverse_mass: np.ndarray | None
+    rates: int
+    periods: np.ndarray
+    known: tuple[Formula, ...] = ()
 
     @property
     def ndof(self) -> int:
         return len(self.scales) // 2
 
-    def kinetic(self) -> Part:
-        """½ pᵀM⁻¹p, learned if it is not known."""
-        return Kinetic(self.scales[self.ndof :]) if self.inverse_mass is None else FixedKinetic(self.inverse_mass)
+    @property
+    def kinetic_is_known(self) -> bool:
+        return self.inverse_mass is not None or any(part.of == "p" for part in self.known)
 
-    def separated(self, potential: Part) -> Model:
-        """½ pᵀM⁻¹p + V(q)."""
-        return Model(self.ndof, (self.kinetic(), potential), self.rates)
+    @property
+    def angles(self) -> bool:
+        """True if there are any."""
+        return bool(np.isfinite(self.periods).any())
+
+    def kinetic(self) -> tuple[Part, ...]:
+        """½ pᵀM⁻¹p, learned if it is not known."""
+        if self.inverse_mass is not None:
+            return (FixedKinetic(self.inverse_mass),)
+        return () if self.kinetic_is_known else (Kinetic(self.scales[self.ndof :]),)
+
+    def separated(self, *potential: Part) -> Model:
+        """T(p) + V(q)."""
+        return Model(self.ndof, (*self.kinetic(), *potential, *self.known), self.rates)
+
+    def whole(self, *parts: Part) -> Model:
+        """H(q, p)."""
+        return Model(self.ndof, (*parts, *self.known), self.rates)
 
 
 @dataclass(frozen=True)
@@ -55,20 +81,76 @@ class Candidate:
     model: Model
 
 
+T = "T = ½ pᵀM⁻¹p"
+
+
+def _few(degrees: Sequence[int], of: str, scales: np.ndarray) -> Iterator[tuple[int, Polynomial]]:
+    """Polynomials of these degrees with not too many terms."""
+    for degree in degrees:
+        if math.comb(len(scales) + degree, degree) <= MOST_TERMS:
+            yield degree, Polynomial.up_to(degree, of, scales)
+
+
 def _polynomials(said: Said) -> Iterator[Candidate]:
-    for degree in DEGREES:
-        V = Polynomial.up_to(degree, "q", said.scales[: said.ndof])
-        if V.n > MOST_TERMS:
-            return
-        yield Candidate(f"T = ½ pᵀM⁻¹p, V a polynomial of degree {degree}", said.separated(V))
+    for degree, V in _few(DEGREES, "q", said.scales[: said.ndof]):
+        yield Candidate(f"{T}, V a polynomial of degree {degree}", said.separated(V))
 
 
 def _whole_polynomials(said: Said) -> Iterator[Candidate]:
-    for degree in DEGREES:
-        H = Polynomial.up_to(degree, "y", said.scales)
-        if H.n > MOST_TERMS:
-            return
-        yield Candidate(f"H(q, p) a polynomial of degree {degree}", Model(said.ndof, (H,), said.rates))
+    for degree, H in _few(DEGREES, "y", said.scales):
+        yield Candidate(f"H(q, p) a polynomial of degree {degree}", said.whole(H))
+
+
+def _waves(said: Said) -> Iterator[Candidate]:
+    q = slice(0, said.ndof)
+    for harmonics in HARMONICS if said.angles else ():
+        V = Waves.up_to(harmonics, max(harmonics, 2), "q", said.scales[q], said.periods[q])
+        if V.n <= MOST_TERMS:
+            yield Candidate(f"{T}, V a Fourier series of {harmonics} harmonics", said.separated(V))
+
+
+def _whole_waves(said: Said) -> Iterator[Candidate]:
+    for harmonics in HARMONICS[1:] if said.angles else ():
+        H = Waves.up_to(harmonics, 2, "y", said.scales, said.periods)
+        if H.n <= MOST_TERMS:
+            yield Candidate(f"H(q, p) quadratic in p, a Fourier series of {harmonics} harmonics", said.whole(H))
+
+
+def _pairs(said: Said) -> Iterator[Candidate]:
+    d = said.ndof
+    size = 2 * float(np.mean(said.scales[:d]))
+    for dim in (2, 3):
+        if d % dim or d < 2 * dim:
+            continue
+        for order, bodies in (
+            ("one body after another", np.arange(d).reshape(-1, dim)),
+            ("one axis after another", np.arange(d).reshape(dim, -1).T),
+        ):
+            for powers in POWERS:
+                said_powers = "1/r" if powers == (-1,) else "powers of r from −2 to 2 and log r"
+                name = f"{T}, V of the distances of {len(bodies)} bodies in {dim} dimensions, {order}, {said_powers}"
+                yield Candidate(name, said.separated(Pairs(bodies, powers, size, shared=False)))
+
+
+def _networks(said: Said) -> Iterator[Candidate]:
+    q = slice(0, said.ndof)
+    for width in WIDTHS:
+        network = Network("q", width, said.scales[q], said.periods[q])
+        name = f"{T}, V a network of {width} neurons"
+        yield Candidate(name, said.separated(_quadratic("q", said.scales[q], said.periods[q]), network))
+
+
+def _whole_networks(said: Said) -> Iterator[Candidate]:
+    for width in WHOLE_WIDTHS:
+        network = Network("y", width, said.scales, said.periods)
+        name = f"H(q, p) a network of {width} neurons"
+        yield Candidate(name, said.whole(_quadratic("y", said.scales, said.periods), network))
+
+
+def _quadratic(of: str, scales: np.ndarray, periods: np.ndarray) -> Polynomial:
+    """The quadratic polynomials of the coordinates that are no angles."""
+    whole = Polynomial.up_to(2, of, scales)
+    return whole.subset((whole.exponents[:, np.isfinite(periods)] == 0).all(axis=1))
 
 
 @dataclass(frozen=True)
@@ -80,7 +162,7 @@ class Family:
     separable : bool
         Whether they have the form T(p) + V(q).
     models : callable
-        models(said): candidates from simple to rich.
+        models(said): candidates from simple to rich, none where the family does not apply.
     """
 
     separable: bool
@@ -88,10 +170,16 @@ class Family:
 
 
 FAMILIES = {
+    "pairs": Family(True, _pairs),
+    "waves": Family(True, _waves),
     "polynomial": Family(True, _polynomials),
+    "network": Family(True, _networks),
+    "whole-waves": Family(False, _whole_waves),
     "whole-polynomial": Family(False, _whole_polynomials),
+    "whole-network": Family(False, _whole_networks),
 }
-"""In the order in which they are tried."""
+"""In the order in which they are tried: potentials of the distances of bodies; Fourier series, where a `period` is
+given; polynomials; networks of one layer. The first four have H = ½ pᵀM⁻¹p + V(q), the others are functions H(q, p)."""
 
 
 def families(said: Said, name: str | None) -> list[str]:
@@ -110,6 +198,11 @@ def families(said: Said, name: str | None) -> list[str]:
         )
     if said.inverse_mass is not None and (said.separable is False or (name and not FAMILIES[name].separable)):
         raise ValueError("`mass` is of T = ½ pᵀM⁻¹p in a separable H: leave out one of them.")
+    if name is not None and not any(True for _ in FAMILIES[name].models(said)):
+        raise ValueError(
+            f"`family` {name!r} does not apply: series need the `period` of an angle, pairs the coordinates of two "
+            "bodies or more in two or three dimensions, and other families not too many degrees of freedom."
+        )
     if name is not None:
         return [name]
     only = said.separable if said.inverse_mass is None else True
@@ -127,7 +220,7 @@ def with_unit_mass(candidate: Candidate, said: Said) -> Candidate | None:
 
 
 def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, values: int) -> Candidate | None:
-    """The same model without the terms of polynomials that the data do not ask for; None if they ask for all.
+    """The same model without the terms of sums that the data do not ask for; None if they ask for all.
 
     Terms are left out one by one, that one first which, by the quadratic approximation of χ² at its minimum, raises it
     least, as long as Schwarz's criterion gains: by less than the logarithm of the number of values.
@@ -147,7 +240,7 @@ def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, value
     model = candidate.model
     droppable = np.zeros(model.n, dtype=bool)
     for part, place in zip(model.parts, model.places, strict=True):
-        droppable[place] = isinstance(part, Polynomial)
+        droppable[place] = part.terms
     theta, covariance, dropped = theta.copy(), np.linalg.pinv(precision, hermitian=True), np.zeros(model.n, dtype=bool)
     while True:
         spread = np.diagonal(covariance)

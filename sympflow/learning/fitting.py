@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from sympflow.learning.models import Model
 from sympflow.learning.shooting import (
     FINEST,
+    Field,
     Fit,
     Method,
     Problem,
@@ -19,11 +20,13 @@ from sympflow.learning.shooting import (
     first_states,
     matched,
     minimized,
+    steppers,
 )
 from sympflow.learning.trajectories import Run, Trajectories
 
 FIRST_POINTS = 10  # of the pieces that a fit begins with
 MATCHED_POINTS = 24  # of those whose increments give its start
+MATCHED_STEPS = 60
 ROUNDS = 4  # of longer pieces, or of another noise
 SETTLED = 0.05  # change of the noise, relative, that ends them
 GROWTH = 1e3  # most that an error of an initial state may grow along a piece
@@ -67,7 +70,7 @@ class Fitted:
         χ² over the number of values after each step.
     """
 
-    model: Model
+    model: Field
     theta: np.ndarray
     sigma: np.ndarray
     fit: Fit
@@ -90,7 +93,7 @@ class Fitted:
 
 
 def fitted(
-    model: Model, data: Trajectories, setting: Setting, theta: np.ndarray | None = None, seed: int = 0
+    model: Field, data: Trajectories, setting: Setting, theta: np.ndarray | None = None, seed: int = 0
 ) -> Fitted:
     """Fit a model: to increments, to orbits of a few points, and to orbits as long as their errors stay small.
 
@@ -102,13 +105,14 @@ def fitted(
     scales = data.scales
     if theta is None:
         theta = model.start(np.random.default_rng(seed))
-        theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales)
+        theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales, 1 if model.linear else MATCHED_STEPS)
     given = None if setting.noise is None else np.maximum(setting.noise, FINEST * scales)
     sigma = 1e-2 * scales if given is None else given
     pieces, span = data.pieces(FIRST_POINTS), 0.0
     states = first_states(pieces)
     costs: list[float] = []
     for attempt in range(1 + ROUNDS):
+        reached = span
         tolerance = np.clip(0.02 * sigma, 1e-13 * scales, 1e-4 * scales)
         method = chosen_method(model, theta, pieces, tolerance)
         problem = Problem(model, pieces, method, sigma, huber=setting.huber)
@@ -126,7 +130,26 @@ def fitted(
         if longer > 1.5 * span:
             span, pieces = longer, data.pieces(span=longer)
         states = orbits[:, _starts(pieces.runs)].T
-    return Fitted(model, theta, sigma, fit, span, costs)
+    return Fitted(model, theta, sigma, fit, reached, costs)
+
+
+def kept(found: Fitted) -> dict[str, Any]:
+    """The numbers of a fit, from which `restored` makes it again."""
+    method = found.method
+    place = steppers(found.model).index(method.stepper)
+    numbers = {"theta": found.theta, "sigma": found.sigma, "of": found.fit.problem.sigma, "states": found.fit.states}
+    return {**numbers, "span": found.span, "costs": found.costs, "stepper": place, "longest": method.longest}
+
+
+def restored(model: Field, data: Trajectories, numbers: dict[str, Any], setting: Setting) -> Fitted:
+    """The fit with these numbers, at which nothing is minimized again."""
+    method = Method(steppers(model)[numbers["stepper"]], numbers["longest"])
+    theta, sigma, of, states = (np.asarray(numbers[name]) for name in ("theta", "sigma", "of", "states"))
+    span = float(numbers["span"])
+    pieces = data.pieces(span=span) if span else data.pieces(FIRST_POINTS)
+    problem = Problem(model, pieces, method, of, huber=setting.huber)
+    fit = minimized(problem, theta, states, iterations=0)
+    return Fitted(model, theta, sigma, fit, span, list(numbers["costs"]))
 
 
 def _starts(runs: Sequence[Run]) -> np.ndarray:
@@ -135,7 +158,7 @@ def _starts(runs: Sequence[Run]) -> np.ndarray:
 
 
 def _span(
-    model: Model,
+    model: Field,
     data: Trajectories,
     method: Method,
     theta: np.ndarray,
@@ -190,6 +213,10 @@ class Held:
     def loss(self) -> float:
         """Minus the log-likelihood of a number."""
         return float(self.losses.sum() / self.values)
+
+    def squares(self, scales: np.ndarray) -> float:
+        """The mean square of the residuals in units of the scales (2d,)."""
+        return float(np.nanmean((np.concatenate(self.fit.residuals, axis=1) / scales[:, None]) ** 2))
 
     @property
     def explained(self) -> bool:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import warnings
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,9 +19,15 @@ from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.learning.families import FAMILIES, Candidate, Said, families, pruned, with_unit_mass
-from sympflow.learning.fitting import Fitted, Held, Setting, fitted, gains, judged
+from sympflow.learning.diagnosis import hint
+from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Said, families, pruned, with_unit_mass
+from sympflow.learning.fitting import Fitted, Held, Setting, fitted, gains, judged, kept, restored
+from sympflow.learning.library import library_for
+from sympflow.learning.models import Formula, FreeField, Model
+from sympflow.learning.shooting import Method
+from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Trajectories
+from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session
 from sympflow.training.trainer import train
 from sympflow.workers import Crew
@@ -30,6 +38,7 @@ TABLE_SHARE = 0.3  # of a time budget, likewise
 HORIZONS = (1, 10, 100)  # in Δt, of the held-out errors
 MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
 HUBER = 1.5  # σ
+FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
 LOSSES = ("squares", "huber")
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
 
@@ -43,8 +52,11 @@ def learn(
     separable: bool | None = None,
     mass: float | ArrayLike | None = None,
     damping: bool | str = False,
+    period: float | ArrayLike | None = None,
+    known: HamiltonianSystem | None = None,
     family: str | None = None,
     loss: str = "squares",
+    replicas: int = 0,
     seed: int = 0,
     name: str = "learned",
     checkpoint: Path | None = None,
@@ -78,16 +90,23 @@ def learn(
         M of T = ½ pᵀM⁻¹p; learned if not given.
     damping : {False, True, "each"}
         True to learn one rate γ of friction, p' = −∂H/∂q − γp; "each" for one rate for each p.
+    period : float or array_like of shape (d,), optional
+        Of H in each q, of angles: 2π, or 360 for degrees; infinite or NaN for coordinates that are none.
+    known : HamiltonianSystem, optional
+        A part of H, symbolic; the rest is learned. Its kinetic energy, if it has one, is taken for the whole.
     family : str, optional
         The only family to be tried, see `sympflow.learning.families.FAMILIES`.
     loss : {"squares", "huber"}
         "huber" for data with outliers.
+    replicas : int
+        So many fits of the chosen model to trajectories that are drawn anew, with repetition (a bootstrap), give
+        `flow.replicas`, whose `bands(y0, t)` tell how certain predictions are.
     seed : int
         Which trajectories are held out, and random starts.
     name : str
         Of the learned system.
     checkpoint, resume, time_budget, progress, callback, workers
-        As for `sympflow.train`. A checkpoint is written after each model.
+        As for `sympflow.train`. A checkpoint is written after each model; `workers` share the replicas.
 
     Returns
     -------
@@ -101,9 +120,15 @@ def learn(
     ValueError, TypeError
         If the trajectories are not as they should be, there is only one, they hold fewer numbers than the simplest
         model has, or an argument is not admissible.
+
+    Warns
+    -----
+    UserWarning
+        If the residuals of the best model are no noise; with what a vector field that need not be Hamiltonian leaves of
+        them, and the likeliest reason.
     """
     data = Trajectories.read(trajectories, ndof)
-    said = _said(data, separable, mass, damping)
+    said = _said(data, separable, mass, damping, period, known)
     if loss not in LOSSES:
         raise ValueError(f"`loss` must be one of {', '.join(LOSSES)}; got {loss!r}.")
     dt = plain(dt)
@@ -113,13 +138,21 @@ def learn(
     setting = Setting(_noise(noise, data), HUBER if loss == "huber" else None)
     chosen = families(said, family)
     ours, held = data.split(HELD_OUT, seed)
-    search = Search(data, ours, held, said, setting, seed)
+    if isinstance(replicas, bool) or not isinstance(replicas, int) or replicas < 0:
+        raise ValueError(f"`replicas` must be an integer, 0 or more; got {replicas!r}: 20 give useful bands.")
+    options = {"family": family, "loss": loss, "seed": seed, "damping": damping, "separable": separable}
+    search = Search(data, ours, held, said, setting, seed, identity=_identity(data, said, setting, options))
+    if resume is not None:
+        search.resume(resume)
     with session.interruption, session.crew:
         search.run(chosen, session)
+        search.diagnose(session)
+        if replicas:
+            search.bootstrap(replicas, session)
         return search.flow(dt, name, session)
 
 
-def _said(data: Trajectories, separable: Any, mass: Any, damping: Any) -> Said:
+def _said(data: Trajectories, separable: Any, mass: Any, damping: Any, period: Any, known: Any) -> Said:
     if separable is not None:
         check_flag("separable", separable)
     if damping not in (False, True, "each"):
@@ -131,7 +164,49 @@ def _said(data: Trajectories, separable: Any, mass: Any, damping: Any) -> Said:
     if mass is not None:
         found = matrices.inverse_mass(mass, d)
         inverse = np.eye(d) if found is None else np.diag(found) if found.ndim == 1 else found
-    return Said(data.scales, separable, inverse, 0 if damping is False else 1 if damping is True else d)
+    parts = () if known is None else _formulas(known, d)
+    if inverse is not None and any(part.of != "q" for part in parts):
+        raise ValueError("`known` has a kinetic energy, and so has `mass`: leave out one of them.")
+    rates = 0 if damping is False else 1 if damping is True else d
+    return Said(data.scales, separable, inverse, rates, _periods(period, d), parts)
+
+
+def _periods(period: Any, d: int) -> np.ndarray:
+    """The period of each coordinate (2d,), infinite where there is none."""
+    periods = np.full(2 * d, np.inf)
+    if period is not None:
+        given = np.asarray(period, dtype=float)
+        if given.shape not in ((), (d,)) or (given <= 0).any():
+            raise ValueError(f"`period` must be positive, one for all q or one for each of {d}; got {period!r}.")
+        periods[:d] = np.where(np.isnan(given), np.inf, given)
+    return periods
+
+
+def _formulas(known: Any, d: int) -> tuple[Formula, ...]:
+    """The parts of a system that is a part of H."""
+    if not isinstance(known, HamiltonianSystem):
+        raise TypeError(f"`known` must be a HamiltonianSystem, a part of H; got {known!r}.")
+    symbols = known.symbols
+    if symbols is None or known.ndof != d or not known.autonomous or known.friction is not None:
+        raise ValueError(
+            f"`known` must be a symbolic system of {d} degrees of freedom that depends on no time and has no friction: "
+            "define it by HamiltonianSystem.from_sympy."
+        )
+    q, p = symbols.q, symbols.p
+    parts = [("y", symbols.H, (*q, *p))]
+    if symbols.V is not None and symbols.T is not None:
+        parts = [("q", symbols.V, q), ("p", symbols.T, p)]
+    values = {v: known.params[v.name] for v in symbols.H.free_symbols if v.name in known.params}
+    return tuple(Formula(of, f.subs(values), names) for of, f, names in parts if f.free_symbols & set(names))
+
+
+def _identity(data: Trajectories, said: Said, setting: Setting, options: dict[str, Any]) -> dict[str, Any]:
+    """The description that a search must share with the one that it goes on with."""
+    numbers = [*(run.t for run in data.runs), *(run.y.ravel() for run in data.runs)]
+    numbers += [v for v in (said.inverse_mass, said.periods, setting.noise) if v is not None]
+    digest = zlib.crc32(np.concatenate([np.ravel(v) for v in numbers]).tobytes())
+    known = [str(part.formula) for part in said.known]
+    return {"config": json.dumps(options), "architecture": json.dumps(known), "fingerprint": [float(digest)]}
 
 
 def _noise(noise: Any, data: Trajectories) -> np.ndarray | None:
@@ -144,6 +219,52 @@ def _noise(noise: Any, data: Trajectories) -> np.ndarray | None:
             f"{noise!r}: leave it out where it is not known."
         )
     return np.broadcast_to(sigma, 2 * data.ndof).astype(float)
+
+
+@dataclass(frozen=True)
+class Replicas:
+    """A model with numbers that were fitted to trajectories drawn anew: how much of them is chance.
+
+    Attributes
+    ----------
+    theta : ndarray of shape (n,)
+        The numbers of the flow.
+    thetas : ndarray of shape (replicas, n)
+    """
+
+    model: Model
+    method: Method
+    theta: np.ndarray
+    thetas: np.ndarray
+
+    def predictions(self, y0: ArrayLike, t: ArrayLike) -> np.ndarray:
+        """The orbits (replicas, 2d, n) from y0 (2d,) at times t (n,), ascending from the time of y0, t[0]."""
+        times = floats("t", t)
+        if times.ndim != 1 or len(times) < 1 or (np.diff(times) < 0).any():
+            raise ValueError(f"`t` must be ascending times (n,), the first that of y0; got {t!r}.")
+        orbits = []
+        for theta in self.thetas:
+            x = floats("y0", y0).reshape(-1, 1)
+            orbit = [x[:, 0]]
+            for gap in np.diff(times):
+                x, _ = self.method.over(self.model, theta, x.copy(), None, np.array([gap]))
+                orbit.append(x[:, 0])
+            orbits.append(np.stack(orbit, axis=1))
+        return np.stack(orbits)
+
+    def bands(self, y0: ArrayLike, t: ArrayLike, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds (2d, n) and (2d, n) between which this share of the orbits from y0 lies at each time."""
+        if not 0 < level < 1:
+            raise ValueError(f"`level` must lie between 0 and 1; got {level!r}: 0.9 is usual.")
+        low, high = np.quantile(self.predictions(y0, t), [(1 - level) / 2, (1 + level) / 2], axis=0)
+        return low, high
+
+
+def replica(common: tuple[Model, Trajectories, Setting, np.ndarray, int], number: int) -> np.ndarray:
+    """The numbers of a model that is fitted to trajectories drawn with repetition: a piece of work."""
+    model, data, setting, theta, seed = common
+    drawn = np.random.default_rng([seed, number]).integers(0, len(data.runs), len(data.runs))
+    return fitted(model, data.subset(drawn), setting, theta).theta
 
 
 Chosen = tuple[Candidate, Fitted, Held]
@@ -161,6 +282,12 @@ class Search:
     seed: int
     history: list[dict[str, Any]] = field(default_factory=list)
     best: Chosen | None = None
+    identity: dict[str, Any] = field(default_factory=dict)
+    done: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """The numbers of the models that were fitted, by their names."""
+    replicas: Replicas | None = None
+    unconstrained: float | None = None
+    """The share of the squares of the held-out residuals that a field which is not Hamiltonian leaves, if small."""
     final: Fitted = field(init=False)
     """The chosen model, fitted to all trajectories."""
 
@@ -221,7 +348,14 @@ class Search:
         return self.data.n_values > candidate.model.n + 2 * self.data.ndof * len(self.data.runs)
 
     def _fit(self, candidate: Candidate, setting: Setting, session: Session) -> Chosen:
-        found = fitted(candidate.model, self.data, setting, seed=self.seed)
+        numbers = self.done.get(candidate.name)
+        if numbers is None:
+            found = fitted(candidate.model, self.data, setting, seed=self.seed)
+            if not setting.stop():
+                self.done[candidate.name] = kept(found)
+                self.save(session)
+        else:
+            found = restored(candidate.model, self.data, numbers, setting)
         held = judged(found, self.held, self.setting)
         figures = {
             "parameters": candidate.model.n,
@@ -253,12 +387,72 @@ class Search:
         if simple[2].exact or lost < fewer * math.log(self.data.n_values):
             self.best = simple
 
+    def save(self, session: Session) -> None:
+        """Write a checkpoint, if one is asked for."""
+        if session.checkpoint is not None:
+            fits = {
+                name: {key: torch.as_tensor(v) if isinstance(v, np.ndarray) else v for key, v in numbers.items()}
+                for name, numbers in self.done.items()
+            }
+            state = {"step": len(fits), "flow": {}, "best": {}, "optimizer": fits, "history": [], "seconds": 0.0}
+            checkpoints.write(session.checkpoint, self.identity | state)
+
+    def resume(self, path: Path) -> None:
+        """Take over the models that were fitted before a run was ended.
+
+        Raises
+        ------
+        ValueError
+            If the file is not a checkpoint, or one of other trajectories or options.
+        """
+        self.done = checkpoints.read_same(path, self.identity)["optimizer"]
+
+    def diagnose(self, session: Session) -> None:
+        """Warn where the residuals of the best model are no noise, with what may be the reason."""
+        candidate, _, held = self.winner
+        if held.explained:
+            return
+        said = (
+            f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are no noise: the "
+            f"correlation of one with the next is {held.correlation:.2f}."
+        )
+        free = next((model for model in map(self._free, (3, 2)) if self._affords_field(model)), None)
+        if free is not None and not session.deadline.over():
+            compared = fitted(free, self.data, Setting(self.setting.noise, self.setting.huber, session.deadline.over))
+            theirs = judged(compared, self.held, self.setting)
+            ours, other = (h.squares(self.data.scales) for h in (held, theirs))
+            if gains(held, theirs) and other < FREER * ours:
+                rate = float(np.mean(free.divergence(compared.theta, compared.states.T)))
+                said += (
+                    f" No symplectic map explains these data: a vector field of cubic polynomials that need not be "
+                    f"Hamiltonian leaves {other / ours:.1e} of the squares; volumes change at a rate of {rate:.3g} "
+                    "along its flow, and not at all along that of a Hamiltonian."
+                )
+                self.unconstrained = other / ours
+        smooth = smoothed(self.data)
+        said += " " + hint(library_for(None, self.data.ndof, 4, smooth.points)[0], smooth, self.data)
+        warnings.warn(said, UserWarning, stacklevel=3)
+
+    def _free(self, degree: int) -> FreeField:
+        return FreeField(self.data.scales, degree)
+
+    def _affords_field(self, model: FreeField) -> bool:
+        return model.n <= MOST_TERMS and self.data.n_values > 2 * model.n + 2 * self.data.ndof * len(self.data.runs)
+
+    def bootstrap(self, n: int, session: Session) -> None:
+        """Fit the chosen model to trajectories that are drawn anew, n times."""
+        setting = Setting(self.setting.noise, self.setting.huber)
+        model = self.winner[0].model
+        common = model, self.all, setting, self.final.theta, self.seed
+        thetas = np.stack(list(session.each(replica, common, range(n), session.deadline)))
+        self.replicas = Replicas(model, self.final.method, self.final.theta, thetas)
+
     # the flow ---------------------------------------------------------------------------------------------------------
 
     def system(self, name: str) -> HamiltonianSystem:
         """The H that was learned."""
-        found = self.final
-        model, states = found.model, found.states
+        found, model = self.final, self.winner[0].model
+        states = found.states
         low, high = states.min(axis=0), states.max(axis=0)
         wider = MARGIN * (high - low)
         box = Box(low - wider, high + wider)
@@ -288,6 +482,7 @@ class Search:
         damping = None if system.friction is None else system.friction.damping.tolist()
         flow.recipe = {**flow.recipe, "learned": {**learned, "damping": damping}}
         flow.take_learned(system)
+        flow.replicas = self.replicas
         return flow
 
     def figures(self, dt: float) -> dict[str, float]:
@@ -299,6 +494,8 @@ class Search:
             "residual_correlation": held.correlation,
             "noise": float(np.sqrt(np.mean(found.sigma**2))),
         }
+        if self.unconstrained is not None:
+            made["unconstrained_share"] = self.unconstrained
         made |= {f"noise_{name}": float(s) for name, s in zip(self.data.names, found.sigma, strict=True)}
         passed = np.concatenate([run.t - run.t[0] for run in held.pieces])
         squares = np.nanmean(np.concatenate(held.fit.residuals, axis=1) ** 2, axis=0)

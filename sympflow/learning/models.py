@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise, product
+from itertools import combinations, combinations_with_replacement, pairwise, product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ class Linear(NamedTuple):
     Attributes
     ----------
     value : ndarray of shape (m, N)
-    slope : ndarray of shape (m, m, N) or None
+    slope : ndarray of shape (m, m, N) or (m, m, 1), or None
         ∂f/∂x.
     by_parameters : ndarray of shape (m, n, N) or None
         ∂f/∂θ.
@@ -68,6 +68,20 @@ class Part(ABC):
         """θ before anything is known."""
         return np.zeros(self.n)
 
+    def subset(self, kept: np.ndarray) -> Part:
+        """The part with some of its numbers (n,), where it is a sum of terms, one for each; else the part itself."""
+        return self
+
+    @property
+    def linear(self) -> bool:
+        """True if it is linear in θ."""
+        return True
+
+    @property
+    def terms(self) -> bool:
+        """True if `subset` leaves terms out."""
+        return False
+
 
 class Polynomial(Part):
     """Σ_m θ_m Π_i (x_i/s_i)^m_i.
@@ -88,6 +102,10 @@ class Polynomial(Part):
     def quadratic(self) -> bool:
         return bool((self.exponents.sum(axis=1) == 2).all())
 
+    @property
+    def terms(self) -> bool:
+        return True
+
     @classmethod
     def up_to(cls, degree: int, of: str, scales: Any) -> Polynomial:
         """All monomials of degree 1 to `degree`."""
@@ -96,7 +114,7 @@ class Polynomial(Part):
         return cls(of, sorted(exponents, key=lambda e: (sum(e), e[::-1])), scales)
 
     @cached_property
-    def _derivatives(self) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
+    def derivatives(self) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
         """For each list of coordinates, of one or two: the factors and exponents of the derivatives by them."""
         made: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
         m = self.exponents.shape[1]
@@ -107,7 +125,7 @@ class Polynomial(Part):
             made[places] = factor, left
         return made
 
-    def _powers(self, x: np.ndarray) -> list[np.ndarray]:
+    def tables(self, x: np.ndarray) -> list[np.ndarray]:
         """The powers of each coordinate, (degree + 1, N)."""
         powers = []
         for z, most in zip(x / self.scales[:, None], self.exponents.max(axis=0, initial=0), strict=True):
@@ -118,7 +136,7 @@ class Polynomial(Part):
         return powers
 
     @staticmethod
-    def _monomials(powers: list[np.ndarray], exponents: np.ndarray) -> np.ndarray:
+    def monomials(powers: list[np.ndarray], exponents: np.ndarray) -> np.ndarray:
         made = powers[0][exponents[:, 0]]
         for table, e in zip(powers[1:], exponents.T[1:], strict=True):
             made *= table[e]
@@ -126,12 +144,12 @@ class Polynomial(Part):
 
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
         m, N = x.shape
-        powers, derivatives = self._powers(x), self._derivatives
+        powers, derivatives = self.tables(x), self.derivatives
         value = np.empty((m, N))
         columns = np.empty((m, self.n, N)) if by_parameters else None
         for i in range(m):
             factor, left = derivatives[i,]
-            made = self._monomials(powers, left)
+            made = self.monomials(powers, left)
             value[i] = (theta * factor) @ made
             if columns is not None:
                 np.multiply(made, factor[:, None], out=columns[i])
@@ -141,11 +159,11 @@ class Polynomial(Part):
                 for j in range(i, m):
                     factor, left = derivatives[i, j]
                     used = factor != 0
-                    slopes[i, j] = slopes[j, i] = (theta * factor)[used] @ self._monomials(powers, left[used])
+                    slopes[i, j] = slopes[j, i] = (theta * factor)[used] @ self.monomials(powers, left[used])
         return Linear(value, slopes, columns)
 
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
-        return theta @ self._monomials(self._powers(x), self.exponents)
+        return theta @ self.monomials(self.tables(x), self.exponents)
 
     def subset(self, kept: np.ndarray) -> Polynomial:
         """The polynomial of some of the monomials (n,)."""
@@ -175,6 +193,21 @@ class Kinetic(Polynomial):
             for i in pair:
                 row[i] += 1
         super().__init__("p", exponents, scales)
+        self._pairs = np.array(pairs)
+        self._units = 1 / np.array([self.scales[i] * self.scales[j] for i, j in pairs])
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        i, j = self._pairs.T
+        W = np.zeros((m, m))
+        np.add.at(W, (i, j), theta * self._units)
+        W += W.T  # an entry of the diagonal is twice its coefficient
+        by = None
+        if by_parameters:
+            by, places = np.zeros((m, self.n, N)), np.arange(self.n)
+            by[i, places] += self._units[:, None] * x[j]
+            by[j, places] += self._units[:, None] * x[i]
+        return Linear(W @ x, W[:, :, None] if slope else None, by)
 
 
 class FixedKinetic(Part):
@@ -189,8 +222,9 @@ class FixedKinetic(Part):
 
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
         W = self.inverse_mass
-        slopes = np.broadcast_to(W[:, :, None], (*W.shape, x.shape[1])) if slope else None
-        return Linear(W @ x, slopes, np.empty((len(x), 0, x.shape[1])) if by_parameters else None)
+        return Linear(
+            W @ x, W[:, :, None] if slope else None, np.empty((len(x), 0, x.shape[1])) if by_parameters else None
+        )
 
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
         return 0.5 * np.einsum("in,ij,jn->n", x, self.inverse_mass, x)
@@ -200,6 +234,336 @@ class FixedKinetic(Part):
 
         v = sympy.Matrix(list(x))
         return sympy.expand((v.T * sympy.Matrix(self.inverse_mass.tolist()) * v)[0] / 2)
+
+
+class Waves(Part):
+    """Σ_m θ_m Π_i (x_i/s_i)^m_i cos(k_m·x + φ_m): Fourier series in angles, with powers of the other coordinates.
+
+    Parameters
+    ----------
+    of : {"q", "p", "y"}
+    exponents : array_like of int, shape (n, m)
+    waves : array_like of shape (n, m)
+        The wave vectors k.
+    phases : array_like of shape (n,)
+        φ, 0 for cosines and −π/2 for sines.
+    scales : array_like of shape (m,)
+    """
+
+    def __init__(self, of: str, exponents: Any, waves: Any, phases: Any, scales: Any) -> None:
+        self.of, self.waves, self.phases = of, np.asarray(waves, dtype=float), np.asarray(phases, dtype=float)
+        self.powers = Polynomial(of, exponents, scales)
+        self.n = len(self.waves)
+        self._angles, self._place = np.unique(self.waves, axis=0, return_inverse=True)
+        self._place = self._place.ravel()
+
+    @property
+    def terms(self) -> bool:
+        return True
+
+    @classmethod
+    def up_to(cls, harmonics: int, degree: int, of: str, scales: Any, periods: np.ndarray) -> Waves:
+        """Harmonics to this order of the angles, which have a period, times powers of the others to this degree."""
+        angles = np.isfinite(periods)
+        span = [range(-harmonics, harmonics + 1) if angle else (0,) for angle in angles]
+        reach = [(0,) if angle else range(degree + 1) for angle in angles]
+        vectors = [v for v in product(*span) if sum(map(abs, v)) <= harmonics and v >= tuple(-x for x in v)]
+        monomials = [e for e in product(*reach) if sum(e) <= degree]
+        terms = [
+            (e, v, phase)
+            for e in sorted(monomials, key=sum)
+            for v in sorted(vectors, key=lambda v: sum(map(abs, v)))
+            for phase in ((0.0, -np.pi / 2) if any(v) else (0.0,))
+            if any(e) or any(v)
+        ]
+        exponents, chosen, phases = zip(*terms, strict=True)
+        return cls(of, exponents, np.array(chosen) * np.where(angles, 2 * np.pi / periods, 0.0), phases, scales)
+
+    def subset(self, kept: np.ndarray) -> Waves:
+        exponents = self.powers.exponents[kept]
+        return Waves(self.of, exponents, self.waves[kept], self.phases[kept], self.powers.scales)
+
+    def _turns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The cosines of all terms and their derivatives by the angle, (n, N)."""
+        u = self._angles @ x
+        cos, sin = np.cos(u)[self._place], np.sin(u)[self._place]
+        c, s = np.cos(self.phases)[:, None], np.sin(self.phases)[:, None]
+        return cos * c - sin * s, -(sin * c + cos * s)
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        wave, turned = self._turns(x)
+        powers = self.powers.tables(x)
+        whole = self.powers.monomials(powers, self.powers.exponents)
+        value, by = np.empty((m, N)), np.empty((m, self.n, N))
+        first = []
+        for i in range(m):
+            factor, left = self.powers.derivatives[i,]
+            first.append(factor[:, None] * self.powers.monomials(powers, left) if factor.any() else 0.0)
+            by[i] = first[i] * wave + self.waves[:, i, None] * whole * turned
+            value[i] = theta @ by[i]
+        slopes = np.empty((m, m, N)) if slope else None
+        if slopes is not None:
+            for i in range(m):
+                for j in range(i, m):
+                    factor, left = self.powers.derivatives[i, j]
+                    ki, kj = self.waves[:, i, None], self.waves[:, j, None]
+                    second = (first[i] * kj + first[j] * ki) * turned - ki * kj * whole * wave
+                    if factor.any():
+                        second = second + factor[:, None] * self.powers.monomials(powers, left) * wave
+                    slopes[i, j] = slopes[j, i] = theta @ second
+        return Linear(value, slopes, by if by_parameters else None)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return theta @ (self.powers.monomials(self.powers.tables(x), self.powers.exponents) * self._turns(x)[0])
+
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        import sympy
+
+        made = []
+        rows = zip(
+            self.powers.coefficients(theta), self.powers.exponents.tolist(), self.waves, self.phases, strict=True
+        )
+        for c, m, k, phase in rows:
+            angle = sympy.Add(*(_float(a) * v for a, v in zip(k, x, strict=True) if a))
+            turn = sympy.sin(angle) if phase else sympy.cos(angle)
+            made.append(_float(c) * sympy.Mul(*(v**e for v, e in zip(x, m, strict=True))) * turn)
+        return sympy.Add(*made)
+
+
+class Network(Part):
+    """Σ_k w_k tanh(a_k·z + b_k), a layer of neurons; z has x_i/s_i, of an angle its cosine and sine.
+
+    Parameters
+    ----------
+    of : {"q", "p", "y"}
+    width : int
+        The number of neurons.
+    scales : array_like of shape (m,)
+    periods : ndarray of shape (m,), optional
+        Of angles, infinite for other coordinates.
+    """
+
+    def __init__(self, of: str, width: int, scales: Any, periods: np.ndarray | None = None) -> None:
+        self.of, self.width, self.scales = of, width, np.asarray(scales, dtype=float)
+        self.periods = np.full(len(self.scales), np.inf) if periods is None else periods
+        self.inputs = [
+            (i, kind) for i, P in enumerate(self.periods) for kind in (("cos", "sin") if np.isfinite(P) else ("line",))
+        ]
+        self.n = width * (len(self.inputs) + 2)
+
+    @property
+    def linear(self) -> bool:
+        return False
+
+    def start(self, rng: np.random.Generator) -> np.ndarray:
+        a = rng.normal(size=(self.width, len(self.inputs)))
+        a *= rng.uniform(0.5, 1.5, self.width)[:, None] / np.linalg.norm(a, axis=1, keepdims=True)
+        w = 0.1 * rng.normal(size=self.width)
+        return np.concatenate([w, a.ravel(), rng.uniform(-1.5, 1.5, self.width)])
+
+    def _split(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        K, e = self.width, len(self.inputs)
+        return theta[:K], theta[K : K + K * e].reshape(K, e), theta[K + K * e :]
+
+    def _embedded(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The inputs z (e, N), with their first and second derivatives by the coordinate of each."""
+        z, first, second = (np.empty((len(self.inputs), x.shape[1])) for _ in range(3))
+        for row, (i, kind) in enumerate(self.inputs):
+            if kind == "line":
+                z[row], first[row], second[row] = x[i] / self.scales[i], 1 / self.scales[i], 0.0
+            else:
+                k = 2 * np.pi / self.periods[i]
+                cos, sin = np.cos(k * x[i]), np.sin(k * x[i])
+                z[row], first[row] = (cos, -k * sin) if kind == "cos" else (sin, k * cos)
+                second[row] = -k * k * z[row]
+        return z, first, second
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        K = self.width
+        w, a, b = self._split(theta)
+        z, first, second = self._embedded(x)
+        neuron = np.tanh(a @ z + b[:, None])
+        s1 = 1 - neuron * neuron
+        s2 = -2 * neuron * s1
+        rows = [[r for r, (place, _) in enumerate(self.inputs) if place == i] for i in range(m)]
+        along = [a[:, r] @ first[r] for r in rows]  # of each coordinate, (K, N)
+        value = np.stack([w @ (s1 * v) for v in along])
+        slopes = np.empty((m, m, N)) if slope else None
+        if slopes is not None:
+            for i in range(m):
+                for j in range(i, m):
+                    slopes[i, j] = slopes[j, i] = w @ (s2 * along[i] * along[j])
+                slopes[i, i] += w @ (s1 * (a[:, rows[i]] @ second[rows[i]]))
+        if not by_parameters:
+            return Linear(value, slopes)
+        by = np.empty((m, self.n, N))
+        e = len(self.inputs)
+        for i in range(m):
+            np.multiply(s1, along[i], out=by[i, :K])
+            bent = (w[:, None] * s2) * along[i]
+            by[i, K + K * e :] = bent
+            for r in range(e):
+                column = by[i, K + r : K + K * e : e]
+                np.multiply(bent, z[r], out=column)
+                if r in rows[i]:
+                    column += (w[:, None] * s1) * first[r]
+        return Linear(value, slopes, by)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        w, a, b = self._split(theta)
+        return w @ np.tanh(a @ self._embedded(x)[0] + b[:, None])
+
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        import sympy
+
+        w, a, b = self._split(theta)
+        inputs = []
+        for i, kind in self.inputs:
+            angle = _float(2 * np.pi / self.periods[i]) * x[i]
+            inputs.append(
+                x[i] / _float(self.scales[i]) if kind == "line" else (sympy.cos if kind == "cos" else sympy.sin)(angle)
+            )
+        made = []
+        for weight, row, bias in zip(w, a, b, strict=True):
+            sum_ = sympy.Add(_float(bias), *(_float(c) * z for c, z in zip(row, inputs, strict=True)))
+            made.append(_float(weight) * sympy.tanh(sum_))
+        return sympy.Add(*made)
+
+
+class Pairs(Part):
+    """Σ over pairs of bodies of Σ_j θ_j (r/s)^e_j, the logarithm of r/s where e_j = 0.
+
+    Parameters
+    ----------
+    bodies : ndarray of int, shape (n_bodies, dim)
+        The places of the coordinates of each body in q.
+    powers : sequence of int
+        The exponents e.
+    scale : float
+        s, of the size of the distances.
+    shared : bool
+        True if all pairs have the same numbers.
+    """
+
+    def __init__(self, bodies: np.ndarray, powers: Sequence[int], scale: float, shared: bool) -> None:
+        self.of, self.bodies, self.powers, self.scale, self.shared = "q", bodies, tuple(powers), scale, shared
+        self.pairs = list(combinations(range(len(bodies)), 2))
+        self.n = len(self.powers) * (1 if shared else len(self.pairs))
+
+    def _numbers(self, pair: int) -> slice:
+        """The places of the numbers of a pair."""
+        start = 0 if self.shared else pair * len(self.powers)
+        return slice(start, start + len(self.powers))
+
+    def _distance(self, x: np.ndarray, pair: int) -> tuple[np.ndarray, np.ndarray]:
+        a, b = self.pairs[pair]
+        line = (x[self.bodies[a]] - x[self.bodies[b]]) / self.scale
+        return line, np.sqrt(np.sum(line * line, axis=0))
+
+    def _functions(self, r: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """f, f' and f'' of each power, (j, N)."""
+        f = np.stack([r**e if e else np.log(r) for e in self.powers])
+        first = np.stack([e * r ** (e - 1) if e else 1 / r for e in self.powers])
+        second = np.stack([e * (e - 1) * r ** (e - 2.0) if e else -1 / r**2 for e in self.powers])
+        return f, first, second
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        value = np.zeros((m, N))
+        slopes = np.zeros((m, m, N)) if slope else None
+        by = np.zeros((m, self.n, N)) if by_parameters else None
+        for pair, (a, b) in enumerate(self.pairs):
+            place = self._numbers(pair)
+            line, r = self._distance(x, pair)
+            unit = line / r
+            _, first, second = self._functions(r)
+            pull = theta[place] @ first
+            for axis, (i, j) in enumerate(zip(self.bodies[a], self.bodies[b], strict=True)):
+                force = pull * unit[axis] / self.scale
+                value[i] += force
+                value[j] -= force
+                if by is not None:
+                    column = first * unit[axis] / self.scale
+                    by[i, place] += column
+                    by[j, place] -= column
+                if slopes is not None:
+                    for other, (k, n) in enumerate(zip(self.bodies[a], self.bodies[b], strict=True)):
+                        curved = (theta[place] @ second - pull / r) * unit[axis] * unit[other]
+                        curved = (curved + (pull / r if axis == other else 0.0)) / self.scale**2
+                        slopes[i, k] += curved
+                        slopes[j, n] += curved
+                        slopes[i, n] -= curved
+                        slopes[j, k] -= curved
+        return Linear(value, slopes, by)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        total = np.zeros(x.shape[1])
+        for pair in range(len(self.pairs)):
+            total += theta[self._numbers(pair)] @ self._functions(self._distance(x, pair)[1])[0]
+        return total
+
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        import sympy
+
+        made = []
+        for pair, (a, b) in enumerate(self.pairs):
+            square = sympy.Add(
+                *((x[i] - x[j]) ** 2 for i, j in zip(self.bodies[a].tolist(), self.bodies[b].tolist(), strict=True))
+            )
+            for c, e in zip(theta[self._numbers(pair)], self.powers, strict=True):
+                if e:
+                    made.append(_float(c / self.scale**e) * square ** sympy.Rational(e, 2))
+                else:
+                    made.append(_float(c / 2) * sympy.log(square))
+        return sympy.Add(*made)
+
+
+class Formula(Part):
+    """A function that is known, in symbols of the coordinates.
+
+    Parameters
+    ----------
+    of : {"q", "p", "y"}
+    formula : sympy.Expr
+    symbols : sequence of sympy.Symbol
+        Those of the coordinates.
+    """
+
+    def __init__(self, of: str, formula: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> None:
+        self.of, self.n, self.formula, self.symbols = of, 0, formula, tuple(symbols)
+
+    @cached_property
+    def _functions(self) -> tuple[Any, Any, Any]:
+        """The function, its gradient and its second derivatives on and above the diagonal."""
+        import sympy
+
+        first = [self.formula.diff(v) for v in self.symbols]
+        second = [f.diff(v) for i, f in enumerate(first) for v in self.symbols[i:]]
+        return tuple(sympy.lambdify([self.symbols], f, "numpy", cse=True) for f in (self.formula, first, second))
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        _, first, second = self._functions
+        value = np.stack([np.broadcast_to(f, N) for f in first(x)])
+        slopes = np.empty((m, m, N)) if slope else None
+        if slopes is not None:
+            for (i, j), f in zip(combinations_with_replacement(range(m), 2), second(x), strict=True):
+                slopes[i, j] = slopes[j, i] = f
+        return Linear(value, slopes, np.empty((m, 0, N)) if by_parameters else None)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(self._functions[0](x), x.shape[1])
+
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        return self.formula.subs(dict(zip(self.symbols, x, strict=True)), simultaneous=True)
+
+
+def _float(value: float) -> sympy.Float:
+    import sympy
+
+    return sympy.Float(float(value), 17)
 
 
 @dataclass(frozen=True)
@@ -245,18 +609,24 @@ class Model:
     def gradient(self, theta: np.ndarray, x: np.ndarray, of: str, slope: bool, by_parameters: bool) -> Linear:
         """∇ of the sum of the parts of q alone, or of p alone, or of all of H."""
         m, N = x.shape
+        chosen = [(part, place) for part, place in zip(self.parts, self.places, strict=True) if of in (part.of, "y")]
+        columns = np.zeros((m, self.n, N)) if by_parameters else None
+        if len(chosen) == 1 and chosen[0][0].of == of:
+            part, place = chosen[0]
+            found = part.gradient(theta[place], x, slope, by_parameters)
+            if columns is not None and found.by_parameters is not None:
+                columns[:, place] = found.by_parameters
+            return Linear(found.value, found.slope, columns)
         value = np.zeros((m, N))
         slopes = np.zeros((m, m, N)) if slope else None
-        columns = np.zeros((m, self.n, N)) if by_parameters else None
-        for part, place in zip(self.parts, self.places, strict=True):
-            if of in (part.of, "y"):
-                rows = self._columns(part.of) if of == "y" else slice(None)
-                found = part.gradient(theta[place], x[rows], slope, by_parameters)
-                value[rows] += found.value
-                if slopes is not None and found.slope is not None:
-                    slopes[rows, rows] += found.slope
-                if columns is not None and found.by_parameters is not None:
-                    columns[rows, place] += found.by_parameters
+        for part, place in chosen:
+            rows = self._columns(part.of) if of == "y" else slice(None)
+            found = part.gradient(theta[place], x[rows], slope, by_parameters)
+            value[rows] += found.value
+            if slopes is not None and found.slope is not None:
+                slopes[rows, rows] += found.slope
+            if columns is not None and found.by_parameters is not None:
+                columns[rows, place] += found.by_parameters
         return Linear(value, slopes, columns)
 
     def field(self, theta: np.ndarray, y: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
@@ -278,6 +648,11 @@ class Model:
                     columns[d + i, self.n - self.rates + place] -= y[d + i]
         return Linear(value, slopes, columns)
 
+    @property
+    def linear(self) -> bool:
+        """True if the vector field is linear in θ."""
+        return all(part.linear for part in self.parts)
+
     def hamiltonian(self, theta: np.ndarray, y: np.ndarray) -> np.ndarray:
         """H (N,)."""
         shares = zip(self.parts, self.places, strict=True)
@@ -294,12 +669,54 @@ class Model:
 
     def without(self, dropped: np.ndarray) -> Model:
         """The model without some of the numbers (n,), which are those of polynomials."""
-        kept = [
-            part.subset(~dropped[place]) if isinstance(part, Polynomial) else part
-            for part, place in zip(self.parts, self.places, strict=True)
-        ]
+        kept = [part.subset(~dropped[place]) for part, place in zip(self.parts, self.places, strict=True)]
         return replace(self, parts=tuple(kept))
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
         """θ before anything is known; friction 0."""
         return np.concatenate([part.start(rng) for part in self.parts] + [np.zeros(self.rates)])
+
+
+class FreeField:
+    """A vector field of polynomials that need not be Hamiltonian, to be compared with those that are.
+
+    Parameters
+    ----------
+    scales : array_like of shape (2d,)
+    degree : int
+    """
+
+    separable = nystrom = False
+    linear = True
+
+    def __init__(self, scales: Any, degree: int) -> None:
+        m = len(scales)
+        self.ndof, self.scales = m // 2, np.asarray(scales, dtype=float)
+        self.polynomial = Polynomial("y", [(0,) * m, *Polynomial.up_to(degree, "y", scales).exponents.tolist()], scales)
+        self.n = m * self.polynomial.n
+
+    def start(self, rng: np.random.Generator) -> np.ndarray:
+        return np.zeros(self.n)
+
+    def field(self, theta: np.ndarray, y: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        """The vector field."""
+        m, N = y.shape
+        rows = theta.reshape(m, -1)
+        powers, K = self.polynomial.tables(y), self.polynomial.n
+        terms = self.polynomial.monomials(powers, self.polynomial.exponents)
+        slopes = np.empty((m, m, N)) if slope else None
+        if slopes is not None:
+            for j in range(m):
+                factor, left = self.polynomial.derivatives[j,]
+                slopes[:, j] = (rows * factor) @ self.polynomial.monomials(powers, left)
+        columns = np.zeros((m, self.n, N)) if by_parameters else None
+        if columns is not None:
+            for i in range(m):
+                columns[i, i * K : (i + 1) * K] = terms
+        return Linear(rows @ terms, slopes, columns)
+
+    def divergence(self, theta: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """The rate (N,) at which volumes of phase space grow."""
+        slopes = self.field(theta, y, True, False).slope
+        assert slopes is not None
+        return np.einsum("iin->n", slopes)

@@ -26,10 +26,13 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import cho_factor, cho_solve
 
-from sympflow.learning.models import Linear, Model
+from sympflow.learning.models import FreeField, Linear, Model
 from sympflow.learning.trajectories import Run, Trajectories
 from sympflow.schemes import Scheme, scheme_named
 from sympflow.training.least_squares import Damping
+
+Field = Model | FreeField
+"""A vector field with numbers θ."""
 
 MOST_NUMBERS = 2**20  # of the derivatives of a batch, which then stay in the cache
 LEAST_DAMPING = 1e-15
@@ -50,7 +53,7 @@ class Stepper(ABC):
     """Of a step, in evaluations of the force with its derivatives."""
 
     @abstractmethod
-    def step(self, model: Model, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
+    def step(self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
         """The states (2d, N) and derivatives (2d, c, N) a time h (N,) after x and X, which may be overwritten.
 
         The first 2d columns of X are those by the initial state, the others those by θ, if there are any.
@@ -67,7 +70,8 @@ class Splitting(Stepper):
     def cost(self) -> float:  # type: ignore[override]
         return float(self.scheme.force_evaluations)
 
-    def step(self, model: Model, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
+    def step(self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
+        assert isinstance(model, Model)
         d = model.ndof
         q, p = slice(0, d), slice(d, 2 * d)
         wanted = X is not None, X is not None and X.shape[1] > 2 * d
@@ -85,6 +89,11 @@ class Splitting(Stepper):
             return
         first = 2 * len(f.value)
         by = X[of]
+        if f.slope.shape[-1] == 1:
+            X[moved] += w * np.tensordot(f.slope[..., 0], by, 1)
+            if f.by_parameters is not None:
+                X[moved, first:] += w * f.by_parameters
+            return
         for i, rows in enumerate(X[moved]):
             for j, slope in enumerate(f.slope[i]):
                 if slope.any():
@@ -108,7 +117,7 @@ class Gauss(Stepper):
     def _table(self) -> tuple[np.ndarray, np.ndarray]:
         return _gauss_table(self.stages)
 
-    def step(self, model: Model, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
+    def step(self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
         A, b = self._table
         m, N = x.shape
         s = self.stages
@@ -155,7 +164,7 @@ SPLITTINGS = ("blanes_moan4", "srkn11b", "kahan_li8")
 STAGES = (2, 3, 4)
 
 
-def steppers(model: Model) -> list[Stepper]:
+def steppers(model: Field) -> list[Stepper]:
     """The schemes that can follow a model."""
     if not model.separable:
         return [Gauss(s) for s in STAGES]
@@ -174,7 +183,7 @@ class Method:
         """How many steps lead over gaps (N,)."""
         return max(1, math.ceil(float(np.max(np.abs(gaps), initial=0.0)) / self.longest * (1 - 1e-9)))
 
-    def over(self, model: Model, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray) -> Any:
+    def over(self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray) -> Any:
         """States and derivatives at the end of gaps."""
         n = self.steps(gaps)
         for _ in range(n):
@@ -304,7 +313,7 @@ class Problem:
 
     Parameters
     ----------
-    model : Model
+    model : Model or FreeField
     data : Trajectories
         Its runs are the pieces.
     method : Method
@@ -316,7 +325,7 @@ class Problem:
         Residuals of more than so many σ count by their size, not its square.
     """
 
-    model: Model
+    model: Field
     data: Trajectories
     method: Method
     sigma: np.ndarray
@@ -533,7 +542,7 @@ def _stepped(
 # starts and methods ---------------------------------------------------------------------------------------------------
 
 
-def chosen_method(model: Model, theta: np.ndarray, data: Trajectories, tolerance: np.ndarray) -> Method:
+def chosen_method(model: Field, theta: np.ndarray, data: Trajectories, tolerance: np.ndarray) -> Method:
     """The cheapest scheme and step whose error over the gaps between points is below a tolerance (2d,).
 
     The error is that over single gaps, from observed states, against half the step.
@@ -579,11 +588,11 @@ def _gaps(data: Trajectories, most: int = 400) -> tuple[np.ndarray, np.ndarray]:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _ends(model: Model, theta: np.ndarray, method: Method, x: np.ndarray, gaps: np.ndarray) -> np.ndarray:
+def _ends(model: Field, theta: np.ndarray, method: Method, x: np.ndarray, gaps: np.ndarray) -> np.ndarray:
     return method.over(model, theta, x.copy(), None, gaps)[0]
 
 
-def matched(model: Model, theta: np.ndarray, data: Trajectories, weights: np.ndarray, steps: int = 1) -> np.ndarray:
+def matched(model: Field, theta: np.ndarray, data: Trajectories, weights: np.ndarray, steps: int = 1) -> np.ndarray:
     """θ by which the observed increments are the integrals of the field along the observed states, by least squares.
 
     No orbit is computed: y(t) − ∫ f_θ(y) dt is compared with a constant for each piece. That is linear where f is
@@ -626,7 +635,7 @@ def _whole(run: Run) -> Run:
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def _increments(
-    model: Model, theta: np.ndarray, pieces: Sequence[Run], weights: np.ndarray
+    model: Field, theta: np.ndarray, pieces: Sequence[Run], weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """What the field does not explain of the increments, and minus its derivative by θ."""
     f = model.field(theta, np.concatenate([run.y for run in pieces], axis=1), False, True)

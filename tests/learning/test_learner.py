@@ -2,13 +2,18 @@
 
 import numpy as np
 import pytest
+import sympy
 from scipy.integrate import solve_ivp
 
 import sympflow
-from sympflow.learning.families import Candidate, pruned
-from sympflow.learning.models import FixedKinetic, Kinetic, Model, Polynomial
+from sympflow.learning.families import FAMILIES, Candidate, pruned
+from sympflow.learning.fitting import Setting, fitted, restored
+from sympflow.learning.learner import Replicas, Search, _said, replica
+from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Network, Pairs, Polynomial, Waves
 from sympflow.learning.shooting import Gauss, Method, Problem, chosen_method, first_states, matched, minimized
 from sympflow.learning.trajectories import Trajectories
+from sympflow.training import checkpoint as checkpoints
+from sympflow.training.session import Session
 
 MASS, STIFF, QUARTIC, RATE = 2.0, 1.5, 0.7, 0.2
 
@@ -137,6 +142,36 @@ def test_terms_without_evidence_are_left_out():
     assert pruned(Candidate("V", model), np.ones(3), precision, values=100) is None
 
 
+Q = sympy.symbols("q1:3", real=True)
+PARTS = [
+    Polynomial.up_to(3, "q", [1.3, 0.9]),
+    Waves.up_to(2, 2, "q", np.array([1.3, 0.9]), np.array([2 * np.pi, np.inf])),
+    Network("q", 4, [1.0, 2.0], np.array([4.0, np.inf])),
+    Pairs(np.array([[0], [1]]), (-2, 0, 1), 1.3, shared=False),
+    Formula("q", sympy.sin(Q[0]) * Q[1] ** 2, Q),
+]
+
+
+@pytest.mark.parametrize("part", PARTS, ids=lambda part: type(part).__name__)
+def test_parts_of_h_are_what_their_derivatives_say(part):
+    """By differences at three states; the expression is the value but for a constant."""
+    rng = np.random.default_rng(0)
+    x, theta, h = rng.normal(size=(2, 3)) + np.array([[0], [3]]), rng.normal(size=part.n), 1e-6
+    found = part.gradient(theta, x, True, True)
+    for i, e in enumerate(h * np.eye(2)[:, :, None]):
+        assert (part.value(theta, x + e) - part.value(theta, x - e)) / (2 * h) == pytest.approx(
+            found.value[i], abs=1e-6
+        )
+        ahead, behind = (part.gradient(theta, x + s * e, False, False).value for s in (1, -1))
+        assert (ahead - behind) / (2 * h) == pytest.approx(found.slope[:, i], abs=1e-6)
+    for i, e in enumerate(h * np.eye(part.n)):
+        ahead, behind = (part.gradient(theta + s * e, x, False, False).value for s in (1, -1))
+        assert (ahead - behind) / (2 * h) == pytest.approx(found.by_parameters[:, i], abs=1e-6)
+    formula = part.expression(theta, Q)
+    values = [float(formula.subs(dict(zip(Q, column, strict=True)))) for column in x.T]
+    assert np.ptp(values - part.value(theta, x)) < 1e-12
+
+
 # learn ----------------------------------------------------------------------------------------------------------------
 
 
@@ -195,3 +230,53 @@ def test_what_cannot_be_learned_is_refused(runs, options, match):
 def test_too_few_numbers_are_refused():
     with pytest.raises(ValueError, match="fewer than the simplest model"):
         sympflow.learn(trajectories(2, 2))
+
+
+def test_a_killed_run_goes_on_from_its_checkpoint(tmp_path):
+    """The callback ends the run after two models; the second run fits these no more, and finds the same."""
+    runs, path = trajectories(6, 12, noise=0.01), tmp_path / "run"
+    seen = []
+
+    def interrupt(step, figures):
+        seen.append(step)
+        if step == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sympflow.learn(runs, dt=0.5, checkpoint=path, callback=interrupt)
+    data = Trajectories.read(runs)
+    search = Search(data, *data.split(0.2, 0), _said(data, None, None, False, None, None), Setting(), 0)
+    with pytest.raises(ValueError, match="`resume` is a run with another"):
+        sympflow.learn(trajectories(6, 12, noise=0.02), dt=0.5, resume=path)
+    state = checkpoints.read(path)
+    assert state["step"] == 2
+    name, numbers = next(iter(state["optimizer"].items()))
+    candidate = next(iter(FAMILIES["polynomial"].models(search.said)))
+    assert candidate.name == name
+    again = restored(candidate.model, search.data, numbers, Setting())
+    assert np.array_equal(again.theta, numbers["theta"].numpy())
+    assert again.sigma == pytest.approx(fitted(candidate.model, search.data, Setting()).sigma)
+
+
+def test_data_of_no_hamiltonian_are_called_so():
+    """Of a damped oscillator, without a word of friction: the areas shrink at its rate."""
+    data = Trajectories.read(trajectories(8, 15, rate=RATE))
+    search = Search(data, *data.split(0.2, 0), _said(data, None, None, False, None, None), Setting(), 0)
+    search.run(["polynomial"], Session())
+    with pytest.warns(UserWarning, match=r"No symplectic map explains.*rate of -0\.2") as record:
+        search.diagnose(Session())
+    assert search.unconstrained < 1e-3
+    assert "damping" in str(record[0].message)
+
+
+def test_replicas_tell_how_certain_a_prediction_is():
+    data = Trajectories.read(trajectories(8, 15, noise=0.02))
+    model = Model(1, (FixedKinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
+    found = fitted(model, data, Setting())
+    thetas = np.stack([replica((model, data, Setting(), found.theta, 0), k) for k in range(6)])
+    low, high = Replicas(model, found.method, found.theta, thetas).bands([0.5, 0.0], np.linspace(0, 4, 5))
+    assert (low[:, 0] == high[:, 0]).all()
+    assert 0 < (high - low)[0, -1] < 0.1
+    theta = found.theta
+    assert np.std(thetas, axis=0) == pytest.approx(np.sqrt(np.diag(found.fit.covariance())), rel=0.9)
+    assert np.abs(thetas.mean(0) - theta).max() < 0.05
