@@ -210,6 +210,35 @@ def test_a_learned_flow_brings_its_system(noisy, tmp_path):
     assert flow.figures == noisy.figures
 
 
+def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
+    """From a table in milliseconds to a file, a report and a figure; the fit itself is that of the fixture."""
+    from typer.testing import CliRunner
+
+    from sympflow.commands import app
+
+    asked = {}
+
+    def learned(data, **options):
+        asked.update(options, span=data.runs[0].span)
+        return noisy
+
+    monkeypatch.setattr("sympflow.learning.learner.learn", learned)
+    rows = ["orbit,t,q,p"]
+    for i, (t, y) in enumerate(trajectories(3, 6)):
+        rows += [f"{i},{1000 * a},{q},{p}" for a, q, p in zip(t, *y, strict=True)]
+    (tmp_path / "data.csv").write_text("\n".join(rows))
+    to, plot = tmp_path / "flow.safetensors", tmp_path / "report.png"
+    arguments = ["learn", str(tmp_path / "data.csv"), "--unit", "t=ms", "--damping", "--out", str(to), "--plot", str(plot)]
+    found = CliRunner().invoke(app, arguments)
+    assert found.exit_code == 0, found.output
+    assert "3 trajectories, 18 points" in found.output
+    assert "noise = 0.0" in found.output
+    assert asked["damping"] is True
+    assert asked["span"] < 2.0  # seconds
+    assert sympflow.load(to).figures == noisy.figures
+    assert plot.stat().st_size > 10_000
+
+
 @pytest.mark.parametrize(
     ("runs", "options", "match"),
     [
