@@ -142,9 +142,9 @@ class Session:
         """Yield `function(common, item)` of each item in order, done by the crew; the function is one of a module.
 
         Where the crew is this thread alone, and the work is compiled code for the most part, `threads` share it, as
-        many as there are cores. What a piece of work does itself by `each` it does alone. While others work Ctrl-C
-        raises KeyboardInterrupt here. Once it has asked for the end, or when workers do not answer soon after the
-        deadline, as while they start, this thread does the rest.
+        many as there are cores. What a piece of work does itself by `each` it does alone. While the crew works Ctrl-C
+        raises KeyboardInterrupt here; threads see that it asked for the end. After that, or when workers do not answer
+        soon after the deadline, as while they start, this thread does the rest.
         """
         ended = self.interruption.asked or deadline.left <= 0
         n_threads = min(available_cores(), len(items)) if threads else 1
@@ -174,7 +174,8 @@ class Session:
         self.crew_is_busy = True
         try:
             for left in reversed(range(len(items))):
-                armed, interruption.armed = interruption.armed, False
+                armed = interruption.armed
+                interruption.armed = armed and crew is not self.crew
                 try:
                     answer = next(answers)
                 except TimeoutError:

@@ -570,10 +570,11 @@ def test_a_checkpoint_is_there_before_the_first_search_ends(tmp_path, monkeypatc
 
 def test_nothing_said_means_at_most_a_minute(monkeypatch):
     """A search that is out of time ends with what it has, says so in the recipe, and does not warn."""
-    monkeypatch.setattr("sympflow.training.trainer.BUDGET", 1.5)
+    monkeypatch.setattr("sympflow.training.trainer.BUDGET", 4.0)
+    monkeypatch.setattr("sympflow.training.table_fit.WORTH_COMPILING", math.inf)
     flow = train(PENDULUM, points=60, reference_states=20, progress=False)
     stage = flow.recipe["stages"][-1]
-    assert stage["restarts_taken"] < stage["restarts"] == 24
+    assert stage["restarts_taken"] < stage["restarts"] == 72
     assert stage["ended_early"] == "the time budget was used up"
     assert flow.figures["one_step_error"] < 1e-3
     seen = {}
