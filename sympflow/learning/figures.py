@@ -44,9 +44,7 @@ def held_out_figure(flow: FlowMap, held: Trajectories) -> Any:
         above.plot(t, y[0], ".", color=f"C{color}")
         above.plot(t[0] + times, states[:, 0], color=f"C{color}", lw=1)
         below.plot(t, system.hamiltonian(y.T), ".", color=f"C{color}")
-        below.plot(sol.t, system.hamiltonian(sol.y.T), color=f"C{color}", lw=1)
-    above.set(
-        ylabel=held.names[0], title="Held-out trajectories (points) and predictions from their first states (lines)"
-    )
+        below.plot(t[0] + times, system.hamiltonian(states), color=f"C{color}", lw=1)
+    above.set(ylabel=held.names[0], title="Held-out trajectories, and predictions from their first states")
     below.set(xlabel="t", ylabel="learned H")
     return figure

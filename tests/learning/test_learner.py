@@ -228,7 +228,17 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
         rows += [f"{i},{1000 * a},{q},{p}" for a, q, p in zip(t, *y, strict=True)]
     (tmp_path / "data.csv").write_text("\n".join(rows))
     to, plot = tmp_path / "flow.safetensors", tmp_path / "report.png"
-    arguments = ["learn", str(tmp_path / "data.csv"), "--unit", "t=ms", "--damping", "--out", str(to), "--plot", str(plot)]
+    arguments = [
+        "learn",
+        str(tmp_path / "data.csv"),
+        "--unit",
+        "t=ms",
+        "--damping",
+        "--out",
+        str(to),
+        "--plot",
+        str(plot),
+    ]
     found = CliRunner().invoke(app, arguments)
     assert found.exit_code == 0, found.output
     assert "3 trajectories, 18 points" in found.output
