@@ -177,7 +177,7 @@ def test_parts_of_h_are_what_their_derivatives_say(part):
 
 @pytest.fixture(scope="module")
 def noisy():
-    return sympflow.learn(trajectories(10, 25, noise=0.01), dt=0.5, time_budget=10)
+    return sympflow.learn(trajectories(10, 25, noise=0.01), dt=0.5, family="polynomial")
 
 
 def test_learn_returns_a_flow_of_what_it_found(noisy):
