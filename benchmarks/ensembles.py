@@ -1,4 +1,5 @@
-"""The cost of an ensemble: time against the number of orbits, the overhead of a chunk, the memory with a store.
+"""The cost of an ensemble: time against the number of orbits, the overhead of a chunk, the memory with a store, and the
+gain of two processes in a fit. Set OMP_NUM_THREADS=1, so that processes do not share cores with each other's threads.
 
     python benchmarks/ensembles.py [--out docs/measured]
     python benchmarks/ensembles.py --memory --orbits 1e7        peak memory of a process that writes a store
@@ -29,6 +30,7 @@ import sympflow
 SYSTEM = sympflow.systems.henon_heiles()
 COUNTS = (1_000, 10_000, 100_000, 1_000_000)
 END, DT, CHUNKS = 100.0, 0.1, 200
+STARTS = 600  # of a primed flow's fit
 ORBITS, CORES = 1e9, 1000  # of the extrapolation
 
 
@@ -104,6 +106,20 @@ def peak(n: int) -> tuple[float, float, float]:
     return tuple(map(float, answer[1:]))  # type: ignore[return-value]
 
 
+def training(rounds: int) -> tuple[float, float]:
+    """Seconds of a fit of `STARTS` random starts, on this thread and in two processes that are there already."""
+    from sympflow import SympFlow, train
+
+    def fit(workers: Any) -> float:
+        flow = SympFlow.primed(SYSTEM, 6, dt=1.0)
+        return seconds(lambda: train(SYSTEM, flow=flow, restarts=STARTS, seed=0, progress=False, workers=workers))
+
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+        fit(pool)  # started, and compiled there
+        alone, shared = np.min([[fit(1), fit(pool)] for _ in range(rounds)], axis=0)
+    return float(alone), float(shared)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
@@ -127,6 +143,12 @@ def main() -> None:
         f"which {idle:.0f} MB are there before the run."
     )
 
+    alone, shared = training(given.rounds)
+    trained = (
+        f"`train` with {STARTS} starts of a primed flow: {fragments.duration(alone)} on one thread, "
+        f"{fragments.duration(shared)} in two processes that are there already, {alone / shared:.2f} times faster."
+    )
+
     largest = max(times)
     orbit = times[largest][0] / largest
     chunk = 16384
@@ -144,7 +166,7 @@ def main() -> None:
         ],
     )
     constants = f"τ = {orbit * 1e6:.3g} µs an orbit of T = 100, n = {chunk:,} orbits a chunk, δ = {dask * 1e3:.2g} ms."
-    fragments.write(given.out, "ensembles", f"{grown}\n\n{cost}\n\n{kept}")
+    fragments.write(given.out, "ensembles", f"{grown}\n\n{cost}\n\n{kept}\n\n{trained}")
     fragments.write(given.out, "ensembles-model", f"{model}\n\n{constants}")
 
 

@@ -70,11 +70,12 @@ class Row:
 
 def exact(system: HamiltonianSystem, y0: np.ndarray, t: np.ndarray) -> np.ndarray:
     """States (N, 2d, n) at times t, which start at 0."""
-    made = []
-    for start in y0:
-        sol = solve(system, "dop853", (0.0, float(t[-1])), start, t_eval=t, rtol=1e-11, atol=1e-12)
-        made.append(sol.raise_for_status().y)
-    return np.array(made)
+    span = (0.0, float(t[-1]))
+    if system.conservative:
+        method = "kahan_li8" if system.separable else "gauss_legendre8"
+        return solve(system, method, span, y0, t_eval=t, dt=0.01).raise_for_status().y
+    made = [solve(system, "dop853", span, start, t_eval=t, rtol=1e-11, atol=1e-12) for start in y0]
+    return np.array([sol.raise_for_status().y for sol in made])
 
 
 def timed(f: Callable[[], Any]) -> tuple[Any, float]:
@@ -329,8 +330,8 @@ def discoveries() -> dict[str, tuple[HamiltonianSystem, np.ndarray, np.ndarray, 
     }
 
 
-def discovered(names: list[str], sigma: float = 0.01) -> list[list[str]]:
-    """For each system the formula, and the largest relative error of a coefficient."""
+def discovered(names: list[str], folder: Path | None, sigma: float = 0.01) -> list[list[str]]:
+    """For each system the formula and the largest relative error of a coefficient; of the first the path, drawn."""
     rows = []
     for name, (system, y0, t, truth) in discoveries().items():
         if names and name not in names:
@@ -346,15 +347,9 @@ def discovered(names: list[str], sigma: float = 0.01) -> list[list[str]]:
         rows.append([name, *counts, f"{100 * error:.2g} %", f"{seconds:.0f}", f"`{record.formula()}`"])
         print(*rows[-1], sep=" | ", flush=True)
         print(record.table(), flush=True)
+        if folder is not None and name == "Hénon–Heiles":
+            record.figure().savefig(folder / "discovery_path.png", dpi=110)
     return rows
-
-
-def path_figure(folder: Path) -> None:
-    """The path of models of Hénon–Heiles."""
-    system, y0, t, _ = discoveries()["Hénon–Heiles"]
-    y = solve(system, "kahan_li8", (0.0, 10.0), y0, t_eval=t, dt=0.02).y
-    found = discover((t, y + 0.01 * np.random.default_rng(1).normal(size=y.shape)))
-    found.discovery.figure().savefig(folder / "discovery_path.png", dpi=110)
 
 
 # sweeps ---------------------------------------------------------------------------------------------------------------
@@ -404,6 +399,12 @@ PROTOCOLS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "hnn-pendulum": lambda o: hnn("pendulum", o),
     "d-hnn": damped_spring,
 }
+TABLES = {
+    "learning-authors": ("authors-oscillator", "authors-henon-heiles"),
+    "learning-ghnn": ("ghnn-pendulum", "ghnn-double-pendulum"),
+    "learning-hnn": ("hnn-spring", "hnn-pendulum", "d-hnn"),
+}
+"""Fragments, and the protocols in each."""
 
 
 def main() -> None:
@@ -417,21 +418,19 @@ def main() -> None:
     options = parser.parse_args()
     wanted = options.only or [*PROTOCOLS, "discovery", "sweeps"]
     figures = None if options.out is None else options.out.parent / "figures"
-    rows = []
-    for name in wanted:
-        if name in PROTOCOLS:
-            for row in PROTOCOLS[name](options):
-                rows.append(row)
-                print(*row.cells(), sep=" | ", flush=True)
-    if rows:
-        titles = ["protocol", "metric", "theirs", "target", "ours", "reached", "s", "model"]
-        fragments.write(options.out, "learning", fragments.table(titles, [row.cells() for row in rows]))
+    for fragment, names in TABLES.items():
+        rows = []
+        for name in names:
+            for row in PROTOCOLS[name](options) if name in wanted else ():
+                rows.append(row.cells())
+                print(*rows[-1], sep=" | ", flush=True)
+        if rows:
+            titles = ["protocol", "metric", "theirs", "target", "ours", "reached", "s", "model"]
+            fragments.write(options.out, fragment, fragments.table(titles, rows), f"--only {' '.join(names)}")
     if "discovery" in wanted:
         titles = ["system", "true terms, of a library", "found", "these and no other", "largest error", "s", "H"]
-        table = fragments.table(titles, discovered(options.systems))
+        table = fragments.table(titles, discovered(options.systems, figures))
         fragments.write(options.out, "learning-discovery", table, "--only discovery")
-        if figures is not None:
-            path_figure(figures)
     if "sweeps" in wanted:
         table = fragments.table(["sweep", "ε", "N", "M", "one-step error", "s"], sweeps(figures))
         fragments.write(options.out, "learning-sweeps", table, "--only sweeps")

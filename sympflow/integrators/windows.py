@@ -22,6 +22,7 @@ FEW_STEPS = 512  # below which a run is never cut
 ARRAY_STEPS = 256  # of array operations, in the first window
 ONE, MANY = 2**18, 2**22
 """Numbers of the states after the steps of a first window, of one trajectory and of a batch: a millisecond or so."""
+LEAST = 16  # steps of the first window of a batch, whose states are loaded and stored in each
 DENSE, LARGE = 16, 2**26
 """A run that saves one of so many steps or more is in one piece unless it has as many numbers: windows are copied."""
 MOST_SAVED = 2**21
@@ -56,7 +57,8 @@ def first_window(stepper: Steps, problem: Problem, n_steps: int, n_saved: int) -
         return ARRAY_STEPS if problem.progress is not None or n_steps > 2 * ARRAY_STEPS else 0
     first = ONE if problem.y0.ndim == 1 else MANY
     long = n_steps * size > max(2 * first, min(DENSE * n_saved * size, LARGE))
-    return max(1, first // size) if long or problem.progress is not None else 0
+    least = 1 if problem.y0.ndim == 1 else LEAST
+    return max(least, first // size) if long or problem.progress is not None else 0
 
 
 class Pace:
@@ -112,15 +114,17 @@ class Pieces:
     ) -> None:
         self.stepper, self.problem, self.h = stepper, problem, h
         self.carry, self.finite = carry, finite
+        self._spare: Any = None  # the running state before that of the carry, which an interrupted run does not need
 
     def to(self, k: int, save: np.ndarray) -> Array:
         """Go on to step k; return the states after the steps `save`."""
-        carry = Carry(self.carry.steps, self.carry.running)
+        before = self.carry
+        carry = Carry(before.steps, before.running, self._spare)
         problem = self.problem
         states, finite = self.stepper.rollout(problem.y0, self.h, k, save, problem.t0, carry=carry)
         if self.finite is not None:
-            finite = np.where(self.finite < self.carry.steps, self.finite, finite)
-        self.carry, self.finite = carry, np.asarray(finite)
+            finite = np.where(self.finite < before.steps, self.finite, finite)
+        self.carry, self.finite, self._spare = carry, np.asarray(finite), before.running
         return states
 
     @property

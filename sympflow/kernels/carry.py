@@ -23,10 +23,13 @@ class Carry:
     running : ndarray of shape (K,), or (N, K) of a batch; or None
         The kernel's own; None before a run. NaN where a trajectory has ended. Of array operations the states (..., K),
         an array or a tensor.
+    spare : ndarray, optional
+        An array that the next running state of a batch may be written into, where it fits: that before the last one.
     """
 
     steps: int = 0
     running: Any = None
+    spare: Any = None
 
     def advance(self, steps: int, running: Any) -> None:
         """Take the place after so many steps."""

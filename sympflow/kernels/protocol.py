@@ -65,7 +65,9 @@ def run_state(
     y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
     if out is None:
         out = np.empty((len(save), len(y0)))
-    first, running = (0, NOTHING[0]) if carry is None else _opened(carry, width)
+    first, running = 0, NOTHING[0]
+    if carry is not None:
+        first, running = carry.steps, np.empty(width) if carry.running is None else carry.running.copy()
     n_finite = run_one(lambda stop: rollout(y0, n_steps, save, out, stop, first, running), (n_steps - first) * work)
     if carry is not None:
         carry.advance(n_steps, running)
@@ -88,20 +90,21 @@ def run_states(
     """
     y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
     out, n_finite = np.empty((len(y0), len(save), y0.shape[1])), np.empty(len(y0), dtype=np.int64)
-    first, running = (0, NOTHING[1]) if carry is None else _opened(carry, len(y0), width)
+    first, running, before = 0, NOTHING[1], None
+    if carry is not None:
+        first, before, shape = carry.steps, carry.running, (len(y0), width)
+        fits = carry.spare is not None and carry.spare.shape == shape
+        running = carry.spare if fits else np.empty(shape)  # new memory of many orbits takes as long as some steps
 
     def rows(i: slice, stop: np.ndarray) -> None:
+        if before is not None:
+            running[i] = before[i]
         rollout(i, y0[i], n_steps, save, out[i], n_finite[i], stop, first, running[i])
 
     run_rows(rows, len(y0), (n_steps - first) * work, threads)
     if carry is not None:
         carry.advance(n_steps, running)
     return Run(out, n_finite)
-
-
-def _opened(carry: Carry, *shape: int) -> tuple[int, np.ndarray]:
-    """The steps made so far and the running state, of that shape, for the loops to change."""
-    return carry.steps, np.empty(shape) if carry.running is None else carry.running.copy()
 
 
 class Steps(NamedTuple):
