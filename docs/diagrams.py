@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 
 FIGURES = Path(__file__).parent / "figures"
-WIDTH, MARGIN, GAP = 860, 20, 26  # of the picture, around it, and between two rows
+WIDTH, MARGIN, GAP = 900, 20, 26  # of the picture, around it, and between two rows
 LINE = 19  # height of a line of text
 INK, SOFT, RULE, FILL = "#1d2433", "#5b6478", "#8a93a8", "#eef1fb"
 
@@ -17,7 +17,7 @@ ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("commands",), "the command line"),
     (
         ("studies", "learning", "testing", "ensembles"),
-        "several runs; trajectories in, flows out; checks of integrators; many orbits",
+        "several runs; flows from data; checks; many orbits",
     ),
     (("training",), "fits of flows to a known H, and what ships"),
     (("metrics",), "energy, symplecticity, accuracy: of the map as executed"),
@@ -33,7 +33,7 @@ ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("hamiltonian",), "H, its structure and derivatives; domains"),
     (
         ("schemes", "events", "workers", "storage"),
-        "tables of numbers; zeros along a run; a map over workers; arrays on disk",
+        "tables; zeros along a run; maps over workers; stores",
     ),
     (("arguments",), "checks of what users give"),
     (("arrays",), "operations that NumPy and torch spell differently"),
@@ -129,12 +129,12 @@ def rooms() -> str:
     """The rooms of the package, arrows down."""
     parts, height, gap, y = [], 32, 20, float(MARGIN)
     for i, (names, words) in enumerate(ROOMS):
-        x, width = float(MARGIN), 118.0
+        x, width = float(MARGIN), 112.0
         for name in names:
             parts.append(box(x, y, width, height))
             parts.append(text(x + 10, y + 21, name, 14, INK, "600"))
-            x += width + 8
-        parts.append(text(420, y + 21, words, 14, SOFT))
+            x += width + 6
+        parts.append(text(498, y + 21, words, 13, SOFT))
         if i < len(ROOMS) - 1:
             parts.append(arrow(MARGIN + 46, y + height + 2, gap - 4))
         y += height + gap

@@ -59,6 +59,7 @@ def solve(
     event_step: float | None = None,
     backend: str = "auto",
     on_domain_exit: str | None = None,
+    diagnose: bool = True,
     progress: Asked = False,
     store: str | os.PathLike[str] | None = None,
     resume: bool = False,
@@ -111,6 +112,9 @@ def solve(
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
         statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The
         default is "warn" for trained flows, whose figures hold in Ω, and "ignore" for classical methods.
+    diagnose : bool
+        Whether to find out, of a run that becomes non-finite, if the solution itself does, and when: a tenth of a
+        second or so.
     progress : bool or callable
         True for a bar on stderr; or a function of the time that is done and the whole one, called a few times a second.
         A method that is not run in pieces, such as one of a library, tells its end only.
@@ -171,6 +175,8 @@ def solve(
     action = ("warn" if integrator.trained else "ignore") if on_domain_exit is None else on_domain_exit
     if not isinstance(action, str) or action not in ("warn", "stop", "ignore"):
         raise ValueError(f"`on_domain_exit` must be 'warn', 'stop' or 'ignore'; got {on_domain_exit!r}.")
+    if not isinstance(diagnose, bool | np.bool_):
+        raise TypeError(f"`diagnose` must be True or False; got {diagnose!r}.")
     if action == "stop" and not readable(y_start):
         raise ValueError(
             "`on_domain_exit` 'stop' needs the values of the states, which torch.func.vmap and torch.compile hide: use "
@@ -179,6 +185,8 @@ def solve(
     if search is not None:
         check_event_search(search, y_start, abs(t1 - t0))
     problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend, search)
+    if not diagnose:
+        problem = replace(problem, diagnosed=False)
     if store is not None:
         from sympflow.storage.runs import RunStore
 
@@ -245,7 +253,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
     failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
-    if failed and stopped is None and problem.letters is None and readable(y_start):
+    if failed and stopped is None and problem.diagnosed and problem.letters is None and readable(y_start):
         from sympflow.integrators.diagnosis import note_singularities
 
         note_singularities(outcome, integrator, problem)
@@ -298,7 +306,7 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
         for index, part in groups:
             sol = _solved(integrator, part, action)
             pieces.append((index, sol))
-            if part.letters is not None and not sol.success:
+            if problem.diagnosed and part.letters is not None and not sol.success:
                 _note_singularities(sol, integrator, part, rows.taken(index))
     except Interrupted as stop:
         pieces.append((index, stop.solution))

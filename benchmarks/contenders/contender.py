@@ -117,7 +117,7 @@ class Contender:
     window : float
         The search ends at an error between window × target and the target.
     choices : tuple of float
-        The settings that there are, the cheapest first; without them any number is one.
+        The settings that there are, of which the fastest is taken; without them any number is one.
     short : tuple of targets
         Those that are calibrated over a tenth of the interval, since the energy error of a Runge–Kutta method grows
         linearly and a whole run would take minutes.

@@ -144,7 +144,9 @@ def calibrate(scene: Scene, contender: Contender, target: float) -> Judged | Non
         return Judged(control, energy_error, state_error, work)
 
     if contender.choices:
-        return next((found for found in map(judge, contender.choices) if found.energy_error <= target), None)
+        good = [found for found in map(judge, contender.choices) if found.energy_error <= target]
+        runs = {found: partial(contender.run, found.control, scene.t_end) for found in good}
+        return min(good, key=lambda found: min(seconds_of(runs[found]) for _ in range(5)), default=None)
     return largest_control(judge, target, contender.guesses[target], contender.order, contender.window)
 
 

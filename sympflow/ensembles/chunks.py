@@ -185,6 +185,7 @@ class Chunk:
                 t_eval=times,
                 backend=self.backend,
                 on_domain_exit="ignore",
+                diagnose=len(rows) == 1,  # else the messages are those of each orbit, without it
             )
         except (KeyboardInterrupt, MemoryError):
             raise

@@ -203,6 +203,11 @@ def parsed(argument: str, expression: str | sp.Expr, symbols: Mapping[str, sp.Sy
             f"`{argument}` must be a string or a SymPy expression such as {example!r}; got {type(expression).__name__}."
         )
     unknown = sorted(s.name for s in f.free_symbols if s.name not in symbols)
+    if "t" in unknown:
+        raise ValueError(
+            f"`{argument}` holds t, and systems by one piece do not depend on the time: give t a value in `params`, or "
+            "write H out by from_sympy(..., time='t')."
+        )
     if unknown:
         raise ValueError(
             f"`{argument}` holds {', '.join(unknown)}, and its names are {', '.join(symbols)}: give other ones a value "

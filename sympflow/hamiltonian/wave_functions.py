@@ -73,8 +73,14 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         w = sp.lambdify(self.k, self.w.xreplace(values), "numpy")
         waves = []
         for axis, (n, length) in enumerate(zip(self.grid, self.length, strict=True)):
+            k = self.transform.angles(axis) * (n / length)
             with np.errstate(all="ignore"):
-                of_axis = w(self.transform.angles(axis) * (n / length))
+                of_axis, other = w(k), w(-k)
+            if not np.allclose(of_axis, other, rtol=1e-12, atol=1e-12, equal_nan=True):
+                raise ValueError(
+                    f"`dispersion` {self.w} must be an even function of k, such as 'k**2/2' or '1 - cos(k)': waves to "
+                    "both sides are taken together."
+                )
             waves.append(np.broadcast_to(np.asarray(of_axis, dtype=float), (n,)))
         self.rates = np.ascontiguousarray(self.transform.total(waves))
         if not np.isfinite(self.rates).all():

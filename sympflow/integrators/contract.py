@@ -131,6 +131,8 @@ class Problem:
     """Told how much of the time from t0 to t1 is done."""
     store: RunStore | None = None
     """The store that takes the outputs, and from which the run goes on; the outcome then has none."""
+    diagnosed: bool = True
+    """Whether it is found out, of a run that becomes non-finite, if the solution itself does."""
 
 
 @dataclass

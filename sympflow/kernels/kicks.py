@@ -90,7 +90,7 @@ def kicks_source(
     return f"{source}\n\n{own}" if varied else source
 
 
-def kick_cycles(symbols: SymbolicHamiltonian, level: int) -> float:
+def kick_cycles(symbols: SymbolicHamiltonian, level: int, ranges: Ranges = ()) -> float:
     """Cycles of a kick and the drift before it in a single trajectory, as its terms are first written down.
 
     That is not the fastest way to write them, for which the compiler looks much longer (`kicks_source`); but
@@ -101,6 +101,8 @@ def kick_cycles(symbols: SymbolicHamiltonian, level: int) -> float:
     symbols : SymbolicHamiltonian
     level : int
         0 for the force alone, 1 with a force gradient, 2 with a curvature term too.
+    ranges
+        Of positions, where one degree of freedom may have its kick as a polynomial.
 
     Raises
     ------
@@ -108,7 +110,10 @@ def kick_cycles(symbols: SymbolicHamiltonian, level: int) -> float:
         If a function in H has no counterpart in compiled code.
     """
     shape = next(iter(shapes(symbols, level + 1)))
-    return min(_scheduled(symbols, shape, "kick_", common).cycles for common in (True, False))
+    tried = [_scheduled(symbols, shape, "kick_", common) for common in (True, False)]
+    if ranges and symbols.ndof == 1 and level:
+        tried += _whole_polynomials(symbols, _parts(symbols, level + 1), "kick_", ranges)
+    return min(kick.cycles for kick in tried)
 
 
 _SOURCES: dict[tuple[sp.Expr, tuple[sp.Symbol, ...], int, Monomials, int, Ranges], tuple[str, str]] = {}

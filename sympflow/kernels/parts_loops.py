@@ -77,10 +77,10 @@ class PartsLoops:
     """
 
     def __init__(self, parts: ExactParts) -> None:
-        if not all(isinstance(part, PartFunctions) for part in parts.rest):
-            raise ValueError("`system` is given by plain functions: define it with from_sympy, or use backend='array'.")
         if parts.linear is not None and not parts.linear.dense:
             raise ValueError("`system` has its normal modes by fast transforms, on arrays: use backend='array'.")
+        if not all(isinstance(part, PartFunctions) for part in parts.rest):
+            raise ValueError("`system` is given by plain functions: define it with from_sympy, or use backend='array'.")
         rest = sum(written_out(part.H, (*part.q, *part.p)) for part in parts.rest)
         if parts.ndof > MOST_IN_REGISTERS or rest > MOST_WRITTEN_OUT:
             raise ValueError(

@@ -417,7 +417,7 @@ def _new_primed(
     can_try = dt is None and not new.given(("stages", "processor", "dtype", "device")) and trials.can_try(system)
     if can_try and session.resume is not None:
         theirs = checkpoints.read(session.resume)["architecture"]
-        for start in trials.tried_starts(system, domain):
+        for start in trials.all_starts(system, domain):
             flow = start.flow(system)
             if checkpoints.identity(flow, system, {})["architecture"] == theirs:
                 return flow, None

@@ -26,7 +26,10 @@ FEWER, REFERENCE = (
     32,
     1e-10,
 )  # steps of orbits of which the energy changes, and the tolerance of the exact ones beside them
-ORDER = 8  # with which the errors of classical schemes fall where these flows are used
+SHAPES = ((3, 9, "drift"), (4, 8, "kick"), (5, 8, "kick"), (6, 8, "kick"))
+"""Kicks of K and of χ, and what a step begins with, of flows that are tried beside that of `default_primed`."""
+ORDER = 6  # with which the errors of classical schemes fall where these flows are used: that of srkn11b and srkn14a
+LARGER = 1.05  # times the work of a flow with a larger processor, which outputs pay for
 MOST_NDOF = 3  # beyond which trials take too long
 SHARE = 0.5  # of a time budget
 DEAREST = 2.0  # times the cycles of a kick without them, beyond which curvature terms are not tried
@@ -49,15 +52,16 @@ def can_try(system: HamiltonianSystem) -> bool:
 
 
 def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | None = None) -> Trial:
-    """The flow that gains most: that of `default_primed`, or one with a longer Δt or curvature terms.
+    """The flow that gains most: that of `default_primed`, or one with a longer Δt, curvature terms or another shape.
 
     Of each the table at Δt is fitted for a few seconds, and followed along held-out orbits. Where its energy error (of
-    a system with friction: the difference from the energy along the exact orbit) is
-    e, the work of a classical scheme of order p is in proportion to e^(−1/p); so the flow gains most whose kicks take
-    the fewest cycles in a unit of time, times e^(1/p), p = 8. Curvature terms are tried with the best Δt, unless they
-    make kicks twice as dear. Where all errors are above 1e-5 it is the flow with the smallest, or of those with up to
-    twice that the one that gains most. The choice depends on the system and Ω alone, not on the machine, unless half
-    the time of the session is not enough for the trials.
+    a system with friction: the difference from the energy along the exact orbit) is e, the work of a classical scheme
+    of order p is in proportion to e^(−1/p); so the flow gains most whose kicks take the fewest cycles in a unit of
+    time, times e^(1/p), p = 6. Curvature terms are tried with the best Δt, unless they make kicks twice as dear, and
+    then `SHAPES` with as many kicks in a unit of time as at that Δt and at the next shorter one, which must gain a
+    twentieth. Where all errors are above 1e-5 it is
+    the flow with the smallest, or of those with up to twice that the one that gains most. The choice depends on the
+    system and Ω alone, not on the machine, unless half the time of the session is not enough for the trials.
 
     Parameters
     ----------
@@ -67,12 +71,14 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     session : Session, optional
         It shows the trials, and may end them: then it is the best so far.
     """
+    from sympflow.kernels.approximations import position_ranges
     from sympflow.kernels.kicks import kick_cycles
 
     assert system.symbols is not None
     starts = tried_starts(system, domain, curvature=False)
     try:
-        cycles = [kick_cycles(system.symbols, level) for level in (FORCE_GRADIENT, CURVATURE)]
+        ranges = position_ranges(system.symbols, domain) if system.autonomous else ()
+        cycles = [kick_cycles(system.symbols, level, ranges) for level in (FORCE_GRADIENT, CURVATURE)]
     except ValueError:  # H has no compiled form
         return Trial(starts[0], math.inf)
     session, found = Session() if session is None else session, dict[Primed, Trial]()
@@ -82,21 +88,25 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         least = min(found[start].error for start in tried)
         worst = GOAL if least <= GOAL else ALIKE * least
         work = {
-            start: cycles[start.curvature] * start.stages / start.dt * found[start].error ** (1 / ORDER)
+            start: cycles[start.curvature]
+            * start.stages
+            / start.dt
+            * found[start].error ** (1 / ORDER)
+            * LARGER ** (start.processor > starts[0].processor)
             for start in tried
             if found[start].error <= worst
         }
         return min(work, key=work.__getitem__)
 
     bends = cycles[1] <= DEAREST * cycles[0]
-    with session.bar(len(starts) + bends, f"{system.name} trials") as bar:
+    with session.bar(len(starts) + bends + 2 * len(SHAPES), f"{system.name} trials") as bar:
 
         def attempt(wanted: list[Primed]) -> None:
             answers = session.each(_trial_of, (system, domain, deadline), wanted, deadline)
             for start in wanted:
                 if deadline.over():
                     return
-                bar.tries(len(found), f"Δt = {start.dt:g}{', with curvature terms' * start.curvature}")
+                bar.tries(len(found), _described(start))
                 try:
                     made = next(answers)
                 except KeyboardInterrupt:  # while others work
@@ -116,13 +126,36 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         bent = replace(straight, curvature=True)
         if bends:
             attempt([bent])
-        return found[best([straight, bent]) if bent in found else straight]
+        chosen = best([straight, bent]) if bent in found else straight
+        shorter = replace(starts[max(0, starts.index(straight) - 1)], curvature=chosen.curvature)
+        others = list(dict.fromkeys([*shaped(chosen), *shaped(shorter)]))
+        attempt(others)
+        return found[best([chosen, *(start for start in others if start in found)])]
 
 
 def tried_starts(system: HamiltonianSystem, domain: Domain, curvature: bool = True) -> list[Primed]:
-    """The flows that may be chosen, from the shortest Δt to the longest; with `curvature` also with such terms."""
+    """The flows that are tried first, from the shortest Δt to the longest; with `curvature` also with such terms."""
     plain = list(dict.fromkeys(default_primed(system, domain, phase=phase) for phase in PHASES))
     return plain + [replace(start, curvature=True) for start in plain if curvature]
+
+
+def all_starts(system: HamiltonianSystem, domain: Domain) -> list[Primed]:
+    """All flows that `chosen_trial` may choose."""
+    starts = tried_starts(system, domain)
+    return starts + [other for start in starts for other in shaped(start)]
+
+
+def shaped(start: Primed) -> list[Primed]:
+    """The flow in each of the `SHAPES`, with as many kicks in a unit of time."""
+    return [
+        replace(start, dt=float(f"{start.dt * n / start.stages:.3g}"), stages=n, processor=c, first=first)
+        for n, c, first in SHAPES
+    ]
+
+
+def _described(start: Primed) -> str:
+    kicks = f"{start.stages} kicks and {start.processor}{', with curvature terms' * start.curvature}"
+    return f"Δt = {start.dt:g}, {kicks}"
 
 
 def _trial_of(common: tuple[HamiltonianSystem, Domain, Deadline], start: Primed) -> Trial:

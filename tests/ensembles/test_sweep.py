@@ -8,6 +8,7 @@ import pytest
 import sympflow
 from sympflow import workers
 from sympflow.ensembles import chunks, reductions, sweep
+from sympflow.integrators import diagnosis
 
 SYSTEM = sympflow.systems.henon_heiles()
 STATES = SYSTEM.domain.sample(200, 1)
@@ -63,6 +64,18 @@ def test_a_failed_orbit_is_a_row():
     assert np.array_equal(result.final[good], kept(reduce="final").final[good])
     assert set(result.messages) == {(3,), (70,)}
     assert "non-finite after t = " in result.message
+
+
+def test_no_orbit_is_asked_when_its_solution_becomes_infinite(monkeypatch):
+    monkeypatch.setattr(diagnosis, "note_singularities", lambda *_: 1 / 0)
+    states = np.array([STATES[0], [60.0, 60.0, 0.0, 0.0]])
+    result = sympflow.ensemble(SYSTEM, "verlet", SPAN, states, dt=DT, reduce="final")
+    assert result.status.tolist() == [0, -1]
+    with pytest.raises(ZeroDivisionError):
+        sympflow.solve(SYSTEM, "verlet", SPAN, states, dt=DT)
+    assert sympflow.solve(SYSTEM, "verlet", SPAN, states, dt=DT, diagnose=False).status.tolist() == [0, -1]
+    with pytest.raises(TypeError, match="`diagnose` must be True or False"):
+        sympflow.solve(SYSTEM, "verlet", SPAN, states, dt=DT, diagnose=2)
 
 
 def test_states_are_drawn_alike_in_any_chunks():

@@ -168,11 +168,21 @@ def test_angles_of_more_than_a_half_turn():
         assert q + 1j * p == pytest.approx((1.2 - 0.9j) * np.exp(-1j * (2 + 2 * rho) * s), abs=1e-13)
 
 
+def test_a_free_field_is_exact_in_one_step():
+    free = HamiltonianSystem.schroedinger(None, shape=9, length=5.0)
+    y0 = np.random.default_rng(2).normal(size=18)
+    psi, k = y0[:9] + 1j * y0[9:], 2 * np.pi * np.fft.fftfreq(9, 5 / 9)
+    end = np.fft.ifft(np.exp(-3.7j * k**2 / 2) * np.fft.fft(psi))
+    found = solve(free, "impulse", (0, 3.7), y0, dt=3.7, t_eval=[3.7]).y[:, -1]
+    np.testing.assert_allclose(found, np.r_[end.real, end.imag], atol=1e-13)
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
         ({"onsite": "q**2"}, "`onsite` holds q"),
-        ({"dispersion": "1/k"}, "`dispersion` must be finite"),
+        ({"dispersion": "1/k**2"}, "`dispersion` must be finite"),
+        ({"dispersion": "k**2 + sin(k)"}, r"`dispersion` k\*\*2 \+ sin\(k\) must be an even function"),
         ({"dispersion": "V*k"}, "`dispersion` holds V"),
         ({"length": -1.0}, "`length` must be positive"),
         ({"length": (1.0, 2.0)}, "`length` must be positive"),

@@ -33,7 +33,7 @@ def law(monkeypatch, error):
 
 
 def test_the_order_of_the_error_decides_between_short_and_long_steps(monkeypatch):
-    """Work e^(1/8) is Δt⁻¹ e^(1/8): an error of order 8 gains as much at every Δt, a lower one at the longest."""
+    """Work e^(1/6) is Δt⁻¹ e^(1/6): an error of order 6 gains as much at every Δt, a lower one at the longest."""
     first, *_, last = trials.tried_starts(HH, HH.domain, curvature=False)
     assert first.dt < last.dt
     assert law(monkeypatch, lambda x, c: 1e-9 * x**4) == last
@@ -64,12 +64,27 @@ def test_a_map_that_keeps_the_energy_alone_is_no_candidate(monkeypatch):
 
 
 def test_curvature_is_taken_where_its_error_is_worth_its_cycles(monkeypatch):
-    """Kicks that are r times dearer must make the error r⁸ times less."""
+    """Kicks that are r times dearer must make the error r⁶ times less."""
     plain, bent = (kick_cycles(HH.symbols, level) for level in (1, 2))
     needed = (bent / plain) ** trials.ORDER
     for gain, taken in ((1.1 * needed, True), (0.9 * needed, False)):
         chosen = law(monkeypatch, lambda x, c, gain=gain: 1e-9 * x**12 / (gain if c else 1.0))
         assert chosen.curvature is taken
+
+
+def test_another_shape_is_taken_where_its_error_is_less_at_as_many_kicks(monkeypatch):
+    """Of the best Δt and with its terms, with Δt in proportion to the kicks; and found again where a run goes on."""
+    chosen = law(monkeypatch, lambda x, c: 1e-9 * x**3)
+    assert chosen == trials.tried_starts(HH, HH.domain, curvature=False)[-1]
+    others = trials.shaped(chosen)
+    for best in others:
+        monkeypatch.setattr(
+            trials, "trial", lambda start, *_, best=best: trials.Trial(start, 1e-9 if start == best else 2e-9)
+        )
+        start = trials.chosen_trial(HH, HH.domain).start
+        assert start == best
+        assert start.stages / start.dt == pytest.approx(chosen.stages / chosen.dt, rel=5e-3)
+        assert start in trials.all_starts(HH, HH.domain)
 
 
 def test_the_error_of_a_trial_is_that_of_its_orbits(monkeypatch):
