@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from sympflow._version import __version__
-from sympflow.commands import listings, running, studying
+from sympflow.commands import learning, listings, running, studying
 from sympflow.commands.console import out
 
 PARAMETERS = {"allow_extra_args": True, "ignore_unknown_options": True}
@@ -24,6 +24,7 @@ app.command(context_settings=PARAMETERS)(studying.stability)
 app.command(context_settings=PARAMETERS)(studying.section)
 app.command(context_settings=PARAMETERS)(running.train)
 app.command(context_settings=PARAMETERS)(running.certificate)
+app.command()(learning.learn)
 
 
 @app.callback(invoke_without_command=True)

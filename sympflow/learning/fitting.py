@@ -113,7 +113,7 @@ def fitted(
     costs: list[float] = []
     for attempt in range(1 + ROUNDS):
         reached = span
-        tolerance = np.clip(0.02 * sigma, 1e-13 * scales, 1e-4 * scales)
+        tolerance = np.clip(0.02 * sigma, 1e-12 * scales, 1e-4 * scales)
         method = chosen_method(model, theta, pieces, tolerance)
         problem = Problem(model, pieces, method, sigma, huber=setting.huber)
         fit = minimized(problem, theta, states, gain=1e-2 if attempt == 0 else 1e-4, stop=setting.stop)

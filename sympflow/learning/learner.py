@@ -34,6 +34,7 @@ from sympflow.workers import Crew
 
 HELD_OUT = 0.2  # of the trajectories
 TABLE_SECONDS = 10.0  # for the numbers of the flow, of a fit of which nothing else is said
+NETWORK_SECONDS = 60.0  # for the weights of one, where H is not separable
 TABLE_SHARE = 0.3  # of a time budget, likewise
 HORIZONS = (1, 10, 100)  # in Δt, of the held-out errors
 MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
@@ -472,10 +473,12 @@ class Search:
     def flow(self, dt: float | None, name: str, session: Session) -> Any:
         """A flow of the H that was learned."""
         system = self.system(name)
-        seconds = TABLE_SECONDS if session.time_budget is None else max(session.deadline.left, 1.0)
+        usual = TABLE_SECONDS if system.separable else NETWORK_SECONDS
+        options: dict[str, Any] = {} if system.separable else {"optimizer": "gauss-newton"}
+        options["time_budget"] = usual if session.time_budget is None else max(session.deadline.left, 1.0)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Training", category=RuntimeWarning)
-            flow = train(system, dt, time_budget=seconds, progress=session.progress, seed=self.seed)
+            flow = train(system, dt, progress=session.progress, seed=self.seed, **options)
         flow.figures = {**flow.figures, **self.figures(flow.dt), "energy_scatter": self.energy_scatter(flow)}
         flow.history = self.history
         learned = {"model": self.winner[0].name, "reason": self.reason, "models": self.history}
@@ -515,7 +518,9 @@ class Search:
 
     @staticmethod
     def _energy(flow: FlowMap, states: np.ndarray) -> np.ndarray:
-        """𝓗 of the flow at states (n, 2d), averaged over [0, Δt]."""
+        """𝓗 of the flow at states (n, 2d), averaged over [0, Δt]; with friction H."""
+        if flow.system is not None and flow.system.friction is not None:  # the maps of a damped flow have no 𝓗
+            return flow.system.hamiltonian(states)
         x = torch.as_tensor(states)
         times = flow.dt * np.arange(OVER_TIMES) / (OVER_TIMES - 1)
         return np.mean([flow.hamiltonian(float(t), x).numpy() for t in times], axis=0)

@@ -552,15 +552,15 @@ def chosen_method(model: Field, theta: np.ndarray, data: Trajectories, tolerance
     best: tuple[float, Method] | None = None
     for stepper in steppers(model):
         method = Method(stepper, widest)
-        end = _ends(model, theta, method, starts, gaps)
+        end, before = _ends(model, theta, method, starts, gaps), math.inf
         for _ in range(12):
             finer = replace(method, longest=method.longest / 2)
             after = _ends(model, theta, finer, starts, gaps)
             with np.errstate(invalid="ignore", over="ignore"):
                 error = np.nanquantile(np.abs(end - after) / tolerance[:, None], 0.99) if len(gaps) else 0.0
-            if error <= 1:
+            if error <= 1 or (error > before / 2 and error < 1e3):  # rounding
                 break
-            method, end = finer, after
+            method, end, before = finer, after, error
         cost = stepper.cost * float(np.mean([method.steps(gap[None]) for gap in gaps]))
         if best is None or cost < best[0]:
             best = cost, method

@@ -1,0 +1,103 @@
+"""`sympflow learn`: from a file of trajectories to a file of a flow, with a report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sympflow.commands.console import Quiet, out, print_table, ready_file, reporting, show
+
+if TYPE_CHECKING:
+    from sympflow.learning.trajectories import Trajectories
+
+
+def learn(
+    ctx: typer.Context,
+    data: Annotated[Path, typer.Argument(help="A CSV, Parquet, NetCDF or zarr file: t, q1 …, p1 …, and the orbit.")],
+    ndof: Annotated[int | None, typer.Option(help="Degrees of freedom, where columns bear other names.")] = None,
+    dt: Annotated[float | None, typer.Option(help="Δt of the flow. Default: what suits its frequencies.")] = None,
+    noise: Annotated[float | None, typer.Option(help="Standard deviation of the data. Default: estimated.")] = None,
+    period: Annotated[float | None, typer.Option(help="Of all q, if these are angles.")] = None,
+    damping: Annotated[bool, typer.Option("--damping", help="Learn a rate of friction as well.")] = False,
+    loss: Annotated[str, typer.Option(help="squares, or huber for data with outliers.")] = "squares",
+    unit: Annotated[
+        list[str] | None, typer.Option("--unit", help="Units of columns, as t=ms, q=deg, p=deg/ms; may be repeated.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Which trajectories are held out.")] = 0,
+    time_budget: Annotated[float | None, typer.Option(help="Seconds that it may take.")] = None,
+    checkpoint: Annotated[Path | None, typer.Option(help="File to keep the state of the run in.")] = None,
+    resume: Annotated[Path | None, typer.Option(help="Checkpoint to go on from.")] = None,
+    to: Annotated[Path, typer.Option("--out", help="File for the flow.")] = Path("flow.safetensors"),
+    plot: Annotated[Path | None, typer.Option(help="File for a figure: predictions and energies, held out.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Learn a flow, and the H behind it, from trajectories.
+
+    Examples:
+
+      sympflow learn data.csv --ndof 2 --out flow.safetensors
+
+      sympflow learn pendulum.csv --period 360 --unit t=ms --plot report.png
+
+      sympflow learn spring.parquet --damping --time-budget 60
+    """
+    with reporting(ctx):
+        from sympflow.learning.learner import learn as learn_flow
+        from sympflow.learning.trajectories import Trajectories
+
+        ready_file(to)
+        if plot is not None:
+            ready_file(plot, "--plot")
+        runs = Trajectories.read(data, ndof, units=_units(unit))
+        out.print(f"{len(runs.runs)} trajectories, {runs.n_points} points, {runs.ndof} degree(s) of freedom")
+        flow = learn_flow(
+            runs,
+            dt=dt,
+            noise=noise,
+            period=period,
+            damping=damping,
+            loss=loss,
+            seed=seed,
+            time_budget=time_budget,
+            checkpoint=checkpoint,
+            resume=resume,
+            progress=not quiet,
+        )
+        flow.save(to)
+        titles = ["model", "numbers", "held-out loss", "correlation"]
+        rows = [
+            [h["model"], str(h["parameters"]), f"{h['held_out_loss']:.4g}", f"{h['correlation']:.2f}"]
+            for h in flow.history
+        ]
+        print_table(titles, rows)
+        learned = flow.recipe["learned"]
+        out.print(f"Chosen: {learned['model']}, for {learned['reason']}", markup=False)
+        show(f"H = {flow.system.expression}")
+        if flow.system.friction is not None:
+            show(f"damping = {flow.system.friction.damping.tolist()}")
+        shown = {k: v for k, v in flow.figures.items() if k.startswith(("held_out_error", "noise", "energy_scatter"))}
+        out.print(", ".join(f"{k} = {v:.3g}" for k, v in shown.items() if v is not None))
+        out.print(f"Written: {to}")
+        if plot is not None:
+            _draw(flow, runs, seed, plot)
+            out.print(f"Written: {plot}")
+
+
+def _units(given: list[str] | None) -> dict[str, str]:
+    """The units of columns by their names."""
+    made = {}
+    for one in given or []:
+        name, sign, unit = one.partition("=")
+        if not sign:
+            raise ValueError(f"`--unit` must be a column and its unit, as t=ms; got {one!r}.")
+        made[name] = unit
+    return made
+
+
+def _draw(flow: Any, runs: Trajectories, seed: int, path: Path) -> None:
+    """Predictions of the flow beside held-out trajectories, and H along both."""
+    from sympflow.learning.figures import held_out_figure
+
+    held_out_figure(flow, runs.split(seed=seed)[1]).savefig(path, dpi=110)
