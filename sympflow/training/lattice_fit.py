@@ -28,9 +28,9 @@ MOST_JUDGED = 1024
 NUMBERS = 40_000
 """Numbers of the states of a judgement, together."""
 FEWEST, MOST_ORBITS, MOST_STATES, TIMES, CERTIFIED = 8, 40, 200, 9, 250
-"""Of the certificate: orbits, states, times in [0, Δt], and the steps of the orbits."""
+"""The certificate: fewest and most orbits, states, times in [0, Δt], and the steps of the orbits."""
 STEPS, SEEN, COPIES, ENDS_STATES = 200, 5, 4, 16
-"""Of the energy errors at ends: steps, how many of them are between two looks, pieces in a row, and states."""
+"""Energy errors at ends: steps, steps between two looks, pieces in a row, and states."""
 
 
 def on_piece(system: HamiltonianSystem) -> bool:
