@@ -19,7 +19,6 @@ from sympflow.hamiltonian.lattice import BOUNDARIES
 from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors
-from sympflow.training.session import Session
 
 MOST_FITTED = 16
 """Degrees of freedom up to which a lattice is fitted as it is, and not by a piece."""
@@ -84,7 +83,7 @@ class Piece:
         made.recipe, made.figures = dict(flow.recipe), dict(flow.figures)
         return made
 
-    def whole(self, fitted: PrimedFlow, session: Session) -> PrimedFlow:
+    def whole(self, fitted: PrimedFlow) -> PrimedFlow:
         """The flow of the lattice with the numbers that were fitted, and what it achieves there."""
         flow = fitted.of_lattice(self.lattice)
         flow.domain = self.states
