@@ -24,7 +24,7 @@ MOST_FITTED = 16
 """Degrees of freedom up to which a lattice is fitted as it is, and not by a piece."""
 MOST_JUDGED = 1024
 """Sites of the lattice on which a flow is judged, where the lattice has more."""
-NUMBERS = 40_000
+NUMBERS = 16_000
 """Numbers of the states of a judgement, together."""
 FEWEST, MOST_ORBITS, MOST_STATES, TIMES, CERTIFIED = 8, 40, 200, 9, 250
 """The certificate: fewest and most orbits, states, times in [0, Δt], and the steps of the orbits."""
