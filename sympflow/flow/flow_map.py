@@ -22,7 +22,7 @@ from sympflow.flow.certificate import Certificate, certify
 from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
-from sympflow.hamiltonian.fingerprint import Identity, check_for_flows, same_system, without_friction
+from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, same_system, without_friction
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
@@ -570,6 +570,8 @@ class FlowMap(nn.Module):
             )
         if system.local is not None and self.lattice_terms:
             reason = _difference(self.lattice_terms, system.local.terms)
+            damped = system.damping is not None or len(self.fingerprint or ()) > PROBES
+            reason = reason or " (its friction is another)" * damped
             raise ValueError(
                 f"`system` {system.name!r} is another lattice than that of this flow{reason}: its numbers cancel the "
                 f"errors of its own terms alone. {remedy[0].upper()}{remedy[1:]}"

@@ -16,15 +16,16 @@ from sympflow.arrays import Array
 if TYPE_CHECKING:
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
 
-SPREAD = 5.0
-"""How many times the density of a few neighbours may exceed that of the lattice, and fall below it."""
+SPREAD, CALM = 8.0, 2.0
+"""How many times the density of the densest few neighbours may exceed the upper one, and fall below the lower one; and
+how many times it does in a calm lattice, where no density is known but theirs."""
 RELAXED, PHASE = 60, 0.3
 """Verlet steps by which drawn states are relaxed, and their length times the fastest frequency."""
 HALVINGS, POWERS = 60, 12
 DRAWN = 200
 """States of another domain from which densities are taken."""
 SHARE = 0.05
-"""Of these, at both ends, that are left out."""
+"""Share of these that is left out at either end."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,9 @@ class LatticeStates:
     one temperature, positions and momenta at random, then relaxed by the lattice's own dynamics. So a few sites are as
     often as far from rest as any few neighbours in a large lattice are.
 
-    A state belongs to the set if no block of as many neighbours as `HamiltonianSystem.piece` has by default has more
-    than 5 times the upper density, and the whole lattice at least a fifth of the lower one.
+    A state belongs to the set if the densest block of as many neighbours as `HamiltonianSystem.piece` has by default
+    has at most 8 times the upper density, and at least an eighth of the lower one: so a wave alone in a lattice at rest
+    is judged by itself.
 
     Parameters
     ----------
@@ -81,7 +83,7 @@ class LatticeStates:
         rest = _Rest.of(system)
         means, blocks = rest.densities(states.reshape(-1, 2 * system.ndof))
         low = float(np.quantile(means, SHARE, method="lower"))
-        high = max(float(np.quantile(means, 1 - SHARE, method="higher")), float(blocks.max()) / SPREAD)
+        high = max(float(np.quantile(means, 1 - SHARE, method="higher")), float(np.median(blocks)) / CALM)
         if not 0 < low <= high < math.inf:
             raise ValueError(
                 f"`y0` has an energy density of {low:.3g} above that of the lattice at rest, from which no states "
@@ -148,9 +150,9 @@ class LatticeStates:
         rest, (low, high) = self._rest, self.bounds
         x = checked_states(x, 2 * rest.system.ndof)
         with np.errstate(all="ignore"):
-            means, blocks = rest.densities(x.reshape(-1, x.shape[-1]).astype(float))
+            _, blocks = rest.densities(x.reshape(-1, x.shape[-1]).astype(float))
         room = slack / rest.sites
-        inside = (means >= low / SPREAD - room) & (blocks <= SPREAD * high + room)
+        inside = (blocks >= low / SPREAD - room) & (blocks <= SPREAD * high + room)
         return inside.reshape(x.shape[:-1])
 
     def to_dict(self) -> dict[str, Any]:

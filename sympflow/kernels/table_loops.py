@@ -30,6 +30,7 @@ Entry = str | None
 MOST_LINES = 600  # of a kick, beyond which compiling takes too long
 MOST_SHARED = 120  # of one with curvature terms that serves where there are none
 LANES = 64  # as in the text `table_rows`
+ROUNDING = 1e-14  # of rows that are in proportion
 BLOCKS = 256  # of lanes, some milliseconds, between two looks at the clock
 
 
@@ -90,11 +91,11 @@ class TableLoops:
         """See `LabelErrors`."""
         return LabelErrors(self, *arguments)
 
-    def step(self, c: np.ndarray, y: np.ndarray, t0: np.ndarray | None, n_rows: int) -> np.ndarray:
-        """The first rows of the states after the step, (n_rows, N), for numbers c (n,)."""
-        zero, no_slope = np.zeros((n_rows, y.shape[1])), np.empty((0, y.shape[1]))
-        errors = LabelErrors(self, y, t0, zero, zero + 1.0, no_slope, np.empty((1, len(c), 0)))
-        return errors(c[None])[0].reshape(zero.shape)
+    def steps(self, c: np.ndarray, y: np.ndarray, t0: np.ndarray | None, n_rows: int) -> np.ndarray:
+        """The first rows of the states after steps by each of the numbers c (J, n), (J, n_rows, N)."""
+        zero, no_slope = np.zeros((n_rows, len(c) * y.shape[1])), np.empty((0, len(c) * y.shape[1]))
+        errors = LabelErrors(self, y, t0, zero, zero + 1.0, no_slope, np.empty((*c.shape, 0)))
+        return errors(c)[0].reshape(len(c), n_rows, y.shape[1])
 
     def opened(self, y: np.ndarray, t0: np.ndarray | None) -> np.ndarray:
         """States (2d, N) with the times (N,) of a driven system after the positions, and its work after the momenta."""
@@ -137,6 +138,11 @@ class LabelErrors:
         Weights of one more error, a sum over the components; none with R' = 0.
     design : (J, n, f)
         The derivatives of the numbers, in the order of the stages, by the parameters.
+
+    Attributes
+    ----------
+    matrices : (J, k, f)
+        The derivatives by the parameters, at each time, of k numbers to which all others are in proportion.
     """
 
     def __init__(
@@ -151,17 +157,21 @@ class LabelErrors:
     ) -> None:
         self._loops = loops
         self._labels = tuple(map(np.ascontiguousarray, (loops.opened(x, t0), y, scale, slope)))
-        used = np.argwhere((design != 0).any(0))
-        used = used[np.lexsort((used[:, 0], used[:, 1]))]
-        self._places = np.stack([used[:, 1], loops.places[used[:, 0]]], axis=1)
-        self._design = np.ascontiguousarray(design[:, used[:, 0], used[:, 1]])
+        leaders, leader, factors = _in_proportion(design.swapaxes(0, 1).reshape(design.shape[1], -1))
+        self.matrices = np.ascontiguousarray(design[:, leaders])
+        used = np.flatnonzero(factors)
+        used = used[np.argsort(leader[used], kind="stable")]
+        self._places = np.stack([leader[used], loops.places[used]], axis=1)
+        self._design = np.tile(factors[used], (len(design), 1))
         self._n_blocks = len(design) * -(-x.shape[1] // LANES)
-        self._shape = design.shape[2], len(design) * x.shape[1] * (len(scale) + bool(len(slope)))
+        self._shape = len(leaders), len(design) * x.shape[1] * (len(scale) + bool(len(slope)))
 
     def __call__(
         self, c: np.ndarray, check: Callable[[], None] = lambda: None, linearized: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The errors (m,) for numbers c (J, n), and their derivatives transposed (f, m), if these are asked for.
+        """The errors (m,) for numbers c (J, n), and if they are asked for their derivatives by the k numbers, (k, m).
+
+        Those by the parameters are these, of each time, times its matrix.
 
         `check` is called now and then, and may raise.
         """
@@ -175,6 +185,28 @@ class LabelErrors:
             check()
             loops.rows(*common, first, min(first + BLOCKS, self._n_blocks), r, J)
         return r, J
+
+
+def _in_proportion(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows (k,) such that each of all rows (n,) is a factor (n,) times the one of a place (n,) among them.
+
+    Factors of rows of zeros are 0.
+    """
+    leaders: list[int] = []
+    leader, factors = np.zeros(len(rows), dtype=np.int64), np.zeros(len(rows))
+    for i, row in enumerate(rows):
+        if not row.any():
+            continue
+        for place, other in enumerate(leaders):
+            largest = np.argmax(np.abs(rows[other]))
+            factor = row[largest] / rows[other, largest]
+            if np.abs(row - factor * rows[other]).max() <= ROUNDING * np.abs(row).max():
+                leader[i], factors[i] = place, factor
+                break
+        else:
+            leader[i], factors[i] = len(leaders), 1.0
+            leaders.append(i)
+    return np.array(leaders, dtype=np.int64), leader, factors
 
 
 def table_loops(

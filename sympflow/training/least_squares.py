@@ -137,7 +137,7 @@ class Minimum:
 @np.errstate(over="ignore", invalid="ignore")  # of trials that go too far; what is not finite is rejected
 def levenberg_marquardt(
     residuals: Callable[[np.ndarray], np.ndarray],
-    linearized: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    linearized: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray | Blocks]],
     x: np.ndarray,
     *,
     iterations: int = 200,
@@ -157,7 +157,7 @@ def levenberg_marquardt(
     residuals : callable
         r(x), (m,); not finite where x is not admissible.
     linearized : callable
-        r(x) and its Jacobian J(x), (m, n).
+        r(x) and its Jacobian J(x), (m, n), or in blocks.
     x : ndarray, shape (n,)
         The start.
     iterations : int
@@ -197,13 +197,37 @@ def levenberg_marquardt(
     return Minimum(x, costs[-1], iterations, "the iterations were used up")
 
 
+@dataclass(frozen=True)
+class Blocks:
+    """A Jacobian in blocks of rows, each some columns of its own times a matrix.
+
+    Parameters
+    ----------
+    columns : (k, m)
+    matrices : (B, k, n)
+        The b-th of B equal blocks of J is the b-th part of the columns, transposed, times the b-th matrix.
+    """
+
+    columns: np.ndarray
+    matrices: np.ndarray
+
+    def whole(self) -> np.ndarray:
+        """J (m, n)."""
+        parts = np.split(self.columns, len(self.matrices), axis=1)
+        return np.concatenate([part.T @ matrix for part, matrix in zip(parts, self.matrices, strict=True)])
+
+
+NO_BLOCKS = np.empty((0, 0, 0))
+
+
 class _Factored(Linearized):
     """A linear model in compiled code, by QR factorizations of [J r] and, for each λ, of [R; √λ D]."""
 
-    def __init__(self, x: np.ndarray, r: np.ndarray, J: np.ndarray, scale: np.ndarray) -> None:
-        self.x, self.r, self.J = x, r, J
-        self._loops, self._columns = gauss_newton_loops(), np.ascontiguousarray(J.T)
-        self._R, self.scale = self._loops.factored(self._columns, r, scale)
+    def __init__(self, x: np.ndarray, r: np.ndarray, J: np.ndarray | Blocks, scale: np.ndarray) -> None:
+        self.x, self.r, self._loops = x, r, gauss_newton_loops()
+        J = J if isinstance(J, Blocks) else Blocks(np.ascontiguousarray(J.T), NO_BLOCKS)
+        self.J = J.columns, J.matrices
+        self._R, self.scale = self._loops.factored(*self.J, r, scale)
         self.D = np.where(self.scale > 0, self.scale, 1.0)
 
     def damp(self, damping: float) -> None:
@@ -215,7 +239,7 @@ class _Factored(Linearized):
 
     def bend(self, residuals: Callable[[np.ndarray], np.ndarray], step: np.ndarray) -> Any:
         probed = residuals(self.x + PROBE * step)
-        return self._loops.bent(self._columns, self.r, probed, PROBE, step, self._damped, self.D, CURVED)
+        return self._loops.bent(*self.J, self.r, probed, PROBE, step, self._damped, self.D, CURVED)
 
     def moved(self, step: np.ndarray, bend: np.ndarray) -> np.ndarray:
         return self.x + step + bend

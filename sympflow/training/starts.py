@@ -66,6 +66,8 @@ class Primed:
     scheme : str, optional
         A scheme of `stages` kicks, from which the search starts in place of equal leapfrog steps: one of a high order
         leads to valleys that random tables, most of whose numbers are positive, do not lie near.
+    force_gradient : bool, optional
+        Whether kicks have force gradients: see `SympFlow.primed`.
     """
 
     dt: float
@@ -75,6 +77,7 @@ class Primed:
     polynomial: int | None = None
     first: str = "drift"
     scheme: str | None = None
+    force_gradient: bool | None = None
 
     kind: ClassVar[str] = "primed"
 
@@ -89,6 +92,7 @@ class Primed:
             first=self.first,
             processor=self.processor,
             curvature=self.curvature,
+            force_gradient=self.force_gradient,
             polynomial=self.polynomial,
         )
         if earlier is not None:

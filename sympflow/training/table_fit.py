@@ -29,7 +29,7 @@ from sympflow.flow.weights import check_memory
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.monomials import in_monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.training.least_squares import Minimum, levenberg_marquardt, put_weights
+from sympflow.training.least_squares import Blocks, Minimum, levenberg_marquardt, put_weights
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.options import TableOptions
 from sympflow.training.points import (
@@ -364,6 +364,10 @@ class Fit:
         """The residuals and their Jacobian, (m, f)."""
         raise NotImplementedError
 
+    def model(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray | Blocks]:
+        """The same, the Jacobian in blocks where these are smaller."""
+        return self.linearized(theta, check)
+
     def own(self) -> Fit:
         """The same for one thread alone; one that changes nothing is that already."""
         return self
@@ -376,7 +380,7 @@ class Fit:
         at_start = self.residuals(theta)
         return levenberg_marquardt(
             lambda x: at_start if x is theta else self.residuals(x, deadline.check),
-            lambda x: self.linearized(x, deadline.check),
+            lambda x: self.model(x, deadline.check),
             theta,
             iterations=iterations,
             patience=20 if thorough else 10,
@@ -488,13 +492,22 @@ class TableFit(Fit):
     @np.errstate(all="ignore")  # as in the residuals: what is not finite is rejected
     def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
         if self._errors_at is not None:
-            numbers = (self.offset + self.design @ theta)[:, self.step.order]
-            r, transposed = self._errors_at(numbers, check, linearized=True)
-            return r, transposed.T
+            r, blocks = self._in_blocks(self._errors_at, theta, check)
+            return r, blocks.whole()
         y, J = self.step.with_jacobian(self.coefficients(theta), self._x, check, self._t0)
         by_table = self._rows(self._errors(J))  # (J, (2d + 1) N, n)
         J = (by_table @ self.design).reshape(-1, self.design.shape[-1])
         return self._rows(self._errors(y - self._y)).ravel(), J
+
+    def model(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray | Blocks]:
+        if self._errors_at is None:
+            return self.linearized(theta, check)
+        return self._in_blocks(self._errors_at, theta, check)
+
+    def _in_blocks(self, errors: LabelErrors, theta: np.ndarray, check: Check) -> tuple[np.ndarray, Blocks]:
+        numbers = (self.offset + self.design @ theta)[:, self.step.order]
+        r, columns = errors(numbers, check, linearized=True)
+        return r, Blocks(columns, errors.matrices)
 
     def _errors(self, change: np.ndarray) -> np.ndarray:
         """The errors of each coordinate and, with a slope, of the energy: (..., 2d + 1, P), else (..., 2d, P)."""
@@ -676,7 +689,7 @@ def differences(flow: PrimedFlow, step: TableStep, labels: Labels) -> np.ndarray
     offset, design = table.polynomial(labels.t)
     coefficients = offset + design @ table.parameters()
     width = labels.x.shape[1]
-    return np.stack([step(c[:, None], labels.x.T, t0=labels.t0)[:width].T for c in coefficients]) - labels.y
+    return step.by_each(coefficients, labels.x.T, labels.t0)[:, :width].swapaxes(1, 2) - labels.y
 
 
 @np.errstate(all="ignore")

@@ -124,7 +124,7 @@ class TableStep:
         """
         if self.loops is not None and c.shape[1] == 1:
             check()
-            return self.loops.step(c[self.order, 0], y, t0, 2 * self.ndof + self.balanced)
+            return self.loops.steps(c[self.order].T, y, t0, 2 * self.ndof + self.balanced)[0]
         q, p = self._opened(y, t0)
         for i, kind in enumerate(self.sequence):
             if kind == "drift":
@@ -135,6 +135,12 @@ class TableStep:
                 for place, F in zip(self._places[i], self._forces.values(q), strict=True):
                     p = p + c[place] * F
         return self._closed(q, p)
+
+    def by_each(self, c: np.ndarray, y: np.ndarray, t0: np.ndarray | None = None) -> np.ndarray:
+        """The steps of the states (2d, P) by each row of coefficients c (J, n): (J, 2d or 2d + 1, P)."""
+        if self.loops is not None:
+            return self.loops.steps(c[:, self.order], y, t0, 2 * self.ndof + self.balanced)
+        return np.stack([self(row[:, None], y, t0=t0) for row in c])
 
     def _drifted(self, p: np.ndarray, s: np.ndarray, velocity: Callable[[np.ndarray], np.ndarray]) -> Any:
         """The change of q and the p after drifts of times s (P,) or (1,), of momenta (..., d, P)."""

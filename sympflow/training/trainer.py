@@ -252,7 +252,7 @@ def fit_flow(
     if kind == "primed" and asked.searches and asked.data is None and on_piece(system):
         piece = Piece.of(system, domain)
         start = None if flow is None else piece.small(flow)
-        return piece.whole(fit_flow(piece.system, dt, start, new, asked, piece.domain, session), session)
+        return piece.whole(fit_flow(piece.system, dt, start, new, asked, piece.domain, session))
     hurried = untold and session.time_budget is None and session.resume is None and kind == "primed" and asked.searches
     if hurried:
         session.time_budget = BUDGET

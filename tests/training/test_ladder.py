@@ -14,7 +14,6 @@ import sympflow
 from sympflow import HamiltonianSystem, SympFlow, get, load, max_energy_error, shipped_flows, solve, systems
 from sympflow.flow import shipped as catalogue
 from sympflow.flow.shipped import ShippedFlow, choose
-from sympflow.hamiltonian.fingerprint import same_system
 from sympflow.integrators import flows
 from sympflow.training import pretrained
 from sympflow.training.clock_fit import clock_errors
@@ -233,7 +232,7 @@ def test_the_figures_are_those_of_the_certificate():
 def test_the_figure_is_met_by_95_per_cent_of_other_states(name):
     """1000 states of another seed to T = 1000: no more than one in twenty exceeds it."""
     listed = next(f for f in FILES if f.name == name)
-    system = next(s for s in SCENES if same_system(listed.fingerprint, s.fingerprint))
+    system = next(s for s in SCENES if listed.is_of(s))
     y0 = system.domain.sample(1000, 90_210)
     n = int(listed.t_end / listed.dt)
     sol = solve(system, listed.load(system), (0.0, n * listed.dt), y0, save_every=5, on_domain_exit="ignore")
@@ -285,7 +284,7 @@ SCENES = [
 @pytest.mark.parametrize("listed", shipped_flows(), ids=lambda f: f.name)
 def test_every_flow_is_a_map_for_all_times(listed):
     """Whatever its kind, networks and stiff ones included; measured on a few states, not read."""
-    system = next(s for s in SCENES if same_system(listed.fingerprint, s.fingerprint))
+    system = next(s for s in SCENES if listed.is_of(s))
     flow = listed.load(system)
     if listed.shift is not None:  # in its own time it is early or late: what it is right in is the physical time
         figures = clock_errors(flow, system, 987, 6)

@@ -33,7 +33,7 @@ def test_states_have_the_density_of_the_lattice_at_every_size():
         assert abs(density.mean() / 0.2 - 1) < 5 / np.sqrt(d * len(density))
         assert 0.6 < density.std() / 0.2 * np.sqrt(d) < 1.5
     assert large.contains(many).all()
-    assert not large.contains(3 * many).any()
+    assert not large.contains(4 * many).any()
     spike = many[0].copy()
     spike[400] += 5.0  # one site alone
     assert not large.contains(spike)
@@ -107,6 +107,27 @@ def test_another_lattice_is_refused_by_the_term_that_differs(flow, other, reason
         solve(other, flow, (0, 5), y0)
     with pytest.raises(ValueError, match=r"has friction|is another lattice"):
         flow.transferred(other if other.ndof != 40 else ring(41, bond="r**2/2 + r**4/5"))
+
+
+def test_the_flow_of_a_damped_lattice_is_of_its_friction():
+    lattice = ring(20, damping=0.1, domain=LatticeStates(0.2))
+    flow = train(lattice, flow=SympFlow.primed(lattice, 2, dt=0.25, processor=0), **FIT)
+    y0 = np.full(60, 0.1)
+    assert solve(ring(30, damping=0.1), flow, (0, 5), y0, backend="array").success
+    for other in (ring(30, damping=0.2), ring(30)):
+        with pytest.raises(ValueError, match="its friction is another"):
+            solve(other, flow, (0, 5), y0)
+
+
+def test_the_flow_of_a_disordered_lattice_is_of_its_arrays():
+    masses = np.random.default_rng(0).uniform(0.8, 1.2, 20)
+    options = {"kinetic": "p**2/(2*m)", "domain": LatticeStates(0.2)}
+    lattice = ring(20, params={"m": masses}, **options)
+    flow = train(lattice, flow=SympFlow.primed(lattice, 2, dt=0.25, processor=0), **FIT)
+    y0 = lattice.domain.sample(1)[0]
+    assert solve(lattice, flow, (0, 5), y0, backend="array").success
+    with pytest.raises(ValueError, match="its array 'm' is one of shape"):
+        solve(ring(20, params={"m": masses + 1e-3}, **options), flow, (0, 5), y0)
 
 
 def test_ends_at_which_the_numbers_do_not_hold_are_refused(flow, monkeypatch):

@@ -53,22 +53,47 @@ def fold(R, columns, first, last, triangular):
 
 
 @njit(**OPTIONS)
-def factored(J, r, scale):
-    """The triangle R (n + 1, n + 1) of [J r], J (n, m) by columns, and the larger of `scale` (n,) and their norms."""
-    n, m = J.shape
-    R, columns = np.zeros((n + 1, n + 1)), np.empty((n + 1, m))
-    for i in range(n):
+def fold_chunks(R, columns, first, last):
+    for start in range(first, last, CHUNK):
+        fold(R, columns, start, min(start + CHUNK, last), False)
+
+
+@njit(**OPTIONS)
+def factored(columns, blocks, r, scale):
+    """The triangle R (n + 1, n + 1) of [J r], and the larger of `scale` (n,) and the norms of the columns of J.
+
+    J is given by columns (n, m); or in as many blocks of rows as `blocks` (B, k, n) are, each the rows of the columns
+    (k, m) times its block: then it is these that are factored first, where k is less than n.
+    """
+    k, m = columns.shape
+    n = blocks.shape[2] if len(blocks) > 0 else k
+    whole = np.empty((k + 1, m))
+    for i in range(k):
         for j in range(m):
-            columns[i, j] = J[i, j]
+            whole[i, j] = columns[i, j]
     for j in range(m):
-        columns[n, j] = r[j]
-    for first in range(0, m, CHUNK):
-        fold(R, columns, first, min(first + CHUNK, m), False)
+        whole[k, j] = r[j]
+    R = np.zeros((n + 1, n + 1))
+    if len(blocks) > 0:
+        size, rows = m // len(blocks), np.zeros((n + 1, k + 1))
+        for b in range(len(blocks)):
+            inner = np.zeros((k + 1, k + 1))
+            fold_chunks(inner, whole, b * size, (b + 1) * size)
+            for row in range(k + 1):
+                for i in range(n):
+                    rows[i, row] = 0.0
+                for j in range(row, k):
+                    for i in range(n):
+                        rows[i, row] += inner[row, j] * blocks[b, j, i]
+                rows[n, row] = inner[row, k]
+            fold(R, rows, 0, k + 1, False)
+    else:
+        fold_chunks(R, whole, 0, m)
     larger = np.empty(n)
     for i in range(n):
         square = 0.0
-        for k in range(i + 1):
-            square += R[k, i] * R[k, i]
+        for j in range(i + 1):
+            square += R[j, i] * R[j, i]
         norm = math.sqrt(square)
         larger[i] = scale[i] if scale[i] > norm else norm
     return R, larger
@@ -119,15 +144,27 @@ def damped(R, D, damping):
 
 
 @njit(**OPTIONS)
-def bent(J, r, probed, probe, step, S, D, curved):
+def bent(columns, blocks, r, probed, probe, step, S, D, curved):
     """The geodesic acceleration, from the errors `probed` a share `probe` of the step away; 0 if it is too large."""
-    n = len(J)
-    curvature = probed - r
-    for i in range(n):
-        subtract(curvature, probe * step[i], J[i])
-    slope = np.empty(n)
-    for i in range(n):
-        slope[i] = -dot(J[i], curvature) / (probe * probe)
+    k, m = columns.shape
+    n = len(D)
+    n_blocks = max(len(blocks), 1)
+    size = m // n_blocks
+    curvature, slope, inner = probed - r, np.zeros(n), step
+    for b in range(n_blocks):
+        part = curvature[b * size : (b + 1) * size]
+        if len(blocks) > 0:
+            inner = np.empty(k)
+            for i in range(k):
+                inner[i] = dot(blocks[b, i], step)
+        for i in range(k):
+            subtract(part, probe * inner[i], columns[i, b * size : (b + 1) * size])
+        for i in range(k):
+            along = dot(columns[i, b * size : (b + 1) * size], part) / (probe * probe)
+            if len(blocks) > 0:
+                subtract(slope, along, blocks[b, i])
+            else:
+                slope[i] -= along
     bend = solved(S, solved_transposed(S, slope))
     of_bend = of_step = 0.0
     for i in range(n):

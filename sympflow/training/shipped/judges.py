@@ -147,9 +147,14 @@ class ByCertificate:
 
     t_end: float = 1000.0
     cost: Cost = primed_cost
+    states: int = 2000
+    times: int = 33
+    held_out: int = HELD_OUT
 
     def __call__(self, flow: SympFlow, system: HamiltonianSystem) -> None:
-        certificate = flow.certificate(system, t_end=self.t_end, held_out=HELD_OUT)
+        certificate = flow.certificate(
+            system, states=self.states, times=self.times, held_out=self.held_out, t_end=self.t_end
+        )
         flow.figures |= {
             "one_step_error_median": certificate.one_step_error.median,
             "one_step_error_max": certificate.one_step_error.largest,
