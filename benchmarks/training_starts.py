@@ -55,7 +55,7 @@ def measured(name: str, curvature: bool, starts: int) -> dict[str, float]:
 
 
 def in_tree(tree: Path, arguments: list[str]) -> dict[str, Any]:
-    """What this script measures with the package of a working tree."""
+    """The rows of this script with the package of a working tree."""
     command = [sys.executable, __file__, "--rows", *arguments]
     environment = os.environ | {"PYTHONPATH": str(tree.resolve())}
     return json.loads(subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout)

@@ -25,7 +25,7 @@ HALVINGS, POWERS = 60, 12
 DRAWN = 200
 """States of another domain from which densities are taken."""
 SHARE = 0.05
-"""Of these, at both ends, that are left out."""
+"""Share of these that is left out at either end."""
 
 
 @dataclass(frozen=True)

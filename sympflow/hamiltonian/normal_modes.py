@@ -13,7 +13,7 @@ from scipy import fft, fftpack
 from sympflow.arrays import Array, is_tensor
 
 ZERO = 1e-12
-"""Of the largest squared frequency: what is below is a free drift, as of `LinearPart`."""
+"""Share of the largest squared frequency below which a mode drifts freely, as in `LinearPart`."""
 
 
 class Transform:

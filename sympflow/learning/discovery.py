@@ -2,15 +2,8 @@
 
 A first model is a regression of smoothed derivatives. From there terms are added and dropped one at a time. Each model
 on the way is refined by shooting from latent initial states (`latent_states`), so that the noise of the states biases
-no coefficient; the linearized problem tells at once what each term that is missing would gain. The extended criterion
-of [2]_ decides, which counts how many terms there were to choose from.
-
-References
-----------
-.. [1] S. L. Brunton, J. L. Proctor, J. N. Kutz, Discovering governing equations from data by sparse identification of
-   nonlinear dynamical systems, PNAS 113 (2016) 3932–3937.
-.. [2] J. Chen, Z. Chen, Extended Bayesian information criteria for model selection with large model spaces,
-   Biometrika 95 (2008) 759–771.
+no coefficient; the linearized problem tells at once what each term that is missing would gain. The extended
+Bayesian criterion decides, which counts how many terms there were to choose from.
 """
 
 from __future__ import annotations
@@ -246,6 +239,13 @@ def discover(
     ------
     ValueError
         If there are fewer values than terms, or data or terms cannot be read.
+
+    References
+    ----------
+    .. [1] S. L. Brunton, J. L. Proctor, J. N. Kutz, Discovering governing equations from data by sparse identification
+       of nonlinear dynamical systems, PNAS 113 (2016) 3932–3937, for the regression that comes first.
+    .. [2] J. Chen, Z. Chen, Extended Bayesian information criteria for model selection with large model spaces,
+       Biometrika 95 (2008) 759–771.
     """
     if isinstance(data, FlowMap):
         if reading or noise is not None:

@@ -15,13 +15,13 @@ HARMONICS = (1, 2, 3, 4, 6, 8)
 WIDTHS = (6, 12, 24)
 WHOLE_WIDTHS = (12, 24, 40)
 POWERS = ((-1,), (-2, -1, 0, 1, 2))
-"""Of the distances of pairs, 0 for the logarithm."""
+"""Powers of the distances of pairs, 0 for the logarithm."""
 MOST_TERMS = 400
 
 
 @dataclass(frozen=True)
 class Said:
-    """What is known of H.
+    """Knowledge of H.
 
     Attributes
     ----------

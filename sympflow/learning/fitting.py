@@ -212,7 +212,7 @@ class Held:
 
     @property
     def pieces(self) -> tuple[Run, ...]:
-        """What was followed in one piece."""
+        """The pieces of trajectories, each followed as one orbit."""
         return self.fit.problem.data.runs
 
     @property

@@ -130,6 +130,12 @@ def learn(
     UserWarning
         If the residuals of the best model are no noise; with what a vector field that need not be Hamiltonian leaves of
         them, and the likeliest reason.
+
+    References
+    ----------
+    .. [1] H. G. Bock, Recent advances in parameter identification techniques for O.D.E., in: Numerical Treatment of
+       Inverse Problems in Differential and Integral Equations (1983) 95–121, for the shooting.
+    .. [2] G. Schwarz, Estimating the dimension of a model, Ann. Statist. 6 (1978) 461–464, for the terms that are kept.
     """
     data = Trajectories.read(trajectories, ndof)
     data.check_moving()

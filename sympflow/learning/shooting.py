@@ -50,7 +50,7 @@ class Stepper(ABC):
     """One step of a scheme, with the derivatives of its end by the initial state and by θ."""
 
     cost: float
-    """Of a step, in evaluations of the force with its derivatives."""
+    """Cost of a step, in evaluations of the force with its derivatives."""
 
     @abstractmethod
     def step(self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
@@ -475,7 +475,7 @@ class Fit:
         return np.sqrt(np.nansum(r * r, axis=1) / np.maximum(seen.sum(axis=1), 1) / free)
 
     def covariance(self) -> np.ndarray:
-        """Of θ (n, n), where σ is the noise."""
+        """The covariance of θ (n, n), where σ is the noise."""
         return np.linalg.pinv(self.normal.precision(), hermitian=True)
 
 
@@ -637,7 +637,7 @@ def _whole(run: Run) -> Run:
 def _increments(
     model: Field, theta: np.ndarray, pieces: Sequence[Run], weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What the field does not explain of the increments, and minus its derivative by θ."""
+    """The increments less the integrals of the field, and minus their derivative by θ."""
     f = model.field(theta, np.concatenate([run.y for run in pieces], axis=1), False, True)
     assert f.by_parameters is not None
     at, rests, columns = 0, [], []

@@ -534,7 +534,7 @@ def _rows(order: str | Sequence[int], width: int) -> list[int]:
 
 
 def _factors(units: Mapping[str, str | float] | None, names: tuple[str, ...]) -> tuple[np.ndarray, float]:
-    """What the coordinates and the times are multiplied by."""
+    """The factors of the coordinates (2d,) and of the times that convert the units."""
     d, factors, of_time = len(names) // 2, np.ones(len(names)), 1.0
     for name, unit in (units or {}).items():
         factor = _factor(name, unit)

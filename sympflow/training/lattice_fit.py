@@ -19,7 +19,6 @@ from sympflow.hamiltonian.lattice import BOUNDARIES
 from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors
-from sympflow.training.session import Session
 
 MOST_FITTED = 16
 """Degrees of freedom up to which a lattice is fitted as it is, and not by a piece."""
@@ -28,9 +27,9 @@ MOST_JUDGED = 1024
 NUMBERS = 16_000
 """Numbers of the states of a judgement, together."""
 FEWEST, MOST_ORBITS, MOST_STATES, TIMES, CERTIFIED = 8, 40, 200, 9, 250
-"""Of the certificate: orbits, states, times in [0, Δt], and the steps of the orbits."""
+"""The certificate: fewest and most orbits, states, times in [0, Δt], and the steps of the orbits."""
 STEPS, SEEN, COPIES, ENDS_STATES = 200, 5, 4, 16
-"""Of the energy errors at ends: steps, how many of them are between two looks, pieces in a row, and states."""
+"""Energy errors at ends: steps, steps between two looks, pieces in a row, and states."""
 
 
 def on_piece(system: HamiltonianSystem) -> bool:
@@ -84,7 +83,7 @@ class Piece:
         made.recipe, made.figures = dict(flow.recipe), dict(flow.figures)
         return made
 
-    def whole(self, fitted: PrimedFlow, session: Session) -> PrimedFlow:
+    def whole(self, fitted: PrimedFlow) -> PrimedFlow:
         """The flow of the lattice with the numbers that were fitted, and what it achieves there."""
         flow = fitted.of_lattice(self.lattice)
         flow.domain = self.states

@@ -78,7 +78,7 @@ RANGED = {
 @pytest.mark.parametrize("level", [FORCE_GRADIENT, CURVATURE])
 @pytest.mark.parametrize("name", RANGED)
 def test_kicks_in_ranges_of_positions_are_the_same_but_for_rounding(name, level):
-    """Those of a trajectory and of lanes, in the ranges and beyond."""
+    """Kicks of a trajectory and of lanes, in the ranges and beyond."""
     make, ranges = RANGED[name]
     system = make()
     functions = ELEMENTARY | {"fast_exp": math.exp, "fast_tanh": math.tanh}

@@ -116,7 +116,7 @@ def test_bad_arguments_are_refused():
 
 
 def test_the_slope_of_the_cost_is_that_of_differences():
-    """Of H(q, p) that is not separable, by a coefficient and an initial state."""
+    """An H(q, p) that is not separable, by a coefficient and an initial state."""
     library = Library([p**2, q**2, p**2 * q**2, sp.cos(q)], 1)
     theta, sigma = np.array([0.5, 0.4, 0.1, -0.2]), np.array([0.1, 0.2])
     random = np.random.default_rng(0)

@@ -19,7 +19,7 @@ MASS, STIFF, QUARTIC, RATE = 2.0, 1.5, 0.7, 0.2
 
 
 def trajectories(n, points, rate=0.0, noise=0.0, span=2.0, seed=0):
-    """Of H = p²/4 + 0.75 q² + 0.175 q⁴ at irregular times, with friction."""
+    """Trajectories of H = p²/4 + 0.75 q² + 0.175 q⁴ at irregular times, with friction."""
     rng = np.random.default_rng(seed)
 
     def field(t, y):
@@ -62,7 +62,7 @@ def test_shooting_finds_h_to_rounding(clean):
 
 @pytest.mark.parametrize("rates", [0, 1])
 def test_derivatives_are_those_of_the_orbits(clean, rates):
-    """Of a splitting scheme and of collocation, by the initial state and by θ, against differences."""
+    """A splitting scheme and collocation, by the initial state and by θ, against differences."""
     model = quartic(clean, rates)
     theta, problem_ = problem(model, clean, clean.scales)
     batch, states = problem_.batches[0], first_states(clean)
@@ -300,7 +300,7 @@ def test_a_killed_run_goes_on_from_its_checkpoint(tmp_path):
 
 
 def test_data_of_no_hamiltonian_are_called_so():
-    """Of a damped oscillator, without a word of friction: the areas shrink at its rate."""
+    """A damped oscillator, without a word of friction: the areas shrink at its rate."""
     data = Trajectories.read(trajectories(8, 15, rate=RATE))
     search = Search(data, *data.split(0.2, 0), _said(data, None, None, False, None, None), Setting(), 0)
     search.run(["polynomial"], Session())

@@ -73,7 +73,7 @@ def test_curvature_is_taken_where_its_error_is_worth_its_cycles(monkeypatch):
 
 
 def test_another_shape_is_taken_where_its_error_is_less_at_as_many_kicks(monkeypatch):
-    """Of the best Δt and with its terms, with Δt in proportion to the kicks; and found again where a run goes on."""
+    """Other shapes have the best Δt and its terms, Δt in proportion to the kicks; a continued run finds them again."""
     chosen = law(monkeypatch, lambda x, c: 1e-9 * x**3)
     assert chosen == trials.tried_starts(HH, HH.domain, curvature=False)[-1]
     others = trials.shaped(chosen)
