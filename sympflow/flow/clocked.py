@@ -162,6 +162,9 @@ class ClockedFlow(SympFlow):
             self._check(system)
             self.identify(system)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_loops": None}  # copies and pickles make their own
+
     @staticmethod
     def _check(system: HamiltonianSystem) -> None:
         check_for_flows(system)

@@ -15,6 +15,7 @@ FAMILIES = {
     "sympflow": "sympflow.flow.sympflow:SympFlow",
     "primed": "sympflow.flow.primed:PrimedFlow",
     "split": "sympflow.flow.split:SplitFlow",
+    "timed": "sympflow.flow.timed:TimedSympFlow",
     "clocked": "sympflow.flow.clocked:ClockedFlow",
     "mlp": "sympflow.flow.mlp:MLPFlow",
 }
@@ -23,7 +24,7 @@ FAMILIES = {
 KINDS = ("sympflow", "mlp")
 """The kinds that files name, which are the methods that run the flows: SympFlows, and their baseline."""
 
-_OF_SYMPFLOW = ("split", "clocked", "primed")
+_OF_SYMPFLOW = ("split", "clocked", "primed", "timed")
 
 
 def family(name: str) -> Any:

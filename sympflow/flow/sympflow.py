@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
@@ -97,21 +97,12 @@ class SympFlow(FlowMap):
         scale: Scaling | None = None,
     ) -> None:
         super().__init__(ndof, dt)
-        ndof, pairs, dt, seed = self.ndof, plain(pairs), self.dt, plain(seed)
-        if isinstance(pairs, bool) or not isinstance(pairs, int) or pairs < 1:
-            raise ValueError(f"`pairs` must be a positive integer, the number of kick–drift pairs; got {pairs!r}.")
-        scale = Scaling.unit(ndof, dt) if scale is None else scale
-        if len(scale.q) != ndof:
-            raise ValueError(f"`scale` is for {len(scale.q)} degrees of freedom, not {ndof}: give one entry for each.")
-        generator = torch.Generator().manual_seed(seed)
-        if 2 * pairs > MAX_LAYERS:
-            raise ValueError(f"`pairs` must be at most {MAX_LAYERS // 2}, as many as a file may hold; got {pairs!r}.")
-        weights = 2 * pairs * count_weights(ndof, widths := hidden_widths(hidden))
-        check_memory(f"`hidden` {widths!r} with `pairs` {pairs}", weights, "take narrower layers, or fewer pairs")
+        scale = Scaling.unit(self.ndof, self.dt) if scale is None else scale
+        generator = torch.Generator().manual_seed(plain(seed))
 
-        def potential(unit: tuple[float, ...], center: tuple[float, ...] | None) -> MLPPotential:
+        def potential(unit: tuple[float, ...], center: tuple[float, ...]) -> MLPPotential:
             return MLPPotential(
-                ndof,
+                self.ndof,
                 hidden,
                 activation,
                 scale=unit,
@@ -123,11 +114,7 @@ class SympFlow(FlowMap):
                 generator=generator,
             )
 
-        self.layers = nn.ModuleList(
-            layer
-            for _ in range(pairs)
-            for layer in (Kick(potential(scale.q, scale.q_center)), Drift(potential(scale.p, scale.p_center)))
-        )
+        self.layers = pairs_of_layers(self.ndof, pairs, hidden, scale, potential)
 
     @classmethod
     def from_layers(cls, layers: Iterable[Layer], dt: float) -> Self:
@@ -351,6 +338,51 @@ class SympFlow(FlowMap):
             device=device,
         )
 
+    @staticmethod
+    def timed(
+        system: HamiltonianSystem,
+        pairs: int = 3,
+        *,
+        hidden: Sequence[int] = (10, 10),
+        activation: str = "tanh",
+        dt: float = 1.0,
+        harmonics: int = 2,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+        seed: int = 0,
+        scale: Scaling | None = None,
+    ) -> Any:
+        """Return a `TimedSympFlow`, of networks for a driven system: their potentials take the time of the state too.
+
+        The time t0 enters by cos(2πk t0/T) and sin(2πk t0/T) where H has a period T; else by its place in `t_span`.
+
+        Parameters
+        ----------
+        system : HamiltonianSystem
+            Driven, of any form.
+        harmonics : int
+            The largest k.
+        pairs, hidden, activation, dt, dtype, device, seed, scale
+            As for `SympFlow`.
+
+        Raises
+        ------
+        ValueError
+            If H does not depend on t, or an argument is not admissible.
+        """
+        return family("timed").untrained(
+            system,
+            pairs,
+            harmonics,
+            hidden=hidden,
+            activation=activation,
+            dt=dt,
+            dtype=dtype,
+            device=device,
+            seed=seed,
+            scale=scale,
+        )
+
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.ndof, "layers": [layer.to_dict() for layer in self.layers]}  # type: ignore[operator]
 
@@ -399,31 +431,79 @@ class SympFlow(FlowMap):
     def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """`hamiltonian` without checks, for inner loops."""
         t, y, batch = self._columns(t, self.lift(x, t0, t))
-        q, p = y.chunk(2)
+        q, p = self._opened(y, t)
         H = torch.zeros_like(y[0])
         for layer in reversed(self.layers):
             q, p, rate = layer.pull_back(t, q, p)  # type: ignore[operator]
             H = H + rate
         return H.reshape(batch)
 
-    def _map(self, t: float | Tensor, y: Tensor) -> Tensor:
+    def _opened(self, y: Tensor, passed: float | Tensor) -> tuple[Tensor, Tensor]:
+        """The q and p that the layers take, of columns y at a time `passed` after t0."""
         q, p = y.chunk(2)
-        for layer in self.layers:
-            q, p = layer(t, q, p)
-        return torch.cat([q, p])
+        return q, p
+
+    def _map(self, t: float | Tensor, y: Tensor) -> Tensor:
+        return torch.cat(self._forwards(t, *y.chunk(2)))
 
     def _map_inverse(self, t: float | Tensor, y: Tensor) -> Tensor:
-        q, p = y.chunk(2)
-        for layer in reversed(self.layers):
-            q, p = layer.inverse(t, q, p)  # type: ignore[operator]
-        return torch.cat([q, p])
+        return torch.cat(self._backwards(t, *y.chunk(2)))
 
     def _map_tangent(self, t: float | Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        q, p = y.chunk(2)
+        q, p, dq, dp = self._tangents(t, *y.chunk(2))
+        return torch.cat([q, p]), torch.cat([dq, dp])
+
+    def _forwards(self, t: float | Tensor, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        """All layers in turn."""
+        for layer in self.layers:
+            q, p = layer(t, q, p)
+        return q, p
+
+    def _backwards(self, t: float | Tensor, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        """The inverses of all layers, the last first."""
+        for layer in reversed(self.layers):
+            q, p = layer.inverse(t, q, p)  # type: ignore[operator]
+        return q, p
+
+    def _tangents(self, t: float | Tensor, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """All layers in turn, and the derivatives by t."""
         dq, dp = torch.zeros_like(q), torch.zeros_like(p)
         for layer in self.layers:
             q, p, dq, dp = layer.tangent(t, q, p, dq, dp)  # type: ignore[operator]
-        return torch.cat([q, p]), torch.cat([dq, dp])
+        return q, p, dq, dp
+
+
+def pairs_of_layers(
+    ndof: int,
+    pairs: Any,
+    hidden: Sequence[int],
+    scale: Scaling,
+    potential: Callable[[tuple[float, ...], tuple[float, ...]], Potential],
+    features: int = 0,
+) -> nn.ModuleList:
+    """Return pairs of a kick and a drift, with potentials made of a unit and a center of q or p.
+
+    `features` is the number of further inputs of each network.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not admissible, or the networks would take more memory than there is.
+    """
+    pairs = plain(pairs)
+    if isinstance(pairs, bool) or not isinstance(pairs, int) or pairs < 1:
+        raise ValueError(f"`pairs` must be a positive integer, the number of kick–drift pairs; got {pairs!r}.")
+    if len(scale.q) != ndof:
+        raise ValueError(f"`scale` is for {len(scale.q)} degrees of freedom, not {ndof}: give one entry for each.")
+    if 2 * pairs > MAX_LAYERS:
+        raise ValueError(f"`pairs` must be at most {MAX_LAYERS // 2}, as many as a file may hold; got {pairs!r}.")
+    weights = 2 * pairs * count_weights(ndof + features, widths := hidden_widths(hidden))
+    check_memory(f"`hidden` {widths!r} with `pairs` {pairs}", weights, "take narrower layers, or fewer pairs")
+    return nn.ModuleList(
+        layer
+        for _ in range(pairs)
+        for layer in (Kick(potential(scale.q, scale.q_center)), Drift(potential(scale.p, scale.p_center)))
+    )
 
 
 def _potential_of(layer: Any) -> dict[str, Any]:

@@ -87,7 +87,7 @@ def check_for_flows(system: Hamiltonian, takes_friction: bool = False, takes_dri
         )
     if not takes_driving:
         system.check_autonomous(
-            "which trained flows take only where they are primed, with H = ½ pᵀM⁻¹p + V(q, t)",
+            "which primed flows take, with H = ½ pᵀM⁻¹p + V(q, t), and networks of SympFlow.timed(system), no others",
             "fit such a flow by sympflow.train(system), or use a splitting method such as 'verlet' or 'kahan_li8'",
         )
 

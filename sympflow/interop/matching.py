@@ -81,18 +81,19 @@ class Comparison:
                 f"differ ({other!r} and {mine!r}). {self.remedy}"
             )
 
-    def with_flow(self, y: np.ndarray) -> None:
+    def with_flow(self, y: np.ndarray, t: float) -> None:
         """Compare the velocity of a flow that knows no system with that of the system it shall solve.
 
         Raises
         ------
         ValueError
-            If they differ at y (2d,) or in the domain of the flow.
+            If they differ at y (2d,) or in the domain of the flow; of a driven system at the time t.
         """
         if self.flow is None or self.system is None or self.flow.fingerprint is not None:
             return
         states = np.concatenate([y[None], _drawn(self.flow.domain_for(self.system), y.size)])
-        self._close_to_flow(np.zeros(len(states)), states, self.system.vector_field(states))
+        times = np.full(len(states), t)
+        self._close_to_flow(times, states, self.system.vector_field(states, times))
 
     def at_start(
         self, fun: RightHandSide, y0: np.ndarray, t_span: tuple[float, float], given: Callable[..., Any] | None = None
@@ -243,7 +244,8 @@ class Comparison:
             return
         self.states_compared += len(states)
         with torch.no_grad():
-            velocity = to_numpy(self.flow.initial_velocity(torch.from_numpy(states.copy()).to(self.flow.dtype)))
+            x = torch.from_numpy(states.copy()).to(self.flow.dtype)
+            velocity = to_numpy(self.flow.initial_velocity(x, torch.from_numpy(times)))
         largest = np.maximum(np.abs(slope).max(-1), np.abs(velocity).max(-1))
         best, worst = OF_A_FLOW
         measured = self.flow.figures.get("one_step_error")

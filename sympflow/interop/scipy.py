@@ -177,7 +177,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
             slope = np.asarray(self.fun(self.t, self.y), dtype=float)
         if slope.shape != self.y.shape:
             raise ValueError(f"`fun` must return shape {self.y.shape}, as `y0`; got {slope.shape}.")
-        self._comparison.with_flow(self.y)
+        self._comparison.with_flow(self.y, self.t)
         self._fun: Any = None if fun is self._solved else fun  # None: there is nothing to compare
         if self._fun is not None:
             self._comparison.at_start(self._slope, self.y, (self.t, self.t_bound), fun)

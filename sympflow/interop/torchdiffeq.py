@@ -450,7 +450,7 @@ class _Compared:
         start = one_lane(y).reshape(-1, y.shape[-1])[0]
         training = flow is not None and any(w.requires_grad or differentiable(w) for w in flow.parameters())
         if flow is not None and not training:
-            comparison.with_flow(start.astype(float))
+            comparison.with_flow(start.astype(float), float(one_lane(t)[0]))
         self.func: Any = None if func is system else _of_pairs(func, y0)
         if self.func is None:
             return

@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.parts import ExactParts, Map
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.loop_functions import LoopFunctions
 from sympflow.kernels.parts_loops import parts_loops
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
-from sympflow.kernels.splitting_loops import LoopFunctions, SplittingKernel, splitting_loops
+from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
 from sympflow.kernels.stages import StageTable, run_table, single_table, with_last_stage
 from sympflow.kernels.timed_loops import reach_times
 from sympflow.schemes import CURVATURE, Scheme

@@ -11,8 +11,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.loop_functions import damped_drift
 from sympflow.kernels.modules import load_algebra, run_rows, template
-from sympflow.kernels.splitting_loops import damped_drift, damped_table, splitting_loops
+from sympflow.kernels.splitting_loops import damped_table, splitting_loops
 from sympflow.kernels.stages import DampedDrift, kicks_of, lanes_source, run_table, stages_source, two_stages_source
 from sympflow.schemes import Scheme
 

@@ -12,8 +12,8 @@ import numpy as np
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import algebra_source, statements
+from sympflow.kernels.loop_functions import symbolic_module
 from sympflow.kernels.modules import load_algebra, run_one, run_rows
-from sympflow.kernels.splitting_loops import symbolic_module
 from sympflow.kernels.stages import run_table, step_table
 from sympflow.kernels.terms import is_large
 from sympflow.schemes import Scheme

@@ -24,6 +24,7 @@ class Loss:
     L1 = mean ‖d/dt ψ̄_t(x) − J∇H(ψ̄_t(x))‖², the residual of the flow; L2 = mean (𝓗(ψ̄)(t, x) − H(x))², Hamiltonian
     matching, less its mean over x at each t, as 𝓗 is defined up to a function of t; L3 = mean ‖ψ̄_t(x) − φ_H,t(x)‖² at
     labelled points. All are divided by the units of the scaling: x by its spread over Ω, t by Δt, H by action / Δt.
+    Of a driven system x is a state at t0, and the field and H are those at t0 + t.
 
     Parameters
     ----------
@@ -45,39 +46,36 @@ class Loss:
     label_weight: float = 0.0
 
     def __post_init__(self) -> None:
-        self.system.check_autonomous(
-            "and the losses compare at no time of it", "fit a primed flow to its labels, optimizer='gauss-newton'"
-        )
         if self.matching_weight:
             self.system.check_conservative(
                 "with which a flow is that of no Hamiltonian, so there is none to match",
                 "pass matching_weight=0, or fit by the labels",
             )
 
-    def residual(self, flow: FlowMap, t: Tensor, x: Tensor) -> Tensor:
+    def residual(self, flow: FlowMap, t: Tensor, x: Tensor, t0: Tensor | None = None) -> Tensor:
         """(d/dt ψ̄_t(x) − J∇H(ψ̄_t(x))) Δt/s: (..., 2d)."""
-        y, velocity = flow.psi_and_velocity(t, x)
+        y, velocity = flow.psi_and_velocity(t, x, t0)
         unit = torch.tensor(self.scaling.x, dtype=y.dtype, device=y.device) / self.scaling.t
-        return (velocity - self.system.vector_field(y)) / unit
+        return (velocity - self.system.vector_field(y, _later(t0, t, y))) / unit
 
-    def mismatch(self, flow: SympFlow, t: Tensor, x: Tensor) -> Tensor:
+    def mismatch(self, flow: SympFlow, t: Tensor, x: Tensor, t0: Tensor | None = None) -> Tensor:
         """(𝓗(ψ̄)(t, x) − H(x)) Δt/action, not yet less c(t): (...)."""
-        H = flow.hamiltonian_unchecked(t, x)
-        return (H - self.system.hamiltonian(x)) * (self.scaling.t / self.scaling.action)
+        H = flow.hamiltonian_unchecked(t, x, t0)
+        return (H - self.system.hamiltonian(x, _later(t0, t, x))) * (self.scaling.t / self.scaling.action)
 
-    def label_error(self, flow: FlowMap, t: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    def label_error(self, flow: FlowMap, t: Tensor, x: Tensor, y: Tensor, t0: Tensor | None = None) -> Tensor:
         """(ψ̄_t(x) − y)/s: (..., 2d)."""
         unit = torch.tensor(self.scaling.x, dtype=y.dtype, device=y.device)
-        return (flow.psi(t, x) - y) / unit
+        return (flow.psi(t, x, t0) - y) / unit
 
     def terms(self, flow: FlowMap, points: Points) -> Terms:
         """L1, L2 and L3, None where the weight is 0."""
         L1 = L2 = L3 = None
         if self.residual_weight:
-            L1 = self.residual(flow, points.t, points.x).square().sum(-1).mean()
+            L1 = self.residual(flow, *points.residual).square().sum(-1).mean()
         if self.matching_weight:
             assert isinstance(flow, SympFlow)  # train refuses a matching weight for any other
-            L2 = _less_mean(self.mismatch(flow, points.matching_t, points.matching_x)).square().mean()
+            L2 = _less_mean(self.mismatch(flow, *points.matching)).square().mean()
         if self.label_weight:
             assert points.labels is not None
             L3 = self.label_error(flow, *points.labels).square().sum(-1).mean()
@@ -92,6 +90,11 @@ class Loss:
     def __call__(self, flow: FlowMap, points: Points) -> Tensor:
         """L at the points."""
         return self.total(self.terms(flow, points))
+
+
+def _later(t0: Tensor | None, t: Tensor, x: Tensor) -> Tensor | None:
+    """t0 + t of states x, None of a system that is not driven."""
+    return None if t0 is None else (t0 + t).expand(x.shape[:-1])
 
 
 def never() -> None:
@@ -142,10 +145,11 @@ class Objective:
         loss, points = self.loss, self.points
         blocks = []
         if loss.residual_weight:
-            blocks.append(_Block(loss.residual_weight, loss.residual, (points.t, points.x)))
+            blocks.append(_Block(loss.residual_weight, loss.residual, points.residual))
         if loss.matching_weight:
-            t = points.matching_t.expand(points.matching_x.shape[:2]).reshape(-1)
-            blocks.append(_Block(loss.matching_weight, loss.mismatch, (t, points.matching_x.flatten(0, 1)), True))
+            t, x, *t0 = points.matching
+            t, *t0 = (s.expand(x.shape[:2]).reshape(-1) for s in (t, *t0))
+            blocks.append(_Block(loss.matching_weight, loss.mismatch, (t, x.flatten(0, 1), *t0), True))
         if loss.label_weight:
             assert points.labels is not None
             blocks.append(_Block(loss.label_weight, loss.label_error, points.labels))

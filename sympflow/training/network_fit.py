@@ -29,6 +29,7 @@ from sympflow.training.points import (
     Stream,
     parted,
     shares_missed,
+    start_times,
     states,
 )
 from sympflow.training.runs import INTERRUPTED, LABEL_SHARE, OUT_OF_TIME, Advance, Run
@@ -46,7 +47,8 @@ class LossRun(Run):
     Attributes
     ----------
     held_out, reference
-        Points of the losses that are never trained on; states, and where the exact flow takes them in Δt.
+        Points of the losses that are never trained on; states, where the exact flow takes them in Δt, and of a driven
+        system the times of the states.
     step : int
         Steps taken.
     best : dict
@@ -60,7 +62,7 @@ class LossRun(Run):
     loss: Loss
     source: PointSource
     held_out: Points
-    reference: tuple[Tensor, Tensor]
+    reference: tuple[Tensor, ...]
     optimizer: Optimizer
     step: int = 0
     best: dict[str, Tensor] = field(default_factory=dict)
@@ -100,16 +102,18 @@ class LossRun(Run):
                 labels, unseen = parted(data, options.seed)
         common = (options.matching_times, options.seed, flow.dtype, flow.device)
         block = 1 if options.refresh is None else BLOCK
-        source = PointSource(domain, flow.dt, options.points, *common, block=block, labels=labels)
+        source = PointSource(domain, flow.dt, options.points, *common, block=block, labels=labels, system=system)
         streams = (Stream.VALIDATION, Stream.VALIDATION)
         held_out = PointSource(
-            domain, flow.dt, options.validation_points, *common, streams=streams, block=1, labels=unseen
+            domain, flow.dt, options.validation_points, *common, streams=streams, block=1, labels=unseen, system=system
         )(0)
         start = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
-        end = _end_of_step(system, start, flow.dt, deadline.part(LABEL_SHARE))
+        t0 = start_times(system, flow.dt, len(start), options.seed, Stream.REFERENCE)
+        end = _end_of_step(system, start, flow.dt, deadline.part(LABEL_SHARE), t0)
         exists = np.isfinite(end).all(-1)
-        x, y = (torch.as_tensor(a[exists], dtype=flow.dtype, device=flow.device) for a in (start, end))
-        return cls(flow, system, domain, scaling, options, loss, source, held_out, (x, y), method)
+        known = (start, end) if t0 is None else (start, end, t0)
+        reference = tuple(torch.as_tensor(a[exists], dtype=flow.dtype, device=flow.device) for a in known)
+        return cls(flow, system, domain, scaling, options, loss, source, held_out, reference, method)
 
     @property
     def done(self) -> int:
@@ -184,20 +188,21 @@ class LossRun(Run):
         return self._best_figures()
 
     def missed(self) -> tuple[float, float] | None:
-        x, _ = self.reference
-        return self._share(self.flow.psi(self.flow.dt, x).detach()) if len(x) else None
+        x, _, *t0 = self.reference
+        return self._share(self.flow.psi(self.flow.dt, x, *t0).detach()) if len(x) else None
 
     def missed_by_verlet(self) -> tuple[float, float] | None:
-        x, _ = self.reference
+        x, _, *t0 = self.reference
         if not (len(x) and self.system.separable):
             return None
         (q, p), dt = x.chunk(2, -1), self.flow.dt
-        q = q + dt / 2 * self.system.velocity(p)
-        p = p + dt * self.system.force(q)
-        return self._share(torch.cat([q + dt / 2 * self.system.velocity(p), p], -1).detach())
+        middle = [t + dt / 2 for t in t0]
+        q = q + dt / 2 * self.system.velocity(p, *middle)
+        p = p + dt * self.system.force(q, *middle)
+        return self._share(torch.cat([q + dt / 2 * self.system.velocity(p, *middle), p], -1).detach())
 
     def _share(self, end: Tensor) -> tuple[float, float]:
-        x, y = (states.cpu().double().numpy() for states in self.reference)
+        x, y = (states.cpu().double().numpy() for states in self.reference[:2])
         labels = Labels(np.array([self.flow.dt]), x, y[None])
         return shares_missed(end.cpu().double().numpy() - y, labels, np.array(self.scaling.x))
 
@@ -240,9 +245,9 @@ class LossRun(Run):
         for name, term in zip(("residual_loss", "matching_loss", "label_loss"), terms, strict=True):
             if term is not None:
                 figures[name] = float(term)
-        x, y = self.reference
+        x, y, *t0 = self.reference
         if len(x):
-            error = torch.linalg.vector_norm(self.flow.psi(self.flow.dt, x) - y, dim=-1)
+            error = torch.linalg.vector_norm(self.flow.psi(self.flow.dt, x, *t0) - y, dim=-1)
             figures |= {"one_step_error": float(error.mean()), "one_step_error_max": float(error.max())}
         return figures
 
@@ -290,13 +295,17 @@ def _first(points: Points, n: int) -> Points:
     """The first n points, and of the other losses as large a share."""
     m = max(2, points.matching_x.shape[1] * n // len(points.t))
     labels = None if points.labels is None else tuple(a[:n] for a in points.labels)
-    return Points(points.t[:n], points.x[:n], points.matching_t, points.matching_x[:, :m], labels)  # type: ignore[arg-type]
+    t0 = None if points.t0 is None else points.t0[:n]
+    matching = points.matching_t, points.matching_x[:, :m]
+    return Points(points.t[:n], points.x[:n], *matching, labels, t0, points.matching_t0)
 
 
-def _end_of_step(system: HamiltonianSystem, x: np.ndarray, dt: float, deadline: Deadline) -> np.ndarray:
+def _end_of_step(
+    system: HamiltonianSystem, x: np.ndarray, dt: float, deadline: Deadline, t0: np.ndarray | None
+) -> np.ndarray:
     """φ_H,Δt(x), NaN if there is no time for it: then the error of a step is not known."""
     try:
-        return reference_step(system, x, dt, check=deadline.check)
+        return reference_step(system, x, dt, check=deadline.check, t0=t0)
     except OutOfTime:
         warnings.warn(
             f"There was no time to follow {len(x)} held-out states to dt = {dt:g}: the one-step error of the flow is "
@@ -310,12 +319,14 @@ def _end_of_step(system: HamiltonianSystem, x: np.ndarray, dt: float, deadline: 
 def _labels(
     system: HamiltonianSystem, domain: Domain, dt: float, options: LossOptions, deadline: Deadline
 ) -> tuple[Labelled, Labelled]:
-    """Labels to train on, and held-out ones, at equidistant times."""
+    """Labels to train on, and held-out ones, at equidistant times; of a driven system with the times of the states."""
     t = dt * np.arange(1, options.label_times + 1) / options.label_times
     unseen = max(1, options.validation_points // options.label_times)
     sets = []
     for n, stream in ((options.points, Stream.LABELS), (unseen, Stream.VALIDATION)):
-        labels = Labels.needed(system, states(domain, n, options.seed, stream), t, deadline)
+        t0 = start_times(system, dt, n, options.seed, stream)
+        labels = Labels.needed(system, states(domain, n, options.seed, stream), t, deadline, t0)
         x = np.broadcast_to(labels.x, labels.y.shape).reshape(-1, labels.x.shape[1])
-        sets.append((np.repeat(t, len(labels.x)), x, labels.y.reshape(x.shape)))
+        begun = () if labels.t0 is None else (np.tile(labels.t0, len(t)),)
+        sets.append((np.repeat(t, len(labels.x)), x, labels.y.reshape(x.shape), *begun))
     return sets[0], sets[1]

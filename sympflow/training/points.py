@@ -29,8 +29,8 @@ LABELS_APART = 8  # intervals without labels that are as long as a fraction of �
 LABELS_COMPARED, COMPARED_TO = 8, 1e-8  # of the labels that are handed in, and the tolerance of their exact flow
 USELESS = 0.1  # of what a step moves a state: leapfrog at ω Δt = 1 misses a hundredth, the identity all of it
 
-Labelled = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Times (n,), states (n, 2d), and where the flow takes them (n, 2d)."""
+Labelled = tuple[np.ndarray, ...]
+"""Times (n,), states (n, 2d), where the flow takes them (n, 2d), and of a driven system the times t0 (n,)."""
 
 
 class Stream(IntEnum):
@@ -57,14 +57,30 @@ class Points:
     matching_t, matching_x : (m, 1), (m, n, 2d)
         Of the matching loss L2: few times with many states each.
     labels : (n,), (n, 2d), (n, 2d), or None
-        Times, states and where the exact flow takes them, of the loss L3.
+        Times, states and where the exact flow takes them, of the loss L3; of a driven system also the times t0 (n,) of
+        the states.
+    t0, matching_t0 : (N,), (m, 1), or None
+        The times of the states x, and of the matching_x, of a driven system.
     """
 
     t: Tensor
     x: Tensor
     matching_t: Tensor
     matching_x: Tensor
-    labels: tuple[Tensor, Tensor, Tensor] | None = None
+    labels: tuple[Tensor, ...] | None = None
+    t0: Tensor | None = None
+    matching_t0: Tensor | None = None
+
+    @property
+    def residual(self) -> tuple[Tensor, ...]:
+        """t, x, and t0 where there is one."""
+        return (self.t, self.x) if self.t0 is None else (self.t, self.x, self.t0)
+
+    @property
+    def matching(self) -> tuple[Tensor, ...]:
+        """t and x of the matching loss, and t0 where there is one."""
+        given = self.matching_t, self.matching_x
+        return given if self.matching_t0 is None else (*given, self.matching_t0)
 
 
 def stream_seed(seed: int, stream: Stream, block: int = 0) -> int:
@@ -116,7 +132,10 @@ def start_times(
 
 
 class PointSource:
-    """Draws the points of a step: uniform in Ω, and in [0, Δt] one time from each of equal cells."""
+    """Draws the points of a step: uniform in Ω, and in [0, Δt] one time from each of equal cells.
+
+    Of a driven `system` states are at random times t0, see `start_times`.
+    """
 
     def __init__(
         self,
@@ -129,8 +148,10 @@ class PointSource:
         device: torch.device,
         streams: tuple[Stream, Stream] = (Stream.RESIDUAL, Stream.MATCHING),
         block: int = BLOCK,
-        labels: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+        labels: tuple[np.ndarray, ...] | None = None,
+        system: HamiltonianSystem | None = None,
     ) -> None:
+        self._driven = None if system is None or system.autonomous else system
         self.domain, self.dt, self.seed, self.streams = domain, dt, seed, streams
         self.points, self.times = points, matching_times
         self.block_length = block
@@ -144,8 +165,8 @@ class PointSource:
         block, i = divmod(index, self.block_length)
         if block != self._block:
             self._draw(block)
-        t, x, matching_t, matching_x = self._arrays
-        return Points(t[i], x[i], matching_t[i], matching_x[i], self._labelled(index))
+        t, x, matching_t, matching_x, *starts = (a[i] for a in self._arrays)
+        return Points(t, x, matching_t, matching_x, self._labelled(index), *starts)
 
     def _labelled(self, index: int) -> Any:
         """All labels, or as many as there are points, drawn anew for each index."""
@@ -164,7 +185,12 @@ class PointSource:
         rng = np.random.default_rng([stream_seed(self.seed, self.streams[0], block), 1])
         t = self.dt * (np.arange(self.points) + rng.random((k, self.points))) / self.points
         tm = self.dt * (np.arange(m) + rng.random((k, m))) / m
-        self._arrays = tuple(torch.as_tensor(a, **self._like) for a in (t, x, tm[..., None], xm))  # type: ignore[arg-type]
+        drawn = [t, x, tm[..., None], xm]
+        if self._driven is not None:
+            for stream, shape in zip(self.streams, ((k, self.points), (k, m, 1)), strict=True):
+                t0 = start_times(self._driven, self.dt, math.prod(shape), self.seed, stream, block)
+                drawn.append(np.reshape(t0, shape))  # type: ignore[arg-type]
+        self._arrays = tuple(torch.as_tensor(a, **self._like) for a in drawn)  # type: ignore[arg-type]
         self._block = block
 
 

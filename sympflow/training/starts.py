@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -257,16 +258,16 @@ def new_network(system: HamiltonianSystem, new: NewFlow, dt: float, scaling: Sca
         If no baseline has as many parameters.
     """
     activation = "tanh" if new.activation is None else new.activation
-    flow = SympFlow(
-        system.ndof,
+    make = partial(SympFlow, system.ndof) if system.autonomous else partial(SympFlow.timed, system)
+    flow = make(
         3 if new.pairs is None else new.pairs,
-        (10, 10) if new.hidden is None else new.hidden,
-        activation,
-        dt,
-        torch.float64 if new.dtype is None else new.dtype,
-        new.device,
-        seed,
-        scaling,
+        hidden=(10, 10) if new.hidden is None else new.hidden,
+        activation=activation,
+        dt=dt,
+        dtype=torch.float64 if new.dtype is None else new.dtype,
+        device=new.device,
+        seed=seed,
+        scale=scaling,
     )
     if new.kind != "mlp":
         return flow

@@ -47,6 +47,7 @@ from sympflow.training.starts import check_step, default_primed, new_network, sc
 from sympflow.training.table_fit import TableRun
 from sympflow.workers import Crew
 
+DRIVEN = ("primed", "sympflow")  # kinds that are fitted to driven systems
 BUDGET = 60.0  # seconds of a fit of which nothing else is said
 STARTS = 72  # of such a fit, where it is compiled: these take a second
 BOUGHT = 1000  # starts that a time budget buys at most
@@ -247,7 +248,7 @@ def fit_flow(
     domain = _domain_for(system, domain)
     untold = flow is None and asked.restarts is None and asked.steps is None
     kind = _kind_of(system, flow, new, asked)
-    check_for_flows(system, takes_friction=kind == "primed", takes_driving=kind == "primed")
+    check_for_flows(system, takes_friction=kind == "primed", takes_driving=kind in DRIVEN)
     if kind == "primed" and asked.searches and asked.data is None and on_piece(system):
         piece = Piece.of(system, domain)
         start = None if flow is None else piece.small(flow)
@@ -294,7 +295,7 @@ def _refuse_unknown(options: dict[str, Any]) -> None:
     """Raise if there are options that `train` does not have, with what may be meant."""
     known = [each for each in inspect.signature(train).parameters if each != "unknown"]
     for name, value in options.items():
-        for maker in (SympFlow.primed, SympFlow.split):
+        for maker in (SympFlow.primed, SympFlow.split, SympFlow.timed):
             if name in inspect.signature(maker).parameters:
                 by = maker.__qualname__
                 raise TypeError(f"`{name}` is an option of {by}: pass flow={by}(system, ..., {name}={value!r}).")

@@ -14,15 +14,25 @@ from sympflow.flow.scaling import Scaling
 from sympflow.kernels.protocol import Kernel
 
 PENDULUM, KEPLER = systems.pendulum(), systems.kepler()
-TRANSFORMED = time_transformed(KEPLER)
+TRANSFORMED, DRIVEN = time_transformed(KEPLER), systems.driven_pendulum()
 FLOWS = {
     "sympflow": (lambda: SympFlow(1, hidden=(4, 3)), PENDULUM),
     "primed": (lambda: SympFlow.primed(PENDULUM, 2, dt=0.3, processor=2, curvature=True), PENDULUM),
     "split": (lambda: SympFlow.split(PENDULUM, 2, dt=0.1, parts=("1 - cos(q1)", "p1**2/2")), PENDULUM),
     "clocked": (lambda: ClockedFlow(TRANSFORMED.ndof, "leapfrog", 3, 0.2, TRANSFORMED), TRANSFORMED),
+    "timed": (lambda: SympFlow.timed(DRIVEN, 2, hidden=(4,)), DRIVEN),
     "mlp": (lambda: MLPFlow(1, (4, 5)), PENDULUM),
 }
+UNCOMPILED = {
+    "mlp": r"^`method` 'mlp' has no compiled form: use backend='array'\.$",
+    "timed": r"^`flow` has networks that take the time .* no compiled form: use backend='array'\.$",
+}
 EACH = pytest.mark.parametrize("name", FLOWS)
+
+
+def started(flow):
+    """The time of a state, which the flow of a driven system asks for."""
+    return {"t0": 0.3} if flow.driven else {}
 
 
 def test_every_family_is_here():
@@ -39,20 +49,22 @@ def test_a_flow_is_built_again_from_its_architecture(name):
     assert again.architecture() == plan
     again.load_state_dict(flow.state_dict())
     x = torch.as_tensor(system.y0)
-    assert torch.equal(again.bound(system).psi(0.1, x), flow.psi(0.1, x))
+    assert torch.equal(again.bound(system).psi(0.1, x, **started(flow)), flow.psi(0.1, x, **started(flow)))
 
 
 @EACH
 def test_a_run_of_kernel_steps_is_one_of_the_flow(name):
     make, system = FLOWS[name]
     flow, x = make(), torch.as_tensor(system.y0)
-    y = flow.prepare(flow.dt, x)
+    z = flow.lift(x, **started(flow))
+    y = flow.prepare(flow.dt, z)
     for _ in range(3):
         y = flow.kernel_step(flow.dt, y)
-    torch.testing.assert_close(flow.finish(flow.dt, y), flow(3 * flow.dt, x), rtol=1e-12, atol=1e-13)
+    end = flow(3 * flow.dt, x, **started(flow))
+    torch.testing.assert_close(flow.project(flow.finish(flow.dt, y)), end, rtol=1e-12, atol=1e-13)
     if flow.symplectic:
-        back = flow.kernel_step(flow.dt, flow.kernel_step(flow.dt, x), back=True)
-        torch.testing.assert_close(back, x, rtol=1e-12, atol=1e-13)
+        back = flow.kernel_step(flow.dt, flow.kernel_step(flow.dt, z), back=True)
+        torch.testing.assert_close(back, z, rtol=1e-12, atol=1e-13)
 
 
 @EACH
@@ -64,9 +76,11 @@ def test_what_is_asked_of_a_flow_map(name):
     assert flow.origin is None
     assert len(flow.clock_numbers()) == (3 if name == "clocked" else 0)
     assert any(flow.evaluations(10, 1, 0, "array").values()) == (name in ("primed", "split", "clocked"))
-    torch.testing.assert_close(flow.initial_velocity(x), flow.velocity(0.0, x), rtol=1e-12, atol=1e-13)
+    begun = started(flow)
+    slope = flow.initial_velocity(x, **begun)
+    torch.testing.assert_close(slope, flow.velocity(0.0, x, **begun), rtol=1e-12, atol=1e-13)
     if flow.symplectic:
-        assert flow.hamiltonian(0.1, x).shape == ()
+        assert flow.hamiltonian(0.1, x, **begun).shape == ()
     else:
         with pytest.raises(TypeError, match="the flow of no Hamiltonian"):
             flow.hamiltonian(0.1, x)
@@ -76,8 +90,8 @@ def test_what_is_asked_of_a_flow_map(name):
 def test_compiled_loops_are_kept_while_no_weight_changes(name):
     make, system = FLOWS[name]
     flow = make().requires_grad_(False)
-    if name == "mlp":
-        with pytest.raises(ValueError, match=r"`method` 'mlp' has no compiled form: use backend='array'\.$"):
+    if name in UNCOMPILED:
+        with pytest.raises(ValueError, match=UNCOMPILED[name]):
             flow.kernel_for(system)
         return
     kernel: Kernel = flow.kernel_for(system)

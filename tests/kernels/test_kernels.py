@@ -184,7 +184,7 @@ def test_code_depends_on_which_parameters_there_are_alone(monkeypatch, level, mo
         texts.append(text)
         raise InterruptedError
 
-    monkeypatch.setattr("sympflow.kernels.splitting_loops.load_module", load)
+    monkeypatch.setattr("sympflow.kernels.loop_functions.load_module", load)
     for params in (*PARAMETERS, {**PARAMETERS[0], "n": 4}, {**PARAMETERS[0], "lam": 0}):
         with pytest.raises(InterruptedError):
             splitting_loops(with_parameters(**params)).functions(level, compensated, monomials)

@@ -1,0 +1,338 @@
+"""Compiled functions of splitting schemes on one system: generated code before a text of loops.
+
+There is a maker for each way in which a system is given: by symbols, few terms or many, autonomous or driven; by Numba
+functions; by one piece, as of lattices and pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.modules import OPTIONS, load_module, template
+from sympflow.kernels.stages import DampedDrift, TimeAlone, WithSystem, kicks_of, lanes_source, stages_source
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    from sympflow.kernels.approximations import Ranges
+    from sympflow.kernels.stage_times import Driving
+
+MOST_COUPLED = 6
+"""Degrees of freedom of a damping matrix in compiled loops, where the two maps of each drift are 2d² numbers."""
+
+
+def damped_drift(system: HamiltonianSystem, in_place: bool) -> DampedDrift | None:
+    """The drift of a system with friction as code; None without."""
+    if system.damping is None:
+        return None
+    if system.damping.ndim == 2 and (in_place or system.ndof > MOST_COUPLED):
+        raise ValueError(
+            f"`system` {system.name!r} has a damping matrix, which is compiled for symbolic systems of up to "
+            f"{MOST_COUPLED} degrees of freedom: use backend='array'."
+        )
+    return DampedDrift(system.damping.ndim, system.ndof, in_place)
+
+
+@dataclass(frozen=True)
+class LoopFunctions:
+    """The compiled functions of one variant (what kicks have, with or without compensated sums)."""
+
+    rollout: Callable[..., int]
+    rollout_batch: Callable[..., None]
+    rollout_processed: Callable[..., int]
+    rollout_processed_batch: Callable[..., None]
+    step_rows: Callable[..., None]
+
+    def with_system(self, numbers: np.ndarray, inverse_mass: np.ndarray) -> LoopFunctions:
+        """The functions of tables, of those whose tables are (stages, numbers, M⁻¹)."""
+
+        def given(function: Callable[..., Any], n_tables: int = 1) -> Callable[..., Any]:
+            def call(*arguments: Any) -> Any:
+                tables = [(table, numbers, inverse_mass) for table in arguments[:n_tables]]
+                return function(*tables, *arguments[n_tables:])
+
+            return call
+
+        return LoopFunctions(
+            given(self.rollout),
+            given(self.rollout_batch),
+            given(self.rollout_processed, 3),
+            given(self.rollout_processed_batch, 3),
+            given(self.step_rows),
+        )
+
+
+def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0, driven: bool = False) -> str:
+    return (
+        f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': cache}}\n"
+        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}\nN_VALUES = {n_values}\nDRIVEN = {driven}"
+    )
+
+
+def takes_values(level: int) -> bool:
+    """True of kicks whose code is the same for all values of parameters.
+
+    In those with force gradients sums such as g ω⁴ − b ω² would round in another way than with numbers in the code.
+    """
+    return level not in (FORCE_GRADIENT, CURVATURE)
+
+
+def symbolic_loops(
+    symbols: SymbolicHamiltonian,
+    algebra: str,
+    friction: DampedDrift | None,
+    level: int,
+    compensated: bool,
+    monomials: Monomials,
+    varied: bool = False,
+    ranges: Ranges = (),
+) -> LoopFunctions:
+    """The loops of an autonomous symbolic system of few terms; parameters are numbers where `takes_values`."""
+    if (varied or (friction is None and takes_values(level))) and symbols.parametric is not symbols:
+        from sympflow.kernels.codegen import algebra_source
+
+        symbols = symbols.parametric
+        algebra = algebra_source(symbols)
+    after = ("loops", "aligned", "lanes")
+    loops = symbolic_module(
+        symbols, algebra, level, compensated, after, monomials, friction, varied=varied, ranges=ranges
+    )
+    processed = loops.rollout_processed, loops.rollout_processed_rows
+    return LoopFunctions(loops.rollout, loops.rollout_lanes, *processed, loops.step_lanes)
+
+
+def driven_loops(
+    driving: Driving,
+    friction: DampedDrift | None,
+    level: int,
+    compensated: bool,
+    monomials: Monomials,
+    varied: bool = False,
+) -> LoopFunctions:
+    """The loops of a symbolic system whose H depends on t; single steps, each at a time of its own, without lanes."""
+    from sympflow.kernels.codegen import algebra_source
+
+    form, after = driving.form, ("loops", "aligned", "lanes")
+    algebra = algebra_source(form)
+    loops = symbolic_module(form, algebra, level, compensated, after, monomials, friction, driving, varied)
+    processed = loops.rollout_processed, loops.rollout_processed_rows
+    return LoopFunctions(loops.rollout, loops.rollout_lanes, *processed, loops.step_each)
+
+
+def symbolic_module(
+    symbols: SymbolicHamiltonian,
+    algebra: str,
+    level: int,
+    compensated: bool,
+    after: Sequence[str],
+    monomials: Monomials = (),
+    friction: DampedDrift | None = None,
+    driving: Driving | None = None,
+    varied: bool = False,
+    ranges: Ranges = (),
+) -> ModuleType:
+    """The algebra of a symbolic system, its kicks and the texts of loops `after` them, as a module.
+
+    In `varied` ones each lane has its own values of the parameters.
+    """
+    from sympflow.kernels.kicks import kicks_source
+
+    kinds, scheduled = kicks_of(level, len(monomials)), not compensated
+    n = len(symbols.parameters)
+    lanes = lanes_source(kinds, scheduled, friction, n, varied, driving)
+    sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
+    if scheduled:
+        sources.append(kicks_source(symbols, level, monomials, varied=varied, ranges=ranges))
+    else:
+        sources += plain_kicks_source(symbols, level, monomials)
+    algebra = "\n\n\n".join(sources)
+    before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
+    n_values = len(symbols.values) if varied else 0
+    header = _header(compensated, cache=True, scheduled=scheduled, n_values=n_values, driven=driving is not None)
+    return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
+
+
+def plain_kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> list[str]:
+    """The kicks of a level, beside that of the algebra, where they are not scheduled."""
+    from sympflow.kernels.codegen import curvature_kick_source, gradient_kick_source, polynomial_kick_source
+
+    if level == POLYNOMIAL:
+        return [polynomial_kick_source(symbols, monomials)]
+    sources = [gradient_kick_source(symbols)] if level else []
+    return [*sources, curvature_kick_source(symbols)] if level == CURVATURE else sources
+
+
+def family_loops(
+    system: HamiltonianSystem, friction: DampedDrift | None, level: int, compensated: bool, monomials: Monomials
+) -> LoopFunctions:
+    """The loops of a symbolic system of many terms, around loops over these: see `sympflow.kernels.terms`."""
+    from sympflow.kernels.codegen import polynomial_slope_source
+    from sympflow.kernels.terms import bend_source, gradient_source, product_source, warn_if_long
+
+    symbols, driving = system.symbols, None
+    assert symbols is not None
+    if symbols.time is not None:
+        from sympflow.kernels.stage_times import driven_form
+
+        driving = driven_form(symbols)
+        if driving.means:
+            raise ValueError("`system` has many terms and a kinetic energy that depends on t: use backend='array'.")
+        symbols = driving.form
+    letters = symbols.parameters
+    warn_if_long(symbols.V, symbols.q, system.name)
+    sources = [f"import numpy as np\n\nNDOF = {symbols.ndof}", _FIXED_SIZE, _given_functions(level, bool(letters))]
+    sources.append(gradient_source(symbols.V, symbols.q, "gradient", letters))
+    if level in (FORCE_GRADIENT, CURVATURE):
+        sources.append(product_source(symbols.V, symbols.q, "hessian_vector", letters))
+    if level == CURVATURE:
+        sources.append(bend_source(symbols.V, symbols.q, "bend", letters))
+    if level == POLYNOMIAL:
+        sources.append(polynomial_slope_source(symbols, monomials))
+    M = system.inverse_mass
+    if system.quadratic_kinetic and (M is None or M.ndim == 1):
+        sources.append(_inverse_mass_source(M))
+        sources.append("" if M is None else f"INVERSE_MASS = np.array({M.tolist()})")
+    else:
+        sources.append(gradient_source(symbols.T, symbols.p, "kinetic_gradient"))
+        sources.append("@njit(**OPTIONS)\ndef apply_inverse_mass(v, out, work):\n    kinetic_gradient(v, out)")
+    sources.append(stages_source(kicks_of(level, len(monomials)), False, friction, 0, driving))
+    code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
+    before = ["elementary"] if "fast_" in code else []
+    header = _header(compensated, cache=True, scheduled=False)
+    return _array_functions(vars(load_module("\n\n\n".join([header, *map(template, before), code]))))
+
+
+_FIXED_SIZE = """@njit(**OPTIONS)
+def size(x, copies):
+    return NDOF
+
+
+@njit(**OPTIONS)
+def size_of(table):
+    return NDOF"""
+_ANY_SIZE = """@njit(**OPTIONS)
+def size(x, copies):
+    return len(x) // copies
+
+
+@njit(**OPTIONS)
+def size_of(table):
+    return len(table[2])
+
+
+@njit(**OPTIONS)
+def apply_inverse_mass(v, out, work):
+    inverse_mass = work[4][2]
+    for i in range(len(v)):
+        out[i] = inverse_mass[i] * v[i]"""
+"""A table is (stages, numbers of the system, M⁻¹)."""
+
+
+def _pair_loops(
+    system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials, varied: bool = False
+) -> LoopFunctions:
+    """The loops of a system that is given by one piece, of any size: their code depends on the piece alone."""
+    from sympflow.kernels.pair_forces import pair_data, pair_source
+
+    local: Any = system.local
+    if level == POLYNOMIAL or varied:
+        raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
+    sources = [pair_source(local, functions_of(level)), _given_functions(level, True, numbers="numbers[-1]")]
+    sources += [_ANY_SIZE, stages_source(kicks_of(level), False, None, 0, WithSystem(), "table[0]")]
+    code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
+    before = ["elementary"] if "fast_" in code or "fused_multiply_add" in code else []
+    header = _header(compensated, cache=True, scheduled=False)
+    functions = _array_functions(vars(load_module("\n\n\n".join([header, *map(template, before), code]))))
+    inverse_mass = np.ones(system.ndof) if system.inverse_mass is None else np.array(system.inverse_mass)
+    return functions.with_system(pair_data(local), inverse_mass)
+
+
+_INVERSE_MASS_TIMES_V = {
+    0: "out[i] = v[i]",
+    1: "out[i] = INVERSE_MASS[i] * v[i]",
+    2: "out[i] = 0.0\n        for j in range(NDOF):\n            out[i] += INVERSE_MASS[i, j] * v[j]",
+}
+
+
+def _inverse_mass_source(inverse_mass: np.ndarray | None) -> str:
+    rows = _INVERSE_MASS_TIMES_V[0 if inverse_mass is None else inverse_mass.ndim]
+    return f"@njit(**OPTIONS)\ndef apply_inverse_mass(v, out, work):\n    for i in range(NDOF):\n        {rows}"
+
+
+def functions_of(level: int) -> tuple[str, ...]:
+    """The functions of the system that kicks of a level call."""
+    return ("gradient", "hessian_vector", "bend")[: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(level, 0)]
+
+
+def _given_functions(level: int, driven: bool, time_first: bool = False, numbers: str = "numbers") -> str:
+    """``gradient_at(q, numbers, out)`` and the others that the text `array_states` calls, by functions of a system.
+
+    Those of a driven one take the letters of `numbers` after their arguments, or the time before them; those of one
+    piece its own numbers, the last of them.
+    """
+    sources = []
+    for name in functions_of(level):
+        arguments = "q, out" if name == "gradient" else "q, v, out"
+        call = f"{name}({arguments})"
+        if driven:
+            call = f"{name}(numbers[-1], {arguments})" if time_first else f"{name}({arguments}, {numbers})"
+        given = arguments.removesuffix("out") + "numbers, out"
+        sources.append(f"@njit(**OPTIONS)\ndef {name}_at({given}):\n    {call}")
+    return "\n\n\n".join(sources)
+
+
+def _array_functions(module: dict[str, Any]) -> LoopFunctions:
+    names = ("rollout", "rollout_each", "rollout_processed", "rollout_processed_rows", "step_each")
+    return LoopFunctions(*(module[name] for name in names))
+
+
+def array_loops(
+    ndof: int,
+    gradient: Any,
+    hessian_vector: Any | None,
+    inverse_mass: np.ndarray | None,
+    driven: bool,
+    friction: DampedDrift | None,
+    level: int,
+    compensated: bool,
+    monomials: Monomials,
+) -> LoopFunctions:
+    """The loops around the user's Numba functions; compiled for this process only."""
+    mass = "\n\n\n".join([_FIXED_SIZE, _inverse_mass_source(inverse_mass)])
+    header = _header(compensated, cache=False, scheduled=False)
+    stages = stages_source(kicks_of(level), False, friction, 0, TimeAlone() if driven else None)
+    given = _given_functions(level, driven, time_first=True)
+    functions: dict[str, Any] = {
+        "NDOF": ndof,
+        "INVERSE_MASS": inverse_mass,
+        "gradient": gradient,
+        "hessian_vector": hessian_vector,
+    }
+    texts = map(template, ("array_states", "loops"))
+    exec("\n\n\n".join([header, mass, given, stages, *texts]), functions)
+    return _array_functions(functions)
+
+
+def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
+    """The loops of a lattice, of which only the structure, and not the size, is part of the code."""
+    from sympflow.hamiltonian.lattice import LatticeHamiltonian
+    from sympflow.kernels.lattice_loops import LatticeLoops
+
+    assert isinstance(system.local, LatticeHamiltonian)
+    loops = LatticeLoops(system.local, level, compensated, system.friction is not None)
+    processed = loops.rollout_processed, loops.rollout_processed_batch
+    return LoopFunctions(loops.rollout, loops.rollout_batch, *processed, loops.step_rows)
+
+
+LOCAL: dict[str, tuple[Callable[..., LoopFunctions], bool, bool]] = {
+    "lattice": (_lattice_loops, True, True),
+    "pairs": (_pair_loops, False, False),
+}
+"""Makers of the loops of systems that are given by one piece, whether these take friction −γp, and `closes`."""

@@ -1,0 +1,158 @@
+"""Networks of driven systems: SympFlows whose potentials take the time of the state, and their training."""
+
+from dataclasses import replace
+from math import pi
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+import sympflow
+from sympflow import Box, HamiltonianSystem, SympFlow, solve
+from sympflow.flow.timed import Drive, TimedSympFlow
+from sympflow.interop import torchdiffeq as ours
+from sympflow.interop.scipy import as_scipy
+
+DT, W = 0.4, 2.7
+X = torch.tensor([[0.5, 0.1], [-0.3, 0.8], [0.9, -0.6]], dtype=torch.float64)
+
+
+def driven(H="p**2/2 - cos(q)*(1 + a*cos(w*t))", a=0.3, **more):
+    given = {"params": {"a": a, "w": W}, "period": 2 * pi / W, "y0": [0.5, 0.1], "domain": Box([-1, -1], [1, 1])}
+    return HamiltonianSystem.from_sympy(H, time="t", **given | more)
+
+
+@pytest.fixture(scope="module")
+def system():
+    return driven()
+
+
+@pytest.fixture(scope="module")
+def bare(system):
+    return SympFlow.timed(system, 2, hidden=(8,), dt=DT, seed=1).requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def trained(system):
+    return sympflow.train(
+        system, kind="sympflow", pairs=2, hidden=(8,), dt=DT, optimizer="gauss-newton", steps=40, points=150,
+        matching_weight=0.1, label_weight=0.1, label_times=2, validation_points=100, reference_states=30,
+        progress=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("t0", [0.0, 1.3, 40.1])
+def test_it_is_symplectic_and_has_an_inverse_at_every_start(bare, t0):
+    for t in (0.3, 2.9, -1.7):
+        y = bare(t, X, t0=t0)
+        assert (y - X).abs().max() > 1e-3
+        torch.testing.assert_close(bare.inverse(t, y, t0=t0), X, rtol=0, atol=1e-14)
+        slopes = torch.func.jacrev(lambda x, t=t: bare(t, x, t0=t0))(X[0])
+        assert float(torch.linalg.det(slopes)) == pytest.approx(1, abs=1e-13)
+    torch.testing.assert_close(bare.psi(0.0, X, t0), X, rtol=0, atol=0)
+    times = torch.tensor([0.1, -0.9, 1.7], dtype=torch.float64)
+    each = torch.stack([bare(t, x, t0=t0) for t, x in zip(times, X, strict=True)])
+    torch.testing.assert_close(bare(times, X, t0=t0), each, rtol=0, atol=1e-14)
+    torch.testing.assert_close(bare.inverse(times, each, t0=t0), X, rtol=0, atol=1e-14)
+
+
+def test_it_has_the_period_of_the_drive(system, bare):
+    here, later = bare(1.7, X, t0=0.3), bare(1.7, X, t0=0.3 + 5 * system.period)
+    torch.testing.assert_close(later, here, rtol=0, atol=1e-13)
+    assert (bare(1.7, X, t0=0.9) - here).abs().max() > 1e-4
+
+
+def test_its_velocity_is_that_of_its_hamiltonian(bare):
+    t = torch.tensor([0.1, 0.25, 0.39], dtype=torch.float64)
+    y = bare.psi(t, X, 1.1).requires_grad_()
+    (g,) = torch.autograd.grad(bare.hamiltonian(t, y, t0=1.1).sum(), y)
+    velocity = bare.velocity(t, X, t0=1.1)
+    torch.testing.assert_close(velocity, torch.stack([g[:, 1], -g[:, 0]], -1), rtol=0, atol=1e-14)
+    slope = (bare.psi(t + 1e-5, X, 1.1) - bare.psi(t - 1e-5, X, 1.1)) / 2e-5
+    torch.testing.assert_close(velocity, slope, rtol=0, atol=1e-9)
+
+
+def test_steps_of_solve_are_chained_calls(system, bare):
+    y, t0 = X, 0.3
+    for k in range(4):
+        y = bare(DT, y, t0=t0 + k * DT)
+    y = bare(0.1, y, t0=t0 + 4 * DT)
+    torch.testing.assert_close(bare(4 * DT + 0.1, X, t0=t0), y, rtol=0, atol=1e-14)
+    sol = solve(system, bare, (t0, t0 + 4 * DT + 0.1), X.numpy())
+    np.testing.assert_allclose(sol.y[..., -1], y, rtol=0, atol=1e-14)
+    back = solve(system, bare, (sol.t[-1], t0), sol.y[..., -1])
+    end = bare(-(4 * DT + 0.1), y, t0=sol.t[-1])
+    np.testing.assert_allclose(back.y[..., -1], end, rtol=0, atol=1e-14)
+
+
+def test_training_fits_it_at_all_times_of_the_drive(system, trained):
+    assert type(trained) is TimedSympFlow
+    start, end = trained.history[0], trained.figures
+    assert end["one_step_error"] < start["one_step_error"] / 30
+    assert end["residual_loss"] < start["residual_loss"] / 1000
+    assert end["matching_loss"] < start["matching_loss"] / 100
+    x = system.domain.sample(20, 7) / 2
+    for t0 in (0.2, 1.0, 1.9):  # states and times that are in no fit
+        truth = solve(system, "dop853", (t0, t0 + 1.2), x, rtol=1e-11, atol=1e-11).y[..., -1]
+        still = np.abs(x - truth).max()
+        assert np.abs(trained(1.2, torch.tensor(x), t0=t0).numpy() - truth).max() < still / 20
+    sol = solve(system, trained, (0.3, 8.3))
+    assert sympflow.energy_balance_error(sol).max() < 0.05
+    assert sympflow.symplecticity_defect(sol).max() < 1e-13
+
+
+def test_scipy_and_torchdiffeq_tell_it_the_time(system, trained):
+    times = np.array([2.9, 1.75, 1.35])
+    expected = solve(system, trained, (2.9, 1.35), t_eval=times).y
+    scipy = solve_ivp(system, (2.9, 1.35), system.y0, method=as_scipy(trained, system), t_eval=times)
+    np.testing.assert_allclose(scipy.y, expected, rtol=0, atol=1e-13)
+    y = ours.odeint(system, torch.tensor(system.y0), torch.tensor(times), method=trained)
+    np.testing.assert_allclose(y.T, expected, rtol=0, atol=1e-13)
+
+
+def test_a_file_holds_it_with_its_drive(system, trained, tmp_path):
+    trained.save(tmp_path / "flow.safetensors")
+    again = sympflow.load(tmp_path / "flow.safetensors", system=system)
+    torch.testing.assert_close(again(1.7, X, t0=0.3), trained(1.7, X, t0=0.3), rtol=0, atol=0)
+    assert (again.drive, again.period) == (trained.drive, system.period)
+    with pytest.raises(ValueError, match="was trained with another drive"):
+        solve(driven(a=0.2), again, (0, 1))
+    other = again.transferred(driven(a=0.2))
+    torch.testing.assert_close(other(1.7, X, t0=0.3), trained(1.7, X, t0=0.3), rtol=0, atol=0)
+    solve(driven(a=0.2), other, (0, 1))
+
+
+def test_networks_take_any_hamiltonian_and_drives_without_a_period():
+    system = driven("p**2*(1 + q**2/4)/2 + q**2/2 + a*q*tanh(w*t)", period=None, t_span=(0, 4))
+    flow = sympflow.train(
+        system, pairs=2, hidden=(8,), dt=DT, optimizer="gauss-newton", steps=20, points=200, validation_points=60,
+        reference_states=20, progress=False,
+    )  # fmt: skip
+    assert flow.drive == Drive(None, (0.0, 4.0))
+    assert flow.figures["one_step_error"] < flow.history[0]["one_step_error"] / 5
+    solve(system, flow, (0, 4))
+    with pytest.warns(UserWarning, match="a drive without a period"):
+        solve(system, flow, (0, 5))
+
+
+def test_it_is_refused_where_it_does_not_belong(system, bare):
+    still = HamiltonianSystem.from_sympy("p**2/2 - cos(q)", y0=[0.5, 0.1], domain=system.domain)
+    with pytest.raises(ValueError, match=r"`system` .* is not driven"):
+        SympFlow.timed(still)
+    with pytest.raises(ValueError, match=r"no drive.*SympFlow\.timed"):
+        solve(still, bare, (0, 1))
+    with pytest.raises(ValueError, match=r"the period 1\.0"):
+        solve(driven(params={"a": 0.3, "w": 2 * pi}, period=1.0), bare, (0, 1))
+    with pytest.raises(ValueError, match=r"networks of SympFlow\.timed"):
+        solve(system, SympFlow(1), (0, 1))
+    with pytest.raises(ValueError, match="is driven"):
+        sympflow.train(system, kind="mlp", steps=1, progress=False)
+    with pytest.raises(TypeError, match="`t0` is missing"):
+        bare(0.1, X)
+    with pytest.raises(ValueError, match="`harmonics`"):
+        SympFlow.timed(system, harmonics=0)
+    with pytest.raises(ValueError, match="`times`"):
+        replace(bare.drive, period=None)
+    with pytest.raises(TypeError, match=r"SympFlow\.timed"):
+        sympflow.train(system, harmonics=3)
