@@ -6,6 +6,7 @@ It has been run in Numba's simulator, and compiled up to NVIDIA's own compiler; 
 from __future__ import annotations
 
 from functools import lru_cache
+from threading import Lock
 from types import ModuleType
 from typing import Any
 
@@ -29,6 +30,8 @@ __all__ = ["CudaKernel", "cuda_kernel", "cuda_module"]
 
 THREADS = 64
 """Threads of a block: each orbit needs many registers."""
+
+_DEVICE = Lock()  # one launch at a time: a device gains nothing by two, and the simulator does not know them
 
 HEADER = """import math
 
@@ -131,15 +134,17 @@ class CudaKernel(SplittingKernel):
         first, running = 0, np.empty((n, self._width))
         if carry is not None and carry.running is not None:
             first, running = carry.steps, carry.running.copy()
-        out, n_finite = cuda.device_array((n, len(save), y0.shape[1])), cuda.device_array(n, dtype=np.int64)
-        of_orbits = cuda.to_device(running)
-        given = [cuda.to_device(array) for array in (self._tables(h, n), y0)]
-        stop = cuda.to_device(np.zeros(1, dtype=np.int64))
-        rollout = self._module().rollout_orbits[-(-n // THREADS), THREADS]
-        rollout(*given, n_steps, cuda.to_device(save), out, n_finite, stop, first, of_orbits)
+        with _DEVICE:
+            out, n_finite = cuda.device_array((n, len(save), y0.shape[1])), cuda.device_array(n, dtype=np.int64)
+            of_orbits = cuda.to_device(running)
+            given = [cuda.to_device(array) for array in (self._tables(h, n), y0)]
+            stop = cuda.to_device(np.zeros(1, dtype=np.int64))
+            rollout = self._module().rollout_orbits[-(-n // THREADS), THREADS]
+            rollout(*given, n_steps, cuda.to_device(save), out, n_finite, stop, first, of_orbits)
+            states, finite, running = out.copy_to_host(), n_finite.copy_to_host(), of_orbits.copy_to_host()
         if carry is not None:
-            carry.advance(n_steps, of_orbits.copy_to_host())
-        return Run(out.copy_to_host(), n_finite.copy_to_host())
+            carry.advance(n_steps, running)
+        return Run(states, finite)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         kernel = self.loops.kernel(self.scheme, self.compensated)

@@ -54,9 +54,11 @@ for method in ("verlet", "chin4a"):
 both(own, "verlet", np.array([1.0, 0.0]), params={"k": [[1.1, 2.2], [3.3, 1.0]]})
 
 how = {"y0": [[1.0, 0.0], [0.3, 0.1]], "params": {"k": [1.1, 2.2]}, "chunk": 3}
-swept = [sympflow.ensemble(own, "verlet", (0, 1), backend=backend, **how) for backend in ("cuda", "array")]
-assert np.allclose(swept[0].y, swept[1].y, rtol=0, atol=1e-14)
-assert np.array_equal(swept[0].status, np.zeros((2, 2)))
+ways = ({"backend": "cuda"}, {"backend": "cuda", "workers": 2}, {"backend": "array"})
+swept = [sympflow.ensemble(own, "verlet", (0, 1), **how, **way) for way in ways]
+assert np.allclose(swept[0].y, swept[2].y, rtol=0, atol=1e-14)
+assert np.array_equal(swept[0].y, swept[1].y)
+assert np.array_equal(swept[1].status, np.zeros((2, 2)))
 
 kernel = cuda_kernel(system, get("verlet").scheme, True)
 whole = kernel.run_batch(0.1, states, 9, np.array([4, 9]))
