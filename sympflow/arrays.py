@@ -54,11 +54,13 @@ def stack(parts: Sequence[Array], axis: int = -1) -> Array:
 
 
 def assemble(values: Sequence[Any], like: Array) -> Array:
-    """Stack numbers and arrays of shape `like.shape` along a new last axis, in the dtype of `like`."""
+    """Stack numbers, and arrays that broadcast to `like.shape`, along a new last axis, in the dtype of `like`."""
     if is_tensor(like):
         import torch
 
-        return torch.stack([v + torch.zeros_like(like) if is_number(v) else v for v in values], dim=-1)
+        # numbers, and what depends on the time alone, are the same for all of a batch
+        full = [v + torch.zeros_like(like) if is_number(v) or v.ndim < like.ndim else v for v in values]
+        return torch.stack(full, dim=-1)
     out = np.empty((*np.shape(like), len(values)), dtype=like.dtype)
     for i, value in enumerate(values):
         out[..., i] = value

@@ -313,7 +313,8 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
         whole = max((sol for _, sol in pieces), key=lambda sol: len(sol.t))
         pieces += [(index, _not_begun(stop.solution, part)) for index, part in groups[len(pieces) :]]
         pieces = [(index, _up_to(sol, whole.t)) for index, sol in pieces]
-        raise Interrupted(stop.outcome, joined(pieces, problem.system, problem.y0, rows)) from None
+        sol = joined(pieces, problem.system, problem.y0, rows)
+        raise Interrupted(stop.outcome, replace(sol, message=stop.solution.message)) from None
     return joined(pieces, problem.system, problem.y0, rows)
 
 

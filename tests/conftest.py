@@ -1,9 +1,14 @@
 """Fixtures shared by several test modules."""
 
 import importlib.util
+import os
 from pathlib import Path
 
 import pytest
+
+# Where colorama is installed, Numba puts sys.stdout of its first message back after each: that of a command under test
+# would be lost whenever something is compiled meanwhile.
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

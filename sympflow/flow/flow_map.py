@@ -551,7 +551,8 @@ class FlowMap(nn.Module):
         """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
         check_system(system)
         check_for_flows(system, self.takes_friction, self.takes_driving)
-        if self.fingerprint is not None and self.matches(system):
+        any_size = system.few_sites is not system
+        if self.fingerprint is not None and self.matches(system) and (any_size or system.ndof == self.ndof):
             self.check_ends(system)
             return
         origin = self.origin
@@ -568,7 +569,7 @@ class FlowMap(nn.Module):
                 "accurate. Fit one to the damped system by sympflow.train(system), or from these numbers by "
                 "sympflow.train(system, flow=flow.transferred(system))."
             )
-        if system.local is not None and self.lattice_terms:
+        if system.local is not None and system.local.shape and self.lattice_terms:
             reason = _difference(self.lattice_terms, system.local.terms)
             damped = system.damping is not None or len(self.fingerprint or ()) > PROBES
             reason = reason or " (its friction is another)" * damped

@@ -615,7 +615,12 @@ def _with_numeric_constants(H: sp.Expr) -> sp.Expr:
 
 def printable(f: sp.Expr) -> sp.Expr:
     """A derivative as code needs it: its constants numbers, and the δ of a kink's second derivative left out."""
-    return _with_numeric_constants(f.replace(sp.DiracDelta, lambda *arguments: sp.S.Zero))
+    return _with_numeric_constants(without_deltas(f))
+
+
+def without_deltas(f: sp.Expr) -> sp.Expr:
+    """A derivative as arrays need it: the δ of a kink, which no state meets, left out."""
+    return f.replace(sp.DiracDelta, lambda *arguments: sp.S.Zero) if f.has(sp.DiracDelta) else f
 
 
 def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tuple[sp.Expr | None, sp.Expr | None]:

@@ -262,6 +262,7 @@ class HamiltonianSystem(Hamiltonian):
         dt: float = 0.05,
         energy_scale: float | None = None,
         exact: Callable[[Any], Array] | None = None,
+        time: None = None,
     ) -> HamiltonianSystem:
         """A lattice of any size, H = Σ_sites [T(p) + U(q)] + Σ_bonds V(r), by expressions for one site and one bond.
 
@@ -291,6 +292,8 @@ class HamiltonianSystem(Hamiltonian):
             the first site where the lower end is a wall.
         damping, name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
+        time : None
+            None alone: H by pieces does not depend on the time.
 
         Raises
         ------
@@ -306,6 +309,7 @@ class HamiltonianSystem(Hamiltonian):
         """
         from sympflow.hamiltonian.lattice import LatticeHamiltonian
 
+        _check_no_time(time)
         local = LatticeHamiltonian(onsite, bond, shape, boundary, kinetic, fields, params)
         return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale, exact)
 
@@ -329,6 +333,7 @@ class HamiltonianSystem(Hamiltonian):
         dt: float = 0.001,
         energy_scale: float | None = None,
         exact: Callable[[Any], Array] | None = None,
+        time: None = None,
     ) -> HamiltonianSystem:
         """Bodies that interact in pairs, any number of them: H = Σ_i |p_i|²/(2 m_i) + Σ_{i<j} V(r_ij).
 
@@ -358,6 +363,8 @@ class HamiltonianSystem(Hamiltonian):
             Values that differ from body to body: of "c" the values are c1 and c2 in V.
         damping, name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
+        time : None
+            None alone: H by pieces does not depend on the time.
 
         Raises
         ------
@@ -374,6 +381,7 @@ class HamiltonianSystem(Hamiltonian):
         """
         from sympflow.hamiltonian.bodies import PairsHamiltonian
 
+        _check_no_time(time)
         local = PairsHamiltonian(potential, masses, dim, box, cutoff, softening, params, bodies)
         return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale, exact)
 
@@ -466,6 +474,7 @@ class HamiltonianSystem(Hamiltonian):
         dt: float = 0.01,
         energy_scale: float | None = None,
         exact: Callable[[Any], Array] | None = None,
+        time: None = None,
     ) -> HamiltonianSystem:
         """A complex field on a periodic grid of any size, i ∂ψ/∂t = ω(−i∇)ψ + f'(|ψ|²)ψ: Schrödinger equations.
 
@@ -493,6 +502,8 @@ class HamiltonianSystem(Hamiltonian):
             Values of the other names; arrays in `onsite`, such as a potential V or disorder.
         name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
+        time : None
+            None alone: H by pieces does not depend on the time.
 
         Raises
         ------
@@ -508,6 +519,7 @@ class HamiltonianSystem(Hamiltonian):
         """
         from sympflow.hamiltonian.wave_functions import WaveFunctionHamiltonian
 
+        _check_no_time(time)
         local = WaveFunctionHamiltonian(onsite, dispersion, shape, length, params)
         return cls._of_pieces(local, None, name, domain, y0, t_span, dt, energy_scale, exact)
 
@@ -773,6 +785,14 @@ class HamiltonianSystem(Hamiltonian):
         if not self.autonomous:
             kind += ", driven" if self.period is None else f", driven with period {self.period:g}"
         return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
+
+
+def _check_no_time(time: object) -> None:
+    if time is not None:
+        raise TypeError(
+            "`time` is for systems that are written out, and those by one piece do not depend on it: leave it out, or "
+            "write H out by HamiltonianSystem.from_sympy(..., time='t')."
+        )
 
 
 def parameters_text(

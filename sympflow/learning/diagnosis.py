@@ -15,8 +15,8 @@ BETTER = 0.5
 """Share of the misfit that another reading of the data must leave at most, to be worth a word."""
 
 
-def hint(library: Library, smooth: Smooth, data: Trajectories) -> str:
-    """The likeliest reason why the terms do not explain the data, with the remedy."""
+def hint(library: Library, smooth: Smooth, data: Trajectories, otherwise: str) -> str:
+    """The likeliest reason why the terms do not explain the data, with the remedy; else what is said otherwise."""
     d, scales = data.ndof, data.scales
     x, v = smooth.points, smooth.slopes
     X = library.fields(x)
@@ -74,7 +74,7 @@ def hint(library: Library, smooth: Smooth, data: Trajectories) -> str:
                 "A vector field of cubic polynomials that is not Hamiltonian fits much better: the data are no motion "
                 "of a Hamiltonian in these coordinates, or these are not canonical."
             )
-    return "Give other `terms`, a higher `degree`, or the `noise` if it is larger than it looks."
+    return otherwise
 
 
 def _left(X: np.ndarray, v: np.ndarray, scales: np.ndarray) -> tuple[float, np.ndarray]:

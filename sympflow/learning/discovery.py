@@ -252,6 +252,7 @@ def discover(
             raise TypeError(f"`{next(iter(reading), 'noise')}` is of trajectories, and `data` is a flow: leave it out.")
         return _of_flow(data, terms, degree, most_terms, domain, seed, name)
     trajectories = Trajectories.read(data, ndof, **reading)
+    trajectories.check_moving()
     if not 0 <= held_out < 1:
         raise ValueError(f"`held_out` must be at least 0 and less than 1; got {held_out!r}: 0.2 keeps a fifth.")
     if piece is not None and not piece > 0:
@@ -561,7 +562,8 @@ class _Search:
 
     def _remark(self, noise: np.ndarray, excess: np.ndarray) -> str:
         worst = int(np.argmax(excess))
-        hint = diagnosis.hint(self.library, self.smooth, self.data)
+        otherwise = "Give other `terms`, a higher `degree`, or the `noise` if it is larger than it looks."
+        hint = diagnosis.hint(self.library, self.smooth, self.data, otherwise)
         return (
             f"No sparse Hamiltonian of the library's {len(self.library)} terms explains the data: of "
             f"{self.data.names[worst]} it leaves {noise[worst]:.3g}, {excess[worst]:.1f} times the noise. {hint} The "

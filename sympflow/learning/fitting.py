@@ -33,6 +33,8 @@ GROWTH = 1e3  # most that an error of an initial state may grow along a piece
 LEAST_GROWTH = 10.0
 PER_NOISE = 0.3  # of the spread of the data, that such an error may reach
 EXACT = 1e-9  # residuals, relative to the spread of the data, that need no explanation
+LOUDER = 2.0  # root mean square of held-out residuals, in σ, above which there are too few data, or another system
+SILENT = 0.5  # of the spread of the data, that noise leaves at most where a model explains anything
 CORRELATED = 0.1  # correlation of one residual with the next that chance is allowed to make, beside 3/√n
 
 
@@ -195,6 +197,9 @@ class Held:
         How many of them.
     exact : bool
         True if residuals are no more than rounding and the scheme leave.
+    loudness : float
+        Their root mean square in σ, of the noise on the trajectories that the model was fitted to; ρ in place of the
+        squares where the loss is robust.
     """
 
     fit: Fit
@@ -203,6 +208,7 @@ class Held:
     correlation: float
     pairs: int
     exact: bool
+    loudness: float
 
     @property
     def pieces(self) -> tuple[Run, ...]:
@@ -214,14 +220,25 @@ class Held:
         """Minus the log-likelihood of a number."""
         return float(self.losses.sum() / self.values)
 
+    @property
+    def complaint(self) -> str:
+        """The reason why they are no noise."""
+        if self.loudness >= LOUDER:
+            return (
+                f"they are {self.loudness:.1f} times the noise, as it was given or as the trajectories that the model "
+                "was fitted to show it"
+            )
+        return f"the correlation of one with the next is {self.correlation:.2f}"
+
     def squares(self, scales: np.ndarray) -> float:
         """The mean square of the residuals in units of the scales (2d,)."""
         return float(np.nanmean((np.concatenate(self.fit.residuals, axis=1) / scales[:, None]) ** 2))
 
     @property
     def explained(self) -> bool:
-        """True if nothing but noise is left: residuals are exact, or one tells nothing of the next."""
-        return self.exact or abs(self.correlation) < CORRELATED + 3 / math.sqrt(max(self.pairs, 1))
+        """True if nothing but noise is left: residuals are exact, or as loud and one tells nothing of the next."""
+        silent = abs(self.correlation) < CORRELATED + 3 / math.sqrt(max(self.pairs, 1))
+        return self.exact or (silent and self.loudness < LOUDER)
 
 
 def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
@@ -248,7 +265,8 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
         pairs += int(both.sum())
     exact = bool(all((np.abs(r)[np.isfinite(r)] < 100 * EXACT * scales.max()).all() for r in residuals))
     losses = np.where(np.isfinite(losses), losses, np.inf)
-    return Held(fit, losses, values, same / size if size > 0 else math.nan, pairs, exact)
+    correlation = same / size if size > 0 else math.nan
+    return Held(fit, losses, values, correlation, pairs, exact, math.sqrt(fit.cost / values))
 
 
 def gains(simple: Held, rich: Held) -> bool:

@@ -21,22 +21,25 @@ from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import hint
 from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Said, families, pruned, with_unit_mass
-from sympflow.learning.fitting import Fitted, Held, Setting, fitted, gains, judged, kept, restored
+from sympflow.learning.fitting import SILENT, Fitted, Held, Setting, fitted, gains, judged, kept, restored
 from sympflow.learning.library import library_for
 from sympflow.learning.models import Formula, FreeField, Model
 from sympflow.learning.shooting import Method
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Trajectories
 from sympflow.training import checkpoint as checkpoints
-from sympflow.training.session import Path, Session
+from sympflow.training.session import Path, Session, Silent
 from sympflow.training.trainer import train
 from sympflow.workers import Crew
 
 HELD_OUT = 0.2  # of the trajectories
-TABLE_SECONDS = 10.0  # for the numbers of the flow, of a fit of which nothing else is said
+TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
 NETWORK_SECONDS = 60.0  # for the weights of one, where H is not separable
 TABLE_SHARE = 0.3  # of a time budget, likewise
 HORIZONS = (1, 10, 100)  # in Δt, of the held-out errors
+MOST_VALUES = 40_000  # numbers observed by which models are chosen; the chosen one is fitted to all
+POOR = 1e-3  # one-step error of a flow, relative to the spread of the data, that is worth a warning
+LEAST_SECONDS = 1.0  # for the flow, however late it is
 MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
 HUBER = 1.5  # σ
 FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
@@ -135,6 +138,9 @@ def learn(
     .. [2] G. Schwarz, Estimating the dimension of a model, Ann. Statist. 6 (1978) 461–464, for the terms that are kept.
     """
     data = Trajectories.read(trajectories, ndof)
+    data.check_moving()
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
     said = _said(data, separable, mass, damping, period, known)
     if loss not in LOSSES:
         raise ValueError(f"`loss` must be one of {', '.join(LOSSES)}; got {loss!r}.")
@@ -148,15 +154,27 @@ def learn(
     if isinstance(replicas, bool) or not isinstance(replicas, int) or replicas < 0:
         raise ValueError(f"`replicas` must be an integer, 0 or more; got {replicas!r}: 20 give useful bands.")
     options = {"family": family, "loss": loss, "seed": seed, "damping": damping, "separable": separable}
-    search = Search(data, ours, held, said, setting, seed, identity=_identity(data, said, setting, options))
+    search = Search(
+        data, _few(ours, seed), _few(held, seed), said, setting, seed, identity=_identity(data, said, setting, options)
+    )
     if resume is not None:
         search.resume(resume)
     with session.interruption, session.crew:
         search.run(chosen, session)
         search.diagnose(session)
+        flow = search.flow(dt, name, session)
         if replicas:
-            search.bootstrap(replicas, session)
-        return search.flow(dt, name, session)
+            flow.replicas = search.bootstrap(replicas, session)
+        return flow
+
+
+def _few(data: Trajectories, seed: int) -> Trajectories:
+    """So many trajectories, drawn at random, that they hold no more numbers than are needed; all if they do not."""
+    if data.n_values <= MOST_VALUES:
+        return data
+    drawn = np.random.default_rng(seed).permutation(len(data.runs))
+    numbers = np.cumsum([np.isfinite(data.runs[i].y).sum() for i in drawn])
+    return data.subset(sorted(drawn[: max(1, int(np.searchsorted(numbers, MOST_VALUES, side="right")))]))
 
 
 def _said(data: Trajectories, separable: Any, mass: Any, damping: Any, period: Any, known: Any) -> Said:
@@ -292,7 +310,9 @@ class Search:
     identity: dict[str, Any] = field(default_factory=dict)
     done: dict[str, dict[str, Any]] = field(default_factory=dict)
     """The numbers of the models that were fitted, by their names."""
-    replicas: Replicas | None = None
+    cut: bool = False
+    """Whether the time was up before the search came to its end."""
+    bar: Silent = field(default_factory=Silent)
     unconstrained: float | None = None
     """The share of the squares of the held-out residuals that a field which is not Hamiltonian leaves, if small."""
     final: Fitted = field(init=False)
@@ -314,18 +334,20 @@ class Search:
             if held.exact
             else "it explains held-out trajectories best, and its residuals are noise: one tells nothing of the next"
             if held.explained
-            else f"it explains held-out trajectories best; but its residuals are not noise, for the correlation of one "
-            f"with the next is {held.correlation:.2f}"
+            else f"it explains held-out trajectories best; but its residuals are not noise: {held.complaint}"
         )
-        return f"{because} (of {others + 1} models)"
+        ended = "; the time budget ended the search" if self.cut else ""
+        return f"{because} (of {others + 1} models{ended})"
 
     def run(self, names: list[str], session: Session) -> None:
         """Fit models of these families until one explains the held-out trajectories, or no richer one does better."""
         deadline = session.deadline.part(1 - TABLE_SHARE) if session.time_budget is not None else session.deadline
         setting = Setting(self.setting.noise, self.setting.huber, deadline.over)
-        for name in names:
-            if self.best is None or not (self.best[2].explained or deadline.over()):
-                self._climb(name, setting, session)
+        total = sum(1 for name in names for _ in FAMILIES[name].models(self.said))
+        with session.bar(total, "Models") as self.bar:
+            for name in names:
+                if self.best is None or not (self.best[2].explained or deadline.over()):
+                    self._climb(name, setting, session)
         if self.best is None:
             raise ValueError(
                 f"`trajectories` have {self.data.n_values} numbers, fewer than the simplest model and the initial "
@@ -340,6 +362,7 @@ class Search:
         candidate, self.final, _ = self.winner
         if not deadline.over():
             self.final = fitted(candidate.model, self.all, setting, self.final.theta)
+        self.cut = deadline.over()
 
     def _climb(self, name: str, setting: Setting, session: Session) -> None:
         """Fit the models of a family, until two that follow each other are no better than one before."""
@@ -372,6 +395,7 @@ class Search:
             "noise": float(np.mean(found.sigma / self.data.scales)),
         }
         self.history.append({"model": candidate.name, **figures})
+        self.bar.tries(len(self.history), f"{candidate.name}: held-out loss {held.loss:.3g}")
         if session.callback is not None:
             session.callback(len(self.history), figures)
         return candidate, found, held
@@ -418,11 +442,22 @@ class Search:
         """Warn where the residuals of the best model are no noise, with what may be the reason."""
         candidate, _, held = self.winner
         if held.explained:
+            share = float(np.min(self.winner[1].sigma / self.data.scales))
+            if share > SILENT:
+                warnings.warn(
+                    f"The best model, {candidate.name}, explains next to nothing: the noise that it leaves is "
+                    f"{share:.0%} of the spread of every coordinate or more. Points may be in no order, of other "
+                    "trajectories or too far apart; else there is only noise.",
+                    UserWarning,
+                    stacklevel=3,
+                )
             return
         said = (
-            f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are no noise: the "
-            f"correlation of one with the next is {held.correlation:.2f}."
+            f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are no noise: "
+            f"{held.complaint}."
         )
+        if self.cut:
+            said += " The time budget ended the search: give it more."
         free = next((model for model in map(self._free, (3, 2)) if self._affords_field(model)), None)
         if free is not None and not session.deadline.over():
             compared = fitted(free, self.data, Setting(self.setting.noise, self.setting.huber, session.deadline.over))
@@ -437,7 +472,8 @@ class Search:
                 )
                 self.unconstrained = other / ours
         smooth = smoothed(self.data)
-        said += " " + hint(library_for(None, self.data.ndof, 4, smooth.points)[0], smooth, self.data)
+        otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
+        said += " " + hint(library_for(None, self.data.ndof, 4, smooth.points)[0], smooth, self.data, otherwise)
         warnings.warn(said, UserWarning, stacklevel=3)
 
     def _free(self, degree: int) -> FreeField:
@@ -446,13 +482,23 @@ class Search:
     def _affords_field(self, model: FreeField) -> bool:
         return model.n <= MOST_TERMS and self.data.n_values > 2 * model.n + 2 * self.data.ndof * len(self.data.runs)
 
-    def bootstrap(self, n: int, session: Session) -> None:
-        """Fit the chosen model to trajectories that are drawn anew, n times."""
+    def bootstrap(self, n: int, session: Session) -> Replicas:
+        """Fit the chosen model to trajectories that are drawn anew, n times, or two at least until the time is up."""
         setting = Setting(self.setting.noise, self.setting.huber)
         model = self.winner[0].model
         common = model, self.all, setting, self.final.theta, self.seed
-        thetas = np.stack(list(session.each(replica, common, range(n), session.deadline)))
-        self.replicas = Replicas(model, self.final.method, self.final.theta, thetas)
+        thetas: list[np.ndarray] = []
+        for theta in session.each(replica, common, range(n), session.deadline):
+            thetas.append(theta)
+            if len(thetas) > 1 and session.deadline.over():
+                break
+        if len(thetas) < n:
+            warnings.warn(
+                f"The time budget ended the bootstrap after {len(thetas)} of {n} replicas: bands are rough.",
+                UserWarning,
+                stacklevel=3,
+            )
+        return Replicas(model, self.final.method, self.final.theta, np.stack(thetas))
 
     # the flow ---------------------------------------------------------------------------------------------------------
 
@@ -479,20 +525,33 @@ class Search:
     def flow(self, dt: float | None, name: str, session: Session) -> Any:
         """A flow of the H that was learned."""
         system = self.system(name)
-        usual = TABLE_SECONDS if system.separable else NETWORK_SECONDS
-        options: dict[str, Any] = {} if system.separable else {"optimizer": "gauss-newton"}
-        options["time_budget"] = usual if session.time_budget is None else max(session.deadline.left, 1.0)
+        options: dict[str, Any] = {"restarts": TABLE_STARTS}
+        if not system.separable:
+            options = {"optimizer": "gauss-newton", "time_budget": NETWORK_SECONDS}
+        if session.time_budget is not None:
+            options["time_budget"] = max(session.deadline.left, LEAST_SECONDS)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Training", category=RuntimeWarning)
             flow = train(system, dt, progress=session.progress, seed=self.seed, **options)
         flow.figures = {**flow.figures, **self.figures(flow.dt), "energy_scatter": self.energy_scatter(flow)}
+        self._check_flow(flow)
         flow.history = self.history
         learned = {"model": self.winner[0].name, "reason": self.reason, "models": self.history}
         damping = None if system.friction is None else system.friction.damping.tolist()
         flow.recipe = {**flow.recipe, "learned": {**learned, "damping": damping}}
         flow.take_learned(system)
-        flow.replicas = self.replicas
         return flow
+
+    def _check_flow(self, flow: FlowMap) -> None:
+        """Warn of a flow that is worse than the H of which it is."""
+        error, noise = flow.figures.get("one_step_error"), flow.figures["noise"]
+        if error is not None and error > max(noise, POOR * float(self.data.scales.min())):
+            warnings.warn(
+                f"The flow is worse than the H that was learned: its one-step error is {error:.1e}, the noise "
+                f"{noise:.1e}. Give a longer `time_budget` or a shorter `dt`, or solve `flow.system` with a scheme.",
+                UserWarning,
+                stacklevel=4,
+            )
 
     def figures(self, dt: float) -> dict[str, float]:
         """The figures of the chosen model on the held-out trajectories, before its last fit to all of them."""

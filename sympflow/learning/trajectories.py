@@ -208,6 +208,16 @@ class Trajectories:
         units = np.array(scaling.x)[:, None]
         return replace(self, runs=tuple(Run(run.t / scaling.t, run.y / units) for run in self.runs))
 
+    def check_moving(self) -> None:
+        """Raise ValueError if a coordinate has the same value everywhere: H could have any slope in it."""
+        for i, name in enumerate(self.names):
+            values = np.concatenate([run.y[i] for run in self.runs])
+            if np.nanmin(values) == np.nanmax(values):
+                raise ValueError(
+                    f"`trajectories` have the same {name} at all points, {np.nanmin(values):g}: nothing can be learned "
+                    "of it; drop this degree of freedom, or add trajectories in which it changes."
+                )
+
     def split(self, share: float = 0.2, seed: int = 0) -> tuple[Trajectories, Trajectories]:
         """Two disjoint sets of whole trajectories, the second with that share of them, drawn at random.
 

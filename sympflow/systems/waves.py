@@ -246,7 +246,8 @@ def nonlinear_schroedinger(
 
         ψ = η sech(η(x − x₀ − vt)) exp(i v(x − x₀) + i(η² − v²)t/2),
 
-    with the norm h Σ|ψ|² = 2η and the energy hH = ηv² − η³/3, to rounding where tails and waves fit the grid. It starts
+    with the norm h Σ|ψ|² = 2η and the energy hH = ηv² − η³/3, to rounding where tails and waves fit the grid; around
+    the ring it is the image nearest to a site. It starts
     an eighth of the length before the middle, and has passed as much behind it at the end of the default interval. The
     domain is a box about it.
 
@@ -258,7 +259,7 @@ def nonlinear_schroedinger(
     n, L = _sites(n, 2), _positive("length", length)
     eta, v = _positive("amplitude", amplitude), _finite("velocity", velocity)
     x, high = _grid(n, L / n), np.full(2 * n, 1.6 * eta)
-    exact = partial(_states, partial(_soliton, amplitude=eta, velocity=v, start=_start(v, L / 2)), x)
+    exact = partial(_states, partial(_soliton, amplitude=eta, velocity=v, start=_start(v, L / 2), length=L), x)
     return HamiltonianSystem.schroedinger(
         "-rho**2/2",
         shape=n,
@@ -273,12 +274,14 @@ def nonlinear_schroedinger(
 
 
 def _soliton(
-    x: np.ndarray, t: np.ndarray, amplitude: float, velocity: float, start: float
+    x: np.ndarray, t: np.ndarray, amplitude: float, velocity: float, start: float, length: float
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Around the ring: at a site that image of the soliton which is nearest."""
     eta, v = amplitude, velocity
+    X = (x - start - v * t + length / 2) % length - length / 2
     with np.errstate(over="ignore"):
-        size = math.sqrt(2) * eta / np.cosh(eta * (x - start - v * t))
-    phase = v * (x - start) + (eta**2 - v**2) * t / 2
+        size = math.sqrt(2) * eta / np.cosh(eta * X)
+    phase = v * X + (eta**2 + v**2) * t / 2
     return size * np.cos(phase), size * np.sin(phase)
 
 

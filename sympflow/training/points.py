@@ -305,6 +305,35 @@ class Labels:
         return None if self.t0 is None else self.t[:, None] + self.t0
 
 
+def box_without(good: np.ndarray, bad: np.ndarray) -> tuple[list[float], list[float]] | None:
+    """The corners, to two digits or three, of a box of states (n, 2d) with none of the bad ones and many good ones.
+
+    From the box around all of them sides are cut off, each time the piece that holds the largest share of the bad less
+    that of the good. None where nothing is bad, or less than a tenth of the good are left.
+    """
+    if not (len(good) and len(bad)):
+        return None
+    low, high = np.minimum(good.min(0), bad.min(0)), np.maximum(good.max(0), bad.max(0))
+    n_good, n_bad = len(good), len(bad)
+    while len(bad):
+        best, cut = -np.inf, (0, 0.0, True)
+        for k in range(bad.shape[1]):
+            for value in bad[:, k]:
+                for below in (True, False):
+                    lost = [np.mean(x[:, k] <= value if below else x[:, k] >= value) for x in (bad, good)]
+                    if (gain := lost[0] * len(bad) / n_bad - lost[1] * len(good) / n_good) > best:
+                        best, cut = gain, (k, value, below)
+        k, value, below = cut
+        good, bad = ((x[x[:, k] > value] if below else x[x[:, k] < value]) for x in (good, bad))
+        if len(good) < 0.1 * n_good or not len(good):
+            return None
+        (low if below else high)[k] = good[:, k].min() if below else good[:, k].max()
+    digits = (2 - np.floor(np.log10(np.maximum(high - low, np.finfo(float).tiny)))).astype(int).tolist()
+    lower = [round(math.ceil(v * 10.0**n) / 10.0**n, max(n, 0)) for v, n in zip(low, digits, strict=True)]
+    upper = [round(math.floor(v * 10.0**n) / 10.0**n, max(n, 0)) for v, n in zip(high, digits, strict=True)]
+    return lower, upper
+
+
 @np.errstate(all="ignore")
 def step_errors(difference: np.ndarray) -> dict[str, float]:
     """Figures of ψ̄_t(x) − φ_H,t(x), (J, N, 2d): mean, median and largest norm at Δt, the last time; mean before it."""

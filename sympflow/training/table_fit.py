@@ -33,10 +33,12 @@ from sympflow.training.least_squares import Blocks, Minimum, levenberg_marquardt
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.options import TableOptions
 from sympflow.training.points import (
+    USELESS,
     Labelled,
     Labels,
     PointSource,
     Stream,
+    box_without,
     shares_missed,
     start_times,
     states,
@@ -225,9 +227,29 @@ class TableRun(SearchRun):
     @property
     def remedy(self) -> str:
         return (
-            "Take a smaller `domain`, without states where H is singular or nearly so, a shorter `dt`, or another "
-            "`flow`, with more kicks."
+            f"{self._spoiled()}Take a smaller `domain`, without states where H is singular, nearly so, or has a kink, "
+            "a shorter `dt`, or another `flow`, with more kicks."
         )
+
+    @np.errstate(all="ignore")
+    def _spoiled(self) -> str:
+        """The held-out states at which the flow is nothing, in words, with a smaller domain that has none of them."""
+        x = states(self.domain, self.options.reference_states, self.options.seed, Stream.REFERENCE)
+        known = self.held_out.x
+        labelled = {row.tobytes() for row in known}
+        lost = x[[row.tobytes() not in labelled for row in x]]
+        unit = np.array(self.scaling.x)
+        error, moved = (np.linalg.norm(v / unit, axis=-1) for v in (self.at_end[-1], self.held_out.y[-1] - known))
+        good = error < USELESS * np.median(moved)
+        if 10 * good.sum() < len(x):  # spoiled everywhere
+            return ""
+        box = box_without(known[good], np.concatenate([lost, known[~good]]))
+        words = f"At {(~good).sum()} of {len(x)} held-out states it misses a tenth of what a step moves most states"
+        if len(lost):
+            words += f", and from {len(lost)} no solution exists up to `dt`"
+        if box is None:
+            return f"{words}. "
+        return f"{words}; none of these is in Box({box[0]}, {box[1]}). "
 
     def missed(self) -> tuple[float, float]:
         return shares_missed(self.at_end[-1], self.held_out, np.array(self.scaling.x))
@@ -264,7 +286,7 @@ class TableRun(SearchRun):
         warnings.warn(
             f"The fit has a larger held-out error ({after:.1e}, in units of the spread of `domain`) than the flow that "
             f"it started from ({before:.1e}), which is returned: its data are too few, too far from Δt, or not of this "
-            "system; or H is singular in `domain`, or nearly so: shrink that.",
+            "system; or H is singular in `domain`, nearly so, or has a kink: shrink that.",
             RuntimeWarning,
             stacklevel=7,
         )

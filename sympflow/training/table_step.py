@@ -570,7 +570,10 @@ def _generated(
     """
     import sympy as sp
 
+    from sympflow.hamiltonian.symbolic import without_deltas
+
     letters: dict[Any, Any] = {}
+    expressions = [without_deltas(f) for f in expressions]
     if samples:
         from sympflow.hamiltonian.driving import with_letters
 

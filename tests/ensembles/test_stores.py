@@ -70,6 +70,19 @@ def test_a_run_goes_on_where_it_ended(tmp_path, monkeypatch):
     assert np.array_equal(run(store=path, resume=True).y, run().y, equal_nan=True)
 
 
+def test_two_programs_share_a_store(tmp_path):
+    path, others = tmp_path / "a.zarr", []
+
+    def other(done, total):
+        if not others and done:  # the whole ensemble, while the first is in its midst
+            others.append(None)
+            others[0] = run(store=path, resume=True, workers=2).y
+
+    result = run(store=path, progress=other)
+    for y in (result.y, others[0], run(store=path, resume=True).y):
+        assert np.array_equal(y, run().y, equal_nan=True)
+
+
 KILLED = """
 import os, signal, sys
 import numpy as np

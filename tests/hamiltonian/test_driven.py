@@ -98,6 +98,14 @@ def test_derivatives_are_those_of_h_at_each_time():
     assert DRIVEN.hamiltonian(Y.astype(np.float32), 1e4).dtype == np.float32
 
 
+def test_a_force_of_the_time_alone_is_that_of_each_state():
+    pushed = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 + q1*cos(t) + q2**2", time="t")
+    y = np.arange(12.0).reshape(3, 4)
+    for function in ("gradient", "vector_field", "hessian"):
+        found = getattr(pushed, function)(torch.tensor(y), 0.3)
+        np.testing.assert_allclose(found, getattr(pushed, function)(y, 0.3), atol=1e-15)
+
+
 TIMES = np.linspace(0, 10, 81)
 SPLINES = {
     "cubic": CubicSpline(TIMES, np.cos(W * TIMES)),

@@ -218,3 +218,16 @@ def test_what_is_better_a_lattice_is_told_so():
     terms = " + ".join(f"p{i}**2/2 + q{i}**2/2" for i in range(1, 402))
     with pytest.warns(UserWarning, match=r"401 coordinates.*HamiltonianSystem.lattice"):
         HamiltonianSystem.from_sympy(terms)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: HamiltonianSystem.lattice(bond="r**2/2", shape=8, time="t"),
+        lambda: HamiltonianSystem.pairs("1/r", masses=np.ones(3), time="t"),
+        lambda: HamiltonianSystem.schroedinger(shape=8, time="t"),
+    ],
+)
+def test_a_time_is_answered_with_what_can_be_done(make):
+    with pytest.raises(TypeError, match=r"^`time` is for systems that are written out.*from_sympy"):
+        make()

@@ -134,4 +134,5 @@ def test_groups_of_parameters_are_kept_up_to_where_they_were(short_windows, monk
     assert 100 < known[1].sum() < 150
     assert not known[2].any()
     assert sol.status.tolist() == [0, -1, -1]
+    assert sol.message.startswith("The run was interrupted")
     np.testing.assert_array_equal(sol.y[:2][..., known[1]], whole.y[:2][..., known[1]])

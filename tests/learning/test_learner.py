@@ -7,8 +7,8 @@ from scipy.integrate import solve_ivp
 
 import sympflow
 from sympflow.learning.families import FAMILIES, Candidate, pruned
-from sympflow.learning.fitting import Setting, fitted, restored
-from sympflow.learning.learner import Replicas, Search, _said, replica
+from sympflow.learning.fitting import Setting, fitted, judged, restored
+from sympflow.learning.learner import MOST_VALUES, Replicas, Search, _few, _said, replica
 from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Network, Pairs, Polynomial, Waves
 from sympflow.learning.shooting import Gauss, Method, Problem, chosen_method, first_states, matched, minimized
 from sympflow.learning.trajectories import Trajectories
@@ -260,6 +260,7 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
         (4, {"damping": 0.1}, "`damping`"),
         (4, {"mass": 1.0, "separable": False}, "`mass`"),
         (4, {"dt": -1.0}, "`dt`"),
+        (4, {"seed": "x"}, "`seed`"),
     ],
 )
 def test_what_cannot_be_learned_is_refused(runs, options, match):
@@ -320,3 +321,30 @@ def test_replicas_tell_how_certain_a_prediction_is():
     theta = found.theta
     assert np.std(thetas, axis=0) == pytest.approx(np.sqrt(np.diag(found.fit.covariance())), rel=0.9)
     assert np.abs(thetas.mean(0) - theta).max() < 0.05
+
+
+def test_noise_alone_and_a_noise_that_is_too_small_are_called_so():
+    random, t = np.random.default_rng(0), np.linspace(0, 4, 21)
+    data = Trajectories.read((t, random.normal(size=(6, 2, 21))))
+    search = Search(data, *data.split(0.2, 0), _said(data, None, None, False, None, None), Setting(), 0)
+    search.run(["polynomial"], Session())
+    with pytest.warns(UserWarning, match="explains next to nothing"):
+        search.diagnose(Session())
+    data = Trajectories.read(trajectories(6, 12, noise=0.02))
+    held = judged(fitted(quartic(data), data, Setting(np.full(2, 0.002))), data, Setting(np.full(2, 0.002)))
+    assert held.loudness == pytest.approx(10, rel=0.2)  # the initial states take a twelfth of it
+    assert not held.explained
+    assert "times the noise" in held.complaint
+
+
+def test_a_coordinate_that_stands_still_is_refused():
+    with pytest.raises(ValueError, match="the same p1 at all points"):
+        sympflow.learn([(t, y * [[1], [0]]) for t, y in trajectories(4, 6)])
+
+
+def test_of_many_numbers_a_part_chooses_the_model():
+    data = Trajectories.read((np.linspace(0, 1, 101), np.random.default_rng(0).normal(size=(300, 2, 101))))
+    few = _few(data, 0)
+    assert 0.98 * MOST_VALUES < few.n_values <= MOST_VALUES
+    assert any(run is not other for run, other in zip(few.runs, data.runs, strict=False))  # not the first ones
+    assert _few(few, 0) is few

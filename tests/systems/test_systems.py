@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sympflow import solve, systems
+from sympflow import max_energy_error, solve, systems
 from sympflow.commands.words import scenes
 from sympflow.hamiltonian.domain import domain_from_dict
 from sympflow.systems import SYSTEMS, celestial, chains
@@ -97,16 +97,19 @@ def test_the_scene_can_be_described_and_starts_inside_its_domain(scene):
     assert system.t_span[1] > system.t_span[0]
 
 
-@pytest.mark.parametrize("scene", sorted(SCENES.keys() - {"kepler 0.999", "spring pendulum, polar"}))
+@pytest.mark.parametrize(
+    "scene", sorted(SCENES.keys() - {"kepler 0.999", "spring pendulum, polar", "henon_heiles_escape"})
+)
 def test_the_default_step_is_sensible(scene):
     """A method of order 8 at the default step keeps the energy to 1e-9 for 500 steps.
 
-    Not for a close encounter, which takes a transformation of time.
+    Not for a close encounter, which takes a transformation of time, nor for a solution that ends in finite time. Far
+    out, where r is 1e9 times p, the coupling of Tao's two copies adds up what differs in units.
     """
     system = SCENES[scene][0]()
-    method = "kahan_li8" if system.separable else "tao8"
+    method = "kahan_li8" if system.separable else "gauss_legendre8" if scene.endswith("far out") else "tao8"
     sol = solve(system, method, (0, 500 * system.dt), backend="array", save_every=50)
-    assert sol.energy_error().max() < 1e-9
+    assert max_energy_error(sol) < 1e-9
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -163,7 +166,7 @@ def test_fput_exchanges_energy_among_the_stiff_springs_and_keeps_its_sum():
     assert stiff.shape == (len(sol.t), 3)
     assert abs(stiff.sum(-1) - 1).max() == pytest.approx(0.065, abs=0.003)
     assert stiff[:, 1].max() == pytest.approx(0.519, abs=0.01)
-    assert sol.energy_error().max() < 1e-9
+    assert max_energy_error(sol) < 1e-9
     assert system.domain.contains(sol.states).all()
     with pytest.raises(ValueError, match=r"^`system` must be fput"):
         systems.oscillatory_energies(systems.quartic(), np.zeros(4))
@@ -336,7 +339,7 @@ def test_jupiter_returns_after_4332_days():
     """Its mean period over 16 revolutions, from the angle swept in the plane of its orbit."""
     system = PLANETS
     sol = solve(system, "kahan_li8", (0, 16 * 4332.0), dt=50.0)
-    assert sol.energy_error().max() < 1e-13
+    assert max_energy_error(sol) < 1e-13
     assert sol.stats["backend"] == "compiled"
     q = (sol.states[:, 3:6] - sol.states[:, :3]).T
     pole = np.cross(q[:, 0], q[:, 20])
@@ -351,7 +354,7 @@ def test_the_argon_crystal_is_that_of_the_book():
     system = ARGON
     assert system.hamiltonian(system.y0) == pytest.approx(-1260.2, abs=0.05)
     sol = solve(system, "verlet", (0, 0.02))
-    assert sol.energy_error().max() * 1260.2 < 10  # figure I.4.1 of the book: a few kelvin
+    assert max_energy_error(sol) * 1260.2 < 10  # figure I.4.1 of the book: a few kelvin
     assert sol.stats["backend"] == "compiled"
 
 

@@ -113,3 +113,9 @@ def test_a_scene_with_an_exact_solution_can_be_copied_and_changed():
 def test_bad_parameters_of_waves_are_refused(make, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         make()
+
+
+def test_the_schroedinger_soliton_goes_around_the_ring():
+    ring = sympflow.systems.nonlinear_schroedinger(velocity=3.0, n=256, length=40.0)
+    sol = solve(ring, "linear_kahan_li8", (0, 20), dt=0.02, t_eval=[0.0, 10.0, 20.0])  # one turn and a half
+    assert abs(sol.states - ring.exact(sol.t)).max() < 1e-7

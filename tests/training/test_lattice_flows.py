@@ -109,6 +109,14 @@ def test_another_lattice_is_refused_by_the_term_that_differs(flow, other, reason
         flow.transferred(other if other.ndof != 40 else ring(41, bond="r**2/2 + r**4/5"))
 
 
+def test_what_is_no_lattice_is_refused(flow):
+    written = HamiltonianSystem.from_sympy(ring(6).local.written_out())
+    with pytest.raises(ValueError, match=r"^`system` 'custom' has 6 degrees of freedom but the flow 40"):
+        solve(written, flow, (0, 5), np.full(12, 0.1), backend="array")
+    with pytest.raises(ValueError, match=r"^`system` 'pairs' has 4 degrees of freedom but the flow 40"):
+        solve(HamiltonianSystem.pairs("1/r", masses=np.ones(2), dim=2), flow, (0, 5), np.arange(8.0))
+
+
 def test_the_flow_of_a_damped_lattice_is_of_its_friction():
     lattice = ring(20, damping=0.1, domain=LatticeStates(0.2))
     flow = train(lattice, flow=SympFlow.primed(lattice, 2, dt=0.25, processor=0), **FIT)

@@ -8,7 +8,7 @@ import pytest
 from sympflow import Box, HamiltonianSystem, SympFlow, systems, train
 from sympflow.flow.scaling import Scaling
 from sympflow.training.options import TableOptions
-from sympflow.training.points import USELESS, Labels, shares_missed
+from sympflow.training.points import USELESS, Labels, box_without, shares_missed
 from sympflow.training.table_fit import TableRun, differences, distance
 
 PENDULUM = systems.pendulum()
@@ -60,3 +60,24 @@ def test_numbers_that_overflow_are_not_finite_without_the_warnings_of_numpy():
         difference = differences(flow, run.step, run.held_out)
         assert distance(difference, np.ones(2)) == np.inf
         assert shares_missed(difference[-1], run.held_out, np.ones(2)) == (np.inf, np.inf)
+
+
+def test_part_of_a_domain_that_spoils_a_fit_is_cut_off():
+    x = np.random.default_rng(0).uniform([-1, -2, -3, -4], [1, 2, 3, 4], (400, 4))
+    bad = (x[:, 1] > 1.5) | (x[:, 2] < -2.0)
+    low, high = box_without(x[~bad], x[bad])
+    inside = ((low <= x) & (x <= high)).all(1)
+    assert not (inside & bad).any()
+    assert inside.sum() > 0.9 * (~bad).sum()
+    assert 1.4 < high[1] <= 1.5
+    assert -2.0 <= low[2] < -1.9
+    assert box_without(x, x[:0]) is None
+
+
+def test_kink_is_trained_on_as_far_as_it_goes():
+    system = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 + Abs(q)", domain=Box([-1, -1], [1, 1]))
+    start = SympFlow.primed(system, stages=2, dt=0.2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it says that kinks spoil it
+        flow = train(system, flow=start, restarts=1, steps=3, points=20, reference_states=20, progress=False)
+    assert flow.figures["missed_share"] < 0.1

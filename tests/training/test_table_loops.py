@@ -29,7 +29,11 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=CASES)
+LONG = ("polynomial", "driven")
+"""Cases that are compiled in the long tests: polynomials, and a drive that another case has with friction."""
+
+
+@pytest.fixture(scope="module", params=[pytest.param(c, marks=pytest.mark.slow) if c in LONG else c for c in CASES])
 def fits(request):
     """Fits of one system at two times to random labels: by arrays and compiled, without and with a weight of H."""
     system, level, of = CASES[request.param]
