@@ -52,21 +52,21 @@ class Loss:
                 "pass matching_weight=0, or fit by the labels",
             )
 
-    def residual(self, flow: FlowMap, t: Tensor, x: Tensor, t0: Tensor | None = None) -> Tensor:
+    def residual(self, flow: FlowMap, t: Tensor, x: Tensor, *t0: Tensor) -> Tensor:
         """(d/dt ψ̄_t(x) − J∇H(ψ̄_t(x))) Δt/s: (..., 2d)."""
-        y, velocity = flow.psi_and_velocity(t, x, t0)
+        y, velocity = flow.psi_and_velocity(t, x, *t0)
         unit = torch.tensor(self.scaling.x, dtype=y.dtype, device=y.device) / self.scaling.t
-        return (velocity - self.system.vector_field(y, _later(t0, t, y))) / unit
+        return (velocity - self.system.vector_field(y, *_later(t, y, *t0))) / unit
 
-    def mismatch(self, flow: SympFlow, t: Tensor, x: Tensor, t0: Tensor | None = None) -> Tensor:
+    def mismatch(self, flow: SympFlow, t: Tensor, x: Tensor, *t0: Tensor) -> Tensor:
         """(𝓗(ψ̄)(t, x) − H(x)) Δt/action, not yet less c(t): (...)."""
-        H = flow.hamiltonian_unchecked(t, x, t0)
-        return (H - self.system.hamiltonian(x, _later(t0, t, x))) * (self.scaling.t / self.scaling.action)
+        H = flow.hamiltonian_unchecked(t, x, *t0)
+        return (H - self.system.hamiltonian(x, *_later(t, x, *t0))) * (self.scaling.t / self.scaling.action)
 
-    def label_error(self, flow: FlowMap, t: Tensor, x: Tensor, y: Tensor, t0: Tensor | None = None) -> Tensor:
+    def label_error(self, flow: FlowMap, t: Tensor, x: Tensor, y: Tensor, *t0: Tensor) -> Tensor:
         """(ψ̄_t(x) − y)/s: (..., 2d)."""
         unit = torch.tensor(self.scaling.x, dtype=y.dtype, device=y.device)
-        return (flow.psi(t, x, t0) - y) / unit
+        return (flow.psi(t, x, *t0) - y) / unit
 
     def terms(self, flow: FlowMap, points: Points) -> Terms:
         """L1, L2 and L3, None where the weight is 0."""
@@ -92,9 +92,9 @@ class Loss:
         return self.total(self.terms(flow, points))
 
 
-def _later(t0: Tensor | None, t: Tensor, x: Tensor) -> Tensor | None:
-    """t0 + t of states x, None of a system that is not driven."""
-    return None if t0 is None else (t0 + t).expand(x.shape[:-1])
+def _later(t: Tensor, x: Tensor, *t0: Tensor) -> list[Tensor]:
+    """t0 + t of states x, nothing of a system that is not driven."""
+    return [(start + t).expand(x.shape[:-1]) for start in t0]
 
 
 def never() -> None:
