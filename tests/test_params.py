@@ -27,8 +27,14 @@ def own(system, method, y0, i, **options):
     return solve(system.with_params(lam=LAM[i]), method, (0, 3), y0[i : i + 1], **options)
 
 
+OF_CODE = ("chin4c", "gauss_legendre4", "linear_srkn11b")  # compiled anew for the values of each trajectory
+
+
 class TestTrajectories:
-    @pytest.mark.parametrize("method", ["verlet", "chin4c", "gauss_legendre4", "linear_srkn11b", "dop853", "rk4"])
+    @pytest.mark.parametrize(
+        "method",
+        [*("verlet", "dop853", "rk4"), *(pytest.param(m, marks=pytest.mark.slow) for m in OF_CODE)],
+    )
     def test_each_is_that_of_its_own_system(self, system, y0, method):
         options = {"t_eval": [0, 0.55, 3]} | ({} if method == "dop853" else {"dt": 0.25})
         sol = solve(system, method, (0, 3), y0, params={"lam": LAM}, **options)
@@ -67,6 +73,7 @@ class TestTrajectories:
             expected = solve(alone, "verlet", (0, 3), y0[i], backend="array", **options)
             np.testing.assert_allclose(sol.y[i], expected.y, rtol=0, atol=1e-14)
 
+    @pytest.mark.slow
     def test_shapes_broadcast_with_those_of_the_states(self, system, y0):
         grid = {"lam": LAM[:, None], "m": [1.0, 2.0]}
         sol = solve(system, "verlet", (0, 1), params=grid, dt=0.25, dense_output=True)

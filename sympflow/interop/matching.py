@@ -245,7 +245,7 @@ class Comparison:
         self.states_compared += len(states)
         with torch.no_grad():
             x = torch.from_numpy(states.copy()).to(self.flow.dtype)
-            velocity = to_numpy(self.flow.initial_velocity(x, torch.from_numpy(times)))
+            velocity = to_numpy(self.flow.initial_velocity(x, torch.from_numpy(times.copy())))
         largest = np.maximum(np.abs(slope).max(-1), np.abs(velocity).max(-1))
         best, worst = OF_A_FLOW
         measured = self.flow.figures.get("one_step_error")

@@ -118,9 +118,13 @@ class SplittingLoops:
                 "`system` cannot be compiled: it is given by plain functions. Define it with "
                 "HamiltonianSystem.from_sympy or by Numba functions, or use backend='array'."
             )
-        self._system = ref(system)  # which keeps these loops
+        self._system: ref[HamiltonianSystem] | None = ref(system)  # which keeps these loops
         self._has_curvature = system.symbols is not None or system.local is not None
         self._variants: dict[tuple[int, bool, Monomials, bool, Ranges], LoopFunctions] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The attributes, with the ranges, for which the system would be asked."""
+        return vars(self) | {"_ranges": self._ranges, "_system": None}
 
     def kernel(self, scheme: Scheme, compensated: bool = False, ranges: Ranges = ()) -> SplittingKernel:
         """The loops of one scheme.
@@ -178,7 +182,7 @@ class SplittingLoops:
 
     @cached_property
     def _ranges(self) -> Ranges:
-        system = self._system()
+        system = None if self._system is None else self._system()
         if not self._has_ranges or system is None or system.symbols is None or system.domain is None:
             return ()
         from sympflow.kernels.approximations import position_ranges

@@ -96,6 +96,7 @@ def test_a_users_function():
     assert np.allclose(errors, np.abs(H / H[:, :1] - 1).max(1), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_grid_of_parameters():
     H = "p**2/(2*m) + k*q**2/2 + a*q**4/4 - F*a*q"  # F a is a product of parameters that is added
     system = sympflow.HamiltonianSystem.from_sympy(H, params={"k": 1.0, "a": 0.1, "m": 1.3, "F": 0.37})

@@ -137,7 +137,7 @@ def test_the_energy_balance_is_that_of_the_steps():
         (lambda: made("p**2*cos(t) + q**2/2", time="t").linear_part, "do not depend on t"),
         (lambda: solve(POLAR, "strang_parts", parts=TERMS[1:]), "^`parts` do not add up"),
         (lambda: solve(LINEAR, "log_kahan_li8"), "'log_kahan_li8' does not take the time"),
-        (lambda: sympflow.SympFlow.split(LINEAR), "is driven, H depends on t, which trained flows take only"),
+        (lambda: sympflow.SympFlow.split(LINEAR), "is driven, H depends on t, which primed flows take"),
     ],
 )
 def test_what_does_not_apply_says_why(ask, message):

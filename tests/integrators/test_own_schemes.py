@@ -48,7 +48,8 @@ def test_a_triple_of_ones_own_is_that_of_the_table(system, triple):
 def test_the_triple_of_a_built_in_method_is_that_method():
     assert splitting_method("verlet", "linear") is get("impulse")
     assert splitting_method(SCHEMES["kahan_li8"], clock="logarithmic") is get("log_kahan_li8")
-    assert splitting_method("kahan_li8", "linear").name == "kahan_li8_linear"
+    assert splitting_method("kahan_li8", "linear") is get("linear_kahan_li8")
+    assert splitting_method("suzuki4", "linear").name == "suzuki4_linear"
 
 
 def test_classes_and_instances_pickle_by_their_table():

@@ -323,6 +323,7 @@ def test_replicas_tell_how_certain_a_prediction_is():
     assert np.abs(thetas.mean(0) - theta).max() < 0.05
 
 
+@pytest.mark.slow
 def test_noise_alone_and_a_noise_that_is_too_small_are_called_so():
     random, t = np.random.default_rng(0), np.linspace(0, 4, 21)
     data = Trajectories.read((t, random.normal(size=(6, 2, 21))))

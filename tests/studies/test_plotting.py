@@ -120,6 +120,7 @@ else:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.slow
 def test_the_portrait_of_a_flow_in_another_time_is_that_of_its_physical_time():
     system = systems.kepler(0.6)
     flow = get("sympflow")(flow="kepler-log-1")

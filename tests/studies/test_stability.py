@@ -252,8 +252,12 @@ def test_initial_states_lie_on_one_orbit():
     ("method", "span"),
     [
         ("verlet", {}),
-        ("gauss_legendre4", {"t_span": (0.0, 20.0), "min_steps": 200}),
-    ],  # by arrays: dear
+        pytest.param(
+            "gauss_legendre4",
+            {"t_span": (0.0, 20.0), "min_steps": 200},
+            marks=pytest.mark.slow,  # by arrays: dear
+        ),
+    ],
 )
 def test_both_precisions_and_every_metric(tmp_path, method, span):
     report = stability(systems.pendulum(), [method], steps=[0.1], dtypes=["float64", "float32"], **span)

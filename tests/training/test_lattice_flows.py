@@ -127,6 +127,7 @@ def test_the_flow_of_a_damped_lattice_is_of_its_friction():
             solve(other, flow, (0, 5), y0)
 
 
+@pytest.mark.slow
 def test_the_flow_of_a_disordered_lattice_is_of_its_arrays():
     masses = np.random.default_rng(0).uniform(0.8, 1.2, 20)
     options = {"kinetic": "p**2/(2*m)", "domain": LatticeStates(0.2)}
