@@ -7,7 +7,8 @@
 The slope of the relative energy error is fitted to the means over 20 blocks of the run, and its standard error to their
 scatter (`sympflow.energy_drift`). A flow passes if |slope|·T ≤ max(3 standard errors · T, 10 ε √N), N steps of Δt in T,
 with ε the rounding unit. The orbit starts at the `y0` of the scene, but for Hénon–Heiles, whose y0 is chaotic: there it
-is near the periodic orbit along q1; and for the Toda chain, whose soliton leaves the domain: there it is a wave. A thousand states count, at equal times. A flow that fails does not pass.
+is near the periodic orbit along q1; and for the Toda chain, whose soliton leaves the domain: there it is a wave. A
+thousand states count, at equal times. A flow that fails does not pass.
 """
 
 # ruff: noqa: E402
