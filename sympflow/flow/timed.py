@@ -65,7 +65,7 @@ class Drive:
 
     @classmethod
     def of(cls, system: HamiltonianSystem, harmonics: int = 2) -> Drive:
-        """That of a driven system."""
+        """The drive of a system: its period, or its `t_span`."""
         span = (float(min(system.t_span)), float(max(system.t_span))) if system.period is None else None
         return cls(system.period, span, harmonics)
 

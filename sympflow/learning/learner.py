@@ -311,7 +311,7 @@ class Search:
     done: dict[str, dict[str, Any]] = field(default_factory=dict)
     """The numbers of the models that were fitted, by their names."""
     cut: bool = False
-    """Whether the time was up before the search came to its end."""
+    """True if the time was up before the search came to its end."""
     bar: Silent = field(default_factory=Silent)
     unconstrained: float | None = None
     """The share of the squares of the held-out residuals that a field which is not Hamiltonian leaves, if small."""

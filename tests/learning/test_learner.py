@@ -124,8 +124,10 @@ def test_outliers_count_less_by_hubers_loss():
     for huber in (None, 1.5):
         theta, fit = problem(quartic(data), data, np.full(2, 0.01), huber=huber)
         found = minimized(fit, theta, first_states(data))
-        errors.append(abs(quartic(data).parts[0].coefficients(found.theta[:1])[0] - 1 / (2 * MASS)))
-    assert errors[1] < errors[0] / 3
+        (coefficient,) = quartic(data).parts[0].coefficients(found.theta[:1])
+        errors.append(abs(coefficient - 1 / (2 * MASS)) / coefficient)
+        deviation = np.sqrt(found.covariance()[0, 0]) / found.theta[0]
+    assert errors[1] < 3 * deviation < errors[0]
 
 
 def test_friction_is_learned():
@@ -181,7 +183,7 @@ def noisy():
 
 
 def test_learn_returns_a_flow_of_what_it_found(noisy):
-    """Its one-step error is what noise of 0.01 on 500 numbers leaves, its energy error does not grow."""
+    """The flow is that of the H that was found, which misses the true one by less than half of the noise."""
     x = np.array([[0.5, -0.4], [-0.7, 0.3]])
     exact = [
         solve_ivp(lambda t, y: [y[1] / MASS, -STIFF * y[0] - QUARTIC * y[0] ** 3], (0, 0.5), row, rtol=1e-10).y[:, -1]
@@ -189,10 +191,9 @@ def test_learn_returns_a_flow_of_what_it_found(noisy):
     ]
     import torch
 
-    assert noisy(0.5, torch.tensor(x)).numpy() == pytest.approx(np.array(exact), abs=0.01)
+    assert noisy(0.5, torch.tensor(x)).numpy() == pytest.approx(np.array(exact), abs=0.005)
     sol = sympflow.solve(noisy.system, noisy, t_span=(0, 50), y0=x[0], dt=0.5, backend="array")
-    error = np.abs(sympflow.energy_error(sol))
-    assert error[len(error) // 2 :].max() < 2 * error[: len(error) // 2].max()
+    assert sympflow.max_energy_error(sol) < 1e-8
 
 
 def test_learn_tells_what_it_did(noisy):
