@@ -194,8 +194,8 @@ FAMILIES = {
     "whole-network": Family(False, _whole_networks),
 }
 """In the order in which they are tried: potentials of the distances of bodies; Fourier series, where a `period` is
-given; polynomials; networks of one layer. The first four have H = ½ pᵀM⁻¹p + V(q), the fifth has a mass matrix that depends
-on q, as of pendulums that hang on each other; the others are functions H(q, p)."""
+given; polynomials; networks of one layer. The first four have H = ½ pᵀM⁻¹p + V(q); "inertia" has a mass matrix that
+depends on q, as of pendulums that hang on each other; the others are functions H(q, p)."""
 
 
 def families(said: Said, name: str | None) -> list[str]:

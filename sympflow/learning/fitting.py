@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.learning.models import Model
 from sympflow.learning.shooting import (
     FINEST,
     Field,
@@ -109,6 +110,7 @@ def fitted(
     if theta is None:
         theta = model.start(np.random.default_rng(seed))
         if model.lagrangian:
+            assert isinstance(model, Model)
             smooth = smoothed(data)
             theta = model.lagrangian_start(smooth.points.T, smooth.slopes.T, scales)
         theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales, 1 if model.linear else MATCHED_STEPS)

@@ -56,7 +56,7 @@ class Inertia(Part):
     def start(self, rng: np.random.Generator) -> np.ndarray:
         """The unit matrix, where it can be written."""
         k, i, j = self.entries.T
-        constant = ~(self.functions.waves.any(axis=1) | self.functions.powers.exponents.any(axis=1))
+        constant = (self.functions.waves == 0).all(axis=1) & (self.functions.powers.exponents == 0).all(axis=1)
         return (constant[k] & (i == j)).astype(float)
 
     def _coefficients(self, theta: np.ndarray) -> np.ndarray:

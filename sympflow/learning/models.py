@@ -687,7 +687,7 @@ class Model:
         )
 
     def lagrangian_start(self, y: np.ndarray, slopes: np.ndarray, scales: np.ndarray) -> np.ndarray:
-        """θ by which p = ∂L/∂v and p' = ∂L/∂q hold best at states (2d, N) with these slopes, by linear least squares."""
+        """θ by which p = ∂L/∂v and p' = ∂L/∂q hold best, by linear least squares, at states (2d, N) with slopes."""
         d = self.ndof
         q, p, v = y[:d], y[d:], slopes[:d]
         rates = np.broadcast_to(np.arange(d) if self.rates > 1 else 0, d)
