@@ -529,7 +529,17 @@ PROTOCOLS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "hnn-two-bodies": lambda o: hnn("two-bodies", o),
     "d-hnn": lambda o: hnn("damped", o),
 }
-"""Each fills the fragment "learning-…" of its name."""
+FRAGMENTS = {
+    "authors-oscillator": "learning-authors-oscillator",
+    "authors-henon-heiles": "learning-authors-henon-heiles",
+    "ghnn-pendulum": "learning-ghnn-pendulum",
+    "ghnn-double-pendulum": "learning-ghnn-double-pendulum",
+    "ghnn-three-bodies": "learning-ghnn-three-bodies",
+    "hnn-spring": "learning-hnn-spring",
+    "hnn-pendulum": "learning-hnn-pendulum",
+    "hnn-two-bodies": "learning-hnn-two-bodies",
+    "d-hnn": "learning-d-hnn",
+}
 
 
 def main() -> None:
@@ -551,7 +561,7 @@ def main() -> None:
             rows = [row.cells() for row in protocol(options)]
             for row in rows:
                 print(name, *row, sep=" | ", flush=True)
-            fragments.write(options.out, "learning-" + name, fragments.table(titles, rows), f"--only {name}")
+            fragments.write(options.out, FRAGMENTS[name], fragments.table(titles, rows), f"--only {name}")
     if "discovery" in wanted:
         titles = ["system", "true terms, of a library", "found", "these and no other", "largest error", "s", "H"]
         table = fragments.table(titles, discovered(options.systems, figures))
