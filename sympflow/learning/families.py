@@ -136,12 +136,13 @@ def _pairs(said: Said) -> Iterator[Candidate]:
     for dim in (2, 3):
         if d % dim or d < 2 * dim:
             continue
-        for order, bodies in (
-            ("one body after another", np.arange(d).reshape(-1, dim)),
-            ("one axis after another", np.arange(d).reshape(dim, -1).T),
-        ):
-            for powers in POWERS:
-                said_powers = "1/r" if powers == (-1,) else "powers of r from −2 to 2 and log r"
+        orders = {
+            "one body after another": np.arange(d).reshape(-1, dim),
+            "one axis after another": np.arange(d).reshape(dim, -1).T,
+        }
+        for powers in POWERS:
+            said_powers = "1/r" if powers == (-1,) else "powers of r from −2 to 2 and log r"
+            for order, bodies in orders.items():
                 name = f"{T}, V of the distances of {len(bodies)} bodies in {dim} dimensions, {order}, {said_powers}"
                 yield Candidate(name, said.separated(Pairs(bodies, powers, size, shared=False)))
 

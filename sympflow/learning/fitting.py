@@ -34,6 +34,7 @@ SETTLED = 0.05  # change of the noise, relative, that ends them
 GROWTH = 1e3  # most that an error of an initial state may grow along a piece
 LEAST_GROWTH = 10.0
 PER_NOISE = 0.3  # of the spread of the data, that such an error may reach
+HOPELESS = 1.5  # noise over that of the best model, from which a model is given up
 EXACT = 1e-9  # residuals, relative to the spread of the data, that need no explanation
 LOUDER = 2.0  # root mean square of held-out residuals, in σ, above which there are too few data, or another system
 SILENT = 0.5  # of the spread of the data, that noise leaves at most where a model explains anything
@@ -52,11 +53,19 @@ class Setting:
         Residuals of more than so many σ count by their size.
     stop : callable
         Asked between steps.
+    rival : ndarray of shape (2d,) or None
+        The noise that the best model so far leaves of whole orbits: one that leaves much more of a few points is given
+        up.
     """
 
     noise: np.ndarray | None = None
     huber: float | None = None
     stop: Stop = lambda: False
+    rival: np.ndarray | None = None
+
+    def hopeless(self, noise: np.ndarray) -> bool:
+        """True if a model that leaves this noise (2d,) of a few points is not worth longer orbits."""
+        return self.rival is not None and float(np.mean(np.log(noise / self.rival))) > math.log(HOPELESS)
 
 
 @dataclass(frozen=True)
@@ -129,7 +138,7 @@ def fitted(
         costs += [cost / data.n_values for cost in fit.costs]
         if given is None:
             sigma = np.maximum(fit.noise(), FINEST * scales)
-        if not math.isfinite(fit.cost) or setting.stop():
+        if not math.isfinite(fit.cost) or setting.stop() or setting.hopeless(np.maximum(fit.noise(), FINEST * scales)):
             break
         orbits = np.concatenate(fit.orbits, axis=1)
         longer = _span(model, data, method, theta, orbits, scales, sigma)

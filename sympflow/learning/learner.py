@@ -7,7 +7,7 @@ import math
 import warnings
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -402,7 +402,8 @@ class Search:
 
     def _try(self, candidate: Candidate, setting: Setting, session: Session) -> bool:
         """Fit a model; True if it is the best so far."""
-        made = self._fit(candidate, setting, session)
+        rival = None if self.best is None else self.best[1].sigma
+        made = self._fit(candidate, replace(setting, rival=rival), session)
         if self.best is None or gains(self.best[2], made[2]):
             self.best = made
             return True
