@@ -9,6 +9,7 @@ import sympflow
 from sympflow.learning.families import FAMILIES, Candidate, pruned
 from sympflow.learning.fitting import Setting, fitted, judged, restored
 from sympflow.learning.learner import MOST_VALUES, Replicas, Search, _few, _said, replica
+from sympflow.learning.library import Library, Terms
 from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Network, Pairs, Polynomial, Waves
 from sympflow.learning.shooting import Gauss, Method, Problem, chosen_method, first_states, matched, minimized
 from sympflow.learning.trajectories import Trajectories
@@ -151,6 +152,8 @@ PARTS = [
     Network("q", 4, [1.0, 2.0], np.array([4.0, np.inf])),
     Pairs(np.array([[0], [1]]), (-2, 0, 1), 1.3, shared=False),
     Formula("q", sympy.sin(Q[0]) * Q[1] ** 2, Q),
+    Terms(Library([Q[0] ** 2 * Q[1], sympy.cos(Q[0] - Q[1]), 1 / Q[1]], 2), "q"),
+    Terms(Library([Q[0] ** 2, Q[0] * Q[1]], 2), "q"),
 ]
 
 
@@ -165,7 +168,7 @@ def test_parts_of_h_are_what_their_derivatives_say(part):
             found.value[i], abs=1e-6
         )
         ahead, behind = (part.gradient(theta, x + s * e, False, False).value for s in (1, -1))
-        assert (ahead - behind) / (2 * h) == pytest.approx(found.slope[:, i], abs=1e-6)
+        assert (ahead - behind) / (2 * h) == pytest.approx(np.broadcast_to(found.slope[:, i], (2, 3)), abs=1e-6)
     for i, e in enumerate(h * np.eye(part.n)):
         ahead, behind = (part.gradient(theta + s * e, x, False, False).value for s in (1, -1))
         assert (ahead - behind) / (2 * h) == pytest.approx(found.by_parameters[:, i], abs=1e-6)
