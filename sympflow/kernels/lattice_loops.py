@@ -19,7 +19,7 @@ import sympy as sp
 
 from sympflow.hamiltonian.lattice import LatticeHamiltonian
 from sympflow.kernels.codegen import statements, vectorised
-from sympflow.kernels.modules import NEVER, load_algebra, threads_for
+from sympflow.kernels.modules import NEVER, given, load_algebra, threads_for
 from sympflow.kernels.protocol import NOTHING
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
@@ -236,7 +236,7 @@ class LatticeLoops:
     def _map(self, tables: Sequence[np.ndarray], y: np.ndarray, out: np.ndarray) -> None:
         """The map of the columns of each table, of each row of `y`."""
         nothing, none = np.empty(0, dtype=np.int64), NOTHING[0]
-        for i, (table, row) in enumerate(zip(tables, np.ascontiguousarray(y), strict=True)):
+        for i, (table, row) in enumerate(zip(tables, given(y), strict=True)):
             if not self._tiled:
                 to = out[i : i + 1]
                 self._module.rollout(table, row, 0, nothing, to, NEVER, 0, none, True, *self._arguments)
