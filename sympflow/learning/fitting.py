@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.learning.models import Model
 from sympflow.learning.shooting import (
     FINEST,
     Field,
@@ -22,6 +23,7 @@ from sympflow.learning.shooting import (
     minimized,
     steppers,
 )
+from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Run, Trajectories
 
 FIRST_POINTS = 10  # of the pieces that a fit begins with
@@ -107,6 +109,10 @@ def fitted(
     scales = data.scales
     if theta is None:
         theta = model.start(np.random.default_rng(seed))
+        if model.lagrangian:
+            assert isinstance(model, Model)
+            smooth = smoothed(data)
+            theta = model.lagrangian_start(smooth.points.T, smooth.slopes.T, scales)
         theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales, 1 if model.linear else MATCHED_STEPS)
     given = None if setting.noise is None else np.maximum(setting.noise, FINEST * scales)
     sigma = 1e-2 * scales if given is None else given
