@@ -197,7 +197,8 @@ def test_bodies_whose_total_momentum_changes_are_no_bodies():
     runs = [(np.arange(50.0), np.stack([x, y, y, x, x, -x, y, -y]))]
     said = _said(Trajectories.read([*runs, *runs]), None, None, False, None, None)
     names = [candidate.name for candidate in FAMILIES["pairs"].models(said)]
-    assert len(names) == 2 and all("one axis after another" in name for name in names)
+    assert len(names) == 2
+    assert all("one axis after another" in name for name in names)
 
 
 # learn ----------------------------------------------------------------------------------------------------------------
