@@ -15,8 +15,26 @@ import numpy as np
 
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.modules import OPTIONS, load_module, template
-from sympflow.kernels.stages import DampedDrift, TimeAlone, WithSystem, kicks_of, lanes_source, stages_source
+from sympflow.kernels.modules import (
+    constants_source,
+    elementary,
+    imports_source,
+    load_algebra,
+    load_module,
+    template,
+)
+from sympflow.kernels.stages import (
+    DampedDrift,
+    Kick,
+    TimeAlone,
+    TimedNumbers,
+    WithSystem,
+    kicks_of,
+    lanes_source,
+    numbers_source,
+    stages_source,
+    step_constants,
+)
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 if TYPE_CHECKING:
@@ -69,13 +87,6 @@ class LoopFunctions:
         )
 
 
-def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0, driven: bool = False) -> str:
-    return (
-        f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': cache}}\n"
-        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}\nN_VALUES = {n_values}\nDRIVEN = {driven}"
-    )
-
-
 def takes_values(level: int) -> bool:
     """True of kicks whose code is the same for all values of parameters.
 
@@ -100,7 +111,7 @@ def symbolic_loops(
 
         symbols = symbols.parametric
         algebra = algebra_source(symbols)
-    after = ("loops", "aligned", "lanes")
+    after = ("loops", "lanes")
     loops = symbolic_module(
         symbols, algebra, level, compensated, after, monomials, friction, varied=varied, ranges=ranges
     )
@@ -119,7 +130,7 @@ def driven_loops(
     """The loops of a symbolic system whose H depends on t; single steps, each at a time of its own, without lanes."""
     from sympflow.kernels.codegen import algebra_source
 
-    form, after = driving.form, ("loops", "aligned", "lanes")
+    form, after = driving.form, ("loops", "lanes")
     algebra = algebra_source(form)
     loops = symbolic_module(form, algebra, level, compensated, after, monomials, friction, driving, varied)
     processed = loops.rollout_processed, loops.rollout_processed_rows
@@ -145,18 +156,31 @@ def symbolic_module(
     from sympflow.kernels.kicks import kicks_source
 
     kinds, scheduled = kicks_of(level, len(monomials)), not compensated
-    n = len(symbols.parameters)
-    lanes = lanes_source(kinds, scheduled, friction, n, varied, driving)
-    sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
+    n, n_values = len(symbols.parameters), len(symbols.values) if varied else 0
+    sources = [algebra] if driving is None else [algebra, numbers_source(kinds, friction, n, driving)]
+    sources.append(stages_source(kinds, scheduled, friction, n, driving))
+    sources.append(lanes_source(kinds, scheduled, friction, n, varied, driving))
     if scheduled:
         sources.append(kicks_source(symbols, level, monomials, varied=varied, ranges=ranges))
     else:
         sources += plain_kicks_source(symbols, level, monomials)
-    algebra = "\n\n\n".join(sources)
-    before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
-    n_values = len(symbols.values) if varied else 0
-    header = _header(compensated, cache=True, scheduled=scheduled, n_values=n_values, driven=driving is not None)
-    return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
+    shared = shared_by_lanes(symbols.ndof, kinds, friction, n, compensated, n_values)
+    shared = shared if driving is None else shared[:1]
+    constants = {"SCHEDULED": scheduled, "DRIVEN": driving is not None}
+    return load_algebra("\n\n\n".join(sources), after, shared, **constants)
+
+
+def shared_by_lanes(
+    ndof: int, kinds: Sequence[Kick], friction: DampedDrift | None, n_parameters: int, compensated: bool, n_values: int
+) -> list[str]:
+    """The sources of the texts `loops` and `lanes` that systems share: of states of this size; of kicks of one kind."""
+    from sympflow.kernels.codegen import tuple_algebra
+
+    constants = constants_source(COMPENSATED=compensated, NDOF=ndof, N_VALUES=n_values)
+    of_states = [constants, tuple_algebra(ndof), *map(template, ("running_states", "aligned", "lane_blocks"))]
+    numbers = [numbers_source(kinds, friction, n_parameters), template("lane_numbers")]
+    of_kicks = [constants_source(**step_constants(kinds)), *numbers]
+    return ["\n\n\n".join(of_states), "\n\n\n".join(of_kicks)]
 
 
 def plain_kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> list[str]:
@@ -187,7 +211,7 @@ def family_loops(
         symbols = driving.form
     letters = symbols.parameters
     warn_if_long(symbols.V, symbols.q, system.name)
-    sources = [f"import numpy as np\n\nNDOF = {symbols.ndof}", _FIXED_SIZE, _given_functions(level, bool(letters))]
+    sources = ["import numpy as np", _given_functions(level, bool(letters))]
     sources.append(gradient_source(symbols.V, symbols.q, "gradient", letters))
     if level in (FORCE_GRADIENT, CURVATURE):
         sources.append(product_source(symbols.V, symbols.q, "hessian_vector", letters))
@@ -202,11 +226,32 @@ def family_loops(
     else:
         sources.append(gradient_source(symbols.T, symbols.p, "kinetic_gradient"))
         sources.append("@njit(**OPTIONS)\ndef apply_inverse_mass(v, out, work):\n    kinetic_gradient(v, out)")
-    sources.append(stages_source(kicks_of(level, len(monomials)), False, friction, 0, driving))
-    code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
-    before = ["elementary"] if "fast_" in code else []
-    header = _header(compensated, cache=True, scheduled=False)
-    return _array_functions(vars(load_module("\n\n\n".join([header, *map(template, before), code]))))
+    kinds = kicks_of(level, len(monomials))
+    source, shared = _around_arrays(sources, _FIXED_SIZE, kinds, compensated, friction, driving, NDOF=symbols.ndof)
+    return _array_functions(vars(load_module(source, shared)))
+
+
+def _around_arrays(
+    sources: Sequence[str],
+    size: str,
+    kinds: Sequence[Kick],
+    compensated: bool,
+    friction: DampedDrift | None = None,
+    driving: TimedNumbers | None = None,
+    stages: str = "table",
+    cache: bool = True,
+    **constants: Any,
+) -> tuple[str, list[str]]:
+    """The source of loops around functions of a system whose states are arrays, and those that systems share."""
+    texts = size, *map(template, ("array_states", "running_states"))
+    of_states = "\n\n\n".join([constants_source(COMPENSATED=compensated, **constants), *texts])
+    numbers = numbers_source(kinds, friction, 0, driving, stages)
+    own = [constants_source(cache, SCHEDULED=False, N_VALUES=0, DRIVEN=driving is not None), *sources]
+    if driving is not None:
+        own.append(numbers)
+    own += [stages_source(kinds, False, friction, 0, driving), *map(template, ("array_kicks", "loops"))]
+    shared = [*elementary(*own), of_states, *([f"{constants_source()}\n\n\n{numbers}"] if driving is None else [])]
+    return "\n\n\n".join(own), shared
 
 
 _FIXED_SIZE = """@njit(**OPTIONS)
@@ -224,10 +269,8 @@ def size(x, copies):
 
 @njit(**OPTIONS)
 def size_of(table):
-    return len(table[2])
-
-
-@njit(**OPTIONS)
+    return len(table[2])"""
+_GIVEN_MASSES = """@njit(**OPTIONS)
 def apply_inverse_mass(v, out, work):
     inverse_mass = work[4][2]
     for i in range(len(v)):
@@ -245,11 +288,9 @@ def _pair_loops(
     if level == POLYNOMIAL or varied:
         raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
     sources = [pair_source(local, functions_of(level)), _given_functions(level, True, numbers="numbers[-1]")]
-    sources += [_ANY_SIZE, stages_source(kicks_of(level), False, None, 0, WithSystem(), "table[0]")]
-    code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
-    before = ["elementary"] if "fast_" in code or "fused_multiply_add" in code else []
-    header = _header(compensated, cache=True, scheduled=False)
-    functions = _array_functions(vars(load_module("\n\n\n".join([header, *map(template, before), code]))))
+    given, kinds = (WithSystem(), "table[0]"), kicks_of(level)
+    source, shared = _around_arrays([*sources, _GIVEN_MASSES], _ANY_SIZE, kinds, compensated, None, *given)
+    functions = _array_functions(vars(load_module(source, shared)))
     inverse_mass = np.ones(system.ndof) if system.inverse_mass is None else np.array(system.inverse_mass)
     return functions.with_system(pair_data(local), inverse_mass)
 
@@ -305,18 +346,11 @@ def array_loops(
     monomials: Monomials,
 ) -> LoopFunctions:
     """The loops around the user's Numba functions; compiled for this process only."""
-    mass = "\n\n\n".join([_FIXED_SIZE, _inverse_mass_source(inverse_mass)])
-    header = _header(compensated, cache=False, scheduled=False)
-    stages = stages_source(kicks_of(level), False, friction, 0, TimeAlone() if driven else None)
-    given = _given_functions(level, driven, time_first=True)
-    functions: dict[str, Any] = {
-        "NDOF": ndof,
-        "INVERSE_MASS": inverse_mass,
-        "gradient": gradient,
-        "hessian_vector": hessian_vector,
-    }
-    texts = map(template, ("array_states", "loops"))
-    exec("\n\n\n".join([header, mass, given, stages, *texts]), functions)
+    sources = [_inverse_mass_source(inverse_mass), _given_functions(level, driven, time_first=True)]
+    given = kicks_of(level), compensated, friction, TimeAlone() if driven else None
+    source, shared = _around_arrays(sources, _FIXED_SIZE, *given, cache=False, NDOF=ndof)
+    functions: dict[str, Any] = {"INVERSE_MASS": inverse_mass, "gradient": gradient, "hessian_vector": hessian_vector}
+    exec(imports_source(shared) + source, functions)
     return _array_functions(functions)
 
 
