@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.kernels.modules import NEVER, threads_for
+from sympflow.kernels.modules import NEVER, given, threads_for
 from sympflow.kernels.protocol import NOTHING
 
 __all__ = ["SizedLoops", "Team"]
@@ -150,7 +150,7 @@ class SizedLoops:
     def _map(self, tables: Sequence[np.ndarray], y: np.ndarray, out: np.ndarray) -> None:
         """The map of the columns of each table, of each row of `y`."""
         nothing, none = np.empty(0, dtype=np.int64), NOTHING[0]
-        for i, (table, row) in enumerate(zip(tables, np.ascontiguousarray(y), strict=True)):
+        for i, (table, row) in enumerate(zip(tables, given(y), strict=True)):
             with self._team(table.shape[1], None) as team:
                 if not self._in_pieces(team.threads):
                     to = out[i : i + 1]
