@@ -28,7 +28,6 @@ from sympflow.kernels.stages import (
     Kick,
     TimeAlone,
     TimedNumbers,
-    WithSystem,
     kicks_of,
     lanes_source,
     numbers_source,
@@ -40,6 +39,7 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
     from sympflow.kernels.approximations import Ranges
+    from sympflow.kernels.sized_loops import SizedLoops
     from sympflow.kernels.stage_times import Driving
 
 MOST_COUPLED = 6
@@ -67,24 +67,6 @@ class LoopFunctions:
     rollout_processed: Callable[..., int]
     rollout_processed_batch: Callable[..., None]
     step_rows: Callable[..., None]
-
-    def with_system(self, numbers: np.ndarray, inverse_mass: np.ndarray) -> LoopFunctions:
-        """The functions of tables, of those whose tables are (stages, numbers, M⁻¹)."""
-
-        def given(function: Callable[..., Any], n_tables: int = 1) -> Callable[..., Any]:
-            def call(*arguments: Any) -> Any:
-                tables = [(table, numbers, inverse_mass) for table in arguments[:n_tables]]
-                return function(*tables, *arguments[n_tables:])
-
-            return call
-
-        return LoopFunctions(
-            given(self.rollout),
-            given(self.rollout_batch),
-            given(self.rollout_processed, 3),
-            given(self.rollout_processed_batch, 3),
-            given(self.step_rows),
-        )
 
 
 def takes_values(level: int) -> bool:
@@ -227,72 +209,30 @@ def family_loops(
         sources.append(gradient_source(symbols.T, symbols.p, "kinetic_gradient"))
         sources.append("@njit(**OPTIONS)\ndef apply_inverse_mass(v, out, work):\n    kinetic_gradient(v, out)")
     kinds = kicks_of(level, len(monomials))
-    source, shared = _around_arrays(sources, _FIXED_SIZE, kinds, compensated, friction, driving, NDOF=symbols.ndof)
+    source, shared = _around_arrays(sources, symbols.ndof, kinds, compensated, friction, driving)
     return _array_functions(vars(load_module(source, shared)))
 
 
 def _around_arrays(
     sources: Sequence[str],
-    size: str,
+    ndof: int,
     kinds: Sequence[Kick],
     compensated: bool,
     friction: DampedDrift | None = None,
     driving: TimedNumbers | None = None,
-    stages: str = "table",
     cache: bool = True,
-    **constants: Any,
 ) -> tuple[str, list[str]]:
     """The source of loops around functions of a system whose states are arrays, and those that systems share."""
-    texts = size, *map(template, ("array_states", "running_states"))
-    of_states = "\n\n\n".join([constants_source(COMPENSATED=compensated, **constants), *texts])
-    numbers = numbers_source(kinds, friction, 0, driving, stages)
+    of_states = [constants_source(COMPENSATED=compensated, NDOF=ndof)]
+    of_states += map(template, ("array_states", "running_states"))
+    shared, numbers = ["\n\n\n".join(of_states)], numbers_source(kinds, friction, 0, driving)
     own = [constants_source(cache, SCHEDULED=False, N_VALUES=0, DRIVEN=driving is not None), *sources]
-    if driving is not None:
+    if driving is None:
+        shared.append(f"{constants_source()}\n\n\n{numbers}")
+    else:
         own.append(numbers)
     own += [stages_source(kinds, False, friction, 0, driving), *map(template, ("array_kicks", "loops"))]
-    shared = [*elementary(*own), of_states, *([f"{constants_source()}\n\n\n{numbers}"] if driving is None else [])]
-    return "\n\n\n".join(own), shared
-
-
-_FIXED_SIZE = """@njit(**OPTIONS)
-def size(x, copies):
-    return NDOF
-
-
-@njit(**OPTIONS)
-def size_of(table):
-    return NDOF"""
-_ANY_SIZE = """@njit(**OPTIONS)
-def size(x, copies):
-    return len(x) // copies
-
-
-@njit(**OPTIONS)
-def size_of(table):
-    return len(table[2])"""
-_GIVEN_MASSES = """@njit(**OPTIONS)
-def apply_inverse_mass(v, out, work):
-    inverse_mass = work[4][2]
-    for i in range(len(v)):
-        out[i] = inverse_mass[i] * v[i]"""
-"""A table is (stages, numbers of the system, M⁻¹)."""
-
-
-def _pair_loops(
-    system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials, varied: bool = False
-) -> LoopFunctions:
-    """The loops of a system that is given by one piece, of any size: their code depends on the piece alone."""
-    from sympflow.kernels.pair_forces import pair_data, pair_source
-
-    local: Any = system.local
-    if level == POLYNOMIAL or varied:
-        raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
-    sources = [pair_source(local, functions_of(level)), _given_functions(level, True, numbers="numbers[-1]")]
-    given, kinds = (WithSystem(), "table[0]"), kicks_of(level)
-    source, shared = _around_arrays([*sources, _GIVEN_MASSES], _ANY_SIZE, kinds, compensated, None, *given)
-    functions = _array_functions(vars(load_module(source, shared)))
-    inverse_mass = np.ones(system.ndof) if system.inverse_mass is None else np.array(system.inverse_mass)
-    return functions.with_system(pair_data(local), inverse_mass)
+    return "\n\n\n".join(own), [*elementary(*own), *shared]
 
 
 _INVERSE_MASS_TIMES_V = {
@@ -312,18 +252,17 @@ def functions_of(level: int) -> tuple[str, ...]:
     return ("gradient", "hessian_vector", "bend")[: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(level, 0)]
 
 
-def _given_functions(level: int, driven: bool, time_first: bool = False, numbers: str = "numbers") -> str:
+def _given_functions(level: int, driven: bool, time_first: bool = False) -> str:
     """``gradient_at(q, numbers, out)`` and the others that the text `array_states` calls, by functions of a system.
 
-    Those of a driven one take the letters of `numbers` after their arguments, or the time before them; those of one
-    piece its own numbers, the last of them.
+    Those of a driven one take the letters of `numbers` after their arguments, or the time before them.
     """
     sources = []
     for name in functions_of(level):
         arguments = "q, out" if name == "gradient" else "q, v, out"
         call = f"{name}({arguments})"
         if driven:
-            call = f"{name}(numbers[-1], {arguments})" if time_first else f"{name}({arguments}, {numbers})"
+            call = f"{name}(numbers[-1], {arguments})" if time_first else f"{name}({arguments}, numbers)"
         given = arguments.removesuffix("out") + "numbers, out"
         sources.append(f"@njit(**OPTIONS)\ndef {name}_at({given}):\n    {call}")
     return "\n\n\n".join(sources)
@@ -348,25 +287,37 @@ def array_loops(
     """The loops around the user's Numba functions; compiled for this process only."""
     sources = [_inverse_mass_source(inverse_mass), _given_functions(level, driven, time_first=True)]
     given = kicks_of(level), compensated, friction, TimeAlone() if driven else None
-    source, shared = _around_arrays(sources, _FIXED_SIZE, *given, cache=False, NDOF=ndof)
+    source, shared = _around_arrays(sources, ndof, *given, cache=False)
     functions: dict[str, Any] = {"INVERSE_MASS": inverse_mass, "gradient": gradient, "hessian_vector": hessian_vector}
     exec(imports_source(shared) + source, functions)
     return _array_functions(functions)
 
 
-def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
+def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool) -> SizedLoops:
     """The loops of a lattice, of which only the structure, and not the size, is part of the code."""
     from sympflow.hamiltonian.lattice import LatticeHamiltonian
     from sympflow.kernels.lattice_loops import LatticeLoops
 
     assert isinstance(system.local, LatticeHamiltonian)
-    loops = LatticeLoops(system.local, level, compensated, system.friction is not None)
+    return LatticeLoops(system.local, level, compensated, system.friction is not None)
+
+
+def _pair_loops(system: HamiltonianSystem, level: int, compensated: bool) -> SizedLoops:
+    """The loops of bodies in pairs, of which only the potential, and not their number, is part of the code."""
+    from sympflow.hamiltonian.bodies import PairsHamiltonian
+    from sympflow.kernels.pair_forces import PairLoops
+
+    assert isinstance(system.local, PairsHamiltonian)
+    return PairLoops(system.local, level, compensated, system.friction is not None)
+
+
+LOCAL: dict[str, Callable[..., SizedLoops]] = {"lattice": _lattice_loops, "pairs": _pair_loops}
+"""Makers of the loops of systems that are given by one piece."""
+
+
+def local_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
+    """The loops of a system that is given by one piece."""
+    assert system.local is not None
+    loops = LOCAL[system.local.loops](system, level, compensated)
     processed = loops.rollout_processed, loops.rollout_processed_batch
     return LoopFunctions(loops.rollout, loops.rollout_batch, *processed, loops.step_rows)
-
-
-LOCAL: dict[str, tuple[Callable[..., LoopFunctions], bool, bool]] = {
-    "lattice": (_lattice_loops, True, True),
-    "pairs": (_pair_loops, False, False),
-}
-"""Makers of the loops of systems that are given by one piece, whether these take friction −γp, and `closes`."""

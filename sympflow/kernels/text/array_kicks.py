@@ -17,7 +17,7 @@ def kick(q, numbers, work):
     slope = work[0]
     forget(slope)
     gradient_at(q, numbers, slope)
-    for i in range(size(q, 1)):
+    for i in range(NDOF):
         slope[i] *= -numbers[0]
     return slope
 
@@ -31,7 +31,7 @@ def gradient_kick(q, numbers, work):
     apply_inverse_mass(slope, velocity, work)
     forget(product)
     hessian_vector_at(q, velocity, numbers, product)
-    for i in range(size(q, 1)):
+    for i in range(NDOF):
         slope[i] *= -b
         product[i] *= g
     return slope, product
@@ -46,11 +46,11 @@ def curvature_kick(q, numbers, work):
     apply_inverse_mass(change, velocity, work)
     hessian_vector_at(q, velocity, numbers, product)
     bend_at(q, velocity, numbers, bent)
-    for i in range(size(q, 1)):
+    for i in range(NDOF):
         change[i] = g * product[i] - b * change[i] - c * bent[i]
     apply_inverse_mass(product, velocity, work)
     hessian_vector_at(q, velocity, numbers, product)
-    for i in range(size(q, 1)):
+    for i in range(NDOF):
         change[i] -= c * product[i]
     return change
 
@@ -59,7 +59,7 @@ def curvature_kick(q, numbers, work):
 def polynomial_kick(q, numbers, work):
     change = kick(q, numbers, work)
     polynomial_slope(q, numbers, work[1])
-    for i in range(size(q, 1)):
+    for i in range(NDOF):
         change[i] -= work[1][i]
     return change
 
@@ -68,6 +68,6 @@ def polynomial_kick(q, numbers, work):
 def drift(p, a, work):
     velocity = work[0]
     apply_inverse_mass(p, velocity, work)
-    for i in range(size(p, 1)):
+    for i in range(NDOF):
         velocity[i] *= a
     return velocity
