@@ -146,7 +146,7 @@ def row_size(size, geometry):
 
 @njit(**OPTIONS)
 def workspace(size, row):
-    return np.zeros((N_HELPERS, N_FIELDS, size)), np.empty((N_BONDS, row + 2 * REACH))
+    return np.zeros((N_HELPERS, N_FIELDS, size)), np.empty((N_BONDS, row + 2 * REACH)), np.empty((N_CURVATURES, size))
 
 
 @njit(**OPTIONS)
