@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 import numba
 import numpy as np
 from numba.core.registry import CPUDispatcher
+from numpy.typing import ArrayLike, DTypeLike
 
 __all__ = [
     "NEVER",
@@ -30,6 +31,7 @@ __all__ = [
     "at_most",
     "cache_folder",
     "compiling_alone",
+    "given",
     "load_algebra",
     "load_module",
     "run_one",
@@ -69,6 +71,12 @@ def cache_folder() -> Path:
         if folder := os.environ.get(variable):
             return Path(folder) / "sympflow"
     return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "sympflow"
+
+
+def given(x: ArrayLike, dtype: DTypeLike = np.float64) -> np.ndarray:
+    """An array as compiled functions are given it: contiguous, and not read-only, for which Numba compiles another."""
+    array = np.ascontiguousarray(x, dtype=dtype)
+    return array if array.flags.writeable else array.copy()
 
 
 def load_algebra(algebra: str, loops: Sequence[str] = (), **constants: Any) -> ModuleType:

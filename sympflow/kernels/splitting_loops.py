@@ -23,6 +23,7 @@ from sympflow.kernels.loop_functions import (
     symbolic_loops,
     takes_values,
 )
+from sympflow.kernels.modules import given
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
 from sympflow.kernels.stages import StageTable, run_table, step_table
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
@@ -231,10 +232,10 @@ class SplittingLoops:
         ranges
             Of positions: see `functions`.
         """
-        y = np.ascontiguousarray(y, dtype=np.float64)
+        y = given(y)
         out = np.empty((len(y), 2 * self.ndof))
-        x, h = np.ascontiguousarray(x), np.ascontiguousarray(h)
-        t = np.ascontiguousarray(np.broadcast_to(np.asarray(t, dtype=np.float64), h.shape)) if self.driven else h
+        x, h = given(x), given(h)
+        t = given(np.broadcast_to(t, h.shape)) if self.driven else h
         functions = self.functions(table.level, False, monomials, varied, ranges)
         functions.step_rows(self.rows(table, varied=varied), x, h, t, y, out)
         return out
@@ -299,7 +300,7 @@ class SplittingKernel(Kernel):
 
     def _rows(self, y: np.ndarray, goes_on: bool = False) -> np.ndarray:
         """The states of a batch (N, 2d) as the loops read them; a run that goes on reads no states from them."""
-        return np.ascontiguousarray(y, dtype=np.float64)
+        return given(y)
 
     def _functions(self) -> LoopFunctions:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, ranges=self._ranges)

@@ -562,20 +562,20 @@ def lanes_source(
         return _over_lanes([errors, *kicked, drifted, stored])
 
     def each(kick: Kick) -> list[str]:
-        steps, places = {1: "H", 3: "H3", 5: "H5"}, range(len(kick.numbers))
-        filled = [f"fill_lanes(Y, width, NUMBERS + {i}, table[{i + 1}, j], {steps[kick.powers[i]]})" for i in places]
-        if not varied:
-            filled += [f"value_{i} = table[FIRST_VALUE + {i}, j, 0]" for i in values]
+        taken = [] if varied else [f"value_{i} = table[FIRST_VALUE + {i}, j, 0]" for i in values]
         value = "Y[NUMBERS + N_NUMBERS + {0}, lane], " if varied else "value_{0}, "
-        numbers = "".join([f"Y[NUMBERS + {i}, lane], " for i in places] + [value.format(i) for i in values])
+        numbers = "".join(
+            [f"Y[NUMBERS + {i}, lane], " for i in range(len(kick.numbers))] + [value.format(i) for i in values]
+        )
         drifted = f"q, _ = move(q, None, drift(p, Y[A, lane], {given}None))"
-        return [*filled, *_over_lanes([f"numbers = ({numbers})", *kick.application(True, lane=True), drifted])]
+        return [*taken, *_over_lanes([f"numbers = ({numbers})", *kick.application(True, lane=True), drifted])]
 
     # Kinds are told apart outside the loops: a loop with a branch in it, once it is long, is no longer made of vector
     # instructions.
     passed = "common" if varied else "numbers"
     own = varied and scheduled and driving is None and len(kinds) == 1
-    before = f"OWN = {own}\n\n\n"
+    powers = (1, *kinds[0].powers)  # of the step length, those of the drift and of the numbers of kicks
+    before = f"OWN = {own}\nN_NUMBERS, FEWEST, STEP_POWERS = {n_numbers}, {len(kinds[-1].numbers)}, {powers}\n\n\n"
     if not varied or driving is None:
         before += "common_of = numbers_of\n\n\n"
     if varied:
@@ -589,15 +589,13 @@ def stage_lanes(Y, error, width, {passed}, a):
         return source
     if own:
         source += "\n\n\n" + _own_stages_source(friction, n_parameters)
-    return f"""N_NUMBERS = {n_numbers}
-
-
-{source}
+    return f"""{source}
 
 
 @njit(**OPTIONS, inline="always")
 def stage_each(Y, width, table, j):
-    {_cases(kinds, "np.any(table[{1}, j] != 0.0)", [each(kick) for kick in kinds])}"""
+    n = fill_lanes(Y, width, table, j)
+    {_cases(kinds, "n == {1}", [each(kick) for kick in kinds])}"""
 
 
 def _lane_source(n_numbers: int, n_parameters: int) -> str:

@@ -8,10 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sympflow.learning.inertia import Inertia
 from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Network, Pairs, Part, Polynomial, Waves
 
 DEGREES = (2, 3, 4, 5, 6, 8, 10)
 HARMONICS = (1, 2, 3, 4, 6, 8)
+ORDERS = (1, 2, 3, 4)
+"""Of the harmonics of angles, or the powers of other coordinates, in a mass matrix M(q) and its potential."""
 WIDTHS = (6, 12, 24)
 WHOLE_WIDTHS = (12, 24, 40)
 POWERS = ((-1,), (-2, -1, 0, 1, 2))
@@ -116,6 +119,17 @@ def _whole_waves(said: Said) -> Iterator[Candidate]:
             yield Candidate(f"H(q, p) quadratic in p, a Fourier series of {harmonics} harmonics", said.whole(H))
 
 
+def _inertia(said: Said) -> Iterator[Candidate]:
+    q = slice(0, said.ndof)
+    scales, periods = said.scales[q], said.periods[q]
+    for order in () if said.kinetic_is_known else ORDERS:
+        V = Waves.up_to(order, max(order, 2), "q", scales, periods)
+        M = Waves.up_to(order, order, "q", scales, periods, constant=True)
+        part = Inertia(M)
+        if V.n + part.n <= MOST_TERMS:
+            yield Candidate(f"H = ½ pᵀM(q)⁻¹p + V(q), M and V series of order {order}", said.whole(part, V))
+
+
 def _pairs(said: Said) -> Iterator[Candidate]:
     d = said.ndof
     size = 2 * float(np.mean(said.scales[:d]))
@@ -174,12 +188,14 @@ FAMILIES = {
     "waves": Family(True, _waves),
     "polynomial": Family(True, _polynomials),
     "network": Family(True, _networks),
+    "inertia": Family(False, _inertia),
     "whole-waves": Family(False, _whole_waves),
     "whole-polynomial": Family(False, _whole_polynomials),
     "whole-network": Family(False, _whole_networks),
 }
 """In the order in which they are tried: potentials of the distances of bodies; Fourier series, where a `period` is
-given; polynomials; networks of one layer. The first four have H = ½ pᵀM⁻¹p + V(q), the others are functions H(q, p)."""
+given; polynomials; networks of one layer. The first four have H = ½ pᵀM⁻¹p + V(q); "inertia" has a mass matrix that
+depends on q, as of pendulums that hang on each other; the others are functions H(q, p)."""
 
 
 def families(said: Said, name: str | None) -> list[str]:

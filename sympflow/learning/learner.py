@@ -21,7 +21,7 @@ from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import hint
 from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Said, families, pruned, with_unit_mass
-from sympflow.learning.fitting import SILENT, Fitted, Held, Setting, fitted, gains, judged, kept, restored
+from sympflow.learning.fitting import SILENT, Fitted, Held, Setting, fitted, gains, judged, kept, limit_of, restored
 from sympflow.learning.library import library_for
 from sympflow.learning.models import Formula, FreeField, Model
 from sympflow.learning.shooting import Method
@@ -41,9 +41,7 @@ MOST_VALUES = 40_000  # numbers observed by which models are chosen; the chosen 
 POOR = 1e-3  # one-step error of a flow, relative to the spread of the data, that is worth a warning
 LEAST_SECONDS = 1.0  # for the flow, however late it is
 MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
-HUBER = 1.5  # σ
 FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
-LOSSES = ("squares", "huber")
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
 
 
@@ -142,13 +140,12 @@ def learn(
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
     said = _said(data, separable, mass, damping, period, known)
-    if loss not in LOSSES:
-        raise ValueError(f"`loss` must be one of {', '.join(LOSSES)}; got {loss!r}.")
+    huber = limit_of(loss)
     dt = plain(dt)
     if dt is not None and (isinstance(dt, bool) or not isinstance(dt, int | float) or not 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
     session = Session(checkpoint, resume, plain(time_budget), progress, callback, Crew(workers))
-    setting = Setting(_noise(noise, data), HUBER if loss == "huber" else None)
+    setting = Setting(_noise(noise, data), huber)
     chosen = families(said, family)
     ours, held = data.split(HELD_OUT, seed)
     if isinstance(replicas, bool) or not isinstance(replicas, int) or replicas < 0:

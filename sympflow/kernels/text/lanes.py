@@ -194,28 +194,47 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running,
 # Rows of what a step of lanes needs beside the states: the variable of the polynomials, powers of the step length, the
 # drift and the numbers of the kick.
 X, H, H3, H5, A, NUMBERS = [2 * NDOF + i for i in range(6)]
+POWERS = tuple([{1: H, 3: H3, 5: H5}[power] for power in STEP_POWERS])
 
 
-@njit(**OPTIONS, inline="always")
-def fill_lanes(Y, width, row, coefficients, factor):
-    """Σ_k coefficients[k] x^k, one or at least three, times a factor, into a row."""
-    if len(coefficients) == 1:
+@njit(**OPTIONS)
+def numbers_that_apply(table, j):
+    """The numbers of the kick of stage j: that with most of them whose last one is not 0 for all x, or `FEWEST`."""
+    n = N_NUMBERS
+    while n > FEWEST:
+        for k in range(table.shape[2]):
+            if table[n, j, k] != 0.0:
+                return n
+        n -= 1
+    return n
+
+
+@njit(**OPTIONS)
+def fill_lanes(Y, width, table, j):
+    """The drift of stage j and the numbers of its kick for all lanes, Σ_k table[i, j, k] x^k times a power of h.
+
+    There are one or at least three terms. Returns how many numbers the kick has.
+    """
+    last, n = table.shape[2] - 1, numbers_that_apply(table, j)
+    for i in range(n + 1):
+        row, factor, c0 = A + i, POWERS[i], table[i, j, 0]
+        if last == 0:
+            for lane in range(width):
+                Y[row, lane] = c0 * Y[factor, lane]
+            continue
+        c1, c2 = table[i, j, 1], table[i, j, 2]
+        if last == 2:
+            for lane in range(width):
+                Y[row, lane] = ((c2 * Y[X, lane] + c1) * Y[X, lane] + c0) * Y[factor, lane]
+            continue
         for lane in range(width):
-            Y[row, lane] = coefficients[0] * Y[factor, lane]
-        return
-    c0, c1, c2 = coefficients[0], coefficients[1], coefficients[2]
-    if len(coefficients) == 3:
+            Y[row, lane] = table[i, j, last]
+        for k in range(last - 1, 2, -1):
+            for lane in range(width):
+                Y[row, lane] = Y[row, lane] * Y[X, lane] + table[i, j, k]
         for lane in range(width):
-            Y[row, lane] = ((c2 * Y[X, lane] + c1) * Y[X, lane] + c0) * Y[factor, lane]
-        return
-    last = coefficients[len(coefficients) - 1]
-    for lane in range(width):
-        Y[row, lane] = last
-    for k in range(len(coefficients) - 2, 2, -1):
-        for lane in range(width):
-            Y[row, lane] = Y[row, lane] * Y[X, lane] + coefficients[k]
-    for lane in range(width):
-        Y[row, lane] = (((Y[row, lane] * Y[X, lane] + c2) * Y[X, lane] + c1) * Y[X, lane] + c0) * Y[factor, lane]
+            Y[row, lane] = (((Y[row, lane] * Y[X, lane] + c2) * Y[X, lane] + c1) * Y[X, lane] + c0) * Y[factor, lane]
+    return n
 
 
 @njit(**OPTIONS)
@@ -237,7 +256,6 @@ def step_lanes(table, x, h, t, y, out):
             for k in range(N_VALUES):
                 Y[NUMBERS + N_NUMBERS + k, lane] = y[i, 2 * NDOF + k]
         for j in range(table.shape[1]):
-            fill_lanes(Y, width, A, table[0, j], H)
             stage_each(Y, width, table, j)
         for lane in range(count):
             q, p = unpack_lane(Y, lane)
