@@ -15,7 +15,7 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels import terms
 from sympflow.kernels.codegen import statements
-from sympflow.kernels.modules import load_algebra
+from sympflow.kernels.modules import given, load_algebra
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
 from sympflow.kernels.terms import is_large
 
@@ -117,8 +117,8 @@ class ImplicitKernel(Kernel):
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,): see `Kernel`."""
-        y = np.ascontiguousarray(y, dtype=np.float64)
-        h, t = (np.ascontiguousarray(np.broadcast_to(np.asarray(x, dtype=np.float64), y.shape[:1])) for x in (h, t))
+        y = given(y)
+        h, t = (given(np.broadcast_to(x, y.shape[:1])) for x in (h, t))
         out, iterations = np.empty_like(y), np.empty(len(y), dtype=np.int64)
         _load(self._algebra, self._tableau, False).step_each(h, t, y, out, iterations)
         return Steps(out, int(iterations.sum()))

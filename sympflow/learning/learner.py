@@ -7,7 +7,7 @@ import math
 import warnings
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import hint
 from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Said, families, pruned, with_unit_mass
-from sympflow.learning.fitting import SILENT, Fitted, Held, Setting, fitted, gains, judged, kept, restored
+from sympflow.learning.fitting import SILENT, Fitted, Held, Setting, fitted, gains, judged, kept, limit_of, restored
 from sympflow.learning.library import library_for
 from sympflow.learning.models import Formula, FreeField, Model
 from sympflow.learning.shooting import Method
@@ -41,9 +41,7 @@ MOST_VALUES = 40_000  # numbers observed by which models are chosen; the chosen 
 POOR = 1e-3  # one-step error of a flow, relative to the spread of the data, that is worth a warning
 LEAST_SECONDS = 1.0  # for the flow, however late it is
 MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
-HUBER = 1.5  # σ
 FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
-LOSSES = ("squares", "huber")
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
 
 
@@ -142,13 +140,12 @@ def learn(
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
     said = _said(data, separable, mass, damping, period, known)
-    if loss not in LOSSES:
-        raise ValueError(f"`loss` must be one of {', '.join(LOSSES)}; got {loss!r}.")
+    huber = limit_of(loss)
     dt = plain(dt)
     if dt is not None and (isinstance(dt, bool) or not isinstance(dt, int | float) or not 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
     session = Session(checkpoint, resume, plain(time_budget), progress, callback, Crew(workers))
-    setting = Setting(_noise(noise, data), HUBER if loss == "huber" else None)
+    setting = Setting(_noise(noise, data), huber)
     chosen = families(said, family)
     ours, held = data.split(HELD_OUT, seed)
     if isinstance(replicas, bool) or not isinstance(replicas, int) or replicas < 0:
@@ -193,7 +190,14 @@ def _said(data: Trajectories, separable: Any, mass: Any, damping: Any, period: A
     if inverse is not None and any(part.of != "q" for part in parts):
         raise ValueError("`known` has a kinetic energy, and so has `mass`: leave out one of them.")
     rates = 0 if damping is False else 1 if damping is True else d
-    return Said(data.scales, separable, inverse, rates, _periods(period, d), parts)
+    return Said(data.scales, separable, inverse, rates, _periods(period, d), parts, _covariance(data))
+
+
+def _covariance(data: Trajectories) -> np.ndarray:
+    """The covariance (d, d) of the momenta along a trajectory, in the mean over all points."""
+    p = [run.y[data.ndof :, np.isfinite(run.y).all(axis=0)] for run in data.runs]
+    rest = np.concatenate([one - one.mean(axis=1, keepdims=True) for one in p if one.size], axis=1)
+    return rest @ rest.T / max(rest.shape[1], 1)
 
 
 def _periods(period: Any, d: int) -> np.ndarray:
@@ -402,7 +406,8 @@ class Search:
 
     def _try(self, candidate: Candidate, setting: Setting, session: Session) -> bool:
         """Fit a model; True if it is the best so far."""
-        made = self._fit(candidate, setting, session)
+        rival = None if self.best is None else self.best[1].sigma
+        made = self._fit(candidate, replace(setting, rival=rival), session)
         if self.best is None or gains(self.best[2], made[2]):
             self.best = made
             return True

@@ -6,9 +6,11 @@ import sympy
 from scipy.integrate import solve_ivp
 
 import sympflow
-from sympflow.learning.families import FAMILIES, Candidate, pruned
+from sympflow.learning.families import FAMILIES, Candidate, Said, pruned
 from sympflow.learning.fitting import Setting, fitted, judged, restored
+from sympflow.learning.inertia import Inertia
 from sympflow.learning.learner import MOST_VALUES, Replicas, Search, _few, _said, replica
+from sympflow.learning.library import Library, Terms
 from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Network, Pairs, Polynomial, Waves
 from sympflow.learning.shooting import Gauss, Method, Problem, chosen_method, first_states, matched, minimized
 from sympflow.learning.trajectories import Trajectories
@@ -150,7 +152,10 @@ PARTS = [
     Waves.up_to(2, 2, "q", np.array([1.3, 0.9]), np.array([2 * np.pi, np.inf])),
     Network("q", 4, [1.0, 2.0], np.array([4.0, np.inf])),
     Pairs(np.array([[0], [1]]), (-2, 0, 1), 1.3, shared=False),
+    Inertia(Waves.up_to(1, 1, "q", np.ones(1), np.array([2 * np.pi]), constant=True)),
     Formula("q", sympy.sin(Q[0]) * Q[1] ** 2, Q),
+    Terms(Library([Q[0] ** 2 * Q[1], sympy.cos(Q[0] - Q[1]), 1 / Q[1]], 2), "q"),
+    Terms(Library([Q[0] ** 2, Q[0] * Q[1]], 2), "q"),
 ]
 
 
@@ -165,13 +170,35 @@ def test_parts_of_h_are_what_their_derivatives_say(part):
             found.value[i], abs=1e-6
         )
         ahead, behind = (part.gradient(theta, x + s * e, False, False).value for s in (1, -1))
-        assert (ahead - behind) / (2 * h) == pytest.approx(found.slope[:, i], abs=1e-6)
+        assert (ahead - behind) / (2 * h) == pytest.approx(np.broadcast_to(found.slope[:, i], (2, 3)), abs=1e-6)
     for i, e in enumerate(h * np.eye(part.n)):
         ahead, behind = (part.gradient(theta + s * e, x, False, False).value for s in (1, -1))
         assert (ahead - behind) / (2 * h) == pytest.approx(found.by_parameters[:, i], abs=1e-6)
     formula = part.expression(theta, Q)
     values = [float(formula.subs(dict(zip(Q, column, strict=True)))) for column in x.T]
     assert np.ptp(values - part.value(theta, x)) < 1e-12
+
+
+def test_lagranges_equations_give_the_masses_of_a_double_pendulum():
+    """By linear least squares from states and their slopes, without a start."""
+    pendulum = sympflow.systems.double_pendulum()
+    y = pendulum.domain.sample(200, 0)
+    periods = np.array([2 * np.pi, 2 * np.pi, np.inf, np.inf])
+    family = FAMILIES["inertia"].models(Said(np.ones(4), None, None, 0, periods))
+    model = [candidate.model for candidate in family][1]
+    theta = model.lagrangian_start(y.T, pendulum.vector_field(y).T, np.ones(4))
+    assert model.field(theta, y.T, False, False).value == pytest.approx(pendulum.vector_field(y).T, abs=1e-9)
+    assert (np.abs(theta) > 1e-9).sum() == 5  # 2, 1, cos(q1 - q2); -2cos(q1), -cos(q2)
+
+
+def test_bodies_whose_total_momentum_changes_are_no_bodies():
+    """Of four coordinates in the order x1, x2, y1, y2 two momenta cancel along each axis."""
+    x, y = np.random.default_rng(0).normal(size=(2, 50))
+    runs = [(np.arange(50.0), np.stack([x, y, y, x, x, -x, y, -y]))]
+    said = _said(Trajectories.read([*runs, *runs]), None, None, False, None, None)
+    names = [candidate.name for candidate in FAMILIES["pairs"].models(said)]
+    assert len(names) == 2
+    assert all("one axis after another" in name for name in names)
 
 
 # learn ----------------------------------------------------------------------------------------------------------------
