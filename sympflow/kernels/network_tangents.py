@@ -139,6 +139,4 @@ def _loops(activation: str, velocity: bool) -> ModuleType:
         f"LANES = {LANES}\nVELOCITY = {velocity}"
     )
     before = map(template, ("elementary", "activation_bends"))
-    return load_module(
-        "\n\n\n".join([constants, *before, f"activation = {activation}", template("network_tangents")])
-    )
+    return load_module("\n\n\n".join([constants, *before, f"activation = {activation}", template("network_tangents")]))

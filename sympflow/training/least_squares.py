@@ -17,7 +17,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -284,7 +284,7 @@ class GaussNewton:
         Why no more steps are worth while.
     """
 
-    needs_residuals = True
+    needs_residuals: ClassVar[bool] = True
 
     def __init__(self, flow: FlowMap, options: LossOptions) -> None:
         if flow.n_parameters > MAX_PARAMETERS:

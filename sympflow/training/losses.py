@@ -228,7 +228,8 @@ class _Compiled(ABC):
         return self._at(*ends), torch.from_numpy(J.reshape(len(J), -1)).T
 
     def _values(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.tangents.values(self._parameters, *self._points, velocity=self.by_velocity)
+        t, x, constants = self._points
+        return self.tangents.values(self._parameters, t, x, constants, self.by_velocity)
 
     by_velocity: ClassVar[bool]
 

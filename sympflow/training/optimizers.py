@@ -51,7 +51,7 @@ class Adam:
     """Adam (Kingma & Ba 2015) with a schedule and gradient clipping."""
 
     finished: str | None = None
-    needs_residuals = False
+    needs_residuals: ClassVar[bool] = False
 
     def __init__(self, flow: FlowMap, options: LossOptions) -> None:
         self.options = options
@@ -80,7 +80,7 @@ class LBFGS:
     """L-BFGS by torch, its memory 30 pairs: 20 iterations a step, on the points of the step."""
 
     finished: str | None = None
-    needs_residuals = False
+    needs_residuals: ClassVar[bool] = False
 
     def __init__(self, flow: FlowMap, options: LossOptions) -> None:
         self.parameters = list(flow.parameters())
@@ -134,7 +134,7 @@ class BFGS:
     """
 
     finished: str | None = None
-    needs_residuals = False
+    needs_residuals: ClassVar[bool] = False
 
     def __init__(self, flow: FlowMap, options: LossOptions) -> None:
         if flow.n_parameters > MAX_PARAMETERS:

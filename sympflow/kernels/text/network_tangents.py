@@ -19,6 +19,7 @@ M by its velocity, are pulled back from layer to layer.
 import numpy as np
 from numba import njit
 
+
 @njit(**OPTIONS)
 def multiply(theta, plan, level, z, out):
     """out = W z, W the matrix from a level to the next."""
@@ -51,7 +52,7 @@ def sweep(theta, plan, x, dx, t, rate, work):
     """z, σ', σ'', σ''', ż, ȧ, and back R = Wᵀr', r, Ṙ = Wᵀṙ', ṙ of all levels, at times t (LANES,)."""
     z, s, u, v, dz = work[0], work[1], work[2], work[3], work[4]
     da, R, r, dR, dr = work[5], work[6], work[7], work[8], work[9]
-    ndof, inputs, widths, biases, matrices, time, out, size = plan
+    inputs, widths, biases, time, out = plan[1], plan[2], plan[3], plan[5], plan[6]
     depth = len(widths)
     for level in range(depth):
         a, h = r[level], widths[level]
@@ -111,7 +112,7 @@ def add_sensitivities(theta, plan, x, dx, t, rate, sign, work, own, j, G, dG, H,
     """Add sign times the derivatives of ∂_jV and d/dt ∂_jV by the weights to G and dG, by x to H and dH."""
     z, s, u, v, dz = work[0], work[1], work[2], work[3], work[4]
     da, R, r, dR, dr = work[5], work[6], work[7], work[8], work[9]
-    ndof, inputs, widths, biases, matrices, time, out, size = plan
+    inputs, widths, biases, matrices, time, out = plan[1], plan[2], plan[3], plan[4], plan[5], plan[6]
     depth = len(widths)
     aj, daj, zj, dzj, A, C, RA, RC = own
     for level in range(depth):
