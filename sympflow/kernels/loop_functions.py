@@ -16,12 +16,13 @@ import numpy as np
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import OPTIONS, load_module, template
-from sympflow.kernels.stages import DampedDrift, TimeAlone, WithSystem, kicks_of, lanes_source, stages_source
+from sympflow.kernels.stages import DampedDrift, TimeAlone, kicks_of, lanes_source, stages_source
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
     from sympflow.kernels.approximations import Ranges
+    from sympflow.kernels.sized_loops import SizedLoops
     from sympflow.kernels.stage_times import Driving
 
 MOST_COUPLED = 6
@@ -49,24 +50,6 @@ class LoopFunctions:
     rollout_processed: Callable[..., int]
     rollout_processed_batch: Callable[..., None]
     step_rows: Callable[..., None]
-
-    def with_system(self, numbers: np.ndarray, inverse_mass: np.ndarray) -> LoopFunctions:
-        """The functions of tables, of those whose tables are (stages, numbers, M⁻¹)."""
-
-        def given(function: Callable[..., Any], n_tables: int = 1) -> Callable[..., Any]:
-            def call(*arguments: Any) -> Any:
-                tables = [(table, numbers, inverse_mass) for table in arguments[:n_tables]]
-                return function(*tables, *arguments[n_tables:])
-
-            return call
-
-        return LoopFunctions(
-            given(self.rollout),
-            given(self.rollout_batch),
-            given(self.rollout_processed, 3),
-            given(self.rollout_processed_batch, 3),
-            given(self.step_rows),
-        )
 
 
 def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0, driven: bool = False) -> str:
@@ -187,7 +170,7 @@ def family_loops(
         symbols = driving.form
     letters = symbols.parameters
     warn_if_long(symbols.V, symbols.q, system.name)
-    sources = [f"import numpy as np\n\nNDOF = {symbols.ndof}", _FIXED_SIZE, _given_functions(level, bool(letters))]
+    sources = [f"import numpy as np\n\nNDOF = {symbols.ndof}", _given_functions(level, bool(letters))]
     sources.append(gradient_source(symbols.V, symbols.q, "gradient", letters))
     if level in (FORCE_GRADIENT, CURVATURE):
         sources.append(product_source(symbols.V, symbols.q, "hessian_vector", letters))
@@ -209,51 +192,6 @@ def family_loops(
     return _array_functions(vars(load_module("\n\n\n".join([header, *map(template, before), code]))))
 
 
-_FIXED_SIZE = """@njit(**OPTIONS)
-def size(x, copies):
-    return NDOF
-
-
-@njit(**OPTIONS)
-def size_of(table):
-    return NDOF"""
-_ANY_SIZE = """@njit(**OPTIONS)
-def size(x, copies):
-    return len(x) // copies
-
-
-@njit(**OPTIONS)
-def size_of(table):
-    return len(table[2])
-
-
-@njit(**OPTIONS)
-def apply_inverse_mass(v, out, work):
-    inverse_mass = work[4][2]
-    for i in range(len(v)):
-        out[i] = inverse_mass[i] * v[i]"""
-"""A table is (stages, numbers of the system, M⁻¹)."""
-
-
-def _pair_loops(
-    system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials, varied: bool = False
-) -> LoopFunctions:
-    """The loops of a system that is given by one piece, of any size: their code depends on the piece alone."""
-    from sympflow.kernels.pair_forces import pair_data, pair_source
-
-    local: Any = system.local
-    if level == POLYNOMIAL or varied:
-        raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
-    sources = [pair_source(local, functions_of(level)), _given_functions(level, True, numbers="numbers[-1]")]
-    sources += [_ANY_SIZE, stages_source(kicks_of(level), False, None, 0, WithSystem(), "table[0]")]
-    code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
-    before = ["elementary"] if "fast_" in code or "fused_multiply_add" in code else []
-    header = _header(compensated, cache=True, scheduled=False)
-    functions = _array_functions(vars(load_module("\n\n\n".join([header, *map(template, before), code]))))
-    inverse_mass = np.ones(system.ndof) if system.inverse_mass is None else np.array(system.inverse_mass)
-    return functions.with_system(pair_data(local), inverse_mass)
-
-
 _INVERSE_MASS_TIMES_V = {
     0: "out[i] = v[i]",
     1: "out[i] = INVERSE_MASS[i] * v[i]",
@@ -271,18 +209,17 @@ def functions_of(level: int) -> tuple[str, ...]:
     return ("gradient", "hessian_vector", "bend")[: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(level, 0)]
 
 
-def _given_functions(level: int, driven: bool, time_first: bool = False, numbers: str = "numbers") -> str:
+def _given_functions(level: int, driven: bool, time_first: bool = False) -> str:
     """``gradient_at(q, numbers, out)`` and the others that the text `array_states` calls, by functions of a system.
 
-    Those of a driven one take the letters of `numbers` after their arguments, or the time before them; those of one
-    piece its own numbers, the last of them.
+    Those of a driven one take the letters of `numbers` after their arguments, or the time before them.
     """
     sources = []
     for name in functions_of(level):
         arguments = "q, out" if name == "gradient" else "q, v, out"
         call = f"{name}({arguments})"
         if driven:
-            call = f"{name}(numbers[-1], {arguments})" if time_first else f"{name}({arguments}, {numbers})"
+            call = f"{name}(numbers[-1], {arguments})" if time_first else f"{name}({arguments}, numbers)"
         given = arguments.removesuffix("out") + "numbers, out"
         sources.append(f"@njit(**OPTIONS)\ndef {name}_at({given}):\n    {call}")
     return "\n\n\n".join(sources)
@@ -305,7 +242,7 @@ def array_loops(
     monomials: Monomials,
 ) -> LoopFunctions:
     """The loops around the user's Numba functions; compiled for this process only."""
-    mass = "\n\n\n".join([_FIXED_SIZE, _inverse_mass_source(inverse_mass)])
+    mass = _inverse_mass_source(inverse_mass)
     header = _header(compensated, cache=False, scheduled=False)
     stages = stages_source(kicks_of(level), False, friction, 0, TimeAlone() if driven else None)
     given = _given_functions(level, driven, time_first=True)
@@ -320,19 +257,31 @@ def array_loops(
     return _array_functions(functions)
 
 
-def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
+def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool) -> SizedLoops:
     """The loops of a lattice, of which only the structure, and not the size, is part of the code."""
     from sympflow.hamiltonian.lattice import LatticeHamiltonian
     from sympflow.kernels.lattice_loops import LatticeLoops
 
     assert isinstance(system.local, LatticeHamiltonian)
-    loops = LatticeLoops(system.local, level, compensated, system.friction is not None)
+    return LatticeLoops(system.local, level, compensated, system.friction is not None)
+
+
+def _pair_loops(system: HamiltonianSystem, level: int, compensated: bool) -> SizedLoops:
+    """The loops of bodies in pairs, of which only the potential, and not their number, is part of the code."""
+    from sympflow.hamiltonian.bodies import PairsHamiltonian
+    from sympflow.kernels.pair_forces import PairLoops
+
+    assert isinstance(system.local, PairsHamiltonian)
+    return PairLoops(system.local, level, compensated, system.friction is not None)
+
+
+LOCAL: dict[str, Callable[..., SizedLoops]] = {"lattice": _lattice_loops, "pairs": _pair_loops}
+"""Makers of the loops of systems that are given by one piece."""
+
+
+def local_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
+    """The loops of a system that is given by one piece."""
+    assert system.local is not None
+    loops = LOCAL[system.local.loops](system, level, compensated)
     processed = loops.rollout_processed, loops.rollout_processed_batch
     return LoopFunctions(loops.rollout, loops.rollout_batch, *processed, loops.step_rows)
-
-
-LOCAL: dict[str, tuple[Callable[..., LoopFunctions], bool, bool]] = {
-    "lattice": (_lattice_loops, True, True),
-    "pairs": (_pair_loops, False, False),
-}
-"""Makers of the loops of systems that are given by one piece, whether these take friction −γp, and `closes`."""

@@ -17,7 +17,6 @@ __all__ = [
     "StageTable",
     "TimeAlone",
     "TimedNumbers",
-    "WithSystem",
     "kicks_of",
     "lanes_source",
     "numbers_of_kicks",
@@ -360,20 +359,20 @@ def damped(p, a):
 
 _DRIFT_OF = """@njit(**OPTIONS, forceinline=True)
 def drift_of(table, j):
-    return {stages}[0, j]"""
+    return table[0, j]"""
 _TABLE = """@njit(**OPTIONS, forceinline=True)
 def columns_of(table):
-    return {stages}.shape[1]
+    return table.shape[1]
 
 
 @njit(**OPTIONS)
 def first_coefficients(table):
-    return {first}
+    return table[:, :, 0]
 
 
 @njit(**OPTIONS)
 def drift_at(table, j, x):
-    return polynomial({stages}[0, j], x)"""
+    return polynomial(table[0, j], x)"""
 
 
 class TimedNumbers(Protocol):
@@ -413,21 +412,6 @@ def numbers_at(table, j, x, h, t):
     return ({", ".join([*values, "time"])})"""
 
 
-class WithSystem:
-    """The numbers of kicks, and after them the array of a system's own numbers: a table is (stages, numbers, M⁻¹)."""
-
-    def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
-        numbers, values = numbers_of_kicks(kinds, "table[0]")
-        return f"""@njit(**OPTIONS)
-def numbers_of(table, j, k=0):
-    return ({", ".join([*numbers, "table[1]"])})
-
-
-@njit(**OPTIONS)
-def numbers_at(table, j, x, h, t):
-    return ({", ".join([*values, "table[1]"])})"""
-
-
 def time_lines(row: int) -> tuple[str, str]:
     """The time of kick j of step k of a run, and in a step h from t on; `row` is the first of those of the time."""
     return (
@@ -436,12 +420,12 @@ def time_lines(row: int) -> tuple[str, str]:
     )
 
 
-def numbers_of_kicks(kinds: Sequence[Kick], stages: str = "table") -> tuple[list[str], list[str]]:
+def numbers_of_kicks(kinds: Sequence[Kick]) -> tuple[list[str], list[str]]:
     """The numbers of kicks as code: those of a run, and those of a step h by polynomials in x."""
     rows = range(1, 1 + len(kinds[0].numbers))
     steps = {1: "h", 3: "h ** 3", 5: "h ** 5"}
-    values = [f"{steps[n]} * polynomial({stages}[{i}, j], x)" for i, n in zip(rows, kinds[0].powers, strict=True)]
-    return [f"{stages}[{i}, j]" for i in rows], values
+    values = [f"{steps[n]} * polynomial(table[{i}, j], x)" for i, n in zip(rows, kinds[0].powers, strict=True)]
+    return [f"table[{i}, j]" for i in rows], values
 
 
 def _numbers_source(kinds: Sequence[Kick], n_parameters: int, n_rows: int) -> str:
@@ -466,13 +450,12 @@ def stages_source(
     friction: DampedDrift | None = None,
     n_parameters: int = 0,
     driving: TimedNumbers | None = None,
-    stages: str = "table",
 ) -> str:
     """The functions of the text `loops` that depend on the kinds of kick, on friction and on the time.
 
     ``numbers_of(table, j, k)`` are the numbers of kick j of step k, ``numbers_at(table, j, x, h, t)`` those of a step h
     by polynomials in x that begins at the time t; the values of the parameters of H come after them. ``drift_of(table,
-    j)`` are those of a drift. `stages` is the array of these numbers, by the `table` that the loops are given.
+    j)`` are those of a drift.
     ``stage`` is a kick and a drift of one trajectory. `FIRST_VALUE` is the row of a table with the first of the values.
     """
     given = "numbers, " if n_parameters else ""
@@ -484,7 +467,6 @@ def stages_source(
     end = [*moved, "return q, p, q_error, p_error"]
     begin = ["fill_coefficients(numbers, work[j])"] if driving is not None and scheduled else []
     first, n_rows = 1 + len(kinds[0].numbers), _rows_before_values(kinds, friction)
-    table = {"stages": stages, "first": "table[:, :, 0]" if stages == "table" else "table"}
     numbers = _numbers_source(kinds, n_parameters, n_rows) if driving is None else driving.source(kinds, n_rows)
     return f"""FIRST_VALUE = {n_rows}
 
@@ -492,10 +474,10 @@ def stages_source(
 {numbers}
 
 
-{_TABLE.format(**table)}
+{_TABLE}
 
 
-{_DRIFT_OF.format(**table) if friction is None else friction.source(first)}
+{_DRIFT_OF if friction is None else friction.source(first)}
 
 
 @njit(**OPTIONS, forceinline=True)

@@ -58,6 +58,7 @@ PROCESSOR_SPREAD = 0.1
 STIFFNESS = 1e-3  # how reluctantly a table is made to vary with t where that is not called for
 FINALISTS = 4  # tables of the search that are followed to the end
 FITTED = 2  # tables from which the polynomials are fitted
+FITTED_STEPS = 200  # iterations of that at most: each takes as long as ten of a table, and more gain a few per cent
 HOPELESS = 100.0  # times the cost of the best table at Δt: polynomials are not fitted from there
 SEARCH_STEPS = 60  # iterations from each start
 FROZEN_SHARE = 0.7  # of a time budget, that all work on frozen tables may use
@@ -216,7 +217,7 @@ class TableRun(SearchRun):
         starts = [self._continued(m) for m in _distinct(finalists)[:FITTED]]
         if not finalists or frozen is None or self._frozen_cost(self.given) < HOPELESS * min(m.cost for m in finalists):
             starts.insert(0, self.given)
-        whole = self.whole, steps, self.whole_end, True
+        whole = self.whole, min(steps, FITTED_STEPS) if frozen is not None else steps, self.whole_end, True
         fitted = list(session.each(descended, whole, starts, self.whole_end, self.whole.compiled))
         best = min(fitted, key=lambda m: m.cost)
         if not math.isfinite(best.cost):

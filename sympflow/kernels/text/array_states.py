@@ -1,9 +1,9 @@
-"""States as arrays, changed in place: systems given by Numba functions, of many terms, or of any size.
+"""States as arrays, changed in place: systems given by Numba functions, or of many terms.
 
 Source text for `loops`. What comes before defines the constants of `loops`, the system's ``gradient_at(q, numbers,
 out)`` and ``hessian_vector_at(q, v, numbers, out)``, and ``apply_inverse_mass(v, out, work)``; where kicks have
 curvature terms or polynomials, ``bend_at(q, v, numbers, out)`` and ``polynomial_slope(q, numbers, out)`` too; and
-``size(x, copies)``, the degrees of freedom by an array x of so many vectors, and ``size_of(table)``.
+`NDOF`.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -14,24 +14,22 @@ from numba import njit
 
 @njit(**OPTIONS)
 def unpack(y):
-    d = size(y, 2)
-    q, p = np.empty(d), np.empty(d)
-    for i in range(d):
-        q[i], p[i] = y[i], y[d + i]
+    q, p = np.empty(NDOF), np.empty(NDOF)
+    for i in range(NDOF):
+        q[i], p[i] = y[i], y[NDOF + i]
     return q, p
 
 
 @njit(**OPTIONS)
 def pack(q, p, y):
-    d = size(y, 2)
-    for i in range(d):
-        y[i], y[d + i] = q[i], p[i]
+    for i in range(NDOF):
+        y[i], y[NDOF + i] = q[i], p[i]
 
 
 @njit(**OPTIONS)
 def copy(x):
-    duplicate = np.empty(size(x, 1))
-    for i in range(size(x, 1)):
+    duplicate = np.empty(NDOF)
+    for i in range(NDOF):
         duplicate[i] = x[i]
     return duplicate
 
@@ -39,20 +37,20 @@ def copy(x):
 @njit(**OPTIONS)
 def is_finite(q, p):
     total = 0.0
-    for i in range(size(q, 1)):
+    for i in range(NDOF):
         total += 0.0 * q[i] + 0.0 * p[i]
     return total == 0.0
 
 
 @njit(**OPTIONS)
 def no_error(x):
-    return np.zeros(size(x, 1))
+    return np.zeros(NDOF)
 
 
 @njit(**OPTIONS)
 def move(x, error, change):
     """x + change; if `COMPENSATED` by Kahan's compensated sum."""
-    for i in range(size(x, 1)):
+    for i in range(NDOF):
         if COMPENSATED:
             corrected = change[i] - error[i]
             total = x[i] + corrected
@@ -65,14 +63,13 @@ def move(x, error, change):
 
 @njit(**OPTIONS)
 def workspace(table):
-    d = size_of(table)
-    return np.empty(d), np.empty(d), np.empty(d), np.empty(d), table
+    return np.empty(NDOF), np.empty(NDOF), np.empty(NDOF), np.empty(NDOF), table
 
 
 @njit(**OPTIONS)
 def forget(x):
     """NaN: what a user's function does not write then ends the run."""
-    for i in range(size(x, 1)):
+    for i in range(NDOF):
         x[i] = np.nan
 
 
@@ -84,7 +81,7 @@ def kick(q, numbers, work):
     slope = work[0]
     forget(slope)
     gradient_at(q, numbers, slope)
-    for i in range(size(q, 1)):
+    for i in range(NDOF):
         slope[i] *= -numbers[0]
     return slope
 
@@ -98,7 +95,7 @@ def gradient_kick(q, numbers, work):
     apply_inverse_mass(slope, velocity, work)
     forget(product)
     hessian_vector_at(q, velocity, numbers, product)
-    for i in range(size(q, 1)):
+    for i in range(NDOF):
         slope[i] *= -b
         product[i] *= g
     return slope, product
@@ -113,11 +110,11 @@ def curvature_kick(q, numbers, work):
     apply_inverse_mass(change, velocity, work)
     hessian_vector_at(q, velocity, numbers, product)
     bend_at(q, velocity, numbers, bent)
-    for i in range(size(q, 1)):
+    for i in range(NDOF):
         change[i] = g * product[i] - b * change[i] - c * bent[i]
     apply_inverse_mass(product, velocity, work)
     hessian_vector_at(q, velocity, numbers, product)
-    for i in range(size(q, 1)):
+    for i in range(NDOF):
         change[i] -= c * product[i]
     return change
 
@@ -126,7 +123,7 @@ def curvature_kick(q, numbers, work):
 def polynomial_kick(q, numbers, work):
     change = kick(q, numbers, work)
     polynomial_slope(q, numbers, work[1])
-    for i in range(size(q, 1)):
+    for i in range(NDOF):
         change[i] -= work[1][i]
     return change
 
@@ -135,6 +132,6 @@ def polynomial_kick(q, numbers, work):
 def drift(p, a, work):
     velocity = work[0]
     apply_inverse_mass(p, velocity, work)
-    for i in range(size(p, 1)):
+    for i in range(NDOF):
         velocity[i] *= a
     return velocity
