@@ -42,6 +42,7 @@ POOR = 1e-3  # one-step error of a flow, relative to the spread of the data, tha
 LEAST_SECONDS = 1.0  # for the flow, however late it is
 MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
 FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
+ROUGH = 60  # points from which the roughness of the data tells their noise to a fifth
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
 
 
@@ -150,7 +151,7 @@ def learn(
     if dt is not None and (isinstance(dt, bool) or not isinstance(dt, int | float) or not 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
     session = Session(checkpoint, resume, plain(time_budget), progress, callback, Crew(workers))
-    setting = Setting(_noise(noise, data), huber, seen=smoothed(data).sigma)
+    setting = Setting(_noise(noise, data), huber, seen=smoothed(data).sigma if data.n_points >= ROUGH else None)
     chosen = families(said, family)
     folds = data.folds(HELD_OUT, seed)
     if len(folds) == 1:

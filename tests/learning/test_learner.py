@@ -380,7 +380,6 @@ def test_residuals_beyond_the_noise_of_the_data_are_not_explained():
     assert not held.explained
     assert "noise that is seen without a model" in held.complaint
     right = left_out(fitted(quartic(data), data, setting), data.folds(), setting)
-    assert right.excess < 1.2
     assert right.explained
 
 
