@@ -69,8 +69,14 @@ def SUM_of_chunk(chunk, x, A, v, sites, F, starts, shape, values, geometry):
         for i in range(G.shape[1]):
             G[k, i] = 0.0
     rows, n_rows = np.empty(20, dtype=np.int64), 1
-    cell = 0
-    for i in range(chunk_begin(chunk, n, n_chunks, starts), chunk_begin(chunk + 1, n, n_chunks, starts)):
+    cell, in_cells = 0, len(starts) > 0
+    begin, end = chunk_begin(chunk, n, n_chunks, in_cells), chunk_begin(chunk + 1, n, n_chunks, in_cells)
+    for place in range(begin if in_cells else 2 * begin, end if in_cells else 2 * end):
+        i = place
+        if not in_cells:  # the first body, the last, the second …: each two of them meet as many
+            i = n - 1 - place // 2 if place % 2 else place // 2
+            if place % 2 and i == place // 2:
+                continue
         rows[0], rows[1] = i + 1, n
         if CUT:
             n_rows, cell = met_by(i, cell, starts, shape, rows, n_rows)

@@ -12,8 +12,6 @@ and added up in the order of these: so threads may share them, and the result do
 # ruff: noqa: F821
 # mypy: ignore-errors
 
-import math
-
 import numpy as np
 from numba import njit
 
@@ -67,11 +65,9 @@ def workspace(size, geometry):
 
 
 @njit(**OPTIONS)
-def chunk_begin(chunk, n, n_chunks, starts):
-    """The first body of a chunk: of all pairs, the chunks have as many each."""
-    if len(starts) > 0:
-        return n * chunk // n_chunks
-    return n - int(math.sqrt(1.0 - chunk / n_chunks) * n)
+def chunk_begin(chunk, n, n_chunks, in_cells):
+    """The first place of a chunk; of all pairs, the places are those of two bodies each."""
+    return (n if in_cells else (n + 1) // 2) * chunk // n_chunks
 
 
 @njit(**OPTIONS)
