@@ -19,6 +19,8 @@ WIDTHS = (6, 12, 24)
 WHOLE_WIDTHS = (12, 24, 40)
 POWERS = ((-1,), (-2, -1, 0, 1, 2))
 """Powers of the distances of pairs, 0 for the logarithm."""
+CHANGING = 0.5
+"""Variance of the total momentum along a trajectory, over the sum of those of its parts, where it is not constant."""
 MOST_TERMS = 400
 
 
@@ -39,6 +41,8 @@ class Said:
         Of the coordinates that are angles, infinite for the others.
     known : tuple of Formula
         Parts of H.
+    momenta : ndarray of shape (d, d) or None
+        The covariance of the momenta along a trajectory, in their mean; None where it is not known.
     """
 
     scales: np.ndarray
@@ -47,6 +51,7 @@ class Said:
     rates: int
     periods: np.ndarray
     known: tuple[Formula, ...] = ()
+    momenta: np.ndarray | None = None
 
     @property
     def ndof(self) -> int:
@@ -60,6 +65,13 @@ class Said:
     def angles(self) -> bool:
         """True if there are any."""
         return bool(np.isfinite(self.periods).any())
+
+    def at_rest(self, bodies: np.ndarray) -> bool:
+        """True unless the total momentum of bodies (n, dim) is seen to change, as it cannot by forces between them."""
+        if self.momenta is None or self.known:
+            return True
+        total = sum(self.momenta[np.ix_(axis, axis)].sum() for axis in bodies.T)
+        return bool(total < CHANGING * np.trace(self.momenta))
 
     def kinetic(self) -> tuple[Part, ...]:
         """½ pᵀM⁻¹p, learned if it is not known."""
@@ -136,12 +148,13 @@ def _pairs(said: Said) -> Iterator[Candidate]:
     for dim in (2, 3):
         if d % dim or d < 2 * dim:
             continue
-        for order, bodies in (
-            ("one body after another", np.arange(d).reshape(-1, dim)),
-            ("one axis after another", np.arange(d).reshape(dim, -1).T),
-        ):
-            for powers in POWERS:
-                said_powers = "1/r" if powers == (-1,) else "powers of r from −2 to 2 and log r"
+        orders = {
+            "one body after another": np.arange(d).reshape(-1, dim),
+            "one axis after another": np.arange(d).reshape(dim, -1).T,
+        }
+        for powers in POWERS:
+            said_powers = "1/r" if powers == (-1,) else "powers of r from −2 to 2 and log r"
+            for order, bodies in ((order, bodies) for order, bodies in orders.items() if said.at_rest(bodies)):
                 name = f"{T}, V of the distances of {len(bodies)} bodies in {dim} dimensions, {order}, {said_powers}"
                 yield Candidate(name, said.separated(Pairs(bodies, powers, size, shared=False)))
 

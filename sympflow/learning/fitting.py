@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ SETTLED = 0.05  # change of the noise, relative, that ends them
 GROWTH = 1e3  # most that an error of an initial state may grow along a piece
 LEAST_GROWTH = 10.0
 PER_NOISE = 0.3  # of the spread of the data, that such an error may reach
+HOPELESS = 1.5  # noise over that of the best model, from which a model is given up
 STEP_ERROR = 0.1  # of the noise, to which the scheme's steps may change an orbit
 EXACT = 1e-9  # residuals, relative to the spread of the data, that need no explanation
 LOUDER = 2.0  # root mean square of held-out residuals, in σ, above which there are too few data, or another system
@@ -68,11 +69,19 @@ class Setting:
         Residuals of more than so many σ count by their size.
     stop : callable
         Asked between steps.
+    rival : ndarray of shape (2d,) or None
+        The noise that the best model so far leaves of whole orbits: one that leaves much more of a few points is given
+        up.
     """
 
     noise: np.ndarray | None = None
     huber: float | None = None
     stop: Stop = lambda: False
+    rival: np.ndarray | None = None
+
+    def hopeless(self, noise: np.ndarray) -> bool:
+        """True if a model that leaves this noise (2d,) of a few points is not worth longer orbits."""
+        return self.rival is not None and float(np.mean(np.log(noise / self.rival))) > math.log(HOPELESS)
 
 
 @dataclass(frozen=True)
@@ -146,7 +155,7 @@ def fitted(
         costs += [cost / data.n_values for cost in fit.costs]
         if given is None:
             sigma = np.maximum(fit.noise(), FINEST * scales)
-        if not math.isfinite(fit.cost) or setting.stop():
+        if not math.isfinite(fit.cost) or setting.stop() or setting.hopeless(np.maximum(fit.noise(), FINEST * scales)):
             break
         orbits = np.concatenate(fit.orbits, axis=1)
         coarse = fit.step_error(np.maximum(sigma, EXACT * scales)) > STEP_ERROR
@@ -273,7 +282,12 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     pieces = held.pieces(span=found.span) if found.span else held.pieces(FIRST_POINTS)
     sigma = np.maximum(found.sigma, EXACT * scales)
     problem = Problem(found.model, pieces, found.method, sigma, frozen=True, huber=setting.huber)
-    fit = minimized(problem, found.theta, first_states(pieces), iterations=20)
+    # the first observation alone leads astray along a whole orbit: a few points give the start
+    few = held.pieces(FIRST_POINTS)
+    short = replace(problem, data=few)
+    orbits = minimized(short, found.theta, first_states(few), iterations=20).orbits
+    states = np.concatenate(orbits, axis=1)[:, _starts(pieces.runs)].T
+    fit = minimized(problem, found.theta, states, iterations=20)
     residuals = fit.residuals
     ends = np.cumsum([run.n_points for run in held.runs])
     owner = np.searchsorted(ends, _starts(pieces.runs), side="right")

@@ -7,7 +7,7 @@ import math
 import warnings
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -190,7 +190,14 @@ def _said(data: Trajectories, separable: Any, mass: Any, damping: Any, period: A
     if inverse is not None and any(part.of != "q" for part in parts):
         raise ValueError("`known` has a kinetic energy, and so has `mass`: leave out one of them.")
     rates = 0 if damping is False else 1 if damping is True else d
-    return Said(data.scales, separable, inverse, rates, _periods(period, d), parts)
+    return Said(data.scales, separable, inverse, rates, _periods(period, d), parts, _covariance(data))
+
+
+def _covariance(data: Trajectories) -> np.ndarray:
+    """The covariance (d, d) of the momenta along a trajectory, in the mean over all points."""
+    p = [run.y[data.ndof :, np.isfinite(run.y).all(axis=0)] for run in data.runs]
+    rest = np.concatenate([one - one.mean(axis=1, keepdims=True) for one in p if one.size], axis=1)
+    return rest @ rest.T / max(rest.shape[1], 1)
 
 
 def _periods(period: Any, d: int) -> np.ndarray:
@@ -399,7 +406,8 @@ class Search:
 
     def _try(self, candidate: Candidate, setting: Setting, session: Session) -> bool:
         """Fit a model; True if it is the best so far."""
-        made = self._fit(candidate, setting, session)
+        rival = None if self.best is None else self.best[1].sigma
+        made = self._fit(candidate, replace(setting, rival=rival), session)
         if self.best is None or gains(self.best[2], made[2]):
             self.best = made
             return True

@@ -191,6 +191,16 @@ def test_lagranges_equations_give_the_masses_of_a_double_pendulum():
     assert (np.abs(theta) > 1e-9).sum() == 5  # 2, 1, cos(q1 - q2); -2cos(q1), -cos(q2)
 
 
+def test_bodies_whose_total_momentum_changes_are_no_bodies():
+    """Of four coordinates in the order x1, x2, y1, y2 two momenta cancel along each axis."""
+    x, y = np.random.default_rng(0).normal(size=(2, 50))
+    runs = [(np.arange(50.0), np.stack([x, y, y, x, x, -x, y, -y]))]
+    said = _said(Trajectories.read([*runs, *runs]), None, None, False, None, None)
+    names = [candidate.name for candidate in FAMILIES["pairs"].models(said)]
+    assert len(names) == 2
+    assert all("one axis after another" in name for name in names)
+
+
 # learn ----------------------------------------------------------------------------------------------------------------
 
 
