@@ -220,8 +220,8 @@ def warn_of_domain(system: HamiltonianSystem, domain: Domain) -> None:
         corners = box_without(y[defined], y[~defined])
         remedy = "Shrink `domain`." if corners is None else f"Take Box({corners[0]}, {corners[1]}), without them."
         warnings.warn(
-            f"H of the system {system.name!r} is not finite at {(~defined).sum()} of {len(y)} states of `domain`, where "
-            f"a flow means nothing. {remedy}",
+            f"H of the system {system.name!r} is not finite at {(~defined).sum()} of {len(y)} states of `domain`, "
+            f"where a flow means nothing. {remedy}",
             UserWarning,
             stacklevel=4,
         )

@@ -268,8 +268,8 @@ class TableRun(SearchRun):
             return None
         words = (
             f"From {len(lost)} of {len(lost) + len(known)} held-out states of `domain` no solution exists up to dt = "
-            f"{self.flow.dt:g}, and the flow was fitted to the others alone: H is not defined there, or orbits run into "
-            "a singularity or escape. "
+            f"{self.flow.dt:g}, and the flow was fitted to the others alone: H is not defined there, or orbits run "
+            "into a singularity or escape. "
         )
         box = box_without(known, lost)
         return words + ("Shrink `domain`." if box is None else f"Take a smaller `domain`: Box({box[0]}, {box[1]}).")
