@@ -45,11 +45,17 @@ class _Pass:
         Of a potential and its letters, to one expression for each field.
     keeps : int or None
         The helper into which M⁻¹ times the slopes go.
+    opens : bool
+        True for the first pass of a kick with force gradient, which leaves p as it is and keeps costly curvatures.
+    turns : bool
+        True for the second one: it makes the kick by the force as well, and takes the curvatures that were kept.
     """
 
     vectors: tuple[str, ...]
     slopes: Callable[[sp.Expr, Sequence[sp.Symbol], LatticeHamiltonian], list[sp.Expr]]
     keeps: int | None = None
+    opens: bool = False
+    turns: bool = False
 
 
 def _slopes(f: sp.Expr, x: Sequence[sp.Symbol], lattice: LatticeHamiltonian) -> list[sp.Expr]:
@@ -71,9 +77,9 @@ def _bent(f: sp.Expr, x: Sequence[sp.Symbol], lattice: LatticeHamiltonian) -> li
 
 
 KICK = _Pass(("q",), _slopes)
-ACCELERATION = _Pass(("q",), _slopes, 0)
-PRODUCT = _Pass(("q", "v"), _product)
-TURN = _Pass(("q", "v"), _product, 1)
+ACCELERATION = _Pass(("q",), _slopes, 0, opens=True)
+PRODUCT = _Pass(("q", "v"), _product, turns=True)
+TURN = _Pass(("q", "v"), _product, 1, turns=True)
 BEND = _Pass(("q", "v", "w"), _bent)
 _LETTERS = {"q": "x", "v": "v", "w": "w"}
 _ARRAYS = {"q": "X[0]", "v": "A[0]", "w": "A[1]"}
@@ -205,6 +211,7 @@ def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleTyp
         N_FIELDS=len(lattice.fields),
         N_SETS=4 if compensated else 2,
         N_HELPERS={0: 0, FORCE_GRADIENT: 1, CURVATURE: 2}[level],
+        N_CURVATURES=len(_curvatures(lattice)) if level else 0,
         N_BONDS=sum(k > 1 for k in lattice.bonds) * len(lattice.fields),
         REACH=max(lattice.bonds, default=0),
         PERIODIC=tuple(b == "periodic" for b in lattice.boundary),
@@ -263,7 +270,9 @@ def _indented(lines: Sequence[str]) -> list[str]:
 
 
 def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> list[str]:
-    """p −= b × the slopes of the sites of planes low … high; M⁻¹ × these are kept for the next pass.
+    """p −= b × the slopes of the sites of planes low … high; of passes that keep M⁻¹ × these, the last one does so.
+
+    That of the accelerations keeps them and leaves p as it is, the next one makes both kicks: p is written once.
 
     The drift is a pass of its own: made in the same one, it keeps compilers from vector instructions.
     """
@@ -276,6 +285,7 @@ def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> 
     row = _Row(lattice)
     known: set[sp.Symbol] = set()
     lines: list[str] = []
+    targets: dict[str, sp.Expr] = {}
     slopes: list[sp.Expr] = [sp.S.Zero] * n_fields
 
     def read(symbol: sp.Symbol, element: str) -> sp.Symbol:
@@ -285,14 +295,18 @@ def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> 
         return symbol
 
     if lattice.U != 0:
-        own = kind.slopes(lattice.U, lattice.x, lattice)
-        used = set().union(*(f.free_symbols for f in own))
+        own, stored, taken = _with_curvatures(lattice, kind, "onsite")
+        all_own = [*own, *stored.values()]
+        used = set().union(*(f.free_symbols for f in all_own))
         for vector in kind.vectors:
             for f, s in enumerate(getattr(lattice, _LETTERS[vector])):
                 if s in used:
                     read(s, row.at(_field(vector, f), "s"))
-        for s, element in row.parameters(own, "s").items():
+        for s, element in row.parameters(all_own, "s").items():
             read(s, element)
+        for s, array in taken.items():
+            read(s, row.at(array, "s"))
+        targets = {row.at(array, "s"): f for array, f in stored.items()}
         slopes = [a + b for a, b in zip(slopes, own, strict=True)]
     for (k, f), place in places.items():
         forward = read(sp.Symbol(f"forward_{place}", real=True), row.at(f"T[{place}]", str(k)))
@@ -305,12 +319,17 @@ def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> 
     nearest = _Nearest.of(lattice, kind, row)
     for f in nearest.fields:
         slopes[f] += sp.Symbol(f"behind_{f}", real=True) - sp.Symbol(f"ahead_{f}", real=True)
-    lines += statements([f"g_{f}" for f in fields], vectorised(slopes))
+    lines += statements([*(f"g_{f}" for f in fields), *targets], vectorised([*slopes, *targets.values()]))
     lines += [f"behind_{f} = ahead_{f}" for f in nearest.fields]
+    if kind.turns:
+        lines += _impulse(lattice, row, [row.at(f"A[0, {f}]", "s") for f in fields])
     momenta = [row.at(f"X[1, {f}]", "s") for f in fields]
-    errors = [row.at(f"X[3, {f}]", "s") for f in fields] if compensated else []
     for f in fields:
-        lines += _moved(momenta[f], f"-b*g_{f}", errors[f] if compensated else None)
+        error = row.at(f"X[3, {f}]", "s") if compensated else None
+        if kind.turns:
+            lines += _moved(momenta[f], f"-force*impulse_{f}", error)
+        if not kind.opens:
+            lines += _moved(momenta[f], f"-b*g_{f}", error)
     if kind.keeps is not None:
         lines += _velocity(lattice, row, [f"g_{f}" for f in fields], "u")
         lines += [f"{row.at(f'A[{kind.keeps}, {f}]', 's')} = u_{f}" for f in fields]
@@ -321,6 +340,46 @@ def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> 
         none = [f"ahead_{f} = 0.0" for f in nearest.fields]
         loop += ["for j in range(np.uint64(m), np.uint64(n)):", *_indented([*none, *lines])]
     return _rows_source(lattice, [*body, *loop])
+
+
+def _curvatures(lattice: LatticeHamiltonian) -> list[tuple[str, int, int, sp.Expr]]:
+    """The second derivatives of the potentials of a site and of a bond to the next one that are worth keeping.
+
+    Of an exponential or a sine one derivative gives the other. A polynomial at a site is computed again in the time
+    that it takes to store and load it; that of a bond needs two loads.
+    """
+    found = []
+    for name, V, x in (("onsite", lattice.U, lattice.x), ("bond", lattice.bonds.get(1, sp.S.Zero), lattice.r)):
+        for i, a in enumerate(x):
+            for j, b in enumerate(x[: i + 1]):
+                f = sp.diff(V, a, b)
+                if not f.is_polynomial(*x) or (name == "bond" and f.free_symbols & set(x)):
+                    found.append((name, i, j, f))
+    return found
+
+
+def _with_curvatures(
+    lattice: LatticeHamiltonian, kind: _Pass, name: str
+) -> tuple[list[sp.Expr], dict[str, sp.Expr], dict[sp.Symbol, str]]:
+    """The slopes of a potential in a pass, with what it stores of each array of curvatures, and what it takes of them.
+
+    Parameters
+    ----------
+    name : {"onsite", "bond"}
+    """
+    V, x = (lattice.U, lattice.x) if name == "onsite" else (lattice.bonds[1], lattice.r)
+    slopes = kind.slopes(V, x, lattice)
+    kept = [(f"C[{k}]", *of) for k, (potential, *of) in enumerate(_curvatures(lattice)) if potential == name]
+    if kind.opens:
+        return slopes, {array: f for array, _, _, f in kept}, {}
+    if not kind.turns:
+        return slopes, {}, {}
+    taken: dict[sp.Symbol, str] = {}
+    H = sp.hessian(V, x)
+    for array, i, j, _ in kept:
+        H[i, j] = H[j, i] = sp.Symbol(f"curvature_{name}_{i}_{j}", real=True)
+        taken[H[i, j]] = array
+    return list(H * sp.Matrix(lattice.v)), {}, taken
 
 
 @dataclass(frozen=True)
@@ -345,21 +404,23 @@ class _Nearest:
     def of(cls, lattice: LatticeHamiltonian, kind: _Pass, row: _Row) -> _Nearest:
         if 1 not in lattice.bonds:
             return cls([], [], [])
-        found = kind.slopes(lattice.bonds[1], lattice.r, lattice)
+        found, stored, taken = _with_curvatures(lattice, kind, "bond")
         wanted = [f for f, slope in enumerate(found) if slope != 0]
-        slopes = vectorised([found[f] for f in wanted])
+        expressions = [*(found[f] for f in wanted), *stored.values()]
 
         def lines(at: Callable[[str, str], str], parameters: dict[sp.Symbol, str], start: str, name: str) -> list[str]:
             code = [
                 f"{s} = {at(_field(vector, f), f'{start} + 1')} - {at(_field(vector, f), start)}"
-                for vector, f, s in _differences(lattice, kind, found)
+                for vector, f, s in _differences(lattice, kind, expressions)
             ]
             code += [f"{s} = {element}" for s, element in parameters.items()]
-            return code + statements([f"{name}_{f}" for f in wanted], slopes)
+            code += [f"{s} = {at(array, start)}" for s, array in taken.items()]
+            targets = [*(f"{name}_{f}" for f in wanted), *(at(array, start) for array in stored)]
+            return code + statements(targets, vectorised(expressions))
 
-        ahead = lines(row.at, row.parameters(found, "s"), "s", "ahead")
+        ahead = lines(row.at, row.parameters(expressions, "s"), "s", "ahead")
         other = _Row(lattice)
-        places = {s: text.replace(" + j]", "]") for s, text in other.parameters(found, "s - 1").items()}
+        places = {s: text.replace(" + j]", "]") for s, text in other.parameters(expressions, "s - 1").items()}
         first = [*other.lines, *lines(lambda array, at: f"{array[:-1]}, {at}]", places, "s - 1", "behind")]
         if lattice.boundary[-1] == "free":
             first = [
@@ -469,6 +530,17 @@ def _velocity(lattice: LatticeHamiltonian, row: _Row, momenta: Sequence[str], na
     )
 
 
+def _impulse(lattice: LatticeHamiltonian, row: _Row, velocities: Sequence[str]) -> list[str]:
+    """Lines for Mv of one site, where T = ½ pᵀM⁻¹p."""
+    letters = [sp.Symbol(f"velocity_{f}", real=True) for f in range(len(velocities))]
+    found = list(sp.hessian(lattice.T, lattice.p).inv() * sp.Matrix(letters))
+    masses = row.parameters(found, "s")
+    put = {s: sp.Symbol(f"{s}_of_v", real=True) for s in masses}
+    lines = [f"{s} = {v}" for s, v in zip(letters, velocities, strict=True)]
+    lines += [f"{put[s]} = {element}" for s, element in masses.items()]
+    return lines + statements([f"impulse_{f}" for f in range(len(letters))], [f.xreplace(put) for f in found])
+
+
 def _moved(x: str, change: str, error: str | None) -> list[str]:
     if error is None:
         return [f"{x} += {change}"]
@@ -515,7 +587,7 @@ def _stages_source(lattice: LatticeHamiltonian, level: int, compensated: bool, r
             *_pass_lines(lattice, kind, compensated),
         ]
 
-    accelerated = passed(ACCELERATION, "table[1, column]", "X[0")
+    accelerated = ["force = table[1, column]", *passed(ACCELERATION, "force", "X[0")]
     cases = [("table[1, column] != 0.0", passed(KICK, "table[1, column]", "X[0"))]
     if level:
         turned = [*accelerated, *passed(PRODUCT, "-table[2, column]", "A[0")]
@@ -535,7 +607,7 @@ def _stages_source(lattice: LatticeHamiltonian, level: int, compensated: bool, r
         lines += [f"b = table[{row + 1}, column]", *_decay_lines(lattice)]
     lines += ["column = column + 1 if single or column < link else 1"]
     arguments = "X, table, column, n_stages, single, work, whole, lo, hi, begin, end, geometry, sites, offset, values"
-    head = [f"@njit(**OPTIONS)\ndef stages({arguments}):", "link = table.shape[1] - 2", "A, T = work"]
+    head = [f"@njit(**OPTIONS)\ndef stages({arguments}):", "link = table.shape[1] - 2", "A, T, C = work"]
     return "\n    ".join(
         [*head, *_value_lines(lattice), "for _ in range(n_stages):", *_indented(lines), "return column"]
     )

@@ -19,8 +19,9 @@ from sympflow.kernels.protocol import NOTHING
 
 __all__ = ["SizedLoops", "Team"]
 
-BLOCK = 64
-"""Steps between two looks for a non-finite state, of a system in pieces."""
+BLOCK, MOMENT = 64, 500_000_000
+"""Most steps between two looks for a non-finite state and for an interrupt, of a system in pieces, and about how many
+nanoseconds they take."""
 
 
 class SizedLoops:
@@ -175,6 +176,7 @@ class SizedLoops:
         running: np.ndarray,
     ) -> int:
         link, width = table.shape[1] - 2, len(y0)
+        most = max(1, min(BLOCK, MOMENT // max(1, link * self._work)))
         states = self._states(), self._states()
 
         def opened() -> int:
@@ -193,7 +195,7 @@ class SizedLoops:
         saved = int(np.searchsorted(save, 0, "right"))
         out[:saved] = y0
         while n < n_steps and not stop[0]:
-            block = min(BLOCK, n_steps - n, *([int(save[saved]) - n] if saved < len(save) else []))
+            block = min(most, n_steps - n, *([int(save[saved]) - n] if saved < len(save) else []))
             states, j = self._advanced(team, states, table, j, block * link, False)
             end = closed()
             if not _finite(end):

@@ -123,7 +123,8 @@ def row_size(size, geometry):
 @njit(**OPTIONS)
 def workspace(size, geometry):
     row = row_size(size, geometry)
-    return np.zeros((N_HELPERS, N_FIELDS, size)), np.empty((N_BONDS, row + 2 * REACH))
+    A, T = np.zeros((N_HELPERS, N_FIELDS, size)), np.empty((N_BONDS, row + 2 * REACH))
+    return A, T, np.empty((N_CURVATURES, size))
 
 
 @njit(**OPTIONS)
