@@ -15,8 +15,25 @@ import numpy as np
 
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.modules import OPTIONS, load_module, template
-from sympflow.kernels.stages import DampedDrift, TimeAlone, kicks_of, lanes_source, stages_source
+from sympflow.kernels.modules import (
+    constants_source,
+    elementary,
+    imports_source,
+    load_algebra,
+    load_module,
+    template,
+)
+from sympflow.kernels.stages import (
+    DampedDrift,
+    Kick,
+    TimeAlone,
+    TimedNumbers,
+    kicks_of,
+    lanes_source,
+    numbers_source,
+    stages_source,
+    step_constants,
+)
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 if TYPE_CHECKING:
@@ -52,13 +69,6 @@ class LoopFunctions:
     step_rows: Callable[..., None]
 
 
-def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0, driven: bool = False) -> str:
-    return (
-        f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': cache}}\n"
-        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}\nN_VALUES = {n_values}\nDRIVEN = {driven}"
-    )
-
-
 def takes_values(level: int) -> bool:
     """True of kicks whose code is the same for all values of parameters.
 
@@ -83,7 +93,7 @@ def symbolic_loops(
 
         symbols = symbols.parametric
         algebra = algebra_source(symbols)
-    after = ("loops", "aligned", "lanes")
+    after = ("loops", "lanes")
     loops = symbolic_module(
         symbols, algebra, level, compensated, after, monomials, friction, varied=varied, ranges=ranges
     )
@@ -102,7 +112,7 @@ def driven_loops(
     """The loops of a symbolic system whose H depends on t; single steps, each at a time of its own, without lanes."""
     from sympflow.kernels.codegen import algebra_source
 
-    form, after = driving.form, ("loops", "aligned", "lanes")
+    form, after = driving.form, ("loops", "lanes")
     algebra = algebra_source(form)
     loops = symbolic_module(form, algebra, level, compensated, after, monomials, friction, driving, varied)
     processed = loops.rollout_processed, loops.rollout_processed_rows
@@ -128,18 +138,31 @@ def symbolic_module(
     from sympflow.kernels.kicks import kicks_source
 
     kinds, scheduled = kicks_of(level, len(monomials)), not compensated
-    n = len(symbols.parameters)
-    lanes = lanes_source(kinds, scheduled, friction, n, varied, driving)
-    sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
+    n, n_values = len(symbols.parameters), len(symbols.values) if varied else 0
+    sources = [algebra] if driving is None else [algebra, numbers_source(kinds, friction, n, driving)]
+    sources.append(stages_source(kinds, scheduled, friction, n, driving))
+    sources.append(lanes_source(kinds, scheduled, friction, n, varied, driving))
     if scheduled:
         sources.append(kicks_source(symbols, level, monomials, varied=varied, ranges=ranges))
     else:
         sources += plain_kicks_source(symbols, level, monomials)
-    algebra = "\n\n\n".join(sources)
-    before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
-    n_values = len(symbols.values) if varied else 0
-    header = _header(compensated, cache=True, scheduled=scheduled, n_values=n_values, driven=driving is not None)
-    return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
+    shared = shared_by_lanes(symbols.ndof, kinds, friction, n, compensated, n_values)
+    shared = shared if driving is None else shared[:1]
+    constants = {"SCHEDULED": scheduled, "DRIVEN": driving is not None}
+    return load_algebra("\n\n\n".join(sources), after, shared, **constants)
+
+
+def shared_by_lanes(
+    ndof: int, kinds: Sequence[Kick], friction: DampedDrift | None, n_parameters: int, compensated: bool, n_values: int
+) -> list[str]:
+    """The sources of the texts `loops` and `lanes` that systems share: of states of this size; of kicks of one kind."""
+    from sympflow.kernels.codegen import tuple_algebra
+
+    constants = constants_source(COMPENSATED=compensated, NDOF=ndof, N_VALUES=n_values)
+    of_states = [constants, tuple_algebra(ndof), *map(template, ("running_states", "aligned", "lane_blocks"))]
+    numbers = [numbers_source(kinds, friction, n_parameters), template("lane_numbers")]
+    of_kicks = [constants_source(**step_constants(kinds)), *numbers]
+    return ["\n\n\n".join(of_states), "\n\n\n".join(of_kicks)]
 
 
 def plain_kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> list[str]:
@@ -170,7 +193,7 @@ def family_loops(
         symbols = driving.form
     letters = symbols.parameters
     warn_if_long(symbols.V, symbols.q, system.name)
-    sources = [f"import numpy as np\n\nNDOF = {symbols.ndof}", _given_functions(level, bool(letters))]
+    sources = ["import numpy as np", _given_functions(level, bool(letters))]
     sources.append(gradient_source(symbols.V, symbols.q, "gradient", letters))
     if level in (FORCE_GRADIENT, CURVATURE):
         sources.append(product_source(symbols.V, symbols.q, "hessian_vector", letters))
@@ -185,11 +208,31 @@ def family_loops(
     else:
         sources.append(gradient_source(symbols.T, symbols.p, "kinetic_gradient"))
         sources.append("@njit(**OPTIONS)\ndef apply_inverse_mass(v, out, work):\n    kinetic_gradient(v, out)")
-    sources.append(stages_source(kicks_of(level, len(monomials)), False, friction, 0, driving))
-    code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
-    before = ["elementary"] if "fast_" in code else []
-    header = _header(compensated, cache=True, scheduled=False)
-    return _array_functions(vars(load_module("\n\n\n".join([header, *map(template, before), code]))))
+    kinds = kicks_of(level, len(monomials))
+    source, shared = _around_arrays(sources, symbols.ndof, kinds, compensated, friction, driving)
+    return _array_functions(vars(load_module(source, shared)))
+
+
+def _around_arrays(
+    sources: Sequence[str],
+    ndof: int,
+    kinds: Sequence[Kick],
+    compensated: bool,
+    friction: DampedDrift | None = None,
+    driving: TimedNumbers | None = None,
+    cache: bool = True,
+) -> tuple[str, list[str]]:
+    """The source of loops around functions of a system whose states are arrays, and those that systems share."""
+    of_states = [constants_source(COMPENSATED=compensated, NDOF=ndof)]
+    of_states += map(template, ("array_states", "running_states"))
+    shared, numbers = ["\n\n\n".join(of_states)], numbers_source(kinds, friction, 0, driving)
+    own = [constants_source(cache, SCHEDULED=False, N_VALUES=0, DRIVEN=driving is not None), *sources]
+    if driving is None:
+        shared.append(f"{constants_source()}\n\n\n{numbers}")
+    else:
+        own.append(numbers)
+    own += [stages_source(kinds, False, friction, 0, driving), *map(template, ("array_kicks", "loops"))]
+    return "\n\n\n".join(own), [*elementary(*own), *shared]
 
 
 _INVERSE_MASS_TIMES_V = {
@@ -242,18 +285,11 @@ def array_loops(
     monomials: Monomials,
 ) -> LoopFunctions:
     """The loops around the user's Numba functions; compiled for this process only."""
-    mass = _inverse_mass_source(inverse_mass)
-    header = _header(compensated, cache=False, scheduled=False)
-    stages = stages_source(kicks_of(level), False, friction, 0, TimeAlone() if driven else None)
-    given = _given_functions(level, driven, time_first=True)
-    functions: dict[str, Any] = {
-        "NDOF": ndof,
-        "INVERSE_MASS": inverse_mass,
-        "gradient": gradient,
-        "hessian_vector": hessian_vector,
-    }
-    texts = map(template, ("array_states", "loops"))
-    exec("\n\n\n".join([header, mass, given, stages, *texts]), functions)
+    sources = [_inverse_mass_source(inverse_mass), _given_functions(level, driven, time_first=True)]
+    given = kicks_of(level), compensated, friction, TimeAlone() if driven else None
+    source, shared = _around_arrays(sources, ndof, *given, cache=False)
+    functions: dict[str, Any] = {"INVERSE_MASS": inverse_mass, "gradient": gradient, "hessian_vector": hessian_vector}
+    exec(imports_source(shared) + source, functions)
     return _array_functions(functions)
 
 

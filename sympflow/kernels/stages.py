@@ -20,9 +20,11 @@ __all__ = [
     "kicks_of",
     "lanes_source",
     "numbers_of_kicks",
+    "numbers_source",
     "run_table",
     "single_table",
     "stages_source",
+    "step_constants",
     "step_table",
     "time_lines",
     "two_stages_source",
@@ -379,7 +381,7 @@ class TimedNumbers(Protocol):
     """The numbers of kicks and drifts as code, where they depend on the time."""
 
     def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
-        """``numbers_of`` and ``numbers_at`` of `stages_source`, of tables as `StageTable.timed_rows` makes them.
+        """``numbers_of`` and ``numbers_at`` of `numbers_source`, of tables as `StageTable.timed_rows` makes them.
 
         `n_rows` are the rows of a table before those of the values of parameters and of the time.
         """
@@ -429,7 +431,7 @@ def numbers_of_kicks(kinds: Sequence[Kick]) -> tuple[list[str], list[str]]:
 
 
 def _numbers_source(kinds: Sequence[Kick], n_parameters: int, n_rows: int) -> str:
-    """``numbers_of`` and ``numbers_at`` of `stages_source`, of a system that does not depend on the time."""
+    """``numbers_of`` and ``numbers_at`` of `numbers_source`, of a system that does not depend on the time."""
     numbers, values = numbers_of_kicks(kinds)
     constant = range(n_rows, n_rows + n_parameters)
     numbers += [f"table[{i}, j]" for i in constant]
@@ -444,28 +446,18 @@ def numbers_at(table, j, x, h, t):
     return ({", ".join(values)}, )"""
 
 
-def stages_source(
+def numbers_source(
     kinds: Sequence[Kick],
-    scheduled: bool,
     friction: DampedDrift | None = None,
     n_parameters: int = 0,
     driving: TimedNumbers | None = None,
 ) -> str:
-    """The functions of the text `loops` that depend on the kinds of kick, on friction and on the time.
+    """The functions of the text `loops` that read the numbers of stages; without `driving` systems may share them.
 
     ``numbers_of(table, j, k)`` are the numbers of kick j of step k, ``numbers_at(table, j, x, h, t)`` those of a step h
     by polynomials in x that begins at the time t; the values of the parameters of H come after them. ``drift_of(table,
-    j)`` are those of a drift.
-    ``stage`` is a kick and a drift of one trajectory. `FIRST_VALUE` is the row of a table with the first of the values.
+    j)`` are those of a drift. `FIRST_VALUE` is the row of a table with the first of the values.
     """
-    given = "numbers, " if n_parameters else ""
-    drifted = f"return move(q, q_error, drift(p, a, {given}work))"
-    if scheduled:
-        drifted = f"return drifted(q, p, {given}a), q_error"
-    move = f"q, q_error = drift_by(q, {{p}}, q_error, {given}{{a}}, work)"
-    moved = [move.format(p="p", a="a")] if friction is None else friction.drifted(move)
-    end = [*moved, "return q, p, q_error, p_error"]
-    begin = ["fill_coefficients(numbers, work[j])"] if driving is not None and scheduled else []
     first, n_rows = 1 + len(kinds[0].numbers), _rows_before_values(kinds, friction)
     numbers = _numbers_source(kinds, n_parameters, n_rows) if driving is None else driving.source(kinds, n_rows)
     return f"""FIRST_VALUE = {n_rows}
@@ -477,10 +469,26 @@ def stages_source(
 {_TABLE}
 
 
-{_DRIFT_OF if friction is None else friction.source(first)}
+{_DRIFT_OF if friction is None else friction.source(first)}"""
 
 
-@njit(**OPTIONS, forceinline=True)
+def stages_source(
+    kinds: Sequence[Kick],
+    scheduled: bool,
+    friction: DampedDrift | None = None,
+    n_parameters: int = 0,
+    driving: TimedNumbers | None = None,
+) -> str:
+    """``stage`` of the text `loops`, a kick and a drift of one trajectory."""
+    given = "numbers, " if n_parameters else ""
+    drifted = f"return move(q, q_error, drift(p, a, {given}work))"
+    if scheduled:
+        drifted = f"return drifted(q, p, {given}a), q_error"
+    move = f"q, q_error = drift_by(q, {{p}}, q_error, {given}{{a}}, work)"
+    moved = [move.format(p="p", a="a")] if friction is None else friction.drifted(move)
+    end = [*moved, "return q, p, q_error, p_error"]
+    begin = ["fill_coefficients(numbers, work[j])"] if driving is not None and scheduled else []
+    return f"""@njit(**OPTIONS, forceinline=True)
 def drift_by(q, p, q_error, {given}a, work):
     {drifted}
 
@@ -556,8 +564,7 @@ def lanes_source(
     # instructions.
     passed = "common" if varied else "numbers"
     own = varied and scheduled and driving is None and len(kinds) == 1
-    powers = (1, *kinds[0].powers)  # of the step length, those of the drift and of the numbers of kicks
-    before = f"OWN = {own}\nN_NUMBERS, FEWEST, STEP_POWERS = {n_numbers}, {len(kinds[-1].numbers)}, {powers}\n\n\n"
+    before = f"OWN = {own}\nN_NUMBERS = {n_numbers}\n\n\n"
     if not varied or driving is None:
         before += "common_of = numbers_of\n\n\n"
     if varied:
@@ -578,6 +585,12 @@ def stage_lanes(Y, error, width, {passed}, a):
 def stage_each(Y, width, table, j):
     n = fill_lanes(Y, width, table, j)
     {_cases(kinds, "n == {1}", [each(kick) for kick in kinds])}"""
+
+
+def step_constants(kinds: Sequence[Kick]) -> dict[str, Any]:
+    """The constants of the text `lane_numbers`."""
+    powers = (1, *kinds[0].powers)  # of the step length, those of the drift and of the numbers of kicks
+    return {"N_NUMBERS": len(kinds[0].numbers), "FEWEST": len(kinds[-1].numbers), "STEP_POWERS": powers}
 
 
 def _lane_source(n_numbers: int, n_parameters: int) -> str:

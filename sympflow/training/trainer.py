@@ -43,7 +43,7 @@ from sympflow.training.points import Stream, digest, handed_in, start_times, unl
 from sympflow.training.runs import Run, Unstarted
 from sympflow.training.session import Deadline, OutOfTime, Path, Session
 from sympflow.training.split_fit import SplitRun
-from sympflow.training.starts import check_step, default_primed, new_network, scaling_of
+from sympflow.training.starts import check_step, default_primed, new_network, scaling_of, warn_of_domain
 from sympflow.training.table_fit import TableRun
 from sympflow.workers import Crew
 
@@ -262,7 +262,7 @@ def fit_flow(
             "`workers` share the starts of a search by 'gauss-newton' for primed and split flows, and this fit is one "
             "run of steps: leave it out."
         )
-    with session.interruption, session.crew:
+    with session.interruption, session.crew, np.errstate(divide="ignore", invalid="ignore"):
         tried = None
         if dt is not None and flow is None:
             check_step(system, domain, dt)
@@ -273,6 +273,8 @@ def fit_flow(
         elif kind == "primed":
             if asked.searches:
                 TableOptions.of(asked)  # raises before trials
+            if dt is None:
+                warn_of_domain(system, domain)
             flow, tried = _new_primed(system, domain, dt, new, asked, session)
             session.cut = session.interruption.asked  # what trials were left out does not end the run
         system.vector_field(

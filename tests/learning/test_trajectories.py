@@ -127,6 +127,43 @@ def test_sets_are_divided_by_trajectory_and_long_runs_into_pieces():
         one.pieces(points=1)
 
 
+def test_of_few_trajectories_each_is_left_out_in_turn():
+    many = Trajectories.read((t, np.arange(240.0).reshape(20, 2, 6)))
+    ((kept, held),) = many.subset(range(8)).folds(0.2)
+    assert (len(kept.runs), len(held.runs)) == (5, 3)  # three at least
+    ((kept, held),) = many.folds(0.2)
+    assert (len(kept.runs), len(held.runs)) == (16, 4)
+    folds = many.subset(range(3)).folds()
+    assert [[run.y[0, 0] for run in held.runs] for _, held in folds] == [[0.0], [12.0], [24.0]]
+    assert [[run.y[0, 0] for run in kept.runs] for kept, _ in folds] == [[12.0, 24.0], [0.0, 24.0], [0.0, 12.0]]
+    with pytest.raises(ValueError, match="one trajectory only"):
+        many.subset([0]).folds()
+
+
+def test_angles_that_were_wrapped_are_noticed_and_continued():
+    times = np.linspace(0, 10, 40)
+    turning = np.stack([1.3 * times - 2.0, 1.3 + 0.1 * np.sin(times)])
+    wrapped = turning.copy()
+    wrapped[0] = (turning[0] + np.pi) % (2 * np.pi) - np.pi
+    wrapped[0, 7] = np.nan
+    for scale, period in ((1.0, r"2\*np.pi"), (180 / np.pi, "360")):
+        data = Trajectories.read([(times, turning), (times, wrapped * [[scale], [1]])][1:])
+        with pytest.raises(ValueError, match=rf"2 jumps of q1 by about {period}, the first in trajectory 0"):
+            data.check_angles()
+        data.check_angles(np.array([True]))  # it was said
+    continued = Trajectories.read((times, wrapped), period=2 * np.pi)
+    continued.check_angles()
+    seen = np.isfinite(wrapped[0])
+    np.testing.assert_allclose(continued.runs[0].y[0, seen], turning[0, seen], atol=1e-12)
+    swinging = Trajectories.read((times, np.stack([3.1 * np.sin(3 * times), np.cos(times)])))
+    swinging.check_angles()  # large steps of all sizes are no jumps
+    same(swinging.unwrapped(np.array([np.inf])), [(run.t, run.y) for run in swinging.runs])
+    with pytest.raises(ValueError, match="pass period=2"):
+        sympflow.discover((times, np.stack([wrapped, wrapped])))
+    with pytest.raises(ValueError, match="`period` must be positive"):
+        Trajectories.read((times, wrapped), period=-1.0)
+
+
 @pytest.mark.parametrize(
     ("data", "options", "message"),
     [
