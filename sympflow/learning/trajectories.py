@@ -491,10 +491,16 @@ def _opened(path: Path) -> Any:
         pandas = imported("pandas", "Reading a table")
         return pandas.read_csv(path, sep=None if ending == ".txt" else "\t" if ending == ".tsv" else ",", comment="#")
     if ending in (".parquet", ".pq"):
-        return imported("pandas", "Reading a table").read_parquet(path)
+        pandas = imported("pandas", "Reading a table")
+        try:
+            return pandas.read_parquet(path)
+        except ImportError as error:
+            raise ImportError(
+                "`data` is a Parquet file, which pandas reads by pyarrow: pip install pyarrow, or give a CSV file."
+            ) from error
     xarray = imported("xarray", "Reading a Dataset")
     if ending == ".zarr":
-        return xarray.open_zarr(path).load()
+        return xarray.open_zarr(path, consolidated=False).load()
     if ending in (".nc", ".netcdf"):
         return xarray.load_dataset(path)
     raise ValueError(f"`data` names a file {ending or 'without an ending'}: .csv, .parquet, .nc and .zarr are read.")

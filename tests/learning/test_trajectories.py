@@ -56,7 +56,18 @@ def test_results_of_solvers_are_read():
     same(Trajectories.read(scipy), [(t, scipy.y)])
 
 
-def test_tables_and_datasets_are_read_by_their_names(tmp_path):
+def no_engine(path):
+    raise ImportError("Unable to find a usable engine")
+
+
+def test_parquet_is_read_where_it_can_be(tmp_path):
+    pd = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    pd.DataFrame({"t": t, "q": RUN[0], "p": RUN[1]}).to_parquet(tmp_path / "run.parquet")
+    same(Trajectories.read(tmp_path / "run.parquet"), [(t, RUN)])
+
+
+def test_tables_and_datasets_are_read_by_their_names(tmp_path, monkeypatch):
     pd, xr = pytest.importorskip("pandas"), pytest.importorskip("xarray")
     sol = sympflow.solve(henon_heiles(), "verlet", (0, 1), np.full((2, 4), 0.1) * [[1], [2]], t_eval=t)
     runs = [(t, y) for y in sol.y]
@@ -65,6 +76,17 @@ def test_tables_and_datasets_are_read_by_their_names(tmp_path):
     same(Trajectories.read(table), runs)
     same(Trajectories.read(table[["p2", "q1", "time", "q2", "orbit", "p1"]]), runs)  # the order does not count
     table.to_csv(tmp_path / "runs.csv", index=False)
+    (tmp_path / "runs.parquet").write_bytes(b"PAR1")
+    with monkeypatch.context() as patch, pytest.raises(ImportError, match=r"a Parquet file, which .* pip install"):
+        patch.setattr(pd, "read_parquet", no_engine)
+        Trajectories.read(tmp_path / "runs.parquet")
+    sol.to_xarray().to_netcdf(tmp_path / "runs.nc", engine="scipy")
+    same(Trajectories.read(tmp_path / "runs.nc"), runs)
+    sol.to_xarray().to_zarr(tmp_path / "runs.zarr", consolidated=False)
+    same(Trajectories.read(tmp_path / "runs.zarr"), runs)
+    with pytest.raises(ValueError, match=r"names a file \.mat: \.csv, \.parquet, \.nc and \.zarr are read"):
+        (tmp_path / "runs.mat").touch()
+        Trajectories.read(tmp_path / "runs.mat")
     read = Trajectories.read(tmp_path / "runs.csv", ndof=2)
     np.testing.assert_allclose([run.y for run in read.runs], sol.y, rtol=1e-15)
     assert read.names == ("q1", "q2", "p1", "p2")
