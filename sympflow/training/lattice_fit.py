@@ -23,8 +23,9 @@ from sympflow.training.points import Labels, Stream, shares_missed, states, step
 MOST_FITTED = 16
 """Degrees of freedom up to which a lattice is fitted as it is, and not by a piece."""
 TAIL = 2.0
-"""Times the upper density that the states of a piece have: in a large lattice a few neighbours at a time have so much, and
-by how much a flow misses those few steps decides about the energy of all."""
+"""Times the upper density that the states of a piece have.
+
+In a large lattice a few neighbours at a time have so much, and a flow's errors there decide about the energy of all."""
 MOST_JUDGED = 1024
 """Sites of the lattice on which a flow is judged, where the lattice has more."""
 NUMBERS = 16_000
