@@ -1,18 +1,24 @@
 """The loops of an implicit Gauss method: Newton's iteration, a step, a run. Source text for `implicit`.
 
 What comes before defines `NDOF`, `COMPENSATED`, the tableau `A`, `B`, `C` and `SCALE` of `STAGES` stages as tuples, and
-the system's ``gradient_and_hessian(y, g, S, t)``, which leaves the entries of S that are always zero as they are.
+the system's ``gradient_and_hessian(y, g, S, t)``, which leaves the entries of S that are always zero as they are; and
+the `RATES` of friction, one for each p, none without.
 
 The unknowns are K_i = h SCALE_i f(y + Σ_j A_ij K_j), in which the coefficients are exact where it matters for the long
 run, and y + Σ B_i K_i needs no further evaluation of f.
+
+With friction they are those of q and P = e^{γτ}p, τ from the beginning of the step.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
+
+import math
 
 import numpy as np
 from numba import njit
 
 SIZE = 2 * NDOF
+DAMPED = len(RATES) > 0
 TOLERANCE = 1e-11  # of a relative increment: convergence is quadratic, so what is left is below rounding
 ROUNDING = 1e-9  # increments below this that no longer shrink are rounding
 MOST_ITERATIONS = 50
@@ -21,7 +27,8 @@ MOST_ITERATIONS = 50
 @njit(**OPTIONS)
 def workspace():
     n = STAGES * SIZE
-    return np.zeros(n), np.zeros(n), np.zeros((n, n)), np.zeros(SIZE), np.zeros(SIZE), np.zeros((SIZE, SIZE))
+    growth = np.ones((STAGES, NDOF))
+    return np.zeros(n), np.zeros(n), np.zeros((n, n)), np.zeros(SIZE), np.zeros(SIZE), np.zeros((SIZE, SIZE)), growth
 
 
 @njit(**OPTIONS)
@@ -74,13 +81,28 @@ def relative_size(change, y, K):
 
 
 @njit(**OPTIONS)
+def scale_slopes(g, S, growth):
+    """∇H and ∇²H at (q, p) into those of [q, P] as the equations hold them: rows e^{γτ} ∂H/∂q, columns ∂p/∂P."""
+    for m in range(NDOF):
+        g[m] *= growth[m]
+        for n in range(NDOF):
+            S[m, n] *= growth[m]
+            S[m, NDOF + n] *= growth[m] / growth[n]
+            S[NDOF + m, NDOF + n] /= growth[n]
+
+
+@njit(**OPTIONS)
 def stages(y, h, t, work):
     """The K of a step of length h from y, at the time t, by Newton's iteration from 0.
 
     Returns the iterations taken, negative if in vain.
     """
-    K, change, M, Y, g, S = work
+    K, change, M, Y, g, S, growth = work
     K[:] = 0.0
+    if DAMPED:
+        for i in range(STAGES):
+            for m in range(NDOF):
+                growth[i, m] = math.exp(RATES[m] * C[i] * h)
     before = np.inf
     for iteration in range(1, MOST_ITERATIONS + 1):
         for i in range(STAGES):
@@ -89,7 +111,12 @@ def stages(y, h, t, work):
                 Y[m] = y[m]
                 for j in range(STAGES):
                     Y[m] += A[i][j] * K[j * SIZE + m]
+            if DAMPED:
+                for m in range(NDOF):
+                    Y[NDOF + m] /= growth[i, m]
             gradient_and_hessian(Y, g, S, t + C[i] * h)
+            if DAMPED:
+                scale_slopes(g, S, growth[i])
             for m in range(SIZE):
                 sign = 1.0 if m < NDOF else -1.0  # J∇H = (∂H/∂p, −∂H/∂q)
                 other = m + NDOF if m < NDOF else m - NDOF
@@ -113,8 +140,11 @@ def stages(y, h, t, work):
 
 
 @njit(**OPTIONS)
-def advance(y, error, K):
-    """y + Σ b_i K_i in place; if `COMPENSATED` by Kahan's compensated sum. True if the result is finite."""
+def advance(y, h, error, K):
+    """y + Σ b_i K_i in place, if `COMPENSATED` by Kahan's compensated sum; a damped p decays over h.
+
+    True if the result is finite.
+    """
     total = 0.0
     for m in range(SIZE):
         change = 0.0
@@ -127,6 +157,8 @@ def advance(y, error, K):
             y[m] = new
         else:
             y[m] += change
+        if DAMPED and m >= NDOF:
+            y[m] *= math.exp(-RATES[m - NDOF] * h)
         total += 0.0 * y[m]
     return total == 0.0
 
@@ -155,7 +187,7 @@ def rollout(h, t0, y0, n_steps, save, out, work, stop, first, running):
             break
         taken = stages(y, h, t0 + (n - 1) * h, work)
         iterations += abs(taken)
-        if taken < 0 or not advance(y, error, work[0]):
+        if taken < 0 or not advance(y, h, error, work[0]):
             out[saved:] = np.nan
             running[:] = np.nan
             return n - 1, iterations
@@ -186,5 +218,5 @@ def step_each(h, t, y, out, iterations):
         taken = stages(y[i], h[i], t[i], work)
         iterations[i] = abs(taken)
         error[:] = 0.0
-        if taken < 0 or not advance(out[i], error, work[0]):
+        if taken < 0 or not advance(out[i], h[i], error, work[0]):
             out[i] = np.nan
