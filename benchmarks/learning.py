@@ -28,6 +28,7 @@ pin_to_one_thread()
 
 import numpy as np
 import torch
+from contenders import networks
 from measuring import fragments
 
 import sympflow
@@ -93,10 +94,54 @@ def predicted(flow: Any, y0: np.ndarray, t: np.ndarray) -> np.ndarray:
         return solve(flow.system, flow, (0.0, float(t[-1])), y0, t_eval=t).y
 
 
+def by_scheme(system: HamiltonianSystem, y0: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """States (N, 2d, n) by a scheme of order 8, with steps whose error is far below those of what was learned."""
+    method = "kahan_li8" if system.separable else "gauss_legendre8"
+    return solve(system, method, (0.0, float(t[-1])), y0, t_eval=t, dt=0.05).y
+
+
 def energy_mse(system: HamiltonianSystem, found: np.ndarray, true: np.ndarray) -> float:
     """Mean square of the true H along predictions, less that along the true solutions."""
     H = [system.hamiltonian(np.moveaxis(y, -1, -2)) for y in (found, true)]
     return float(np.mean((H[0] - H[1]) ** 2))
+
+
+# baselines of our own -------------------------------------------------------------------------------------------------
+
+
+def adam(x: np.ndarray, t: np.ndarray, y: np.ndarray, dt: float, seconds: float) -> SympFlow:
+    """A SympFlow of 5 pairs of layers of 10 by Adam on labels y (n, 2d), a time t (n,) after x, in processor time."""
+    torch.manual_seed(0)
+    inputs, times, targets = (torch.tensor(a) for a in (x, t, y))
+    flow = SympFlow(x.shape[1] // 2, 5, [10], dt=dt, seed=0)
+    optimizer = torch.optim.Adam(flow.parameters(), 5e-3)
+    start, generator = time.process_time(), torch.Generator().manual_seed(0)
+    while time.process_time() - start < seconds:
+        for group in optimizer.param_groups:
+            group["lr"] = 5e-3 * (1 - 0.98 * (time.process_time() - start) / seconds)
+        i = torch.randint(len(times), (500,), generator=generator)
+        optimizer.zero_grad()
+        loss = ((flow.psi(times[i], inputs[i]) - targets[i]) ** 2).sum(-1).mean()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(flow.parameters(), 1.0)
+        optimizer.step()
+    return flow
+
+
+def adam_on_steps(t: np.ndarray, y: np.ndarray, dt: float, seconds: float) -> SympFlow:
+    """The same on all steps of trajectories y (N, 2d, n) from one point to the next."""
+    x, target = (part.transpose(0, 2, 1).reshape(-1, y.shape[1]) for part in (y[..., :-1], y[..., 1:]))
+    return adam(x, np.tile(np.diff(t), len(y)), target, dt, seconds)
+
+
+def stepped(flow: SympFlow, y0: np.ndarray, dt: float, n: int) -> np.ndarray:
+    """States (N, 2d, n + 1) after 0 to n steps."""
+    made, x = [y0], torch.tensor(y0)
+    with torch.no_grad():
+        for _ in range(n):
+            x = flow.psi(dt, x)
+            made.append(x.numpy())
+    return np.stack(made, axis=-1)
 
 
 # the authors' experiment ----------------------------------------------------------------------------------------------
@@ -117,40 +162,30 @@ def authors_data(
     return data, states[n:]
 
 
-def authors_adam(data: list[tuple[np.ndarray, np.ndarray]], ndof: int, seconds: float, seed: int) -> SympFlow:
-    """A SympFlow of 5 pairs of layers of 10 by Adam on the labels, for so much processor time."""
-    torch.manual_seed(seed)
-    x = torch.tensor(np.concatenate([np.repeat(y[:, :1].T, y.shape[1] - 1, 0) for _, y in data]))
-    t = torch.tensor(np.concatenate([one[1:] for one, _ in data]))
-    target = torch.tensor(np.concatenate([y[:, 1:].T for _, y in data]))
-    flow = SympFlow(ndof, 5, [10], dt=1.0, seed=seed)
-    optimizer = torch.optim.Adam(flow.parameters(), 5e-3)
-    start, generator = time.process_time(), torch.Generator().manual_seed(seed)
-    while time.process_time() - start < seconds:
-        for group in optimizer.param_groups:
-            group["lr"] = 5e-3 * (1 - 0.98 * (time.process_time() - start) / seconds)
-        i = torch.randint(len(t), (500,), generator=generator)
-        optimizer.zero_grad()
-        loss = ((flow.psi(t[i], x[i]) - target[i]) ** 2).sum(-1).mean()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(flow.parameters(), 1.0)
-        optimizer.step()
-    return flow
+def authors_adam(data: list[tuple[np.ndarray, np.ndarray]], seconds: float) -> SympFlow:
+    """The paper's mode: a SympFlow on the labels."""
+    x = np.concatenate([np.repeat(y[:, :1].T, y.shape[1] - 1, 0) for _, y in data])
+    t = np.concatenate([one[1:] for one, _ in data])
+    return adam(x, t, np.concatenate([y[:, 1:].T for _, y in data]), 1.0, seconds)
+
+
+def one_step_error(flow: Any, system: HamiltonianSystem, held: np.ndarray) -> float:
+    """The mean distance after Δt = 1 of a flow that was learned, or of one by Adam, which belongs to no system."""
+    t = np.array([0.0, 1.0])
+    truth = exact(system, held, t)[:, :, -1]
+    made = stepped(flow, held, 1.0, 1) if flow.system is None else predicted(flow, held, t)
+    return float(np.linalg.norm(made[:, :, -1] - truth, axis=1).mean())
 
 
 def authors(system: HamiltonianSystem, width: float, eps: float, options: argparse.Namespace) -> Row:
     data, held = authors_data(system, width, eps, 100, 50, 0)
-    truth = exact(system, held, np.array([0.0, 1.0]))[:, :, -1]
     flow, seconds = timed(lambda: sympflow.learn(data, dt=1.0))
-    adam = authors_adam(data, system.ndof, max(seconds, options.baseline), 0)
-    with torch.no_grad():
-        theirs = adam.psi(1.0, torch.tensor(held)).numpy()
-    ours = predicted(flow, held, np.array([0.0, 1.0]))[:, :, -1]
-    errors = [float(np.linalg.norm(y - truth, axis=1).mean()) for y in (theirs, ours)]
-    target = errors[0] / 10 if eps == 0 else 5e-3
-    adams = f"{fragments.number(errors[0])} (ours, Adam)"
-    name = f"authors: {system.name}, ε = {eps:g}"
-    return Row(name, "one-step error at Δt = 1", adams, target, errors[1], seconds, _model(flow))
+    budget = max(seconds, options.baseline)
+    theirs, ours = (one_step_error(f, system, held) for f in (authors_adam(data, budget), flow))
+    target = theirs / 10 if eps == 0 else 5e-3
+    name = f"{system.name}, ε = {eps:g}"
+    baseline = f"{fragments.number(theirs)} (Adam, {budget:.0f} s)"
+    return Row(name, "one-step error at Δt = 1", baseline, target, ours, seconds, _model(flow))
 
 
 def _model(flow: Any) -> str:
@@ -170,141 +205,231 @@ def ghnn_pendulum(options: argparse.Namespace) -> list[Row]:
     y0 = np.stack([q0, np.zeros(500)], 1)
     t = np.arange(0.0, periods.max() + 0.1, 0.1)
     y = exact(PENDULUM, y0, t)
-    data = [(t[:n], y[i, :, :n]) for i in range(400) if (n := int(periods[i] / 4 / 0.1) + 1) > 1]
     at = np.minimum(np.round(periods / 0.1).astype(int), len(t) - 1)[400:]
     truth = y[400 + np.arange(100), :, at]
     rows = []
-    fits: dict[str, Callable[[], Any]] = {
-        "learn": lambda: sympflow.learn(data[: options.runs], dt=0.5),
-        "discover": lambda: discover(data[: options.runs]),
-    }
-    for name, fit in fits.items():
-        found, seconds = timed(fit)
-        remark = _model(found) if name == "learn" else found.discovery.formula()
-        if name == "learn":
-            made = predicted(found, y0[400:], t)
-        else:
-            made = solve(found, "kahan_li8", (0.0, float(t[-1])), y0[400:], t_eval=t, dt=0.05).y
-        error = float(np.abs(made[np.arange(100), :, at] - truth).mean())
-        rows.append(Row(f"GHNN pendulum, `{name}`", "MAE at 1 T", "1.3e-3 … 1.1e-2", 1e-3, error, seconds, remark))
+    for sigma in (0.0, 1e-4):
+        labels = y + sigma * random.normal(size=y.shape)
+        data = [(t[:n], labels[i, :, :n]) for i in range(400) if (n := int(periods[i] / 4 / 0.1) + 1) > 1]
+        fits: dict[str, Callable[[], Any]] = {
+            "learn": lambda data=data: sympflow.learn(data[: options.runs], dt=0.5),  # type: ignore[misc]
+            "discover": lambda data=data: discover(data[: options.runs]),  # type: ignore[misc]
+        }
+        for name, fit in fits.items():
+            found, seconds = timed(fit)
+            remark = _model(found) if name == "learn" else found.discovery.formula()
+            made = predicted(found, y0[400:], t) if name == "learn" else by_scheme(found, y0[400:], t)
+            error = float(np.abs(made[np.arange(100), :, at] - truth).mean())
+            rows.append(
+                Row(f"`{name}`{labelled(sigma)}", "MAE at 1 T", "1.3e-3 … 1.1e-2", 1e-3, error, seconds, remark)
+            )
+    flow, seconds = timed(lambda: adam_on_runs(data[: options.runs], 0.1, options.baseline))
+    error = float(np.abs(stepped(flow, y0[400:], 0.1, int(at.max()))[np.arange(100), :, at] - truth).mean())
+    rows.append(Row("SympFlow by Adam" + labelled(1e-4), "MAE at 1 T", "0.39 (SympNet)", 1e-3, error, seconds))
     return rows
 
 
+def adam_on_runs(data: list[tuple[np.ndarray, np.ndarray]], dt: float, seconds: float) -> SympFlow:
+    """A SympFlow on the steps of trajectories of several lengths."""
+    x, y = (np.concatenate([one[:, part].T for _, one in data]) for part in (slice(None, -1), slice(1, None)))
+    return adam(x, np.concatenate([np.diff(t) for t, _ in data]), y, dt, seconds)
+
+
+def labelled(sigma: float) -> str:
+    return ", exact labels" if sigma == 0 else f", labels with errors of {sigma:g}"
+
+
+RATIONAL = "(1 + sin(q1 - q2)**2)"
+TERMS = [f"{f}/{RATIONAL}" for f in ("p1**2", "p2**2", "p1*p2", "p1*p2*cos(q1 - q2)", "p1*p2*sin(q1 - q2)")]
+"""Of a double pendulum's kinetic energy, beside which `discover` has polynomials and trigonometric functions."""
+
+
 def ghnn_double_pendulum(options: argparse.Namespace) -> list[Row]:
-    system = systems.double_pendulum()
+    """From rest at angles within ±π/2, steps of 0.1, trained to t = 5; H is not separable."""
+    system, n = systems.double_pendulum(), options.pendulums
     random = np.random.default_rng(0)
-    y0 = np.concatenate(
-        [random.uniform(-np.pi / 2, np.pi / 2, (options.runs + 100, 2)), np.zeros((options.runs + 100, 2))], 1
-    )
+    y0 = np.concatenate([random.uniform(-np.pi / 2, np.pi / 2, (n + 100, 2)), np.zeros((n + 100, 2))], 1)
     t = np.linspace(0.0, 10.0, 101)
     y = exact(system, y0, t)
-    flow, seconds = timed(lambda: sympflow.learn((t[:51], y[100:, :, :51]), dt=0.1, separable=False))
-    made = predicted(flow, y0[:100], t)
+    rows: list[Row] = []
+
+    def judge(name: str, made: np.ndarray, seconds: float, remark: str = "") -> None:
+        for at, theirs, target in ((50, "6.3e-3", 4e-3), (100, "2.5e-2", 1.5e-2)):
+            error = float(np.abs(made[:, :, at] - y[:100, :, at]).mean())
+            rows.append(Row(name, f"MAE at t = {t[at]:g}", theirs, target, error, seconds, remark))
+
+    for sigma in (0.0, 1e-3):
+        data = t[:51], y[100:, :, :51] + sigma * random.normal(size=(n, 4, 51))
+        flow, seconds = timed(lambda data=data: sympflow.learn(data, dt=0.1, separable=False, period=2 * np.pi))  # type: ignore[misc]
+        judge(f"`learn`, its H{labelled(sigma)}", by_scheme(flow.system, y0[:100], t), seconds, _model(flow))
+        if sigma == 0:
+            judge("`learn`, its flow, exact labels", predicted(flow, y0[:100], t), seconds)
+    found, seconds = timed(lambda: discover(data, [*TERMS, "trigonometric", "polynomials"], degree=2))
+    remark = found.discovery.formula()
+    judge(f"`discover`{labelled(1e-3)}", by_scheme(found, y0[:100], t), seconds, remark)
+    flow, seconds = timed(lambda: adam_on_steps(*data, 0.1, options.baseline))
+    judge("SympFlow by Adam" + labelled(1e-3), stepped(flow, y0[:100], 0.1, 100), seconds)
+    return rows
+
+
+BODIES = HamiltonianSystem.from_sympy(
+    "(p1**2 + p2**2 + p3**2 + p4**2 + p5**2 + p6**2)/2 - 1/sqrt((q1 - q3)**2 + (q2 - q4)**2)"
+    " - 1/sqrt((q3 - q5)**2 + (q4 - q6)**2) - 1/sqrt((q1 - q5)**2 + (q2 - q6)**2)",
+    name="three_bodies",
+)
+
+
+def circular_bodies(random: np.random.Generator, n: int) -> np.ndarray:
+    """States (n, 12) of three bodies on circles of radii of 0.9 to 1.2, their velocities up to a fifth off.
+
+    By the authors' generator the factor of each velocity is drawn once, for all runs.
+    """
+
+    def turned(x: np.ndarray, angle: float) -> np.ndarray:
+        return x @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+
+    first = random.uniform(-1.0, 1.0, (n, 2))
+    radius = random.uniform(0.9, 1.2, (n, 1))
+    first *= radius / np.linalg.norm(first, axis=1, keepdims=True)
+    places = [turned(first, k * 2 * np.pi / 3) for k in range(3)]
+    speed = radius**-1.5 * np.sqrt(np.sin(np.pi / 3) / (2 * np.cos(np.pi / 6) ** 2))
+    velocities = [turned(x, np.pi / 2) * speed * random.uniform(0.8, 1.2, 2) for x in places]
+    return np.concatenate(places + velocities, axis=1)
+
+
+def ghnn_three_bodies(options: argparse.Namespace) -> list[Row]:
+    """Three bodies near a circle, steps of 0.5, trained to t = 5 and judged there."""
+    random = np.random.default_rng(0)
+    n = options.runs
+    y0 = circular_bodies(random, n + 100)
+    t = np.linspace(0.0, 5.0, 11)
+    y = exact(BODIES, y0, t)
     rows = []
-    for at, theirs, target in ((50, "6.3e-3", 4e-3), (100, "2.5e-2", 1.5e-2)):
-        error = float(np.abs(made[:, :, at] - y[:100, :, at]).mean())
-        rows.append(Row("GHNN double pendulum", f"MAE at t = {t[at]:g}", theirs, target, error, seconds, _model(flow)))
+
+    def judge(name: str, made: np.ndarray, seconds: float, remark: str = "") -> None:
+        error = float(np.abs(made[:, :, -1] - y[:100, :, -1]).mean())
+        rows.append(Row(name, "MAE at t = 5", "1.2e-3", 1e-3, error, seconds, remark))
+
+    for sigma in (0.0, 1e-3):
+        data = t, y[100:] + sigma * random.normal(size=(n, 12, 11))
+        flow, seconds = timed(lambda data=data: sympflow.learn(data, dt=0.5))  # type: ignore[misc]
+        judge(f"`learn`, its flow{labelled(sigma)}", predicted(flow, y0[:100], t), seconds, _model(flow))
+        judge(f"`learn`, its H{labelled(sigma)}", by_scheme(flow.system, y0[:100], t), seconds)
+    flow, seconds = timed(lambda: adam_on_steps(*data, 0.5, options.baseline))
+    judge("SympFlow by Adam" + labelled(1e-3), stepped(flow, y0[:100], 0.5, 10), seconds)
     return rows
 
 
 # HNN ------------------------------------------------------------------------------------------------------------------
 
+TWO_BODIES = HamiltonianSystem.from_sympy(
+    "(p1**2 + p2**2 + p3**2 + p4**2)/2 - 1/sqrt((q1 - q2)**2 + (q3 - q4)**2)", name="two_bodies"
+)
+"""Masses of 1 at (q1, q3) and (q2, q4): the authors' order of coordinates."""
 
-def hnn_data(
-    system: HamiltonianSystem, radii: tuple[float, float], rate: int, sigma: float
-) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """25 noisy trajectories over [0, 3], and 25 held-out states, on circles of random radii."""
-    random = np.random.default_rng(0)
+
+def circles(random: np.random.Generator, radii: tuple[float, float]) -> np.ndarray:
+    """50 states on circles of random radii."""
     y0 = random.uniform(-1.0, 1.0, (50, 2))
-    y0 *= random.uniform(*radii, (50, 1)) / np.linalg.norm(y0, axis=1, keepdims=True)
-    t = np.linspace(0.0, 3.0, 3 * rate)
-    return (t, exact(system, y0[:25], t) + sigma * random.normal(size=(25, 2, len(t)))), y0[25:]
+    return y0 * random.uniform(*radii, (50, 1)) / np.linalg.norm(y0, axis=1, keepdims=True)
+
+
+def two_circles(random: np.random.Generator) -> np.ndarray:
+    """50 states of two bodies on nearly circular orbits about their centre."""
+    x = random.uniform(0.5, 1.5, (50, 2))
+    r = np.linalg.norm(x, axis=1, keepdims=True)
+    v = np.stack([-x[:, 1], x[:, 0]], axis=1) / (2 * r**1.5) * (1 + 0.05 * random.normal(size=(50, 1)))
+    return np.stack([x[:, 0], -x[:, 0], x[:, 1], -x[:, 1], v[:, 0], -v[:, 0], v[:, 1], -v[:, 1]], axis=1)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One of the tasks of HNN and D-HNN: 25 noisy trajectories of 50 to learn from, the others to be judged by.
+
+    Attributes
+    ----------
+    start : callable
+        start(random): states (50, 2d).
+    t, judged : ndarray
+        Times of the data, and of the predictions.
+    theirs : dict of str to float
+        Published mean squares of the energy's error, of each kind of network; the smallest is to be beaten tenfold.
+    """
+
+    system: HamiltonianSystem
+    start: Callable[[np.random.Generator], np.ndarray]
+    t: np.ndarray
+    judged: np.ndarray
+    theirs: dict[str, float]
+    sigma: float = 0.1
+
+
+def tasks() -> dict[str, Task]:
+    far = np.linspace(0.0, 20.0, 201)
+    return {
+        "spring": Task(
+            SPRING, lambda r: circles(r, (0.1, 1.0)), np.linspace(0.0, 3.0, 30), far, {"MLP": 0.17, "HNN": 3.8e-4}
+        ),
+        "pendulum": Task(
+            HNN_PENDULUM,
+            lambda r: circles(r, (0.2, 2.0)),
+            np.linspace(0.0, 3.0, 45),
+            far,
+            {"MLP": 4.2e-2, "HNN": 2.5e-2},
+        ),
+        "two-bodies": Task(
+            TWO_BODIES, two_circles, np.linspace(0.0, 20.0, 50), far, {"MLP": 6.3e-2, "HNN": 3.9e-5}
+        ),
+        "damped": Task(
+            DAMPED,
+            lambda r: r.uniform(-1.0, 1.0, (50, 2)),
+            np.linspace(0.0, 6.0, 61),
+            np.linspace(0.0, 6.0, 61),
+            {"MLP": 6.0e-6, "HNN": 0.29, "D-HNN": 3.6e-6},
+            0.01,
+        ),
+    }  # fmt: skip
 
 
 def hnn(name: str, options: argparse.Namespace) -> list[Row]:
-    system, radii, rate, theirs = {
-        "spring": (SPRING, (0.1, 1.0), 10, 3.8e-4),
-        "pendulum": (HNN_PENDULUM, (0.2, 2.0), 15, 2.5e-2),
-    }[name]
-    data, held = hnn_data(system, radii, rate, 0.1)
-    t = np.linspace(0.0, 20.0, 201)
+    """`learn`, `discover`, and networks on exact derivatives at the noisy states, judged by the energy."""
+    task = tasks()[name]
+    system, damped = task.system, not task.system.conservative
+    random = np.random.default_rng(0)
+    y0 = task.start(random)
+    clean = exact(system, y0[:25], task.t)
+    data = task.t, clean + task.sigma * random.normal(size=clean.shape)
+    held, t = y0[25:], task.judged
     truth = exact(system, held, t)
-    flow, seconds = timed(lambda: sympflow.learn(data))
-    ours = energy_mse(system, predicted(flow, held, t), truth)
-    rows = [
-        Row(f"HNN {name}, `learn`", "energy MSE to t = 20", f"{theirs:g}", theirs / 10, ours, seconds, _model(flow))
-    ]
-    found, seconds = timed(lambda: discover(data))
-    made = solve(found, "kahan_li8", (0.0, 20.0), held, t_eval=t, dt=0.05).y
-    remark = found.discovery.formula()
-    error = energy_mse(system, made, truth)
-    rows.append(
-        Row(f"HNN {name}, `discover`", "energy MSE to t = 20", f"{theirs:g}", theirs / 10, error, seconds, remark)
-    )
-    if options.networks:
-        rows.append(_network(name, system, data, held, t, truth, theirs))
+    metric, least = f"energy MSE to t = {t[-1]:g}", min(task.theirs.values())
+    rows = []
+
+    def judge(name: str, theirs: float, made: np.ndarray, seconds: float, remark: str = "") -> None:
+        rows.append(Row(name, metric, f"{theirs:.1e}", least / 10, energy_mse(system, made, truth), seconds, remark))
+
+    flow, seconds = timed(lambda: sympflow.learn(data, damping=damped))
+    judge("`learn`", least, predicted(flow, held, t), seconds, _model(flow))
+    if damped:
+        gamma = float(np.mean(flow.system.damping))
+        rows.append(Row("`learn`", "relative error of γ", "", 0.01, abs(gamma / 0.1 - 1), seconds, f"γ = {gamma:.5f}"))
+    else:
+        found, seconds = timed(lambda: discover(data, task_terms(name)))
+        judge("`discover`", least, by_scheme(found, held, t), seconds, found.discovery.formula())
+    x = data[1].transpose(0, 2, 1).reshape(-1, 2 * system.ndof)
+    v = system.vector_field(clean.transpose(0, 2, 1).reshape(-1, 2 * system.ndof))
+    for kind, theirs in task.theirs.items() if options.networks else ():
+        field, seconds = timed(lambda kind=kind: networks.learned_field(kind, x, v, options.networks))  # type: ignore[misc]
+        judge(f"{kind}, ours, exact derivatives", theirs, networks.followed(field, held, t), seconds)
     return rows
 
 
-def _network(
-    name: str, system: HamiltonianSystem, data: Any, held: np.ndarray, t: np.ndarray, truth: np.ndarray, theirs: float
-) -> Row:
-    """An HNN of two hidden layers of 200, tanh: exact derivatives at the noisy states, 2000 steps of Adam."""
-    from scipy.integrate import solve_ivp
-
-    times, y = data
-    torch.manual_seed(0)
-    net = torch.nn.Sequential(
-        torch.nn.Linear(2, 200), torch.nn.Tanh(), torch.nn.Linear(200, 200), torch.nn.Tanh(), torch.nn.Linear(200, 1)
-    ).double()
-    clean = exact(system, hnn_clean(system, data), times)
-    x = torch.tensor(y.transpose(0, 2, 1).reshape(-1, 2))
-    v = torch.tensor(system.vector_field(clean.transpose(0, 2, 1).reshape(-1, 2)))
-
-    def field(z: torch.Tensor, graph: bool = True) -> torch.Tensor:
-        z = z.requires_grad_()
-        (g,) = torch.autograd.grad(net(z).sum(), z, create_graph=graph)
-        return torch.stack([g[:, 1], -g[:, 0]], 1)
-
-    optimizer = torch.optim.Adam(net.parameters(), 1e-3, weight_decay=1e-4)
-    start = time.process_time()
-    for _ in range(2000):
-        optimizer.zero_grad()
-        ((field(x) - v) ** 2).mean().backward()
-        optimizer.step()
-    seconds = time.process_time() - start
-
-    def f(_: float, z: np.ndarray) -> np.ndarray:
-        return field(torch.tensor(z).reshape(-1, 2), False).detach().numpy().ravel()
-
-    made = solve_ivp(f, (0.0, t[-1]), held.ravel(), t_eval=t, rtol=1e-6).y.reshape(len(held), 2, -1)
-    error = energy_mse(system, made, truth)
-    remark = "our own HNN, exact derivatives"
-    return Row(f"HNN {name}, network", "energy MSE to t = 20", f"{theirs:g}", theirs / 10, error, seconds, remark)
-
-
-def hnn_clean(system: HamiltonianSystem, data: Any) -> np.ndarray:
-    """The initial states of `hnn_data` without noise, drawn again."""
-    radii = (0.1, 1.0) if system is SPRING else (0.2, 2.0)
-    random = np.random.default_rng(0)
-    y0 = random.uniform(-1.0, 1.0, (50, 2))
-    y0 *= random.uniform(*radii, (50, 1)) / np.linalg.norm(y0, axis=1, keepdims=True)
-    return y0[: len(data[1])]
-
-
-def damped_spring(options: argparse.Namespace) -> list[Row]:
-    random = np.random.default_rng(0)
-    y0 = random.uniform(-1.0, 1.0, (50, 2))
-    t = np.linspace(0.0, 6.0, 61)
-    y = exact(DAMPED, y0, t)
-    data = (t, y[:25] + 0.01 * random.normal(size=(25, 2, len(t))))
-    flow, seconds = timed(lambda: sympflow.learn(data, damping=True))
-    error = energy_mse(DAMPED, predicted(flow, y0[25:], t), y[25:])
-    gamma = float(np.mean(flow.system.damping))
-    return [
-        Row("D-HNN damped spring", "energy MSE", "3.6e-06", 3.6e-7, error, seconds, _model(flow)),
-        Row("D-HNN damped spring", "relative error of γ", "", 0.01, abs(gamma / 0.1 - 1), seconds, f"γ = {gamma:.5f}"),
-    ]
+def task_terms(name: str) -> list[str] | None:
+    """The library of `discover`: of bodies their distance beside the momenta, else the default one."""
+    if name != "two-bodies":
+        return None
+    r = "sqrt((q1 - q2)**2 + (q3 - q4)**2)"
+    squares = [f"p{i}*p{j}" for i in range(1, 5) for j in range(i, 5)]
+    return [*(f"{r}**{e}" for e in (-3, -2, -1, 1, 2)), f"log({r})", *squares]
 
 
 # discovery ------------------------------------------------------------------------------------------------------------
@@ -361,30 +486,33 @@ SWEEPS = {
 }
 
 
-def sweeps(folder: Path | None) -> list[list[str]]:
-    """One-step errors of `learn` on the authors' oscillator against noise, trajectories and times."""
+def sweeps(folder: Path | None, options: argparse.Namespace) -> list[list[str]]:
+    """One-step errors on the authors' oscillator against noise, trajectories and times, of `learn` and of Adam."""
     from matplotlib.figure import Figure
 
     system = systems.harmonic_oscillator()
     figure = Figure(figsize=(9.0, 3.0), layout="constrained", facecolor="white")
     rows = []
-    for ax, (label, cases) in zip(figure.subplots(1, 3), SWEEPS.items(), strict=True):
+    for ax, (label, cases) in zip(figure.subplots(1, 3, sharey=True), SWEEPS.items(), strict=True):
         points = []
         for eps, n, m in cases:
             data, held = authors_data(system, 1.2, eps, n, m, 0)
-            truth = exact(system, held, np.array([0.0, 1.0]))[:, :, -1]
             flow, seconds = timed(lambda data=data: sympflow.learn(data, dt=1.0))  # type: ignore[misc]
-            error = float(np.linalg.norm(predicted(flow, held, np.array([0.0, 1.0]))[:, :, -1] - truth, axis=1).mean())
-            points.append(({"ε": eps, "N": n, "M": m}[label[-1]], error))
-            rows.append([label, f"{eps:g}", str(n), str(m), fragments.number(error), f"{seconds:.0f}"])
+            theirs = one_step_error(authors_adam(data, max(seconds, options.swept)), system, held)
+            error = one_step_error(flow, system, held)
+            points.append(({"ε": eps, "N": n, "M": m}[label[-1]], error, theirs))
+            numbers = [fragments.number(error), f"{seconds:.0f}", fragments.number(theirs)]
+            rows.append([label, f"{eps:g}", str(n), str(m), *numbers])
             print(*rows[-1], sep=" | ", flush=True)
-        x, y = np.array(points).T
-        ax.plot(x, y, "o-", color="#D55E00")
+        x, ours, adams = np.array(points).T
+        ax.plot(x, adams, "s--", color="#0072B2", label="SympFlow by Adam")
+        ax.plot(x, ours, "o-", color="#D55E00", label="learn")
         ax.set(xlabel=label, yscale="log", xscale="linear" if label[0] == "n" else "log")
         ax.grid(alpha=0.3, which="both")
     figure.axes[0].set_ylabel("one-step error at Δt = 1")
+    figure.axes[0].legend(frameon=False)
     if folder is not None:
-        figure.savefig(folder / "learning_sweeps.png", dpi=110)
+        figure.savefig(folder / "learning_sweeps.svg")
     return rows
 
 
@@ -395,16 +523,23 @@ PROTOCOLS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "authors-henon-heiles": lambda o: [authors(systems.henon_heiles(), 1.0, eps, o) for eps in (0.0, 0.05)],
     "ghnn-pendulum": ghnn_pendulum,
     "ghnn-double-pendulum": ghnn_double_pendulum,
+    "ghnn-three-bodies": ghnn_three_bodies,
     "hnn-spring": lambda o: hnn("spring", o),
     "hnn-pendulum": lambda o: hnn("pendulum", o),
-    "d-hnn": damped_spring,
+    "hnn-two-bodies": lambda o: hnn("two-bodies", o),
+    "d-hnn": lambda o: hnn("damped", o),
 }
-TABLES = {
-    "learning-authors": ("authors-oscillator", "authors-henon-heiles"),
-    "learning-ghnn": ("ghnn-pendulum", "ghnn-double-pendulum"),
-    "learning-hnn": ("hnn-spring", "hnn-pendulum", "d-hnn"),
+FRAGMENTS = {
+    "authors-oscillator": "learning-authors-oscillator",
+    "authors-henon-heiles": "learning-authors-henon-heiles",
+    "ghnn-pendulum": "learning-ghnn-pendulum",
+    "ghnn-double-pendulum": "learning-ghnn-double-pendulum",
+    "ghnn-three-bodies": "learning-ghnn-three-bodies",
+    "hnn-spring": "learning-hnn-spring",
+    "hnn-pendulum": "learning-hnn-pendulum",
+    "hnn-two-bodies": "learning-hnn-two-bodies",
+    "d-hnn": "learning-d-hnn",
 }
-"""Fragments, and the protocols in each."""
 
 
 def main() -> None:
@@ -412,28 +547,30 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=[*PROTOCOLS, "discovery", "sweeps"], default=None)
     parser.add_argument("--systems", nargs="+", default=[], help="of the discovery; all of them by default")
     parser.add_argument("--runs", type=int, default=100, help="training trajectories of the GHNN protocols")
-    parser.add_argument("--baseline", type=float, default=60.0, help="least processor time of Adam, in seconds")
-    parser.add_argument("--networks", action="store_true", help="an HNN of our own beside the published figures")
+    parser.add_argument("--pendulums", type=int, default=40, help="training trajectories of the double pendulum")
+    parser.add_argument("--baseline", type=float, default=30.0, help="least processor time of Adam, in seconds")
+    parser.add_argument("--networks", type=int, default=2000, help="steps of the networks' training, 0 for none")
+    parser.add_argument("--swept", type=float, default=10.0, help="the same in the sweeps")
     fragments.add_out(parser)
     options = parser.parse_args()
     wanted = options.only or [*PROTOCOLS, "discovery", "sweeps"]
     figures = None if options.out is None else options.out.parent / "figures"
-    for fragment, names in TABLES.items():
-        rows = []
-        for name in names:
-            for row in PROTOCOLS[name](options) if name in wanted else ():
-                rows.append(row.cells())
-                print(*rows[-1], sep=" | ", flush=True)
-        if rows:
-            titles = ["protocol", "metric", "theirs", "target", "ours", "reached", "s", "model"]
-            fragments.write(options.out, fragment, fragments.table(titles, rows), f"--only {' '.join(names)}")
+    titles = ["method", "metric", "theirs", "target", "got", "reached", "s", "model"]
+    for name, protocol in PROTOCOLS.items():
+        if name in wanted:
+            rows = [row.cells() for row in protocol(options)]
+            for row in rows:
+                print(name, *row, sep=" | ", flush=True)
+            fragments.write(options.out, FRAGMENTS[name], fragments.table(titles, rows), f"--only {name}")
     if "discovery" in wanted:
         titles = ["system", "true terms, of a library", "found", "these and no other", "largest error", "s", "H"]
         table = fragments.table(titles, discovered(options.systems, figures))
         fragments.write(options.out, "learning-discovery", table, "--only discovery")
     if "sweeps" in wanted:
-        table = fragments.table(["sweep", "ε", "N", "M", "one-step error", "s"], sweeps(figures))
-        fragments.write(options.out, "learning-sweeps", table, "--only sweeps")
+        titles = ["sweep", "ε", "N", "M", "one-step error", "s", "Adam"]
+        fragments.write(
+            options.out, "learning-sweeps", fragments.table(titles, sweeps(figures, options)), "--only sweeps"
+        )
 
 
 if __name__ == "__main__":

@@ -179,7 +179,7 @@ def train(
 ) -> None:
     """Train a flow for a system and save it.
 
-    With nothing else said, a system with separable H gets a flow primed with its own V and T, in about a minute.
+    With nothing else said, a system with separable H gets a flow primed with its own V and T, in a minute at most.
 
     Any other, or where an option is one of networks, gets a SympFlow with neural potentials.
 

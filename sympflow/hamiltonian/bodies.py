@@ -15,6 +15,8 @@ from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
 
 MOST_AXES = 3
+MOST_NEAR = 300
+"""About how many bodies each is compared with where there are cells."""
 MOST_PAIRS = 1_000_000
 """Pairs whose values stand in memory at a time."""
 
@@ -133,6 +135,11 @@ class PairsHamiltonian(LocalHamiltonian):
             V = V - V.subs(self.s, end) - (self.s - end) * slope
             self.c, self.constants = (*self.c, end), (*self.constants, self.cutoff**2 + self.softening**2)
         self.V = V
+
+    @property
+    def work(self) -> int:
+        pairs = self.n_bodies * (self.n_bodies - 1) // 2
+        return 2 * (pairs if self.cutoff is None else min(pairs, MOST_NEAR * self.n_bodies))
 
     @property
     def slopes(self) -> list[sp.Expr]:

@@ -105,6 +105,11 @@ class LocalHamiltonian(Definition):
         )
 
     @property
+    def work(self) -> int:
+        """About how many nanoseconds a force takes in compiled loops: threads are set to work where that pays."""
+        return self.ndof
+
+    @property
     def uniform(self) -> bool:
         """True if all sites are alike, so that a few of them tell all of the rest."""
         return False

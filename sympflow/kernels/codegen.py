@@ -134,7 +134,7 @@ def _product(factor: str, power: int) -> str:
 
 
 def algebra_source(symbols: SymbolicHamiltonian) -> str:
-    """The functions that `loops` and `lanes` ask for, for H = T(p) + V(q), calling `elementary`; states are tuples.
+    """The kick and the drift that `loops` ask for, for H = T(p) + V(q), calling `elementary`; states are tuples.
 
     Raises
     ------
@@ -145,8 +145,6 @@ def algebra_source(symbols: SymbolicHamiltonian) -> str:
     velocity = [sp.diff(symbols.T, s) for s in p]
     slope = [sp.diff(symbols.V, s) for s in q]
     parts = [
-        f"NDOF = {d}",
-        tuple_algebra(d),
         _function(symbols, "kick", "q, numbers, work", [-s for s in slope], [f"b*{{{i}}}" for i in range(d)], "b"),
         _drift(symbols, velocity),
     ]
@@ -154,16 +152,14 @@ def algebra_source(symbols: SymbolicHamiltonian) -> str:
 
 
 def variations_source(variations: Variations) -> str:
-    """`algebra_source` of an orbit and its deviation vectors, without the kick, which is scheduled.
+    """The drift of an orbit and its deviation vectors; their kick is scheduled.
 
     Raises
     ------
     ValueError
         As `algebra_source`.
     """
-    n = variations.ndof
-    parts = [f"NDOF = {n}", tuple_algebra(n), _drift(variations, list(variations.velocity))]
-    return "\n\n\n".join(parts) + "\n"
+    return _drift(variations, list(variations.velocity))
 
 
 def _drift(symbols: SymbolicHamiltonian | Variations, velocity: list[sp.Expr]) -> str:

@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.codegen import algebra_source
+from sympflow.kernels.codegen import algebra_source, tuple_algebra
 from sympflow.kernels.loop_functions import plain_kicks_source, takes_values
 from sympflow.kernels.modules import load_module, template
 from sympflow.kernels.protocol import Carry, Run, Steps
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
-from sympflow.kernels.stages import kicks_of, run_table, stages_source
+from sympflow.kernels.stages import kicks_of, numbers_source, run_table, stages_source
 from sympflow.kernels.terms import is_large
 from sympflow.schemes import Scheme
 
@@ -178,16 +178,25 @@ def _rows_of(running: np.ndarray | None) -> np.ndarray | None:
     return None if running is None else running[None]
 
 
+def _on_device(name: str) -> str:
+    """The text of loops of that name, with the header's `njit`."""
+    return template(name).replace("from numba import njit\n", "")
+
+
 @lru_cache(maxsize=64)
 def cuda_module(symbols: SymbolicHamiltonian, level: int, monomials: Monomials, compensated: bool) -> ModuleType:
     """The algebra of a symbolic system, its kicks and the loops after them, for the GPU."""
     kinds = kicks_of(level, len(monomials))
     sources = [
         HEADER.format(compensated=bool(compensated)),
+        f"NDOF = {symbols.ndof}",
+        tuple_algebra(symbols.ndof),
+        _on_device("running_states"),
         algebra_source(symbols),
+        numbers_source(kinds, None, len(symbols.parameters)),
         stages_source(kinds, False, None, len(symbols.parameters)),
         *plain_kicks_source(symbols, level, monomials),
-        template("loops").replace("from numba import njit\n", ""),
+        _on_device("loops"),
         template("cuda"),
     ]
     return load_module("\n\n\n".join(sources))

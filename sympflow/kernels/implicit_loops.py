@@ -15,7 +15,7 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels import terms
 from sympflow.kernels.codegen import statements
-from sympflow.kernels.modules import load_algebra
+from sympflow.kernels.modules import constants_source, given, load_algebra, template
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
 from sympflow.kernels.terms import is_large
 
@@ -112,7 +112,7 @@ class ImplicitKernel(Kernel):
         threads: int | None,
         carry: Carry | None,
     ) -> Run:
-        loops = _load(self._algebra, self._tableau, self._compensated, self._rates)
+        loops = _load(self._algebra, self.ndof, self._tableau, self._compensated, self._rates)
         iterations = np.empty(len(y0), dtype=np.int64)
 
         def rows(i: slice, *rest: Any) -> None:
@@ -125,19 +125,21 @@ class ImplicitKernel(Kernel):
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,): see `Kernel`."""
-        y = np.ascontiguousarray(y, dtype=np.float64)
-        h, t = (np.ascontiguousarray(np.broadcast_to(np.asarray(x, dtype=np.float64), y.shape[:1])) for x in (h, t))
+        y = given(y)
+        h, t = (given(np.broadcast_to(x, y.shape[:1])) for x in (h, t))
         out, iterations = np.empty_like(y), np.empty(len(y), dtype=np.int64)
-        _load(self._algebra, self._tableau, False, self._rates).step_each(h, t, y, out, iterations)
+        _load(self._algebra, self.ndof, self._tableau, False, self._rates).step_each(h, t, y, out, iterations)
         return Steps(out, int(iterations.sum()))
 
 
 @lru_cache(maxsize=256)
-def _load(algebra: str, tableau: Tableau, compensated: bool, rates: tuple[float, ...]) -> ModuleType:
+def _load(algebra: str, ndof: int, tableau: Tableau, compensated: bool, rates: tuple[float, ...]) -> ModuleType:
     A, B, scale = tableau
     C = tuple(float(np.dot(row, scale)) for row in A)
     numbers = {"A": A, "B": B, "C": C, "SCALE": scale, "RATES": rates}
-    return load_algebra(algebra, ["newton"], COMPENSATED=compensated, STAGES=len(B), **numbers)
+    constants = constants_source(COMPENSATED=compensated, NDOF=ndof, STAGES=len(B), **numbers)
+    steps = "\n\n\n".join([constants, template("running_states"), template("newton_steps")])
+    return load_algebra(algebra, ["newton"], [steps])
 
 
 def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:
@@ -148,7 +150,7 @@ def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:
     ValueError
         If a function in H has no counterpart in compiled code.
     """
-    variables, H, before = symbols.q + symbols.p, symbols.H, f"NDOF = {symbols.ndof}\n\n\n"
+    variables, H, before = symbols.q + symbols.p, symbols.H, ""
     if symbols.time is not None:
         from sympflow.kernels.stage_times import in_code, sampled_sources
 

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from itertools import pairwise
 from types import ModuleType
 from typing import Any
 
@@ -19,8 +17,8 @@ import sympy as sp
 
 from sympflow.hamiltonian.lattice import LatticeHamiltonian
 from sympflow.kernels.codegen import statements, vectorised
-from sympflow.kernels.modules import NEVER, load_algebra, threads_for
-from sympflow.kernels.protocol import NOTHING
+from sympflow.kernels.modules import load_algebra
+from sympflow.kernels.sized_loops import SizedLoops, Team
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 __all__ = ["LatticeLoops"]
@@ -47,11 +45,17 @@ class _Pass:
         Of a potential and its letters, to one expression for each field.
     keeps : int or None
         The helper into which M⁻¹ times the slopes go.
+    opens : bool
+        True for the first pass of a kick with force gradient, which leaves p as it is and keeps costly curvatures.
+    turns : bool
+        True for the second one: it makes the kick by the force as well, and takes the curvatures that were kept.
     """
 
     vectors: tuple[str, ...]
     slopes: Callable[[sp.Expr, Sequence[sp.Symbol], LatticeHamiltonian], list[sp.Expr]]
     keeps: int | None = None
+    opens: bool = False
+    turns: bool = False
 
 
 def _slopes(f: sp.Expr, x: Sequence[sp.Symbol], lattice: LatticeHamiltonian) -> list[sp.Expr]:
@@ -73,16 +77,16 @@ def _bent(f: sp.Expr, x: Sequence[sp.Symbol], lattice: LatticeHamiltonian) -> li
 
 
 KICK = _Pass(("q",), _slopes)
-ACCELERATION = _Pass(("q",), _slopes, 0)
-PRODUCT = _Pass(("q", "v"), _product)
-TURN = _Pass(("q", "v"), _product, 1)
+ACCELERATION = _Pass(("q",), _slopes, 0, opens=True)
+PRODUCT = _Pass(("q", "v"), _product, turns=True)
+TURN = _Pass(("q", "v"), _product, 1, turns=True)
 BEND = _Pass(("q", "v", "w"), _bent)
 _LETTERS = {"q": "x", "v": "v", "w": "w"}
 _ARRAYS = {"q": "X[0]", "v": "A[0]", "w": "A[1]"}
 
 
-class LatticeLoops:
-    """The functions that `SplittingLoops` asks for, of one lattice and one kind of kicks.
+class LatticeLoops(SizedLoops):
+    """The functions that `SplittingLoops` asks for, of one lattice and one kind of kicks: large ones in tiles.
 
     Parameters
     ----------
@@ -99,16 +103,15 @@ class LatticeLoops:
             raise ValueError(
                 "`scheme` has polynomials, which are of systems by their coordinates one by one: use backend='array'."
             )
-        self._lattice, self._level, self._compensated = lattice, level, compensated
-        self._module = _module(_definition(lattice), level, compensated, rate)
+        self._lattice, self._level = lattice, level
         self._reach = max(lattice.bonds, default=0)
-        self._values = np.array([v for v in lattice.params.values() if not isinstance(v, np.ndarray)], dtype=float)
+        values = np.array([v for v in lattice.params.values() if not isinstance(v, np.ndarray)], dtype=float)
         planes = lattice.shape[0]
         plane = math.prod(lattice.shape[1:])
         of_a_stage = self._reach * {0: 1, FORCE_GRADIENT: 2, CURVATURE: 3}[level]
         tile = max((TILE if len(lattice.shape) == 1 else LARGER_TILE) // plane, 8 * of_a_stage)
         self._tiled = of_a_stage > 0 and planes >= FEWEST_TILES * tile
-        self._planes, self._n_tiles = tile, -(-planes // tile)
+        self._planes = tile
         self._of_a_stage = of_a_stage
         self._margin = max(of_a_stage, tile // MARGIN) if self._tiled else self._reach
         self._padded = (planes + 2 * self._margin, *(n + 2 * self._reach for n in lattice.shape[1:]))
@@ -117,7 +120,10 @@ class LatticeLoops:
         self._geometry = np.array(
             [last, self._size // self._padded[0], row, self._padded_rows(), self._margin, planes], dtype=np.int64
         )
-        self._sites = self._padded_parameters()
+        self._shared = self._geometry, self._padded_parameters(), values
+        module = _module(_definition(lattice), level, compensated, rate)
+        arguments = (self._geometry, self._size, *self._shared[1:])
+        super().__init__(module, compensated, lattice.ndof, -(-planes // tile), arguments)
 
     def _padded_rows(self) -> int:
         return self._lattice.shape[1] if len(self._lattice.shape) == 3 else 1
@@ -135,191 +141,14 @@ class LatticeLoops:
             row[:] = padded.ravel()
         return found
 
-    # the functions of `SplittingLoops` ----------------------------------------------------------------------------
-
-    def rollout(
-        self,
-        table: np.ndarray,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-        threads: int | None = None,
-    ) -> int:
-        """The steps of one state: see the text `loops`; of a lattice in tiles on several threads where that pays."""
-        if not self._tiled:
-            return self._module.rollout(table, y0, n_steps, save, out, stop, first, running, False, *self._arguments)
-        work = table.shape[1] * self._lattice.ndof * (n_steps - first)
-        with _Team(threads_for(self._n_tiles, work, threads)) as team:
-            return self._tiled_rollout(team, table, y0, n_steps, save, out, stop, first, running)
-
-    def rollout_batch(
-        self,
-        table: np.ndarray,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        n_finite: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-    ) -> None:
-        """The same of every row of `y0` (N, 2d), each in one thread."""
-        for i in range(len(y0)):
-            own = running[i] if len(running) else NOTHING[0]
-            n_finite[i] = self.rollout(table, y0[i], n_steps, save, out[i], stop, first, own, 1)
-
-    def rollout_processed(
-        self,
-        before: np.ndarray,
-        run: np.ndarray,
-        after: np.ndarray,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-        threads: int | None = None,
-    ) -> int:
-        """`rollout` in other coordinates, `before` into them and `after` out of them."""
-        start = np.zeros((1, len(y0)))
-        if first == 0:
-            self._map([before], y0[None], start)
-        n_finite = self.rollout(run, start[0], n_steps, save, out, stop, first, running, threads)
-        at_start = int(np.searchsorted(save, 0, "right"))
-        self._map([after] * (len(out) - at_start), out[at_start:], out[at_start:])
-        out[:at_start] = y0
-        finite = np.isfinite(out).all(-1) | (save > n_finite)
-        if finite.all():
-            return n_finite
-        row = int(np.argmin(finite))
-        out[row:] = math.nan
-        return int(save[row]) - 1
-
-    def rollout_processed_batch(
-        self,
-        before: np.ndarray,
-        run: np.ndarray,
-        after: np.ndarray,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        n_finite: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-    ) -> None:
-        """The same of every row of `y0` (N, 2d)."""
-        tables = before, run, after
-        for i in range(len(y0)):
-            own = running[i] if len(running) else NOTHING[0]
-            n_finite[i] = self.rollout_processed(*tables, y0[i], n_steps, save, out[i], stop, first, own, 1)
-
-    def step_rows(
-        self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
-    ) -> None:
-        """One step of length ``h[i]`` from every row of `y` (N, 2d): see the text `loops`."""
-        numbers = np.zeros((*table.shape[:2], len(h)))
-        for k in range(table.shape[2] - 1, -1, -1):
-            numbers = numbers * x + table[:, :, k, None]
-        powers = np.array([1, 1, 3, 5])[: len(table)]
-        tables = np.ascontiguousarray((numbers * h ** powers[:, None, None]).transpose(2, 0, 1))
-        self._map(list(tables), y, out)
-
-    def _map(self, tables: Sequence[np.ndarray], y: np.ndarray, out: np.ndarray) -> None:
-        """The map of the columns of each table, of each row of `y`."""
-        nothing, none = np.empty(0, dtype=np.int64), NOTHING[0]
-        for i, (table, row) in enumerate(zip(tables, np.ascontiguousarray(y), strict=True)):
-            if not self._tiled:
-                to = out[i : i + 1]
-                self._module.rollout(table, row, 0, nothing, to, NEVER, 0, none, True, *self._arguments)
-                continue
-            with _Team(threads_for(self._n_tiles, table.size * len(row), None)) as team:
-                states = self._states(), self._states()
-                self._load(row, states[0], 0)
-                found, _ = self._advanced(team, states, table, 0, table.shape[1], True)
-                self._pack(found[0], 0, out[i])
-
-    @property
-    def _shared(self) -> tuple[Any, ...]:
-        return self._geometry, self._sites, self._values
-
-    @property
-    def _arguments(self) -> tuple[Any, ...]:
-        return self._geometry, self._size, self._sites, self._values
-
-    # lattices in tiles ----------------------------------------------------------------------------------------------
-
-    def _tiled_rollout(
-        self,
-        team: _Team,
-        table: np.ndarray,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-    ) -> int:
-        link, width = table.shape[1] - 2, len(y0)
-        states = self._states(), self._states()
-
-        def opened() -> int:
-            """Load the running state after `first` steps; the column that comes next."""
-            states[0][2:] = 0.0
-            self._load(running[:width] if first else y0, states[0], 0)
-            if first and self._compensated:
-                self._load(running[width:], states[0], 2)
-            return link if first else 0
-
-        def closed() -> np.ndarray:
-            """The end of the present step, beside the running state."""
-            return self._advanced(team, states, table, link + 1, 1, False)[0][0]
-
-        n, j = first, opened()
-        saved = int(np.searchsorted(save, 0, "right"))
-        out[:saved] = y0
-        while n < n_steps and not stop[0]:
-            block = min(BLOCK, n_steps - n, *([int(save[saved]) - n] if saved < len(save) else []))
-            states, j = self._advanced(team, states, table, j, block * link, False)
-            end = closed()
-            if not _finite(end):
-                out[saved:] = math.nan
-                states, j = self._advanced(team, states, table, opened(), (n - first) * link, False)
-                for _ in range(block - 1):
-                    states, j = self._advanced(team, states, table, j, link, False)
-                    if not _finite(closed()):
-                        break
-                    n += 1
-                running[:] = math.nan
-                return n
-            n += block
-            while saved < len(save) and save[saved] == n:
-                self._pack(end, 0, out[saved])
-                saved += 1
-        if len(running):
-            self._pack(states[0], 0, running[:width])
-            if self._compensated:
-                self._pack(states[0], 2, running[width:])
-        return n_steps
+    def _in_pieces(self, threads: int) -> bool:
+        return self._tiled
 
     def _advanced(
-        self, team: _Team, states: tuple[np.ndarray, np.ndarray], table: np.ndarray, j: int, count: int, single: bool
+        self, team: Team, states: tuple[np.ndarray, np.ndarray], table: np.ndarray, j: int, count: int, single: bool
     ) -> tuple[tuple[np.ndarray, np.ndarray], int]:
-        """The states after `count` stages from column j on, the first of them the present one; and the column after.
-
-        Of a run, or of a `single` map.
-        """
         here, there = states
-        module, tiles = self._module, self._n_tiles
+        module, tiles = self._module, self._n_pieces
         link, at_once = table.shape[1] - 2, self._margin // self._of_a_stage
         while count:
             n = min(count, at_once)
@@ -347,41 +176,6 @@ class LatticeLoops:
     def _pack(self, X: np.ndarray, first: int, y: np.ndarray) -> None:
         inner = self._inner(X, first)
         y.reshape(inner.shape)[...] = inner
-
-
-BLOCK = 64
-"""Steps between two looks for a non-finite state, of a lattice in tiles."""
-
-
-def _finite(X: np.ndarray) -> bool:
-    with np.errstate(all="ignore"):
-        return bool(np.isfinite(X[:2].sum()) or np.isfinite(X[:2]).all())
-
-
-class _Team:
-    """Threads that share the tiles of a lattice, each the same ones in every sweep."""
-
-    def __init__(self, threads: int) -> None:
-        self._threads = threads
-        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
-
-    def __enter__(self) -> _Team:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown()
-
-    def __call__(self, tiles: Callable[[int, int], None], n: int) -> None:
-        """``tiles(first, last)`` over 0 … n."""
-        if self._pool is None:
-            tiles(0, n)
-            return
-        bounds = [n * k // self._threads for k in range(self._threads + 1)]
-        others = [self._pool.submit(tiles, *ends) for ends in pairwise(bounds[1:])]
-        tiles(bounds[0], bounds[1])
-        for other in others:
-            other.result()
 
 
 # code -------------------------------------------------------------------------------------------------------------
@@ -412,11 +206,12 @@ def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleTyp
     lattice = code.lattice
     return load_algebra(
         "import numpy as np\n\n\n" + _stages_source(lattice, level, compensated, rate),
-        ("lattice",),
+        ("sized_states", "lattice"),
         N_AXES=len(lattice.shape),
         N_FIELDS=len(lattice.fields),
         N_SETS=4 if compensated else 2,
         N_HELPERS={0: 0, FORCE_GRADIENT: 1, CURVATURE: 2}[level],
+        N_CURVATURES=len(_curvatures(lattice)) if level else 0,
         N_BONDS=sum(k > 1 for k in lattice.bonds) * len(lattice.fields),
         REACH=max(lattice.bonds, default=0),
         PERIODIC=tuple(b == "periodic" for b in lattice.boundary),
@@ -475,7 +270,9 @@ def _indented(lines: Sequence[str]) -> list[str]:
 
 
 def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> list[str]:
-    """p −= b × the slopes of the sites of planes low … high; M⁻¹ × these are kept for the next pass.
+    """p −= b × the slopes of the sites of planes low … high; of passes that keep M⁻¹ × these, the last one does so.
+
+    That of the accelerations keeps them and leaves p as it is, the next one makes both kicks: p is written once.
 
     The drift is a pass of its own: made in the same one, it keeps compilers from vector instructions.
     """
@@ -488,6 +285,7 @@ def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> 
     row = _Row(lattice)
     known: set[sp.Symbol] = set()
     lines: list[str] = []
+    targets: dict[str, sp.Expr] = {}
     slopes: list[sp.Expr] = [sp.S.Zero] * n_fields
 
     def read(symbol: sp.Symbol, element: str) -> sp.Symbol:
@@ -497,14 +295,18 @@ def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> 
         return symbol
 
     if lattice.U != 0:
-        own = kind.slopes(lattice.U, lattice.x, lattice)
-        used = set().union(*(f.free_symbols for f in own))
+        own, stored, taken = _with_curvatures(lattice, kind, "onsite")
+        all_own = [*own, *stored.values()]
+        used = set().union(*(f.free_symbols for f in all_own))
         for vector in kind.vectors:
             for f, s in enumerate(getattr(lattice, _LETTERS[vector])):
                 if s in used:
                     read(s, row.at(_field(vector, f), "s"))
-        for s, element in row.parameters(own, "s").items():
+        for s, element in row.parameters(all_own, "s").items():
             read(s, element)
+        for s, array in taken.items():
+            read(s, row.at(array, "s"))
+        targets = {row.at(array, "s"): f for array, f in stored.items()}
         slopes = [a + b for a, b in zip(slopes, own, strict=True)]
     for (k, f), place in places.items():
         forward = read(sp.Symbol(f"forward_{place}", real=True), row.at(f"T[{place}]", str(k)))
@@ -517,12 +319,17 @@ def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> 
     nearest = _Nearest.of(lattice, kind, row)
     for f in nearest.fields:
         slopes[f] += sp.Symbol(f"behind_{f}", real=True) - sp.Symbol(f"ahead_{f}", real=True)
-    lines += statements([f"g_{f}" for f in fields], vectorised(slopes))
+    lines += statements([*(f"g_{f}" for f in fields), *targets], vectorised([*slopes, *targets.values()]))
     lines += [f"behind_{f} = ahead_{f}" for f in nearest.fields]
+    if kind.turns:
+        lines += _impulse(lattice, row, [row.at(f"A[0, {f}]", "s") for f in fields])
     momenta = [row.at(f"X[1, {f}]", "s") for f in fields]
-    errors = [row.at(f"X[3, {f}]", "s") for f in fields] if compensated else []
     for f in fields:
-        lines += _moved(momenta[f], f"-b*g_{f}", errors[f] if compensated else None)
+        error = row.at(f"X[3, {f}]", "s") if compensated else None
+        if kind.turns:
+            lines += _moved(momenta[f], f"-force*impulse_{f}", error)
+        if not kind.opens:
+            lines += _moved(momenta[f], f"-b*g_{f}", error)
     if kind.keeps is not None:
         lines += _velocity(lattice, row, [f"g_{f}" for f in fields], "u")
         lines += [f"{row.at(f'A[{kind.keeps}, {f}]', 's')} = u_{f}" for f in fields]
@@ -533,6 +340,46 @@ def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> 
         none = [f"ahead_{f} = 0.0" for f in nearest.fields]
         loop += ["for j in range(np.uint64(m), np.uint64(n)):", *_indented([*none, *lines])]
     return _rows_source(lattice, [*body, *loop])
+
+
+def _curvatures(lattice: LatticeHamiltonian) -> list[tuple[str, int, int, sp.Expr]]:
+    """The second derivatives of the potentials of a site and of a bond to the next one that are worth keeping.
+
+    Of an exponential or a sine one derivative gives the other. A polynomial at a site is computed again in the time
+    that it takes to store and load it; that of a bond needs two loads.
+    """
+    found = []
+    for name, V, x in (("onsite", lattice.U, lattice.x), ("bond", lattice.bonds.get(1, sp.S.Zero), lattice.r)):
+        for i, a in enumerate(x):
+            for j, b in enumerate(x[: i + 1]):
+                f = sp.diff(V, a, b)
+                if not f.is_polynomial(*x) or (name == "bond" and f.free_symbols & set(x)):
+                    found.append((name, i, j, f))
+    return found
+
+
+def _with_curvatures(
+    lattice: LatticeHamiltonian, kind: _Pass, name: str
+) -> tuple[list[sp.Expr], dict[str, sp.Expr], dict[sp.Symbol, str]]:
+    """The slopes of a potential in a pass, with what it stores of each array of curvatures, and what it takes of them.
+
+    Parameters
+    ----------
+    name : {"onsite", "bond"}
+    """
+    V, x = (lattice.U, lattice.x) if name == "onsite" else (lattice.bonds[1], lattice.r)
+    slopes = kind.slopes(V, x, lattice)
+    kept = [(f"C[{k}]", *of) for k, (potential, *of) in enumerate(_curvatures(lattice)) if potential == name]
+    if kind.opens:
+        return slopes, {array: f for array, _, _, f in kept}, {}
+    if not kind.turns:
+        return slopes, {}, {}
+    taken: dict[sp.Symbol, str] = {}
+    H = sp.hessian(V, x)
+    for array, i, j, _ in kept:
+        H[i, j] = H[j, i] = sp.Symbol(f"curvature_{name}_{i}_{j}", real=True)
+        taken[H[i, j]] = array
+    return list(H * sp.Matrix(lattice.v)), {}, taken
 
 
 @dataclass(frozen=True)
@@ -557,21 +404,23 @@ class _Nearest:
     def of(cls, lattice: LatticeHamiltonian, kind: _Pass, row: _Row) -> _Nearest:
         if 1 not in lattice.bonds:
             return cls([], [], [])
-        found = kind.slopes(lattice.bonds[1], lattice.r, lattice)
+        found, stored, taken = _with_curvatures(lattice, kind, "bond")
         wanted = [f for f, slope in enumerate(found) if slope != 0]
-        slopes = vectorised([found[f] for f in wanted])
+        expressions = [*(found[f] for f in wanted), *stored.values()]
 
         def lines(at: Callable[[str, str], str], parameters: dict[sp.Symbol, str], start: str, name: str) -> list[str]:
             code = [
                 f"{s} = {at(_field(vector, f), f'{start} + 1')} - {at(_field(vector, f), start)}"
-                for vector, f, s in _differences(lattice, kind, found)
+                for vector, f, s in _differences(lattice, kind, expressions)
             ]
             code += [f"{s} = {element}" for s, element in parameters.items()]
-            return code + statements([f"{name}_{f}" for f in wanted], slopes)
+            code += [f"{s} = {at(array, start)}" for s, array in taken.items()]
+            targets = [*(f"{name}_{f}" for f in wanted), *(at(array, start) for array in stored)]
+            return code + statements(targets, vectorised(expressions))
 
-        ahead = lines(row.at, row.parameters(found, "s"), "s", "ahead")
+        ahead = lines(row.at, row.parameters(expressions, "s"), "s", "ahead")
         other = _Row(lattice)
-        places = {s: text.replace(" + j]", "]") for s, text in other.parameters(found, "s - 1").items()}
+        places = {s: text.replace(" + j]", "]") for s, text in other.parameters(expressions, "s - 1").items()}
         first = [*other.lines, *lines(lambda array, at: f"{array[:-1]}, {at}]", places, "s - 1", "behind")]
         if lattice.boundary[-1] == "free":
             first = [
@@ -681,6 +530,17 @@ def _velocity(lattice: LatticeHamiltonian, row: _Row, momenta: Sequence[str], na
     )
 
 
+def _impulse(lattice: LatticeHamiltonian, row: _Row, velocities: Sequence[str]) -> list[str]:
+    """Lines for Mv of one site, where T = ½ pᵀM⁻¹p."""
+    letters = [sp.Symbol(f"velocity_{f}", real=True) for f in range(len(velocities))]
+    found = list(sp.hessian(lattice.T, lattice.p).inv() * sp.Matrix(letters))
+    masses = row.parameters(found, "s")
+    put = {s: sp.Symbol(f"{s}_of_v", real=True) for s in masses}
+    lines = [f"{s} = {v}" for s, v in zip(letters, velocities, strict=True)]
+    lines += [f"{put[s]} = {element}" for s, element in masses.items()]
+    return lines + statements([f"impulse_{f}" for f in range(len(letters))], [f.xreplace(put) for f in found])
+
+
 def _moved(x: str, change: str, error: str | None) -> list[str]:
     if error is None:
         return [f"{x} += {change}"]
@@ -727,7 +587,7 @@ def _stages_source(lattice: LatticeHamiltonian, level: int, compensated: bool, r
             *_pass_lines(lattice, kind, compensated),
         ]
 
-    accelerated = passed(ACCELERATION, "table[1, column]", "X[0")
+    accelerated = ["force = table[1, column]", *passed(ACCELERATION, "force", "X[0")]
     cases = [("table[1, column] != 0.0", passed(KICK, "table[1, column]", "X[0"))]
     if level:
         turned = [*accelerated, *passed(PRODUCT, "-table[2, column]", "A[0")]
@@ -747,7 +607,7 @@ def _stages_source(lattice: LatticeHamiltonian, level: int, compensated: bool, r
         lines += [f"b = table[{row + 1}, column]", *_decay_lines(lattice)]
     lines += ["column = column + 1 if single or column < link else 1"]
     arguments = "X, table, column, n_stages, single, work, whole, lo, hi, begin, end, geometry, sites, offset, values"
-    head = [f"@njit(**OPTIONS)\ndef stages({arguments}):", "link = table.shape[1] - 2", "A, T = work"]
+    head = [f"@njit(**OPTIONS)\ndef stages({arguments}):", "link = table.shape[1] - 2", "A, T, C = work"]
     return "\n    ".join(
         [*head, *_value_lines(lattice), "for _ in range(n_stages):", *_indented(lines), "return column"]
     )

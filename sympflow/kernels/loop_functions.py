@@ -15,13 +15,31 @@ import numpy as np
 
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.modules import OPTIONS, load_module, template
-from sympflow.kernels.stages import DampedDrift, TimeAlone, WithSystem, kicks_of, lanes_source, stages_source
+from sympflow.kernels.modules import (
+    constants_source,
+    elementary,
+    imports_source,
+    load_algebra,
+    load_module,
+    template,
+)
+from sympflow.kernels.stages import (
+    DampedDrift,
+    Kick,
+    TimeAlone,
+    TimedNumbers,
+    kicks_of,
+    lanes_source,
+    numbers_source,
+    stages_source,
+    step_constants,
+)
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
     from sympflow.kernels.approximations import Ranges
+    from sympflow.kernels.sized_loops import SizedLoops
     from sympflow.kernels.stage_times import Driving
 
 MOST_COUPLED = 6
@@ -50,31 +68,6 @@ class LoopFunctions:
     rollout_processed_batch: Callable[..., None]
     step_rows: Callable[..., None]
 
-    def with_system(self, numbers: np.ndarray, inverse_mass: np.ndarray) -> LoopFunctions:
-        """The functions of tables, of those whose tables are (stages, numbers, M⁻¹)."""
-
-        def given(function: Callable[..., Any], n_tables: int = 1) -> Callable[..., Any]:
-            def call(*arguments: Any) -> Any:
-                tables = [(table, numbers, inverse_mass) for table in arguments[:n_tables]]
-                return function(*tables, *arguments[n_tables:])
-
-            return call
-
-        return LoopFunctions(
-            given(self.rollout),
-            given(self.rollout_batch),
-            given(self.rollout_processed, 3),
-            given(self.rollout_processed_batch, 3),
-            given(self.step_rows),
-        )
-
-
-def _header(compensated: bool, cache: bool, scheduled: bool, n_values: int = 0, driven: bool = False) -> str:
-    return (
-        f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': cache}}\n"
-        f"COMPENSATED = {compensated}\nSCHEDULED = {scheduled}\nN_VALUES = {n_values}\nDRIVEN = {driven}"
-    )
-
 
 def takes_values(level: int) -> bool:
     """True of kicks whose code is the same for all values of parameters.
@@ -100,7 +93,7 @@ def symbolic_loops(
 
         symbols = symbols.parametric
         algebra = algebra_source(symbols)
-    after = ("loops", "aligned", "lanes")
+    after = ("loops", "lanes")
     loops = symbolic_module(
         symbols, algebra, level, compensated, after, monomials, friction, varied=varied, ranges=ranges
     )
@@ -119,7 +112,7 @@ def driven_loops(
     """The loops of a symbolic system whose H depends on t; single steps, each at a time of its own, without lanes."""
     from sympflow.kernels.codegen import algebra_source
 
-    form, after = driving.form, ("loops", "aligned", "lanes")
+    form, after = driving.form, ("loops", "lanes")
     algebra = algebra_source(form)
     loops = symbolic_module(form, algebra, level, compensated, after, monomials, friction, driving, varied)
     processed = loops.rollout_processed, loops.rollout_processed_rows
@@ -145,18 +138,36 @@ def symbolic_module(
     from sympflow.kernels.kicks import kicks_source
 
     kinds, scheduled = kicks_of(level, len(monomials)), not compensated
-    n = len(symbols.parameters)
-    lanes = lanes_source(kinds, scheduled, friction, n, varied, driving)
-    sources = [algebra, stages_source(kinds, scheduled, friction, n, driving), lanes]
+    n, n_values = len(symbols.parameters), len(symbols.values) if varied else 0
+    sources = [algebra] if driving is None else [algebra, numbers_source(kinds, friction, n, driving)]
+    sources.append(stages_source(kinds, scheduled, friction, n, driving))
+    sources.append(lanes_source(kinds, scheduled, friction, n, varied, driving))
     if scheduled:
         sources.append(kicks_source(symbols, level, monomials, varied=varied, ranges=ranges))
     else:
         sources += plain_kicks_source(symbols, level, monomials)
-    algebra = "\n\n\n".join(sources)
-    before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
-    n_values = len(symbols.values) if varied else 0
-    header = _header(compensated, cache=True, scheduled=scheduled, n_values=n_values, driven=driving is not None)
-    return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, after)]))
+    shared = shared_by_lanes(symbols.ndof, kinds, friction, n, compensated, n_values)
+    shared = shared if driving is None else shared[:1]
+    constants = {"SCHEDULED": scheduled, "DRIVEN": driving is not None}
+    return load_algebra("\n\n\n".join(sources), after, shared, **constants)
+
+
+def shared_by_lanes(
+    ndof: int, kinds: Sequence[Kick], friction: DampedDrift | None, n_parameters: int, compensated: bool, n_values: int
+) -> list[str]:
+    """The sources of the texts `loops` and `lanes` that systems share: of states of this size; of kicks of one kind."""
+    numbers = [numbers_source(kinds, friction, n_parameters), template("lane_numbers")]
+    of_kicks = [constants_source(**step_constants(kinds)), *numbers]
+    return [states_source(ndof, compensated, n_values), "\n\n\n".join(of_kicks)]
+
+
+def states_source(ndof: int, compensated: bool = False, n_values: int = 0) -> str:
+    """The source of states that are tuples, one by one and in lanes, which systems share."""
+    from sympflow.kernels.codegen import tuple_algebra
+
+    constants = constants_source(COMPENSATED=compensated, NDOF=ndof, N_VALUES=n_values)
+    texts = map(template, ("running_states", "aligned", "lane_blocks"))
+    return "\n\n\n".join([constants, tuple_algebra(ndof), *texts])
 
 
 def plain_kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> list[str]:
@@ -187,7 +198,7 @@ def family_loops(
         symbols = driving.form
     letters = symbols.parameters
     warn_if_long(symbols.V, symbols.q, system.name)
-    sources = [f"import numpy as np\n\nNDOF = {symbols.ndof}", _FIXED_SIZE, _given_functions(level, bool(letters))]
+    sources = ["import numpy as np", _given_functions(level, bool(letters))]
     sources.append(gradient_source(symbols.V, symbols.q, "gradient", letters))
     if level in (FORCE_GRADIENT, CURVATURE):
         sources.append(product_source(symbols.V, symbols.q, "hessian_vector", letters))
@@ -202,56 +213,31 @@ def family_loops(
     else:
         sources.append(gradient_source(symbols.T, symbols.p, "kinetic_gradient"))
         sources.append("@njit(**OPTIONS)\ndef apply_inverse_mass(v, out, work):\n    kinetic_gradient(v, out)")
-    sources.append(stages_source(kicks_of(level, len(monomials)), False, friction, 0, driving))
-    code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
-    before = ["elementary"] if "fast_" in code else []
-    header = _header(compensated, cache=True, scheduled=False)
-    return _array_functions(vars(load_module("\n\n\n".join([header, *map(template, before), code]))))
+    kinds = kicks_of(level, len(monomials))
+    source, shared = _around_arrays(sources, symbols.ndof, kinds, compensated, friction, driving)
+    return _array_functions(vars(load_module(source, shared)))
 
 
-_FIXED_SIZE = """@njit(**OPTIONS)
-def size(x, copies):
-    return NDOF
-
-
-@njit(**OPTIONS)
-def size_of(table):
-    return NDOF"""
-_ANY_SIZE = """@njit(**OPTIONS)
-def size(x, copies):
-    return len(x) // copies
-
-
-@njit(**OPTIONS)
-def size_of(table):
-    return len(table[2])
-
-
-@njit(**OPTIONS)
-def apply_inverse_mass(v, out, work):
-    inverse_mass = work[4][2]
-    for i in range(len(v)):
-        out[i] = inverse_mass[i] * v[i]"""
-"""A table is (stages, numbers of the system, M⁻¹)."""
-
-
-def _pair_loops(
-    system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials, varied: bool = False
-) -> LoopFunctions:
-    """The loops of a system that is given by one piece, of any size: their code depends on the piece alone."""
-    from sympflow.kernels.pair_forces import pair_data, pair_source
-
-    local: Any = system.local
-    if level == POLYNOMIAL or varied:
-        raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
-    sources = [pair_source(local, functions_of(level)), _given_functions(level, True, numbers="numbers[-1]")]
-    sources += [_ANY_SIZE, stages_source(kicks_of(level), False, None, 0, WithSystem(), "table[0]")]
-    code = "\n\n\n".join([*sources, *map(template, ("array_states", "loops"))])
-    before = ["elementary"] if "fast_" in code or "fused_multiply_add" in code else []
-    header = _header(compensated, cache=True, scheduled=False)
-    functions = _array_functions(vars(load_module("\n\n\n".join([header, *map(template, before), code]))))
-    inverse_mass = np.ones(system.ndof) if system.inverse_mass is None else np.array(system.inverse_mass)
-    return functions.with_system(pair_data(local), inverse_mass)
+def _around_arrays(
+    sources: Sequence[str],
+    ndof: int,
+    kinds: Sequence[Kick],
+    compensated: bool,
+    friction: DampedDrift | None = None,
+    driving: TimedNumbers | None = None,
+    cache: bool = True,
+) -> tuple[str, list[str]]:
+    """The source of loops around functions of a system whose states are arrays, and those that systems share."""
+    of_states = [constants_source(COMPENSATED=compensated, NDOF=ndof)]
+    of_states += map(template, ("array_states", "running_states"))
+    shared, numbers = ["\n\n\n".join(of_states)], numbers_source(kinds, friction, 0, driving)
+    own = [constants_source(cache, SCHEDULED=False, N_VALUES=0, DRIVEN=driving is not None), *sources]
+    if driving is None:
+        shared.append(f"{constants_source()}\n\n\n{numbers}")
+    else:
+        own.append(numbers)
+    own += [stages_source(kinds, False, friction, 0, driving), *map(template, ("array_kicks", "loops"))]
+    return "\n\n\n".join(own), [*elementary(*own), *shared]
 
 
 _INVERSE_MASS_TIMES_V = {
@@ -271,18 +257,17 @@ def functions_of(level: int) -> tuple[str, ...]:
     return ("gradient", "hessian_vector", "bend")[: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(level, 0)]
 
 
-def _given_functions(level: int, driven: bool, time_first: bool = False, numbers: str = "numbers") -> str:
+def _given_functions(level: int, driven: bool, time_first: bool = False) -> str:
     """``gradient_at(q, numbers, out)`` and the others that the text `array_states` calls, by functions of a system.
 
-    Those of a driven one take the letters of `numbers` after their arguments, or the time before them; those of one
-    piece its own numbers, the last of them.
+    Those of a driven one take the letters of `numbers` after their arguments, or the time before them.
     """
     sources = []
     for name in functions_of(level):
         arguments = "q, out" if name == "gradient" else "q, v, out"
         call = f"{name}({arguments})"
         if driven:
-            call = f"{name}(numbers[-1], {arguments})" if time_first else f"{name}({arguments}, {numbers})"
+            call = f"{name}(numbers[-1], {arguments})" if time_first else f"{name}({arguments}, numbers)"
         given = arguments.removesuffix("out") + "numbers, out"
         sources.append(f"@njit(**OPTIONS)\ndef {name}_at({given}):\n    {call}")
     return "\n\n\n".join(sources)
@@ -305,34 +290,39 @@ def array_loops(
     monomials: Monomials,
 ) -> LoopFunctions:
     """The loops around the user's Numba functions; compiled for this process only."""
-    mass = "\n\n\n".join([_FIXED_SIZE, _inverse_mass_source(inverse_mass)])
-    header = _header(compensated, cache=False, scheduled=False)
-    stages = stages_source(kicks_of(level), False, friction, 0, TimeAlone() if driven else None)
-    given = _given_functions(level, driven, time_first=True)
-    functions: dict[str, Any] = {
-        "NDOF": ndof,
-        "INVERSE_MASS": inverse_mass,
-        "gradient": gradient,
-        "hessian_vector": hessian_vector,
-    }
-    texts = map(template, ("array_states", "loops"))
-    exec("\n\n\n".join([header, mass, given, stages, *texts]), functions)
+    sources = [_inverse_mass_source(inverse_mass), _given_functions(level, driven, time_first=True)]
+    given = kicks_of(level), compensated, friction, TimeAlone() if driven else None
+    source, shared = _around_arrays(sources, ndof, *given, cache=False)
+    functions: dict[str, Any] = {"INVERSE_MASS": inverse_mass, "gradient": gradient, "hessian_vector": hessian_vector}
+    exec(imports_source(shared) + source, functions)
     return _array_functions(functions)
 
 
-def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
+def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool) -> SizedLoops:
     """The loops of a lattice, of which only the structure, and not the size, is part of the code."""
     from sympflow.hamiltonian.lattice import LatticeHamiltonian
     from sympflow.kernels.lattice_loops import LatticeLoops
 
     assert isinstance(system.local, LatticeHamiltonian)
-    loops = LatticeLoops(system.local, level, compensated, system.friction is not None)
+    return LatticeLoops(system.local, level, compensated, system.friction is not None)
+
+
+def _pair_loops(system: HamiltonianSystem, level: int, compensated: bool) -> SizedLoops:
+    """The loops of bodies in pairs, of which only the potential, and not their number, is part of the code."""
+    from sympflow.hamiltonian.bodies import PairsHamiltonian
+    from sympflow.kernels.pair_forces import PairLoops
+
+    assert isinstance(system.local, PairsHamiltonian)
+    return PairLoops(system.local, level, compensated, system.friction is not None)
+
+
+LOCAL: dict[str, Callable[..., SizedLoops]] = {"lattice": _lattice_loops, "pairs": _pair_loops}
+"""Makers of the loops of systems that are given by one piece."""
+
+
+def local_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
+    """The loops of a system that is given by one piece."""
+    assert system.local is not None
+    loops = LOCAL[system.local.loops](system, level, compensated)
     processed = loops.rollout_processed, loops.rollout_processed_batch
     return LoopFunctions(loops.rollout, loops.rollout_batch, *processed, loops.step_rows)
-
-
-LOCAL: dict[str, tuple[Callable[..., LoopFunctions], bool, bool]] = {
-    "lattice": (_lattice_loops, True, True),
-    "pairs": (_pair_loops, False, False),
-}
-"""Makers of the loops of systems that are given by one piece, whether these take friction −γp, and `closes`."""

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from functools import cache, partial
 from importlib.resources import files
 from itertools import pairwise
@@ -22,7 +22,9 @@ from typing import Any, TypeVar
 
 import numba
 import numpy as np
+from numba.core.caching import FunctionCache
 from numba.core.registry import CPUDispatcher
+from numpy.typing import ArrayLike, DTypeLike
 
 __all__ = [
     "NEVER",
@@ -30,6 +32,10 @@ __all__ = [
     "at_most",
     "cache_folder",
     "compiling_alone",
+    "constants_source",
+    "elementary",
+    "given",
+    "imports_source",
     "load_algebra",
     "load_module",
     "run_one",
@@ -71,21 +77,68 @@ def cache_folder() -> Path:
     return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "sympflow"
 
 
-def load_algebra(algebra: str, loops: Sequence[str] = (), **constants: Any) -> ModuleType:
-    """The module of a system's algebra: constants before it, and `elementary` where it calls that; after it `loops`."""
-    lines = [f"{name} = {value}" for name, value in {"OPTIONS": OPTIONS | {"cache": True}, **constants}.items()]
-    header = "import math\n\nfrom numba import njit\n\n" + "\n".join(lines)
-    before = ["elementary"] if "fast_" in algebra or "fused_multiply_add" in algebra else []
-    return load_module("\n\n\n".join([header, *map(template, before), algebra, *map(template, loops)]))
+def given(x: ArrayLike, dtype: DTypeLike = np.float64) -> np.ndarray:
+    """An array as compiled functions are given it: contiguous, and not read-only, for which Numba compiles another."""
+    array = np.ascontiguousarray(x, dtype=dtype)
+    return array if array.flags.writeable else array.copy()
 
 
-@cache
-def load_module(source: str) -> ModuleType:
+def constants_source(cache: bool = True, **constants: Any) -> str:
+    """The beginning of a source: imports, the options of the compiler, and constants."""
+    lines = [f"{name} = {value}" for name, value in {"OPTIONS": OPTIONS | {"cache": cache}, **constants}.items()]
+    return "import math\n\nfrom numba import njit\n\n" + "\n".join(lines)
+
+
+def elementary(*sources: str) -> list[str]:
+    """The source of elementary functions, where one of these calls them: for `load_module` to share."""
+    called = any("fast_" in source or "fused_multiply_add" in source for source in sources)
+    return [f"{constants_source()}\n\n\n{template('elementary')}"] if called else []
+
+
+def load_algebra(algebra: str, loops: Sequence[str] = (), shared: Sequence[str] = (), **constants: Any) -> ModuleType:
+    """The module of a system's algebra: constants before it, after it `loops`; `elementary` is shared."""
+    source = "\n\n\n".join([constants_source(**constants), algebra, *map(template, loops)])
+    return load_module(source, (*elementary(algebra), *shared))
+
+
+def load_module(source: str, shared: Sequence[str] = ()) -> ModuleType:
     """Import `source`, written once to `cache_folder` under a name made from its contents.
 
     Where that folder cannot be written, a temporary one serves for the life of the process. Only what Python may call
     is in the module that is returned: see `_callable_part`.
+
+    Parameters
+    ----------
+    source : str
+    shared : sequence of str
+        Sources of what it has in common with others: modules of their own, so that their functions are compiled once
+        for all. All names of theirs are known in `source`, and in those after them. Python calls none of them.
     """
+    return _loaded(source, tuple(shared))
+
+
+@cache
+def _loaded(source: str, shared: tuple[str, ...]) -> ModuleType:
+    return _callable_part(_imported(source, shared))
+
+
+def imports_source(shared: Sequence[str]) -> str:
+    """The beginning of a source that knows the names of `shared` ones: see `load_module`."""
+    shared = tuple(shared)
+    modules = [_shared(text, shared[:i]) for i, text in enumerate(shared)]
+    return "".join(f"from {module.__name__} import *\n" for module in modules)
+
+
+@cache
+def _shared(source: str, before: tuple[str, ...]) -> ModuleType:
+    module = _imported(source, before)
+    for f in _functions(module).values():
+        f.targetoptions.update(_INNER)
+    return module
+
+
+def _imported(source: str, shared: tuple[str, ...]) -> ModuleType:
+    source = imports_source(shared) + source
     versions = f"{numba.__version__} {sys.version} {_INNER}"
     key = hashlib.sha256(f"{versions}\n{source}".encode()).hexdigest()[:24]
     name = f"sympflow_kernel_{key}"
@@ -99,7 +152,28 @@ def load_module(source: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # Numba looks a function's module up by name
     spec.loader.exec_module(module)
-    return _callable_part(module)
+    for f in _functions(module).values():
+        if isinstance(f._cache, FunctionCache):
+            f._cache = _Cache(f.py_func)
+    return module
+
+
+def _functions(module: ModuleType) -> dict[str, CPUDispatcher]:
+    """The compiled functions that a module defines, without those that it imports."""
+    found = {name: f for name, f in vars(module).items() if isinstance(f, CPUDispatcher)}
+    return {name: f for name, f in found.items() if f.py_func.__module__ == module.__name__}
+
+
+class _Cache(FunctionCache):
+    """Numba's cache on disk, for processes that compile the same shared functions at once.
+
+    Numba reads the index of what is there, writes a file beside it, and then the index: two processes in between each
+    other would give two files one name.
+    """
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with _locked(".index-lock"):
+            super().save_overload(sig, data)
 
 
 def _callable_part(module: ModuleType) -> ModuleType:
@@ -108,10 +182,11 @@ def _callable_part(module: ModuleType) -> ModuleType:
     The others are compiled without an entry from Python, which for functions as small as these is a third of the time
     that compilation takes. Such a function must not be called: so the part has none.
     """
-    functions = {name: f for name, f in vars(module).items() if isinstance(f, CPUDispatcher)}
+    functions = _functions(module)
     part = ModuleType(module.__name__)
-    for name in vars(module).keys() - functions.keys():
-        setattr(part, name, getattr(module, name))
+    for name, value in vars(module).items():
+        if not isinstance(value, CPUDispatcher):
+            setattr(part, name, value)
     inner = {name for f in functions.values() for name in f.py_func.__code__.co_names if name != f.__name__}
     for name, f in functions.items():
         if name in inner - _CALLED:
@@ -123,16 +198,20 @@ def _callable_part(module: ModuleType) -> ModuleType:
 
 @contextmanager
 def compiling_alone() -> Iterator[None]:
-    """Keep other processes that say so from compiling what is inside: the next one finds it in the cache on disk.
+    """Keep other processes that say so from compiling what is inside: the next one finds it in the cache on disk."""
+    with _locked(".lock"):
+        yield
 
-    Numba's index of that cache would lose what two processes add to it at once.
-    """
+
+@contextmanager
+def _locked(name: str) -> Iterator[None]:
+    """Keep other processes from what is inside, by a file of that name in `cache_folder`."""
     try:
         import fcntl
 
         folder = cache_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        file = open(folder / ".lock", "w")  # noqa: SIM115
+        file = open(folder / name, "w")  # noqa: SIM115
     except (ImportError, OSError, RuntimeError):  # Windows; no folder that can be written
         yield
         return
@@ -217,7 +296,7 @@ def run_rows(rows: Callable[[slice, np.ndarray], None], n_rows: int, work_per_ro
 def _run_in_threads(calls: Sequence[Callable[[np.ndarray], T]]) -> list[T]:
     stop = np.zeros(1, dtype=np.int64)
     with ThreadPoolExecutor(len(calls)) as pool:
-        futures = [pool.submit(call, stop) for call in calls]
+        futures = [pool.submit(copy_context().run, call, stop) for call in calls]  # with the limit of `at_most`
         try:
             return [future.result() for future in futures]
         except BaseException:  # of the user's, most likely: the threads need not go on

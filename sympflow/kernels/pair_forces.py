@@ -1,4 +1,4 @@
-"""Forces between pairs of bodies as code: the sums over pairs of a `PairsHamiltonian`, for any number of bodies.
+"""Compiled loops of splitting methods on bodies that interact in pairs, any number of them, by sums over pairs.
 
 Few bodies are met one by one. Many stand in blocks of `LANES`, so that one body meets a block at a time in vector
 registers; with a cut-off they are sorted into cells, and each meets the blocks of the cells around its own. The forces
@@ -8,78 +8,152 @@ on both bodies of a pair are the same number, added to one and taken from the ot
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
+from types import ModuleType
 
 import numpy as np
 
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.kernels.codegen import statements
-from sympflow.kernels.modules import template
+from sympflow.kernels.modules import load_algebra, template
+from sympflow.kernels.sized_loops import SizedLoops, Team
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
-__all__ = ["pair_data", "pair_source"]
+__all__ = ["PairLoops"]
 
 KINDS = {"gradient": (1,), "hessian_vector": (1, 2), "bend": (2, 3)}
-"""The derivatives of V by s that are in ∇V, ∇²V·v and ∇³V(v, v)."""
+"""The derivatives of V by s that are in ∇V, ∇²V·v and ½ ∇³V(v, v)."""
 LANES = 16
 FEW = 24
 """Bodies from which blocks pay."""
+CHUNKS, WORTH_CHUNKS = 8, 100_000
+"""Chunks of a sum, which threads share, and about how many nanoseconds a sum takes from which there are more than one:
+threads wait for each other after each sum."""
+LONG = 2_000_000
+"""The same, of a run that is made stage by stage even in one thread, so that it may be interrupted soon."""
 
 
-def pair_data(local: PairsHamiltonian) -> np.ndarray:
-    """The numbers that the functions read: ε², the largest s, the box, the parameters, and the columns of bodies."""
-    end = np.inf if local.cutoff is None else local.cutoff**2 + local.softening**2
-    box = np.zeros(local.dim) if local.box is None else local.box
-    numbers = [local.softening**2, end, *box, *local.constants]
-    return np.concatenate([np.array(numbers), local.columns.ravel()])
+class PairLoops(SizedLoops):
+    """The functions that `SplittingLoops` asks for, of one system of bodies and one kind of kicks.
 
-
-def pair_source(local: PairsHamiltonian, kinds: Sequence[str]) -> str:
-    """``gradient(q, out, data)``, ``hessian_vector(q, v, out, data)`` and ``bend(q, v, out, data)``, as text.
-
-    The code is the same for all numbers of bodies, masses and parameters.
+    Parameters
+    ----------
+    local : PairsHamiltonian
+    level : int
+        See `Scheme`.
+    compensated : bool
+    rate : bool
+        True if there is friction −γp, whose numbers are the last two rows of a table.
     """
-    constants = {
-        "DIM": local.dim,
-        "COLUMNS": len(local.first),
-        "NUMBERS": 2 + local.dim + len(local.c),
-        "CUT": local.cutoff is not None,
-        "PERIODIC": local.box is not None,
-        "LANES": LANES,
-        "FEW": FEW,
-    }
-    header = "\n".join(f"{name} = {value}" for name, value in constants.items())
+
+    def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, rate: bool) -> None:
+        if level == POLYNOMIAL:
+            raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
+        n, few = local.n_bodies, local.n_bodies < FEW
+        n_chunks = CHUNKS if local.work >= WORTH_CHUNKS else 1
+        self._size = n if few else -(-n // LANES) * LANES
+        self._geometry = np.array([n, 0 if few else n_chunks], dtype=np.int64)
+        end = np.inf if local.cutoff is None else local.cutoff**2 + local.softening**2
+        box = np.zeros(local.dim) if local.box is None else local.box
+        self._values = np.array([local.softening**2, end, *box, *local.constants])
+        self._sites = np.zeros((local.dim + len(local.columns), self._size))
+        self._sites[: local.dim, :n], self._sites[local.dim :, :n] = 1 / local.masses, local.columns
+        self._dim = local.dim
+        arguments = (self._geometry, self._size, self._sites, self._values)
+        module = _module(_Code(local), level, compensated, rate)
+        super().__init__(module, compensated, local.work, n_chunks, arguments)
+
+    def _in_pieces(self, threads: int) -> bool:
+        return threads > 1 or self._work > LONG
+
+    def _states(self) -> np.ndarray:
+        return np.zeros((4 if self._compensated else 2, self._dim, self._size))
+
+    def _load(self, y: np.ndarray, X: np.ndarray, first: int) -> None:
+        self._module.loaded(y, X, first, self._geometry)
+
+    def _pack(self, X: np.ndarray, first: int, y: np.ndarray) -> None:
+        self._module.packed(X, first, y, self._geometry)
+
+    def _advanced(
+        self, team: Team, states: tuple[np.ndarray, np.ndarray], table: np.ndarray, j: int, count: int, single: bool
+    ) -> tuple[tuple[np.ndarray, np.ndarray], int]:
+        before, X = states
+        X[...] = before
+        module, link = self._module, table.shape[1] - 2
+        work = module.room(self._size, self._geometry)
+        cells = np.empty(0, dtype=np.int64), np.ones(3, dtype=np.int64)
+        for _ in range(count):
+            first, last = module.kick_of(table, j)
+            for phase in range(first, last):
+                cells = module.begun(phase, first, X, work, *cells, self._sites, self._values)
+                given = (phase, work, *cells, self._geometry, self._values)
+                team(lambda lo, hi, given=given: module.shared(lo, hi, *given), self._n_pieces)  # type: ignore[misc]
+                module.kicked(X, table, j, phase, work, self._sites)
+            module.drifted(X, table, j, self._sites)
+            j = j + 1 if single or j < link else 1
+        return (X, before), j
+
+
+class _Code:
+    """Key of the code of bodies in pairs: all that the code depends on."""
+
+    def __init__(self, local: PairsHamiltonian) -> None:
+        self.local = local
+        self.key = local.V, local.dim, local.first, local.c, local.cutoff is None, local.box is None
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Code) and self.key == other.key
+
+
+@lru_cache(maxsize=64)
+def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleType:
+    local = code.local
+    kinds = tuple(KINDS)[: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(level, 0)]
     cells = [] if local.cutoff is None else [template("cells")]
-    return "\n\n\n".join([header, *cells, *(_functions(local, kind) for kind in kinds)])
+    return load_algebra(
+        "\n\n\n".join([*cells, *(_functions(local, kind) for kind in kinds)]),
+        ("sized_states", "pairs"),
+        N_SETS=4 if compensated else 2,
+        N_FIELDS=local.dim,
+        N_HELPERS={0: 1, FORCE_GRADIENT: 2, CURVATURE: 3}[level],
+        DRIFT=0 if not rate else {0: 2, FORCE_GRADIENT: 3, CURVATURE: 4}[level],
+        DAMPED=rate,
+        HAS_GRADIENT=level > 0,
+        HAS_CURVATURE=level == CURVATURE,
+        COMPENSATED=compensated,
+        DIM=local.dim,
+        COLUMNS=len(local.first),
+        WIDTH=local.dim * (1 + (level > 0)) + len(local.first),
+        CUT=local.cutoff is not None,
+        PERIODIC=local.box is not None,
+        LANES=LANES,
+    )
 
 
 def _functions(local: PairsHamiltonian, kind: str) -> str:
-    """The sum over pairs of one kind: `kind`, and for it one body with a row of others, in blocks, and few bodies."""
+    """The sum over pairs of one kind: of a chunk of many bodies, in blocks, and of few bodies."""
     sums = _Sums(local, kind)
-    text = template("pairs").partition("# ---\n")[2]
-    for name, value in {"KIND": kind, "WIDTH": str(len(sums.own)), "(vectors, ": f"({sums.arguments}, "}.items():
-        text = text.replace(name, value)
+    text = template("pair_sums").partition("# ---\n")[2].replace("SUM", kind)
     lines = {
         "# numbers": sums.numbers(),
-        "# own": [f"{name} = Xi[{row} * LANES + lane]" for row, name in enumerate(sums.own)],
-        "# other": [f"{name} = Xj[{row} * LANES + lane]" for row, name in enumerate(sums.other)],
-        "# own of few": [f"{name} = {place}" for name, place in zip(sums.own, sums.places("i"), strict=True)],
-        "# other of few": [f"{name} = {place}" for name, place in zip(sums.other, sums.places("j"), strict=True)],
-        "# packed": [f"X[at + {row} * LANES] = {place}" for row, place in enumerate(sums.places("j"))],
+        "# own": sums.in_block("Pi", sums.own),
+        "# other": sums.in_block("Pj", sums.other),
+        "# own of few": sums.of_few("i", sums.own),
+        "# other of few": sums.of_few("j", sums.other),
         "# slopes": sums.slopes(),
         "# masked": [f"{g} = {g} if inside else 0.0" for g in sums.g],
         "# force": sums.force(),
         "# begin": [f"total_{k} = 0.0" for k in sums.axes],
         "# both lanes": [f"mine[{k} * LANES + lane] += f_{k}" for k in sums.axes]
         + [f"Fj[{k} * LANES + lane] -= f_{k}" for k in sums.axes],
-        "# both": [f"total_{k} += f_{k}" for k in sums.axes]
-        + [f"out[{_few(k, 'j', local)}] -= f_{k}" for k in sums.axes],
-        "# end": [f"out[{_few(k, 'i', local)}] += total_{k}" for k in sums.axes],
+        "# both": [f"total_{k} += f_{k}" for k in sums.axes] + [f"A[0, {k}, j] -= f_{k}" for k in sums.axes],
+        "# end": [f"A[0, {k}, i] += total_{k}" for k in sums.axes],
     }
     return _filled(text, lines)
-
-
-def _few(k: int, body: str, local: PairsHamiltonian) -> str:
-    """The place of coordinate k of a body, in unsigned integers, of which Numba asks no sign."""
-    return f"np.uint64({local.dim}) * {body} + np.uint64({k})"
 
 
 def _filled(text: str, lines: dict[str, list[str]]) -> str:
@@ -106,25 +180,32 @@ class _Sums:
     def __init__(self, local: PairsHamiltonian, kind: str) -> None:
         self.local, self.kind, self.axes = local, kind, range(local.dim)
         self.vector = kind != "gradient"
-        self.arguments = "q, v" if self.vector else "q"
-        moved = ["x", "w"] if self.vector else ["x"]
-        self.own = [f"{x}_{k}" for x in moved for k in self.axes] + [a.name for a in local.first]
-        self.other = [f"{x}_{k}_j" for x in moved for k in self.axes] + [b.name for b in local.second]
+        self.own = self._names([a.name for a in local.first], "")
+        self.other = self._names([b.name for b in local.second], "_j")
         self.g = [f"g_{k}" for k in range(len(KINDS[kind]))]
 
     def numbers(self) -> list[str]:
         """The numbers of the system."""
         local = self.local
-        lines = ["softening, end = data[0], data[1]"]
+        lines = ["softening, end = values[0], values[1]"]
         if local.box is not None:
-            lines += [f"box_{k} = data[{2 + k}]" for k in self.axes]
-        return lines + [f"{c.name} = data[{2 + local.dim + i}]" for i, c in enumerate(local.c)]
+            lines += [f"box_{k} = values[{2 + k}]" for k in self.axes]
+        return lines + [f"{c.name} = values[{2 + local.dim + i}]" for i, c in enumerate(local.c)]
 
-    def places(self, body: str) -> list[str]:
-        """The numbers of a body in the arrays that are given."""
-        arrays = ["q", "v"] if self.vector else ["q"]
-        columns = [f"data[np.uint64(NUMBERS) + np.uint64({k}) * n + {body}]" for k in range(len(self.local.first))]
-        return [f"{x}[{_few(k, body, self.local)}]" for x in arrays for k in self.axes] + columns
+    def _names(self, columns: list[str], end: str) -> list[str]:
+        moved = [[f"{x}_{k}{end}" for k in self.axes] for x in "xw"]
+        return [*moved[0], *columns, *(moved[1] if self.vector else [])]
+
+    def in_block(self, block: str, names: Sequence[str]) -> list[str]:
+        """The numbers of a body in a block, by their names."""
+        return [f"{name} = {block}[{row} * LANES + lane]" for row, name in enumerate(names)]
+
+    def of_few(self, index: str, names: Sequence[str]) -> list[str]:
+        """The numbers of one of few bodies, by their names."""
+        places = [f"X[0, {k}, {index}]" for k in self.axes]
+        places += [f"sites[{self.local.dim + k}, {index}]" for k in range(len(self.local.first))]
+        places += [f"A[v, {k}, {index}]" for k in self.axes] if self.vector else []
+        return [f"{name} = {place}" for name, place in zip(names, places, strict=True)]
 
     def slopes(self) -> list[str]:
         """The differences d_k and u_k, s, and the derivatives of V there."""
@@ -145,5 +226,5 @@ class _Sums:
             lines.append("along, beside = g_1 * e, g_0")
         else:
             square = " + ".join(f"u_{k} * u_{k}" for k in self.axes)
-            lines.append(f"along, beside = g_1 * e * e + g_0 * ({square}), 2.0 * g_0 * e")
+            lines.append(f"along, beside = 0.5 * (g_1 * e * e + g_0 * ({square})), g_0 * e")
         return lines + [f"f_{k} = along * d_{k} + beside * u_{k}" for k in self.axes]

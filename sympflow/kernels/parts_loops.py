@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
-from sympflow.kernels.modules import NEVER, load_algebra
+from sympflow.kernels.loop_functions import states_source
+from sympflow.kernels.modules import NEVER, given, load_algebra
 from sympflow.kernels.output_loops import row_products
 from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
 from sympflow.kernels.protocol import NOTHING, Carry, Kernel, Run, Steps, run_state, run_states
@@ -117,7 +118,7 @@ class PartsLoops:
                 self._coefficients.clear()
             known = self._coefficients[id(sequence)] = sequence, *self._coefficient_table(sequence)
         out = np.empty(y.shape)
-        functions, t = self.functions(sequence), np.ascontiguousarray(t, dtype=np.float64)
+        functions, t = self.functions(sequence), given(t)
         functions.step_lanes(*known[1:], dt, t, self.modes(y), self.mixed, out)
         return self.states(out)
 
@@ -144,7 +145,7 @@ class PartsLoops:
 
     def modes(self, y: np.ndarray) -> np.ndarray:
         """The input of the loops: modes where these are mixed, else states."""
-        y = np.ascontiguousarray(y, dtype=np.float64)
+        y = given(y)
         if not self.mixed:
             return y
         parts, d = self.parts, self.parts.ndof
@@ -171,7 +172,7 @@ class PartsLoops:
             raise ValueError("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
         if (filters, gradients) not in self._variants:
             algebra = parts_source(self.parts, filters, gradients)
-            module = load_algebra(algebra, ["aligned", "part_maps"], COMPENSATED=False)
+            module = load_algebra(algebra, ["part_maps"], [states_source(self.parts.ndof)])
             self._variants[filters, gradients] = LoopFunctions(
                 module.rollout,
                 module.rollout_lanes,

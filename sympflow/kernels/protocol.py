@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.kernels.carry import Carry
-from sympflow.kernels.modules import run_one, run_rows
+from sympflow.kernels.modules import given, run_one, run_rows
 
 __all__ = ["Carry", "Kernel", "Run", "Steps", "run_state", "run_states"]
 
@@ -62,7 +62,7 @@ def run_state(
     out : ndarray of shape (n, 2d), optional
         Where the states go.
     """
-    y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+    y0, save = given(y0), given(save, np.int64)
     if out is None:
         out = np.empty((len(save), len(y0)))
     first, running = 0, NOTHING[0]
@@ -88,7 +88,7 @@ def run_states(
 
     `rollout` is called with the rows that it is to run before everything else, and with their `n_finite` after `out`.
     """
-    y0, save = np.ascontiguousarray(y0, dtype=np.float64), np.ascontiguousarray(save, dtype=np.int64)
+    y0, save = given(y0), given(save, np.int64)
     out, n_finite = np.empty((len(y0), len(save), y0.shape[1])), np.empty(len(y0), dtype=np.int64)
     first, running, before = 0, NOTHING[1], None
     if carry is not None:

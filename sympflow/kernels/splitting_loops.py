@@ -14,15 +14,16 @@ from numpy.typing import ArrayLike
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.loop_functions import (
-    LOCAL,
     LoopFunctions,
     array_loops,
     damped_drift,
     driven_loops,
     family_loops,
+    local_loops,
     symbolic_loops,
     takes_values,
 )
+from sympflow.kernels.modules import given
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
 from sympflow.kernels.stages import StageTable, run_table, step_table
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
@@ -66,6 +67,8 @@ class SplittingLoops:
         Of what depends on parameters of H alone: arguments of the loops, so that systems which differ in them share
         these. With friction, and in kicks with force gradients, the values are part of the code, unless H depends on t
         or each trajectory of a batch has its own.
+    work : int
+        About how many nanoseconds a kick takes.
     driven : bool
         True if H depends on t.
     closes : bool
@@ -75,6 +78,7 @@ class SplittingLoops:
     def __init__(self, system: HamiltonianSystem) -> None:
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
+        self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.closes = False
         self.driven = not system.autonomous
         if not system.separable:
@@ -105,14 +109,14 @@ class SplittingLoops:
                 array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, self.driven, damped
             )
         elif system.local is not None:
-            make, takes_rate, self.closes = LOCAL[system.local.loops]
-            if system.damping is not None and (system.damping.ndim or not takes_rate):
-                has = "one rate of friction for all momenta" if takes_rate else "no friction"
+            if system.damping is not None and system.damping.ndim:
                 raise ValueError(
-                    f"`system` {system.name!r} has friction, and its loops take {has}: use backend='array'."
+                    f"`system` {system.name!r} has friction, and its loops take one rate for all momenta: use "
+                    "backend='array'."
                 )
+            self.closes = True
             self._has_force_gradient = system.quadratic_kinetic
-            self._compile = partial(make, system)
+            self._compile = partial(local_loops, system)
         else:
             raise ValueError(
                 "`system` cannot be compiled: it is given by plain functions. Define it with "
@@ -231,10 +235,10 @@ class SplittingLoops:
         ranges
             Of positions: see `functions`.
         """
-        y = np.ascontiguousarray(y, dtype=np.float64)
+        y = given(y)
         out = np.empty((len(y), 2 * self.ndof))
-        x, h = np.ascontiguousarray(x), np.ascontiguousarray(h)
-        t = np.ascontiguousarray(np.broadcast_to(np.asarray(t, dtype=np.float64), h.shape)) if self.driven else h
+        x, h = given(x), given(h)
+        t = given(np.broadcast_to(t, h.shape)) if self.driven else h
         functions = self.functions(table.level, False, monomials, varied, ranges)
         functions.step_rows(self.rows(table, varied=varied), x, h, t, y, out)
         return out
@@ -264,7 +268,7 @@ class SplittingKernel(Kernel):
     ) -> Run:
         """`n_steps` steps of length `h` from one state: see `Kernel`."""
         table = self.table(h, t0)
-        work = table.shape[1] * self.loops.ndof
+        work = table.shape[1] * self.loops.work
         return run_state(partial(self._functions().rollout, table), y0, n_steps, save, carry, self._width, work)
 
     def run_batch(
@@ -284,7 +288,7 @@ class SplittingKernel(Kernel):
         def rows(i: slice, _: np.ndarray, *rest: Any) -> None:
             rollout(table, start[i], *rest)
 
-        work = table.shape[1] * self.loops.ndof
+        work = table.shape[1] * self.loops.work
         return run_states(rows, y0, n_steps, save, threads, carry, self._width, work)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
@@ -299,7 +303,7 @@ class SplittingKernel(Kernel):
 
     def _rows(self, y: np.ndarray, goes_on: bool = False) -> np.ndarray:
         """The states of a batch (N, 2d) as the loops read them; a run that goes on reads no states from them."""
-        return np.ascontiguousarray(y, dtype=np.float64)
+        return given(y)
 
     def _functions(self) -> LoopFunctions:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, ranges=self._ranges)

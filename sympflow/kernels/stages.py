@@ -17,13 +17,14 @@ __all__ = [
     "StageTable",
     "TimeAlone",
     "TimedNumbers",
-    "WithSystem",
     "kicks_of",
     "lanes_source",
     "numbers_of_kicks",
+    "numbers_source",
     "run_table",
     "single_table",
     "stages_source",
+    "step_constants",
     "step_table",
     "time_lines",
     "two_stages_source",
@@ -360,27 +361,27 @@ def damped(p, a):
 
 _DRIFT_OF = """@njit(**OPTIONS, forceinline=True)
 def drift_of(table, j):
-    return {stages}[0, j]"""
+    return table[0, j]"""
 _TABLE = """@njit(**OPTIONS, forceinline=True)
 def columns_of(table):
-    return {stages}.shape[1]
+    return table.shape[1]
 
 
 @njit(**OPTIONS)
 def first_coefficients(table):
-    return {first}
+    return table[:, :, 0]
 
 
 @njit(**OPTIONS)
 def drift_at(table, j, x):
-    return polynomial({stages}[0, j], x)"""
+    return polynomial(table[0, j], x)"""
 
 
 class TimedNumbers(Protocol):
     """The numbers of kicks and drifts as code, where they depend on the time."""
 
     def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
-        """``numbers_of`` and ``numbers_at`` of `stages_source`, of tables as `StageTable.timed_rows` makes them.
+        """``numbers_of`` and ``numbers_at`` of `numbers_source`, of tables as `StageTable.timed_rows` makes them.
 
         `n_rows` are the rows of a table before those of the values of parameters and of the time.
         """
@@ -413,21 +414,6 @@ def numbers_at(table, j, x, h, t):
     return ({", ".join([*values, "time"])})"""
 
 
-class WithSystem:
-    """The numbers of kicks, and after them the array of a system's own numbers: a table is (stages, numbers, M⁻¹)."""
-
-    def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
-        numbers, values = numbers_of_kicks(kinds, "table[0]")
-        return f"""@njit(**OPTIONS)
-def numbers_of(table, j, k=0):
-    return ({", ".join([*numbers, "table[1]"])})
-
-
-@njit(**OPTIONS)
-def numbers_at(table, j, x, h, t):
-    return ({", ".join([*values, "table[1]"])})"""
-
-
 def time_lines(row: int) -> tuple[str, str]:
     """The time of kick j of step k of a run, and in a step h from t on; `row` is the first of those of the time."""
     return (
@@ -436,16 +422,16 @@ def time_lines(row: int) -> tuple[str, str]:
     )
 
 
-def numbers_of_kicks(kinds: Sequence[Kick], stages: str = "table") -> tuple[list[str], list[str]]:
+def numbers_of_kicks(kinds: Sequence[Kick]) -> tuple[list[str], list[str]]:
     """The numbers of kicks as code: those of a run, and those of a step h by polynomials in x."""
     rows = range(1, 1 + len(kinds[0].numbers))
     steps = {1: "h", 3: "h ** 3", 5: "h ** 5"}
-    values = [f"{steps[n]} * polynomial({stages}[{i}, j], x)" for i, n in zip(rows, kinds[0].powers, strict=True)]
-    return [f"{stages}[{i}, j]" for i in rows], values
+    values = [f"{steps[n]} * polynomial(table[{i}, j], x)" for i, n in zip(rows, kinds[0].powers, strict=True)]
+    return [f"table[{i}, j]" for i in rows], values
 
 
 def _numbers_source(kinds: Sequence[Kick], n_parameters: int, n_rows: int) -> str:
-    """``numbers_of`` and ``numbers_at`` of `stages_source`, of a system that does not depend on the time."""
+    """``numbers_of`` and ``numbers_at`` of `numbers_source`, of a system that does not depend on the time."""
     numbers, values = numbers_of_kicks(kinds)
     constant = range(n_rows, n_rows + n_parameters)
     numbers += [f"table[{i}, j]" for i in constant]
@@ -460,21 +446,40 @@ def numbers_at(table, j, x, h, t):
     return ({", ".join(values)}, )"""
 
 
+def numbers_source(
+    kinds: Sequence[Kick],
+    friction: DampedDrift | None = None,
+    n_parameters: int = 0,
+    driving: TimedNumbers | None = None,
+) -> str:
+    """The functions of the text `loops` that read the numbers of stages; without `driving` systems may share them.
+
+    ``numbers_of(table, j, k)`` are the numbers of kick j of step k, ``numbers_at(table, j, x, h, t)`` those of a step h
+    by polynomials in x that begins at the time t; the values of the parameters of H come after them. ``drift_of(table,
+    j)`` are those of a drift. `FIRST_VALUE` is the row of a table with the first of the values.
+    """
+    first, n_rows = 1 + len(kinds[0].numbers), _rows_before_values(kinds, friction)
+    numbers = _numbers_source(kinds, n_parameters, n_rows) if driving is None else driving.source(kinds, n_rows)
+    return f"""FIRST_VALUE = {n_rows}
+
+
+{numbers}
+
+
+{_TABLE}
+
+
+{_DRIFT_OF if friction is None else friction.source(first)}"""
+
+
 def stages_source(
     kinds: Sequence[Kick],
     scheduled: bool,
     friction: DampedDrift | None = None,
     n_parameters: int = 0,
     driving: TimedNumbers | None = None,
-    stages: str = "table",
 ) -> str:
-    """The functions of the text `loops` that depend on the kinds of kick, on friction and on the time.
-
-    ``numbers_of(table, j, k)`` are the numbers of kick j of step k, ``numbers_at(table, j, x, h, t)`` those of a step h
-    by polynomials in x that begins at the time t; the values of the parameters of H come after them. ``drift_of(table,
-    j)`` are those of a drift. `stages` is the array of these numbers, by the `table` that the loops are given.
-    ``stage`` is a kick and a drift of one trajectory. `FIRST_VALUE` is the row of a table with the first of the values.
-    """
+    """``stage`` of the text `loops`, a kick and a drift of one trajectory."""
     given = "numbers, " if n_parameters else ""
     drifted = f"return move(q, q_error, drift(p, a, {given}work))"
     if scheduled:
@@ -483,22 +488,7 @@ def stages_source(
     moved = [move.format(p="p", a="a")] if friction is None else friction.drifted(move)
     end = [*moved, "return q, p, q_error, p_error"]
     begin = ["fill_coefficients(numbers, work[j])"] if driving is not None and scheduled else []
-    first, n_rows = 1 + len(kinds[0].numbers), _rows_before_values(kinds, friction)
-    table = {"stages": stages, "first": "table[:, :, 0]" if stages == "table" else "table"}
-    numbers = _numbers_source(kinds, n_parameters, n_rows) if driving is None else driving.source(kinds, n_rows)
-    return f"""FIRST_VALUE = {n_rows}
-
-
-{numbers}
-
-
-{_TABLE.format(**table)}
-
-
-{_DRIFT_OF.format(**table) if friction is None else friction.source(first)}
-
-
-@njit(**OPTIONS, forceinline=True)
+    return f"""@njit(**OPTIONS, forceinline=True)
 def drift_by(q, p, q_error, {given}a, work):
     {drifted}
 
@@ -562,20 +552,19 @@ def lanes_source(
         return _over_lanes([errors, *kicked, drifted, stored])
 
     def each(kick: Kick) -> list[str]:
-        steps, places = {1: "H", 3: "H3", 5: "H5"}, range(len(kick.numbers))
-        filled = [f"fill_lanes(Y, width, NUMBERS + {i}, table[{i + 1}, j], {steps[kick.powers[i]]})" for i in places]
-        if not varied:
-            filled += [f"value_{i} = table[FIRST_VALUE + {i}, j, 0]" for i in values]
+        taken = [] if varied else [f"value_{i} = table[FIRST_VALUE + {i}, j, 0]" for i in values]
         value = "Y[NUMBERS + N_NUMBERS + {0}, lane], " if varied else "value_{0}, "
-        numbers = "".join([f"Y[NUMBERS + {i}, lane], " for i in places] + [value.format(i) for i in values])
+        numbers = "".join(
+            [f"Y[NUMBERS + {i}, lane], " for i in range(len(kick.numbers))] + [value.format(i) for i in values]
+        )
         drifted = f"q, _ = move(q, None, drift(p, Y[A, lane], {given}None))"
-        return [*filled, *_over_lanes([f"numbers = ({numbers})", *kick.application(True, lane=True), drifted])]
+        return [*taken, *_over_lanes([f"numbers = ({numbers})", *kick.application(True, lane=True), drifted])]
 
     # Kinds are told apart outside the loops: a loop with a branch in it, once it is long, is no longer made of vector
     # instructions.
     passed = "common" if varied else "numbers"
     own = varied and scheduled and driving is None and len(kinds) == 1
-    before = f"OWN = {own}\n\n\n"
+    before = f"OWN = {own}\nN_NUMBERS = {n_numbers}\n\n\n"
     if not varied or driving is None:
         before += "common_of = numbers_of\n\n\n"
     if varied:
@@ -589,15 +578,19 @@ def stage_lanes(Y, error, width, {passed}, a):
         return source
     if own:
         source += "\n\n\n" + _own_stages_source(friction, n_parameters)
-    return f"""N_NUMBERS = {n_numbers}
-
-
-{source}
+    return f"""{source}
 
 
 @njit(**OPTIONS, inline="always")
 def stage_each(Y, width, table, j):
-    {_cases(kinds, "np.any(table[{1}, j] != 0.0)", [each(kick) for kick in kinds])}"""
+    n = fill_lanes(Y, width, table, j)
+    {_cases(kinds, "n == {1}", [each(kick) for kick in kinds])}"""
+
+
+def step_constants(kinds: Sequence[Kick]) -> dict[str, Any]:
+    """The constants of the text `lane_numbers`."""
+    powers = (1, *kinds[0].powers)  # of the step length, those of the drift and of the numbers of kicks
+    return {"N_NUMBERS": len(kinds[0].numbers), "FEWEST": len(kinds[-1].numbers), "STEP_POWERS": powers}
 
 
 def _lane_source(n_numbers: int, n_parameters: int) -> str:

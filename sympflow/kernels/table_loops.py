@@ -238,7 +238,7 @@ def _compiled(
             source, text = both, both.text()
     width, d = source.width, form.ndof
     outputs = (*range(d), *range(width, width + d), *range(width + d, 2 * width))
-    constants = {"WIDTH": width, "TERMS": source.terms, "TAPE": source.tape, "OUTPUTS": outputs}
+    constants: dict[str, Any] = {"WIDTH": width, "TERMS": source.terms, "TAPE": source.tape, "OUTPUTS": outputs}
     return load_algebra(text, ("aligned", "table_rows"), **constants).table_rows, source.terms
 
 

@@ -11,8 +11,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.loop_functions import damped_drift
-from sympflow.kernels.modules import load_algebra, run_rows, template
+from sympflow.kernels.loop_functions import damped_drift, shared_by_lanes
+from sympflow.kernels.modules import load_algebra, run_rows
 from sympflow.kernels.splitting_loops import damped_table, splitting_loops
 from sympflow.kernels.stages import DampedDrift, kicks_of, lanes_source, run_table, stages_source, two_stages_source
 from sympflow.schemes import Scheme
@@ -171,7 +171,7 @@ def _rollout(
         two_stages_source(kinds, friction, n),
         kicks_source(symbols, level, monomials, vectors),
     ]
-    constants = {"COMPENSATED": False, "SCHEDULED": True, "DRIVEN": False, "N_VALUES": 0}
-    constants |= {"VECTORS": vectors, "SINGLE": single}
-    texts = ("loops", "aligned", "lanes", "tangents")
-    return load_algebra("\n\n\n".join([template("elementary"), *sources]), texts, **constants).rollout_tangents
+    constants = {"SCHEDULED": True, "DRIVEN": False, "VECTORS": vectors, "SINGLE": single}
+    shared = shared_by_lanes(symbols.ndof * (1 + vectors), kinds, friction, n, False, 0)
+    texts = ("loops", "lanes", "tangents")
+    return load_algebra("\n\n\n".join(sources), texts, shared, **constants).rollout_tangents

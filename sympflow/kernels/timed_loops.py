@@ -131,7 +131,7 @@ def _loops(system: HamiltonianSystem) -> ModuleType:
     assert symbols is not None
     loops = _LOOPS.get(symbols)
     if loops is None:
-        after = ("loops", "aligned", "lanes", "elapsed_times")
+        after = ("loops", "lanes", "elapsed_times")
         loops = _LOOPS[symbols] = symbolic_module(symbols, algebra_source(symbols), 0, False, after)
     return loops
 

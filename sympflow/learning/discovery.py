@@ -1,7 +1,7 @@
 """`discover`: the Hamiltonian behind trajectories, or behind a trained flow, as a sparse sum of terms.
 
 A first model is a regression of smoothed derivatives. From there terms are added and dropped one at a time. Each model
-on the way is refined by shooting from latent initial states (`latent_states`), so that the noise of the states biases
+on the way is refined by shooting from latent initial states (`shooting`), so that the noise of the states biases
 no coefficient; the linearized problem tells at once what each term that is missing would gain. The extended
 Bayesian criterion decides, which counts how many terms there were to choose from.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -22,9 +22,10 @@ from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning import diagnosis
-from sympflow.learning.latent_states import STEPS, Fit, Shooting
+from sympflow.learning.fitting import STEP_ERROR, limit_of
 from sympflow.learning.library import Library, library_for
 from sympflow.learning.regression import Regression
+from sympflow.learning.shooting import Fit, Method, Problem, chosen_method, minimized
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Run, Trajectories
 
@@ -35,10 +36,22 @@ RADIANS = 6.0
 """Length of the pieces that are shot through, in the mean angular rate of the data: about one period."""
 FLOOR = 1e-6
 """Least noise, over the spread of a coordinate: below it a formula would explain the errors of the scheme."""
-STEP_ERROR = 0.1
-"""Largest change of a prediction, over the noise, when the steps of the scheme are halved."""
+STEP = 0.1
+"""Step of the system that is made, in the mean angular rate of the data."""
+STEP_SHARE = 0.02
+"""Error of the scheme from one point to the next, over the noise."""
+STEPS = 40
+"""Most steps of a fit."""
+SETTLED = 0.05
+"""Change of the noise, relative, that ends its estimation."""
+CONVERGED = 1e-7
+"""Decrease of the squares, relative, at which a fit ends."""
 UNEXPLAINED = 1.3
 """Residual over the noise from which a model does not explain the data."""
+QUIET = 0.5
+"""Residual over the noise that was given, below which that is too large."""
+LOUD = 1.5
+"""Residual over the noise that is seen without a model, up to which that may be all."""
 BEYOND = 2
 """Terms by which the path goes on beyond the model that is chosen."""
 WORTH = 0.5
@@ -96,7 +109,7 @@ class Discovery:
     explains : bool
         False if the model leaves more than noise.
     remark : str
-        What the data say where no model explains them.
+        What the data say where no model explains them, or where the noise that was given is too large.
     path : tuple of Model
         The best model of each number of terms.
     library : tuple of sympy.Expr
@@ -181,6 +194,7 @@ def discover(
     noise: float | ArrayLike | None = None,
     held_out: float = 0.2,
     piece: float | None = None,
+    loss: str = "squares",
     most_terms: int = 40,
     domain: Domain | None = None,
     seed: int = 0,
@@ -209,6 +223,8 @@ def discover(
     piece : float, optional
         The longest time that is shot through from one latent state: for chaotic data a Lyapunov time or two. The
         default is about one period.
+    loss : {"squares", "huber"}
+        "huber" for data with outliers.
     most_terms : int
         The most terms of a model.
     domain : Domain, optional
@@ -233,7 +249,8 @@ def discover(
     -----
     UserWarning
         If no model explains the data: its residuals are larger than their noise. The message says by how much, and
-        what the data rather look like: friction, velocities in place of momenta, columns in another order.
+        what the data rather look like: friction, velocities in place of momenta, columns in another order. If the noise
+        that was given is much larger than the residuals.
 
     Raises
     ------
@@ -253,19 +270,21 @@ def discover(
         return _of_flow(data, terms, degree, most_terms, domain, seed, name)
     trajectories = Trajectories.read(data, ndof, **reading)
     trajectories.check_moving()
+    trajectories.check_angles(None if reading.get("period") is None else np.full(trajectories.ndof, True))
     if not 0 <= held_out < 1:
         raise ValueError(f"`held_out` must be at least 0 and less than 1; got {held_out!r}: 0.2 keeps a fifth.")
     if piece is not None and not piece > 0:
         raise ValueError(f"`piece` must be a positive time; got {piece!r}: leave it out for about one period.")
+    huber = limit_of(loss)
     search = _Search(
-        trajectories, terms, degree, noise, held_out, piece, most_terms, seed, progress or (lambda _: None)
+        trajectories, terms, degree, noise, held_out, piece, huber, most_terms, seed, progress or (lambda _: None)
     )
     discovery = search.run()
     box = np.array([trajectories.states.min(0), trajectories.states.max(0)])
     first = max(trajectories.runs, key=lambda run: run.span)
     scene = {"domain": domain or Box(box[0].tolist(), box[1].tolist()), "y0": trajectories.states[0]}
-    system = _system(discovery, trajectories.ndof, name=name, t_span=(0.0, first.span), dt=search.step, **scene)
-    if not discovery.explains:
+    system = _system(discovery, trajectories.ndof, name=name, t_span=(0.0, first.span), dt=STEP / search.rate, **scene)
+    if discovery.remark:
         warnings.warn(discovery.remark, stacklevel=2)
     return system
 
@@ -291,11 +310,12 @@ class _Search:
         noise: Any,
         held_out: float,
         piece: float | None,
+        huber: float | None,
         most_terms: int,
         seed: int,
         say: Callable[[str], None],
     ) -> None:
-        self.data, self.say, self.most_terms = data, say, most_terms
+        self.data, self.say, self.most_terms, self.huber = data, say, most_terms, huber
         self.known = _noise(noise, 2 * data.ndof)
         n = len(data.runs)
         drawn = np.random.default_rng(seed).permutation(n).tolist()
@@ -309,7 +329,8 @@ class _Search:
         if not len(points):
             raise ValueError("`data` has no two successive points with all values: discover needs whole states.")
         shown = points[np.random.default_rng(seed).permutation(len(points))[:COMPARED]]
-        self.library, self.superfluous = library_for(terms, data.ndof, degree, shown)
+        library, self.superfluous = library_for(terms, data.ndof, degree, shown)
+        self.library = library.by_kind()
         K = len(self.library)
         if not K:
             raise ValueError("`terms` has no term that changes over the data: give others.")
@@ -326,13 +347,17 @@ class _Search:
         longest = max(run.span for run in data.runs)
         self.rate = max(self.rate, 1e-3 / longest)
         self.piece = RADIANS / self.rate if piece is None else piece
-        tolerance = 0.02 * float((np.maximum(self.expected, self.floor) / data.scales).min())
-        self.step = float(np.clip((1000 * tolerance / RADIANS) ** 0.25, 0.02, 0.25)) / self.rate
-        self.fits: dict[frozenset[int], Fit | None] = {}
-        self.shooting = self._shooting(self.fitted)
+        self.refined = 0
+        self._begin()
 
-    def _shooting(self, index: list[int]) -> Shooting:
-        """Pieces of some trajectories, each from the smoothed state at its start."""
+    def _begin(self) -> None:
+        """Cut the trajectories into pieces, and forget all fits."""
+        self.pieces, self.starts = self._cut(self.fitted)
+        self.methods: dict[bool, Method] = {}
+        self.fits: dict[frozenset[int], Fit | None] = {}
+
+    def _cut(self, index: Iterable[int]) -> tuple[Trajectories, np.ndarray]:
+        """Pieces of some trajectories, and the smoothed states (P, 2d) at their starts."""
         starts: list[np.ndarray] = []
         pieces: list[Run] = []
         for i in index:
@@ -341,18 +366,18 @@ class _Search:
             at = np.cumsum([0, *(piece.n_points for piece in one[:-1])])
             pieces += one
             starts += list(self.smooth.states[i][:, at].T)
-        return Shooting(replace(self.data, runs=tuple(pieces)), np.array(starts), self.step)
+        return replace(self.data, runs=tuple(pieces)), np.array(starts)
 
     def run(self) -> Discovery:
         sigma = self.known if self.known is not None else np.maximum(self.smooth.sigma, 1e-2 * self.data.scales)
         self.sigma = np.maximum(sigma, self.floor)
         chosen = self._steps(self._first())
         for _ in range(3):  # steps short enough for the model that was found
-            if self._step_error(chosen) <= STEP_ERROR:
+            fit = self._known(chosen)
+            if fit.step_error(fit.problem.sigma) <= STEP_ERROR:
                 break
-            self.step /= 2
-            self.fits.clear()
-            self.shooting = self._shooting(self.fitted)
+            self.refined += 1
+            self._begin()
             chosen = self._steps(chosen)
         return self._record(chosen, self._path(chosen))
 
@@ -376,32 +401,51 @@ class _Search:
             if starts:
                 return min(starts, key=self._criterion)
             self.piece /= 2
-            self.fits.clear()
-            self.shooting = self._shooting(self.fitted)
+            self._begin()
         raise ValueError(
             "`data` cannot be followed by any model of the library, however short the pieces: give other `terms`, or "
             "look whether the columns are q1 … qd, p1 … pd."
         )
 
+    def _known(self, active: Sequence[int]) -> Fit:
+        """The fit of a model that was fitted, and did not diverge."""
+        fit = self.fits[frozenset(active)]
+        assert fit is not None
+        return fit
+
+    def _problem(self, active: Sequence[int], theta: np.ndarray, sigma: np.ndarray) -> Problem:
+        """Shooting for some of the terms; the scheme and its step are chosen once for separable H, once for others."""
+        model = self.library.subset(active).model()
+        if model.separable not in self.methods:
+            noise = np.maximum(self.expected, self.floor)
+            method = chosen_method(model, theta, self.pieces, STEP_SHARE * noise)
+            self.methods[model.separable] = replace(method, longest=method.longest / 2**self.refined)
+        return Problem(model, self.pieces, self.methods[model.separable], sigma, huber=self.huber)
+
+    def _minimized(self, problem: Problem, theta: np.ndarray, states: np.ndarray, steps: int = STEPS) -> Fit | None:
+        """The minimum, where the noise is estimated unless it is known; None if orbits diverge."""
+        for _ in range(1 if self.known is not None else 5 if steps == STEPS else 2):
+            fit = minimized(problem, theta, states, iterations=steps, gain=CONVERGED, patience=1)
+            if not math.isfinite(fit.cost):
+                return None
+            found = np.maximum(fit.noise(), self.floor)
+            settled = np.abs(np.log(found / problem.sigma)).max() < SETTLED
+            problem, theta, states = replace(problem, sigma=found), fit.theta, fit.states
+            if settled:
+                break
+        return fit
+
     def _fit(self, active: Sequence[int], before: Fit | None = None, steps: int = STEPS) -> Fit | None:
-        """The fit of the terms, in ascending order, its noise estimated unless it is known; None if it diverges."""
+        """The fit of the terms, in ascending order; None if it diverges."""
         key = frozenset(active)
         if key in self.fits:
             return self.fits[key]
-        library = self.library.subset(list(active))
         theta = np.array([self.guess.get(k, 0.0) for k in active])
-        x0, sigma = (self.shooting.starts, self.sigma) if before is None else (before.x0, before.sigma)
-        fit = self.shooting.fit(library, theta, x0, sigma, steps=steps)
+        states, sigma = (self.starts, self.sigma) if before is None else (before.states, before.problem.sigma)
+        problem = self._problem(active, theta, sigma)
+        fit = self._minimized(problem, theta, states, steps)
         if fit is None and before is not None:
-            fit = self.shooting.fit(library, theta, self.shooting.starts, sigma, steps=steps)
-        for _ in range(0 if self.known is not None else 4 if steps == STEPS else 1):
-            if fit is None:
-                break
-            found = np.maximum(fit.noise, self.floor)
-            settled = np.abs(np.log(found / fit.sigma)).max() < 0.05
-            fit = self.shooting.fit(library, fit.theta, fit.x0, found, steps=steps)
-            if settled:
-                break
+            fit = self._minimized(problem, theta, self.starts, steps)
         self.fits[key] = fit
         if fit is not None:
             self.guess = self.guess | dict(zip(active, fit.theta, strict=True))
@@ -413,14 +457,12 @@ class _Search:
         fit = self.fits[frozenset(active)]
         if fit is None:
             return math.inf
-        counts = np.maximum(self.shooting.counts - len(self.shooting.starts), 1)  # less the latent states
         if self.known is not None:
-            sigma = np.maximum(self.known, self.floor)
-            misfit = float((fit.squares / sigma**2).sum())
+            misfit = fit.cost
         else:
-            misfit = float(
-                (counts * np.log(np.maximum(fit.squares / counts, self.floor**2) / self.data.scales**2)).sum()
-            )
+            counts = np.maximum(fit.counts - len(self.starts), 1)  # less the latent states
+            shares = fit.counts / counts * fit.variances
+            misfit = float((counts * np.log(np.maximum(shares, self.floor**2) / self.data.scales**2)).sum())
         return misfit + len(active) * self.penalty
 
     def _steps(self, active: list[int]) -> list[int]:
@@ -442,7 +484,7 @@ class _Search:
         fit = self.fits[frozenset(active)]
         if fit is None or len(active) < 2:
             return None
-        significance = fit.theta**2 / np.maximum(np.diag(fit.covariance), 1e-300)
+        significance = fit.theta**2 / np.maximum(np.diag(fit.covariance()), 1e-300)
         for weakest in np.argsort(significance)[:2]:
             rest = [k for i, k in enumerate(active) if i != weakest]
             if self._fit(rest, fit, steps) is not None:
@@ -455,29 +497,29 @@ class _Search:
         others = [k for k in range(len(self.library)) if k not in active]
         if fit is None or not others or len(active) >= self.most_terms:
             return None
-        gains = self.shooting.gains(self.library.subset(active), fit, self.library.subset(others))
+        gains = self._gains(active, fit)
         least = 0.0 if anyhow else WORTH * self.penalty
-        best = [int(i) for i in np.argsort(gains)[::-1][: 1 if anyhow else 3] if gains[i] > least]
+        best = [int(k) for k in np.argsort(gains)[::-1][: 1 if anyhow else 3] if gains[k] > least]
         found: list[int] | None = None
-        for i in best:
-            self.guess = self.guess | {others[i]: 0.0}
-            wider = sorted([*active, others[i]])
+        for k in best:
+            self.guess = self.guess | {k: 0.0}
+            wider = sorted([*active, k])
             if self._fit(wider, fit) is not None and (found is None or self._criterion(wider) < self._criterion(found)):
                 found = wider
             if found is not None and self._criterion(found) < self._criterion(active):
                 break
         return found
 
-    def _step_error(self, active: list[int]) -> float:
-        fit = self.fits[frozenset(active)]
-        assert fit is not None
-        library = self.library.subset(active)
-        fine = Shooting(self.data, self.shooting.starts, self.step / 2)
-        fine.spans, fine.y, fine.seen = self.shooting.spans, self.shooting.y, self.shooting.seen
-        difference = fine.predictions(library, fit.theta, fit.x0) - self.shooting.predictions(
-            library, fit.theta, fit.x0
-        )
-        return float((np.abs(difference) / fit.sigma).max())
+    def _gains(self, active: list[int], fit: Fit) -> np.ndarray:
+        """The decrease of the squares by each term of the library beside those of a model, by the linear problem."""
+        K = len(self.library)
+        theta, fitted = np.zeros(K), np.isin(np.arange(K), active)
+        theta[fitted] = fit.theta
+        whole = self._problem(range(K), theta, fit.problem.sigma)
+        try:
+            return whole.normal(theta, fit.states).gains(fitted)
+        except np.linalg.LinAlgError:
+            return np.zeros(K)
 
     # the path, and the record -----------------------------------------------------------------------------------
 
@@ -486,7 +528,7 @@ class _Search:
         active = chosen
         while (rest := self._without_least(active, SKETCHED)) is not None:
             active = rest
-            if self._criterion(active) > self._criterion(chosen) + HOPELESS * self.shooting.n_values:
+            if self._criterion(active) > self._criterion(chosen) + HOPELESS * self.pieces.n_values:
                 break
         active = chosen
         for _ in range(BEYOND):
@@ -503,22 +545,24 @@ class _Search:
         return [best[n] for n in sorted(best)]
 
     def _record(self, chosen: list[int], path: list[list[int]]) -> Discovery:
+        best = self._known(chosen)
+        sigma = np.maximum(best.noise(), self.floor) if self.known is None else best.problem.sigma
+        held_out = self._cut(self.held) if self.held else None
+        models = tuple(self._model(active, sigma, held_out) for active in path)
         fit = self._chosen_fit(chosen)
-        sigma = fit.sigma if self.known is None else np.maximum(self.known, self.floor)
-        noise = np.maximum(fit.noise, self.floor)
+        noise = np.maximum(fit.noise(), self.floor)
         excess = noise / np.maximum(self.expected, self.floor)
         windows = self.data.n_points / len(self.data.runs) >= 6
         told = (self.expected > 0) & (windows or self.known is not None)
         limit = UNEXPLAINED + 4 / math.sqrt(max(self.data.n_points, 1))
         explains = not (told & (excess > limit)).any()
         explains &= bool((noise < 0.5 * self.data.scales).all())
-        remark = "" if explains else self._remark(noise, excess)
-        models = tuple(self._model(active, sigma) for active in path)
+        remark = self._doubt(noise) if explains else self._remark(noise, excess)
         order = np.argsort([str(self.library.expressions[k]) for k in chosen])
         return Discovery(
             tuple(self.library.expressions[chosen[i]] for i in order),
             fit.theta[order],
-            np.sqrt(np.diag(fit.covariance))[order],
+            np.sqrt(np.diag(fit.covariance()))[order],
             noise,
             self.expected,
             explains,
@@ -530,39 +574,46 @@ class _Search:
 
     def _chosen_fit(self, chosen: list[int]) -> Fit:
         """The chosen model, fitted to all trajectories."""
-        fit = self.fits[frozenset(chosen)]
-        assert fit is not None
+        fit = self._known(chosen)
         if len(self.fitted) == len(self.data.runs):
             return fit
-        part, fits = self.shooting, self.fits
-        self.guess = dict(zip(chosen, fit.theta, strict=True))  # not that of a poor model of the path
-        self.shooting, self.fits = self._shooting([*range(len(self.data.runs))]), {}
-        whole = self._fit(chosen)
-        self.shooting, self.fits = part, fits
-        return fit if whole is None else whole
+        pieces, starts = self._cut(range(len(self.data.runs)))
+        return self._minimized(replace(fit.problem, data=pieces), fit.theta, starts) or fit
 
-    def _model(self, active: list[int], sigma: np.ndarray) -> Model:
-        fit = self.fits[frozenset(active)]
-        assert fit is not None
-        library = self.library.subset(active)
+    def _model(self, active: list[int], sigma: np.ndarray, held_out: tuple[Trajectories, np.ndarray] | None) -> Model:
+        fit = self._known(active)
+        problem = replace(fit.problem, sigma=sigma)
         held = None
-        if self.held:
-            shooting = self._shooting(self.held)
-            followed = shooting.fit(library, fit.theta, shooting.starts, sigma, free=False)
-            held = math.inf if followed is None else _residual(followed, shooting, 0)
-        shown = replace(fit, cost=float((fit.squares / sigma**2).sum()))
+        if held_out is not None:
+            pieces, starts = held_out
+            followed = minimized(replace(problem, data=pieces, frozen=True), fit.theta, starts, gain=CONVERGED)
+            held = _residual(followed.cost, pieces.n_values - starts.size)
         return Model(
-            library.expressions,
+            self.library.subset(active).expressions,
             tuple(fit.theta.tolist()),
-            tuple(np.sqrt(np.diag(fit.covariance)).tolist()),
-            _residual(shown, self.shooting, len(active)),
+            tuple(np.sqrt(np.diag(fit.covariance())).tolist()),
+            _residual(problem.cost(fit.theta, fit.states), self.pieces.n_values - fit.states.size - len(active)),
             self._criterion(active),
             held,
+        )
+
+    def _doubt(self, noise: np.ndarray) -> str:
+        """The remark that the noise which was given is too large, if it is."""
+        if self.known is None or not (noise < QUIET * self.known).all():
+            return ""
+        return (
+            f"The model leaves {float((noise / self.known).max()):.2g} of the `noise` that was given, or less: leave "
+            "that out, or give what is left, `discovery.noise`; small terms may be missing."
         )
 
     def _remark(self, noise: np.ndarray, excess: np.ndarray) -> str:
         worst = int(np.argmax(excess))
         otherwise = "Give other `terms`, a higher `degree`, or the `noise` if it is larger than it looks."
+        if self.known is not None and noise[worst] < LOUD * self.smooth.sigma[worst]:
+            otherwise = (
+                f"But without any model the data show noise of up to {self.smooth.sigma[worst]:.2g} there: leave "
+                "`noise` out, or give that."
+            )
         hint = diagnosis.hint(self.library, self.smooth, self.data, otherwise)
         return (
             f"No sparse Hamiltonian of the library's {len(self.library)} terms explains the data: of "
@@ -571,8 +622,9 @@ class _Search:
         )
 
 
-def _residual(fit: Fit, shooting: Shooting, n_terms: int) -> float:
-    return math.sqrt(fit.cost / max(shooting.n_values - fit.x0.size - n_terms, 1))
+def _residual(cost: float, freedom: int) -> float:
+    """The root mean square of the residuals over the noise."""
+    return math.sqrt(cost / max(freedom, 1))
 
 
 def _noise(noise: Any, width: int) -> np.ndarray | None:

@@ -8,14 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sympflow.learning.inertia import Inertia
 from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Network, Pairs, Part, Polynomial, Waves
 
 DEGREES = (2, 3, 4, 5, 6, 8, 10)
 HARMONICS = (1, 2, 3, 4, 6, 8)
+ORDERS = (1, 2, 3, 4)
+"""Of the harmonics of angles, or the powers of other coordinates, in a mass matrix M(q) and its potential."""
 WIDTHS = (6, 12, 24)
 WHOLE_WIDTHS = (12, 24, 40)
 POWERS = ((-1,), (-2, -1, 0, 1, 2))
 """Powers of the distances of pairs, 0 for the logarithm."""
+CHANGING = 0.5
+"""Variance of the total momentum along a trajectory, over the sum of those of its parts, where it is not constant."""
 MOST_TERMS = 400
 
 
@@ -36,6 +41,8 @@ class Said:
         Of the coordinates that are angles, infinite for the others.
     known : tuple of Formula
         Parts of H.
+    momenta : ndarray of shape (d, d) or None
+        The covariance of the momenta along a trajectory, in their mean; None where it is not known.
     """
 
     scales: np.ndarray
@@ -44,6 +51,7 @@ class Said:
     rates: int
     periods: np.ndarray
     known: tuple[Formula, ...] = ()
+    momenta: np.ndarray | None = None
 
     @property
     def ndof(self) -> int:
@@ -57,6 +65,13 @@ class Said:
     def angles(self) -> bool:
         """True if there are any."""
         return bool(np.isfinite(self.periods).any())
+
+    def at_rest(self, bodies: np.ndarray) -> bool:
+        """True unless the total momentum of bodies (n, dim) is seen to change, as it cannot by forces between them."""
+        if self.momenta is None or self.known:
+            return True
+        total = sum(self.momenta[np.ix_(axis, axis)].sum() for axis in bodies.T)
+        return bool(total < CHANGING * np.trace(self.momenta))
 
     def kinetic(self) -> tuple[Part, ...]:
         """½ pᵀM⁻¹p, learned if it is not known."""
@@ -116,18 +131,30 @@ def _whole_waves(said: Said) -> Iterator[Candidate]:
             yield Candidate(f"H(q, p) quadratic in p, a Fourier series of {harmonics} harmonics", said.whole(H))
 
 
+def _inertia(said: Said) -> Iterator[Candidate]:
+    q = slice(0, said.ndof)
+    scales, periods = said.scales[q], said.periods[q]
+    for order in () if said.kinetic_is_known else ORDERS:
+        V = Waves.up_to(order, max(order, 2), "q", scales, periods)
+        M = Waves.up_to(order, order, "q", scales, periods, constant=True)
+        part = Inertia(M)
+        if V.n + part.n <= MOST_TERMS:
+            yield Candidate(f"H = ½ pᵀM(q)⁻¹p + V(q), M and V series of order {order}", said.whole(part, V))
+
+
 def _pairs(said: Said) -> Iterator[Candidate]:
     d = said.ndof
     size = 2 * float(np.mean(said.scales[:d]))
     for dim in (2, 3):
         if d % dim or d < 2 * dim:
             continue
-        for order, bodies in (
-            ("one body after another", np.arange(d).reshape(-1, dim)),
-            ("one axis after another", np.arange(d).reshape(dim, -1).T),
-        ):
-            for powers in POWERS:
-                said_powers = "1/r" if powers == (-1,) else "powers of r from −2 to 2 and log r"
+        orders = {
+            "one body after another": np.arange(d).reshape(-1, dim),
+            "one axis after another": np.arange(d).reshape(dim, -1).T,
+        }
+        for powers in POWERS:
+            said_powers = "1/r" if powers == (-1,) else "powers of r from −2 to 2 and log r"
+            for order, bodies in ((order, bodies) for order, bodies in orders.items() if said.at_rest(bodies)):
                 name = f"{T}, V of the distances of {len(bodies)} bodies in {dim} dimensions, {order}, {said_powers}"
                 yield Candidate(name, said.separated(Pairs(bodies, powers, size, shared=False)))
 
@@ -163,23 +190,29 @@ class Family:
         Whether they have the form T(p) + V(q).
     models : callable
         models(said): candidates from simple to rich, none where the family does not apply.
+    linear : bool
+        Whether they are linear in their numbers, and soon fitted. Before those that are not, the data are asked
+        whether any H explains them.
     """
 
     separable: bool
     models: Callable[[Said], Iterator[Candidate]]
+    linear: bool = True
 
 
 FAMILIES = {
     "pairs": Family(True, _pairs),
     "waves": Family(True, _waves),
     "polynomial": Family(True, _polynomials),
-    "network": Family(True, _networks),
+    "network": Family(True, _networks, linear=False),
+    "inertia": Family(False, _inertia, linear=False),
     "whole-waves": Family(False, _whole_waves),
     "whole-polynomial": Family(False, _whole_polynomials),
-    "whole-network": Family(False, _whole_networks),
+    "whole-network": Family(False, _whole_networks, linear=False),
 }
 """In the order in which they are tried: potentials of the distances of bodies; Fourier series, where a `period` is
-given; polynomials; networks of one layer. The first four have H = ½ pᵀM⁻¹p + V(q), the others are functions H(q, p)."""
+given; polynomials; networks of one layer. The first four have H = ½ pᵀM⁻¹p + V(q); "inertia" has a mass matrix that
+depends on q, as of pendulums that hang on each other; the others are functions H(q, p)."""
 
 
 def families(said: Said, name: str | None) -> list[str]:

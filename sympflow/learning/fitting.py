@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from sympflow.learning.models import Model
 from sympflow.learning.shooting import (
     FINEST,
     Field,
@@ -22,6 +23,7 @@ from sympflow.learning.shooting import (
     minimized,
     steppers,
 )
+from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Run, Trajectories
 
 FIRST_POINTS = 10  # of the pieces that a fit begins with
@@ -32,10 +34,27 @@ SETTLED = 0.05  # change of the noise, relative, that ends them
 GROWTH = 1e3  # most that an error of an initial state may grow along a piece
 LEAST_GROWTH = 10.0
 PER_NOISE = 0.3  # of the spread of the data, that such an error may reach
+HOPELESS = 1.5  # noise over that of the best model, from which a model is given up
+STEP_ERROR = 0.1  # of the noise, to which the scheme's steps may change an orbit
 EXACT = 1e-9  # residuals, relative to the spread of the data, that need no explanation
 LOUDER = 2.0  # root mean square of held-out residuals, in σ, above which there are too few data, or another system
 SILENT = 0.5  # of the spread of the data, that noise leaves at most where a model explains anything
+HUBER = 1.5  # σ
+LOSSES = {"squares": None, "huber": HUBER}
 CORRELATED = 0.1  # correlation of one residual with the next that chance is allowed to make, beside 3/√n
+
+
+def limit_of(loss: str) -> float | None:
+    """The size of residuals, in σ, from which a loss is no square; None if there is none.
+
+    Raises
+    ------
+    ValueError
+        If there is no such loss.
+    """
+    if loss not in LOSSES:
+        raise ValueError(f"`loss` must be one of {', '.join(LOSSES)}; got {loss!r}.")
+    return LOSSES[loss]
 
 
 @dataclass(frozen=True)
@@ -50,11 +69,22 @@ class Setting:
         Residuals of more than so many σ count by their size.
     stop : callable
         Asked between steps.
+    seen : ndarray of shape (2d,) or None
+        The noise as it is seen without a model, at most: 0 where it is not.
+    rival : ndarray of shape (2d,) or None
+        The noise that the best model so far leaves of whole orbits: one that leaves much more of a few points is given
+        up.
     """
 
     noise: np.ndarray | None = None
     huber: float | None = None
     stop: Stop = lambda: False
+    seen: np.ndarray | None = None
+    rival: np.ndarray | None = None
+
+    def hopeless(self, noise: np.ndarray) -> bool:
+        """True if a model that leaves this noise (2d,) of a few points is not worth longer orbits."""
+        return self.rival is not None and float(np.mean(np.log(noise / self.rival))) > math.log(HOPELESS)
 
 
 @dataclass(frozen=True)
@@ -107,15 +137,20 @@ def fitted(
     scales = data.scales
     if theta is None:
         theta = model.start(np.random.default_rng(seed))
+        if model.lagrangian:
+            assert isinstance(model, Model)
+            smooth = smoothed(data)
+            theta = model.lagrangian_start(smooth.points.T, smooth.slopes.T, scales)
         theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales, 1 if model.linear else MATCHED_STEPS)
     given = None if setting.noise is None else np.maximum(setting.noise, FINEST * scales)
     sigma = 1e-2 * scales if given is None else given
     pieces, span = data.pieces(FIRST_POINTS), 0.0
     states = first_states(pieces)
     costs: list[float] = []
+    finer = 1.0
     for attempt in range(1 + ROUNDS):
         reached = span
-        tolerance = np.clip(0.02 * sigma, 1e-12 * scales, 1e-4 * scales)
+        tolerance = np.clip(0.02 * finer * sigma, 1e-12 * scales, 1e-4 * scales)
         method = chosen_method(model, theta, pieces, tolerance)
         problem = Problem(model, pieces, method, sigma, huber=setting.huber)
         fit = minimized(problem, theta, states, gain=1e-2 if attempt == 0 else 1e-4, stop=setting.stop)
@@ -123,11 +158,14 @@ def fitted(
         costs += [cost / data.n_values for cost in fit.costs]
         if given is None:
             sigma = np.maximum(fit.noise(), FINEST * scales)
-        if not math.isfinite(fit.cost) or setting.stop():
+        if not math.isfinite(fit.cost) or setting.stop() or setting.hopeless(np.maximum(fit.noise(), FINEST * scales)):
             break
         orbits = np.concatenate(fit.orbits, axis=1)
+        coarse = fit.step_error(np.maximum(sigma, EXACT * scales)) > STEP_ERROR
+        finer = finer / 10 if coarse else finer
         longer = _span(model, data, method, theta, orbits, scales, sigma)
-        if longer <= 1.5 * span and np.allclose(sigma, before, rtol=SETTLED, atol=EXACT * scales.min()):
+        settled = np.allclose(sigma, before, rtol=SETTLED, atol=EXACT * scales.min())
+        if longer <= 1.5 * span and settled and not coarse:
             break
         if longer > 1.5 * span:
             span, pieces = longer, data.pieces(span=longer)
@@ -185,8 +223,10 @@ class Held:
 
     Attributes
     ----------
-    fit : Fit
-        Of the pieces of the trajectories.
+    pieces : tuple of Run
+        The pieces of trajectories, each followed as one orbit.
+    residuals : tuple of ndarray
+        Of each piece, (2d, k).
     losses : ndarray of shape (N,)
         Minus the log-likelihood of each trajectory.
     values : int
@@ -200,20 +240,19 @@ class Held:
     loudness : float
         Their root mean square in σ, of the noise on the trajectories that the model was fitted to; ρ in place of the
         squares where the loss is robust.
+    excess : float
+        The noise that the model leaves of a coordinate, over that which is seen without a model; the largest.
     """
 
-    fit: Fit
+    pieces: tuple[Run, ...]
+    residuals: tuple[np.ndarray, ...]
     losses: np.ndarray
     values: int
     correlation: float
     pairs: int
     exact: bool
     loudness: float
-
-    @property
-    def pieces(self) -> tuple[Run, ...]:
-        """The pieces of trajectories, each followed as one orbit."""
-        return self.fit.problem.data.runs
+    excess: float = 0.0
 
     @property
     def loss(self) -> float:
@@ -223,6 +262,8 @@ class Held:
     @property
     def complaint(self) -> str:
         """The reason why they are no noise."""
+        if self.excess >= LOUDER:
+            return f"they are {self.excess:.1f} times the noise that is seen without a model"
         if self.loudness >= LOUDER:
             return (
                 f"they are {self.loudness:.1f} times the noise, as it was given or as the trajectories that the model "
@@ -232,13 +273,13 @@ class Held:
 
     def squares(self, scales: np.ndarray) -> float:
         """The mean square of the residuals in units of the scales (2d,)."""
-        return float(np.nanmean((np.concatenate(self.fit.residuals, axis=1) / scales[:, None]) ** 2))
+        return float(np.nanmean((np.concatenate(self.residuals, axis=1) / scales[:, None]) ** 2))
 
     @property
     def explained(self) -> bool:
         """True if nothing but noise is left: residuals are exact, or as loud and one tells nothing of the next."""
         silent = abs(self.correlation) < CORRELATED + 3 / math.sqrt(max(self.pairs, 1))
-        return self.exact or (silent and self.loudness < LOUDER)
+        return self.exact or (silent and self.loudness < LOUDER and self.excess < LOUDER)
 
 
 def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
@@ -247,7 +288,12 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     pieces = held.pieces(span=found.span) if found.span else held.pieces(FIRST_POINTS)
     sigma = np.maximum(found.sigma, EXACT * scales)
     problem = Problem(found.model, pieces, found.method, sigma, frozen=True, huber=setting.huber)
-    fit = minimized(problem, found.theta, first_states(pieces), iterations=20)
+    # the first observation alone leads astray along a whole orbit: a few points give the start
+    few = held.pieces(FIRST_POINTS)
+    short = replace(problem, data=few)
+    orbits = minimized(short, found.theta, first_states(few), iterations=20).orbits
+    states = np.concatenate(orbits, axis=1)[:, _starts(pieces.runs)].T
+    fit = minimized(problem, found.theta, states, iterations=20)
     residuals = fit.residuals
     ends = np.cumsum([run.n_points for run in held.runs])
     owner = np.searchsorted(ends, _starts(pieces.runs), side="right")
@@ -266,7 +312,32 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     exact = bool(all((np.abs(r)[np.isfinite(r)] < 100 * EXACT * scales.max()).all() for r in residuals))
     losses = np.where(np.isfinite(losses), losses, np.inf)
     correlation = same / size if size > 0 else math.nan
-    return Held(fit, losses, values, correlation, pairs, exact, math.sqrt(fit.cost / values))
+    loudness = math.sqrt(fit.cost / values)
+    excess = 0.0
+    if setting.seen is not None and (setting.seen > 0).any():
+        excess = float(np.max(found.sigma[setting.seen > 0] / setting.seen[setting.seen > 0]))
+    return Held(pieces.runs, tuple(residuals), losses, values, correlation, pairs, exact, loudness, excess)
+
+
+def left_out(found: Fitted, folds: Sequence[tuple[Trajectories, Trajectories]], setting: Setting) -> Held:
+    """The likelihood of held-out trajectories; of several divisions, each by a fit to the others from this one."""
+    if len(folds) == 1:
+        return judged(found, folds[0][1], setting)
+    parts = [judged(fitted(found.model, data, setting, found.theta), held, setting) for data, held in folds]
+    values, pairs = np.array([part.values for part in parts]), np.array([part.pairs for part in parts])
+    share = np.average([part.correlation if part.pairs else 0.0 for part in parts], weights=pairs + 1e-300)
+    loudness = math.sqrt(np.average([part.loudness**2 for part in parts], weights=values))
+    return Held(
+        tuple(piece for part in parts for piece in part.pieces),
+        tuple(r for part in parts for r in part.residuals),
+        np.concatenate([part.losses for part in parts]),
+        int(values.sum()),
+        float(share) if pairs.any() else math.nan,
+        int(pairs.sum()),
+        all(part.exact for part in parts),
+        loudness,
+        max(part.excess for part in parts),
+    )
 
 
 def gains(simple: Held, rich: Held) -> bool:

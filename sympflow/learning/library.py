@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
 from sympflow.hamiltonian.symbolic import generate, parse
+from sympflow.learning.models import Linear, Model, Part
 
 NEAR = 0.05
 """Least distance from a singular point, over the size of the coordinates, of data for which 1/r is in the library."""
@@ -18,6 +19,9 @@ COLLINEAR = 1e-7
 """Sine of the angle between a term's gradient and those before it, over the data, below which it says nothing new."""
 MOST_PRODUCTS = 2
 """Degrees of freedom up to which all products of powers are in the library; beyond, those of one and of pairs."""
+
+KINDS = "qpy"
+"""Of terms: of q alone, of p alone, of both."""
 
 Coordinates = tuple[sp.Symbol, ...]
 
@@ -66,15 +70,27 @@ LIBRARIES = {"polynomials": polynomials, "trigonometric": trigonometric, "distan
 
 
 class _Term:
-    """A term with its derivatives, as functions of columns."""
+    """A term with its derivatives, as functions of the columns of the coordinates that it depends on.
+
+    Attributes
+    ----------
+    rows : list of int
+        The places of these coordinates among q1 … qd, p1 … pd.
+    """
 
     def __init__(self, expression: sp.Expr, symbols: Sequence[sp.Symbol]) -> None:
         self.expression = expression
-        slopes = {i: sp.diff(expression, x) for i, x in enumerate(symbols) if x in expression.free_symbols}
-        self.rows = list(slopes)
-        self.places = [(i, j) for i in self.rows for j in self.rows if i <= j]
-        self._symbols = symbols
-        self._slopes = slopes
+        self.rows = [i for i, x in enumerate(symbols) if x in expression.free_symbols]
+        self._symbols = [symbols[i] for i in self.rows]
+        self._slopes = [sp.diff(expression, x) for x in self._symbols]
+
+    def kind(self, ndof: int) -> str:
+        """The coordinates that it depends on: "q", "p" or "y" for both."""
+        return "q" if max(self.rows, default=0) < ndof else "p" if min(self.rows) >= ndof else "y"
+
+    @cached_property
+    def quadratic(self) -> bool:
+        return self.expression.is_polynomial() and sp.Poly(self.expression, *self._symbols).homogeneous_order() == 2
 
     @cached_property
     def value(self) -> Any:
@@ -82,14 +98,7 @@ class _Term:
 
     @cached_property
     def gradient(self) -> Any:
-        return generate(list(self._slopes.values()), self._symbols, "numpy")
-
-    @cached_property
-    def hessian(self) -> Any:
-        """The entries at `places` that are not 0."""
-        second = {(i, j): sp.diff(self._slopes[i], self._symbols[j]) for i, j in self.places}
-        self.places = [place for place, entry in second.items() if entry != 0]
-        return generate([second[place] for place in self.places], self._symbols, "numpy") if self.places else None
+        return generate(self._slopes, self._symbols, "numpy")
 
 
 class Library:
@@ -106,7 +115,7 @@ class Library:
         self.ndof = ndof
         q, p = coordinates(ndof)
         self.expressions = tuple(expressions)
-        self._terms = [_Term(f, (*q, *p)) for f in expressions]
+        self.terms = [_Term(f, (*q, *p)) for f in expressions]
 
     def __len__(self) -> int:
         return len(self.expressions)
@@ -114,31 +123,32 @@ class Library:
     def subset(self, index: Sequence[int]) -> Library:
         """The library of some of the terms."""
         chosen = Library.__new__(Library)
-        chosen.ndof, chosen._terms = self.ndof, [self._terms[k] for k in index]
+        chosen.ndof, chosen.terms = self.ndof, [self.terms[k] for k in index]
         chosen.expressions = tuple(self.expressions[k] for k in index)
         return chosen
 
-    @classmethod
-    def joined(cls, *libraries: Library) -> Library:
-        """The terms of several libraries, one after another."""
-        whole = cls.__new__(cls)
-        whole.ndof, whole._terms = libraries[0].ndof, [term for one in libraries for term in one._terms]
-        whole.expressions = tuple(term.expression for term in whole._terms)
-        return whole
+    def by_kind(self) -> Library:
+        """The same terms, those of q alone first, then those of p alone: in the order of a `model`."""
+        return self.subset(sorted(range(len(self)), key=lambda k: KINDS.index(self.terms[k].kind(self.ndof))))
+
+    def model(self) -> Model:
+        """The sum of these terms as an H to be fitted, of terms `by_kind`."""
+        kinds = [term.kind(self.ndof) for term in self.terms]
+        chosen = {of: [k for k, kind in enumerate(kinds) if kind == of] for of in KINDS}
+        return Model(self.ndof, tuple(Terms(self.subset(index), of) for of, index in chosen.items() if index))
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """f_k at x (n, 2d): (n, K)."""
         made = np.empty((len(x), len(self)))
-        for k, term in enumerate(self._terms):
-            made[:, k] = term.value(*x.T)[0]
+        for k, term in enumerate(self.terms):
+            made[:, k] = term.value(*x.T[term.rows])[0]
         return made
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """∇f_k at x (n, 2d): (n, 2d, K)."""
         made = np.zeros((*x.shape, len(self)))
-        columns = list(x.T)
-        for k, term in enumerate(self._terms):
-            for i, entry in zip(term.rows, term.gradient(*columns), strict=True):
+        for k, term in enumerate(self.terms):
+            for i, entry in zip(term.rows, term.gradient(*x.T[term.rows]), strict=True):
                 made[:, i, k] = entry
         return made
 
@@ -147,22 +157,108 @@ class Library:
         g, d = self.gradients(x), self.ndof
         return np.concatenate([g[:, d:], -g[:, :d]], axis=1)
 
-    def field_jacobian(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """The Jacobian of J∇H at x (n, 2d): (n, 2d, 2d)."""
-        made, d = np.zeros((len(x), 2 * self.ndof, 2 * self.ndof)), self.ndof
-        columns = list(x.T)
-        for coefficient, term in zip(theta, self._terms, strict=True):
-            if term.hessian is None:
-                continue
-            for (i, j), entry in zip(term.places, term.hessian(*columns), strict=True):
-                made[:, i, j] += coefficient * entry
-                if i != j:
-                    made[:, j, i] += coefficient * entry
-        return np.concatenate([made[:, d:], -made[:, :d]], axis=1)
-
     def hamiltonian(self, theta: np.ndarray) -> sp.Expr:
         """Σ θ_k f_k."""
         return sp.Add(*[sp.Float(float(c)) * f for c, f in zip(theta, self.expressions, strict=True)])
+
+
+class Terms(Part):
+    """Σ_k θ_k f_k, the terms of a library, which are all of q alone, of p alone, or of both.
+
+    Parameters
+    ----------
+    library : Library
+    of : {"q", "p", "y"}
+    """
+
+    def __init__(self, library: Library, of: str) -> None:
+        self.of, self.library, self.n = of, library, len(library)
+        self._sums: dict[bytes, tuple[Any, Any]] = {}
+        self._first = library.ndof if of == "p" else 0
+
+    @cached_property
+    def quadratic(self) -> bool:
+        return all(term.quadratic for term in self.library.terms)
+
+    @property
+    def terms(self) -> bool:
+        return True
+
+    def subset(self, kept: np.ndarray) -> Terms:
+        return Terms(self.library.subset(np.flatnonzero(kept).tolist()), self.of)
+
+    @cached_property
+    def _symbols(self) -> tuple[sp.Symbol, ...]:
+        q, p = coordinates(self.library.ndof)
+        return {"q": q, "p": p, "y": (*q, *p)}[self.of]
+
+    @cached_property
+    def _forms(self) -> np.ndarray:
+        """The second derivatives (m, m, n) of quadratic forms."""
+        entries = [sp.hessian(f, self._symbols).tolist() for f in self.library.expressions]
+        return np.moveaxis(np.array(entries, dtype=float), 0, -1)
+
+    def _sum(self, used: np.ndarray) -> tuple[Any, Any]:
+        """The derivatives of the sum of some terms (n,)."""
+        key = used.tobytes()
+        if key not in self._sums:
+            self._sums[key] = _derivatives(tuple(np.array(self.library.expressions)[used]), self._symbols)
+        return self._sums[key]
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        slopes: np.ndarray | None = None
+        if self.quadratic:
+            W = self._forms @ theta
+            value, slopes = W @ x, W[..., None] if slope else None
+        else:
+            used = theta != 0  # of terms that may be missing, few have a coefficient
+            first, second = self._sum(used)
+            numbers = (*x, *theta[used].tolist())
+            value = np.empty((m, N))
+            for row, entry in zip(value, first(*numbers), strict=True):
+                row[:] = entry
+            if slope:
+                slopes = np.zeros((m, m, N))
+                places, function = second()
+                for (i, j), entry in zip(places, function(*numbers), strict=True):
+                    slopes[i, j] = slopes[j, i] = entry
+        columns = np.zeros((m, self.n, N)) if by_parameters else None
+        if columns is not None:
+            start = self.library.ndof if self.of == "p" else 0
+            for k, term in enumerate(self.library.terms):
+                rows = [i - start for i in term.rows]
+                for i, entry in zip(rows, term.gradient(*x[rows]), strict=True):
+                    columns[i, k] = entry
+        return Linear(value, slopes, columns)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        y = np.zeros((x.shape[1], 2 * self.library.ndof))
+        y[:, slice(self.library.ndof, None) if self.of == "p" else slice(len(x))] = x.T
+        return self.library.values(y) @ theta
+
+    def expression(self, theta: np.ndarray, x: Sequence[sp.Symbol]) -> sp.Expr:
+        return self.library.hamiltonian(theta).subs(dict(zip(self._symbols, x, strict=True)), simultaneous=True)
+
+
+@lru_cache(maxsize=256)
+def _derivatives(terms: tuple[sp.Expr, ...], symbols: tuple[sp.Symbol, ...]) -> tuple[Any, Any]:
+    """The gradient of Σ θ_k f_k as a function of the columns of x and of θ; and its slope, made when it is asked for.
+
+    The slope is the places of entries that are not 0, on and above the diagonal, and a function of these entries.
+    """
+    theta = sp.symbols(f"theta:{len(terms)}", real=True)
+    whole = sp.Add(*(c * f for c, f in zip(theta, terms, strict=True)))
+    first = [sp.diff(whole, x) for x in symbols]
+
+    @cache
+    def second() -> tuple[list[tuple[int, int]], Any]:
+        m = len(symbols)
+        entries = {(i, j): sp.diff(first[i], symbols[j]) for i in range(m) for j in range(i, m)}
+        kept = {place: entry for place, entry in entries.items() if entry != 0}
+        return [*kept], generate([*kept.values()], [*symbols, *theta], "numpy")
+
+    return generate(first, [*symbols, *theta], "numpy"), second
 
 
 def library_for(terms: Any, ndof: int, degree: int, states: np.ndarray) -> tuple[Library, tuple[sp.Expr, ...]]:

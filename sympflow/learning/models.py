@@ -82,6 +82,20 @@ class Part(ABC):
         """True if `subset` leaves terms out."""
         return False
 
+    @property
+    def inertial(self) -> bool:
+        """True if it is a kinetic energy whose masses depend on q, and linear in θ in Lagrange's form."""
+        return False
+
+    def momenta(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """The derivatives (2d, n, N) of p = ∂L/∂v and of p' = ∂L/∂q by θ, at columns q and velocities v (d, N).
+
+        L is the Lagrangian; the default is that of a potential that is linear in θ.
+        """
+        by = self.gradient(np.zeros(self.n), q, False, True).by_parameters
+        assert by is not None
+        return np.concatenate([np.zeros_like(by), -by])
+
 
 class Polynomial(Part):
     """Σ_m θ_m Π_i (x_i/s_i)^m_i.
@@ -262,8 +276,13 @@ class Waves(Part):
         return True
 
     @classmethod
-    def up_to(cls, harmonics: int, degree: int, of: str, scales: Any, periods: np.ndarray) -> Waves:
-        """Harmonics to this order of the angles, which have a period, times powers of the others to this degree."""
+    def up_to(
+        cls, harmonics: int, degree: int, of: str, scales: Any, periods: np.ndarray, constant: bool = False
+    ) -> Waves:
+        """Harmonics to this order of the angles, which have a period, times powers of the others to this degree.
+
+        The constant, which moves nothing as a term of H, is the first term if it is asked for.
+        """
         angles = np.isfinite(periods)
         span = [range(-harmonics, harmonics + 1) if angle else (0,) for angle in angles]
         reach = [(0,) if angle else range(degree + 1) for angle in angles]
@@ -274,7 +293,7 @@ class Waves(Part):
             for e in sorted(monomials, key=sum)
             for v in sorted(vectors, key=lambda v: sum(map(abs, v)))
             for phase in ((0.0, -np.pi / 2) if any(v) else (0.0,))
-            if any(e) or any(v)
+            if constant or any(e) or any(v)
         ]
         exponents, chosen, phases = zip(*terms, strict=True)
         return cls(of, exponents, np.array(chosen) * np.where(angles, 2 * np.pi / periods, 0.0), phases, scales)
@@ -290,29 +309,36 @@ class Waves(Part):
         c, s = np.cos(self.phases)[:, None], np.sin(self.phases)[:, None]
         return cos * c - sin * s, -(sin * c + cos * s)
 
-    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+    def derivatives(
+        self, x: np.ndarray, twice: bool
+    ) -> tuple[np.ndarray, np.ndarray, dict[tuple[int, int], np.ndarray]]:
+        """The terms (n, N), their slopes (m, n, N), and for i ≤ j their second derivatives (n, N) if asked for."""
         m, N = x.shape
         wave, turned = self._turns(x)
         powers = self.powers.tables(x)
         whole = self.powers.monomials(powers, self.powers.exponents)
-        value, by = np.empty((m, N)), np.empty((m, self.n, N))
-        first = []
+        slopes = np.empty((m, self.n, N))
+        first, second = [], {}
         for i in range(m):
             factor, left = self.powers.derivatives[i,]
             first.append(factor[:, None] * self.powers.monomials(powers, left) if factor.any() else 0.0)
-            by[i] = first[i] * wave + self.waves[:, i, None] * whole * turned
-            value[i] = theta @ by[i]
+            slopes[i] = first[i] * wave + self.waves[:, i, None] * whole * turned
+        for i, j in combinations_with_replacement(range(m), 2) if twice else ():
+            factor, left = self.powers.derivatives[i, j]
+            ki, kj = self.waves[:, i, None], self.waves[:, j, None]
+            second[i, j] = (first[i] * kj + first[j] * ki) * turned - ki * kj * whole * wave
+            if factor.any():
+                second[i, j] += factor[:, None] * self.powers.monomials(powers, left) * wave
+        return whole * wave, slopes, second
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        _, by, second = self.derivatives(x, slope)
         slopes = np.empty((m, m, N)) if slope else None
         if slopes is not None:
-            for i in range(m):
-                for j in range(i, m):
-                    factor, left = self.powers.derivatives[i, j]
-                    ki, kj = self.waves[:, i, None], self.waves[:, j, None]
-                    second = (first[i] * kj + first[j] * ki) * turned - ki * kj * whole * wave
-                    if factor.any():
-                        second = second + factor[:, None] * self.powers.monomials(powers, left) * wave
-                    slopes[i, j] = slopes[j, i] = theta @ second
-        return Linear(value, slopes, by if by_parameters else None)
+            for (i, j), terms in second.items():
+                slopes[i, j] = slopes[j, i] = theta @ terms
+        return Linear(np.stack([theta @ rows for rows in by]), slopes, by if by_parameters else None)
 
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
         return theta @ (self.powers.monomials(self.powers.tables(x), self.powers.exponents) * self._turns(x)[0])
@@ -653,6 +679,33 @@ class Model:
         """True if the vector field is linear in θ."""
         return all(part.linear for part in self.parts)
 
+    @property
+    def lagrangian(self) -> bool:
+        """True if Lagrange's equations of motion are linear in θ though the vector field is not."""
+        return any(part.inertial for part in self.parts) and all(
+            part.inertial or (part.of == "q" and part.linear) for part in self.parts
+        )
+
+    def lagrangian_start(self, y: np.ndarray, slopes: np.ndarray, scales: np.ndarray) -> np.ndarray:
+        """θ by which p = ∂L/∂v and p' = ∂L/∂q hold best, by linear least squares, at states (2d, N) with slopes."""
+        d = self.ndof
+        q, p, v = y[:d], y[d:], slopes[:d]
+        rates = np.broadcast_to(np.arange(d) if self.rates > 1 else 0, d)
+        columns = [part.momenta(q, v) for part in self.parts]
+        friction = np.zeros((2 * d, self.rates, y.shape[1]))
+        for i in range(d if self.rates else 0):
+            friction[d + i, rates[i]] = -p[i]
+        A = np.concatenate([*columns, friction], axis=1)
+        b = np.concatenate([p, slopes[d:]])
+        for part in self.parts:
+            if not part.n:  # a part that is known
+                b[d:] += part.gradient(np.zeros(0), q, False, False).value
+        weights = np.concatenate([1 / scales[d:], 1 / np.maximum(slopes[d:].std(axis=1), np.finfo(float).tiny)])
+        rows = (A * weights[:, None, None]).transpose(0, 2, 1).reshape(-1, self.n)
+        lengths = np.linalg.norm(rows, axis=0)
+        lengths[lengths == 0] = 1.0
+        return np.linalg.lstsq(rows / lengths, (b * weights[:, None]).ravel(), rcond=1e-10)[0] / lengths
+
     def hamiltonian(self, theta: np.ndarray, y: np.ndarray) -> np.ndarray:
         """H (N,)."""
         shares = zip(self.parts, self.places, strict=True)
@@ -686,7 +739,7 @@ class FreeField:
     degree : int
     """
 
-    separable = nystrom = False
+    separable = nystrom = lagrangian = False
     linear = True
 
     def __init__(self, scales: Any, degree: int) -> None:
@@ -714,6 +767,17 @@ class FreeField:
             for i in range(m):
                 columns[i, i * K : (i + 1) * K] = terms
         return Linear(rows @ terms, slopes, columns)
+
+    def defect(self, theta: np.ndarray, y: np.ndarray) -> float:
+        """The size of LᵀJ + JL over twice that of JL, L the Jacobian in units of the scales: at most 1, 0 for any H."""
+        d = self.ndof
+        slopes = self.field(theta, y, True, False).slope
+        assert slopes is not None
+        ratio = np.sqrt(self.scales[:d] / self.scales[d:])
+        units = np.concatenate([ratio, 1 / ratio])  # in which dq∧dp is what it is
+        L = slopes * (units / units[:, None])[..., None]
+        JL = np.concatenate([L[d:], -L[:d]])
+        return float(np.linalg.norm(JL - JL.transpose(1, 0, 2)) / (2 * np.linalg.norm(JL)))
 
     def divergence(self, theta: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The rate (N,) at which volumes of phase space grow."""

@@ -11,6 +11,7 @@ References
 .. [1] H. G. Bock, Recent advances in parameter identification techniques for O.D.E., in: Numerical Treatment of Inverse
    Problems in Differential and Integral Equations (1983), for multiple shooting.
 .. [2] E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (2006), sections II.1 and VI.6, for the schemes.
+.. [3] P. J. Huber, Robust Statistics (1981), sections 6.4 and 7.7, for the robust loss and σ ("proposal 2").
 """
 
 from __future__ import annotations
@@ -299,12 +300,38 @@ class Normal:
         model -= np.einsum("ni,nij,nj->", x, self.A, x, optimize=True) + 2 * np.sum(x * (self.B @ theta))
         return theta, x, float(model)
 
-    def precision(self) -> np.ndarray:
-        """The matrix of θ when the initial states are eliminated, (n, n): its inverse is their covariance."""
+    def reduced(self) -> tuple[np.ndarray, np.ndarray]:
+        """JᵀJ (n, n) and −Jᵀr (n,) of θ when the initial states are eliminated."""
         n = self.C.shape[0]
         flat = self.B.reshape(-1, n)
         inverse = np.linalg.pinv(self.A, hermitian=True)
-        return self.C - flat.T @ (inverse @ self.B).reshape(-1, n)
+        x = (inverse @ self.a[..., None])[..., 0]
+        return self.C - flat.T @ (inverse @ self.B).reshape(-1, n), self.c - flat.T @ x.reshape(-1)
+
+    def precision(self) -> np.ndarray:
+        """The matrix of θ when the initial states are eliminated, (n, n): its inverse is their covariance."""
+        return self.reduced()[0]
+
+    def gains(self, fitted: np.ndarray) -> np.ndarray:
+        """Decrease of |r|², by the linear model, when one of the numbers that were not fitted joins those that were.
+
+        Parameters
+        ----------
+        fitted : ndarray of bool, shape (n,)
+            The numbers at whose minimum the problem stands.
+
+        Returns
+        -------
+        ndarray of shape (n,)
+            0 of the fitted numbers, and of those that they make up.
+        """
+        S, g = self.reduced()
+        inner = S[np.ix_(fitted, fitted)]
+        found = np.linalg.solve(inner, np.column_stack([S[fitted], g[fitted]]))
+        curvature = np.diag(S) - np.einsum("ak,ak->k", S[fitted], found[:, :-1])
+        slope = g - S[:, fitted] @ found[:, -1]
+        usable = ~fitted & (curvature > 1e-10 * np.diag(S))
+        return np.where(usable, slope**2 / np.where(usable, curvature, 1.0), 0.0)
 
 
 @dataclass(frozen=True)
@@ -466,17 +493,56 @@ class Fit:
         """Observation less orbit of each piece, (2d, k), NaN where nothing was observed."""
         return [run.y - orbit for run, orbit in zip(self.problem.data.runs, self.orbits, strict=True)]
 
+    @cached_property
+    def variances(self) -> np.ndarray:
+        """Mean squares of the residuals of each coordinate (2d,), of outliers limited where the loss is robust."""
+        r = np.concatenate(self.residuals, axis=1)
+        return np.nanmean(r * r, axis=1) if self.problem.huber is None else _robust_variances(r, self.problem.huber)
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """How many values of each coordinate were observed, (2d,)."""
+        return np.isfinite(np.concatenate([run.y for run in self.problem.data.runs], axis=1)).sum(axis=1)
+
     def noise(self) -> np.ndarray:
         """σ of each coordinate (2d,) by the residuals, with the share that the fit took of them given back."""
-        r = np.concatenate(self.residuals, axis=1)
-        seen = np.isfinite(r)
-        values, fitted = int(seen.sum()), self.states.size + len(self.theta)
-        free = max(1 - fitted / values, 0.1)
-        return np.sqrt(np.nansum(r * r, axis=1) / np.maximum(seen.sum(axis=1), 1) / free)
+        fitted = self.states.size + len(self.theta)
+        return np.sqrt(self.variances / max(1 - fitted / self.counts.sum(), 0.1))
+
+    def step_error(self, sigma: np.ndarray) -> float:
+        """Largest change of an orbit, in σ (2d,), when the steps of the scheme are halved."""
+        method = self.problem.method
+        finer = replace(self.problem, method=replace(method, longest=method.longest / 2))
+        moved = finer.orbits(self.theta, self.states)
+        return max(
+            float((np.abs(a - b) / sigma[:, None]).max(initial=0.0)) for a, b in zip(moved, self.orbits, strict=True)
+        )
 
     def covariance(self) -> np.ndarray:
         """The covariance of θ (n, n), where σ is the noise."""
         return np.linalg.pinv(self.normal.precision(), hermitian=True)
+
+
+def _robust_variances(r: np.ndarray, huber: float) -> np.ndarray:
+    """σ² of rows (2d, n) by Huber's proposal 2: the mean of min(r², k²σ²) is that of normal residuals."""
+    expected = _clipped_square(huber)
+    made = np.empty(len(r))
+    for i, row in enumerate(r):
+        squares = row[np.isfinite(row)] ** 2
+        variance = float(np.median(squares)) / 0.4549 if len(squares) else 0.0
+        for _ in range(30):
+            before, variance = variance, float(np.minimum(squares, huber**2 * variance).mean()) / expected
+            if abs(variance - before) <= 1e-6 * before:
+                break
+        made[i] = variance
+    return made
+
+
+def _clipped_square(k: float) -> float:
+    """The mean of min(z², k²) of normal z."""
+    density = math.exp(-k * k / 2) / math.sqrt(2 * math.pi)
+    inside = math.erf(k / math.sqrt(2))
+    return inside - 2 * k * density + k * k * (1 - inside)
 
 
 def minimized(

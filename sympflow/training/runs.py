@@ -101,6 +101,10 @@ class Run(ABC):
         """The same of one Verlet step of Δt; None if there is none to compare with."""
         return None
 
+    def left_out(self) -> str | None:
+        """The words that say which part of Ω the fit says nothing of; None if there is none."""
+        return None
+
     @property
     def remedy(self) -> str:
         """The advice for a flow that is far from the exact one."""
@@ -192,6 +196,8 @@ class Run(ABC):
                 UserWarning,
                 stacklevel=5,
             )
+        elif (words := self.left_out()) is not None:
+            warnings.warn(words, UserWarning, stacklevel=5)
         return {"missed_share": mean} | ({} if verlet is None else {"verlet_missed_share": verlet[0]})
 
     # checkpoints ------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Protocol
@@ -19,7 +20,7 @@ from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.options import NewFlow
-from sympflow.training.points import Stream, start_times, states
+from sympflow.training.points import Stream, box_without, start_times, states
 from sympflow.training.table_fit import take_over
 from sympflow.training.table_step import DENSE, forces_of
 
@@ -30,6 +31,8 @@ PHASE = 1.0  # ω Δt of the default flow: energy errors of 1e-8 to 1e-5, where 
 KICK_PHASE = 0.25  # ω Δt for each kick of the kernel
 MOST_STAGES = 24
 MOST_PERIODS = 30  # of most states, that Δt may hold
+FASTER, SEVERAL_SAMPLES = 50.0, 400  # times the rate at half of so many states, beyond which a domain is too large
+NARROWED = 10  # times at most
 ITERATIONS, FEWER_SAMPLES = 40, 100  # of the power method, for many degrees of freedom
 
 
@@ -126,6 +129,7 @@ def default_primed(
     return Primed(float(dt), min(max(2, math.ceil(omega * dt / KICK_PHASE - 1e-9)), MOST_STAGES))
 
 
+@np.errstate(all="ignore")  # of states at which H is not defined
 def frequency(system: HamiltonianSystem, domain: Domain | None) -> float:
     """The fastest frequency of the linearized motion that 99 % of the states of the domain stay below.
 
@@ -179,17 +183,7 @@ def _largest_eigenvalues(system: HamiltonianSystem, q: np.ndarray, t: np.ndarray
 
 def check_step(system: HamiltonianSystem, domain: Domain, dt: float) -> None:
     """Raise ValueError where Δt is far beyond the periods of the system, or what changes it, at half of the states."""
-    y = domain.sample(FEWER_SAMPLES, SEED)
-    d, t = system.ndof, start_times(system, 0.0, len(y), SEED, Stream.SCALING)
-    with np.errstate(all="ignore"):
-        if system.separable and system.quadratic_kinetic and d > DENSE:
-            rates = np.sqrt(_largest_eigenvalues(system, y[:, :d], t))
-        elif system.separable:
-            squares = system.kinetic_hessian(y[:, d:], t) @ potential_hessian(system, y[:, :d], t)
-            rates = np.sqrt(_sizes(squares))
-        else:
-            second = system.hessian(y, t)
-            rates = _sizes(np.concatenate([second[:, d:], -second[:, :d]], axis=1))
+    rates = _rates(system, domain.sample(FEWER_SAMPLES, SEED))
     rates = rates[np.isfinite(rates)]
     rate = float(np.median(rates)) if len(rates) else 0.0
     periods = rate * dt / (2 * math.pi)
@@ -199,6 +193,63 @@ def check_step(system: HamiltonianSystem, domain: Domain, dt: float) -> None:
             f"the states of `domain`: no flow takes that in one step. Leave `dt` out, or take "
             f"dt={_rounded(PHASE / rate)}."
         )
+
+
+@np.errstate(all="ignore")
+def _rates(system: HamiltonianSystem, y: np.ndarray) -> np.ndarray:
+    """The fastest rate of the linearized motion at each of the states (n, 2d): (n,), NaN where it is not finite."""
+    d, t = system.ndof, start_times(system, 0.0, len(y), SEED, Stream.SCALING)
+    if system.separable and system.quadratic_kinetic and d > DENSE:
+        return np.sqrt(_largest_eigenvalues(system, y[:, :d], t))
+    if system.separable:
+        squares = system.kinetic_hessian(y[:, d:], t) @ potential_hessian(system, y[:, :d], t)
+        return np.sqrt(_sizes(squares))
+    second = system.hessian(y, t)
+    return _sizes(np.concatenate([second[:, d:], -second[:, :d]], axis=1))
+
+
+def warn_of_domain(system: HamiltonianSystem, domain: Domain) -> None:
+    """Warn of a domain where H is not defined in part of it, or the motion far faster than at half of its states.
+
+    Δt is made for the fastest ones. The warning names a box without that part.
+    """
+    y = domain.sample(SEVERAL_SAMPLES, SEED)
+    with np.errstate(all="ignore"):
+        defined = np.isfinite(system.hamiltonian(y, start_times(system, 0.0, len(y), SEED, Stream.SCALING)))
+    if not defined.all():
+        corners = box_without(y[defined], y[~defined])
+        remedy = "Shrink `domain`." if corners is None else f"Take Box({corners[0]}, {corners[1]}), without them."
+        warnings.warn(
+            f"H of the system {system.name!r} is not finite at {(~defined).sum()} of {len(y)} states of `domain`, "
+            f"where a flow means nothing. {remedy}",
+            UserWarning,
+            stacklevel=4,
+        )
+        y = y[defined]
+        if not len(y):
+            return
+    rates = _rates(system, y)
+    known = rates[np.isfinite(rates)]
+    if not len(known) or not np.quantile(known, QUANTILE) > FASTER * np.median(known) > 0:
+        return
+    low, high = y.min(0).tolist(), y.max(0).tolist()
+    for _ in range(NARROWED):
+        slow = rates <= 0.5 * FASTER * np.median(rates[np.isfinite(rates)])
+        box = box_without(y[slow], y[~slow])
+        if box is None:
+            break
+        low, high = box
+        inside = ((y >= low) & (y <= high)).all(1)
+        y, rates = y[inside], rates[inside]
+    q, half = np.quantile(known, QUANTILE), np.median(known)
+    warnings.warn(
+        f"`domain` has states at which the motion is {q / half:.1e} times faster than at half of them, and the Δt of a "
+        f"flow for all of it suits these, about {PHASE / q:.1e}, where most others could have {PHASE / half:.1e}. "
+        f"Without them the domain is about Box({low}, {high}): take that, or a smaller one that holds your orbits, or "
+        "give `dt`.",
+        UserWarning,
+        stacklevel=4,
+    )
 
 
 def _sizes(matrices: np.ndarray) -> np.ndarray:

@@ -58,6 +58,7 @@ PROCESSOR_SPREAD = 0.1
 STIFFNESS = 1e-3  # how reluctantly a table is made to vary with t where that is not called for
 FINALISTS = 4  # tables of the search that are followed to the end
 FITTED = 2  # tables from which the polynomials are fitted
+FITTED_STEPS = 200  # iterations of that at most: each takes as long as ten of a table, and more gain a few per cent
 HOPELESS = 100.0  # times the cost of the best table at Δt: polynomials are not fitted from there
 SEARCH_STEPS = 60  # iterations from each start
 FROZEN_SHARE = 0.7  # of a time budget, that all work on frozen tables may use
@@ -65,6 +66,7 @@ FRACTIONAL_TIMES = 50  # of the held-out labels; as many as of the fit where the
 HELD_OUT_SHARE = 0.1  # of the time left
 WORTH_COMPILING = 250  # iterations of a fit, which take longer without
 LAST_EVALUATIONS = 3  # times what the held-out figures take, for what is left to do when the time is up
+LOST = 0.02  # share of the states of a domain from which no solution may exist without a warning
 CLOSE = 1.1  # held-out errors that differ by less are the same for a warning
 FEWEST_POINTS, MOST_POINTS, COORDINATES = 16, 250, 1000
 FITTED_POINTS = 120  # that are enough for the polynomials in t: at each of several times
@@ -216,7 +218,7 @@ class TableRun(SearchRun):
         starts = [self._continued(m) for m in _distinct(finalists)[:FITTED]]
         if not finalists or frozen is None or self._frozen_cost(self.given) < HOPELESS * min(m.cost for m in finalists):
             starts.insert(0, self.given)
-        whole = self.whole, steps, self.whole_end, True
+        whole = self.whole, min(steps, FITTED_STEPS) if frozen is not None else steps, self.whole_end, True
         fitted = list(session.each(descended, whole, starts, self.whole_end, self.whole.compiled))
         best = min(fitted, key=lambda m: m.cost)
         if not math.isfinite(best.cost):
@@ -234,13 +236,11 @@ class TableRun(SearchRun):
     @np.errstate(all="ignore")
     def _spoiled(self) -> str:
         """The held-out states at which the flow is nothing, in words, with a smaller domain that has none of them."""
-        x = states(self.domain, self.options.reference_states, self.options.seed, Stream.REFERENCE)
-        known = self.held_out.x
-        labelled = {row.tobytes() for row in known}
-        lost = x[[row.tobytes() not in labelled for row in x]]
+        x, known, lost = self._asked(), self.held_out.x, self._lost()
         unit = np.array(self.scaling.x)
         error, moved = (np.linalg.norm(v / unit, axis=-1) for v in (self.at_end[-1], self.held_out.y[-1] - known))
-        good = error < USELESS * np.median(moved)
+        defined = np.isfinite(self.system.hamiltonian(known, self.held_out.t0))
+        good = defined & (error < USELESS * np.median(moved[defined]))
         if 10 * good.sum() < len(x):  # spoiled everywhere
             return ""
         box = box_without(known[good], np.concatenate([lost, known[~good]]))
@@ -250,6 +250,29 @@ class TableRun(SearchRun):
         if box is None:
             return f"{words}. "
         return f"{words}; none of these is in Box({box[0]}, {box[1]}). "
+
+    def _asked(self) -> np.ndarray:
+        """The held-out states that were drawn."""
+        return states(self.domain, self.options.reference_states, self.options.seed, Stream.REFERENCE)
+
+    def _lost(self) -> np.ndarray:
+        """Those of them from which no solution exists up to Δt."""
+        labelled = {row.tobytes() for row in self.held_out.x}
+        return np.array([row for row in self._asked() if row.tobytes() not in labelled]).reshape(
+            -1, len(self.scaling.x)
+        )
+
+    def left_out(self) -> str | None:
+        lost, known = self._lost(), self.held_out.x
+        if len(lost) <= LOST * (len(lost) + len(known)):
+            return None
+        words = (
+            f"From {len(lost)} of {len(lost) + len(known)} held-out states of `domain` no solution exists up to dt = "
+            f"{self.flow.dt:g}, and the flow was fitted to the others alone: H is not defined there, or orbits run "
+            "into a singularity or escape. "
+        )
+        box = box_without(known, lost)
+        return words + ("Shrink `domain`." if box is None else f"Take a smaller `domain`: Box({box[0]}, {box[1]}).")
 
     def missed(self) -> tuple[float, float]:
         return shares_missed(self.at_end[-1], self.held_out, np.array(self.scaling.x))

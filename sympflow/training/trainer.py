@@ -43,12 +43,13 @@ from sympflow.training.points import Stream, digest, handed_in, start_times, unl
 from sympflow.training.runs import Run, Unstarted
 from sympflow.training.session import Deadline, OutOfTime, Path, Session
 from sympflow.training.split_fit import SplitRun
-from sympflow.training.starts import check_step, default_primed, new_network, scaling_of
+from sympflow.training.starts import check_step, default_primed, new_network, scaling_of, warn_of_domain
 from sympflow.training.table_fit import TableRun
 from sympflow.workers import Crew
 
 DRIVEN = ("primed", "sympflow")  # kinds that are fitted to driven systems
 BUDGET = 60.0  # seconds of a fit of which nothing else is said
+SHORT_BUDGET = 15.0  # of such a fit with trials, which is compiled: most end before
 STARTS = 72  # of such a fit, where it is compiled: these take a second
 BOUGHT = 1000  # starts that a time budget buys at most
 
@@ -159,11 +160,11 @@ def train(
         Stop after so many seconds, to 20 %, and a few seconds for what is imported and compiled; a single evaluation of
         a network's loss at 32 points is the smallest piece. All counts: trials (at most half of it), labels (at most
         0.3 of what is left, each set), starts, fits, held-out figures. Where labels take longer the flow
-        is returned as it was, and a warning says how far they came. The default for a new primed flow is 60, unless
-        `restarts`, `steps` or `resume` is given: the search then takes fewer starts than it might, which the recipe
-        records; else there is none. In up to three degrees of freedom of a symbolic system such a fit has 72 starts;
-        one with a budget, and without `restarts`, `steps` and files, as many as two fifths of the time allow, up to
-        1000.
+        is returned as it was, and a warning says how far they came. The default for a new primed flow is 60, and 15
+        where trials choose it, unless `restarts`, `steps` or `resume` is given: the search may take fewer starts then,
+        which the recipe records; else there is none. In up to three degrees of freedom of a symbolic system such a fit
+        has 72 starts; one with a budget, and without `restarts`, `steps` and files, as many as two fifths of the time
+        allow, up to 1000.
     progress : bool, optional
         Show a progress bar; the default is on a terminal only.
     callback : callable, optional
@@ -255,13 +256,13 @@ def fit_flow(
         return piece.whole(fit_flow(piece.system, dt, start, new, asked, piece.domain, session))
     hurried = untold and session.time_budget is None and session.resume is None and kind == "primed" and asked.searches
     if hurried:
-        session.time_budget = BUDGET
+        session.time_budget = SHORT_BUDGET if dt is None and trials.can_try(system) else BUDGET
     if not ((kind in ("primed", "split") and asked.searches) or session.crew.alone):
         raise TypeError(
             "`workers` share the starts of a search by 'gauss-newton' for primed and split flows, and this fit is one "
             "run of steps: leave it out."
         )
-    with session.interruption, session.crew:
+    with session.interruption, session.crew, np.errstate(divide="ignore", invalid="ignore"):
         tried = None
         if dt is not None and flow is None:
             check_step(system, domain, dt)
@@ -272,6 +273,8 @@ def fit_flow(
         elif kind == "primed":
             if asked.searches:
                 TableOptions.of(asked)  # raises before trials
+            if dt is None:
+                warn_of_domain(system, domain)
             flow, tried = _new_primed(system, domain, dt, new, asked, session)
             session.cut = session.interruption.asked  # what trials were left out does not end the run
         system.vector_field(
@@ -444,7 +447,7 @@ def _new_primed(
 
 def _fit_is_untold(asked: NewFit, session: Session) -> bool:
     """Return whether nothing is said of the fit of a new flow, and there is time for trials."""
-    hurried = session.time_budget is not None and session.time_budget < BUDGET
+    hurried = session.time_budget is not None and session.time_budget < SHORT_BUDGET
     return asked.searches and not hurried and not set(asked.given()) - {"optimizer", "seed", "reference_states"}
 
 

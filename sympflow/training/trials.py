@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,13 +27,27 @@ FEWER, REFERENCE = (
     32,
     1e-10,
 )  # steps of orbits of which the energy changes, and the tolerance of the exact ones beside them
-SHAPES = ((3, 9, "drift"), (4, 8, "kick"), (5, 8, "kick"), (6, 8, "kick"))
-"""Kicks of K and of χ, and what a step begins with, of flows that are tried beside that of `default_primed`."""
+SHAPES = (
+    (1, 12, "drift", 1.5),
+    (2, 12, "drift", 1.2),
+    (3, 9, "drift", 1.0),
+    (3, 12, "drift", 1.0),
+    (4, 8, "kick", 1.0),
+    (5, 8, "kick", 1.0),
+    (5, 12, "kick", 1.0),
+    (6, 8, "kick", 1.0),
+)
+"""Kicks of K and of χ, what a step begins with, and how much longer it is for its kicks, of flows that are tried too.
+
+A step of one kick or two stands with curvature terms between a large processor and its inverse, and is longer."""
 ORDER = 6  # with which the errors of classical schemes fall where these flows are used: that of srkn11b and srkn14a
 LARGER = 1.05  # times the work of a flow with a larger processor, which outputs pay for
 MOST_NDOF = 3  # beyond which trials take too long
 SHARE = 0.5  # of a time budget
 DEAREST = 2.0  # times the cycles of a kick without them, beyond which curvature terms are not tried
+BEHIND = 1.25  # times the estimated work of the best, beyond which kicks of another kind are not compiled and timed
+TIMED, TIMES = 20_000, 5  # kicks, and how often, of which the least time counts
+SURE = 1.05  # times the measured work, by which kicks with more terms must be better
 GOAL = 1e-5  # the energy error of a trial that a default flow shall not exceed, if one of those tried does not
 ALIKE = 2.0  # energy errors above that which differ by no more are the same
 
@@ -54,14 +69,16 @@ def can_try(system: HamiltonianSystem) -> bool:
 def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | None = None) -> Trial:
     """The flow that gains most: that of `default_primed`, or one with a longer Δt, curvature terms or another shape.
 
-    Of each the table at Δt is fitted for a few seconds, and followed along held-out orbits. Where its energy error (of
-    a system with friction: the difference from the energy along the exact orbit) is e, the work of a classical scheme
-    of order p is in proportion to e^(−1/p); so the flow gains most whose kicks take the fewest cycles in a unit of
-    time, times e^(1/p), p = 6. Curvature terms are tried with the best Δt, unless they make kicks twice as dear, and
-    then `SHAPES` with as many kicks in a unit of time as at that Δt and at the next shorter one, which must gain a
-    twentieth. Where all errors are above 1e-5 it is
-    the flow with the smallest, or of those with up to twice that the one that gains most. The choice depends on the
-    system and Ω alone, not on the machine, unless half the time of the session is not enough for the trials.
+    Of each the table at Δt is fitted in less than a second, and followed along held-out orbits. Where its energy error
+    (of a system with friction: the difference from the energy along the exact orbit) is e, the work of a classical
+    scheme of order p is in proportion to e^(−1/p); so the flow gains most whose kicks take the least time in a unit of
+    time, times e^(1/p), p = 6. Curvature terms are tried with the best Δt, unless they make kicks twice as dear. What
+    kicks with and without them take is estimated in cycles (`kick_cycles`), and where that does not decide, by a
+    quarter, measured: the loops of both flows are compiled and run, as they will be by `solve`. Then `SHAPES` are tried
+    with kicks of the better kind, about as many in a unit of time as at that Δt and at the next shorter one; a larger
+    processor must gain a twentieth. Where all errors are above 1e-5 it is the flow with the smallest, or of those with
+    up to twice that the one that gains most. The machine has a say in the kind of the kicks alone, and time only if
+    half that of the session is not enough for the trials.
 
     Parameters
     ----------
@@ -78,17 +95,18 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     starts = tried_starts(system, domain, curvature=False)
     try:
         ranges = position_ranges(system.symbols, domain) if system.autonomous else ()
-        cycles = [kick_cycles(system.symbols, level, ranges) for level in (FORCE_GRADIENT, CURVATURE)]
+        costs = [kick_cycles(system.symbols, level, ranges) for level in (FORCE_GRADIENT, CURVATURE)]
     except ValueError:  # H has no compiled form
         return Trial(starts[0], math.inf)
     session, found = Session() if session is None else session, dict[Primed, Trial]()
     interruption, deadline = session.interruption, session.deadline.part(SHARE)
 
-    def best(tried: list[Primed]) -> Primed:
+    def good(tried: list[Primed]) -> dict[Primed, float]:
+        """The work of those that are good enough."""
         least = min(found[start].error for start in tried)
         worst = GOAL if least <= GOAL else ALIKE * least
-        work = {
-            start: cycles[start.curvature]
+        return {
+            start: costs[start.curvature]
             * start.stages
             / start.dt
             * found[start].error ** (1 / ORDER)
@@ -96,9 +114,12 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
             for start in tried
             if found[start].error <= worst
         }
+
+    def best(tried: list[Primed]) -> Primed:
+        work = good(tried)
         return min(work, key=work.__getitem__)
 
-    bends = cycles[1] <= DEAREST * cycles[0]
+    bends = costs[1] <= DEAREST * costs[0]
     with session.bar(len(starts) + bends + 2 * len(SHAPES), f"{system.name} trials") as bar:
 
         def attempt(wanted: list[Primed]) -> None:
@@ -126,11 +147,35 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         bent = replace(straight, curvature=True)
         if bends:
             attempt([bent])
-        chosen = best([straight, bent]) if bent in found else straight
+        both = [straight, bent]
+        work = good(both) if bent in found else {}
+        if len(work) == 2 and max(work.values()) <= BEHIND * min(work.values()) and not deadline.over():
+            measured = [_kick_seconds(found[start].flow, system, domain) for start in both]
+            if all(measured):
+                costs = [measured[0], SURE * measured[1]]
+        chosen = best(both) if bent in found else straight
         shorter = replace(starts[max(0, starts.index(straight) - 1)], curvature=chosen.curvature)
         others = list(dict.fromkeys([*shaped(chosen), *shaped(shorter)]))
         attempt(others)
         return found[best([chosen, *(start for start in others if start in found)])]
+
+
+def _kick_seconds(flow: PrimedFlow | None, system: HamiltonianSystem, domain: Domain) -> float:
+    """The time that a kick of the flow and its share of all else take in the compiled loops; 0 if it cannot be told.
+
+    Compiling them is not lost: it is kept for the flow's first run.
+    """
+    if flow is None:
+        return 0.0
+    kicks = flow.kernel_scheme().force_evaluations
+    kernel, y0, n = flow.kernel_for(system), states(domain, 1, SEED, Stream.REFERENCE)[0], TIMED // kicks
+    least = math.inf
+    for _ in range(1 + TIMES):  # the first compiles
+        began = time.perf_counter()
+        if kernel.run(flow.dt, y0, n, np.array([n])).n_finite < n:
+            return 0.0
+        least = min(least, time.perf_counter() - began)
+    return least / (n * kicks)
 
 
 def tried_starts(system: HamiltonianSystem, domain: Domain, curvature: bool = True) -> list[Primed]:
@@ -146,10 +191,10 @@ def all_starts(system: HamiltonianSystem, domain: Domain) -> list[Primed]:
 
 
 def shaped(start: Primed) -> list[Primed]:
-    """The flow in each of the `SHAPES`, with as many kicks in a unit of time."""
+    """The flow in each of the `SHAPES`, with about as many kicks in a unit of time."""
     return [
-        replace(start, dt=float(f"{start.dt * n / start.stages:.3g}"), stages=n, processor=c, first=first)
-        for n, c, first in SHAPES
+        replace(start, dt=float(f"{start.dt * longer * n / start.stages:.3g}"), stages=n, processor=c, first=first)
+        for n, c, first, longer in SHAPES
     ]
 
 

@@ -1,10 +1,14 @@
 """Bodies that interact in pairs: forces, conservation laws, cells, and bad input."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from sympflow import HamiltonianSystem, solve
+from sympflow import HamiltonianSystem, solve, splitting_method
+from sympflow.kernels.modules import at_most
+from sympflow.schemes import SCHEMES
 
 GRAVITY, LENNARD_JONES = "-G*m1*m2/r", "4*(1/r**12 - 1/r**6)"
 
@@ -95,6 +99,39 @@ class TestRuns:
         back = solve(system, "verlet", (1, 0), solve(system, "verlet").y[:, -1])
         np.testing.assert_allclose(back.y[:, -1], system.y0, atol=1e-12)
 
+    def test_threads_share_a_large_system_and_keep_its_bits(self):
+        system = gravity(330)
+        runs = []
+        for threads in (1, 3):
+            with at_most(threads):
+                runs.append(solve(system, "verlet", (0, 1), t_eval=[0.5, 1], backend="compiled").y)
+        np.testing.assert_array_equal(*runs)
+        together = gravity(330, softening=None)
+        y0 = together.y0.copy()
+        y0[:3] = y0[9:12]
+        sol = solve(together, "verlet", (0, 1), y0)
+        assert sol.status == -1
+        assert len(sol.t) == 1
+
+    def test_friction_of_one_rate_is_compiled(self):
+        system = gravity(4, damping=0.1)
+        sol = solve(system, "verlet")
+        assert sol.stats["backend"] == "compiled"
+        np.testing.assert_allclose(sol.y, solve(system, "verlet", backend="array").y, rtol=0, atol=1e-12)
+        each = gravity(4, damping=np.linspace(0.1, 0.2, 12))
+        assert solve(each, "verlet").stats["backend"] != "compiled"
+        with pytest.raises(ValueError, match=r"`system` .pairs. has friction, and its loops take one rate"):
+            solve(each, "verlet", backend="compiled")
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("n", [4, 40], ids=["few", "blocks"])
+    def test_curvature_terms_are_those_of_arrays(self, n):
+        chin = SCHEMES["chin4c"]
+        curved = replace(chin, name="curved", curvatures=tuple(0.01 if g else 0.0 for g in chin.gradients))
+        method = splitting_method(curved)
+        compiled, by_arrays = (solve(gravity(n), method, (0, 0.2), backend=b).y for b in ("compiled", "array"))
+        np.testing.assert_allclose(compiled, by_arrays, rtol=0, atol=1e-13)
+
     @pytest.mark.parametrize("n_side", [4, 6], ids=["all pairs", "cells"])
     def test_atoms_in_a_box(self, n_side):
         system = fluid(n_side)
@@ -161,9 +198,3 @@ class TestBadInput:
         sol = solve(system, "verlet", (0.5, 1), y0)
         assert sol.status == -1
         assert "At t = 0.5 the bodies 1 and 3 are at one place, r = 0: pass `softening`" in sol.message
-
-    def test_friction_runs_by_arrays(self):
-        system = gravity(4, damping=0.1)
-        assert solve(system, "verlet").stats["backend"] != "compiled"
-        with pytest.raises(ValueError, match=r"`system` 'pairs' has friction, and its loops take no friction"):
-            solve(system, "verlet", backend="compiled")

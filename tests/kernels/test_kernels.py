@@ -180,11 +180,11 @@ def test_other_values_of_parameters_compile_nothing(compensated):
 def test_code_depends_on_which_parameters_there_are_alone(monkeypatch, level, monomials, compensated):
     texts = []
 
-    def load(text):
+    def load(text, *_, **__):
         texts.append(text)
         raise InterruptedError
 
-    monkeypatch.setattr("sympflow.kernels.loop_functions.load_module", load)
+    monkeypatch.setattr("sympflow.kernels.loop_functions.load_algebra", load)
     for params in (*PARAMETERS, {**PARAMETERS[0], "n": 4}, {**PARAMETERS[0], "lam": 0}):
         with pytest.raises(InterruptedError):
             splitting_loops(with_parameters(**params)).functions(level, compensated, monomials)
@@ -384,3 +384,40 @@ def test_a_folder_that_cannot_be_written_is_no_obstacle(tmp_path):
     values, _, misses = run_in_fresh_process(tmp_path / "file" / "cache")
     assert values.startswith("[[")
     assert misses == 1
+
+
+SHARING = """
+import sys
+import numba
+from sympflow.kernels.modules import constants_source, load_module
+
+compiled = []
+
+
+class Compilations(numba.core.event.Listener):
+    def on_start(self, event):
+        pass
+
+    def on_end(self, event):
+        compiled.append(event.data["dispatcher"].__name__)
+
+
+numba.core.event.register("numba:compile", Compilations())
+shared = constants_source(FACTOR=0.5) + "\\n\\n\\n@njit(**OPTIONS)\\ndef scaled(x):\\n    return FACTOR * x\\n"
+for name in sys.argv[1:]:
+    own = f"{constants_source()}\\n\\n\\n@njit(**OPTIONS)\\ndef {name}(x):\\n    return scaled(x) + {len(name)}\\n"
+    module = load_module(own, [shared])
+    print(getattr(module, name)(3.0), hasattr(module, "scaled"))
+print(*compiled)
+"""
+
+
+def test_shared_functions_are_compiled_once_for_all_modules_and_processes(tmp_path):
+    def run(*names):
+        environment = os.environ | {"SYMPFLOW_CACHE_DIR": str(tmp_path)}
+        command = [sys.executable, "-c", SHARING, *names]
+        result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return result.stdout.splitlines()
+
+    assert run("f") == ["2.5 False", "scaled f"]
+    assert run("f", "second", "third") == ["2.5 False", "7.5 False", "6.5 False", "second third"]

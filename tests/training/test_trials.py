@@ -26,6 +26,7 @@ def test_each_term_makes_a_kick_dearer(system):
 def law(monkeypatch, error):
     """Trials whose errors are those of a law, error(ω Δt, curvature)."""
     omega = 1.0 / default_primed(HH).dt
+    monkeypatch.setattr(trials, "SHAPES", ())
     monkeypatch.setattr(
         trials, "trial", lambda start, *_: trials.Trial(start, error(start.dt * omega, start.curvature))
     )
@@ -74,17 +75,38 @@ def test_curvature_is_taken_where_its_error_is_worth_its_cycles(monkeypatch):
 
 def test_another_shape_is_taken_where_its_error_is_less_at_as_many_kicks(monkeypatch):
     """Other shapes have the best Δt and its terms, Δt in proportion to the kicks; a continued run finds them again."""
+    shapes = trials.SHAPES
     chosen = law(monkeypatch, lambda x, c: 1e-9 * x**3)
+    monkeypatch.setattr(trials, "SHAPES", shapes)
     assert chosen == trials.tried_starts(HH, HH.domain, curvature=False)[-1]
     others = trials.shaped(chosen)
     for best in others:
         monkeypatch.setattr(
-            trials, "trial", lambda start, *_, best=best: trials.Trial(start, 1e-9 if start == best else 2e-9)
+            trials, "trial", lambda start, *_, best=best: trials.Trial(start, 1e-12 if start == best else 2e-9)
         )
         start = trials.chosen_trial(HH, HH.domain).start
         assert start == best
-        assert start.stages / start.dt == pytest.approx(chosen.stages / chosen.dt, rel=5e-3)
+        longer = next(longer for n, c, _, longer in shapes if (n, c) == (start.stages, start.processor))
+        assert longer * start.stages / start.dt == pytest.approx(chosen.stages / chosen.dt, rel=5e-3)
         assert start in trials.all_starts(HH, HH.domain)
+
+
+@pytest.mark.parametrize("seconds", [1e-8, 3e-8])
+def test_what_kicks_take_is_measured_where_estimates_do_not_decide(monkeypatch, seconds):
+    """Errors by which the estimates are equal: curvature terms that take longer than that are left, others taken."""
+    plain, bent = (kick_cycles(HH.symbols, level) for level in (1, 2))
+    measured = {False: 1e-8, True: seconds}
+    monkeypatch.setattr(trials, "_kick_seconds", lambda flow, *_: measured[flow])
+    monkeypatch.setattr(trials, "SHAPES", ())
+    error = {False: 1e-9, True: 1e-9 * (plain / bent) ** trials.ORDER}
+    monkeypatch.setattr(trials, "trial", lambda start, *_: trials.Trial(start, error[start.curvature], start.curvature))
+    assert trials.chosen_trial(HH, HH.domain).start.curvature is (seconds < 1.1e-8)
+
+
+def test_a_kick_takes_some_nanoseconds():
+    flow = default_primed(PENDULUM).flow(PENDULUM)
+    assert 1e-10 < trials._kick_seconds(flow, PENDULUM, PENDULUM.domain) < 1e-5
+    assert trials._kick_seconds(None, PENDULUM, PENDULUM.domain) == 0.0
 
 
 def test_the_error_of_a_trial_is_that_of_its_orbits(monkeypatch):

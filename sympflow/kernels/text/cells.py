@@ -13,19 +13,19 @@ from numba import njit
 
 
 @njit(**OPTIONS)
-def sorted_cells(q, data, order):
+def sorted_cells(x, values, order):
     """Sort the bodies by their cells; the place of the first of each, and the cells along each axis; none if few."""
-    n = len(q) // DIM
+    n = len(order)
     shape, nothing = np.ones(3, dtype=np.int64), np.empty(0, dtype=np.int64)
     low, size = np.zeros(3), np.ones(3)
-    length = math.sqrt(data[1] - data[0])
+    length = math.sqrt(values[1] - values[0])
     for k in range(DIM):
         if PERIODIC:
-            low[k], extent = 0.0, data[2 + k]
+            low[k], extent = 0.0, values[2 + k]
         else:
-            low[k] = high = q[k]
+            low[k] = high = x[k, 0]
             for i in range(n):
-                low[k], high = min(low[k], q[DIM * i + k]), max(high, q[DIM * i + k])
+                low[k], high = min(low[k], x[k, i]), max(high, x[k, i])
             extent = high - low[k]
         if not extent < math.inf:
             return nothing, shape
@@ -38,12 +38,12 @@ def sorted_cells(q, data, order):
     for i in range(n):
         cell, stride = 0, 1
         for k in range(DIM):
-            x = q[DIM * i + k] - low[k]
+            place = x[k, i] - low[k]
             if PERIODIC:
-                x -= data[2 + k] * math.floor(x / data[2 + k])
-            if not abs(x) < math.inf:
+                place -= values[2 + k] * math.floor(place / values[2 + k])
+            if not abs(place) < math.inf:
                 return nothing, shape
-            cell += stride * (min(shape[k] - 1, int(x / size[k])) if size[k] > 0.0 else 0)
+            cell += stride * (min(shape[k] - 1, int(place / size[k])) if size[k] > 0.0 else 0)
             stride *= shape[k]
         cells[i] = cell
         starts[cell + 1] += 1

@@ -1,6 +1,6 @@
 """Many trajectories at once: their states side by side, so that one instruction moves several of them.
 
-Source text, pasted after the tuple algebra of a symbolic system, its kicks, `loops` and `aligned`. A block holds
+Source text, pasted after the kicks of a symbolic system and `loops`, by the functions of `lane_blocks`. A block holds
 `LANES` trajectories, in a run `MANY_LANES`, component first, as an array (2d, LANES) that stays in the first-level
 cache; the compiler turns the loop over the lanes of a stage into vector instructions. Lanes never mix: one that
 overflows leaves the others as they are. `sympflow.kernels.stages` writes ``stage_lanes`` and ``stage_each``, a kick and
@@ -12,34 +12,7 @@ the rows of y0 (N, 2d + `N_VALUES`) as in those of the blocks.
 # ruff: noqa: F821
 # mypy: ignore-errors
 
-import math
-
-from numba import njit, types
-from numba.extending import intrinsic
-
-LANES = 64
-MANY_LANES = max(LANES, min(256, 512 // NDOF // LANES * LANES))  # the more, the less goes for the start of a stage
-VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
-
-
-@intrinsic
-def widest_vectors(typing_context):
-    """Let loops over lanes take vectors of 512 bits where there are some, of which LLVM prefers half by itself.
-
-    These loops keep the multipliers busy, which are twice as many then: they run in two thirds of the time.
-    """
-
-    def generate(context, builder, signature, arguments):
-        # `add` of the attributes knows those without a value only
-        set.add(builder.function.attributes, '"prefer-vector-width"="512"')
-        return context.get_dummy_value()
-
-    return types.void(), generate
-
-
-@njit(**OPTIONS)
-def empty_lanes():
-    return aligned_zeros((2 * NDOF + N_VALUES) * MANY_LANES).reshape((2 * NDOF + N_VALUES, MANY_LANES))
+from numba import njit
 
 
 @njit(**OPTIONS)
@@ -95,29 +68,6 @@ def close_lane(Y, error, lane, table, k, work):
 
 
 @njit(**OPTIONS)
-def go_on(Y, start, error, running, block_start, count, width):
-    """Take up the running states of a block, where a run was cut."""
-    for lane in range(width):
-        row = running[block_start + min(lane, count - 1)]
-        for m in range(2 * NDOF):
-            Y[m, lane] = start[m, lane] = row[m]
-            if COMPENSATED:
-                error[m, lane] = row[2 * NDOF + m]
-
-
-@njit(**OPTIONS)
-def keep_lanes(Y, error, running, block_start, count, n_finite, n_steps):
-    """Write the running states of a block, NaN of those that have ended."""
-    for lane in range(count):
-        ended = n_finite[block_start + lane] < n_steps
-        row = running[block_start + lane]
-        for m in range(2 * NDOF):
-            row[m] = math.nan if ended else Y[m, lane]
-            if COMPENSATED:
-                row[2 * NDOF + m] = error[m, lane]
-
-
-@njit(**OPTIONS)
 def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running, closed=True):
     """`rollout` of every row of `y0` (N, 2d), `MANY_LANES` at a time; outputs as in `rollout_each`."""
     widest_vectors()
@@ -142,7 +92,7 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running,
                     break
                 pack(q, p, out[i, row])
         fill_lanes_own(Y, table, width, own)
-        error[:] = 0.0
+        zero_lanes(error)
         n, saved, begin = first, 0, 0
         if first > 0:
             begin = link
@@ -191,33 +141,6 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running,
             keep_lanes(Y, error, running, block_start, count, n_finite, n_steps)
 
 
-# Rows of what a step of lanes needs beside the states: the variable of the polynomials, powers of the step length, the
-# drift and the numbers of the kick.
-X, H, H3, H5, A, NUMBERS = [2 * NDOF + i for i in range(6)]
-
-
-@njit(**OPTIONS, inline="always")
-def fill_lanes(Y, width, row, coefficients, factor):
-    """Σ_k coefficients[k] x^k, one or at least three, times a factor, into a row."""
-    if len(coefficients) == 1:
-        for lane in range(width):
-            Y[row, lane] = coefficients[0] * Y[factor, lane]
-        return
-    c0, c1, c2 = coefficients[0], coefficients[1], coefficients[2]
-    if len(coefficients) == 3:
-        for lane in range(width):
-            Y[row, lane] = ((c2 * Y[X, lane] + c1) * Y[X, lane] + c0) * Y[factor, lane]
-        return
-    last = coefficients[len(coefficients) - 1]
-    for lane in range(width):
-        Y[row, lane] = last
-    for k in range(len(coefficients) - 2, 2, -1):
-        for lane in range(width):
-            Y[row, lane] = Y[row, lane] * Y[X, lane] + coefficients[k]
-    for lane in range(width):
-        Y[row, lane] = (((Y[row, lane] * Y[X, lane] + c2) * Y[X, lane] + c1) * Y[X, lane] + c0) * Y[factor, lane]
-
-
 @njit(**OPTIONS)
 def step_lanes(table, x, h, t, y, out):
     """`step_each`, `LANES` rows at a time, of systems that do not depend on the time.
@@ -237,7 +160,6 @@ def step_lanes(table, x, h, t, y, out):
             for k in range(N_VALUES):
                 Y[NUMBERS + N_NUMBERS + k, lane] = y[i, 2 * NDOF + k]
         for j in range(table.shape[1]):
-            fill_lanes(Y, width, A, table[0, j], H)
             stage_each(Y, width, table, j)
         for lane in range(count):
             q, p = unpack_lane(Y, lane)
@@ -252,7 +174,7 @@ def map_lanes(table, steps, y, out):
     for block_start in range(0, y.shape[0], MANY_LANES):
         count = min(MANY_LANES, y.shape[0] - block_start)
         width = (count + VECTOR - 1) // VECTOR * VECTOR
-        error[:] = 0.0
+        zero_lanes(error)
         for lane in range(width):
             q, p = unpack(y[block_start + min(lane, count - 1)])
             pack_lane(q, p, Y, lane)

@@ -1,9 +1,9 @@
-"""The loops of splitting methods on lattices of any size. Source text, pasted after ``stages``.
+"""The stages of splitting methods on lattices of any size. Source text, pasted after ``stages`` and `sized_states`.
 
-A state is an array X (sets, fields, size): q, p and, if `COMPENSATED`, their errors, each field of the lattice's shape
-with `REACH` ghost sites at both ends of every axis but the first, and more at those of the first axis. A pass runs over
-the planes lo … hi of the first axis and never beyond the lattice, begin … end. Before a pass the ghosts are refreshed:
-where an axis is periodic they are copies of sites, at walls they stay 0.
+A state is an array X (sets, fields, size) of that text, each field of the lattice's shape with `REACH` ghost sites at
+both ends of every axis but the first, and more at those of the first axis. A pass runs over the planes lo … hi of the
+first axis and never beyond the lattice, begin … end. Before a pass the ghosts are refreshed: where an axis is periodic
+they are copies of sites, at walls they stay 0.
 
 A large lattice is executed in tiles, slabs of planes that fit into the cache: each is loaded with a margin of planes at
 both ends, several stages are made in place, of which each loses `REACH` planes of the margin or more, and what is left
@@ -17,12 +17,8 @@ many stages from column j on, of a run or a `single` map, in place, and returns 
 # ruff: noqa: F821
 # mypy: ignore-errors
 
-import math
-
 import numpy as np
 from numba import njit
-
-CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where nothing is saved
 
 
 @njit(**OPTIONS, forceinline=True)
@@ -110,13 +106,6 @@ def pack(X, first, y, geometry):
 
 
 @njit(**OPTIONS)
-def copy_state(source, target):
-    a, b = source.reshape(-1), target.reshape(-1)
-    for i in range(len(a)):
-        b[i] = a[i]
-
-
-@njit(**OPTIONS)
 def copy_tile(source, first, target, to, n):
     """n numbers of each field, from one place of a state on to another place of another."""
     for s in range(N_SETS):
@@ -127,26 +116,15 @@ def copy_tile(source, first, target, to, n):
 
 
 @njit(**OPTIONS)
-def is_finite(x):
-    flat, total = x.reshape(-1), 0.0
-    for i in range(len(flat)):
-        total += 0.0 * flat[i]
-    return total == 0.0
-
-
-@njit(**OPTIONS)
-def finite_numbers(X):
-    return is_finite(X[:2])
-
-
-@njit(**OPTIONS)
 def row_size(size, geometry):
     return size if N_AXES == 1 else geometry[0]
 
 
 @njit(**OPTIONS)
-def workspace(size, row):
-    return np.zeros((N_HELPERS, N_FIELDS, size)), np.empty((N_BONDS, row + 2 * REACH))
+def workspace(size, geometry):
+    row = row_size(size, geometry)
+    A, T = np.zeros((N_HELPERS, N_FIELDS, size)), np.empty((N_BONDS, row + 2 * REACH))
+    return A, T, np.empty((N_CURVATURES, size))
 
 
 @njit(**OPTIONS)
@@ -155,76 +133,6 @@ def in_one(X, table, j, n_stages, single, work, geometry, sites, values):
     begin = geometry[4]
     end = begin + geometry[5]
     return stages(X, table, j, n_stages, single, work, True, begin, end, begin, end, geometry, sites, 0, values)
-
-
-@njit(**OPTIONS)
-def close(X, end_X, table, work, geometry, sites, values):
-    """The end of a step into `end_X`, from the running state before its last stage."""
-    copy_state(X, end_X)
-    in_one(end_X, table, table.shape[1] - 1, 1, True, work, geometry, sites, values)
-
-
-@njit(**OPTIONS)
-def first_non_finite(X, end_X, table, j, n_steps, work, geometry, sites, values):
-    """The first of `n_steps` steps from a running state whose end is not finite, or `n_steps`."""
-    link = table.shape[1] - 2
-    for n in range(1, n_steps):
-        j = in_one(X, table, j, link, False, work, geometry, sites, values)
-        close(X, end_X, table, work, geometry, sites, values)
-        if not finite_numbers(end_X):
-            return n
-    return n_steps
-
-
-@njit(**OPTIONS)
-def rollout(table, y0, n_steps, save, out, stop, first, running, single, geometry, size, sites, values):
-    """The steps from `first` to `n_steps` from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
-
-    Of a lattice in one piece; otherwise as in the text `loops`. If `single`, the columns of the table are one map,
-    whose value goes into ``out[0]``: a function of its own for that would be compiled as long as this one.
-    """
-    link = table.shape[1] - 2
-    work = workspace(size, row_size(size, geometry))
-    X, width = np.zeros((N_SETS, N_FIELDS, size)), len(y0)
-    if single:
-        load(y0, X, 0, geometry)
-        in_one(X, table, 0, table.shape[1], True, work, geometry, sites, values)
-        pack(X, 0, out[0], geometry)
-        return 0
-    start_X, end_X = np.zeros((N_SETS, N_FIELDS, size)), np.zeros((N_SETS, N_FIELDS, size))
-    if first > 0:
-        load(running[:width], X, 0, geometry)
-        if COMPENSATED:
-            load(running[width:], X, 2, geometry)
-    else:
-        load(y0, X, 0, geometry)
-    n, saved, j = first, 0, link if first > 0 else 0
-    while saved < len(save) and save[saved] <= 0:
-        pack(X, 0, out[saved], geometry)
-        saved += 1
-    while n < n_steps and stop[0] == 0:
-        block = min(CHECK_EVERY, n_steps - n)
-        if saved < len(save):
-            block = min(block, save[saved] - n)
-        copy_state(X, start_X)
-        before = j
-        j = in_one(X, table, j, block * link, False, work, geometry, sites, values)
-        close(X, end_X, table, work, geometry, sites, values)
-        if not finite_numbers(end_X):
-            for i in range(saved, out.shape[0]):
-                for k in range(width):
-                    out[i, k] = math.nan
-            running[:] = math.nan
-            return n - 1 + first_non_finite(start_X, end_X, table, before, block, work, geometry, sites, values)
-        n += block
-        while saved < len(save) and save[saved] == n:
-            pack(end_X, 0, out[saved], geometry)
-            saved += 1
-    if len(running) > 0:
-        pack(X, 0, running[:width], geometry)
-        if COMPENSATED:
-            pack(X, 2, running[width:], geometry)
-    return n_steps
 
 
 @njit(**OPTIONS)
@@ -244,7 +152,7 @@ def sweep(X, to, table, j, n_stages, single, planes, first, last, geometry, site
     """
     stride, margin, n_planes = geometry[1], geometry[4], geometry[5]
     size = (planes + 2 * margin) * stride
-    work, local = workspace(size, row_size(size, geometry)), np.zeros((N_SETS, N_FIELDS, size))
+    work, local = workspace(size, geometry), np.zeros((N_SETS, N_FIELDS, size))
     for tile in range(first, last):
         low = tile * planes
         n = min(planes, n_planes - low)

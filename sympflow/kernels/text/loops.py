@@ -2,10 +2,10 @@
 
 The algebra says what a state is: q and p are tuples held in registers (a symbolic system) or arrays changed in place
 (Numba functions). It defines ``unpack``, ``pack``, ``copy``, ``is_finite``, ``move``, ``no_error``, ``drift``,
-``workspace``, and functions for each kind of kick. `sympflow.kernels.stages` writes what depends on the kinds of kick:
-``numbers_of`` and ``numbers_at``, which read the numbers of a kick from a table and, where H depends on t, compute what
-depends on that, ``drift_of`` and ``drift_at``, which read those of a drift, ``columns_of`` and ``first_coefficients``
-of a table, and ``stage``, a kick and a drift.
+``workspace``, and functions for each kind of kick; the text `running_states` follows it. `sympflow.kernels.stages`
+writes what depends on the kinds of kick: ``numbers_of`` and ``numbers_at``, which read the numbers of a kick from a
+table and, where H depends on t, compute what depends on that, ``drift_of`` and ``drift_at``, which read those of a
+drift, ``columns_of`` and ``first_coefficients`` of a table, and ``stage``, a kick and a drift.
 Where `SCHEDULED`, kicks and ``drifted`` run in an order of operations that is fast, and ``fill_coefficients`` prepares
 their coefficients.
 
@@ -21,8 +21,6 @@ The constants `COMPENSATED` and `SCHEDULED` are known when it is compiled: Numba
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
-
-import math
 
 import numpy as np
 from numba import njit
@@ -76,36 +74,6 @@ def first_non_finite(q, p, table, first, k, n_steps, work):
 
 
 @njit(**OPTIONS)
-def fill_with_nan(rows, first):
-    for i in range(first, rows.shape[0]):
-        for j in range(rows.shape[1]):
-            rows[i, j] = math.nan
-
-
-@njit(**OPTIONS)
-def opened(y0, first, running):
-    """The running state after `first` steps, and its errors."""
-    q, p = unpack(y0)
-    q_error, p_error = no_error(q), no_error(p)
-    if first > 0:
-        end = len(running) // (1 + COMPENSATED)
-        q, p = unpack(running[:end])
-        if COMPENSATED:
-            q_error, p_error = unpack(running[end:])
-    return q, p, q_error, p_error
-
-
-@njit(**OPTIONS)
-def keep(q, p, q_error, p_error, running):
-    """Write the running state, if it is asked for."""
-    if len(running) > 0:
-        end = len(running) // (1 + COMPENSATED)
-        pack(q, p, running[:end])
-        if COMPENSATED:
-            pack(q_error, p_error, running[end:])
-
-
-@njit(**OPTIONS)
 def rollout(table, y0, n_steps, save, out, stop, first, running, closed=True):
     """The steps from `first` to `n_steps` from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
 
@@ -135,7 +103,7 @@ def rollout(table, y0, n_steps, save, out, stop, first, running, closed=True):
             end_q, end_p = copy(q), copy(p)
         if not is_finite(end_q, end_p):
             fill_with_nan(out, saved)
-            running[:] = math.nan
+            set_nan(running)
             return n - 1 + first_non_finite(start_q, start_p, table, begin, n, block, work)
         n += block
         while saved < len(save) and save[saved] == n:
@@ -150,14 +118,6 @@ def rollout_each(table, y0, n_steps, save, out, n_finite, stop, first, running, 
     """`rollout` of every row of `y0` (N, 2d) by itself."""
     for i in range(y0.shape[0]):
         n_finite[i] = rollout(table, y0[i], n_steps, save, out[i], stop, first, running[i], closed)
-
-
-@njit(**OPTIONS)
-def polynomial(coefficients, x):
-    total = 0.0
-    for k in range(len(coefficients) - 1, -1, -1):
-        total = total * x + coefficients[k]
-    return total
 
 
 @njit(**OPTIONS)
@@ -202,25 +162,6 @@ map_rows, rollout_rows = map_each, rollout_each  # where there are lanes, theirs
 # Runs in other coordinates, χ ∘ Kⁿ ∘ χ⁻¹: χ⁻¹ is executed once, and χ for each output. The tables of χ⁻¹ and χ are
 # those of single maps, see `map_each`, that of K is that of a run. The table of χ begins with the last stage of K: so
 # that is executed for many outputs at once, and the run does not wait for it.
-
-
-@njit(**OPTIONS)
-def up_to_finite(out, save, n_finite):
-    """Let a run end before an output (n, 2d) that is not finite though the state that it is made of is."""
-    finite = True
-    flat = out.reshape(-1)
-    for i in range(len(flat)):
-        finite &= abs(flat[i]) < math.inf
-    row = 0
-    while not finite and row < len(save) and save[row] <= n_finite:
-        finite_row = True
-        for j in range(out.shape[1]):
-            finite_row &= abs(out[row, j]) < math.inf
-        if not finite_row:
-            fill_with_nan(out, row)
-            return save[row] - 1
-        row += 1
-    return n_finite
 
 
 @njit(**OPTIONS)

@@ -1,91 +1,228 @@
-"""Sums over pairs of bodies: the text of one kind of sum, see `sympflow.kernels.pair_forces`.
+"""The stages of splitting methods on bodies that interact in pairs. Source text, pasted after `sized_states` and sums.
 
-Comments alone on their lines stand for code that depends on the potential, and `KIND`, `WIDTH` and `vectors` for names.
-A block holds `LANES` bodies, as rows of coordinates and of what else a pair depends on.
+A state is an array X (sets, `DIM`, size) of that text, the coordinates of all bodies in rows. `sites` has `DIM` rows of
+1/m, then what else a pair depends on; `values` are ε², the largest s, the box and the parameters; `geometry` the number
+of bodies, and that of the chunks in which sums are taken, 0 for few bodies.
+
+A kick is a few phases. In each a sum over pairs is taken, moves the momenta, and may be kept, times 1/m, as a velocity
+for the sums that follow. The sums are ``gradient``, ``hessian_vector`` and ``bend``, written by
+`sympflow.kernels.pair_forces` from the text `pair_sums`. Those over many bodies are taken in chunks, each by itself,
+and added up in the order of these: so threads may share them, and the result does not depend on the threads.
 """
-# ruff: noqa: B007, F821, F841
+# ruff: noqa: F821
 # mypy: ignore-errors
 
 import numpy as np
 from numba import njit
 
-
-# ---
-@njit(**OPTIONS)
-def KIND_with_row(i, first, last, X, F, mine, data):
-    """Add the pairs of the body i with those from `first` to `last` to the blocks `F`."""
-    # numbers
-    lane = i % LANES
-    Xi = X[i // LANES * WIDTH * LANES : (i // LANES + 1) * WIDTH * LANES]
-    # own
-    for k in range(DIM * LANES):
-        mine[k] = 0.0
-    for block in range(first // LANES, (last + LANES - 1) // LANES):
-        Xj = X[block * WIDTH * LANES : (block + 1) * WIDTH * LANES]
-        Fj = F[block * DIM * LANES : (block + 1) * DIM * LANES]
-        for lane in range(LANES):
-            j = block * LANES + lane
-            # other
-            # slopes
-            inside = (j >= first) & (j < last)
-            if CUT:
-                inside &= s < end
-            # masked
-            # force
-            # both lanes
-    Fi = F[i // LANES * DIM * LANES : (i // LANES + 1) * DIM * LANES]
-    for k in range(DIM):
-        total = 0.0
-        for lane in range(LANES):
-            total += mine[k * LANES + lane]
-        Fi[k * LANES + i % LANES] += total
+# Of each phase: its sum, the row of a table with its factor, the sign of that, the velocity in the sum, and where the
+# sum is kept as a velocity, 0 for nowhere. A plain kick, one with a force gradient, and one with curvature terms.
+SUMS = (0, 0, 1, 0, 1, 2, 1)
+ROWS = (1, 1, 2, 1, 2, 3, 3)
+SIGNS = (-1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0)
+ALONG = (0, 0, 1, 0, 1, 1, 2)
+KEPT = (0, 1, 0, 1, 2, 0, 0)
 
 
 @njit(**OPTIONS)
-def KIND_of_few(vectors, out, data):
-    # numbers
-    n = np.uint64(len(q) // DIM)
-    for k in range(len(q)):
-        out[k] = 0.0
-    for i in range(n):
-        # own of few
-        # begin
-        for j in range(i + np.uint64(1), n):
-            # other of few
-            # slopes
-            inside = True
-            if CUT:
-                inside = s < end
-            # masked
-            # force
-            # both
-        # end
+def phases_of(table, column):
+    """The first phase of the kick of a stage, and the one after its last."""
+    if HAS_CURVATURE and table[3, column] != 0.0:
+        return 3, 7
+    if HAS_GRADIENT and table[2, column] != 0.0:
+        return 1, 3
+    if table[1, column] != 0.0:
+        return 0, 1
+    return 0, 0
 
 
 @njit(**OPTIONS)
-def KIND(vectors, out, data):
-    if len(q) < FEW * DIM:
-        KIND_of_few(vectors, out, data)
-        return
-    n = np.uint64(len(q) // DIM)
-    n_blocks = (len(q) // DIM + LANES - 1) // LANES
-    X, F, mine = np.zeros(n_blocks * WIDTH * LANES), np.zeros(n_blocks * DIM * LANES), np.empty(DIM * LANES)
-    order = np.arange(len(q) // DIM)
-    if CUT:
-        starts, shape = sorted_cells(q, data, order)
-    for place in range(n):
-        j = np.uint64(order[place])
-        at = place // np.uint64(LANES) * np.uint64(WIDTH * LANES) + place % np.uint64(LANES)
-        # packed
-    rows, n_rows, cell = np.empty(20, dtype=np.int64), 1, 0
-    for i in range(len(order)):
-        rows[0], rows[1] = i + 1, len(order)
+def load(y, X, first, geometry):
+    """A row [q, p] into two sets of X, the first of which is given."""
+    n = geometry[0]
+    for s in range(2):
+        for i in range(n):
+            for k in range(DIM):
+                X[first + s, k, i] = y[(s * n + i) * DIM + k]
+
+
+@njit(**OPTIONS)
+def pack(X, first, y, geometry):
+    """The inverse of `load`."""
+    n = geometry[0]
+    for s in range(2):
+        for i in range(n):
+            for k in range(DIM):
+                y[(s * n + i) * DIM + k] = X[first + s, k, i]
+
+
+@njit(**OPTIONS)
+def workspace(size, geometry):
+    """Sums and velocities; the sums of chunks, and bodies, in blocks; the order of bodies in these."""
+    n_chunks = geometry[1]
+    blocks = size if n_chunks > 0 else 0
+    A, F = np.zeros((N_HELPERS, DIM, size)), np.zeros((n_chunks, DIM * blocks))
+    return A, F, np.zeros(WIDTH * blocks), np.arange(geometry[0])
+
+
+@njit(**OPTIONS)
+def chunk_begin(chunk, n, n_chunks, in_cells):
+    """The first place of a chunk; of all pairs, the places are those of two bodies each."""
+    return (n if in_cells else (n + 1) // 2) * chunk // n_chunks
+
+
+@njit(**OPTIONS)
+def fill_rows(P, row, n_rows, source, first, order):
+    """Rows of the blocks, by rows of an array from `first` on."""
+    for k in range(n_rows):
+        for i in range(len(order)):
+            P[(i // LANES * WIDTH + row + k) * LANES + i % LANES] = source[first + k, order[i]]
+
+
+@njit(**OPTIONS)
+def fill_blocks(phase, first, X, work, starts, shape, sites, values):
+    """Put the bodies into blocks, once in a kick, and the velocity of a phase; returns what `sorted_cells` does."""
+    A, _, P, order = work
+    if phase == first:
         if CUT:
-            n_rows, cell = met_by(i, cell, starts, shape, rows, n_rows)
-        for k in range(n_rows):
-            KIND_with_row(i, rows[2 * k], rows[2 * k + 1], X, F, mine, data)
-    for place in range(n):
-        j = np.uint64(order[place])
-        at = place // np.uint64(LANES) * np.uint64(DIM * LANES) + place % np.uint64(LANES)
+            starts, shape = sorted_cells(X[0], values, order)
+        fill_rows(P, 0, DIM, X[0], 0, order)
+        fill_rows(P, DIM, COLUMNS, sites, DIM, order)
+    if HAS_GRADIENT and ALONG[phase] > 0:
+        fill_rows(P, DIM + COLUMNS, DIM, A[ALONG[phase]], 0, order)
+    return starts, shape
+
+
+@njit(**OPTIONS)
+def sum_chunk(kind, chunk, work, starts, shape, geometry, values):
+    """The part of a chunk in a sum."""
+    F, P = work[1], work[2]
+    if kind == 0:
+        gradient_of_chunk(chunk, P, F, starts, shape, values, geometry)
+    if HAS_GRADIENT and kind == 1:
+        hessian_vector_of_chunk(chunk, P, F, starts, shape, values, geometry)
+    if HAS_CURVATURE and kind == 2:
+        bend_of_chunk(chunk, P, F, starts, shape, values, geometry)
+
+
+@njit(**OPTIONS)
+def sum_of_few(kind, X, along, work, geometry, sites, values):
+    n, A = geometry[0], work[0]
+    if kind == 0:
+        gradient_of_few(n, X, A, along, sites, values)
+    if HAS_GRADIENT and kind == 1:
+        hessian_vector_of_few(n, X, A, along, sites, values)
+    if HAS_CURVATURE and kind == 2:
+        bend_of_few(n, X, A, along, sites, values)
+
+
+@njit(**OPTIONS)
+def sum_of_chunks(work):
+    """Add the sums of chunks up, in the order of the bodies."""
+    total, F, order = work[0][0], work[1], work[3]
+    for chunk in range(1, F.shape[0]):
+        for k in range(F.shape[1]):
+            F[0, k] += F[chunk, k]
+    for k in range(DIM):
+        for i in range(len(order)):
+            total[k, order[i]] = F[0, (i // LANES * DIM + k) * LANES + i % LANES]
+
+
+@njit(**OPTIONS, forceinline=True)
+def add(X, s, k, i, change):
+    """Add a change to number i of a row of q or p."""
+    if COMPENSATED:
+        corrected = change - X[2 + s, k, i]
+        total = X[s, k, i] + corrected
+        X[2 + s, k, i] = (total - X[s, k, i]) - corrected
+        X[s, k, i] = total
+    else:
+        X[s, k, i] += change
+
+
+@njit(**OPTIONS)
+def kick(X, table, column, phase, work, sites):
+    """What follows the sum of a phase."""
+    A, factor, kept = work[0], SIGNS[phase] * table[ROWS[phase], column], KEPT[phase]
+    for k in range(DIM):
+        for i in range(np.uint64(X.shape[2])):
+            add(X, 1, k, i, factor * A[0, k, i])
+    if HAS_GRADIENT and kept > 0:
         for k in range(DIM):
-            out[np.uint64(DIM) * j + np.uint64(k)] = F[at + np.uint64(k) * np.uint64(LANES)]
+            for i in range(np.uint64(X.shape[2])):
+                A[kept, k, i] = sites[k, i] * A[0, k, i]
+
+
+@njit(**OPTIONS)
+def drift(X, table, column, sites):
+    a = table[DRIFT, column]
+    for k in range(DIM):
+        for i in range(np.uint64(X.shape[2])):
+            add(X, 0, k, i, a * (sites[k, i] * X[1, k, i]))
+            if DAMPED:
+                X[1, k, i] *= table[DRIFT + 1, column]
+
+
+@njit(**OPTIONS)
+def in_one(X, table, column, n_stages, single, work, geometry, sites, values):
+    link, n_chunks = table.shape[1] - 2, geometry[1]
+    starts, shape = np.empty(0, dtype=np.int64), np.ones(3, dtype=np.int64)
+    for _ in range(n_stages):
+        first, last = phases_of(table, column)
+        for phase in range(first, last):
+            if n_chunks == 0:
+                sum_of_few(SUMS[phase], X, ALONG[phase], work, geometry, sites, values)
+            else:
+                starts, shape = fill_blocks(phase, first, X, work, starts, shape, sites, values)
+                for chunk in range(n_chunks):
+                    sum_chunk(SUMS[phase], chunk, work, starts, shape, geometry, values)
+                sum_of_chunks(work)
+            kick(X, table, column, phase, work, sites)
+        drift(X, table, column, sites)
+        column = column + 1 if single or column < link else 1
+    return column
+
+
+# The same where threads share the chunks of a sum.
+
+
+@njit(**OPTIONS)
+def kick_of(table, column):
+    return phases_of(table, column)
+
+
+@njit(**OPTIONS)
+def begun(phase, first, X, work, starts, shape, sites, values):
+    return fill_blocks(phase, first, X, work, starts, shape, sites, values)
+
+
+@njit(**OPTIONS)
+def shared(lo, hi, phase, work, starts, shape, geometry, values):
+    for chunk in range(lo, hi):
+        sum_chunk(SUMS[phase], chunk, work, starts, shape, geometry, values)
+
+
+@njit(**OPTIONS)
+def kicked(X, table, column, phase, work, sites):
+    sum_of_chunks(work)
+    kick(X, table, column, phase, work, sites)
+
+
+@njit(**OPTIONS)
+def drifted(X, table, column, sites):
+    drift(X, table, column, sites)
+
+
+@njit(**OPTIONS)
+def room(size, geometry):
+    return workspace(size, geometry)
+
+
+@njit(**OPTIONS)
+def loaded(y, X, first, geometry):
+    load(y, X, first, geometry)
+
+
+@njit(**OPTIONS)
+def packed(X, first, y, geometry):
+    pack(X, first, y, geometry)

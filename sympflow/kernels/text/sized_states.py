@@ -1,0 +1,106 @@
+"""The loops of splitting methods on systems of any size, by states that are changed in place. Source text.
+
+A state is an array X (sets, fields, size): q, p and, if `COMPENSATED`, their errors. What is pasted with it, `lattice`
+or `pairs`, defines ``load``, ``pack``, ``workspace``, and ``in_one(X, table, j, n_stages, single, work, geometry,
+sites, values)``, which makes so many stages from column j on, of a run or a `single` map, in place, and returns the
+column after them. The shape of the system, and the values of its parameters, are arguments.
+"""
+# ruff: noqa: F821
+# mypy: ignore-errors
+
+import math
+
+import numpy as np
+from numba import njit
+
+CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where nothing is saved
+
+
+@njit(**OPTIONS)
+def copy_state(source, target):
+    a, b = source.reshape(-1), target.reshape(-1)
+    for i in range(len(a)):
+        b[i] = a[i]
+
+
+@njit(**OPTIONS)
+def is_finite(x):
+    flat, total = x.reshape(-1), 0.0
+    for i in range(len(flat)):
+        total += 0.0 * flat[i]
+    return total == 0.0
+
+
+@njit(**OPTIONS)
+def finite_numbers(X):
+    return is_finite(X[:2])
+
+
+@njit(**OPTIONS)
+def close(X, end_X, table, work, geometry, sites, values):
+    """The end of a step into `end_X`, from the running state before its last stage."""
+    copy_state(X, end_X)
+    in_one(end_X, table, table.shape[1] - 1, 1, True, work, geometry, sites, values)
+
+
+@njit(**OPTIONS)
+def first_non_finite(X, end_X, table, j, n_steps, work, geometry, sites, values):
+    """The first of `n_steps` steps from a running state whose end is not finite, or `n_steps`."""
+    link = table.shape[1] - 2
+    for n in range(1, n_steps):
+        j = in_one(X, table, j, link, False, work, geometry, sites, values)
+        close(X, end_X, table, work, geometry, sites, values)
+        if not finite_numbers(end_X):
+            return n
+    return n_steps
+
+
+@njit(**OPTIONS)
+def rollout(table, y0, n_steps, save, out, stop, first, running, single, geometry, size, sites, values):
+    """The steps from `first` to `n_steps` from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
+
+    Of a system in one piece; otherwise as in the text `loops`. If `single`, the columns of the table are one map,
+    whose value goes into ``out[0]``: a function of its own for that would be compiled as long as this one.
+    """
+    link = table.shape[1] - 2
+    work = workspace(size, geometry)
+    X, width = np.zeros((N_SETS, N_FIELDS, size)), len(y0)
+    if single:
+        load(y0, X, 0, geometry)
+        in_one(X, table, 0, table.shape[1], True, work, geometry, sites, values)
+        pack(X, 0, out[0], geometry)
+        return 0
+    start_X, end_X = np.zeros((N_SETS, N_FIELDS, size)), np.zeros((N_SETS, N_FIELDS, size))
+    if first > 0:
+        load(running[:width], X, 0, geometry)
+        if COMPENSATED:
+            load(running[width:], X, 2, geometry)
+    else:
+        load(y0, X, 0, geometry)
+    n, saved, j = first, 0, link if first > 0 else 0
+    while saved < len(save) and save[saved] <= 0:
+        pack(X, 0, out[saved], geometry)
+        saved += 1
+    while n < n_steps and stop[0] == 0:
+        block = min(CHECK_EVERY, n_steps - n)
+        if saved < len(save):
+            block = min(block, save[saved] - n)
+        copy_state(X, start_X)
+        before = j
+        j = in_one(X, table, j, block * link, False, work, geometry, sites, values)
+        close(X, end_X, table, work, geometry, sites, values)
+        if not finite_numbers(end_X):
+            for i in range(saved, out.shape[0]):
+                for k in range(width):
+                    out[i, k] = math.nan
+            running[:] = math.nan
+            return n - 1 + first_non_finite(start_X, end_X, table, before, block, work, geometry, sites, values)
+        n += block
+        while saved < len(save) and save[saved] == n:
+            pack(end_X, 0, out[saved], geometry)
+            saved += 1
+    if len(running) > 0:
+        pack(X, 0, running[:width], geometry)
+        if COMPENSATED:
+            pack(X, 2, running[width:], geometry)
+    return n_steps

@@ -1,0 +1,60 @@
+"""Domains that are too large for a flow: which part spoils them, and a smaller one that works."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+
+from sympflow import Box, HamiltonianSystem, systems, train
+from sympflow.training.starts import frequency, warn_of_domain
+
+MORSE = "p**2/2 + (1 - exp(-q))**2"
+
+
+def warned(H, low, high):
+    """What is said of a box, and the box that is named in its place."""
+    system = HamiltonianSystem.from_sympy(H, domain=Box(low, high))
+    with pytest.warns(UserWarning, match="`domain`") as found:
+        warn_of_domain(system, system.domain)
+    corners = re.findall(r"\[([^]]+)\]", str(found[0].message))
+    return system, str(found[0].message), [[float(x) for x in corner.split(",")] for corner in corners[:2]]
+
+
+@pytest.mark.parametrize("low", [-20.0, -8.0])
+def test_the_wall_of_a_morse_bond_is_left_out(low):
+    """The rate is e^(−q) on the wall: in the box that is named it differs by far less, and nothing is said of it."""
+    system, _, (lower, upper) = warned(MORSE, [low, -1.0], [3.0, 1.0])
+    assert lower[0] > low / 2
+    smaller = Box(lower, upper)
+    assert frequency(system, smaller) < 1e-2 * frequency(system, system.domain)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_domain(system, smaller)
+
+
+def test_a_half_without_a_finite_energy_is_left_out():
+    _, message, (lower, upper) = warned("p**2/2 + q - log(q)", [-1.0, -1.0], [1.0, 1.0])
+    assert "is not finite at 175 of 400 states" in message
+    assert 0 <= lower[0] < 0.05
+    assert upper[0] > 0.9
+
+
+@pytest.mark.parametrize("make", [systems.henon_heiles, systems.pendulum, systems.quartic, systems.kepler])
+def test_nothing_is_said_of_domains_that_suit(make):
+    system = make()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_domain(system, system.domain)
+
+
+def test_states_whose_solutions_end_before_a_step_are_counted():
+    """Of H = p²/2 − q⁴ most orbits escape to infinity in a finite time; the others lie about the origin."""
+    system = HamiltonianSystem.from_sympy("p**2/2 - q**4/4", domain=Box([-1.6, -0.3], [1.6, 0.3]))
+    options = {"restarts": 2, "steps": 20, "points": 60, "reference_states": 50, "label_times": 2, "progress": False}
+    with pytest.warns(UserWarning, match=r"From \d+ of 50 held-out states|no solution exists up to") as found:
+        train(system, 1.2, **options)
+    (lower, upper) = (
+        [float(x) for x in corner.split(",")] for corner in re.findall(r"\[([^]]+)\]", str(found[0].message))[:2]
+    )
+    assert np.max(np.abs([lower[0], upper[0]])) < 1.6
