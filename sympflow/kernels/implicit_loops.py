@@ -136,7 +136,7 @@ class ImplicitKernel(Kernel):
 def _load(algebra: str, ndof: int, tableau: Tableau, compensated: bool, rates: tuple[float, ...]) -> ModuleType:
     A, B, scale = tableau
     C = tuple(float(np.dot(row, scale)) for row in A)
-    numbers = {"A": A, "B": B, "C": C, "SCALE": scale, "RATES": rates}
+    numbers: dict[str, Any] = {"A": A, "B": B, "C": C, "SCALE": scale, "RATES": rates}
     constants = constants_source(COMPENSATED=compensated, NDOF=ndof, STAGES=len(B), **numbers)
     steps = "\n\n\n".join([constants, template("running_states"), template("newton_steps")])
     return load_algebra(algebra, ["newton"], [steps])

@@ -1,7 +1,7 @@
 """The algebra of Newton's iteration for Gauss methods. Source text for `newton`, which systems share, compiled.
 
-What comes before defines `NDOF`, `COMPENSATED`, the tableau `A`, `B`, `C` and `SCALE` of `STAGES` stages as tuples, and the
-`RATES` of friction, one for each p, none without.
+What comes before defines `NDOF`, `COMPENSATED`, the tableau `A`, `B`, `C` and `SCALE` of `STAGES` stages as tuples, and
+the `RATES` of friction, one for each p, none without.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
