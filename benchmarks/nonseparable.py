@@ -4,13 +4,16 @@
     python benchmarks/nonseparable.py --systems schwarzschild        one scene
     python benchmarks/nonseparable.py --seconds 0                    without a network
     python benchmarks/nonseparable.py --long                         a million steps of tao4, nothing else
+    python benchmarks/nonseparable.py --networks                     a network for each scene, nothing else
 
 Each method runs from the scene's y0 to T, compiled, with as few steps as meet a target, found by doubling and
 bisection; for dop853 it is the tolerance that is searched. The targets are errors of 1e-4 and 1e-8 over 100 outputs:
 of the energy, the largest relative one, and of the state, the largest of a coordinate or momentum against
 gauss_legendre8 with short steps. The run time is that of a call of `solve` with the final state as the only output, the
 shortest of several in processor time. A network SympFlow, trained for so many seconds by Gauss–Newton on states of the
-double pendulum, stands with the errors that it has. Long runs tell whether the energy drifts and the copies part.
+double pendulum, stands with the errors that it has. With `--networks` one is trained by Gauss–Newton on labels for each
+scene, and beside it stands the fastest of the methods with steps so short that both of its errors are met. Long runs
+tell whether the energy drifts and the copies part.
 """
 
 # ruff: noqa: E402
@@ -57,6 +60,9 @@ COURSES = {
 """The scene and the time T of each fragment."""
 LONG = ((systems.double_pendulum, 0.1), (systems.schwarzschild, 1.0), (systems.charged_particle, 0.01))
 LONG_STEPS = 1_000_000
+NETWORKS = {"nonseparable": 0.1, "double_pendulum": 0.5, "schwarzschild": 20.0, "charged_particle": 0.1}
+"""Δt of a network for each scene."""
+NETWORK_STEPS = 100
 SCENES = [make.__name__ for make, _ in COURSES.values()]
 
 
@@ -123,6 +129,60 @@ def trained(system: HamiltonianSystem, seconds: float) -> FlowMap:
         )
 
 
+def networks(options: argparse.Namespace) -> None:
+    """A network of three pairs for each scene, and the fastest of the methods at the errors that it has."""
+    rows = []
+    for make, T in COURSES.values():
+        if make.__name__ not in options.systems:
+            continue
+        system = make()
+        times = np.linspace(0.0, T, OUTPUTS + 1)
+        exact = solve(system, "gauss_legendre8", (0.0, T), t_eval=times, dt=T / REFERENCE_STEPS).y
+        begin = time.process_time()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it is far from the exact flow is shown
+            flow = train(
+                system,
+                NETWORKS[make.__name__],
+                kind="sympflow",
+                optimizer="gauss-newton",
+                loss="labels",
+                hidden=(8, 8),
+                points=800,
+                steps=NETWORK_STEPS,
+                progress=False,
+            )
+        trained_in = time.process_time() - begin
+        got = errors(solve(system, flow, (0.0, T), t_eval=times), exact)
+        seconds = run_time(system, T, flow, {})
+        fastest, name = math.inf, "—"
+        for method in METHODS[:-1]:
+            runs = Runs(system, T, exact, method)
+            needed = [runs.fewest(got[measure], measure) for measure in MEASURES]
+            if None not in needed:
+                taken = run_time(system, T, method, runs.chosen(max(needed)))
+                fastest, name = min((fastest, name), (taken, f"`{method}` (dt {T / max(needed):.2g})"))
+        rows.append(
+            (
+                f"`{system.name}`, Δt = {flow.dt:g}",
+                f"{flow.n_parameters}, {trained_in:.0f} s",
+                f"{flow.figures['one_step_error']:.1e}",
+                f"{got['energy']:.1e}",
+                f"{got['state']:.1e}",
+                fragments.duration(seconds),
+                f"{name}, {fragments.duration(fastest)}",
+                f"{fastest / seconds:.2g}",
+            )
+        )
+        print(fragments.row(rows[-1]), flush=True)
+    titles = (
+        *("scene", "parameters, training", "error of a step", "energy", "state", "network"),
+        *("fastest method at both errors", "times as fast"),
+    )
+    asked = "--networks" if options.systems == SCENES else f"--networks --systems {' '.join(options.systems)}"
+    fragments.write(options.out, "nonseparable-networks", fragments.table(titles, rows), asked)
+
+
 def long_runs(folder: Path | None) -> None:
     """The energy error and the distance of the copies over a million steps of tao4."""
     rows = []
@@ -152,8 +212,12 @@ def main() -> None:
     parser.add_argument("--systems", nargs="*", choices=SCENES, default=SCENES, metavar="scene")
     parser.add_argument("--seconds", type=float, default=150.0, help="of training; 0 for none")
     parser.add_argument("--long", action="store_true", help="long runs alone")
+    parser.add_argument("--networks", action="store_true", help="networks alone")
     fragments.add_out(parser)
     options = parser.parse_args()
+    if options.networks:
+        networks(options)
+        return
     if not options.long:
         race(options)
     if options.long or options.systems == SCENES:

@@ -3,7 +3,7 @@
     python benchmarks/primed.py                        four scenes: energy error over T = 1000, state error at T = 100
     python benchmarks/primed.py --system pendulum      one of them
     python benchmarks/primed.py --fit --flows folder   flows that are fitted first, and kept in a folder
-    python benchmarks/primed.py --driven               flows of driven systems, fitted first; kept with --fit --flows
+    python benchmarks/primed.py --driven               driven systems
     python benchmarks/primed.py --ablation             what of a flow and its training pays, on Hénon–Heiles
     python benchmarks/primed.py --quick                the same in miniature
     python benchmarks/primed.py --out docs/measured    with the fragments of docs/primed.md
@@ -24,7 +24,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -65,12 +64,12 @@ DRIVEN: dict[str, tuple[Callable[[], HamiltonianSystem], dict[str, float], tuple
     "driven_pendulum": (
         systems.driven_pendulum,
         MEASURES,
-        tuple(Primed(dt, 3, curvature=True) for dt in (0.8, 0.6, 0.4, 0.25)),
+        tuple(Primed(dt, 6, 8, curvature=True, first="kick") for dt in (2.0, 1.5, 1.0, 0.8, 0.5, 0.4)),
     ),
     "duffing": (
         partial(systems.duffing, damping=0.0, force=0.1, frequency=2.7, alpha=1.0),
         MEASURES,
-        (Primed(0.5, 3),),
+        tuple(Primed(dt, 6, 8, curvature=True, first="kick") for dt in (1.5, 1.0, 0.8, 0.5, 0.4)),
     ),
 }
 """Driven systems, what is measured, and the starts of trainings, 8 tables each."""
@@ -233,31 +232,34 @@ def main() -> None:
 
 
 def driven(options: argparse.Namespace, quick: dict[str, Any]) -> str:
-    """The race of flows of driven systems; they are fitted, or taken from the folder that is given."""
+    """The race of flows of driven systems, those that ship or others."""
     rows: list[Row] = []
     targets = (1e-2,) if options.quick else TARGETS
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = options.flows if options.fit else Path(scratch)
-        for name in options.system or DRIVEN:
-            make, measures, starts = DRIVEN[name]
-            system = make()
-            system.name = name
-            flows = [fitted(system, start, 8, folder, **quick) for start in starts[: 1 if options.quick else None]]
-            for measure, t_end in measures.items():
-                for target in targets:
-                    row = race(
-                        Measure(system, measure, 20.0 if options.quick else t_end),
-                        target,
-                        flows,
-                        None,
-                        options.repeats,
-                        options.batch,
-                    )
-                    if row is None:
-                        print(f"{name}: no flow reaches {measure} {target:g}", flush=True)
-                        continue
-                    rows.append(row)
-                    print(table([row]).splitlines()[-1], flush=True)
+    for name in options.system or DRIVEN:
+        make, measures, starts = DRIVEN[name]
+        system = make()
+        system.name = name
+        if options.fit:
+            flows = [
+                fitted(system, start, 8, options.flows, **quick) for start in starts[: 1 if options.quick else None]
+            ]
+        else:
+            flows = stored(system, options.flows)
+        for measure, t_end in measures.items():
+            for target in targets:
+                row = race(
+                    Measure(system, measure, 20.0 if options.quick else t_end),
+                    target,
+                    flows,
+                    None,
+                    options.repeats,
+                    options.batch,
+                )
+                if row is None:
+                    print(f"{name}: no flow reaches {measure} {target:g}", flush=True)
+                    continue
+                rows.append(row)
+                print(table([row]).splitlines()[-1], flush=True)
     fragments.write(options.out, "primed-driven", fragment(rows))
     return "\n" + table(rows)
 

@@ -41,6 +41,10 @@ class Gauss(OwnStepper):
     iteration that stops at a tolerance would make the energy drift [2]_. A step that has no solution, or whose
     iteration does not find it, ends the solution with status −1.
 
+    With friction −Γp a step is one in q and P = e^{Γτ}p, τ from its beginning: P' = −e^{Γτ}∂H/∂q has no friction, and
+    for Γ = γ these are the equations of e^{γτ}H(q, e^{−γτ}P), of which a Gauss method is symplectic. So the step is
+    conformally symplectic, of the same order, for any H.
+
     Parameters
     ----------
     dt : float, optional
@@ -75,7 +79,7 @@ class Gauss(OwnStepper):
     def counted_step(self, system: HamiltonianSystem, t: Any, y: Array, h: float | Array) -> tuple[Array, int]:
         """The step, and the iterations that it took, in sum over the states."""
         K, iterations = self._stages(system, y, per_state(h, y), self.stage_times(system, t, y, h))
-        return self._advanced(y, K), iterations
+        return self._advanced(system, y, K, per_state(h, y)), iterations
 
     def stage_times(self, system: HamiltonianSystem, t: Any, y: Array, h: Any) -> Any:
         """The times t + c_i h of the stages, (..., s), of a driven system; None of another."""
@@ -102,7 +106,15 @@ class Gauss(OwnStepper):
         s, n = K.shape[-2:]
         slopes = (h[..., None, None] * scale[:, None, None] * D).reshape(*y.shape[:-1], s * n, n)
         dK = _solved(M, slopes).reshape(*y.shape[:-1], s, n, n)
-        return self._advanced(y, K), np.eye(n, dtype=y.dtype) + np.einsum("i,...ijk->...jk", b, dK)
+        J = np.eye(n, dtype=y.dtype) + np.einsum("i,...ijk->...jk", b, dK)
+        if system.friction is not None:
+            E = _decays(system, h[..., 0])
+            J = np.concatenate([J[..., : n // 2, :], E @ J[..., n // 2 :, :]], axis=-2)
+        return self._advanced(system, y, K, h), J
+
+    @property
+    def takes_friction(self) -> bool:
+        return True
 
     @property
     def takes_driving(self) -> bool:
@@ -119,8 +131,12 @@ class Gauss(OwnStepper):
         )
         return ArrayGauss(self, problem) if kernel is None else CompiledGauss(self, problem, kernel)
 
-    def _advanced(self, y: Array, K: Array) -> Array:
-        return y + sum(b * K[..., i, :] for i, b in enumerate(self.tableau[1]))
+    def _advanced(self, system: HamiltonianSystem, y: Array, K: Array, h: Any) -> Array:
+        end = y + sum(b * K[..., i, :] for i, b in enumerate(self.tableau[1]))
+        if system.friction is None:
+            return end
+        d = system.ndof
+        return concatenate([end[..., :d], system.friction.drift(end[..., d:], h)[1]])
 
     def _stages(self, system: HamiltonianSystem, y: Array, h: Any, times: Any) -> tuple[Array, int]:
         """The K (..., s, 2d) of a step, NaN where the step was not solved; and the iterations, over all states."""
@@ -251,8 +267,31 @@ def _equations(
 def _residual(system: HamiltonianSystem, y: Array, K: Array, h: Any, times: Any, A: Array, scale: Array) -> Array:
     """K_i − h scale_i f(Y_i), (..., s·2d)."""
     outer = h[..., None] if getattr(h, "ndim", 0) else h
-    residual = K - outer * scale[:, None] * system.vector_field(y[..., None, :] + A @ K, times)
+    residual = K - outer * scale[:, None] * _field(system, y[..., None, :] + A @ K, h, times, A, scale)
     return residual.reshape(*residual.shape[:-2], -1)
+
+
+def _field(system: HamiltonianSystem, Y: Array, h: Any, times: Any, A: Array, scale: Array) -> Array:
+    """f of the stages Y (..., s, 2d); with friction of [q, P], [∂H/∂p, −e^{Γτ}∂H/∂q] at p = e^{−Γτ}P."""
+    friction, d = system.friction, system.ndof
+    if friction is None:
+        return system.vector_field(Y, times)
+    tau = (A @ scale * h)[..., None]
+    slope = system.gradient(concatenate([Y[..., :d], friction.drift(Y[..., d:], tau)[1]]), times)
+    return concatenate([slope[..., d:], -friction.drift(slope[..., :d], -tau)[1]])
+
+
+def _decays(system: HamiltonianSystem, s: Any) -> Array:
+    """e^{−Γs} for times s, a number or (...): (..., d, d)."""
+    friction = system.friction
+    assert friction is not None
+    identity = np.eye(system.ndof)
+    if is_tensor(s):
+        import torch
+
+        return friction.drift(torch.as_tensor(identity, dtype=s.dtype, device=s.device), s[..., None, None])[1]
+    s = np.asarray(s)
+    return friction.drift(identity.astype(s.dtype), s[..., None, None])[1]
 
 
 def _newton_matrix(
@@ -260,8 +299,18 @@ def _newton_matrix(
 ) -> tuple[Array, Array]:
     """M = I − h (scale_i A_ij f'(Y_i)), (..., s·2d, s·2d), and f'(Y), (..., s, 2d, 2d)."""
     d, (s, n) = system.ndof, Y.shape[-2:]
+    tau: Any = None
+    if system.friction is not None:
+        tau = A @ scale * h
+        p = system.friction.drift(Y[..., d:], tau[..., None])[1]
+        Y = concatenate([Y[..., :d], p])
     S = system.hessian(Y, times)
     D = concatenate([S[..., d:, :].swapaxes(-1, -2), -S[..., :d, :].swapaxes(-1, -2)]).swapaxes(-1, -2)
+    if tau is not None:
+        by_P, grown = D[..., d:] @ _decays(system, tau), _decays(system, -tau)
+        D = concatenate([D[..., :d], by_P])
+        lower = grown @ D[..., d:, :]
+        D = concatenate([D[..., :d, :].swapaxes(-1, -2), lower.swapaxes(-1, -2)]).swapaxes(-1, -2)
     outer = h[..., None, None, None] if getattr(h, "ndim", 0) else h
     blocks = outer * (scale[:, None] * A)[:, None, :, None] * D[..., :, :, None, :]
     M = -blocks.reshape(*Y.shape[:-2], s * n, s * n)

@@ -248,8 +248,9 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
         what = "was trained without it" if integrator.trained else "does not take it"
         system.check_conservative(
             f"and method {integrator.name!r} {what}",
-            "use a splitting method on the splitting 'kinetic', such as 'verlet' or 'kahan_li8', or a Runge–Kutta "
-            "method such as 'dop853' or 'dopri5', or solve the system that sympflow.doubled makes of it",
+            "use a splitting method on the splitting 'kinetic', such as 'verlet' or 'kahan_li8', an implicit method "
+            "such as 'gauss_legendre6', or a Runge–Kutta method such as 'dop853' or 'dopri5', or solve the system "
+            "that sympflow.doubled makes of it",
         )
     if not system.autonomous and not (integrator.takes_driving and _speaks_for_itself(mro, "takes_driving")):
         what = "was trained for a system without t" if integrator.trained else "does not take the time into account"

@@ -65,7 +65,15 @@ class ImplicitKernel(Kernel):
                 "`system` cannot be compiled: its Hessian is not symbolic. Use HamiltonianSystem.from_sympy, "
                 "or use backend='array'."
             )
-        self.ndof, self._tableau, self._compensated = system.ndof, tableau, compensated
+        friction = system.friction
+        if friction is not None and compensated:
+            raise ValueError(
+                "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
+            )
+        if friction is not None and friction.damping.ndim == 2:
+            raise ValueError("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
+        rates = () if friction is None else tuple(np.broadcast_to(friction.rates, system.ndof).tolist())
+        self.ndof, self._tableau, self._compensated, self._rates = system.ndof, tableau, compensated, rates
         self._algebra = gradient_and_hessian_source(system.symbols)
 
     def run(
@@ -104,7 +112,7 @@ class ImplicitKernel(Kernel):
         threads: int | None,
         carry: Carry | None,
     ) -> Run:
-        loops = _load(self._algebra, self.ndof, self._tableau, self._compensated)
+        loops = _load(self._algebra, self.ndof, self._tableau, self._compensated, self._rates)
         iterations = np.empty(len(y0), dtype=np.int64)
 
         def rows(i: slice, *rest: Any) -> None:
@@ -120,15 +128,16 @@ class ImplicitKernel(Kernel):
         y = given(y)
         h, t = (given(np.broadcast_to(x, y.shape[:1])) for x in (h, t))
         out, iterations = np.empty_like(y), np.empty(len(y), dtype=np.int64)
-        _load(self._algebra, self.ndof, self._tableau, False).step_each(h, t, y, out, iterations)
+        _load(self._algebra, self.ndof, self._tableau, False, self._rates).step_each(h, t, y, out, iterations)
         return Steps(out, int(iterations.sum()))
 
 
 @lru_cache(maxsize=256)
-def _load(algebra: str, ndof: int, tableau: Tableau, compensated: bool) -> ModuleType:
+def _load(algebra: str, ndof: int, tableau: Tableau, compensated: bool, rates: tuple[float, ...]) -> ModuleType:
     A, B, scale = tableau
     C = tuple(float(np.dot(row, scale)) for row in A)
-    constants = constants_source(COMPENSATED=compensated, NDOF=ndof, STAGES=len(B), A=A, B=B, C=C, SCALE=scale)
+    numbers: dict[str, Any] = {"A": A, "B": B, "C": C, "SCALE": scale, "RATES": rates}
+    constants = constants_source(COMPENSATED=compensated, NDOF=ndof, STAGES=len(B), **numbers)
     steps = "\n\n\n".join([constants, template("running_states"), template("newton_steps")])
     return load_algebra(algebra, ["newton"], [steps])
 

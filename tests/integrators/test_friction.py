@@ -321,13 +321,73 @@ def test_methods_of_peers_and_ours_within_them():
     ours = solve_ivp(system, (0, 2.0), system.y0, method=as_scipy("kahan_li8", system, dt=0.1))
     np.testing.assert_allclose(theirs.y[:, -1], truth, atol=1e-7)
     np.testing.assert_allclose(ours.y[:, -1], truth, atol=1e-9)
-    with pytest.raises(ValueError, match="has friction"):
-        as_scipy("implicit_midpoint", system, dt=0.1)
+    implicit = solve_ivp(system, (0, 2.0), system.y0, method=as_scipy("gauss_legendre6", system, dt=0.1))
+    np.testing.assert_allclose(implicit.y[:, -1], truth, atol=1e-8)
     with pytest.raises(ValueError):
         solve_ivp(pendulum(), (0, 2.0), system.y0, method=as_scipy("verlet", system, dt=0.1))
     y0, t = torch.tensor(system.y0), torch.tensor([0.0, 2.0], dtype=torch.float64)
     states = torchdiffeq.odeint(system, y0, t, method="dopri8", rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(states[-1].numpy(), truth, atol=2e-6)
+
+
+# implicit methods, of any H ------------------------------------------------------------------------------------------
+
+TURNING = HamiltonianSystem.from_sympy(
+    "p**2/2*(1 + q**2/3) + q**2/2 + q*cos(2*t)", damping=0.3, time="t", period=np.pi, y0=[0.7, -0.2], t_span=(0, 2)
+)
+"""Not separable, driven and damped."""
+GAUSS = {"implicit_midpoint": 2, "gauss_legendre4": 4, "gauss_legendre6": 6, "gauss_legendre8": 8}
+
+
+@pytest.fixture(scope="module")
+def ends():
+    """Where DOP853 ends, of one rate, of two, and of a matrix, at t = 2."""
+    two = HamiltonianSystem.from_sympy(
+        "p1**2/2*(1 + q2**2/3) + p2**2/4 + 1 - cos(q1 - q2) + q1**4/4", damping=[0.5, 0.2], y0=COUPLED.y0
+    )
+    return [
+        (system, solve(system, "dop853", (0, 2.0), rtol=1e-13, atol=1e-14).y[:, -1])
+        for system in (TURNING, two, COUPLED)
+    ]
+
+
+@pytest.mark.parametrize(("name", "order"), GAUSS.items())
+def test_gauss_methods_keep_their_order_with_friction(name, order, ends):
+    for system, end in ends:
+        errors = [
+            np.abs(solve(system, name, (0, 2.0), dt=dt, backend="array").y[:, -1] - end).max() for dt in (0.4, 0.2)
+        ]
+        assert order - 0.2 < np.log2(errors[0] / errors[1]) < order + 0.5
+
+
+@pytest.mark.parametrize("name", GAUSS)
+def test_gauss_methods_are_conformally_symplectic_for_any_h(name):
+    sol = solve(TURNING, name, (0, 20.0), dt=0.4, backend="array")
+    assert sympflow.conformal_defect(sol) < 1e-14
+
+
+def test_compiled_gauss_methods_with_friction_are_those_of_arrays(ends):
+    (turning, _), (two, _), (coupled, _) = ends
+    for system in (turning, two):
+        y0 = np.stack([system.y0, 0.5 * system.y0])
+        compiled, arrays = (
+            solve(system, "gauss_legendre4", (0, 4.0), y0, dt=0.2, backend=backend) for backend in ("compiled", "array")
+        )
+        np.testing.assert_allclose(compiled.y, arrays.y, rtol=0, atol=1e-13)
+    back = solve(turning, "gauss_legendre4", (4.0, 0.0), solve(turning, "gauss_legendre4", (0, 4.0)).y[:, -1])
+    np.testing.assert_allclose(back.y[:, -1], turning.y0, atol=1e-12)
+    assert solve(coupled, "gauss_legendre4", (0, 0.4), dt=0.2).stats["backend"] == "numpy"
+    with pytest.raises(ValueError, match="is a matrix"):
+        solve(coupled, "gauss_legendre4", (0, 0.4), dt=0.2, backend="compiled")
+
+
+def test_gradients_flow_through_implicit_steps_with_friction():
+    y0 = torch.tensor(TURNING.y0, requires_grad=True)
+    end = solve(TURNING, "gauss_legendre4", (0, 1.0), y0, dt=0.1).y[..., -1]
+    (slope,) = torch.autograd.grad(end[0], y0)
+    y0 = TURNING.y0 + np.array([[1e-5, 0.0], [-1e-5, 0.0]])
+    ahead, behind = solve(TURNING, "gauss_legendre4", (0, 1.0), y0, dt=0.1).y[:, 0, -1]
+    assert float(slope[0]) == pytest.approx((ahead - behind) / 2e-5, rel=1e-8)
 
 
 # what does not hold, or is for later --------------------------------------------------------------------------------

@@ -84,8 +84,9 @@ def test_shipped_sympflows_stay_for_a_hundred_thousand_steps(scene):
 
 
 def test_every_shipped_sympflow_has_its_certificate():
-    """But for those in another time, whose H has another flow."""
-    for entry in (e for e in shipped_flows(kind="sympflow") if "-log-" not in e.name):
+    """But for those in another time, whose H has another flow, and of driven systems."""
+    without = ("driven_pendulum", "duffing")
+    for entry in (e for e in shipped_flows(kind="sympflow") if "-log-" not in e.name and e.system not in without):
         flow = load(entry.path)
         assert flow.certified is not None, entry.name
         assert flow.certified.delta.largest > 0

@@ -5,6 +5,8 @@ entries of S that are always zero as they are.
 
 The unknowns are K_i = h SCALE_i f(y + Σ_j A_ij K_j), in which the coefficients are exact where it matters for the long
 run, and y + Σ B_i K_i needs no further evaluation of f.
+
+With friction they are those of q and P = e^{γτ}p, τ from the beginning of the step.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -23,9 +25,11 @@ def stages(y, h, t, work):
 
     Returns the iterations taken, negative if in vain.
     """
-    K, change, M, Y, g, S = work
+    K, change, M, Y, g, S, growth = work
     for m in range(len(K)):
         K[m] = 0.0
+    if DAMPED:
+        fill_growth(h, growth)
     before = np.inf
     for iteration in range(1, MOST_ITERATIONS + 1):
         for i in range(STAGES):
@@ -34,7 +38,12 @@ def stages(y, h, t, work):
                 Y[m] = y[m]
                 for j in range(STAGES):
                     Y[m] += A[i][j] * K[j * SIZE + m]
+            if DAMPED:
+                for m in range(NDOF):
+                    Y[NDOF + m] /= growth[i, m]
             gradient_and_hessian(Y, g, S, t + C[i] * h)
+            if DAMPED:
+                scale_slopes(g, S, growth[i])
             for m in range(SIZE):
                 sign = 1.0 if m < NDOF else -1.0  # J∇H = (∂H/∂p, −∂H/∂q)
                 other = m + NDOF if m < NDOF else m - NDOF
@@ -82,7 +91,7 @@ def rollout(h, t0, y0, n_steps, save, out, work, stop, first, running):
             break
         taken = stages(y, h, t0 + (n - 1) * h, work)
         iterations += abs(taken)
-        if taken < 0 or not advance(y, error, work[0]):
+        if taken < 0 or not advance(y, h, error, work[0]):
             fill_with_nan(out, saved)
             set_nan(running)
             return n - 1, iterations
@@ -114,5 +123,5 @@ def step_each(h, t, y, out, iterations):
         iterations[i] = abs(taken)
         for m in range(SIZE):
             error[m] = 0.0
-        if taken < 0 or not advance(out[i], error, work[0]):
+        if taken < 0 or not advance(out[i], h[i], error, work[0]):
             set_nan(out[i])

@@ -1,14 +1,18 @@
 """The algebra of Newton's iteration for Gauss methods. Source text for `newton`, which systems share, compiled.
 
-What comes before defines `NDOF`, `COMPENSATED`, and the tableau `A`, `B`, `C` and `SCALE` of `STAGES` stages as tuples.
+What comes before defines `NDOF`, `COMPENSATED`, the tableau `A`, `B`, `C` and `SCALE` of `STAGES` stages as tuples, and
+the `RATES` of friction, one for each p, none without.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
+
+import math
 
 import numpy as np
 from numba import njit
 
 SIZE = 2 * NDOF
+DAMPED = len(RATES) > 0
 
 
 @njit(**OPTIONS)
@@ -21,7 +25,8 @@ def copy_numbers(source, target):
 @njit(**OPTIONS)
 def workspace():
     n = STAGES * SIZE
-    return np.zeros(n), np.zeros(n), np.zeros((n, n)), np.zeros(SIZE), np.zeros(SIZE), np.zeros((SIZE, SIZE))
+    growth = np.ones((STAGES, NDOF))
+    return np.zeros(n), np.zeros(n), np.zeros((n, n)), np.zeros(SIZE), np.zeros(SIZE), np.zeros((SIZE, SIZE)), growth
 
 
 @njit(**OPTIONS)
@@ -74,8 +79,30 @@ def relative_size(change, y, K):
 
 
 @njit(**OPTIONS)
-def advance(y, error, K):
-    """y + Σ b_i K_i in place; if `COMPENSATED` by Kahan's compensated sum. True if the result is finite."""
+def fill_growth(h, growth):
+    """e^{γτ} at the stages of a step of length h."""
+    for i in range(STAGES):
+        for m in range(NDOF):
+            growth[i, m] = math.exp(RATES[m] * C[i] * h)
+
+
+@njit(**OPTIONS)
+def scale_slopes(g, S, growth):
+    """∇H and ∇²H at (q, p) into those of [q, P] as the equations hold them: rows e^{γτ} ∂H/∂q, columns ∂p/∂P."""
+    for m in range(NDOF):
+        g[m] *= growth[m]
+        for n in range(NDOF):
+            S[m, n] *= growth[m]
+            S[m, NDOF + n] *= growth[m] / growth[n]
+            S[NDOF + m, NDOF + n] /= growth[n]
+
+
+@njit(**OPTIONS)
+def advance(y, h, error, K):
+    """y + Σ b_i K_i in place, if `COMPENSATED` by Kahan's compensated sum; a damped p decays over h.
+
+    True if the result is finite.
+    """
     total = 0.0
     for m in range(SIZE):
         change = 0.0
@@ -88,5 +115,7 @@ def advance(y, error, K):
             y[m] = new
         else:
             y[m] += change
+        if DAMPED and m >= NDOF:
+            y[m] *= math.exp(-RATES[m - NDOF] * h)
         total += 0.0 * y[m]
     return total == 0.0

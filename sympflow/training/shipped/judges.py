@@ -20,6 +20,7 @@ from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.energy import max_energy_error
+from sympflow.metrics.energy_balance import energy_balance_error
 from sympflow.solver import solve
 from sympflow.training.clock_fit import energy_errors
 from sympflow.training.points import Labels
@@ -187,6 +188,21 @@ class ByRuns:
         run = solve(system, flow, (0.0, self.t_end), y0, t_eval=times, on_domain_exit="ignore")
         flow.certificate(system, t_end=self.t_certified)
         flow.figures |= _of_runs(max_energy_error(run), self.t_end) | {"cost": round(self.cost(flow), 8)}
+
+
+@dataclass(frozen=True)
+class ByBalance:
+    """Relative errors of the energy balance of runs of a driven system over T = t_end; it has no certificate."""
+
+    t_end: float = 1000.0
+    cost: Cost = primed_cost
+
+    def __call__(self, flow: PrimedFlow, system: HamiltonianSystem) -> None:
+        assert system.domain is not None
+        y0, times = system.domain.sample(HELD_OUT, CLOCK_SEED), np.linspace(0.0, self.t_end, OUTPUTS + 1)
+        run = solve(system, flow, (0.0, self.t_end), y0, t_eval=times, on_domain_exit="ignore")
+        errors = energy_balance_error(run, relative=True).max(-1)
+        flow.figures |= _of_runs(errors, self.t_end) | {"cost": round(self.cost(flow), 3)}
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.solver import solve
-from sympflow.systems import SYSTEMS, fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum
+from sympflow.systems import SYSTEMS, duffing, fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum
 from sympflow.training.clock_fit import train_clock
 from sympflow.training.options import NewFit
-from sympflow.training.shipped.judges import AsPublished, ByCertificate, ByClock, ByRuns, OfStiff
+from sympflow.training.shipped.judges import AsPublished, ByBalance, ByCertificate, ByClock, ByRuns, OfStiff
 from sympflow.training.shipped.recipe import Judge, Recipe
 from sympflow.training.starts import Network, Primed, Split
 
@@ -113,7 +113,33 @@ def ladders() -> list[Recipe]:
         Recipe("kepler", "log-1", SYSTEMS[kepler], Clock(1.0), ByClock()),
         *(rung(planets, 3, dt, fit=short, judge=along) for dt in (300.0, 200.0, 100.0)),
         *(lattice_rung("toda-chain", dt) for dt in (0.8, 0.5, 0.25)),
+        *(driven_rung(SYSTEMS["driven-pendulum"], 6, dt) for dt in (2.0, 1.5, 1.0, 0.8, 0.4)),
+        driven_rung(SYSTEMS["driven-pendulum"], 6, 0.5, 10, seed=2),
+        driven_rung(SYSTEMS["driven-pendulum"], 8, 0.5, 10, restarts=100),
+        driven_rung(weak_duffing, 3, 1.0, 9, first="drift"),
+        *(driven_rung(weak_duffing, 6, dt) for dt in (1.5, 1.0, 0.8, 0.5, 0.4)),
+        driven_rung(weak_duffing, 8, 0.5, 10, restarts=100),
     ]
+
+
+def driven_rung(
+    system: Callable[[], HamiltonianSystem],
+    stages: int,
+    dt: float,
+    processor: int = 8,
+    restarts: int = 150,
+    seed: int = 1,
+    first: str = "kick",
+) -> Recipe:
+    """A primed flow of a driven system, judged by its energy balance; its minima are many, and starts are cheap."""
+    start = Primed(dt, stages, processor, curvature=True, first=first)
+    fit = NewFit(restarts=restarts, seed=seed, energy_weight=1.0)
+    return Recipe(system().name, f"primed-{stages}-{dt:g}", system, start, ByBalance(), (fit,))
+
+
+def weak_duffing() -> HamiltonianSystem:
+    """Duffing's oscillator in one well, without friction and weakly driven: its orbits are regular."""
+    return duffing(damping=0.0, force=0.1, frequency=2.7, alpha=1.0)
 
 
 def lattice_rung(scene: str, dt: float, density: tuple[float, float] = (0.02, 0.2)) -> Recipe:
