@@ -98,8 +98,6 @@ def ladders() -> list[Recipe]:
         # Of six seeds the one whose energy error over a long time is the lowest: the fit looks at single steps.
         rung(hh, 1, 0.82, fit=NewFit(seed=4, energy_weight=1000.0)),
         *(rung(hh, 3, dt, curvature=True) for dt in (1.6, 1.4, 1.0, 0.8, 0.6, 0.4)),
-        # One kick, and more of a processor: faster in long runs, with dearer outputs.
-        rung(hh, 1, 0.4, 12, NewFit(restarts=24), curvature=True),
         rung(swing, 2, 1.5, fit=plain),
         *(rung(swing, 3, dt, fit=plain, curvature=True) for dt in (2.0, 1.5)),
         *(rung(swing, 3, dt, curvature=True) for dt in (1.0, 0.8, 0.6, 0.4)),
