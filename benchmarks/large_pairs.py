@@ -2,7 +2,8 @@
 
     python benchmarks/large_pairs.py [--out docs/measured]
 
-Float64, one thread, processor time; what is compared is timed in turn, and the least time of the rounds counts. All
+Float64; processor time of one thread, and for one large system wall time on two. What is compared is timed in turn, and
+the least time of the rounds counts. All
 take the same steps of Verlet under gravity with softening. The loop by hand is direct summation over i < j in Numba.
 REBOUND is its `leapfrog` with `gravity="basic"`, where it is installed. Atoms are a Lennard-Jones fluid in a periodic
 box at the density 0.8442 with a cut-off of 2.5.
@@ -24,6 +25,7 @@ from measuring import fragments
 from numba import njit
 
 from sympflow import HamiltonianSystem, solve
+from sympflow.kernels.modules import at_most
 
 SOFTENING, H = 0.05, 1e-4
 
@@ -74,24 +76,47 @@ def rebound_run(n: int, steps: int) -> Callable[[], Any] | None:
     return lambda: sim.steps(steps)
 
 
-def least_times(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
+def least_times(
+    calls: dict[str, Callable[[], Any]], rounds: int, clock: Callable[[], float] = time.process_time
+) -> dict[str, float]:
     least = dict.fromkeys(calls, math.inf)
     for call in calls.values():
         call()
     for _ in range(rounds):
         for name, call in calls.items():
-            start = time.process_time()
+            start = clock()
             call()
-            least[name] = min(least[name], time.process_time() - start)
+            least[name] = min(least[name], clock() - start)
     return least
+
+
+def on_threads(n: int, call: Callable[[], Any]) -> Callable[[], Any]:
+    def limited() -> Any:
+        with at_most(n):
+            return call()
+
+    return limited
+
+
+def gravity(n: int) -> HamiltonianSystem:
+    q, p, m = cluster(n)
+    y0 = np.concatenate([q.ravel(), p.ravel()])
+    return HamiltonianSystem.pairs("-m1*m2/r", masses=m, softening=SOFTENING, y0=y0)
+
+
+def fluid(side: int) -> HamiltonianSystem:
+    n, length = side**3, side * 0.8442 ** (-1 / 3)
+    rng = np.random.default_rng(0)
+    places = np.stack(np.meshgrid(*[np.arange(side)] * 3), -1).reshape(-1, 3) * (length / side)
+    y0 = np.concatenate([(places + rng.uniform(-0.05, 0.05, places.shape)).ravel(), rng.standard_normal(3 * n)])
+    return HamiltonianSystem.pairs("4*(1/r**12 - 1/r**6)", masses=np.ones(n), box=length, cutoff=2.5, y0=y0, dt=0.002)
 
 
 def bodies(rounds: int) -> str:
     rows = []
     for n, steps in ((10, 20_000), (100, 2_000), (1000, 30)):
         q, p, m = cluster(n)
-        y0 = np.concatenate([q.ravel(), p.ravel()])
-        system = HamiltonianSystem.pairs("-m1*m2/r", masses=m, softening=SOFTENING, y0=y0)
+        system = gravity(n)
 
         def ours(system: HamiltonianSystem = system, steps: int = steps) -> np.ndarray:
             return solve(system, "verlet", (0.0, steps * H), dt=H, t_eval=[steps * H]).y[:, -1]
@@ -102,7 +127,7 @@ def bodies(rounds: int) -> str:
             return np.concatenate([x.ravel(), momenta.ravel()])
 
         np.testing.assert_allclose(ours(steps=20), by_hand(steps=20), rtol=0, atol=1e-10)
-        calls: dict[str, Callable[[], Any]] = {"ours": ours, "by hand": by_hand}
+        calls: dict[str, Callable[[], Any]] = {"ours": on_threads(1, ours), "by hand": by_hand}
         theirs = rebound_run(n, steps)
         if theirs is not None:
             calls["REBOUND"] = theirs
@@ -118,23 +143,32 @@ def bodies(rounds: int) -> str:
 def atoms(rounds: int) -> str:
     rows = []
     for side in (8, 11, 16, 23):
-        n, length = side**3, side * 0.8442 ** (-1 / 3)
-        rng = np.random.default_rng(0)
-        places = np.stack(np.meshgrid(*[np.arange(side)] * 3), -1).reshape(-1, 3) * (length / side)
-        y0 = np.concatenate([(places + rng.uniform(-0.05, 0.05, places.shape)).ravel(), rng.standard_normal(3 * n)])
-        system = HamiltonianSystem.pairs(
-            "4*(1/r**12 - 1/r**6)", masses=np.ones(n), box=length, cutoff=2.5, y0=y0, dt=0.002
-        )
+        system, n = fluid(side), side**3
 
         def run(system: HamiltonianSystem = system) -> np.ndarray:
             return solve(system, "verlet", (0.0, 0.04), t_eval=[0.04]).y
 
-        seconds = least_times({"ours": run}, rounds)["ours"] / 20
+        seconds = least_times({"ours": on_threads(1, run)}, rounds)["ours"] / 20
         rows.append([f"{n:,}", f"{1e3 * seconds:.3g}", f"{1e6 * seconds / n:.2f}"])
     return fragments.table(["atoms", "ms a step", "µs an atom and step"], rows)
 
 
-PARTS = {"large-bodies": bodies, "large-atoms": atoms}
+def threads(rounds: int) -> str:
+    rows = []
+    systems = {f"gravity, {n:,} bodies": (gravity(n), H, steps) for n, steps in ((1000, 100), (3000, 15))}
+    systems["4,096 atoms, cells"] = fluid(16), 0.002, 20
+    for name, (system, h, steps) in systems.items():
+
+        def run(system: HamiltonianSystem = system, h: float = h, steps: int = steps) -> np.ndarray:
+            return solve(system, "verlet", (0.0, steps * h), dt=h, t_eval=[steps * h]).y
+
+        calls = {str(n): on_threads(n, run) for n in (1, 2)}
+        one, two = least_times(calls, rounds, time.perf_counter).values()
+        rows.append([name, f"{1e3 * one / steps:.3g}", f"{1e3 * two / steps:.3g}", f"{one / two:.2f}"])
+    return fragments.table(["system", "ms a step, one thread", "two threads", "ratio"], rows)
+
+
+PARTS = {"large-bodies": bodies, "large-atoms": atoms, "large-pair-threads": threads}
 
 
 def main() -> None:

@@ -1,5 +1,6 @@
 """Fixtures shared by several test modules."""
 
+import gc
 import importlib.util
 import os
 from pathlib import Path
@@ -9,6 +10,9 @@ import pytest
 # Where colorama is installed, Numba puts sys.stdout of its first message back after each: that of a command under test
 # would be lost whenever something is compiled meanwhile.
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
+
+# A compiler makes many objects that live on: looking through all of them for circles takes a sixth of its time.
+gc.set_threshold(50_000, 20, 50)
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from types import MappingProxyType
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -26,6 +26,9 @@ from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, 
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
+
+if TYPE_CHECKING:  # Numba, which a flow needs only to be compiled
+    from sympflow.kernels.network_tangents import NetworkTangents
 
 MAX_STEPS = 10_000_000  # of one call
 
@@ -440,6 +443,14 @@ class FlowMap(nn.Module):
     @staticmethod
     def _states(y: Tensor, batch: torch.Size) -> Tensor:
         return y.T.reshape(*batch, y.shape[0])
+
+    def tangents(self) -> NetworkTangents | None:
+        """Return compiled derivatives of ψ̄_t and d/dt ψ̄_t by the parameters, for Gauss–Newton; None if it has none."""
+        return None
+
+    def step_constants(self, x: Tensor, *t0: Tensor) -> Tensor:
+        """The constants of a step from states (N, 2d) that its networks take beside these and t: (m, N)."""
+        return x.new_empty(0, len(x))
 
     # its numbers -------------------------------------------------------------------------------------------
 

@@ -13,6 +13,7 @@ from sympflow.flow.potentials import NO_NETWORK, Potential, Time
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
     from sympflow.kernels.network_loops import NetworkLayer
+    from sympflow.kernels.network_tangents import TrainedNetwork
 
 
 class Layer(nn.Module):
@@ -58,6 +59,10 @@ class Layer(nn.Module):
         """
         raise ValueError(NO_NETWORK)
 
+    def trained(self) -> TrainedNetwork | None:
+        """Return its network for compiled derivatives by the parameters; None if there are none."""
+        return None
+
 
 class _PotentialLayer(Layer):
     def __init__(self, potential: Potential) -> None:
@@ -70,6 +75,9 @@ class _PotentialLayer(Layer):
 
     def network(self) -> NetworkLayer:
         return self.potential.network(self.kind == "kick")
+
+    def trained(self) -> TrainedNetwork | None:
+        return self.potential.trained()
 
 
 class Kick(_PotentialLayer):

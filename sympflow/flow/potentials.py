@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
     from importlib.metadata import EntryPoint
 
     from sympflow.kernels.network_loops import NetworkLayer
+    from sympflow.kernels.network_tangents import TrainedNetwork
 
 Time = float | Tensor
 
@@ -337,6 +338,10 @@ class Potential(nn.Module):
         """Return the weights of a kick or drift of it for compiled loops; ValueError if there are none."""
         raise ValueError(NO_NETWORK)
 
+    def trained(self) -> TrainedNetwork | None:
+        """Return the network for compiled derivatives by its parameters; None if there are none."""
+        return None
+
 
 class MLPPotential(Potential):
     """V(t, x) = c · N(t/τ, x/s), N a multilayer perceptron of any depth whose input is x with t appended.
@@ -523,6 +528,17 @@ class MLPPotential(Potential):
         biases, weights = [*map(array, b)], [*map(array, W)]
         first = is_kick, self.activation, array(K), array(k)
         return NetworkLayer(*first, biases, weights, array(w), self._sigma.compiled)
+
+    def trained(self) -> TrainedNetwork | None:
+        from sympflow.kernels.network_tangents import BENDING, TrainedNetwork
+
+        if self.activation not in BENDING or self.weight_x.dtype != torch.float64 or self.weight_x.device.type != "cpu":
+            return None
+        inner = [*self.biases, *self.weights]
+        units = [1 / self.scale.expand_as(self.weight_x), 1 / self.tau.expand_as(self.weight_t)]
+        units += [self.gain.expand_as(self.weight_out), *(torch.ones_like(w) for w in inner)]
+        flat = torch.cat([u.detach().reshape(-1) for u in units]).numpy()
+        return TrainedNetwork(self.ndof, self.hidden, self.activation, flat)
 
     # V and its derivatives at one time ---------------------------------------------------------------
 

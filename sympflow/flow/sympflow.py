@@ -37,6 +37,7 @@ from sympflow.schemes import Scheme
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
     from sympflow.kernels.network_loops import MLPFlowKernel
+    from sympflow.kernels.network_tangents import NetworkTangents
 
 UNCOMPENSATED = (
     "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave it out, or take a "
@@ -419,6 +420,17 @@ class SympFlow(FlowMap):
         networks = [layer.network() for layer in self.layers]  # type: ignore[operator]
         check_compilable(self.dtype, self.device)
         return MLPFlowKernel(self.ndof, networks)
+
+    def tangents(self) -> NetworkTangents | None:
+        from sympflow.kernels.network_tangents import NetworkTangents
+
+        networks = [layer.trained() for layer in self.layers]  # type: ignore[operator]
+        if None in networks or len({(n.inputs, n.widths, n.activation) for n in networks}) > 1:
+            return None
+        return NetworkTangents(self.ndof, [layer.kind == "kick" for layer in self.layers], networks)
+
+    def step_constants(self, x: Tensor, *t0: Tensor) -> Tensor:
+        return self._opened(self._columns(0.0, self.lift(x, *t0))[1], 0.0)[0][self.ndof :]
 
     def hamiltonian(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """𝓗(ψ̄)(t, x), (...), for t ∈ [0, Δt]: the Hamiltonian of which ψ̄_t is the exact flow.

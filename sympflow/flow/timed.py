@@ -21,6 +21,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
     from sympflow.kernels.network_loops import NetworkLayer
+    from sympflow.kernels.network_tangents import TrainedNetwork
 
 
 @dataclass(frozen=True)
@@ -140,6 +141,9 @@ class TimedPotential(Potential):
         raise ValueError(
             "`flow` has networks that take the time of the state, and these have no compiled form: use backend='array'."
         )
+
+    def trained(self) -> TrainedNetwork | None:
+        return self.mlp.trained()
 
     def to_dict(self) -> dict[str, Any]:
         return {**self.mlp.to_dict(), "type": "timed"}

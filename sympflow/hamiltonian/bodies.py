@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import reprlib
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import sympy as sp
@@ -135,6 +136,13 @@ class PairsHamiltonian(LocalHamiltonian):
             V = V - V.subs(self.s, end) - (self.s - end) * slope
             self.c, self.constants = (*self.c, end), (*self.constants, self.cutoff**2 + self.softening**2)
         self.V = V
+
+    def with_params(self, values: Mapping[str, Any]) -> Self:
+        self.check_names(values)
+        other = copy.copy(self)
+        other.params = _checked_params({**self.params, **values})
+        other.constants = (*other.params.values(), *self.constants[len(self.params) :])
+        return other
 
     @property
     def work(self) -> int:

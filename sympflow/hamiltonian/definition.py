@@ -42,6 +42,8 @@ class Definition:
     loops : str
         Name of the compiled loops that are generated for it, of a definition by one piece: see
         `sympflow.hamiltonian.local`.
+    instead : str
+        The methods that are advised where H is not separable, in words.
     """
 
     ndof: int
@@ -56,6 +58,7 @@ class Definition:
     shortest_piece: float = inf
     has_third_derivative: bool = False
     loops: str = ""
+    instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""

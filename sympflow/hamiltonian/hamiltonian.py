@@ -446,9 +446,14 @@ class Hamiltonian:
         if not self.separable:
             raise ValueError(
                 f"`system` {self.name!r} is not separable: H does not split into T(p) + V(q), so splitting methods do "
-                "not apply. Use an implicit method such as 'gauss_legendre6', or a Runge–Kutta method."
+                f"not apply. Use {self.instead}."
             )
         return self
+
+    @property
+    def instead(self) -> str:
+        """The methods that are advised where H is not separable, in words."""
+        return self._definition.instead
 
     def remark(self, q: np.ndarray) -> str:
         """A clause on the last positions (d,) of a run that could not go on, such as bodies that met; or nothing."""

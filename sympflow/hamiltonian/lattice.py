@@ -76,11 +76,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         self._set_mass()
 
     def with_params(self, values: Mapping[str, Any]) -> Self:
-        for name in values:
-            if name not in self.params:
-                raise ValueError(
-                    f"`params` has {name!r}, and those of the lattice are {', '.join(self.params) or 'none'}."
-                )
+        self.check_names(values)
         other = copy.copy(self)
         for name in ("_functions", "terms"):
             vars(other).pop(name, None)

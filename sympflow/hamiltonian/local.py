@@ -7,7 +7,7 @@ operations. Nothing that it holds, but what depends on sites, is as long as the 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Self
 
@@ -62,12 +62,29 @@ class LocalHamiltonian(Definition):
         Raises
         ------
         TypeError, ValueError
-            If there is none, or values are bad.
+            If there is no such parameter, or values are bad.
         """
-        raise TypeError(
-            f"`params` of {self.loops} cannot be changed: make a system for each value, by "
-            f"HamiltonianSystem.{self.loops}."
-        )
+        raise NotImplementedError(f"{type(self).__name__} must define with_params().")
+
+    def check_names(self, names: Iterable[str]) -> None:
+        """Refuse names that are no parameters, with those that there are."""
+        for name in names:
+            if name not in self.params:
+                raise ValueError(
+                    f"`params` has {name!r}, and those of the system are {', '.join(self.params) or 'none'}: name one "
+                    "of these."
+                )
+
+    def check_numbers(self, names: Iterable[str]) -> None:
+        """Refuse names that are no parameters, and those of arrays, of which trajectories have none of their own."""
+        names = list(names)
+        self.check_names(names)
+        for name in names:
+            if isinstance(self.params[name], np.ndarray):
+                raise TypeError(
+                    f"`params` has {name!r}, an array of the sites, and trajectories have numbers of their own: make a "
+                    "system for each array, by system.with_params."
+                )
 
     def linear_and_rest(self, interval: float) -> tuple[Any, list[Any]]:
         """The quadratic part of H, in its normal modes, and the part that remains, if there is one.

@@ -1,4 +1,4 @@
-"""Values of the parameters of a symbolic system for each trajectory of a batch."""
+"""Values of the parameters of a system for each trajectory of a batch."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class ParameterRows:
     Parameters
     ----------
     system : HamiltonianSystem
-        Symbolic; it has the parameters.
+        It has the parameters.
     values : mapping of str to ndarray
         Of some of its parameters, each of the shape of the batch.
 
@@ -91,10 +91,14 @@ class ParameterRows:
     def by_form(self) -> Iterator[Rows]:
         """The trajectories by the `parametric` form of H; those whose values belong to the code, by their values.
 
+        Systems by one piece have the same code for all values, and run one value after the other.
+
         A value that makes a part of H 0, 1 or −1 has a form of its own, as it has in a system that is made with it.
         """
         symbols = self.system.symbols
-        assert symbols is not None
+        if symbols is None:
+            yield from self.distinct()
+            return
         try:
             parts, replaced = symbols.parametric_parts
         except (TypeError, OverflowError):
@@ -157,11 +161,21 @@ class ParameterRows:
 
     def hamiltonian(self, y: np.ndarray) -> np.ndarray:
         """H of each trajectory at its states y (*shape, ..., 2d): (*shape, ...)."""
+        if self.system.symbols is None:
+            return self._one_by_one(y)
         more = (1,) * (y.ndim - 1 - len(self.shape))
         columns = [value.reshape(*self.shape, *more) for value in self.values.values()]
         d = self.system.ndof
         (H,) = self._function(*(y[..., i] for i in range(2 * d)), *columns)
         return np.broadcast_to(H, y.shape[:-1])
+
+    def _one_by_one(self, y: np.ndarray) -> np.ndarray:
+        """`hamiltonian` by the system of each value."""
+        states = y.reshape(math.prod(self.shape), *y.shape[len(self.shape) :])
+        H = np.empty(states.shape[:-1])
+        for index, system, _ in self.distinct():
+            H[index] = system.hamiltonian(states[index])
+        return H.reshape(y.shape[:-1])
 
     @cached_property
     def _function(self) -> Any:

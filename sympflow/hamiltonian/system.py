@@ -619,15 +619,13 @@ class HamiltonianSystem(Hamiltonian):
         Raises
         ------
         TypeError
-            If the system is given by functions.
+            If the system is given by functions, or a parameter is an array of a lattice's sites.
         ValueError
             With the names that it has.
         """
         if self.local is not None:
-            raise TypeError(
-                f"`params` of {self.name!r} are arrays and numbers of all runs: make a system for each value, by "
-                "system.with_params."
-            )
+            self.local.check_numbers(names)
+            return
         if self.symbols is None:
             raise TypeError(
                 f"`params` are of symbolic systems, and {self.name!r} is given by functions, which hold their values: "

@@ -37,6 +37,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
     has_third_derivative = False
     quadratic_kinetic = False
     inverse_mass = None
+    instead = "a method with the exact linear flow, such as 'impulse' or 'linear_kahan_li6'"
 
     def __init__(
         self,
@@ -87,11 +88,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
             raise ValueError("`dispersion` must be finite at all wave numbers k of the grid, 0 among them; it is not.")
 
     def with_params(self, values: Mapping[str, Any]) -> Self:
-        for name in values:
-            if name not in self.params:
-                raise ValueError(
-                    f"`params` has {name!r}, and those of the system are {', '.join(self.params) or 'none'}."
-                )
+        self.check_names(values)
         other = copy.copy(self)
         vars(other).pop("_functions", None)
         other.params = checked_params({**self.params, **values}, self.grid)

@@ -154,8 +154,8 @@ class KineticPotential(Composition):
         self.method, self.scheme, self.system = method, scheme, system
         if not system.separable:
             raise ValueError(
-                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use an "
-                "implicit method such as 'gauss_legendre6', or a Runge–Kutta method."
+                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use "
+                f"{system.instead}."
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(

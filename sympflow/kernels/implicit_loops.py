@@ -15,7 +15,7 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels import terms
 from sympflow.kernels.codegen import statements
-from sympflow.kernels.modules import given, load_algebra
+from sympflow.kernels.modules import constants_source, given, load_algebra, template
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
 from sympflow.kernels.terms import is_large
 
@@ -104,7 +104,7 @@ class ImplicitKernel(Kernel):
         threads: int | None,
         carry: Carry | None,
     ) -> Run:
-        loops = _load(self._algebra, self._tableau, self._compensated)
+        loops = _load(self._algebra, self.ndof, self._tableau, self._compensated)
         iterations = np.empty(len(y0), dtype=np.int64)
 
         def rows(i: slice, *rest: Any) -> None:
@@ -120,15 +120,17 @@ class ImplicitKernel(Kernel):
         y = given(y)
         h, t = (given(np.broadcast_to(x, y.shape[:1])) for x in (h, t))
         out, iterations = np.empty_like(y), np.empty(len(y), dtype=np.int64)
-        _load(self._algebra, self._tableau, False).step_each(h, t, y, out, iterations)
+        _load(self._algebra, self.ndof, self._tableau, False).step_each(h, t, y, out, iterations)
         return Steps(out, int(iterations.sum()))
 
 
 @lru_cache(maxsize=256)
-def _load(algebra: str, tableau: Tableau, compensated: bool) -> ModuleType:
+def _load(algebra: str, ndof: int, tableau: Tableau, compensated: bool) -> ModuleType:
     A, B, scale = tableau
     C = tuple(float(np.dot(row, scale)) for row in A)
-    return load_algebra(algebra, ["newton"], COMPENSATED=compensated, STAGES=len(B), A=A, B=B, C=C, SCALE=scale)
+    constants = constants_source(COMPENSATED=compensated, NDOF=ndof, STAGES=len(B), A=A, B=B, C=C, SCALE=scale)
+    steps = "\n\n\n".join([constants, template("running_states"), template("newton_steps")])
+    return load_algebra(algebra, ["newton"], [steps])
 
 
 def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:
@@ -139,7 +141,7 @@ def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:
     ValueError
         If a function in H has no counterpart in compiled code.
     """
-    variables, H, before = symbols.q + symbols.p, symbols.H, f"NDOF = {symbols.ndof}\n\n\n"
+    variables, H, before = symbols.q + symbols.p, symbols.H, ""
     if symbols.time is not None:
         from sympflow.kernels.stage_times import in_code, sampled_sources
 

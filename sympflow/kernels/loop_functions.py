@@ -156,13 +156,18 @@ def shared_by_lanes(
     ndof: int, kinds: Sequence[Kick], friction: DampedDrift | None, n_parameters: int, compensated: bool, n_values: int
 ) -> list[str]:
     """The sources of the texts `loops` and `lanes` that systems share: of states of this size; of kicks of one kind."""
+    numbers = [numbers_source(kinds, friction, n_parameters), template("lane_numbers")]
+    of_kicks = [constants_source(**step_constants(kinds)), *numbers]
+    return [states_source(ndof, compensated, n_values), "\n\n\n".join(of_kicks)]
+
+
+def states_source(ndof: int, compensated: bool = False, n_values: int = 0) -> str:
+    """The source of states that are tuples, one by one and in lanes, which systems share."""
     from sympflow.kernels.codegen import tuple_algebra
 
     constants = constants_source(COMPENSATED=compensated, NDOF=ndof, N_VALUES=n_values)
-    of_states = [constants, tuple_algebra(ndof), *map(template, ("running_states", "aligned", "lane_blocks"))]
-    numbers = [numbers_source(kinds, friction, n_parameters), template("lane_numbers")]
-    of_kicks = [constants_source(**step_constants(kinds)), *numbers]
-    return ["\n\n\n".join(of_states), "\n\n\n".join(of_kicks)]
+    texts = map(template, ("running_states", "aligned", "lane_blocks"))
+    return "\n\n\n".join([constants, tuple_algebra(ndof), *texts])
 
 
 def plain_kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> list[str]:

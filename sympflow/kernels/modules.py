@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from functools import cache, partial
 from importlib.resources import files
 from itertools import pairwise
@@ -296,7 +296,7 @@ def run_rows(rows: Callable[[slice, np.ndarray], None], n_rows: int, work_per_ro
 def _run_in_threads(calls: Sequence[Callable[[np.ndarray], T]]) -> list[T]:
     stop = np.zeros(1, dtype=np.int64)
     with ThreadPoolExecutor(len(calls)) as pool:
-        futures = [pool.submit(call, stop) for call in calls]
+        futures = [pool.submit(copy_context().run, call, stop) for call in calls]  # with the limit of `at_most`
         try:
             return [future.result() for future in futures]
         except BaseException:  # of the user's, most likely: the threads need not go on

@@ -87,7 +87,7 @@ class PairLoops(SizedLoops):
             first, last = module.kick_of(table, j)
             for phase in range(first, last):
                 cells = module.begun(phase, first, X, work, *cells, self._sites, self._values)
-                given = (phase, X, work, *cells, self._geometry, self._sites, self._values)
+                given = (phase, work, *cells, self._geometry, self._values)
                 team(lambda lo, hi, given=given: module.shared(lo, hi, *given), self._n_pieces)  # type: ignore[misc]
                 module.kicked(X, table, j, phase, work, self._sites)
             module.drifted(X, table, j, self._sites)
@@ -127,6 +127,7 @@ def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleTyp
         COMPENSATED=compensated,
         DIM=local.dim,
         COLUMNS=len(local.first),
+        WIDTH=local.dim * (1 + (level > 0)) + len(local.first),
         CUT=local.cutoff is not None,
         PERIODIC=local.box is not None,
         LANES=LANES,
@@ -139,16 +140,16 @@ def _functions(local: PairsHamiltonian, kind: str) -> str:
     text = template("pair_sums").partition("# ---\n")[2].replace("SUM", kind)
     lines = {
         "# numbers": sums.numbers(),
-        "# own": sums.body("x[", "i", sums.own),
-        "# other": sums.body("x[", "j", sums.other),
-        "# own of few": sums.body("X[0, ", "i", sums.own),
-        "# other of few": sums.body("X[0, ", "j", sums.other),
+        "# own": sums.in_block("Pi", sums.own),
+        "# other": sums.in_block("Pj", sums.other),
+        "# own of few": sums.of_few("i", sums.own),
+        "# other of few": sums.of_few("j", sums.other),
         "# slopes": sums.slopes(),
         "# masked": [f"{g} = {g} if inside else 0.0" for g in sums.g],
         "# force": sums.force(),
         "# begin": [f"total_{k} = 0.0" for k in sums.axes],
         "# both lanes": [f"mine[{k} * LANES + lane] += f_{k}" for k in sums.axes]
-        + [f"F[{k}, j] -= f_{k}" for k in sums.axes],
+        + [f"Fj[{k} * LANES + lane] -= f_{k}" for k in sums.axes],
         "# both": [f"total_{k} += f_{k}" for k in sums.axes] + [f"A[0, {k}, j] -= f_{k}" for k in sums.axes],
         "# end": [f"A[0, {k}, i] += total_{k}" for k in sums.axes],
     }
@@ -179,9 +180,8 @@ class _Sums:
     def __init__(self, local: PairsHamiltonian, kind: str) -> None:
         self.local, self.kind, self.axes = local, kind, range(local.dim)
         self.vector = kind != "gradient"
-        moved = ["x", "w"] if self.vector else ["x"]
-        self.own = [f"{x}_{k}" for x in moved for k in self.axes] + [a.name for a in local.first]
-        self.other = [f"{x}_{k}_j" for x in moved for k in self.axes] + [b.name for b in local.second]
+        self.own = self._names([a.name for a in local.first], "")
+        self.other = self._names([b.name for b in local.second], "_j")
         self.g = [f"g_{k}" for k in range(len(KINDS[kind]))]
 
     def numbers(self) -> list[str]:
@@ -192,11 +192,19 @@ class _Sums:
             lines += [f"box_{k} = values[{2 + k}]" for k in self.axes]
         return lines + [f"{c.name} = values[{2 + local.dim + i}]" for i, c in enumerate(local.c)]
 
-    def body(self, coordinates: str, index: str, names: Sequence[str]) -> list[str]:
-        """The numbers of a body, by their names."""
-        places = [f"{coordinates}{k}, {index}]" for k in self.axes]
-        places += [f"A[v, {k}, {index}]" for k in self.axes] if self.vector else []
+    def _names(self, columns: list[str], end: str) -> list[str]:
+        moved = [[f"{x}_{k}{end}" for k in self.axes] for x in "xw"]
+        return [*moved[0], *columns, *(moved[1] if self.vector else [])]
+
+    def in_block(self, block: str, names: Sequence[str]) -> list[str]:
+        """The numbers of a body in a block, by their names."""
+        return [f"{name} = {block}[{row} * LANES + lane]" for row, name in enumerate(names)]
+
+    def of_few(self, index: str, names: Sequence[str]) -> list[str]:
+        """The numbers of one of few bodies, by their names."""
+        places = [f"X[0, {k}, {index}]" for k in self.axes]
         places += [f"sites[{self.local.dim + k}, {index}]" for k in range(len(self.local.first))]
+        places += [f"A[v, {k}, {index}]" for k in self.axes] if self.vector else []
         return [f"{name} = {place}" for name, place in zip(names, places, strict=True)]
 
     def slopes(self) -> list[str]:

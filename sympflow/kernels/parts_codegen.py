@@ -11,7 +11,7 @@ import sympy as sp
 
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions
 from sympflow.hamiltonian.symbolic import printable
-from sympflow.kernels.codegen import printed, statements, tuple_algebra
+from sympflow.kernels.codegen import printed, statements
 from sympflow.kernels.scheduling import FUSED, Schedule
 from sympflow.kernels.stage_times import in_code, letters_of_time, sampled_sources
 
@@ -46,8 +46,8 @@ def parts_source(parts: ExactParts, filters: bool, gradients: bool) -> str:
         if gradients and part.of_positions:
             flows.append(_part_flow(parts, part, WITH_GRADIENT + k, f"gradient_{k}", filters, gradient=True))
     width = max([2 + d, TURN_WIDTH * parts.n_classes, *(flow.width for flow in flows)])
-    constants = f"NDOF = {d}\nROW_WIDTH = {width}\nN_CLASSES = {parts.n_classes}\nFILTERS = {filters}"
-    functions = [constants, tuple_algebra(d), *_between_modes(parts), *letters, *(flow.source for flow in flows)]
+    constants = f"ROW_WIDTH = {width}\nN_CLASSES = {parts.n_classes}\nFILTERS = {filters}"
+    functions = [constants, *_between_modes(parts), *letters, *(flow.source for flow in flows)]
     functions += [_dispatch(flows), _dispatch_lanes(flows), _fill(flows), _dispatch_each(flows), _turns_each(parts)]
     functions.append(_filters_each(parts))
     return "\n\n\n".join(functions) + "\n"

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
+from sympflow.kernels.loop_functions import states_source
 from sympflow.kernels.modules import NEVER, given, load_algebra
 from sympflow.kernels.output_loops import row_products
 from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
@@ -171,7 +172,7 @@ class PartsLoops:
             raise ValueError("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
         if (filters, gradients) not in self._variants:
             algebra = parts_source(self.parts, filters, gradients)
-            module = load_algebra(algebra, ["aligned", "part_maps"], COMPENSATED=False)
+            module = load_algebra(algebra, ["part_maps"], [states_source(self.parts.ndof)])
             self._variants[filters, gradients] = LoopFunctions(
                 module.rollout,
                 module.rollout_lanes,

@@ -48,6 +48,10 @@ CONVERGED = 1e-7
 """Decrease of the squares, relative, at which a fit ends."""
 UNEXPLAINED = 1.3
 """Residual over the noise from which a model does not explain the data."""
+QUIET = 0.5
+"""Residual over the noise that was given, below which that is too large."""
+LOUD = 1.5
+"""Residual over the noise that is seen without a model, up to which that may be all."""
 BEYOND = 2
 """Terms by which the path goes on beyond the model that is chosen."""
 WORTH = 0.5
@@ -105,7 +109,7 @@ class Discovery:
     explains : bool
         False if the model leaves more than noise.
     remark : str
-        What the data say where no model explains them.
+        What the data say where no model explains them, or where the noise that was given is too large.
     path : tuple of Model
         The best model of each number of terms.
     library : tuple of sympy.Expr
@@ -245,7 +249,8 @@ def discover(
     -----
     UserWarning
         If no model explains the data: its residuals are larger than their noise. The message says by how much, and
-        what the data rather look like: friction, velocities in place of momenta, columns in another order.
+        what the data rather look like: friction, velocities in place of momenta, columns in another order. If the noise
+        that was given is much larger than the residuals.
 
     Raises
     ------
@@ -265,6 +270,7 @@ def discover(
         return _of_flow(data, terms, degree, most_terms, domain, seed, name)
     trajectories = Trajectories.read(data, ndof, **reading)
     trajectories.check_moving()
+    trajectories.check_angles(None if reading.get("period") is None else np.full(trajectories.ndof, True))
     if not 0 <= held_out < 1:
         raise ValueError(f"`held_out` must be at least 0 and less than 1; got {held_out!r}: 0.2 keeps a fifth.")
     if piece is not None and not piece > 0:
@@ -278,7 +284,7 @@ def discover(
     first = max(trajectories.runs, key=lambda run: run.span)
     scene = {"domain": domain or Box(box[0].tolist(), box[1].tolist()), "y0": trajectories.states[0]}
     system = _system(discovery, trajectories.ndof, name=name, t_span=(0.0, first.span), dt=STEP / search.rate, **scene)
-    if not discovery.explains:
+    if discovery.remark:
         warnings.warn(discovery.remark, stacklevel=2)
     return system
 
@@ -551,7 +557,7 @@ class _Search:
         limit = UNEXPLAINED + 4 / math.sqrt(max(self.data.n_points, 1))
         explains = not (told & (excess > limit)).any()
         explains &= bool((noise < 0.5 * self.data.scales).all())
-        remark = "" if explains else self._remark(noise, excess)
+        remark = self._doubt(noise) if explains else self._remark(noise, excess)
         order = np.argsort([str(self.library.expressions[k]) for k in chosen])
         return Discovery(
             tuple(self.library.expressions[chosen[i]] for i in order),
@@ -591,9 +597,23 @@ class _Search:
             held,
         )
 
+    def _doubt(self, noise: np.ndarray) -> str:
+        """The remark that the noise which was given is too large, if it is."""
+        if self.known is None or not (noise < QUIET * self.known).all():
+            return ""
+        return (
+            f"The model leaves {float((noise / self.known).max()):.2g} of the `noise` that was given, or less: leave "
+            "that out, or give what is left, `discovery.noise`; small terms may be missing."
+        )
+
     def _remark(self, noise: np.ndarray, excess: np.ndarray) -> str:
         worst = int(np.argmax(excess))
         otherwise = "Give other `terms`, a higher `degree`, or the `noise` if it is larger than it looks."
+        if self.known is not None and noise[worst] < LOUD * self.smooth.sigma[worst]:
+            otherwise = (
+                f"But without any model the data show noise of up to {self.smooth.sigma[worst]:.2g} there: leave "
+                "`noise` out, or give that."
+            )
         hint = diagnosis.hint(self.library, self.smooth, self.data, otherwise)
         return (
             f"No sparse Hamiltonian of the library's {len(self.library)} terms explains the data: of "

@@ -190,21 +190,25 @@ class Family:
         Whether they have the form T(p) + V(q).
     models : callable
         models(said): candidates from simple to rich, none where the family does not apply.
+    linear : bool
+        Whether they are linear in their numbers, and soon fitted. Before those that are not, the data are asked
+        whether any H explains them.
     """
 
     separable: bool
     models: Callable[[Said], Iterator[Candidate]]
+    linear: bool = True
 
 
 FAMILIES = {
     "pairs": Family(True, _pairs),
     "waves": Family(True, _waves),
     "polynomial": Family(True, _polynomials),
-    "network": Family(True, _networks),
-    "inertia": Family(False, _inertia),
+    "network": Family(True, _networks, linear=False),
+    "inertia": Family(False, _inertia, linear=False),
     "whole-waves": Family(False, _whole_waves),
     "whole-polynomial": Family(False, _whole_polynomials),
-    "whole-network": Family(False, _whole_networks),
+    "whole-network": Family(False, _whole_networks, linear=False),
 }
 """In the order in which they are tried: potentials of the distances of bodies; Fourier series, where a `period` is
 given; polynomials; networks of one layer. The first four have H = ½ pᵀM⁻¹p + V(q); "inertia" has a mass matrix that

@@ -69,6 +69,8 @@ class Setting:
         Residuals of more than so many σ count by their size.
     stop : callable
         Asked between steps.
+    seen : ndarray of shape (2d,) or None
+        The noise as it is seen without a model, at most: 0 where it is not.
     rival : ndarray of shape (2d,) or None
         The noise that the best model so far leaves of whole orbits: one that leaves much more of a few points is given
         up.
@@ -77,6 +79,7 @@ class Setting:
     noise: np.ndarray | None = None
     huber: float | None = None
     stop: Stop = lambda: False
+    seen: np.ndarray | None = None
     rival: np.ndarray | None = None
 
     def hopeless(self, noise: np.ndarray) -> bool:
@@ -220,8 +223,10 @@ class Held:
 
     Attributes
     ----------
-    fit : Fit
-        Of the pieces of the trajectories.
+    pieces : tuple of Run
+        The pieces of trajectories, each followed as one orbit.
+    residuals : tuple of ndarray
+        Of each piece, (2d, k).
     losses : ndarray of shape (N,)
         Minus the log-likelihood of each trajectory.
     values : int
@@ -235,20 +240,19 @@ class Held:
     loudness : float
         Their root mean square in σ, of the noise on the trajectories that the model was fitted to; ρ in place of the
         squares where the loss is robust.
+    excess : float
+        The noise that the model leaves of a coordinate, over that which is seen without a model; the largest.
     """
 
-    fit: Fit
+    pieces: tuple[Run, ...]
+    residuals: tuple[np.ndarray, ...]
     losses: np.ndarray
     values: int
     correlation: float
     pairs: int
     exact: bool
     loudness: float
-
-    @property
-    def pieces(self) -> tuple[Run, ...]:
-        """The pieces of trajectories, each followed as one orbit."""
-        return self.fit.problem.data.runs
+    excess: float = 0.0
 
     @property
     def loss(self) -> float:
@@ -258,6 +262,8 @@ class Held:
     @property
     def complaint(self) -> str:
         """The reason why they are no noise."""
+        if self.excess >= LOUDER:
+            return f"they are {self.excess:.1f} times the noise that is seen without a model"
         if self.loudness >= LOUDER:
             return (
                 f"they are {self.loudness:.1f} times the noise, as it was given or as the trajectories that the model "
@@ -267,13 +273,13 @@ class Held:
 
     def squares(self, scales: np.ndarray) -> float:
         """The mean square of the residuals in units of the scales (2d,)."""
-        return float(np.nanmean((np.concatenate(self.fit.residuals, axis=1) / scales[:, None]) ** 2))
+        return float(np.nanmean((np.concatenate(self.residuals, axis=1) / scales[:, None]) ** 2))
 
     @property
     def explained(self) -> bool:
         """True if nothing but noise is left: residuals are exact, or as loud and one tells nothing of the next."""
         silent = abs(self.correlation) < CORRELATED + 3 / math.sqrt(max(self.pairs, 1))
-        return self.exact or (silent and self.loudness < LOUDER)
+        return self.exact or (silent and self.loudness < LOUDER and self.excess < LOUDER)
 
 
 def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
@@ -306,7 +312,32 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     exact = bool(all((np.abs(r)[np.isfinite(r)] < 100 * EXACT * scales.max()).all() for r in residuals))
     losses = np.where(np.isfinite(losses), losses, np.inf)
     correlation = same / size if size > 0 else math.nan
-    return Held(fit, losses, values, correlation, pairs, exact, math.sqrt(fit.cost / values))
+    loudness = math.sqrt(fit.cost / values)
+    excess = 0.0
+    if setting.seen is not None and (setting.seen > 0).any():
+        excess = float(np.max(found.sigma[setting.seen > 0] / setting.seen[setting.seen > 0]))
+    return Held(pieces.runs, tuple(residuals), losses, values, correlation, pairs, exact, loudness, excess)
+
+
+def left_out(found: Fitted, folds: Sequence[tuple[Trajectories, Trajectories]], setting: Setting) -> Held:
+    """The likelihood of held-out trajectories; of several divisions, each by a fit to the others from this one."""
+    if len(folds) == 1:
+        return judged(found, folds[0][1], setting)
+    parts = [judged(fitted(found.model, data, setting, found.theta), held, setting) for data, held in folds]
+    values, pairs = np.array([part.values for part in parts]), np.array([part.pairs for part in parts])
+    share = np.average([part.correlation if part.pairs else 0.0 for part in parts], weights=pairs + 1e-300)
+    loudness = math.sqrt(np.average([part.loudness**2 for part in parts], weights=values))
+    return Held(
+        tuple(piece for part in parts for piece in part.pieces),
+        tuple(r for part in parts for r in part.residuals),
+        np.concatenate([part.losses for part in parts]),
+        int(values.sum()),
+        float(share) if pairs.any() else math.nan,
+        int(pairs.sum()),
+        all(part.exact for part in parts),
+        loudness,
+        max(part.excess for part in parts),
+    )
 
 
 def gains(simple: Held, rich: Held) -> bool:

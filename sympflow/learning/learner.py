@@ -21,12 +21,12 @@ from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import hint
 from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Said, families, pruned, with_unit_mass
-from sympflow.learning.fitting import SILENT, Fitted, Held, Setting, fitted, gains, judged, kept, limit_of, restored
+from sympflow.learning.fitting import SILENT, Fitted, Held, Setting, fitted, gains, kept, left_out, limit_of, restored
 from sympflow.learning.library import library_for
-from sympflow.learning.models import Formula, FreeField, Model
+from sympflow.learning.models import Formula, FreeField, Model, Polynomial
 from sympflow.learning.shooting import Method
 from sympflow.learning.smoothing import smoothed
-from sympflow.learning.trajectories import Trajectories
+from sympflow.learning.trajectories import Trajectories, periods_of
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
 from sympflow.training.trainer import train
@@ -42,6 +42,7 @@ POOR = 1e-3  # one-step error of a flow, relative to the spread of the data, tha
 LEAST_SECONDS = 1.0  # for the flow, however late it is
 MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
 FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
+ROUGH = 60  # points from which the roughness of the data tells their noise to a fifth
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
 
 
@@ -67,6 +68,7 @@ def learn(
     progress: bool | None = None,
     callback: Callable[[int, dict[str, float]], None] | None = None,
     workers: Any = 1,
+    **reading: Any,
 ) -> Any:
     """Learn a flow map from trajectories of a system whose H is not known.
 
@@ -79,7 +81,7 @@ def learn(
     trajectories
         A list of (t, y), t (n,) and y (2d, n), each with its own times; a pair of arrays t (n,) and y (N, 2d, n); or
         any data that `sympflow.learning.trajectories.Trajectories.read` takes. NaN is what is missing. At least two
-        trajectories: a fifth of them is held out.
+        trajectories: a fifth of them is held out, three at least; of fewer than eight each is left out in turn.
     ndof : int, optional
         Degrees of freedom d.
     dt : float, optional
@@ -93,7 +95,8 @@ def learn(
     damping : {False, True, "each"}
         True to learn one rate γ of friction, p' = −∂H/∂q − γp; "each" for one rate for each p.
     period : float or array_like of shape (d,), optional
-        Of H in each q, of angles: 2π, or 360 for degrees; infinite or NaN for coordinates that are none.
+        Of H in each q, of angles: 2π, or 360 for degrees; infinite or NaN for coordinates that are none. Angles that
+        were wrapped are continued.
     known : HamiltonianSystem, optional
         A part of H, symbolic; the rest is learned. Its kinetic energy, if it has one, is taken for the whole.
     family : str, optional
@@ -109,6 +112,8 @@ def learn(
         Of the learned system.
     checkpoint, resume, time_budget, progress, callback, workers
         As for `sympflow.train`. A checkpoint is written after each model; `workers` share the replicas.
+    **reading
+        Options of `Trajectories.read`, such as `units`, `order` and `velocity_mass`.
 
     Returns
     -------
@@ -135,8 +140,9 @@ def learn(
        Inverse Problems in Differential and Integral Equations (1983) 95–121, for the shooting.
     .. [2] G. Schwarz, Estimating the dimension of a model, Ann. Statist. 6 (1978) 461–464, for the terms that are kept.
     """
-    data = Trajectories.read(trajectories, ndof)
+    data = Trajectories.read(trajectories, ndof, period=period, **reading)
     data.check_moving()
+    data.check_angles(None if period is None else np.full(data.ndof, True))
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
     said = _said(data, separable, mass, damping, period, known)
@@ -145,15 +151,15 @@ def learn(
     if dt is not None and (isinstance(dt, bool) or not isinstance(dt, int | float) or not 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
     session = Session(checkpoint, resume, plain(time_budget), progress, callback, Crew(workers))
-    setting = Setting(_noise(noise, data), huber)
+    setting = Setting(_noise(noise, data), huber, seen=smoothed(data).sigma if data.n_points >= ROUGH else None)
     chosen = families(said, family)
-    ours, held = data.split(HELD_OUT, seed)
+    folds = data.folds(HELD_OUT, seed)
+    if len(folds) == 1:
+        folds = [(_few(folds[0][0], seed), _few(folds[0][1], seed))]
     if isinstance(replicas, bool) or not isinstance(replicas, int) or replicas < 0:
         raise ValueError(f"`replicas` must be an integer, 0 or more; got {replicas!r}: 20 give useful bands.")
     options = {"family": family, "loss": loss, "seed": seed, "damping": damping, "separable": separable}
-    search = Search(
-        data, _few(ours, seed), _few(held, seed), said, setting, seed, identity=_identity(data, said, setting, options)
-    )
+    search = Search(data, folds, said, setting, seed, identity=_identity(data, said, setting, options))
     if resume is not None:
         search.resume(resume)
     with session.interruption, session.crew:
@@ -204,10 +210,7 @@ def _periods(period: Any, d: int) -> np.ndarray:
     """The period of each coordinate (2d,), infinite where there is none."""
     periods = np.full(2 * d, np.inf)
     if period is not None:
-        given = np.asarray(period, dtype=float)
-        if given.shape not in ((), (d,)) or (given <= 0).any():
-            raise ValueError(f"`period` must be positive, one for all q or one for each of {d}; got {period!r}.")
-        periods[:d] = np.where(np.isnan(given), np.inf, given)
+        periods[:d] = periods_of(period, d)
     return periods
 
 
@@ -299,13 +302,32 @@ def replica(common: tuple[Model, Trajectories, Setting, np.ndarray, int], number
 Chosen = tuple[Candidate, Fitted, Held]
 
 
+@dataclass(frozen=True)
+class Freedom:
+    """A vector field that need not be Hamiltonian, beside the best H.
+
+    Attributes
+    ----------
+    share : float
+        Of the squares of held-out residuals, that it leaves.
+    defect : float
+        The size of LᵀJ + JL, over that of JL, L its Jacobian: 0 for a Hamiltonian.
+    rate : float
+        At which volumes of phase space grow.
+    """
+
+    share: float
+    defect: float
+    rate: float
+
+
 @dataclass
 class Search:
     """The models that were fitted so far, and the best of them."""
 
     all: Trajectories
-    data: Trajectories
-    held: Trajectories
+    folds: list[tuple[Trajectories, Trajectories]]
+    """Divisions into trajectories that models are fitted to and held-out ones: one, or each trajectory in turn."""
     said: Said
     setting: Setting
     seed: int
@@ -317,10 +339,25 @@ class Search:
     cut: bool = False
     """True if the time was up before the search came to its end."""
     bar: Silent = field(default_factory=Silent)
-    unconstrained: float | None = None
-    """The share of the squares of the held-out residuals that a field which is not Hamiltonian leaves, if small."""
+    tested: list[Freedom | None] = field(default_factory=list)
+    """The comparison with a vector field that need not be Hamiltonian, once it was made; None where H does as well."""
     final: Fitted = field(init=False)
     """The chosen model, fitted to all trajectories."""
+
+    @property
+    def data(self) -> Trajectories:
+        """The trajectories that models are fitted to: of few all, whose fit is the start of those without one."""
+        return self.folds[0][0] if len(self.folds) == 1 else self.all
+
+    @property
+    def held(self) -> Trajectories:
+        """The held-out trajectories."""
+        return self.folds[0][1] if len(self.folds) == 1 else self.all
+
+    @property
+    def numbers(self) -> int:
+        """The numbers that the least of the fits has, beside the initial states."""
+        return min(data.n_values - 2 * data.ndof * len(data.runs) for data, _ in self.folds)
 
     @property
     def winner(self) -> Chosen:
@@ -346,12 +383,15 @@ class Search:
     def run(self, names: list[str], session: Session) -> None:
         """Fit models of these families until one explains the held-out trajectories, or no richer one does better."""
         deadline = session.deadline.part(1 - TABLE_SHARE) if session.time_budget is not None else session.deadline
-        setting = Setting(self.setting.noise, self.setting.huber, deadline.over)
+        setting = replace(self.setting, stop=deadline.over)
         total = sum(1 for name in names for _ in FAMILIES[name].models(self.said))
         with session.bar(total, "Models") as self.bar:
             for name in names:
-                if self.best is None or not (self.best[2].explained or deadline.over()):
-                    self._climb(name, setting, session)
+                if self.best is not None and (self.best[2].explained or deadline.over()):
+                    break
+                if self.best is not None and not FAMILIES[name].linear and self.freedom(setting) is not None:
+                    break
+                self._climb(name, setting, session)
         if self.best is None:
             raise ValueError(
                 f"`trajectories` have {self.data.n_values} numbers, fewer than the simplest model and the initial "
@@ -379,7 +419,7 @@ class Search:
 
     def _affords(self, candidate: Candidate) -> bool:
         """True if there are more numbers than the model and the initial states have."""
-        return self.data.n_values > candidate.model.n + 2 * self.data.ndof * len(self.data.runs)
+        return self.numbers > candidate.model.n
 
     def _fit(self, candidate: Candidate, setting: Setting, session: Session) -> Chosen:
         numbers = self.done.get(candidate.name)
@@ -390,7 +430,7 @@ class Search:
                 self.save(session)
         else:
             found = restored(candidate.model, self.data, numbers, setting)
-        held = judged(found, self.held, self.setting)
+        held = left_out(found, self.folds, self.setting)
         figures = {
             "parameters": candidate.model.n,
             "training_chi2": found.costs[-1],
@@ -463,33 +503,56 @@ class Search:
         )
         if self.cut:
             said += " The time budget ended the search: give it more."
-        free = next((model for model in map(self._free, (3, 2)) if self._affords_field(model)), None)
-        if free is not None and not session.deadline.over():
-            compared = fitted(free, self.data, Setting(self.setting.noise, self.setting.huber, session.deadline.over))
-            theirs = judged(compared, self.held, self.setting)
-            ours, other = (h.squares(self.data.scales) for h in (held, theirs))
-            if gains(held, theirs) and other < FREER * ours:
-                rate = float(np.mean(free.divergence(compared.theta, compared.states.T)))
-                said += (
-                    f" No symplectic map explains these data: a vector field of cubic polynomials that need not be "
-                    f"Hamiltonian leaves {other / ours:.1e} of the squares; volumes change at a rate of {rate:.3g} "
-                    "along its flow, and not at all along that of a Hamiltonian."
-                )
-                self.unconstrained = other / ours
+        deadline = session.deadline
+        free = None if deadline.over() else self.freedom(replace(self.setting, stop=deadline.over))
+        if free is not None:
+            said += (
+                f" No symplectic map explains these data: a vector field of polynomials that need not be Hamiltonian "
+                f"leaves {free.share:.1e} of the squares. Its Jacobian L fails the test of symplecticity: LᵀJ + JL, "
+                f"which is 0 for a Hamiltonian, is {free.defect:.2g} of L; volumes change at a rate of {free.rate:.3g}."
+            )
         smooth = smoothed(self.data)
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
         said += " " + hint(library_for(None, self.data.ndof, 4, smooth.points)[0], smooth, self.data, otherwise)
         warnings.warn(said, UserWarning, stacklevel=3)
 
-    def _free(self, degree: int) -> FreeField:
-        return FreeField(self.data.scales, degree)
+    def freedom(self, setting: Setting) -> Freedom | None:
+        """The comparison with a field that need not be Hamiltonian, where it explains much more than any H; else None.
+
+        The field of cubic polynomials has those of all H(q, p) of degree four, which must leave as much as the best
+        model: so that not only functions are missing.
+        """
+        if not self.tested:
+            self.tested.append(self._freedom(setting))
+        return self.tested[0]
+
+    def _freedom(self, setting: Setting) -> Freedom | None:
+        held = self.winner[2]
+        for degree in (3, 2):
+            free = FreeField(self.data.scales, degree)
+            if self._affords_field(free):
+                break
+        else:
+            return None
+        found = fitted(free, self.data, setting)
+        theirs = left_out(found, self.folds, self.setting)
+        share = theirs.squares(self.data.scales) / held.squares(self.data.scales)
+        if not gains(held, theirs) or not share < FREER:
+            return None
+        H = Polynomial.up_to(degree + 1, "y", self.data.scales)
+        whole = left_out(fitted(self.said.whole(H), self.data, setting), self.folds, self.setting)
+        share = max(share, theirs.squares(self.data.scales) / whole.squares(self.data.scales))
+        if not gains(whole, theirs) or not share < FREER:
+            return None
+        states = found.states.T
+        return Freedom(share, free.defect(found.theta, states), float(np.mean(free.divergence(found.theta, states))))
 
     def _affords_field(self, model: FreeField) -> bool:
-        return model.n <= MOST_TERMS and self.data.n_values > 2 * model.n + 2 * self.data.ndof * len(self.data.runs)
+        return model.n <= MOST_TERMS and self.numbers > 2 * model.n
 
     def bootstrap(self, n: int, session: Session) -> Replicas:
         """Fit the chosen model to trajectories that are drawn anew, n times, or two at least until the time is up."""
-        setting = Setting(self.setting.noise, self.setting.huber)
+        setting = self.setting
         model = self.winner[0].model
         common = model, self.all, setting, self.final.theta, self.seed
         thetas: list[np.ndarray] = []
@@ -567,11 +630,11 @@ class Search:
             "residual_correlation": held.correlation,
             "noise": float(np.sqrt(np.mean(found.sigma**2))),
         }
-        if self.unconstrained is not None:
-            made["unconstrained_share"] = self.unconstrained
+        if self.tested and self.tested[0] is not None:
+            made["unconstrained_share"] = self.tested[0].share
         made |= {f"noise_{name}": float(s) for name, s in zip(self.data.names, found.sigma, strict=True)}
         passed = np.concatenate([run.t - run.t[0] for run in held.pieces])
-        squares = np.nanmean(np.concatenate(held.fit.residuals, axis=1) ** 2, axis=0)
+        squares = np.nanmean(np.concatenate(held.residuals, axis=1) ** 2, axis=0)
         for k in HORIZONS:
             near = np.abs(passed - k * dt) <= 0.5 * dt * max(1, k / 10)
             if near.any():

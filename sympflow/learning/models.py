@@ -768,6 +768,17 @@ class FreeField:
                 columns[i, i * K : (i + 1) * K] = terms
         return Linear(rows @ terms, slopes, columns)
 
+    def defect(self, theta: np.ndarray, y: np.ndarray) -> float:
+        """The size of LᵀJ + JL over twice that of JL, L the Jacobian in units of the scales: at most 1, 0 for any H."""
+        d = self.ndof
+        slopes = self.field(theta, y, True, False).slope
+        assert slopes is not None
+        ratio = np.sqrt(self.scales[:d] / self.scales[d:])
+        units = np.concatenate([ratio, 1 / ratio])  # in which dq∧dp is what it is
+        L = slopes * (units / units[:, None])[..., None]
+        JL = np.concatenate([L[d:], -L[:d]])
+        return float(np.linalg.norm(JL - JL.transpose(1, 0, 2)) / (2 * np.linalg.norm(JL)))
+
     def divergence(self, theta: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The rate (N,) at which volumes of phase space grow."""
         slopes = self.field(theta, y, True, False).slope

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.arguments import floats
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.flow.scaling import Scaling
 from sympflow.storage.layout import DOF, ORBIT, TIME, imported
@@ -30,6 +31,13 @@ RUNS = (ORBIT, "run", "run_id", "trajectory", "trajectory_id", "traj", "id")
 BESIDE = ("energy", "status")
 """Columns of tables of sympflow that are no states."""
 ORDERS = ("halves", "pairs")
+FEW = 8
+"""Trajectories from which some are held out for good; of fewer each is left out in turn."""
+HELD_LEAST = 3
+JUMP, STEP = 0.75, 0.3
+"""Shares of a period: steps of an angle that was wrapped are longer than the first, or shorter than the second."""
+ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}
+"""Periods of angles that are looked for."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +87,7 @@ class Trajectories:
         p: str | Sequence[str] | None = None,
         units: Mapping[str, str | float] | None = None,
         velocity_mass: ArrayLike | None = None,
+        period: ArrayLike | None = None,
     ) -> Trajectories:
         """Read trajectories.
 
@@ -110,6 +119,9 @@ class Trajectories:
             "p": "deg/ms"}, or factors. The data are converted to those of the SI, and to radians.
         velocity_mass : float or array_like of shape (d,) or (d, d), optional
             M where the data have velocities in place of momenta: then p = M v.
+        period : float or array_like of shape (d,), optional
+            Of q that are angles, in the converted units; infinite or NaN for coordinates that are none. Where an angle
+            jumps by more than half of it from one point to the next, as one that was wrapped does, it is continued.
 
         Raises
         ------
@@ -138,7 +150,8 @@ class Trajectories:
             order = "halves"
         elif isinstance(data, str | Path):
             given = {"order": order, "time": time, "run": run, "q": q, "p": p}
-            return cls.read(_opened(Path(data)), ndof, units=units, velocity_mass=velocity_mass, **given)  # type: ignore[arg-type]
+            converted = {"units": units, "velocity_mass": velocity_mass, "period": period}
+            return cls.read(_opened(Path(data)), ndof, **given, **converted)  # type: ignore[arg-type]
         else:
             found, names = list(_of_arrays(data)), ()
         if not found:
@@ -159,7 +172,8 @@ class Trajectories:
                 raise ValueError(
                     f"`data` has no value of {name} in any trajectory: drop the degree of freedom, or add it."
                 )
-        return cls(tuple(runs), names)
+        read = cls(tuple(runs), names)
+        return read if period is None else read.unwrapped(periods_of(period, width // 2))
 
     @property
     def ndof(self) -> int:
@@ -208,6 +222,29 @@ class Trajectories:
         units = np.array(scaling.x)[:, None]
         return replace(self, runs=tuple(Run(run.t / scaling.t, run.y / units) for run in self.runs))
 
+    def unwrapped(self, periods: np.ndarray) -> Trajectories:
+        """The trajectories with angles of these periods (d,) continued where they jump by more than half a period."""
+        return replace(self, runs=tuple(Run(run.t, _unwrapped(run.y, periods)) for run in self.runs))
+
+    def check_angles(self, known: np.ndarray | None = None) -> None:
+        """Raise ValueError if a coordinate jumps as a wrapped angle does, and it is not known (d,) if it is one."""
+        for i, name in enumerate(self.names[: self.ndof]):
+            if known is not None and known[i]:
+                continue
+            rows = [run.y[i][np.isfinite(run.y[i])] for run in self.runs]
+            steps = np.concatenate([np.diff(row) for row in rows])
+            spread = float(np.ptp(np.concatenate(rows)))
+            for text, P in ANGLES.items():
+                size = np.abs(steps) / P
+                jumps = size > JUMP
+                if spread <= P * (1 + 1e-9) and jumps.any() and not (~jumps & (size > STEP)).any():
+                    at = next(k for k, row in enumerate(rows) if (np.abs(np.diff(row)) > JUMP * P).any())
+                    raise ValueError(
+                        f"`trajectories` have {int(jumps.sum())} jumps of {name} by about {text}, the first in "
+                        f"trajectory {at}, as of an angle that was wrapped: pass period={text}, by which it is "
+                        f"continued; or period=np.inf if {name} is no angle."
+                    )
+
     def check_moving(self) -> None:
         """Raise ValueError if a coordinate has the same value everywhere: H could have any slope in it."""
         for i, name in enumerate(self.names):
@@ -240,6 +277,20 @@ class Trajectories:
         drawn = set(np.random.default_rng(seed).permutation(len(self.runs))[:count].tolist())
         return self.subset(i for i in range(len(self.runs)) if i not in drawn), self.subset(sorted(drawn))
 
+    def folds(self, share: float = 0.2, seed: int = 0) -> list[tuple[Trajectories, Trajectories]]:
+        """Divisions as by `split`: one, of three held-out trajectories at least; of few trajectories each in turn.
+
+        Raises
+        ------
+        ValueError
+            If there is one trajectory only.
+        """
+        n = len(self.runs)
+        if n >= FEW:
+            return [self.split(max(share, HELD_LEAST / n), seed)]
+        self.split(share, seed)  # of one trajectory that is refused
+        return [(self.subset(j for j in range(n) if j != i), self.subset([i])) for i in range(n)]
+
     def subset(self, index: Any) -> Trajectories:
         """The trajectories of some places, which may repeat, as a bootstrap draws them."""
         return replace(self, runs=tuple(self.runs[i] for i in index))
@@ -268,6 +319,30 @@ class Trajectories:
             f"<{len(self.runs)} trajectories, ndof {self.ndof}, {self.n_points} points, "
             f"{min(spans):.3g} to {max(spans):.3g} long>"
         )
+
+
+def periods_of(period: Any, ndof: int) -> np.ndarray:
+    """The period of each q (d,), infinite where there is none.
+
+    Raises
+    ------
+    ValueError
+        If it is not positive, or of another shape.
+    """
+    given = floats("period", period)
+    if given.shape not in ((), (ndof,)) or (given <= 0).any():
+        raise ValueError(f"`period` must be positive, one for all q or one for each of {ndof}; got {period!r}.")
+    return np.broadcast_to(np.where(np.isnan(given), np.inf, given), ndof)
+
+
+def _unwrapped(y: np.ndarray, periods: np.ndarray) -> np.ndarray:
+    """States (2d, n) whose angles make no step of more than half their period."""
+    y = y.copy()
+    for row, P in zip(y, periods, strict=False):
+        seen = np.isfinite(row)
+        if np.isfinite(P):
+            row[seen] = np.unwrap(row[seen], period=P)
+    return y
 
 
 def _cut(run: Run, points: int, span: float) -> Iterator[Run]:
@@ -416,10 +491,16 @@ def _opened(path: Path) -> Any:
         pandas = imported("pandas", "Reading a table")
         return pandas.read_csv(path, sep=None if ending == ".txt" else "\t" if ending == ".tsv" else ",", comment="#")
     if ending in (".parquet", ".pq"):
-        return imported("pandas", "Reading a table").read_parquet(path)
+        pandas = imported("pandas", "Reading a table")
+        try:
+            return pandas.read_parquet(path)
+        except ImportError as error:
+            raise ImportError(
+                "`data` is a Parquet file, which pandas reads by pyarrow: pip install pyarrow, or give a CSV file."
+            ) from error
     xarray = imported("xarray", "Reading a Dataset")
     if ending == ".zarr":
-        return xarray.open_zarr(path).load()
+        return xarray.open_zarr(path, consolidated=False).load()
     if ending in (".nc", ".netcdf"):
         return xarray.load_dataset(path)
     raise ValueError(f"`data` names a file {ending or 'without an ending'}: .csv, .parquet, .nc and .zarr are read.")

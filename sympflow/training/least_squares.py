@@ -17,10 +17,11 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
 from sympflow.flow.flow_map import FlowMap
@@ -283,6 +284,8 @@ class GaussNewton:
         Why no more steps are worth while.
     """
 
+    needs_residuals: ClassVar[bool] = True
+
     def __init__(self, flow: FlowMap, options: LossOptions) -> None:
         if flow.n_parameters > MAX_PARAMETERS:
             raise ValueError(
@@ -326,8 +329,7 @@ class GaussNewton:
     def _step(self, x: Tensor, objective: Objective) -> float:
         r, J = objective.linearized()
         loss = float(r @ r)
-        r, J = torch.cat([r, PULL**0.5 * x]), torch.cat([J, PULL**0.5 * torch.eye(len(x)).to(J)])
-        cost = float(r @ r)
+        cost = loss + PULL * float(x @ x)
         if not math.isfinite(cost):
             return cost
         if objective.draw != self.draw:
@@ -335,12 +337,10 @@ class GaussNewton:
 
         def residuals(x: Tensor) -> Tensor:
             put_weights(self.parameters, x)
-            return torch.cat([objective.residuals(), PULL**0.5 * x])
+            return objective.residuals()
 
         def cost_at(x: Tensor) -> float:
-            put_weights(self.parameters, x)
-            with torch.no_grad():
-                return float(objective()) + PULL * float(x @ x)
+            return float(residuals(x).square().sum()) + PULL * float(x @ x)
 
         model = _Normal(x, r, J, self.scale)
         self.scale = model.scale
@@ -357,22 +357,31 @@ class GaussNewton:
 
 
 class _Normal(Linearized):
-    """A linear model in torch, by Cholesky's factors of JᵀJ + λD²; where λ is small, by a QR factorization of J."""
+    """A linear model in torch, with the pull to 0, by Cholesky's factors of JᵀJ + λD².
+
+    Where λ is small, by a QR factorization of J, once, and one of its triangle for each λ.
+    """
 
     def __init__(self, x: Tensor, r: Tensor, J: Tensor, scale: Tensor | None) -> None:
         self.x, self.r, self.J = x, r, J
-        self._G, self._g = J.T @ J, J.T @ r
+        self._G, self._g = gram(J), J.T @ r + PULL * x
+        self._G.diagonal().add_(PULL)
         squares = self._G.diagonal()
         self.scale = squares.clone() if scale is None else torch.maximum(scale, squares)
         self.D = torch.where(self.scale > 0, self.scale, 1.0).sqrt()
+        self._in_units = self._G / self.D / self.D[:, None]
+        self._triangle: Tensor | None = None
 
     def damp(self, damping: float) -> None:
-        D = self.D
-        identity = torch.eye(len(D), dtype=D.dtype, device=D.device)
         if damping > WELL_CONDITIONED:
-            R, failed = torch.linalg.cholesky_ex(self._G / torch.outer(D, D) + damping * identity, upper=True)
+            damped = self._in_units.clone()
+            damped.diagonal().add_(damping)
+            R, failed = torch.linalg.cholesky_ex(damped, upper=True)
         if damping <= WELL_CONDITIONED or failed:
-            R = torch.linalg.qr(torch.cat([self.J / D, damping**0.5 * identity]), mode="r")[1]
+            if self._triangle is None:
+                self._triangle = torch.linalg.qr(self.J, mode="r")[1] / self.D
+            below = (damping + PULL / self.D**2).sqrt().diag()
+            R = torch.linalg.qr(torch.cat([self._triangle, below]), mode="r")[1]
         self._R = R
 
     def newton(self) -> tuple[Tensor, float]:
@@ -391,3 +400,12 @@ class _Normal(Linearized):
 
     def moved(self, step: Tensor, bend: Tensor) -> Tensor:
         return self.x + (step + bend)
+
+
+def gram(J: Tensor) -> Tensor:
+    """JᵀJ, by half of the products where the numbers are on the CPU."""
+    if J.device.type != "cpu":
+        return J.T @ J
+    columns, transposed = (J.T, 0) if J.is_contiguous() else (J, 1)
+    upper = torch.from_numpy(dsyrk(1.0, columns.numpy(), trans=transposed))
+    return upper.triu() + upper.triu(1).T

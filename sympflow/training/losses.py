@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -12,6 +15,7 @@ from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.network_tangents import NetworkTangents
 from sympflow.training.points import Points
 
 Terms = tuple[Tensor | None, Tensor | None, Tensor | None]
@@ -114,6 +118,8 @@ class Objective:
         Which points of the run these are.
     check : callable
         Called before each evaluation, and may raise to end it.
+    tangents : NetworkTangents, optional
+        Those of the flow, by which residuals and label errors are compiled; their order is another one then.
     """
 
     loss: Loss
@@ -121,6 +127,7 @@ class Objective:
     points: Points
     draw: int = 0
     check: Callable[[], None] = never
+    tangents: NetworkTangents | None = None
 
     def __call__(self) -> Tensor:
         self.check()
@@ -130,50 +137,143 @@ class Objective:
     def residuals(self) -> Tensor:
         """The residuals (m,)."""
         self.check()
-        return torch.cat([self._reduced(b, b.function(self.flow, *b.points)) for b in self._blocks()])
+        return torch.cat([block.residuals() for block in self._blocks()])
 
     def linearized(self) -> tuple[Tensor, Tensor]:
-        """The residuals (m,) and their Jacobian (m, n) by the parameters, in the order of `flow.parameters()`."""
-        rows = []
-        for block in self._blocks():
-            r, J = jacobian(self.flow, block.function, block.points, self.check)
-            rows.append((self._reduced(block, r), self._reduced(block, J.movedim(-1, 0), 1).T))
+        """The residuals (m,) and their Jacobian (m, n) by the parameters, in the order of `flow.parameters()`.
+
+        The next call may overwrite the Jacobian.
+        """
+        rows = [block.linearized(self.check) for block in self._blocks()]
+        if len(rows) == 1:
+            return rows[0]
         return torch.cat([r for r, _ in rows]), torch.cat([J for _, J in rows])
 
-    def _blocks(self) -> list[_Block]:
+    def _blocks(self) -> list[_Block | _Compiled]:
         """The losses that count."""
-        loss, points = self.loss, self.points
-        blocks = []
-        if loss.residual_weight:
-            blocks.append(_Block(loss.residual_weight, loss.residual, points.residual))
+        loss, points, flow, tangents = self.loss, self.points, self.flow, self.tangents
+        blocks: list[_Block | _Compiled] = []
+        if loss.residual_weight and tangents is not None:
+            blocks.append(_CompiledResidual(loss.residual_weight, loss, flow, tangents, *points.residual))
+        elif loss.residual_weight:
+            blocks.append(_Block(loss.residual_weight, flow, loss.residual, points.residual))
         if loss.matching_weight:
             t, x, *t0 = points.matching
             t, *t0 = (s.expand(x.shape[:2]).reshape(-1) for s in (t, *t0))
-            blocks.append(_Block(loss.matching_weight, loss.mismatch, (t, x.flatten(0, 1), *t0), True))
+            matched = (t, x.flatten(0, 1), *t0)
+            blocks.append(_Block(loss.matching_weight, flow, loss.mismatch, matched, x.shape[:2]))
         if loss.label_weight:
             assert points.labels is not None
-            blocks.append(_Block(loss.label_weight, loss.label_error, points.labels))
+            if tangents is None:
+                blocks.append(_Block(loss.label_weight, flow, loss.label_error, points.labels))
+            else:
+                t, x, y, *t0 = points.labels
+                blocks.append(_CompiledLabels(loss.label_weight, loss, flow, tangents, t, x, *t0, y=y))
         return blocks
-
-    def _reduced(self, block: _Block, values: Tensor, leading: int = 0) -> Tensor:
-        """(..., N, ...) after `leading` axes as (..., m), so weighted that the sum of squares is the loss."""
-        weight = (block.weight / values.shape[leading]) ** 0.5
-        if block.less_mean:
-            values = _less_mean(values.unflatten(leading, self.points.matching_x.shape[:2]))
-        return weight * values.flatten(leading)
 
 
 @dataclass(frozen=True)
 class _Block:
     """A loss that counts: its weight, its function of the flow and points, the points, one a row.
 
-    With `less_mean` the values at each of the times of the points are taken less their mean.
+    With `times`, the shape of the points, the values at each of the times are taken less their mean.
     """
 
     weight: float
+    flow: FlowMap
     function: Callable[..., Tensor]
     points: tuple[Tensor, ...]
-    less_mean: bool = False
+    times: torch.Size | None = None
+
+    def residuals(self) -> Tensor:
+        """The residuals (m,)."""
+        return self._reduced(self.function(self.flow, *self.points))
+
+    def linearized(self, check: Callable[[], None]) -> tuple[Tensor, Tensor]:
+        """The residuals (m,) and their Jacobian (m, n)."""
+        r, J = jacobian(self.flow, self.function, self.points, check)
+        return self._reduced(r), self._reduced(J.movedim(-1, 0), 1).T
+
+    def _reduced(self, values: Tensor, leading: int = 0) -> Tensor:
+        """(..., N, ...) after `leading` axes as (..., m), so weighted that the sum of squares is the loss."""
+        weight = (self.weight / values.shape[leading]) ** 0.5
+        if self.times is not None:
+            values = _less_mean(values.unflatten(leading, self.times))
+        return weight * values.flatten(leading)
+
+
+class _Compiled(ABC):
+    """A loss of a flow of networks that counts, by compiled loops: its weight, its points, one a row."""
+
+    def __init__(
+        self, weight: float, loss: Loss, flow: FlowMap, tangents: NetworkTangents, t: Tensor, x: Tensor, *t0: Tensor
+    ) -> None:
+        self.loss, self.tangents = loss, tangents
+        self.share = (weight / len(t)) ** 0.5
+        self.unit = np.array(loss.scaling.x)
+        self.t, self.x, self.t0 = t, x, t0
+        self._parameters = torch.cat([w.detach().reshape(-1) for w in flow.parameters()]).numpy()
+        arrays = t, x, flow.step_constants(x, *t0)
+        self._points = tuple(np.ascontiguousarray(a.detach().numpy()) for a in arrays)
+
+    def residuals(self) -> Tensor:
+        """The residuals (m,), all points of a coordinate after those of the one before."""
+        return self._at(*self._values())
+
+    def linearized(self, check: Callable[[], None]) -> tuple[Tensor, Tensor]:
+        """The residuals (m,) and their Jacobian (m, n), which the next call for as many points overwrites."""
+        check()
+        ends = self._values()
+        J = self.tangents.jacobian(self._parameters, *self._points, *self._factors(ends[0]))
+        return self._at(*ends), torch.from_numpy(J.reshape(len(J), -1)).T
+
+    def _values(self) -> tuple[np.ndarray, np.ndarray]:
+        t, x, constants = self._points
+        return self.tangents.values(self._parameters, t, x, constants, self.by_velocity)
+
+    by_velocity: ClassVar[bool]
+
+    @abstractmethod
+    def _at(self, y: np.ndarray, velocity: np.ndarray) -> Tensor:
+        """The residuals of ψ̄_t(x) and d/dt ψ̄_t(x)."""
+
+    @abstractmethod
+    def _factors(self, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Their derivatives by ψ̄_t(x), and by d/dt ψ̄_t(x) if they depend on that."""
+
+
+class _CompiledLabels(_Compiled):
+    by_velocity = False
+
+    def __init__(self, *given: Any, y: Tensor) -> None:
+        super().__init__(*given)
+        self.y = y.detach().numpy()
+
+    def _at(self, y: np.ndarray, velocity: np.ndarray) -> Tensor:
+        return torch.from_numpy(((y - self.y) * (self.share / self.unit)).T.reshape(-1))
+
+    def _factors(self, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        return (np.repeat(np.diag(self.share / self.unit)[None], len(y), 0),)
+
+
+class _CompiledResidual(_Compiled):
+    by_velocity = True
+
+    def _at(self, y: np.ndarray, velocity: np.ndarray) -> Tensor:
+        r = velocity - self._field("vector_field", y)
+        return torch.from_numpy((r * self._weights()).T.reshape(-1))
+
+    def _factors(self, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        weights = self._weights()
+        return np.ascontiguousarray(-self._field("field_jacobian", y) * weights[:, None]), weights
+
+    def _weights(self) -> np.ndarray:
+        return self.share * self.loss.scaling.t / self.unit
+
+    def _field(self, name: str, y: np.ndarray) -> np.ndarray:
+        """The vector field or its Jacobian at the ends, as torch has it, which any H can do."""
+        states = torch.from_numpy(y)
+        return getattr(self.loss.system, name)(states, *_later(self.t, states, *self.t0)).detach().numpy()
 
 
 class _Evaluation(nn.Module):

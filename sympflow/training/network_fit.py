@@ -17,6 +17,7 @@ from sympflow.flow.weights import check_memory
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.network_tangents import NetworkTangents
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.optimizers import MEMORY, Optimizer, optimizer
 from sympflow.training.options import LossOptions
@@ -49,6 +50,8 @@ class LossRun(Run):
     held_out, reference
         Points of the losses that are never trained on; states, where the exact flow takes them in Δt, and of a driven
         system the times of the states.
+    tangents : NetworkTangents or None
+        For the residuals and their Jacobian; None where the optimizer needs none, or the flow is no such network.
     step : int
         Steps taken.
     best : dict
@@ -64,6 +67,7 @@ class LossRun(Run):
     held_out: Points
     reference: tuple[Tensor, ...]
     optimizer: Optimizer
+    tangents: NetworkTangents | None = None
     step: int = 0
     best: dict[str, Tensor] = field(default_factory=dict)
     ended: bool = field(default=False, init=False)
@@ -113,7 +117,8 @@ class LossRun(Run):
         exists = np.isfinite(end).all(-1)
         known = (start, end) if t0 is None else (start, end, t0)
         reference = tuple(torch.as_tensor(a[exists], dtype=flow.dtype, device=flow.device) for a in known)
-        return cls(flow, system, domain, scaling, options, loss, source, held_out, reference, method)
+        tangents = flow.tangents() if method.needs_residuals else None
+        return cls(flow, system, domain, scaling, options, loss, source, held_out, reference, method, tangents)
 
     @property
     def done(self) -> int:
@@ -160,7 +165,7 @@ class LossRun(Run):
         options = self.options
         index = 0 if options.refresh is None else self.step // options.refresh
         began = session.passed
-        objective = Objective(self.loss, self.flow, self.source(index), index, self.work_end.check)
+        objective = Objective(self.loss, self.flow, self.source(index), index, self.work_end.check, self.tangents)
         try:
             value = self.optimizer.step(self.step, objective)
         except OutOfTime:

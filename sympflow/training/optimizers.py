@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -32,9 +32,12 @@ class Optimizer(Protocol):
     ----------
     finished : str or None
         Why no more steps on the same points are worth while.
+    needs_residuals : bool
+        True if it lowers a sum of squares by its residuals.
     """
 
     finished: str | None
+    needs_residuals: ClassVar[bool]
 
     def step(self, index: int, objective: Objective) -> float:
         """Take a step; the loss before it."""
@@ -48,6 +51,7 @@ class Adam:
     """Adam (Kingma & Ba 2015) with a schedule and gradient clipping."""
 
     finished: str | None = None
+    needs_residuals: ClassVar[bool] = False
 
     def __init__(self, flow: FlowMap, options: LossOptions) -> None:
         self.options = options
@@ -76,6 +80,7 @@ class LBFGS:
     """L-BFGS by torch, its memory 30 pairs: 20 iterations a step, on the points of the step."""
 
     finished: str | None = None
+    needs_residuals: ClassVar[bool] = False
 
     def __init__(self, flow: FlowMap, options: LossOptions) -> None:
         self.parameters = list(flow.parameters())
@@ -129,6 +134,7 @@ class BFGS:
     """
 
     finished: str | None = None
+    needs_residuals: ClassVar[bool] = False
 
     def __init__(self, flow: FlowMap, options: LossOptions) -> None:
         if flow.n_parameters > MAX_PARAMETERS:

@@ -214,6 +214,20 @@ def test_other_values_of_parameters_give_another_lattice():
         system.with_params(c=1.0)
 
 
+def test_trajectories_have_numbers_of_their_own_and_share_arrays():
+    system = HamiltonianSystem.lattice(**DISORDERED, y0=np.full(14, 0.1))
+    options = {"t_span": (0, 1), "dt": 0.1, "t_eval": [0.5, 1]}
+    together = sf.solve(system, "verlet", params={"b": [0.3, 0.7, 0.3]}, **options)
+    alone = sf.solve(system.with_params(b=0.7), "verlet", **options)
+    np.testing.assert_array_equal(together.y[1], alone.y)
+    np.testing.assert_array_equal(together.y[0], together.y[2])
+    np.testing.assert_array_equal(together.energy()[1], alone.energy())
+    swept = sf.ensemble(system, "verlet", (0, 1), system.y0, dt=0.1, params={"b": [0.3, 0.7]}, t_eval=[0.5, 1])
+    np.testing.assert_array_equal(np.squeeze(swept.y)[1], alone.y)
+    with pytest.raises(TypeError, match="`params` has 'm', an array of the sites"):
+        sf.solve(system, "verlet", params={"m": [1.0, 2.0]}, **options)
+
+
 def test_what_is_better_a_lattice_is_told_so():
     terms = " + ".join(f"p{i}**2/2 + q{i}**2/2" for i in range(1, 402))
     with pytest.warns(UserWarning, match=r"401 coordinates.*HamiltonianSystem.lattice"):

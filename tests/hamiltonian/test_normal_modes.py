@@ -115,6 +115,8 @@ def test_derivatives_of_a_complex_field_are_those_of_H():
     again = pickle.loads(pickle.dumps(TRAP)).with_params(g=0.0)
     assert again.params["g"] == 0.0
     assert TRAP.params["g"] == 0.7
+    with pytest.raises(ValueError, match="use a method with the exact linear flow, such as 'impulse'"):
+        solve(TRAP, "verlet", (0, 1), np.ones(48), dt=0.1)
 
 
 def test_the_soliton_solves_the_equation_and_has_its_norm_and_energy():

@@ -123,6 +123,15 @@ class TestRuns:
         with pytest.raises(ValueError, match=r"`system` .pairs. has friction, and its loops take one rate"):
             solve(each, "verlet", backend="compiled")
 
+    def test_values_of_parameters_of_each_trajectory(self):
+        system = gravity(4)
+        together = solve(system, "verlet", params={"G": [0.25, 0.5]})
+        alone = solve(system.with_params(G=0.5), "verlet")
+        np.testing.assert_array_equal(together.y[1], alone.y)
+        np.testing.assert_array_equal(together.y[0], solve(system, "verlet").y)
+        with pytest.raises(ValueError, match=r"^`params` has 'g', and those of the system are G"):
+            system.with_params(g=1.0)
+
     @pytest.mark.slow
     @pytest.mark.parametrize("n", [4, 40], ids=["few", "blocks"])
     def test_curvature_terms_are_those_of_arrays(self, n):

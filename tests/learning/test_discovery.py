@@ -88,6 +88,14 @@ def test_friction_and_a_wrong_library_are_told():
         sympflow.discover(measured(pendulum(), 0.01), ["p**2", "q**2"])
 
 
+def test_a_noise_that_is_not_that_of_the_data_is_told():
+    data = measured(pendulum(), 0.01)
+    with pytest.warns(UserWarning, match=r"leaves 0\.1\d* of the `noise` that was given"):
+        assert sympflow.discover(data, ["p**2", "cos(q)"], noise=0.1).discovery.explains
+    with pytest.warns(UserWarning, match=r"without any model the data show noise of up to 0\.01"):
+        assert not sympflow.discover(data, ["p**2", "cos(q)"], noise=0.001).discovery.explains
+
+
 def test_the_hamiltonian_behind_a_flow():
     flow = next(f for f in sympflow.shipped_flows() if f.name == "pendulum-primed-3-0.4").load(pendulum())
     record = sympflow.discover(flow).discovery

@@ -56,7 +56,18 @@ def test_results_of_solvers_are_read():
     same(Trajectories.read(scipy), [(t, scipy.y)])
 
 
-def test_tables_and_datasets_are_read_by_their_names(tmp_path):
+def no_engine(path):
+    raise ImportError("Unable to find a usable engine")
+
+
+def test_parquet_is_read_where_it_can_be(tmp_path):
+    pd = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    pd.DataFrame({"t": t, "q": RUN[0], "p": RUN[1]}).to_parquet(tmp_path / "run.parquet")
+    same(Trajectories.read(tmp_path / "run.parquet"), [(t, RUN)])
+
+
+def test_tables_and_datasets_are_read_by_their_names(tmp_path, monkeypatch):
     pd, xr = pytest.importorskip("pandas"), pytest.importorskip("xarray")
     sol = sympflow.solve(henon_heiles(), "verlet", (0, 1), np.full((2, 4), 0.1) * [[1], [2]], t_eval=t)
     runs = [(t, y) for y in sol.y]
@@ -65,6 +76,17 @@ def test_tables_and_datasets_are_read_by_their_names(tmp_path):
     same(Trajectories.read(table), runs)
     same(Trajectories.read(table[["p2", "q1", "time", "q2", "orbit", "p1"]]), runs)  # the order does not count
     table.to_csv(tmp_path / "runs.csv", index=False)
+    (tmp_path / "runs.parquet").write_bytes(b"PAR1")
+    with monkeypatch.context() as patch, pytest.raises(ImportError, match=r"a Parquet file, which .* pip install"):
+        patch.setattr(pd, "read_parquet", no_engine)
+        Trajectories.read(tmp_path / "runs.parquet")
+    sol.to_xarray().to_netcdf(tmp_path / "runs.nc", engine="scipy")
+    same(Trajectories.read(tmp_path / "runs.nc"), runs)
+    sol.to_xarray().to_zarr(tmp_path / "runs.zarr", consolidated=False)
+    same(Trajectories.read(tmp_path / "runs.zarr"), runs)
+    with pytest.raises(ValueError, match=r"names a file \.mat: \.csv, \.parquet, \.nc and \.zarr are read"):
+        (tmp_path / "runs.mat").touch()
+        Trajectories.read(tmp_path / "runs.mat")
     read = Trajectories.read(tmp_path / "runs.csv", ndof=2)
     np.testing.assert_allclose([run.y for run in read.runs], sol.y, rtol=1e-15)
     assert read.names == ("q1", "q2", "p1", "p2")
@@ -125,6 +147,43 @@ def test_sets_are_divided_by_trajectory_and_long_runs_into_pieces():
         one.split()
     with pytest.raises(ValueError, match="`points` must be 2 or more"):
         one.pieces(points=1)
+
+
+def test_of_few_trajectories_each_is_left_out_in_turn():
+    many = Trajectories.read((t, np.arange(240.0).reshape(20, 2, 6)))
+    ((kept, held),) = many.subset(range(8)).folds(0.2)
+    assert (len(kept.runs), len(held.runs)) == (5, 3)  # three at least
+    ((kept, held),) = many.folds(0.2)
+    assert (len(kept.runs), len(held.runs)) == (16, 4)
+    folds = many.subset(range(3)).folds()
+    assert [[run.y[0, 0] for run in held.runs] for _, held in folds] == [[0.0], [12.0], [24.0]]
+    assert [[run.y[0, 0] for run in kept.runs] for kept, _ in folds] == [[12.0, 24.0], [0.0, 24.0], [0.0, 12.0]]
+    with pytest.raises(ValueError, match="one trajectory only"):
+        many.subset([0]).folds()
+
+
+def test_angles_that_were_wrapped_are_noticed_and_continued():
+    times = np.linspace(0, 10, 40)
+    turning = np.stack([1.3 * times - 2.0, 1.3 + 0.1 * np.sin(times)])
+    wrapped = turning.copy()
+    wrapped[0] = (turning[0] + np.pi) % (2 * np.pi) - np.pi
+    wrapped[0, 7] = np.nan
+    for scale, period in ((1.0, r"2\*np.pi"), (180 / np.pi, "360")):
+        data = Trajectories.read([(times, turning), (times, wrapped * [[scale], [1]])][1:])
+        with pytest.raises(ValueError, match=rf"2 jumps of q1 by about {period}, the first in trajectory 0"):
+            data.check_angles()
+        data.check_angles(np.array([True]))  # it was said
+    continued = Trajectories.read((times, wrapped), period=2 * np.pi)
+    continued.check_angles()
+    seen = np.isfinite(wrapped[0])
+    np.testing.assert_allclose(continued.runs[0].y[0, seen], turning[0, seen], atol=1e-12)
+    swinging = Trajectories.read((times, np.stack([3.1 * np.sin(3 * times), np.cos(times)])))
+    swinging.check_angles()  # large steps of all sizes are no jumps
+    same(swinging.unwrapped(np.array([np.inf])), [(run.t, run.y) for run in swinging.runs])
+    with pytest.raises(ValueError, match="pass period=2"):
+        sympflow.discover((times, np.stack([wrapped, wrapped])))
+    with pytest.raises(ValueError, match="`period` must be positive"):
+        Trajectories.read((times, wrapped), period=-1.0)
 
 
 @pytest.mark.parametrize(

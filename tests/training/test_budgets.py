@@ -13,6 +13,7 @@ from sympflow.flow import weights
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
+from sympflow.kernels.network_tangents import NetworkTangents
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import session as sessions
 from sympflow.training import starts, trials
@@ -184,6 +185,7 @@ def test_trials_take_at_most_two_thirds_of_the_time(clock, monkeypatch):
 def test_the_training_of_a_network_keeps_its_budget(clock, optimizer):
     """Each evaluation of the loss takes a second: a step of a quasi-Newton method tens of them."""
     clock.costs_seconds(Loss, "residual", 1.0)
+    clock.costs_seconds(NetworkTangents, "values", 1.0)
     loss = {"matching_weight": 0.0}
     with pytest.warns(RuntimeWarning, match="because the time budget was used up"):
         flow = train(PENDULUM, time_budget=30.0, optimizer=optimizer, **loss, **NETWORK)

@@ -1,7 +1,7 @@
 """The loops of an implicit Gauss method: Newton's iteration, a step, a run. Source text for `implicit`.
 
-What comes before defines `NDOF`, `COMPENSATED`, the tableau `A`, `B`, `C` and `SCALE` of `STAGES` stages as tuples, and
-the system's ``gradient_and_hessian(y, g, S, t)``, which leaves the entries of S that are always zero as they are.
+What comes before are the text `newton_steps` and the system's ``gradient_and_hessian(y, g, S, t)``, which leaves the
+entries of S that are always zero as they are.
 
 The unknowns are K_i = h SCALE_i f(y + Σ_j A_ij K_j), in which the coefficients are exact where it matters for the long
 run, and y + Σ B_i K_i needs no further evaluation of f.
@@ -12,65 +12,9 @@ run, and y + Σ B_i K_i needs no further evaluation of f.
 import numpy as np
 from numba import njit
 
-SIZE = 2 * NDOF
 TOLERANCE = 1e-11  # of a relative increment: convergence is quadratic, so what is left is below rounding
 ROUNDING = 1e-9  # increments below this that no longer shrink are rounding
 MOST_ITERATIONS = 50
-
-
-@njit(**OPTIONS)
-def workspace():
-    n = STAGES * SIZE
-    return np.zeros(n), np.zeros(n), np.zeros((n, n)), np.zeros(SIZE), np.zeros(SIZE), np.zeros((SIZE, SIZE))
-
-
-@njit(**OPTIONS)
-def solve_in_place(M, x):
-    """M⁻¹x into x by Gaussian elimination with partial pivoting; M is overwritten. False if a pivot vanishes."""
-    n = len(x)
-    for k in range(n):
-        pivot = k
-        for i in range(k + 1, n):
-            if abs(M[i, k]) > abs(M[pivot, k]):
-                pivot = i
-        if not abs(M[pivot, k]) > 0.0:
-            return False
-        if pivot != k:
-            for j in range(k, n):
-                M[k, j], M[pivot, j] = M[pivot, j], M[k, j]
-            x[k], x[pivot] = x[pivot], x[k]
-        for i in range(k + 1, n):
-            factor = M[i, k] / M[k, k]
-            if factor != 0.0:
-                for j in range(k + 1, n):
-                    M[i, j] -= factor * M[k, j]
-                x[i] -= factor * x[k]
-    for k in range(n - 1, -1, -1):
-        total = x[k]
-        for j in range(k + 1, n):
-            total -= M[k, j] * x[j]
-        x[k] = total / M[k, k]
-    return True
-
-
-@njit(**OPTIONS)
-def relative_size(change, y, K):
-    """The largest of ‖Δq‖/(‖q‖ + ‖K_q‖) and ‖Δp‖/(‖p‖ + ‖K_p‖), maxima over components and stages; NaN stays NaN."""
-    worst = 0.0
-    for part in range(2):
-        top, scale = 0.0, 0.0
-        for m in range(part * NDOF, (part + 1) * NDOF):
-            largest = 0.0
-            for i in range(STAGES):
-                value = abs(change[i * SIZE + m])
-                if not value <= top:
-                    top = value
-                largest = max(largest, abs(K[i * SIZE + m]))
-            scale = max(scale, abs(y[m]) + largest)
-        ratio = 0.0 if top == 0.0 else top / scale
-        if not ratio <= worst:
-            worst = ratio
-    return worst
 
 
 @njit(**OPTIONS)
@@ -80,7 +24,8 @@ def stages(y, h, t, work):
     Returns the iterations taken, negative if in vain.
     """
     K, change, M, Y, g, S = work
-    K[:] = 0.0
+    for m in range(len(K)):
+        K[m] = 0.0
     before = np.inf
     for iteration in range(1, MOST_ITERATIONS + 1):
         for i in range(STAGES):
@@ -113,25 +58,6 @@ def stages(y, h, t, work):
 
 
 @njit(**OPTIONS)
-def advance(y, error, K):
-    """y + Σ b_i K_i in place; if `COMPENSATED` by Kahan's compensated sum. True if the result is finite."""
-    total = 0.0
-    for m in range(SIZE):
-        change = 0.0
-        for i in range(STAGES):
-            change += B[i] * K[i * SIZE + m]
-        if COMPENSATED:
-            change -= error[m]
-            new = y[m] + change
-            error[m] = (new - y[m]) - change
-            y[m] = new
-        else:
-            y[m] += change
-        total += 0.0 * y[m]
-    return total == 0.0
-
-
-@njit(**OPTIONS)
 def rollout(h, t0, y0, n_steps, save, out, work, stop, first, running):
     """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``; later rows are NaN.
 
@@ -141,14 +67,15 @@ def rollout(h, t0, y0, n_steps, save, out, work, stop, first, running):
     Returns the index of the last step that was solved and ends in a finite state, and the iterations taken. Ends early,
     with rows unset, when another thread sets ``stop[0]``.
     """
-    y, error = y0.copy(), np.zeros(SIZE)
+    y, error = np.empty(SIZE), np.zeros(SIZE)
+    copy_numbers(y0, y)
     if first > 0:
-        y[:] = running[:SIZE]
+        copy_numbers(running[:SIZE], y)
         if COMPENSATED:
-            error[:] = running[SIZE:]
+            copy_numbers(running[SIZE:], error)
     saved = iterations = 0
     while saved < len(save) and save[saved] <= 0:
-        out[saved] = y
+        copy_numbers(y, out[saved])
         saved += 1
     for n in range(first + 1, n_steps + 1):
         if stop[0] != 0:
@@ -156,16 +83,16 @@ def rollout(h, t0, y0, n_steps, save, out, work, stop, first, running):
         taken = stages(y, h, t0 + (n - 1) * h, work)
         iterations += abs(taken)
         if taken < 0 or not advance(y, error, work[0]):
-            out[saved:] = np.nan
-            running[:] = np.nan
+            fill_with_nan(out, saved)
+            set_nan(running)
             return n - 1, iterations
         while saved < len(save) and save[saved] == n:
-            out[saved] = y
+            copy_numbers(y, out[saved])
             saved += 1
     if len(running) > 0:
-        running[:SIZE] = y
+        copy_numbers(y, running[:SIZE])
         if COMPENSATED:
-            running[SIZE:] = error
+            copy_numbers(error, running[SIZE:])
     return n_steps, iterations
 
 
@@ -182,9 +109,10 @@ def step_each(h, t, y, out, iterations):
     """One step of length ``h[i]`` from every row of `y` (N, 2d), at the time ``t[i]``; NaN where it has no solution."""
     work, error = workspace(), np.zeros(SIZE)
     for i in range(y.shape[0]):
-        out[i] = y[i]
+        copy_numbers(y[i], out[i])
         taken = stages(y[i], h[i], t[i], work)
         iterations[i] = abs(taken)
-        error[:] = 0.0
+        for m in range(SIZE):
+            error[m] = 0.0
         if taken < 0 or not advance(out[i], error, work[0]):
-            out[i] = np.nan
+            set_nan(out[i])

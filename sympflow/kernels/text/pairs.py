@@ -12,8 +12,6 @@ and added up in the order of these: so threads may share them, and the result do
 # ruff: noqa: F821
 # mypy: ignore-errors
 
-import math
-
 import numpy as np
 from numba import njit
 
@@ -60,55 +58,51 @@ def pack(X, first, y, geometry):
 
 @njit(**OPTIONS)
 def workspace(size, geometry):
-    """Sums and velocities, the sums of chunks, bodies in the order of their cells, and that order."""
-    cut = size if CUT else 0
-    A, F = np.zeros((N_HELPERS, DIM, size)), np.zeros((geometry[1], DIM, size))
-    return A, F, np.zeros((DIM, cut)), np.zeros((2, DIM, cut)), np.zeros((DIM + COLUMNS, cut)), np.arange(geometry[0])
+    """Sums and velocities; the sums of chunks, and bodies, in blocks; the order of bodies in these."""
+    n_chunks = geometry[1]
+    blocks = size if n_chunks > 0 else 0
+    A, F = np.zeros((N_HELPERS, DIM, size)), np.zeros((n_chunks, DIM * blocks))
+    return A, F, np.zeros(WIDTH * blocks), np.arange(geometry[0])
 
 
 @njit(**OPTIONS)
-def chunk_begin(chunk, n, n_chunks, starts):
-    """The first body of a chunk: of all pairs, the chunks have as many each."""
-    if len(starts) > 0:
-        return n * chunk // n_chunks
-    return n - int(math.sqrt(1.0 - chunk / n_chunks) * n)
+def chunk_begin(chunk, n, n_chunks, in_cells):
+    """The first place of a chunk; of all pairs, the places are those of two bodies each."""
+    return (n if in_cells else (n + 1) // 2) * chunk // n_chunks
 
 
 @njit(**OPTIONS)
-def sorted_bodies(x, work, sites, values):
-    """Sort the bodies into cells, copy what pairs depend on in that order; see `sorted_cells`."""
-    sorted_x, sorted_sites, order = work[2], work[4], work[5]
-    starts, shape = sorted_cells(x, values, order)
-    for i in range(len(order)):
-        for k in range(DIM):
-            sorted_x[k, i] = x[k, order[i]]
-        for k in range(COLUMNS):
-            sorted_sites[DIM + k, i] = sites[DIM + k, order[i]]
+def fill_rows(P, row, n_rows, source, first, order):
+    """Rows of the blocks, by rows of an array from `first` on."""
+    for k in range(n_rows):
+        for i in range(len(order)):
+            P[(i // LANES * WIDTH + row + k) * LANES + i % LANES] = source[first + k, order[i]]
+
+
+@njit(**OPTIONS)
+def fill_blocks(phase, first, X, work, starts, shape, sites, values):
+    """Put the bodies into blocks, once in a kick, and the velocity of a phase; returns what `sorted_cells` does."""
+    A, _, P, order = work
+    if phase == first:
+        if CUT:
+            starts, shape = sorted_cells(X[0], values, order)
+        fill_rows(P, 0, DIM, X[0], 0, order)
+        fill_rows(P, DIM, COLUMNS, sites, DIM, order)
+    if HAS_GRADIENT and ALONG[phase] > 0:
+        fill_rows(P, DIM + COLUMNS, DIM, A[ALONG[phase]], 0, order)
     return starts, shape
 
 
 @njit(**OPTIONS)
-def sort_vector(v, work):
-    """Copy a velocity into the order of the cells."""
-    sorted_v, order = work[3][1], work[5]
-    for i in range(len(order)):
-        for k in range(DIM):
-            sorted_v[k, i] = v[k, order[i]]
-
-
-@njit(**OPTIONS)
-def sum_chunk(kind, chunk, X, along, work, starts, shape, geometry, sites, values):
+def sum_chunk(kind, chunk, work, starts, shape, geometry, values):
     """The part of a chunk in a sum."""
-    A, F, sorted_x, sorted_A, sorted_sites, _ = work
-    x, v = X[0], along
-    if CUT:
-        x, A, v, sites = sorted_x, sorted_A, 1, sorted_sites
+    F, P = work[1], work[2]
     if kind == 0:
-        gradient_of_chunk(chunk, x, A, v, sites, F, starts, shape, values, geometry)
+        gradient_of_chunk(chunk, P, F, starts, shape, values, geometry)
     if HAS_GRADIENT and kind == 1:
-        hessian_vector_of_chunk(chunk, x, A, v, sites, F, starts, shape, values, geometry)
+        hessian_vector_of_chunk(chunk, P, F, starts, shape, values, geometry)
     if HAS_CURVATURE and kind == 2:
-        bend_of_chunk(chunk, x, A, v, sites, F, starts, shape, values, geometry)
+        bend_of_chunk(chunk, P, F, starts, shape, values, geometry)
 
 
 @njit(**OPTIONS)
@@ -125,17 +119,13 @@ def sum_of_few(kind, X, along, work, geometry, sites, values):
 @njit(**OPTIONS)
 def sum_of_chunks(work):
     """Add the sums of chunks up, in the order of the bodies."""
-    total, F, order = work[0][0], work[1], work[5]
+    total, F, order = work[0][0], work[1], work[3]
+    for chunk in range(1, F.shape[0]):
+        for k in range(F.shape[1]):
+            F[0, k] += F[chunk, k]
     for k in range(DIM):
-        for i in range(total.shape[1]):
-            total[k, i] = 0.0
-        for chunk in range(F.shape[0]):
-            if CUT:
-                for i in range(len(order)):
-                    total[k, order[i]] += F[chunk, k, i]
-            else:
-                for i in range(total.shape[1]):
-                    total[k, i] += F[chunk, k, i]
+        for i in range(len(order)):
+            total[k, order[i]] = F[0, (i // LANES * DIM + k) * LANES + i % LANES]
 
 
 @njit(**OPTIONS, forceinline=True)
@@ -183,25 +173,14 @@ def in_one(X, table, column, n_stages, single, work, geometry, sites, values):
             if n_chunks == 0:
                 sum_of_few(SUMS[phase], X, ALONG[phase], work, geometry, sites, values)
             else:
-                if CUT:
-                    starts, shape = sorted_for(phase, first, X, work, starts, shape, sites, values)
+                starts, shape = fill_blocks(phase, first, X, work, starts, shape, sites, values)
                 for chunk in range(n_chunks):
-                    sum_chunk(SUMS[phase], chunk, X, ALONG[phase], work, starts, shape, geometry, sites, values)
+                    sum_chunk(SUMS[phase], chunk, work, starts, shape, geometry, values)
                 sum_of_chunks(work)
             kick(X, table, column, phase, work, sites)
         drift(X, table, column, sites)
         column = column + 1 if single or column < link else 1
     return column
-
-
-@njit(**OPTIONS)
-def sorted_for(phase, first, X, work, starts, shape, sites, values):
-    """Sort the bodies and the velocity of a phase of a kick, with the bodies sorted once in it."""
-    if phase == first:
-        starts, shape = sorted_bodies(X[0], work, sites, values)
-    if HAS_GRADIENT and ALONG[phase] > 0:
-        sort_vector(work[0][ALONG[phase]], work)
-    return starts, shape
 
 
 # The same where threads share the chunks of a sum.
@@ -214,15 +193,13 @@ def kick_of(table, column):
 
 @njit(**OPTIONS)
 def begun(phase, first, X, work, starts, shape, sites, values):
-    if CUT:
-        return sorted_for(phase, first, X, work, starts, shape, sites, values)
-    return starts, shape
+    return fill_blocks(phase, first, X, work, starts, shape, sites, values)
 
 
 @njit(**OPTIONS)
-def shared(lo, hi, phase, X, work, starts, shape, geometry, sites, values):
+def shared(lo, hi, phase, work, starts, shape, geometry, values):
     for chunk in range(lo, hi):
-        sum_chunk(SUMS[phase], chunk, X, ALONG[phase], work, starts, shape, geometry, sites, values)
+        sum_chunk(SUMS[phase], chunk, work, starts, shape, geometry, values)
 
 
 @njit(**OPTIONS)

@@ -15,8 +15,6 @@ import numpy as np
 from numba import njit
 
 CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where nothing is saved
-LANES = 64
-VECTOR = 8  # lanes are padded to a multiple of this with copies of the last one
 
 
 @njit(**OPTIONS, forceinline=True)  # called, it would take and give its states in memory
@@ -74,8 +72,8 @@ def rollout(codes, table, y0, in_modes, n_steps, save, out, stop, first, running
             begin = link
         end_x, end_y = closed(x, y, codes, table, in_modes, n + block - 1)
         if not is_finite(end_x, end_y):
-            out[saved:] = np.nan
-            running[:] = np.nan
+            fill_with_nan(out, saved)
+            set_nan(running)
             return n - 1 + first_non_finite(start_x, start_y, codes, table, start, block, in_modes, n)
         n += block
         while saved < len(save) and save[saved] == n:
@@ -106,17 +104,24 @@ TIME = NUMBERS + 2 + N_CLASSES
 BASIS = TIME + 1
 
 
-@njit(**OPTIONS, inline="always")
-def fill_number(Z, width, i, coefficients, power):
-    """t to a power, times the sum of the basis functions with these coefficients."""
-    for lane in range(width):
-        Z[NUMBERS + i, lane] = coefficients[0]
-    for k in range(1, len(coefficients)):
+@njit(**OPTIONS)
+def fill_numbers(Z, width, coefficients, j, linear):
+    """The numbers of map j: powers of t, times sums of the basis functions with these coefficients.
+
+    The power is 1 of lengths, 3 of a force gradient, the second number of a part, and 0 of filters.
+    """
+    n = N_CLASSES if linear else 2 + FILTERS * N_CLASSES
+    for i in range(n):
+        row = NUMBERS + i
         for lane in range(width):
-            Z[NUMBERS + i, lane] += coefficients[k] * Z[BASIS + k, lane]
-    for _ in range(power):
-        for lane in range(width):
-            Z[NUMBERS + i, lane] *= Z[TIME, lane]
+            Z[row, lane] = coefficients[j, i, 0]
+        for k in range(1, coefficients.shape[2]):
+            for lane in range(width):
+                Z[row, lane] += coefficients[j, i, k] * Z[BASIS + k, lane]
+        power = 1 if linear or i == 0 else 3 if i == 1 else 0
+        for _ in range(power):
+            for lane in range(width):
+                Z[row, lane] *= Z[TIME, lane]
 
 
 @njit(**OPTIONS)
@@ -145,18 +150,14 @@ def step_lanes(codes, coefficients, dt, t, y, in_modes, out):
                 x = 2.0 * (2.0 * Z[BASIS + 1, lane] - 1.0)
                 Z[BASIS + k, lane] = x * Z[BASIS + k - 1, lane] - Z[BASIS + k - 2, lane]
         for j in range(len(codes)):
-            if codes[j] == 0:
-                for f in range(N_CLASSES):
-                    fill_number(Z, width, f, coefficients[j, f], 1)
+            linear = codes[j] == 0
+            fill_numbers(Z, width, coefficients, j, linear)
+            if linear:
                 fill_turns(Z, width)
             else:
-                fill_number(Z, width, 0, coefficients[j, 0], 1)
-                fill_number(Z, width, 1, coefficients[j, 1], 3)
                 for lane in range(width):
                     Z[TABLE, lane], Z[TABLE + 1, lane] = Z[NUMBERS, lane], Z[NUMBERS + 1, lane]
                 if FILTERS:
-                    for f in range(N_CLASSES):
-                        fill_number(Z, width, 2 + f, coefficients[j, 2 + f], 0)
                     fill_filters(Z, width)
             apply_map_each(Z, width, codes[j])
         for lane in range(count):
@@ -220,7 +221,7 @@ def rollout_lanes(codes, table, y0, in_modes, n_steps, save, out, n_finite, stop
                     x, y = unpack_lane(start, lane)
                     n_finite[i] = n - 1 + first_non_finite(x, y, codes, table, begin, block, in_modes, n)
                     n_alive -= 1
-                    out[i, saved:] = np.nan
+                    fill_with_nan(out[i], saved)
                 else:
                     for row in range(saved, next_saved):
                         pack(x, y, out[i, row])
