@@ -22,6 +22,10 @@ from sympflow.training.points import Labels, Stream, shares_missed, states, step
 
 MOST_FITTED = 16
 """Degrees of freedom up to which a lattice is fitted as it is, and not by a piece."""
+TAIL = 2.0
+"""Times the upper density that the states of a piece have.
+
+In a large lattice a few neighbours at a time have so much, and a flow's errors there decide about the energy of all."""
 MOST_JUDGED = 1024
 """Sites of the lattice on which a flow is judged, where the lattice has more."""
 NUMBERS = 16_000
@@ -73,7 +77,9 @@ class Piece:
         written = HamiltonianSystem.from_sympy(
             local.written_out(), damping=lattice.damping, name=lattice.name, t_span=lattice.t_span, dt=lattice.dt
         )
-        return cls(lattice, few, written, domain if small else found.of(few), found.of(lattice))
+        low, high = found.bounds
+        excited = LatticeStates((low, TAIL * high)).of(few)
+        return cls(lattice, few, written, domain if small else excited, found.of(lattice))
 
     def small(self, flow: FlowMap) -> PrimedFlow:
         """A flow of the lattice as one of the piece by its coordinates."""

@@ -158,9 +158,9 @@ def train(
         run that was not interrupted.
     time_budget : float, optional
         Stop after so many seconds, to 20 %, and a few seconds for what is imported and compiled; a single evaluation of
-        a network's loss at 32 points is the smallest piece. All counts: trials (at most half of it), labels (at most
-        0.3 of what is left, each set), starts, fits, held-out figures. Where labels take longer the flow
-        is returned as it was, and a warning says how far they came. The default for a new primed flow is 60, and 15
+        a network's loss at 32 points is the smallest piece. All counts: trials (at most two thirds of it), labels (at
+        most 0.3 of what is left, each set), starts, fits, held-out figures. Where labels take longer the flow is
+        returned as it was, and a warning says how far they came. The default for a new primed flow is 60, and 15
         where trials choose it, unless `restarts`, `steps` or `resume` is given: the search may take fewer starts then,
         which the recipe records; else there is none. In up to three degrees of freedom of a symbolic system such a fit
         has 72 starts; one with a budget, and without `restarts`, `steps` and files, as many as two fifths of the time

@@ -7,6 +7,7 @@ import pytest
 
 import sympflow
 from sympflow import Box, HamiltonianSystem, LatticeStates, SympFlow, solve, train
+from sympflow.training.lattice_fit import TAIL, Piece
 
 BOND = "r**2/2 + r**4/4"
 FIT = {"restarts": 1, "steps": 8, "points": 20, "label_times": 3, "reference_states": 10, "progress": False}
@@ -46,6 +47,10 @@ def test_a_piece_has_the_states_of_the_lattice():
     assert high == pytest.approx(low, rel=1.0)
     of_box = ring(6, domain=Box([-0.5] * 12, [0.5] * 12)).piece().domain
     assert 0.01 < of_box.bounds[0] < of_box.bounds[1] < 1
+    large = ring(200)
+    fitted = Piece.of(large, LatticeStates((0.1, 0.3)).of(large))
+    assert fitted.domain.bounds == (0.1, TAIL * 0.3)  # a few neighbours have more than all of them
+    assert fitted.states.bounds == (0.1, 0.3)
     assert ring(200).piece(8).domain is None
     with pytest.raises(TypeError, match=r"^`system` 'custom' is no lattice"):
         HamiltonianSystem.from_sympy("p**2/2 + q**2/2").piece()
