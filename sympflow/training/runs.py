@@ -264,8 +264,8 @@ class Unstarted(Run):
     def ended_early(self, reason: str) -> str:
         return (
             f"Training did not start because {reason}: {self.reached}. What it was to start from is returned. Give a "
-            "longer `time_budget`, a shorter `dt`, or fewer `points`, `label_times` and `reference_states`; or a `domain` "
-            "without states at which H has a kink or is nearly singular, near which exact solutions take long."
+            "longer `time_budget`, a shorter `dt`, or fewer `points`, `label_times` and `reference_states`; or a "
+            "`domain` without states at which H has a kink or is nearly singular, near which exact solutions take long."
         )
 
     def achieved(self) -> dict[str, float]:
