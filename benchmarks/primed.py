@@ -260,6 +260,7 @@ def driven(options: argparse.Namespace, quick: dict[str, Any]) -> str:
                 print(table([row]).splitlines()[-1], flush=True)
                 if options.json:
                     options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
+    rows.sort(key=lambda row: [*DRIVEN].index(row.system))
     fragments.write(options.out, "primed-driven", fragment(rows))
     return "\n" + table(rows)
 
