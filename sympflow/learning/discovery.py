@@ -185,6 +185,7 @@ class DiscoveredSystem(HamiltonianSystem):
     discovery: Discovery
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # models that cannot be right diverge
 def discover(
     data: Any,
     terms: str | sp.Expr | Sequence[str | sp.Expr] | None = None,

@@ -46,6 +46,7 @@ ROUGH = 60  # points from which the roughness of the data tells their noise to a
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # models that cannot be right diverge
 def learn(
     trajectories: Any,
     ndof: int | None = None,
