@@ -58,7 +58,7 @@ def _ladder(*steps: float, processor: int = 12) -> tuple[Primed, ...]:
 
 
 LATTICES: dict[str, tuple[str, dict[str, Any], int, tuple[Primed, ...]]] = {
-    "fput_beta": ("FPUT-β", {"bond": "r**2/2 + r**4/4"}, 1, _ladder(0.8, 0.55, 0.25, processor=6)),
+    "fput_beta": ("FPUT-β", {"bond": "r**2/2 + r**4/4"}, 1, _ladder(0.8, 0.55, 0.25, 0.15, processor=6)),
     "phi4": ("φ⁴", {"onsite": "(q**2 - 1)**2/4", "bond": "r**2/2"}, 1, _ladder(1.3, 0.65, 0.32)),
     "phi4_sheet": ("φ⁴, two axes", {"onsite": "(q**2 - 1)**2/4", "bond": "r**2/2"}, 2, _ladder(1.0, 0.5, 0.25)),
     "toda_chain": ("Toda", {"bond": "exp(-r) + r - 1"}, 1, _ladder(1.2, 0.7, 0.28)),
@@ -133,6 +133,7 @@ class Race:
         y0 = self.y0()[0]
         sides = [[r for r in side if r.name in steps] for side in (self.flows, self.schemes)]
         if not sides[0]:
+            print(f"{self.system.name}: no flow reaches {target:g}", flush=True)
             return None
         work = {r: steps[r.name] * (r.forces + r.hessians / 2) for side in sides for r in side}
         near = [r for side in sides for r in side if work[r] <= NEAR * min(work[s] for s in side)]
@@ -227,12 +228,13 @@ def main() -> None:
             if not options.search:
                 of_targets = zip(TARGETS, mine["steps"], strict=True)
                 mine["rows"] = [entrants.row(target, steps, options.rounds) for target, steps in of_targets]
+                mine["gradient"] = gradient_cost(name, options.sites, options.rounds)
         if options.json:
             options.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
     if options.search:
         return
     rows = [row for name in names for row in found[name]["rows"] if row is not None]
-    costs = {name: gradient_cost(name, options.sites, options.rounds) for name in names}
+    costs = {name: found[name]["gradient"] for name in names}
     for name, body in (("large-flows", fragment(rows)), ("large-gradients", gradients_fragment(costs))):
         fragments.write(options.out, name, body)
         print(body)
