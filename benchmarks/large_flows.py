@@ -58,7 +58,7 @@ def _ladder(*steps: float, processor: int = 12) -> tuple[Primed, ...]:
 
 
 LATTICES: dict[str, tuple[str, dict[str, Any], int, tuple[Primed, ...]]] = {
-    "fput_beta": ("FPUT-β", {"bond": "r**2/2 + r**4/4"}, 1, _ladder(0.8, 0.55, 0.25, 0.15, processor=6)),
+    "fput_beta": ("FPUT-β", {"bond": "r**2/2 + r**4/4"}, 1, _ladder(0.8, 0.55, 0.25, processor=6)),
     "phi4": ("φ⁴", {"onsite": "(q**2 - 1)**2/4", "bond": "r**2/2"}, 1, _ladder(1.3, 0.65, 0.32)),
     "phi4_sheet": ("φ⁴, two axes", {"onsite": "(q**2 - 1)**2/4", "bond": "r**2/2"}, 2, _ladder(1.0, 0.5, 0.25)),
     "toda_chain": ("Toda", {"bond": "exp(-r) + r - 1"}, 1, _ladder(1.2, 0.7, 0.28)),
