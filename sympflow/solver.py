@@ -29,7 +29,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import report_lanes, run_and_search
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
 from sympflow.integrators.domain_exit import check_domain, check_system_along
-from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
+from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
 from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, naming_plugin
 from sympflow.solution import Solution, StoredSolution, joined
@@ -236,6 +236,8 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     integrator = integrator.resolved(system, y_start, abs(problem.t1 - problem.t0))
     check_applies(integrator, system, y_start)
     integrator.check_library(y_start)
+    if not system.autonomous:
+        warn_of_jumps(system, problem.t0, problem.t1, integrator.step_length(system), stacklevel=4)
     run: Callable[[Integrator, Problem], tuple[Outcome, Problem]] = _run
     if problem.t1 in (math.inf, -math.inf):
         run = _run_endless

@@ -60,6 +60,10 @@ class Definition:
     loops: str = ""
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
 
+    def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
+        """The times (n,) between two others at which H is known to jump; `step` as of `Hamiltonian.jump_times`."""
+        return np.zeros(0)
+
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""
 

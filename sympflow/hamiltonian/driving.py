@@ -7,6 +7,7 @@ splitting cuts it into T(p, t) + E, a drift with which the time moves, and V(q, 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -20,6 +21,11 @@ from sympflow.hamiltonian.expression import ELEMENTARY
 
 JUMP = 1e-9
 """Share of the largest value by which both sides of an end of an interval differ where samples jump."""
+
+MOST_TURNS = 1000
+"""Periods of samples, and zeros of a function, beyond which jumps are not listed."""
+MOST_POINTS = 2**14
+"""Times at which a function that is not linear is looked at for its zeros."""
 
 # samples -------------------------------------------------------------------------------------------
 
@@ -95,6 +101,16 @@ class Samples:
         inner = np.abs(ends[:-1] - starts[1:]) > large
         last = [self.periodic and abs(ends[-1] - starts[0]) > large]
         return self.x[1:][np.concatenate([inner, last])]
+
+    def jump_times(self, low: float, high: float) -> np.ndarray:
+        """The times between two others at which the value jumps, in `MOST_TURNS` periods of a spline at most."""
+        times = self.jumps
+        if self.periodic and len(times):
+            start, end = self.span
+            first = math.floor((low - start) / (end - start))
+            turns = np.arange(first, min(math.ceil((high - start) / (end - start)), first + MOST_TURNS))
+            times = (times + turns[:, None] * (end - start)).ravel()
+        return times[(times > low) & (times < high)]
 
     @property
     def shortest_piece(self) -> float:
@@ -240,6 +256,39 @@ def with_letters(f: list[sp.Expr]) -> tuple[list[sp.Expr], dict[sampled, sp.Symb
     found = sorted({a for each in f for a in each.atoms(sampled)}, key=str)
     letters = {a: sp.Symbol(f"sample_{i}", real=True) for i, a in enumerate(found)}
     return ([each.xreplace(letters) for each in f] if letters else f), letters
+
+
+# jumps ---------------------------------------------------------------------------------------------
+
+
+def switches(H: sp.Expr, time: sp.Symbol) -> tuple[sp.Expr, ...]:
+    """The functions of t alone at whose zeros H may jump: of steps, of signs, of the conditions of pieces."""
+    found = [a.args[0] for a in H.atoms(sp.Heaviside, sp.sign)]
+    for pieces in H.atoms(sp.Piecewise):
+        found += [r.lhs - r.rhs for _, condition in pieces.args for r in condition.atoms(sp.core.relational.Relational)]
+    return tuple(sorted({g for g in found if g.free_symbols == {time}}, key=str))
+
+
+def zeros(g: sp.Expr, time: sp.Symbol, low: float, high: float, step: float) -> np.ndarray:
+    """The zeros of g(t) between two times: of a linear g exactly, else where its sign changes within a time `step`.
+
+    Of one that is not linear, in the first `MOST_POINTS` of these times at most.
+    """
+    slope = sp.diff(g, time)
+    if slope.is_number:
+        found = np.array([float(-g.subs(time, 0) / slope)]) if slope != 0 else np.zeros(0)
+        return found[(found > low) & (found < high)]
+    f = sp.lambdify(time, g, "numpy")
+    t = low + step * np.arange(min(MOST_POINTS, math.ceil((high - low) / step)) + 1)
+    with np.errstate(all="ignore"):
+        up = f(t) > 0
+        changed = np.flatnonzero(up[1:] != up[:-1])[:MOST_TURNS]
+        left, right, up = t[changed], t[changed + 1], up[changed]
+        for _ in range(60):
+            middle = (left + right) / 2
+            same = (f(middle) > 0) == up
+            left, right = np.where(same, middle, left), np.where(same, right, middle)
+    return right[(right > low) & (right < high)]
 
 
 # drifts of T(p, t) ---------------------------------------------------------------------------------

@@ -266,6 +266,14 @@ class Hamiltonian:
         """
         return self._definition.shortest_piece
 
+    def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
+        """The times (n,) between two others at which H jumps: of samples, of `Heaviside`, `sign` and pieces of t alone.
+
+        Of a function of t that is not linear, as in sign(cos(t)), zeros nearer to each other than `step` are not told
+        apart. In a long interval with many jumps the first ones alone are given.
+        """
+        return self._definition.jump_times(low, high, step)
+
     def check_times(self, t0: float, t1: float) -> None:
         """Refuse an interval that leaves the times of sampled parameters.
 

@@ -23,17 +23,23 @@ from sympflow.arrays import Array, assemble, concatenate, is_tensor
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.driving import (
     DURATION,
+    JUMP,
+    MOST_POINTS,
     Samples,
     check_span,
     drift,
     is_spline,
     sampled,
     sampled_parameter,
+    switches,
     with_letters,
+    zeros,
 )
 from sympflow.hamiltonian.expression import FUNCTIONS, Unreadable, read
 
 LARGEST = sys.float_info.max
+FAR = 1000.0
+"""The time before and after 0 in which it is looked if H jumps."""
 
 
 class SymbolicHamiltonian(Definition):
@@ -192,10 +198,31 @@ class SymbolicHamiltonian(Definition):
     def shortest_piece(self) -> float:  # type: ignore[override]
         return min((samples.shortest_piece for samples in self.samples.values()), default=math.inf)
 
-    @property
+    @cached_property
     def jumps(self) -> bool:
-        """True if H jumps at some times, at those of samples or of a step function of the time."""
-        return self.shortest_piece < math.inf or (self.time is not None and self.Ht.has(sp.DiracDelta))
+        """True if H jumps at some times, at those of samples or of a function of the time that jumps."""
+        if self.shortest_piece < math.inf or self.time is None:
+            return self.shortest_piece < math.inf
+        return self.Ht.has(sp.DiracDelta) or len(self.jump_times(-FAR, FAR, FAR / MOST_POINTS)) > 0
+
+    @cached_property
+    def _switches(self) -> tuple[sp.Expr, ...]:
+        return () if self.time is None else switches(self.H, self.time)
+
+    def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
+        found = [samples.jump_times(low, high) for samples in self.samples.values()]
+        for g in self._switches:
+            times = zeros(g, self.time, low, high, step)
+            found.append(times[self._differs_across(times)])
+        return np.unique(np.concatenate(found)) if found else np.zeros(0)
+
+    def _differs_across(self, times: np.ndarray) -> np.ndarray:
+        """True for the times (n,) at which H jumps, by its values on both sides at a few states."""
+        y = np.random.default_rng(0).uniform(-1.0, 1.0, (len(times), 4, 2 * self.ndof))
+        aside = 1e-12 * np.maximum(1.0, np.abs(times))[:, None]
+        with np.errstate(all="ignore"):
+            before, after = (self.hamiltonian(y, times[:, None] + s * aside) for s in (-1, 1))
+            return (np.abs(after - before) > JUMP * (np.abs(after) + np.abs(before))).any(-1)
 
     @cached_property
     def Ht(self) -> sp.Expr:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
+
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 EPS = float(np.finfo(float).eps)
 MOST_STEPS = 10**11
@@ -24,6 +27,23 @@ def no_event(n_steps: int, t: float) -> str:
         f"No terminal event ended the run within {n_steps:,} steps, up to t = {t:.17g}. Check the event, or give "
         "`t_span` a finite end, however late."
     )
+
+
+def warn_of_jumps(system: HamiltonianSystem, t0: float, t1: float, dt: float | None, stacklevel: int) -> None:
+    """Warn where H is known to jump within a step of length dt, which loses its order there; not without one."""
+    if dt is None or not math.isfinite(t1) or t0 == t1:
+        return
+    times = system.jump_times(min(t0, t1), max(t0, t1), dt / 4)
+    x = (times - t0) / dt
+    within = np.abs(x - np.round(x)) > np.maximum(1e-9, 8 * EPS * np.maximum(abs(t0), np.abs(times)) / dt)
+    if within.any():
+        first = times[within][0 if t1 > t0 else -1]
+        warnings.warn(
+            f"`dt` {dt:g}: H of {system.name!r} jumps within a step, at t = {first:.6g}, where every method is of "
+            "first order. Choose a `dt` that divides all pieces between jumps from t0 on, or solve from jump to jump.",
+            RuntimeWarning,
+            stacklevel=stacklevel + 1,
+        )
 
 
 class Grid:

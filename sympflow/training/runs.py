@@ -152,8 +152,11 @@ class Run(ABC):
         return f"Training ended {when} because {reason}. The best state so far is returned."
 
     def finish(self, reason: str | None, expected: bool = False) -> Any:
-        """The flow with the record of its training, its parameters without gradient; an expected end does not warn."""
-        if reason is not None and not (expected and reason == OUT_OF_TIME):
+        """The flow with the record of its training, its parameters without gradient.
+
+        An end that is expected does not warn, unless it came before the first of its steps.
+        """
+        if reason is not None and not (expected and self.done and reason == OUT_OF_TIME):
             warnings.warn(self.ended_early(reason), RuntimeWarning, stacklevel=4)
         flow, figures = self.flow, self.achieved()
         flow.requires_grad_(False)
@@ -261,7 +264,8 @@ class Unstarted(Run):
     def ended_early(self, reason: str) -> str:
         return (
             f"Training did not start because {reason}: {self.reached}. What it was to start from is returned. Give a "
-            "longer `time_budget`, a shorter `dt`, or fewer `points`, `label_times` and `reference_states`."
+            "longer `time_budget`, a shorter `dt`, or fewer `points`, `label_times` and `reference_states`; or a "
+            "`domain` without states at which H has a kink or is nearly singular, near which exact solutions take long."
         )
 
     def achieved(self) -> dict[str, float]:

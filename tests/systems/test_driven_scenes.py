@@ -1,15 +1,17 @@
 """The driven scenes: the truths that their docstrings tell."""
 
 import math
+import re
 import warnings
 
 import numpy as np
 import pytest
+import sympy as sp
 from conftest import load_example
 from scipy.interpolate import CubicSpline, PPoly
 from scipy.special import mathieu_a, mathieu_b, mathieu_cem
 
-from sympflow import energy_balance_error, floquet_multipliers, solve, systems
+from sympflow import HamiltonianSystem, energy_balance_error, floquet_multipliers, solve, systems
 from sympflow.hamiltonian.domain import domain_from_dict
 from sympflow.hamiltonian.driving import Samples
 
@@ -110,6 +112,42 @@ def test_adaptive_methods_do_not_step_over_a_quadrupole():
         assert np.abs(sol.y[[0, 2], -1] - exact[0, :, 0]).max() < 0.01
     with pytest.raises(ValueError, match=r"^`sol` is of 'fodo_cell', of which H jumps .* use sympflow.reference_error"):
         energy_balance_error(sol)
+
+
+def test_a_jump_within_a_step_warns():
+    """And none where steps end at all of them, or where H is continuous."""
+    cell = SCENES["fodo-cell"]
+    t = sp.Symbol("t", real=True)
+
+    def system(drive, **scene):
+        q, p = sp.symbols("q p", real=True)
+        return HamiltonianSystem.from_sympy(p**2 / 2 + q**2 / 2 - q * drive, time="t", y0=[0.5, 0.1], **scene)
+
+    switched = system(sp.Piecewise((0, t < 1.2), (1, True)))
+    waves = system(sp.sign(sp.cos(t)))
+    for each, t0, dt, where in (
+        (cell, 0.0, 0.2, 0.25),
+        (cell, 0.06, cell.dt, 0.25),
+        (switched, 0.0, 0.5, 1.2),
+        (waves, 0.0, 0.1, math.pi / 2),
+        (waves, 2.0, -0.1, math.pi / 2),
+    ):
+        found = re.escape(
+            f"jumps within a step, at t = {where:.6g}, where every method is of first order. Choose a `dt`"
+        )
+        with pytest.warns(RuntimeWarning, match=found):
+            solve(each, "kahan_li8", (t0, t0 + math.copysign(2.0, dt)), dt=abs(dt), backend="array")
+    with pytest.raises(ValueError, match="jumps at some times"):
+        energy_balance_error(solve(switched, "verlet", (0, 2), dt=0.4, backend="array"))
+    ramp = system((t - 1.2) * sp.Heaviside(t - 1.2))
+    for each, t0, dt in (
+        (cell, 0.0, cell.dt),
+        (switched, 0.2, 0.25),
+        (ramp, 0.0, 0.5),
+        (waves, -math.pi / 2, math.pi / 7),
+    ):
+        solve(each, "kahan_li8", (t0, t0 + 2.0), dt=dt, backend="array")
+    solve(switched, "dop853", (0.0, 2.0))  # its steps are its own
 
 
 def test_jumps_of_samples():

@@ -136,6 +136,15 @@ def test_labels_that_take_too_long_are_a_message_with_what_was_reached(clock, ki
     assert clock.now < 24.0
 
 
+@pytest.mark.parametrize("dt", [1.0, None], ids=["at dt", "with trials"])
+def test_no_time_for_labels_is_told_where_nothing_else_is_said(clock, dt):
+    """A search that its time ends is what is meant then, but not a flow that was never fitted."""
+    clock.costs_seconds(Hamiltonian, "vector_field", 0.2)
+    with pytest.warns(RuntimeWarning, match=r"^Training did not start .* kink"):
+        flow = train(PENDULUM, dt, time_budget=20.0, progress=False)
+    assert ended_early(flow).startswith("the time budget was used up")
+
+
 def ended_early(flow):
     return flow.recipe["stages"][-1]["ended_early"]
 

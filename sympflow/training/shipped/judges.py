@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -151,6 +151,7 @@ class ByCertificate:
     states: int = 2000
     times: int = 33
     held_out: int = HELD_OUT
+    certifies: ClassVar[bool] = True
 
     def __call__(self, flow: SympFlow, system: HamiltonianSystem) -> None:
         certificate = flow.certificate(
@@ -182,6 +183,7 @@ class ByRuns:
     t_end: float
     t_certified: float
     cost: Cost = primed_cost
+    certifies: ClassVar[bool] = True
 
     def __call__(self, flow: SympFlow, system: HamiltonianSystem) -> None:
         y0, times = self.held_out(system), np.linspace(0.0, self.t_end, OUTPUTS + 1)
@@ -196,6 +198,7 @@ class ByBalance:
 
     t_end: float = 1000.0
     cost: Cost = primed_cost
+    certifies: ClassVar[bool] = False
 
     def __call__(self, flow: PrimedFlow, system: HamiltonianSystem) -> None:
         assert system.domain is not None
@@ -211,6 +214,7 @@ class ByClock:
 
     t_end: float = 1000.0
     cost: Cost = clocked_cost
+    certifies: ClassVar[bool] = False
 
     def __call__(self, flow: ClockedFlow, system: HamiltonianSystem) -> None:
         assert system.domain is not None
@@ -241,6 +245,7 @@ class AsPublished:
     initial: Callable[[], np.ndarray]
     omega: float = 1.0
     cost: Cost = network_cost
+    certifies: ClassVar[bool] = True
 
     def measured(self, flow: FlowMap, system: HamiltonianSystem, steps: int = 1000) -> dict[str, Any]:
         """`measure` from the initial states."""
@@ -269,6 +274,7 @@ class OfStiff:
 
     domain: Callable[[HamiltonianSystem], Domain]
     cost: Cost = split_cost
+    certifies: ClassVar[bool] = True
 
     def __call__(self, flow: SplitFlow, system: HamiltonianSystem) -> None:
         bound = flow.bound(system)

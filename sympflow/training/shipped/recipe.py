@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch
 
@@ -24,7 +24,9 @@ from sympflow.workers import Crew
 
 
 class Judge(Protocol):
-    """A measurement of a trained flow."""
+    """A measurement of a trained flow; `certifies` says if it gives those that are symplectic a certificate."""
+
+    certifies: ClassVar[bool]
 
     def __call__(self, flow: Any, system: HamiltonianSystem) -> None:
         """Put the figures by which flows are chosen, and a certificate, into the flow."""
