@@ -4,8 +4,9 @@
     python benchmarks/driven.py --only cost,balance,mathieu,heyoka
 
 Float64, one thread, process time. In `cost` the runs of a row are timed in turn, in rounds, and the least of each
-counts. In `heyoka` every candidate is timed at the longest step, or the largest tolerance, with which its error at the
-end of 1000 periods is at most 1e-9; the reference is a run of Gauss–Legendre 8 with compensated sums.
+counts. In `heyoka` every candidate, flows that ship among them, is timed at the longest step, or the largest tolerance,
+with which its error at the end of 1000 periods is at most 1e-9; the reference is a run of Gauss–Legendre 8 with
+compensated sums.
 """
 
 # ruff: noqa: E402
@@ -28,6 +29,7 @@ pin_to_one_thread()
 import numpy as np
 from measuring import fragments
 
+import sympflow
 from sympflow import HamiltonianSystem, energy_balance_error, floquet_multipliers, solve, systems
 from sympflow.kernels.modules import load_module, template
 from sympflow.kernels.splitting_loops import splitting_loops
@@ -38,9 +40,8 @@ PENDULUM = HamiltonianSystem.from_sympy("p**2/2 - b*cos(q)", params={"b": 1.1}, 
 DRIVEN = HamiltonianSystem.from_sympy(
     "p**2/2 - cos(q)*(1 + a*cos(w*t))", time="t", params={"a": 0.1, "w": W}, period=2 * pi / W, y0=[0.5, 0.1]
 )
-DUFFING = HamiltonianSystem.from_sympy(
-    "p**2/2 + q**2/2 + q**4/4 - F*q*cos(w*t)", time="t", params={"F": 0.1, "w": W}, period=2 * pi / W, y0=[0.5, 0.1]
-)
+START = np.array([0.5, 0.1])
+"""The state from which heyoka, the schemes and the flows that ship are compared, on the systems of these flows."""
 TARGET, PERIODS = 1e-9, 1000
 CANDIDATES = ("kahan_li6", "kahan_li8", "srkn11b", "srkn14a", "omelyan6", "chin4c")
 COSINES = """
@@ -105,9 +106,9 @@ def mathieu() -> list[tuple[str, ...]]:
     return [("boundary q at a = 0", "known"), (f"{low:.9f}", "0.908046334")]
 
 
-def cheapest(error: Callable[[float], float], first: float, factor: float) -> float | None:
-    """The first of first, first·factor, first·factor², … with which the error is at most the target; None for none."""
-    for k in range(30):
+def cheapest(error: Callable[[float], float], first: float, factor: float, most: int = 30) -> float | None:
+    """The first of first, first·factor, … , so many, with which the error is at most the target; None for none."""
+    for k in range(most):
         if error(first * factor**k) <= TARGET:
             return first * factor**k
     return None
@@ -120,11 +121,30 @@ def ours(system: HamiltonianSystem, exact: np.ndarray, t_end: float) -> list[tup
 
         def end(n: float, kernel: Any = kernel) -> np.ndarray:
             n = round(n)
-            return kernel.run(t_end / n, system.y0, n, np.array([n])).states[-1]
+            return kernel.run(t_end / n, START, n, np.array([n])).states[-1]
 
         n = cheapest(lambda n: float(np.abs(end(n) - exact).max()), PERIODS * 4.0, 1.1)
         if n is not None:
             found.append((f"{name}, {n / PERIODS:.0f} steps a period", partial(end, n)))
+    return found
+
+
+def shipped(system: HamiltonianSystem, exact: np.ndarray, t_end: float) -> list[tuple[str, Callable[[], Any]]]:
+    """The shipped flows of the system at the longest steps, of at most their Δt, that reach the target."""
+    found = []
+    for entry in sympflow.shipped_flows(system):
+        flow = sympflow.load(entry.path, system=system)
+        kernel = flow.kernel_for(system)
+
+        def end(n: float, kernel: Any = kernel) -> np.ndarray:
+            n = round(n)
+            return kernel.run(t_end / n, START, n, np.array([n])).states[-1]
+
+        least = float(np.ceil(t_end / flow.dt))
+        n = cheapest(lambda n: float(np.abs(end(n) - exact).max()), least, 1.05, 20)
+        if n is not None:
+            label = f"{entry.name}, {round(n) / PERIODS:.1f} steps a period"
+            found.append((label, partial(end, n)))
     return found
 
 
@@ -139,14 +159,14 @@ def heyokas(system: HamiltonianSystem, exact: np.ndarray, t_end: float) -> list[
     def run(tolerance: float) -> np.ndarray:
         integrator = made[tolerance]
         integrator.time = 0.0
-        integrator.state[:] = system.y0
+        integrator.state[:] = START
         integrator.propagate_until(t_end)
         return integrator.state.copy()
 
     made: dict[float, Any] = {}
 
     def error(tolerance: float) -> float:
-        made[tolerance] = hy.taylor_adaptive([(q, p), (p, slope)], system.y0.copy(), tol=tolerance)
+        made[tolerance] = hy.taylor_adaptive([(q, p), (p, slope)], START.copy(), tol=tolerance)
         return float(np.abs(run(tolerance) - exact).max())
 
     tolerance = cheapest(error, 1e-9, 1 / 4)
@@ -155,12 +175,12 @@ def heyokas(system: HamiltonianSystem, exact: np.ndarray, t_end: float) -> list[
 
 def peers(rounds: int) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = [("system", "method", "ms", "error")]
-    for name, system in (("driven pendulum", DRIVEN), ("Duffing oscillator", DUFFING)):
+    duffing = systems.duffing(damping=0.0, force=0.1, frequency=W, alpha=1.0)
+    for name, system in (("driven pendulum", systems.driven_pendulum()), ("Duffing oscillator, δ = 0", duffing)):
         t_end = PERIODS * system.period
-        exact = solve(
-            system, "gauss_legendre8", (0.0, t_end), dt=system.period / 64, compensated=True, t_eval=[t_end]
-        ).y[:, -1]
-        runs = ours(system, exact, t_end)
+        options: dict[str, Any] = {"dt": system.period / 64, "compensated": True, "t_eval": [t_end]}
+        exact = solve(system, "gauss_legendre8", (0.0, t_end), START, **options).y[:, -1]
+        runs = [*ours(system, exact, t_end), *shipped(system, exact, t_end)]
         if importlib.util.find_spec("heyoka"):
             runs += heyokas(system, exact, t_end)
         times = least([run for _, run in runs], rounds)

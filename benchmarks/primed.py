@@ -35,7 +35,7 @@ from measuring.machine import pin_to_one_thread
 pin_to_one_thread()
 
 from measuring import fragments
-from measuring.race import MOST_FORCES, Measure, Row, Runner, fewest_steps, race, schemes
+from measuring.race import HELD_OUT_SEED, MOST_FORCES, Measure, Row, Runner, fewest_steps, race, schemes
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, time_transformed, train
@@ -226,14 +226,16 @@ def main() -> None:
     parser.add_argument("--fit-seconds", type=float, help="time budget of a fit")
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--batch", type=int, default=1000)
-    parser.add_argument("--json", type=Path, help="file for the rows")
+    parser.add_argument("--json", type=Path, help="file for the rows; of --driven those that are in it are not run")
+    parser.add_argument("--seed", type=int, default=HELD_OUT_SEED, help="of the held-out states")
     fragments.add_out(parser)
     print(run(parser.parse_args()))
 
 
 def driven(options: argparse.Namespace, quick: dict[str, Any]) -> str:
     """The race of flows of driven systems, those that ship or others."""
-    rows: list[Row] = []
+    kept = options.json is not None and options.json.exists()
+    rows = [Row(**row) for row in json.loads(options.json.read_text(encoding="utf-8"))] if kept else []
     targets = (1e-2,) if options.quick else TARGETS
     for name in options.system or DRIVEN:
         make, measures, starts = DRIVEN[name]
@@ -246,20 +248,19 @@ def driven(options: argparse.Namespace, quick: dict[str, Any]) -> str:
         else:
             flows = stored(system, options.flows)
         for measure, t_end in measures.items():
+            over = Measure(system, measure, 20.0 if options.quick else t_end, options.seed)
             for target in targets:
-                row = race(
-                    Measure(system, measure, 20.0 if options.quick else t_end),
-                    target,
-                    flows,
-                    None,
-                    options.repeats,
-                    options.batch,
-                )
+                if any((row.system, row.measure, row.target) == (name, measure, target) for row in rows):
+                    continue
+                row = race(over, target, flows, None, options.repeats, options.batch)
                 if row is None:
                     print(f"{name}: no flow reaches {measure} {target:g}", flush=True)
                     continue
                 rows.append(row)
                 print(table([row]).splitlines()[-1], flush=True)
+                if options.json:
+                    options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
+    rows.sort(key=lambda row: [*DRIVEN].index(row.system))
     fragments.write(options.out, "primed-driven", fragment(rows))
     return "\n" + table(rows)
 
@@ -291,7 +292,9 @@ def run(options: argparse.Namespace) -> str:
         taylor = taylor_of(system)
         for measure, t_end in measures.items():
             for target in targets:
-                row = race(Measure(system, measure, t_end), target, flows, taylor, options.repeats, options.batch)
+                row = race(
+                    Measure(system, measure, t_end, options.seed), target, flows, taylor, options.repeats, options.batch
+                )
                 if row is None:
                     print(f"{name}: no flow reaches {measure} {target:g}", flush=True)
                     continue

@@ -268,7 +268,7 @@ def test_fewest_steps_are_the_fewest():
 def arguments(**options):
     given = {"system": ["pendulum"], "ablation": False, "quick": True, "fit": True, "json": None, "out": None}
     given["driven"] = False
-    return argparse.Namespace(**{**given, "fit_seconds": None, "repeats": 1, "batch": 16, **options})
+    return argparse.Namespace(**{**given, "fit_seconds": None, "repeats": 1, "batch": 16, "seed": 1, **options})
 
 
 def test_a_tiny_race_of_primed_flows(tmp_path, monkeypatch):

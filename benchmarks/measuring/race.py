@@ -105,11 +105,12 @@ class Measure:
     system: HamiltonianSystem
     name: str
     t_end: float
+    seed: int = HELD_OUT_SEED
 
     @cached_property
     def y0(self) -> np.ndarray:
         assert self.system.domain is not None
-        return self.system.domain.sample(HELD_OUT, HELD_OUT_SEED)
+        return self.system.domain.sample(HELD_OUT, self.seed)
 
     @cached_property
     def _end(self) -> np.ndarray:

@@ -39,7 +39,7 @@ MOST_NUMBERS = 2**20  # of the derivatives of a batch, which then stay in the ca
 LEAST_DAMPING = 1e-15
 TRIES = 12
 FINEST = 1e-13  # of an observation, relative to the spread of the coordinate
-ROUNDING = 1e-12
+SOLVED = 1e-4  # of the error of a scheme, to which its equations are solved
 
 Stop = Callable[[], bool]
 
@@ -52,6 +52,10 @@ class Stepper(ABC):
 
     cost: float
     """Cost of a step, in evaluations of the force with its derivatives."""
+
+    def within(self, tolerance: np.ndarray) -> Stepper:
+        """The same scheme, whose equations are solved no better than is needed for an error (2d,) of a step."""
+        return self
 
     @abstractmethod
     def step(self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
@@ -105,10 +109,11 @@ class Splitting(Stepper):
 
 @dataclass(frozen=True)
 class Gauss(Stepper):
-    """Gauss collocation, symplectic for any H."""
+    """Gauss collocation, symplectic for any H, to the tolerance (2d,) of its equations; 0 for rounding."""
 
     stages: int
     iterations: int = 60
+    tolerance: np.ndarray | float = field(default=0.0, compare=False)
 
     @property
     def cost(self) -> float:  # type: ignore[override]
@@ -118,18 +123,26 @@ class Gauss(Stepper):
     def _table(self) -> tuple[np.ndarray, np.ndarray]:
         return _gauss_table(self.stages)
 
+    def within(self, tolerance: np.ndarray) -> Gauss:
+        return replace(self, tolerance=SOLVED * tolerance)
+
     def step(self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
         A, b = self._table
         m, N = x.shape
         s = self.stages
         K = np.repeat(model.field(theta, x, False, False).value[:, None], s, axis=1)  # (m, s, N)
-        before = math.inf
+        before, near = math.inf, np.reshape(self.tolerance, (-1, 1, 1))
         for _ in range(self.iterations):
             inner = x[:, None] + h * np.einsum("ij,mjn->min", A, K)
             new = model.field(theta, inner.reshape(m, s * N), False, False).value.reshape(m, s, N)
-            change = float(np.abs(h * (new - K)).max(initial=0.0))
+            moved = np.abs(h * (new - K))
+            change = float(moved.max(initial=0.0))
             K = new
-            if not math.isfinite(change) or change == 0 or (change >= before and change < 1e-9 * np.abs(x).max()):
+            if (
+                not math.isfinite(change)
+                or (moved <= near).all()
+                or (change >= before and change < 1e-9 * np.abs(x).max())
+            ):
                 break
             before = change
         end = x + h * np.einsum("j,mjn->mn", b, K)
@@ -617,7 +630,7 @@ def chosen_method(model: Field, theta: np.ndarray, data: Trajectories, tolerance
     widest = float(gaps.max())
     best: tuple[float, Method] | None = None
     for stepper in steppers(model):
-        method = Method(stepper, widest)
+        method = Method(stepper.within(tolerance), widest)
         end, before = _ends(model, theta, method, starts, gaps), math.inf
         for _ in range(12):
             finer = replace(method, longest=method.longest / 2)

@@ -90,6 +90,13 @@ def test_collocation_is_symplectic():
     _, X = Method(Gauss(3), 0.5).over(model, np.array([0.5, 0.5, 0.4]), x, X, np.array([2.0]))
     A, J = X[..., 0], np.array([[0.0, 1.0], [-1.0, 0.0]])
     assert pytest.approx(J, abs=1e-12) == A.T @ J @ A
+    exact, tolerance = Method(Gauss(3), 0.5), np.full(2, 1e-3)
+    rough = Method(Gauss(3).within(tolerance), 0.5)
+    ends = [
+        method.over(model, np.array([0.5, 0.5, 0.4]), x.copy(), None, np.array([2.0]))[0] for method in (exact, rough)
+    ]
+    assert 0 < np.abs(ends[1] - ends[0]).max() < 1e-3 * tolerance.max()
+    assert rough.stepper == exact.stepper  # by which a checkpoint finds it
 
 
 def test_what_is_missing_is_left_out():
