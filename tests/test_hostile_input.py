@@ -498,7 +498,7 @@ SCENES = {
     "compensated Gauss with friction": (
         lambda: solve(DAMPED, "gauss_legendre4", compensated=True),
         ValueError,
-        "systems without friction",
+        "`compensated` sums are for systems without friction",
     ),
     "the time of a state": (lambda: DRIVEN.vector_field(np.ones(2)), TypeError, "`t` is missing"),
 }

@@ -377,7 +377,8 @@ def compiled_loops(
     if backend in COMPILED:
         raise ValueError(f"`backend` {backend!r} does not apply. {reason}") from None
     if compensated:
-        raise ValueError(f"`compensated` sums need compiled loops. {reason}") from None
+        needed = "" if reason.startswith("`compensated`") else "`compensated` sums need compiled loops. "
+        raise ValueError(needed + reason) from None
     return None
 
 

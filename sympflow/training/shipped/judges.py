@@ -23,7 +23,7 @@ from sympflow.metrics.energy import max_energy_error
 from sympflow.metrics.energy_balance import energy_balance_error
 from sympflow.solver import solve
 from sympflow.training.clock_fit import energy_errors
-from sympflow.training.points import Labels
+from sympflow.training.points import Labels, Stream, start_times
 
 FRACTIONAL_TIMES = 50
 HELD_OUT = 1000  # states of the certificate
@@ -123,13 +123,16 @@ def one_step_errors(
 ) -> tuple[float, float]:
     """Means of ‖ψ̄_t(x) − φ_H,t(x)‖ over the states x (n, 2d): at Δt, and over as many times spread over (0, Δt).
 
-    A flow of which the second is far larger than the first is a map for Δt only. States are measured as [q, p/ω].
+    A flow of which the second is far larger than the first is a map for Δt only. States are measured as [q, p/ω]; those
+    of a driven system are at random times t0.
     """
     units = np.repeat([1.0, omega], system.ndof)
     t = flow.dt * (np.arange(times) + 0.5) / times
-    labels = Labels.of(system, x, np.append(t, flow.dt))
+    begun = start_times(system, flow.dt, len(x), 0, Stream.REFERENCE)
+    labels = Labels.of(system, x, np.append(t, flow.dt), t0=begun)
     start = torch.as_tensor(labels.x, dtype=flow.dtype, device=flow.device)
-    psi = np.stack([flow.psi(s, start).cpu().numpy() for s in labels.t.tolist()])
+    t0 = None if labels.t0 is None else torch.as_tensor(labels.t0, dtype=flow.dtype, device=flow.device)
+    psi = np.stack([flow.psi(s, start, t0).cpu().numpy() for s in labels.t.tolist()])
     error = np.linalg.norm((psi - labels.y) / units, axis=-1).mean(-1)
     return float(error[-1]), float(error[:-1].mean())
 
