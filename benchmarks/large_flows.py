@@ -1,8 +1,9 @@
 """Flows of lattices, fitted on a few sites, against every splitting scheme of the package at equal energy error.
 
     python benchmarks/large_flows.py [--out docs/measured]
-    python benchmarks/large_flows.py --only fput_beta,toda      some of the lattices
+    python benchmarks/large_flows.py --only fput_beta,toda_chain  some of the lattices
     python benchmarks/large_flows.py --fit --flows folder       flows that are fitted first, and kept in a folder
+    python benchmarks/large_flows.py --json found.json --search   numbers of steps alone, to be timed when all is quiet
     python benchmarks/large_flows.py --sites 8192               another size of chains and, squared, of sheets
 
 Lattices of 1024 sites at energy densities of 0.02 to 0.2 above rest. The flows are those that ship, or of a folder;
@@ -10,6 +11,8 @@ Lattices of 1024 sites at energy densities of 0.02 to 0.2 above rest. The flows 
 T = 100, relative to the energy above rest, the median over a few held-out states of the lattice. For each target every
 scheme, and every flow with steps of a quarter of its Δt and longer, gets the fewest steps that meet it. Then they run
 in turn over T = 1000, one thread, one state of which the end is kept: the least process time of several.
+
+A second table says how much longer a kick takes that has a force gradient.
 """
 
 # ruff: noqa: E402
@@ -20,6 +23,7 @@ import argparse
 import json
 import math
 import time
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,21 +46,26 @@ TARGETS = (1e-4, 1e-6, 1e-8)
 T, OUTPUTS, STATES, SEED = 100.0, 100, 3, 20_261_121
 LONGER = 10  # times T, of a run that is timed
 DENSITY = 0.02, 0.2
+STEP, STEPS = 0.05, 2000  # of a run that shows what a force gradient costs
 NEAR = 1.7  # schemes with so many times the fewest forces are not timed
-MOST = 20_000  # forces of a scheme that is in the race
+MOST = 5000  # forces up to T of a scheme that is in the race
 SHIPPED = Path(sympflow.__file__).parent / "pretrained"
-LATTICES: dict[str, tuple[str, dict[str, Any], int, float]] = {
-    "fput_beta": ("FPUT-β", {"bond": "r**2/2 + r**4/4"}, 1, 1.0),
-    "phi4": ("φ⁴", {"onsite": "(q**2 - 1)**2/4", "bond": "r**2/2"}, 1, 1.0),
-    "phi4_sheet": ("φ⁴, two axes", {"onsite": "(q**2 - 1)**2/4", "bond": "r**2/2"}, 2, 0.75),
-    "toda_chain": ("Toda", {"bond": "exp(-r) + r - 1"}, 1, 1.0),
-    "sine_gordon": ("sine-Gordon", {"onsite": "1 - cos(q)", "bond": "r**2/2"}, 1, 1.0),
+
+
+def _ladder(*steps: float, processor: int = 12) -> tuple[Primed, ...]:
+    """Flows of four kicks with these Δt."""
+    return tuple(Primed(dt, 4, processor) for dt in steps)
+
+
+LATTICES: dict[str, tuple[str, dict[str, Any], int, tuple[Primed, ...]]] = {
+    "fput_beta": ("FPUT-β", {"bond": "r**2/2 + r**4/4"}, 1, _ladder(0.8, 0.55, 0.25, processor=6)),
+    "phi4": ("φ⁴", {"onsite": "(q**2 - 1)**2/4", "bond": "r**2/2"}, 1, _ladder(1.3, 0.65, 0.32)),
+    "phi4_sheet": ("φ⁴, two axes", {"onsite": "(q**2 - 1)**2/4", "bond": "r**2/2"}, 2, _ladder(1.0, 0.5, 0.25)),
+    "toda_chain": ("Toda", {"bond": "exp(-r) + r - 1"}, 1, _ladder(1.2, 0.7, 0.28)),
+    "sine_gordon": ("sine-Gordon", {"onsite": "1 - cos(q)", "bond": "r**2/2"}, 1, _ladder(1.6, 0.7, 0.28)),
 }
-"""Title, terms, number of axes, and Δt of the flows over `STEPS`."""
-STEPS = (1.2, 0.7, 0.28)
-KICKS, PROCESSOR = 4, 12
+"""Title, terms, number of axes, and the flows that `--fit` fits. The fastest frequency is 2 to 3.2."""
 FIT: dict[str, Any] = {"restarts": 20, "energy_weight": 300.0, "frozen_weight": 1000.0, "label_times": 5}
-"""Δt of a ladder of flows, where the fastest frequency is about 2.2."""
 
 
 def lattice(name: str, sites: int) -> HamiltonianSystem:
@@ -65,12 +74,11 @@ def lattice(name: str, sites: int) -> HamiltonianSystem:
     return HamiltonianSystem.lattice(**terms, shape=(n,) * axes, name=name, domain=LatticeStates(DENSITY))
 
 
-def flows_of(system: HamiltonianSystem, folder: Path, fit: bool, steps: tuple[float, ...]) -> list[PrimedFlow]:
+def flows_of(system: HamiltonianSystem, folder: Path, fit: bool) -> list[PrimedFlow]:
     """The flows of a lattice in a folder, fitted first if asked."""
     if fit:
         folder.mkdir(parents=True, exist_ok=True)
-        for dt in steps:
-            start = Primed(round(dt * LATTICES[system.name][3], 2), KICKS, PROCESSOR)
+        for start in LATTICES[system.name][3]:
             path = folder / f"{system.name}-primed-{start.stages}-{start.dt:g}.safetensors"
             if not path.exists():
                 begun = time.process_time()
@@ -90,57 +98,93 @@ def error(system: HamiltonianSystem, y0: np.ndarray, runner: Runner, n: int) -> 
     return float(np.median(np.where(np.isnan(largest), np.inf, largest)))
 
 
-def race(
-    name: str, sites: int, folder: Path, fit: bool, lengths: tuple[float, ...], rounds: int
-) -> list[dict[str, Any]]:
-    """A row for each target."""
-    system = lattice(name, sites)
-    assert system.domain is not None
-    flows = flows_of(system, folder, fit, lengths)
-    own = {Runner.of_flow(flow, system): flow for flow in flows}
-    y0 = system.domain.sample(STATES, SEED)
-    rows = []
-    for target in TARGETS:
-        steps: dict[Runner, int] = {}
-        for runner in [*own, *schemes(system)]:
+@dataclass
+class Race:
+    """The flows and schemes of a lattice."""
+
+    system: HamiltonianSystem
+    flows: list[Runner]
+    schemes: list[Runner]
+
+    @classmethod
+    def of(cls, name: str, sites: int, folder: Path, fit: bool) -> Race:
+        system = lattice(name, sites)
+        flows = [Runner.of_flow(flow, system) for flow in flows_of(system, folder, fit)]
+        return cls(system, flows, schemes(system))
+
+    def y0(self) -> np.ndarray:
+        assert self.system.domain is not None
+        return self.system.domain.sample(STATES, SEED)
+
+    def steps(self, target: float) -> dict[str, int]:
+        """The fewest steps up to T of each that meets a target."""
+        y0, steps = self.y0(), {}
+        for runner in [*self.flows, *self.schemes]:
             least = max(1, math.ceil(T / runner.longest * (1 - 1e-12)))
-            most = SHORTEST * least if runner in own else MOST // runner.forces
+            most = SHORTEST * least if runner in self.flows else MOST // runner.forces
             guess = max(least, round(1000 / runner.forces))
-            found = fewest_steps(partial(error, system, y0, runner), target, min(guess, most), least, most)
+            found = fewest_steps(partial(error, self.system, y0, runner), target, min(guess, most), least, most)
             if found is not None:
-                steps[runner] = found
-        if not any(r in own for r in steps):
-            print(f"{name}: no flow reaches {target:g}", flush=True)
-            continue
-        work = {r: n * (r.forces + r.hessians / 2) for r, n in steps.items()}
-        sides = [[r for r in steps if (r in own) == mine] for mine in (True, False)]
+                steps[runner.name] = found
+        return steps
+
+    def row(self, target: float, steps: dict[str, int], rounds: int) -> dict[str, Any] | None:
+        """The fastest flow and the fastest scheme, each with so many steps; none if no flow meets the target."""
+        y0 = self.y0()[0]
+        sides = [[r for r in side if r.name in steps] for side in (self.flows, self.schemes)]
+        if not sides[0]:
+            print(f"{self.system.name}: no flow reaches {target:g}", flush=True)
+            return None
+        work = {r: steps[r.name] * (r.forces + r.hessians / 2) for side in sides for r in side}
         near = [r for side in sides for r in side if work[r] <= NEAR * min(work[s] for s in side)]
         seconds = dict.fromkeys(near, math.inf)
         for r in near:
-            r.one(T / steps[r], y0[0], 1, last(1))
+            r.one(T / steps[r.name], y0, 1, last(1))
         for _ in range(rounds):
             for r in near:
+                n = LONGER * steps[r.name]
                 begun = time.process_time()
-                r.one(T / steps[r], y0[0], LONGER * steps[r], last(LONGER * steps[r]))
+                r.one(LONGER * T / n, y0, n, last(n))
                 seconds[r] = min(seconds[r], time.process_time() - begun)
-        flow = min((r for r in near if r in own), key=seconds.__getitem__)
-        rival = min((r for r in near if r not in own), key=seconds.__getitem__)
-        fewest = min(steps[r] * r.forces for r in steps if r not in own)
-        rows.append(
-            {
-                "lattice": name,
-                "sites": system.ndof,
-                "target": target,
-                "flow": flow.name,
-                "dt": T / steps[flow],
-                "seconds": seconds[flow],
-                "rival": rival.name,
-                "faster": seconds[rival] / seconds[flow],
-                "forces_saved": fewest / (steps[flow] * flow.forces),
-            }
-        )
-        print(rows[-1], flush=True)
-    return rows
+        flow, rival = (min((r for r in side if r in seconds), key=seconds.__getitem__) for side in sides)
+        fewest = min(steps[r.name] * r.forces for r in sides[1])
+        return {
+            "lattice": self.system.name,
+            "sites": self.system.ndof,
+            "target": target,
+            "flow": flow.name,
+            "dt": T / steps[flow.name],
+            "seconds": seconds[flow],
+            "rival": rival.name,
+            "faster": seconds[rival] / seconds[flow],
+            "forces_saved": fewest / (steps[flow.name] * flow.forces),
+        }
+
+
+def gradient_cost(name: str, sites: int, rounds: int) -> float:
+    """Times that a kick with a force gradient and the drift after it take as long as they do without.
+
+    A step of leapfrog has one without, and one of `chin4a` one of each.
+    """
+    system = lattice(name, sites)
+    assert system.domain is not None
+    y0 = system.domain.sample(1, SEED)[0]
+    runners = [Runner.of_scheme(scheme, system) for scheme in ("leapfrog", "chin4a")]
+    seconds = [math.inf, math.inf]
+    for r in runners:
+        r.one(STEP, y0, 1, last(1))
+    for _ in range(rounds):
+        for i, r in enumerate(runners):
+            begun = time.process_time()
+            r.one(STEP, y0, STEPS, last(STEPS))
+            seconds[i] = min(seconds[i], time.process_time() - begun)
+    return seconds[1] / seconds[0] - 1
+
+
+def gradients_fragment(costs: dict[str, float]) -> str:
+    return fragments.table(
+        ["lattice", "kick with force gradient"], [[LATTICES[name][0], f"{cost:.2f}"] for name, cost in costs.items()]
+    )
 
 
 def fragment(rows: list[dict[str, Any]]) -> str:
@@ -166,20 +210,34 @@ def main() -> None:
     parser.add_argument("--only", help=f"some of {', '.join(LATTICES)}, with commas")
     parser.add_argument("--flows", type=Path, default=SHIPPED, help="folder of the flows; the package's if left out")
     parser.add_argument("--fit", action="store_true", help="fit the flows that are not there, and keep them")
-    parser.add_argument("--steps", help="with --fit: some of the steps Δt, with commas")
     parser.add_argument("--sites", type=int, default=1024)
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--json", type=Path, help="file for the rows")
+    parser.add_argument("--json", type=Path, help="file for what is found; what is in it is not measured again")
+    parser.add_argument("--search", action="store_true", help="leave the times to a later call with this file")
     fragments.add_out(parser)
     options = parser.parse_args()
     names = list(LATTICES) if options.only is None else options.only.split(",")
-    lengths = STEPS if options.steps is None else tuple(map(float, options.steps.split(",")))
-    common = (options.sites, options.flows, options.fit, lengths, options.rounds)
-    rows = [row for name in names for row in race(name, *common)]
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
-    fragments.write(options.out, "large-flows", fragment(rows))
-    print(fragment(rows))
+    found: dict[str, dict[str, Any]] = {}
+    if options.json and options.json.exists():
+        found = json.loads(options.json.read_text("utf-8"))
+    for name in names:
+        mine = found.setdefault(name, {})
+        if "rows" not in mine:
+            entrants = Race.of(name, options.sites, options.flows, options.fit)
+            mine.setdefault("steps", [entrants.steps(target) for target in TARGETS])
+            if not options.search:
+                of_targets = zip(TARGETS, mine["steps"], strict=True)
+                mine["rows"] = [entrants.row(target, steps, options.rounds) for target, steps in of_targets]
+                mine["gradient"] = gradient_cost(name, options.sites, options.rounds)
+        if options.json:
+            options.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
+    if options.search:
+        return
+    rows = [row for name in names for row in found[name]["rows"] if row is not None]
+    costs = {name: found[name]["gradient"] for name in names}
+    for name, body in (("large-flows", fragment(rows)), ("large-gradients", gradients_fragment(costs))):
+        fragments.write(options.out, name, body)
+        print(body)
 
 
 if __name__ == "__main__":
