@@ -6,6 +6,7 @@ A large one is executed in pieces, which threads share: see `Team`.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -24,7 +25,7 @@ BLOCK, MOMENT = 64, 500_000_000
 nanoseconds they take."""
 
 
-class SizedLoops:
+class SizedLoops(ABC):
     """The functions that `SplittingLoops` asks for, of one system of any size and one kind of kicks.
 
     A subclass says which pieces the system has, and how stages are made of them: `_in_pieces`, `_advanced`, `_states`,
@@ -222,22 +223,23 @@ class SizedLoops:
         """The threads of a run of so many stages."""
         return Team(threads_for(self._n_pieces, stages * self._work, threads))
 
+    @abstractmethod
     def _in_pieces(self, threads: int) -> bool:
         """True if a run with so many threads is made in pieces, stage by stage from here; else by one compiled call."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _states(self) -> np.ndarray:
         """Room for a state: q, p and, with compensated sums, their errors first."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _load(self, y: np.ndarray, X: np.ndarray, first: int) -> None:
         """A row [q, p] into two sets of X, the first of which is given."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _pack(self, X: np.ndarray, first: int, y: np.ndarray) -> None:
         """The inverse of `_load`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _advanced(
         self, team: Team, states: tuple[np.ndarray, np.ndarray], table: np.ndarray, j: int, count: int, single: bool
     ) -> tuple[tuple[np.ndarray, np.ndarray], int]:
@@ -245,7 +247,6 @@ class SizedLoops:
 
         Of a run, or of a `single` map. One stage leaves the present state as it is, as the second one.
         """
-        raise NotImplementedError
 
 
 def _finite(X: np.ndarray) -> bool:

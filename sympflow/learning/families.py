@@ -14,7 +14,7 @@ from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Netw
 DEGREES = (2, 3, 4, 5, 6, 8, 10)
 HARMONICS = (1, 2, 3, 4, 6, 8)
 ORDERS = (1, 2, 3, 4)
-"""Of the harmonics of angles, or the powers of other coordinates, in a mass matrix M(q) and its potential."""
+"""Highest harmonics of angles, or powers of other coordinates, in a mass matrix M(q) and its potential."""
 WIDTHS = (6, 12, 24)
 WHOLE_WIDTHS = (12, 24, 40)
 POWERS = ((-1,), (-2, -1, 0, 1, 2))

@@ -256,7 +256,7 @@ class TableRun(SearchRun):
         return states(self.domain, self.options.reference_states, self.options.seed, Stream.REFERENCE)
 
     def _lost(self) -> np.ndarray:
-        """Those of them from which no solution exists up to Δt."""
+        """The drawn states from which no solution exists up to Δt."""
         labelled = {row.tobytes() for row in self.held_out.x}
         return np.array([row for row in self._asked() if row.tobytes() not in labelled]).reshape(
             -1, len(self.scaling.x)

@@ -142,7 +142,7 @@ def add(X, s, k, i, change):
 
 @njit(**OPTIONS)
 def kick(X, table, column, phase, work, sites):
-    """What follows the sum of a phase."""
+    """The kick after the sums of a phase."""
     A, factor, kept = work[0], SIGNS[phase] * table[ROWS[phase], column], KEPT[phase]
     for k in range(DIM):
         for i in range(np.uint64(X.shape[2])):
