@@ -27,6 +27,8 @@ class FreeTable(nn.Module):
         For how many k, from 0, the sum over i is fixed, whatever the parameters: Σ_i c_i0 = total, the others 0. The
         middle (or else the last) c_ik is what the others leave.
     total : float, optional
+    zero : tuple of int
+        The i, from 0 and in a palindrome up to the middle, of which all c_ik are 0.
 
     Attributes
     ----------
@@ -48,12 +50,15 @@ class FreeTable(nn.Module):
         total: float | None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
+        zero: tuple[int, ...] = (),
     ) -> None:
         super().__init__()
         representative = np.minimum(np.arange(n), np.arange(n)[::-1]) if palindromic else np.arange(n)
         count = np.bincount(representative)
         last = len(count) - 1
-        self._free = [(i, k) for i in range(last + 1) for k in range(terms) if i != last or k >= bound]
+        self._free = [
+            (i, k) for i in range(last + 1) for k in range(terms) if (i != last or k >= bound) and i not in zero
+        ]
         basis, offset = np.zeros((n, terms, len(self._free))), np.zeros((n, terms))
         for column, (i, k) in enumerate(self._free):
             basis[representative == i, k, column] = 1.0
@@ -95,9 +100,12 @@ class Coefficients(FreeTable):
     palindromic : bool
     total : float, optional
     always : bool
+    zero : tuple of int
+        The i, from 0 and in a palindrome up to the middle, for which c_i(τ) = 0.
     """
 
     always = False  # of pickles of earlier versions, which did not have it
+    zero: tuple[int, ...] = ()
 
     def __init__(
         self,
@@ -110,10 +118,11 @@ class Coefficients(FreeTable):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
         always: bool = False,
+        zero: tuple[int, ...] = (),
     ) -> None:
         bound = len(exponents) if always else int(total is not None)
-        super().__init__(n, len(exponents), palindromic, bound, total, dtype, device)
-        self.exponents, self.dt, self.power, self.always = exponents, dt, power, always
+        super().__init__(n, len(exponents), palindromic, bound, total, dtype, device, zero)
+        self.exponents, self.dt, self.power, self.always, self.zero = exponents, dt, power, always, zero
 
     def set_constant(self, c: Sequence[Any]) -> None:
         """Let c_i(τ) be c_i at every τ."""

@@ -84,6 +84,8 @@ class PrimedShape:
     timed : bool
         True if the drifts of the kernel add up to t at every t, as they must with friction, with an exact e^{−γt},
         and in a driven system, in which the time moves with them.
+    gradient_kicks, curvature_kicks : tuple of int, optional
+        The kicks of the kernel that have a force gradient and a curvature term, from 0; by default all.
 
     Raises
     ------
@@ -100,6 +102,8 @@ class PrimedShape:
     curvature: bool = False
     monomials: Monomials = ()
     timed: bool = False
+    gradient_kicks: tuple[int, ...] | None = None
+    curvature_kicks: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         maps, degree, processor = self.maps, self.degree, self.processor
@@ -118,6 +122,35 @@ class PrimedShape:
             raise ValueError("`curvature` goes with force gradients: leave it out.")
         if self.monomials and self.force_gradient:
             raise ValueError("`monomials` stand in place of force gradients: leave these out.")
+        n = self.kernel.count("kick")
+        for name, kicks, has in (
+            ("force_gradient", self.gradient_kicks, self.force_gradient),
+            ("curvature", self.curvature_kicks, self.curvature),
+        ):
+            if kicks is None:
+                continue
+            if not has or not kicks or sorted(set(kicks)) != list(kicks) or not 0 <= kicks[0] <= kicks[-1] < n:
+                raise ValueError(
+                    f"`{name}` {list(kicks)!r} names no kicks: count them from 0 to {n - 1}, each once and in order."
+                )
+            if self.palindromic and kicks != tuple(n - 1 - i for i in reversed(kicks)):
+                raise ValueError(
+                    f"`{name}` {list(kicks)!r} is not the same from either end of {n} kicks: name them from both, or "
+                    "take palindromic=False."
+                )
+        if self.curvature and not set(self._curved) <= set(self._with_gradient):
+            raise ValueError(
+                f"`curvature` {list(self._curved)!r} names kicks without a force gradient: take those of "
+                f"{list(self._with_gradient)!r}."
+            )
+
+    @property
+    def _with_gradient(self) -> tuple[int, ...]:
+        return self.gradient_kicks or tuple(range(self.kernel.count("kick")))
+
+    @property
+    def _curved(self) -> tuple[int, ...]:
+        return self.curvature_kicks or tuple(range(self.kernel.count("kick")))
 
     @property
     def kernel(self) -> tuple[Kind, ...]:
@@ -133,16 +166,25 @@ class PrimedShape:
         """Return untrained columns of the numbers of K, whose kicks and drifts have a `total` of 1, or of χ."""
         if not sequence:
             return Columns()
+        having = (None, None) if total is None else (self.gradient_kicks, self.curvature_kicks)
         powers, mirrored = range(0, self.degree, 2 if self.palindromic else 1), self.palindromic and total is not None
 
-        def column(kind: Kind, power: int, total: float | None = None, always: bool = False) -> Coefficients:
-            return Coefficients(sequence.count(kind), tuple(powers), dt, power, mirrored, total, always=always, **like)
+        def column(
+            kind: Kind,
+            power: int,
+            total: float | None = None,
+            always: bool = False,
+            among: tuple[int, ...] | None = None,
+        ) -> Coefficients:
+            n = sequence.count(kind)
+            zero = () if among is None else tuple(i for i in range((n + 1) // 2 if mirrored else n) if i not in among)
+            return Coefficients(n, tuple(powers), dt, power, mirrored, total, always=always, zero=zero, **like)
 
         return Columns(
             column("kick", 1, total),
             column("drift", 1, total, self.timed and total is not None),
-            column("kick", 3) if self.force_gradient else None,
-            column("kick", 5) if self.curvature else None,
+            column("kick", 3, among=having[0]) if self.force_gradient else None,
+            column("kick", 5, among=having[1]) if self.curvature else None,
             nn.ModuleList(column("kick", 3) for _ in self.monomials) if self.monomials else None,
         )
 
@@ -158,6 +200,8 @@ class PrimedShape:
             "curvature": self.curvature,
             **({"monomials": [list(m) for m in self.monomials]} if self.monomials else {}),
             **({"timed": True} if self.timed else {}),
+            **({"gradient_kicks": list(self.gradient_kicks)} if self.gradient_kicks else {}),
+            **({"curvature_kicks": list(self.curvature_kicks)} if self.curvature_kicks else {}),
         }
 
     @classmethod
@@ -181,6 +225,7 @@ class PrimedShape:
         if processor != 0 or isinstance(processor, bool):
             processor = checked_integer(processor, "processor", MAX_LAYERS)
         exponents = _checked_monomials(plan.get("monomials", []), ndof)
+        flags |= {name: _checked_kicks(plan.get(name), maps) for name in ("gradient_kicks", "curvature_kicks")}
         return cls(plan["first"], maps, degree, processor=processor, monomials=exponents, **flags)
 
 
@@ -188,6 +233,16 @@ def _alternating(first: Kind, n: int) -> tuple[Kind, ...]:
     """Return the kinds of n maps."""
     other: Kind = "drift" if first == "kick" else "kick"
     return tuple(first if i % 2 == 0 else other for i in range(n))
+
+
+def _checked_kicks(plan: Any, maps: int) -> tuple[int, ...] | None:
+    if plan is None:
+        return None
+    if not isinstance(plan, list) or not all(isinstance(i, int) and not isinstance(i, bool) for i in plan):
+        raise Refused("its kicks with force gradients or curvature terms are no list of integers")
+    if len(plan) > maps:
+        raise Refused("it has more kicks with force gradients or curvature terms than kicks")
+    return tuple(plan)
 
 
 def _checked_monomials(plan: Any, ndof: int) -> Monomials:
@@ -456,9 +511,9 @@ class PrimedFlow(SympFlow):
         palindromic: bool,
         scheme: Scheme | str | None,
         degree: int | None,
-        force_gradient: bool | None,
+        force_gradient: bool | Sequence[int] | None,
         processor: int,
-        curvature: bool,
+        curvature: bool | Sequence[int],
         polynomial: int | None,
         first: str,
         dtype: torch.dtype,
@@ -472,9 +527,11 @@ class PrimedFlow(SympFlow):
         check_system(system)
         check_for_flows(system, cls.takes_friction, cls.takes_driving)
         check_flag("palindromic", palindromic)
-        check_flag("curvature", curvature)
+        curvature, curved = _some_kicks("curvature", curvature)
         if force_gradient is not None:
-            check_flag("force_gradient", force_gradient)
+            force_gradient, with_gradient = _some_kicks("force_gradient", force_gradient)
+        else:
+            with_gradient = None
         if not system.separable:
             raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
         if system.kinetic_timed:
@@ -510,11 +567,17 @@ class PrimedFlow(SympFlow):
             curvature=curvature,
             monomials=exponents,
             timed=_is_timed(system),
+            gradient_kicks=_unless_all(with_gradient, substeps),
+            curvature_kicks=_unless_all(curved, substeps),
         )
         flow = cls(system.ndof, shape, dt, system, dtype, device)
         kicks, drifts = ([s for s in substeps if s.kind == kind] for kind in ("kick", "drift"))
         flow.kicks.set_constant([s.one for s in kicks])
         flow.drifts.set_constant([s.one for s in drifts])
+        if shape.gradient_kicks and any(s.three and i not in shape.gradient_kicks for i, s in enumerate(kicks)):
+            raise ValueError(
+                f"`force_gradient` leaves out kicks of {scheme.name!r} that have force gradients: name these too."
+            )
         if flow.gradients is not None:
             flow.gradients.set_constant([s.three for s in kicks])
         if flow.curvatures is not None:
@@ -833,6 +896,22 @@ def _force_gradient_of(system: HamiltonianSystem, asked: bool | None, curvature:
             f"`curvature` goes with force gradients of a symbolic system or a lattice, H = ½ pᵀM⁻¹p + V(q): {remedy}."
         )
     return asked
+
+
+def _some_kicks(name: str, given: Any) -> tuple[bool, tuple[int, ...] | None]:
+    """Return whether kicks have a term, and which of them: None for all."""
+    if isinstance(given, bool):
+        return given, None
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise TypeError(f"`{name}` must be True or False; got {given!r}: or give the numbers of kicks, from 0.")
+    kicks = tuple(map(plain, given))
+    if not all(isinstance(i, int) and not isinstance(i, bool) for i in kicks):
+        raise TypeError(f"`{name}` must be True or False; got {given!r}: or give the numbers of kicks, from 0.")
+    return bool(kicks), tuple(sorted(set(kicks))) or None
+
+
+def _unless_all(kicks: tuple[int, ...] | None, substeps: Sequence[Any]) -> tuple[int, ...] | None:
+    return None if kicks == tuple(range(sum(s.kind == "kick" for s in substeps))) else kicks
 
 
 def _equal_steps(n: int, first: str) -> Scheme:

@@ -56,6 +56,9 @@ FLOWS = {
     "processed, with curvature": lambda: random_flow(HH, scheme="verlet", processor=1, curvature=True),
     "polynomial": lambda: random_flow(HH, stages=2, degree=3, polynomial=4),
     "processed, with polynomials": lambda: random_flow(HH, size=0.01, scheme="verlet", processor=1, polynomial=4),
+    "some kicks with more terms": lambda: random_flow(
+        HH, stages=3, degree=3, processor=1, force_gradient=[0, 1, 2], curvature=[1]
+    ),
     "another dt": lambda: random_flow(HH, stages=2, dt=0.3, degree=1),
 }
 
@@ -169,6 +172,21 @@ def test_a_processed_palindrome_reverses_with_the_momenta():
     torch.testing.assert_close(rho * flow.psi(0.5, rho * x), flow.psi(-0.5, x), rtol=0, atol=64 * EPS)
     y = flow.kernel_step(0.5, x)
     torch.testing.assert_close(flow.kernel_step(-0.5, y), x, rtol=0, atol=64 * EPS)
+
+
+def test_some_kicks_have_more_terms_than_others(tmp_path):
+    """Whatever its numbers are; in a file, too, whose damaged numbers of kicks are refused."""
+    flow = random_flow(HH, stages=3, dt=0.5, processor=2, force_gradient=(1,))
+    kernel, outer = flow.kernel_scheme(0.3), flow.processor_scheme(0.3)
+    assert np.count_nonzero(kernel.gradients) == 1
+    assert np.count_nonzero(outer.gradients) == 2
+    assert SympFlow.primed(HH, 3, force_gradient=[0, 1, 2]).shape.gradient_kicks is None
+    path = tmp_path / "flow.safetensors"
+    flow.save(path)
+    assert sympflow.load(path, system=HH).kernel_scheme(0.3) == kernel
+    for kicks in ([0, 1], [1, 1], [7], [True], "1", [], [-1]):
+        with pytest.raises(ValueError):
+            type(flow.shape).from_dict(flow.shape.to_dict() | {"gradient_kicks": kicks}, 2)
 
 
 def test_untrained_the_processor_is_the_identity():
@@ -408,6 +426,10 @@ def test_it_trains_like_any_sympflow():
         ({"scheme": "chin4a", "force_gradient": False}, r"^`force_gradient` is False but 'chin4a'"),
         ({"dt": -1.0}, r"^`dt` must be a positive"),
         ({"processor": -1}, r"^`processor` must be a non-negative integer"),
+        ({"stages": 3, "force_gradient": [0]}, r"^`force_gradient` \[0\] is not the same from either end of 3 kicks"),
+        ({"stages": 3, "force_gradient": [3]}, r"^`force_gradient` \[3\] names no kicks: count them from 0 to 2"),
+        ({"stages": 3, "force_gradient": [1], "curvature": [0, 2]}, r"^`curvature` \[0, 2\] names kicks without a"),
+        ({"scheme": "omelyan4", "force_gradient": [0, 2]}, r"^`force_gradient` leaves out kicks of 'omelyan4'"),
         ({"polynomial": 0}, r"^`polynomial` must be a positive integer, its degree; got 0"),
         ({"polynomial": True}, r"^`polynomial` must be a positive integer, its degree; got True"),
         ({"polynomial": 20}, r"^`polynomial` 20 makes more than 60 monomials in 2 coordinates: take a lower degree"),
