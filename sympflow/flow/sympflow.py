@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from sympflow.arguments import plain
@@ -337,6 +338,54 @@ class SympFlow(FlowMap):
             linear_outside=linear_outside,
             dtype=dtype,
             device=device,
+        )
+
+    @staticmethod
+    def collocated(
+        system: HamiltonianSystem,
+        *,
+        dt: float = 1.0,
+        stages: int = 4,
+        steps: int | None = None,
+        states: ArrayLike | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> Any:
+        """Return a `CollocatedFlow`, of steps of a Gauss method with the system's own H, separable or not.
+
+        Nothing in it is trained. It is the flow of a Hamiltonian that is not separable and known, or was learned: exact
+        to the error of the method, at the cost of Newton's iteration in every step.
+
+        Parameters
+        ----------
+        system : HamiltonianSystem
+            Of any form, with friction too; not driven.
+        dt : float
+            Δt.
+        stages : int
+            s, of the method of order 2s.
+        steps : int, optional
+            Equal steps in Δt; by default so many that at 99 % of some states the error of ψ̄_Δt is below 1e-10 of
+            their spread.
+        states : array_like of shape (n, 2d), optional
+            These states; by default some of the domain of the system.
+        dtype, device
+            Of the states.
+
+        Raises
+        ------
+        ValueError
+            If the system is driven or has another force than friction, `dt` is so long that it takes more than
+            two hundred steps, or an argument is not admissible.
+
+        Examples
+        --------
+        >>> flow = SympFlow.collocated(sympflow.systems.double_pendulum(), dt=0.1)
+        >>> flow.hamiltonian(0.1, torch.zeros(5, 4, dtype=torch.float64)).shape
+        torch.Size([5])
+        """
+        return family("collocated").of(
+            system, dt=dt, stages=stages, steps=steps, states=states, dtype=dtype, device=device
         )
 
     @staticmethod
