@@ -284,7 +284,7 @@ def test_a_tiny_race_of_primed_flows(tmp_path, monkeypatch):
         assert all(value > 0 for value in row["faster"].values())
     assert len(list(tmp_path.glob("*.safetensors"))) == 1
     system = pendulum()
-    again = primed.fitted(system, *primed.FLOWS["pendulum"][0], tmp_path)  # not fitted again, but read
+    again = primed.fitted(system, *primed.FLOWS["pendulum"].starts[0], tmp_path)  # not fitted again, but read
     assert again.recipe["stages"][0]["restarts"] == 2
 
 
