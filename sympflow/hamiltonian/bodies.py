@@ -174,7 +174,7 @@ class PairsHamiltonian(LocalHamiltonian):
 
     @cached_property
     def bond_length(self) -> float | None:
-        """The distance at which two bodies rest, if V has a minimum and falls off so fast that only neighbours count."""
+        """The distance at which two bodies rest, if V has a minimum and so short a range that only neighbours count."""
         if not self.uniform:
             return None
         r = np.geomspace(SHORTEST, LONGEST, SCANNED)

@@ -1,7 +1,7 @@
 """Flows of lattices and of like bodies: fitted on a few of them, judged on many.
 
 The numbers of a primed flow know the potential and Δt, not the size. So they are fitted to the exact flow of a ring of
-a few sites, or a small cluster, the ring written out by its coordinates, at states of the energy density of the large system.
+a few sites, written out by its coordinates, or of a small cluster, at states of the energy density of the large system.
 Held-out states and the certificate are those of the large one: a lattice with its own ends, 13 bodies of more.
 """
 

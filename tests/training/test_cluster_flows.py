@@ -41,7 +41,7 @@ def test_a_piece_has_the_states_of_the_cluster():
     assert density.mean() == pytest.approx(0.06, rel=0.1)  # of 400 draws, each with a spread of about a half
     pressed = rest.copy()
     pressed[:2] *= 1 - 1e-9
-    pressed[2:4] = pressed[:2] + [0.9, 0.0]  # two bodies closer than any thermal motion brings them
+    pressed[2:4] = pressed[0] + 0.9, pressed[1]  # two bodies closer than any thermal motion brings them
     assert not piece.domain.contains(pressed)
     from_y0 = cluster(7, y0=x[0]).piece(5).domain
     assert isinstance(from_y0, ClusterStates)
