@@ -25,7 +25,7 @@ SHORTEST, LONGEST, SCANNED = 1e-4, 1e4, 4001
 """Distances between which a minimum of V is looked for."""
 FAR, REACH = (10.0, 100.0), 2.0
 """Bond lengths at which V must have fallen off faster than bodies grow in number, and which a cut-off must have."""
-FEW = 4, 7, 5
+FEW = 4, 7, 13
 """Bodies of a piece in one, two and three dimensions."""
 JUDGED = 13
 """Bodies of the cluster on which a flow is judged, where there are more."""
@@ -252,7 +252,7 @@ class PairsHamiltonian(LocalHamiltonian):
 
         length = self.bond_length
         assert length is not None
-        starts = [near]
+        starts = [] if near is None else [near]
         if near is None:
             few = self.n_bodies <= MOST_SHAKEN
             starts = [length * _packed(self.n_bodies, self.dim, hollow).ravel() for hollow in (False, True)[: 1 + few]]

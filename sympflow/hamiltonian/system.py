@@ -398,7 +398,8 @@ class HamiltonianSystem(Hamiltonian):
         ----------
         sites : int or sequence of ints, optional
             Sites along each axis; the default is 6 of a lattice of one axis, 4 by 4 of one of two and 3 by 3 by 3 of
-            one of three, more where bonds reach farther. Of bodies their number; 4, 7 and 5 in one to three dimensions.
+            one of three, more where bonds reach farther. Of bodies their number: 4, 7 or 13 in one, two or three
+            dimensions.
         boundary : str, or one for each axis
             As in `lattice`; of lattices only.
 
