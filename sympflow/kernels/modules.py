@@ -192,6 +192,7 @@ def _callable_part(module: ModuleType) -> ModuleType:
         if name in inner - _CALLED:
             f.targetoptions.update(_INNER)
         else:
+            f.targetoptions["no_cfunc_wrapper"] = True
             setattr(part, name, f)
     return part
 
