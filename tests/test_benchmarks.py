@@ -45,9 +45,10 @@ from contenders.measurement import (
 from measuring import fragments
 from measuring import race as at_equal_error
 
-from sympflow import SympFlow, shipped_flows
+from sympflow import SympFlow, shipped_flows, systems
 from sympflow.schemes import SCHEMES
 from sympflow.systems import henon_heiles, kepler, pendulum
+from sympflow.training.shipped.rows import weak_duffing
 
 pytestmark = pytest.mark.slow
 
@@ -283,7 +284,7 @@ def test_a_tiny_race_of_primed_flows(tmp_path, monkeypatch):
         assert all(value > 0 for value in row["faster"].values())
     assert len(list(tmp_path.glob("*.safetensors"))) == 1
     system = pendulum()
-    again = primed.fitted(system, *primed.FLOWS["pendulum"][0], tmp_path)  # not fitted again, but read
+    again = primed.fitted(system, *primed.FLOWS["pendulum"].starts[0], tmp_path)  # not fitted again, but read
     assert again.recipe["stages"][0]["restarts"] == 2
 
 
@@ -374,11 +375,9 @@ def test_a_tiny_search_for_drift():
 
 
 def test_scenes_of_the_drift_are_those_of_all_flows():
-    """But of driven systems, whose energy is not kept and has no drift, and of lattices beyond the first."""
-    scenes = drift.scenes()
+    """But of driven systems, whose energy is not kept and has no drift."""
+    scenes = [*drift.scenes(), systems.driven_pendulum(), weak_duffing()]
     for entry in shipped_flows(kind="sympflow"):
-        if entry.system in ("driven_pendulum", "duffing", "fput_beta"):
-            continue
         assert any(entry.is_of(system) for system in scenes), entry.name
 
 

@@ -7,6 +7,7 @@ operations. Nothing that it holds, but what depends on sites, is as long as the 
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Self
@@ -27,7 +28,7 @@ VECTORS_OF_A_RUN = 12
 """Vectors of d numbers that a run holds: its state, the next one, copies to look for what is not finite, forces."""
 
 
-class LocalHamiltonian(Definition):
+class LocalHamiltonian(Definition, ABC):
     """H = T(p) + V(q) as a sum over sites and bonds, or over pairs, by one expression for each kind of term.
 
     A subclass defines `potential`, `potential_gradient`, `hessian_vector`, `third_derivative` and, unless T is
@@ -56,6 +57,7 @@ class LocalHamiltonian(Definition):
     quadratic_kinetic: bool
     params: Mapping[str, Any]
 
+    @abstractmethod
     def with_params(self, values: Mapping[str, Any]) -> Self:
         """Return the definition with other values of some parameters.
 
@@ -64,7 +66,6 @@ class LocalHamiltonian(Definition):
         TypeError, ValueError
             If there is no such parameter, or values are bad.
         """
-        raise NotImplementedError(f"{type(self).__name__} must define with_params().")
 
     def check_names(self, names: Iterable[str]) -> None:
         """Refuse names that are no parameters, with those that there are."""
