@@ -19,6 +19,7 @@ if not BENCHMARKS.exists():
     pytest.skip("the benchmarks are not part of the source distribution", allow_module_level=True)
 sys.path.insert(0, str(BENCHMARKS))
 
+import again
 import drift
 import nonseparable
 import own_systems
@@ -254,6 +255,25 @@ def test_every_fragment_has_a_command_that_writes_it():
         section = re.sub(r"^peers-(one|batch)", "peers-", section)
         stem = section.removesuffix("-against").removesuffix("-flow").removesuffix("-work")
         assert f'"{section}"' in sources or f'"{stem}' in sources, path.name
+
+
+def test_fragments_are_made_again_by_their_commands(tmp_path, monkeypatch):
+    text = "| a |\n\n<small>`python benchmarks/{}` · one thread · commit 1a2b3c4 · 2026-01-01</small>\n"
+    for name, command in (("one-a", "one.py --only 'x y'"), ("one-b", "one.py --only 'x y'"), ("two", "two.py")):
+        (tmp_path / f"{name}.md").write_text(text.format(command), encoding="utf-8")
+    (tmp_path / "flows.md").write_text("| a |\n\n<small>`sympflow flows`</small>\n", encoding="utf-8")
+    one = {"python benchmarks/one.py --only 'x y'": {"one-a": "1a2b3c4", "one-b": "1a2b3c4"}}
+    assert again.commands(tmp_path, ["one-*"]) == one
+    assert again.commands(tmp_path, ["*"]) == {**one, "python benchmarks/two.py": {"two": "1a2b3c4"}}
+    assert not again.commands(tmp_path, ["flows"])
+    (tmp_path / "benchmarks").mkdir()
+    (tmp_path / "benchmarks" / "one.py").write_text("import sys; print(sys.argv[1:])", encoding="utf-8")
+    (tmp_path / "benchmarks" / "two.py").write_text("while True: pass", encoding="utf-8")
+    monkeypatch.setattr(again, "HOUSE", tmp_path)
+    assert again.run(*one, tmp_path, tmp_path / "log", None)
+    assert (tmp_path / "log").read_text(encoding="utf-8").strip() == f"['--only', 'x y', '--out', {str(tmp_path)!r}]"
+    assert not again.run("python benchmarks/two.py", tmp_path, tmp_path / "log", 0.2)
+    assert not again.run("python benchmarks/three.py", tmp_path, tmp_path / "log", None)
 
 
 # primed flows against schemes -------------------------------------------------------------------------
