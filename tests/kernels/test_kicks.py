@@ -1,6 +1,5 @@
 """Kicks as generated code: every shape gives the same momenta; the costs by which one is chosen."""
 
-import itertools
 import math
 import re
 
