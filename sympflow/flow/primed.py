@@ -43,8 +43,9 @@ from sympflow.flow.primed_potentials import (
 )
 from sympflow.flow.sympflow import SympFlow
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
+from sympflow.hamiltonian.domain import states_of
 from sympflow.hamiltonian.fingerprint import check_for_flows
-from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
+from sympflow.hamiltonian.local_states import DRAWN, LocalStates
 from sympflow.hamiltonian.monomials import MOST_MONOMIALS, Monomials, monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE as CURVATURE_LEVEL
@@ -52,6 +53,7 @@ from sympflow.schemes import POLYNOMIAL as POLYNOMIAL_LEVEL
 from sympflow.schemes import SCHEMES, Scheme, compose, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.kernels.flow_loops import PrimedFlowKernel
     from sympflow.kernels.stages import StageTable
 
@@ -698,7 +700,8 @@ class PrimedFlow(SympFlow):
         return self._binding.system if self._binding.known else None
 
     def known_by(self, system: HamiltonianSystem) -> HamiltonianSystem:
-        return system if self.monomials else system.few_sites
+        of_one_size = self.monomials or (self.fingerprint is not None and not self.lattice_terms)
+        return system if of_one_size else system.few_sites
 
     @property
     def kept_ndof(self) -> int:
@@ -707,7 +710,7 @@ class PrimedFlow(SympFlow):
     def bind(self, system: HamiltonianSystem) -> Self:
         """Give a flow that was loaded from a file the V and T of its system; itself.
 
-        The flow of a lattice takes the size of the one that it is given.
+        The flow of a lattice or of like bodies takes the size of the one that it is given.
 
         Raises
         ------
@@ -719,7 +722,7 @@ class PrimedFlow(SympFlow):
         if system.ndof != self.ndof:
             self.ndof = system.ndof
             self.layers = tuple(map(self._layer, range(len(self.substeps))))  # type: ignore[assignment]
-        if isinstance(self.domain, LatticeStates):
+        if isinstance(self.domain, LocalStates):
             self.domain = self.domain.of(system)
         return self
 
@@ -728,7 +731,7 @@ class PrimedFlow(SympFlow):
 
         They are a start for ``train(system, flow=flow.transferred(system))``. As they are they need not be near the
         exact flow of that system, with friction for instance. The numbers know the potential and dt, not the size: of a
-        lattice they serve any other one of the same terms, for which `solve` takes the flow as it is.
+        lattice, or of like bodies, they serve any other one of the same terms: `solve` takes the flow as it is.
 
         Raises
         ------
@@ -750,8 +753,8 @@ class PrimedFlow(SympFlow):
             )
         return self._of(system, replace(self.shape, timed=_is_timed(system)))
 
-    def of_lattice(self, system: HamiltonianSystem) -> Self:
-        """Return the flow of a lattice with the numbers of this one, of a few sites of it by their coordinates."""
+    def of_any_size(self, system: HamiltonianSystem) -> Self:
+        """Return the flow of a system with the numbers of this one, of a piece of it by its coordinates."""
         return self._of(system, self.shape).requires_grad_(False)
 
     def on_extended(self, extended: HamiltonianSystem) -> Self:
@@ -770,7 +773,7 @@ class PrimedFlow(SympFlow):
         if not self._binding.known:
             return self.bind(system)
         mine, theirs = self._binding.system.local, system.local
-        if mine is theirs or mine is None or theirs is None or (mine.shape, mine.ends) == (theirs.shape, theirs.ends):
+        if mine is theirs or mine is None or theirs is None or _size(mine) == _size(theirs):
             return self
         tables = self.tables
         if tables.carried is None or tables.carried.system is not system:
@@ -792,14 +795,14 @@ class PrimedFlow(SympFlow):
             )
 
     def _carried(self, system: HamiltonianSystem) -> Self:
-        """This flow of a lattice, of another shape of it, with what is known of it."""
+        """This flow, of another size of its system, with what is known of it."""
         other = self._of(system, self.shape).requires_grad_(False)
         other.describe(self.description)
-        if isinstance(self.domain, LatticeStates):
+        if isinstance(self.domain, LocalStates):
             other.domain = self.domain.of(system)
         elif self.domain is not None:
             assert self.system is not None
-            other.domain = LatticeStates.of_states(self.system, self.domain.sample(DRAWN)).of(system)
+            other.domain = states_of(self.system, self.domain.sample(DRAWN)).of(system)
         return other
 
     @property
@@ -813,6 +816,10 @@ class PrimedFlow(SympFlow):
     def initial_velocity(self, x: Tensor, t0: Any = None) -> Tensor:
         """d/dt ψ̄_t(x) at t = 0: that of its system, as the coefficients of V and T sum up to 1."""
         return super().initial_velocity(x, t0) if self.system is None else self.system.vector_field(x, t0)
+
+
+def _size(local: LocalHamiltonian) -> tuple[Any, ...]:
+    return local.shape, local.ends, local.ndof
 
 
 def _is_timed(system: HamiltonianSystem) -> bool:
