@@ -215,7 +215,7 @@ class SympFlow(FlowMap):
         palindromic: bool = True,
         scheme: Scheme | str | None = None,
         degree: int | None = None,
-        force_gradient: bool | None = None,
+        force_gradient: bool | Sequence[int] | None = None,
         processor: int = 0,
         curvature: bool = False,
         polynomial: int | None = None,
@@ -242,8 +242,10 @@ class SympFlow(FlowMap):
             A table, or its name as `sympflow.schemes.scheme_named` knows it, to start from in place of leapfrog.
         degree : int, optional
             Of the polynomials that multiply V and T; 7 by default, 5 with a processor, which has more of them.
-        force_gradient : bool, optional
-            True for a term in ½|∇V|²_{M⁻¹} in the kicks, which is the default where T is quadratic.
+        force_gradient : bool or sequence of int, optional
+            True for a term in ½|∇V|²_{M⁻¹} in the kicks, which is the default where T is quadratic. Of a sequence of
+            integers these kicks of the kernel alone have it, counted from 0: ``[1, 3]`` of five. Where a force gradient
+            takes as long as a force, as on lattices of polynomials, more kicks with fewer of them go farther.
         processor : int
             Number of kicks of χ in ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹, 0 for none. A run executes χ⁻¹ once, the kernel K of
             `stages` kicks in every step, and χ for every output.

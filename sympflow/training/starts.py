@@ -69,8 +69,8 @@ class Primed:
     scheme : str, optional
         A scheme of `stages` kicks, from which the search starts in place of equal leapfrog steps: one of a high order
         leads to valleys that random tables, most of whose numbers are positive, do not lie near.
-    force_gradient : bool, optional
-        Whether kicks have force gradients: see `SympFlow.primed`.
+    force_gradient : bool or tuple of int, optional
+        Whether kicks have force gradients, or which: see `SympFlow.primed`.
     """
 
     dt: float
@@ -80,7 +80,7 @@ class Primed:
     polynomial: int | None = None
     first: str = "drift"
     scheme: str | None = None
-    force_gradient: bool | None = None
+    force_gradient: bool | tuple[int, ...] | None = None
 
     kind: ClassVar[str] = "primed"
 
