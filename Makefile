@@ -42,18 +42,9 @@ docs: .venv/installed-test  ## The documentation, into site/
 	$(BIN)/python docs/diagrams.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
-bench: .venv/installed  ## The benchmarks that the docs quote, into docs/measured (half an hour or so on a quiet machine)
+bench: .venv/installed  ## The figures that the docs quote, again, into docs/measured (hours on a quiet machine)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
-	$(BIN)/python benchmarks/training_step.py
-	$(BIN)/python benchmarks/kernels.py
-	$(BIN)/python benchmarks/large_pairs.py --out docs/measured
-	$(BIN)/python benchmarks/interop.py --out docs/measured
-	$(BIN)/python benchmarks/plugins.py --out docs/measured
-	$(BIN)/python benchmarks/primed.py --out docs/measured
-	$(BIN)/python benchmarks/through_solve.py --out docs/measured
-	$(BIN)/python benchmarks/stability.py --out docs/measured
-	$(BIN)/python benchmarks/stiff.py --out docs/measured
-	$(BIN)/python benchmarks/peers.py --out docs/measured
+	$(BIN)/python benchmarks/again.py
 
 clean:  ## Remove the environment and everything generated
 	rm -rf .venv out site build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -37,6 +37,7 @@ EPS = float(np.finfo(float).eps)
 REGULAR = {
     "henon_heiles": [0.0, 0.1, 0.35, 0.0],  # E = 0.0659: near the periodic orbit in the q1 direction
     "toda_chain": [*np.zeros(128), *0.45 * np.sin(2 * np.pi * np.arange(128) / 16)],  # not one soliton: a wave
+    "fput_beta": [*np.zeros(64), *0.45 * np.sin(2 * np.pi * np.arange(64) / 16)],  # its y0 is unstable
 }
 
 
@@ -54,6 +55,7 @@ def scenes() -> list[HamiltonianSystem]:
         systems.fput(1000.0),
         systems.spring_pendulum(1e6, coordinates="polar"),
         systems.toda_chain(),
+        systems.fput_beta(),
     ]
 
 

@@ -241,7 +241,7 @@ def labelled(sigma: float) -> str:
 
 RATIONAL = "(1 + sin(q1 - q2)**2)"
 TERMS = [f"{f}/{RATIONAL}" for f in ("p1**2", "p2**2", "p1*p2", "p1*p2*cos(q1 - q2)", "p1*p2*sin(q1 - q2)")]
-"""Of a double pendulum's kinetic energy, beside which `discover` has polynomials and trigonometric functions."""
+"""Terms of a double pendulum's kinetic energy, beside which `discover` has polynomials and trigonometric functions."""
 
 
 def ghnn_double_pendulum(options: argparse.Namespace) -> list[Row]:

@@ -24,7 +24,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -46,33 +46,48 @@ from sympflow.training.starts import Primed
 
 TARGETS = (1e-4, 1e-6, 1e-8)
 SHIPPED = Path(sympflow.__file__).parent / "pretrained"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A system in the race.
+
+    Attributes
+    ----------
+    make : callable
+    starts : tuple of (Primed, int)
+        Starts of trainings, and how many tables their searches begin from.
+    """
+
+    make: Callable[[], HamiltonianSystem]
+    starts: tuple[tuple[Primed, int], ...]
+
+
+def driven_starts(*steps: float) -> tuple[tuple[Primed, int], ...]:
+    """Starts of a driven system at these Δt."""
+    return tuple((Primed(dt, 6, 8, curvature=True, first="kick"), 8) for dt in steps)
+
+
 MEASURES = {"energy": 1000.0, "state": 100.0}
 FLOWS = {
-    "henon_heiles": (
-        (Primed(1.1, 2), 24), (Primed(0.65, 2), 24), (Primed(0.9, 3), 24), (Primed(0.55, 3), 48),
+    "henon_heiles": Scene(
+        systems.henon_heiles,
+        ((Primed(1.1, 2), 24), (Primed(0.65, 2), 24), (Primed(0.9, 3), 24), (Primed(0.55, 3), 48)),
     ),
-    "pendulum": (
-        (Primed(0.8, 1), 24), (Primed(1.2, 2, 4), 24), (Primed(0.5, 2), 24), (Primed(0.5, 3), 48),
+    "pendulum": Scene(
+        systems.pendulum,
+        ((Primed(0.8, 1), 24), (Primed(1.2, 2, 4), 24), (Primed(0.5, 2), 24), (Primed(0.5, 3), 48)),
     ),
-    "quartic": ((Primed(0.8, 2), 24), (Primed(0.5, 3), 24), (Primed(0.3, 3), 48)),
-    "kepler": ((Primed(0.15, 2), 24), (Primed(0.1, 3), 24), (Primed(0.045, 3), 48)),
-}  # fmt: skip
-"""Starts of trainings, and how many tables their searches begin from."""
-
-
-DRIVEN: dict[str, tuple[Callable[[], HamiltonianSystem], dict[str, float], tuple[Primed, ...]]] = {
-    "driven_pendulum": (
-        systems.driven_pendulum,
-        MEASURES,
-        tuple(Primed(dt, 6, 8, curvature=True, first="kick") for dt in (2.0, 1.5, 1.0, 0.8, 0.5, 0.4)),
-    ),
-    "duffing": (
+    "quartic": Scene(systems.quartic, ((Primed(0.8, 2), 24), (Primed(0.5, 3), 24), (Primed(0.3, 3), 48))),
+    "kepler": Scene(systems.kepler, ((Primed(0.15, 2), 24), (Primed(0.1, 3), 24), (Primed(0.045, 3), 48))),
+}
+DRIVEN = {
+    "driven_pendulum": Scene(systems.driven_pendulum, driven_starts(2.0, 1.5, 1.0, 0.8, 0.5, 0.4)),
+    "duffing": Scene(
         partial(systems.duffing, damping=0.0, force=0.1, frequency=2.7, alpha=1.0),
-        MEASURES,
-        tuple(Primed(dt, 6, 8, curvature=True, first="kick") for dt in (1.5, 1.0, 0.8, 0.5, 0.4)),
+        driven_starts(1.5, 1.0, 0.8, 0.5, 0.4),
     ),
 }
-"""Driven systems, what is measured, and the starts of trainings, 8 tables each."""
 
 
 def fitted(system: HamiltonianSystem, start: Primed, tables: int, folder: Path, **options: Any) -> PrimedFlow:
@@ -226,83 +241,59 @@ def main() -> None:
     parser.add_argument("--fit-seconds", type=float, help="time budget of a fit")
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--batch", type=int, default=1000)
-    parser.add_argument("--json", type=Path, help="file for the rows; of --driven those that are in it are not run")
+    parser.add_argument("--json", type=Path, help="file for the rows; those that are in it are not run")
     parser.add_argument("--seed", type=int, default=HELD_OUT_SEED, help="of the held-out states")
     fragments.add_out(parser)
     print(run(parser.parse_args()))
 
 
-def driven(options: argparse.Namespace, quick: dict[str, Any]) -> str:
-    """The race of flows of driven systems, those that ship or others."""
-    kept = options.json is not None and options.json.exists()
-    rows = [Row(**row) for row in json.loads(options.json.read_text(encoding="utf-8"))] if kept else []
-    targets = (1e-2,) if options.quick else TARGETS
-    for name in options.system or DRIVEN:
-        make, measures, starts = DRIVEN[name]
-        system = make()
-        system.name = name
-        if options.fit:
-            flows = [
-                fitted(system, start, 8, options.flows, **quick) for start in starts[: 1 if options.quick else None]
-            ]
-        else:
-            flows = stored(system, options.flows)
-        for measure, t_end in measures.items():
-            over = Measure(system, measure, 20.0 if options.quick else t_end, options.seed)
-            for target in targets:
-                if any((row.system, row.measure, row.target) == (name, measure, target) for row in rows):
-                    continue
-                row = race(over, target, flows, None, options.repeats, options.batch)
-                if row is None:
-                    print(f"{name}: no flow reaches {measure} {target:g}", flush=True)
-                    continue
-                rows.append(row)
-                print(table([row]).splitlines()[-1], flush=True)
-                if options.json:
-                    options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
-    rows.sort(key=lambda row: [*DRIVEN].index(row.system))
-    fragments.write(options.out, "primed-driven", fragment(rows))
-    return "\n" + table(rows)
+def rows_of(
+    name: str, scene: Scene, options: argparse.Namespace, quick: dict[str, Any], done: list[Row]
+) -> Iterator[Row]:
+    """The rows of a system that are not done, by its flows that ship, or others."""
+    system = scene.make()
+    system.name = name
+    if options.fit:
+        starts = scene.starts[: 1 if options.quick else None]
+        flows = [fitted(system, start, tables, options.flows, **quick) for start, tables in starts]
+    else:
+        flows = stored(system, options.flows)
+    if not flows:
+        print(f"{name}: no flows in the folder; fit some with --fit", flush=True)
+        return
+    taylor = taylor_of(system) if system.autonomous else None
+    for measure, t_end in (MEASURES if not options.quick else {"energy": 20.0, "state": 5.0}).items():
+        over = Measure(system, measure, t_end, options.seed)
+        for target in TARGETS if not options.quick else (1e-2,):
+            if any((row.system, row.measure, row.target) == (name, measure, target) for row in done):
+                continue
+            row = race(over, target, flows, taylor, options.repeats, options.batch)
+            if row is None:
+                print(f"{name}: no flow reaches {measure} {target:g}", flush=True)
+                continue
+            print(table([row]).splitlines()[-1], flush=True)
+            yield row
 
 
 def run(options: argparse.Namespace) -> str:
     quick: dict[str, Any] = {"restarts": 2, "steps": 10, "points": 60, "reference_states": 20} if options.quick else {}
     if options.fit_seconds:
         quick["time_budget"] = options.fit_seconds
-    targets, measures = (TARGETS, MEASURES) if not options.quick else ((1e-2,), {"energy": 20.0, "state": 5.0})
-    if options.driven:
-        return driven(options, quick)
     if options.ablation:
         system = getattr(systems, (options.system or ["henon_heiles"])[0])()
         found = ablation(system, 0.6, ABLATION[:3] if options.quick else ABLATION, **quick)
         fragments.write(options.out, "primed-ablation", found)
         return found
-    rows: list[Row] = []
-    for name in options.system or FLOWS:
-        system = getattr(systems, name)()
-        if options.fit:
-            flows = [
-                fitted(system, *row, options.flows, **quick) for row in FLOWS[name][: 1 if options.quick else None]
-            ]
-        else:
-            flows = stored(system, options.flows)
-        if not flows:
-            print(f"{name}: no flows in the folder; fit some with --fit", flush=True)
-            continue
-        taylor = taylor_of(system)
-        for measure, t_end in measures.items():
-            for target in targets:
-                row = race(
-                    Measure(system, measure, t_end, options.seed), target, flows, taylor, options.repeats, options.batch
-                )
-                if row is None:
-                    print(f"{name}: no flow reaches {measure} {target:g}", flush=True)
-                    continue
-                rows.append(row)
-                print(table([row]).splitlines()[-1], flush=True)
-    if options.json:
-        options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
-    fragments.write(options.out, "primed-race", fragment(rows))
+    scenes, name = (DRIVEN, "primed-driven") if options.driven else (FLOWS, "primed-race")
+    kept = options.json is not None and options.json.exists()
+    rows = [Row(**row) for row in json.loads(options.json.read_text(encoding="utf-8"))] if kept else []
+    for system in options.system or scenes:
+        for row in rows_of(system, scenes[system], options, quick, list(rows)):
+            rows.append(row)
+            if options.json:
+                options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
+    rows.sort(key=lambda row: [*scenes].index(row.system))
+    fragments.write(options.out, name, fragment(rows))
     return "\n" + table(rows)
 
 

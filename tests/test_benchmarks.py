@@ -19,6 +19,7 @@ if not BENCHMARKS.exists():
     pytest.skip("the benchmarks are not part of the source distribution", allow_module_level=True)
 sys.path.insert(0, str(BENCHMARKS))
 
+import again
 import drift
 import nonseparable
 import own_systems
@@ -45,9 +46,10 @@ from contenders.measurement import (
 from measuring import fragments
 from measuring import race as at_equal_error
 
-from sympflow import SympFlow, shipped_flows
+from sympflow import SympFlow, shipped_flows, systems
 from sympflow.schemes import SCHEMES
 from sympflow.systems import henon_heiles, kepler, pendulum
+from sympflow.training.shipped.rows import weak_duffing
 
 pytestmark = pytest.mark.slow
 
@@ -255,6 +257,25 @@ def test_every_fragment_has_a_command_that_writes_it():
         assert f'"{section}"' in sources or f'"{stem}' in sources, path.name
 
 
+def test_fragments_are_made_again_by_their_commands(tmp_path, monkeypatch):
+    text = "| a |\n\n<small>`python benchmarks/{}` · one thread · commit 1a2b3c4 · 2026-01-01</small>\n"
+    for name, command in (("one-a", "one.py --only 'x y'"), ("one-b", "one.py --only 'x y'"), ("two", "two.py")):
+        (tmp_path / f"{name}.md").write_text(text.format(command), encoding="utf-8")
+    (tmp_path / "flows.md").write_text("| a |\n\n<small>`sympflow flows`</small>\n", encoding="utf-8")
+    one = {"python benchmarks/one.py --only 'x y'": {"one-a": "1a2b3c4", "one-b": "1a2b3c4"}}
+    assert again.commands(tmp_path, ["one-*"]) == one
+    assert again.commands(tmp_path, ["*"]) == {**one, "python benchmarks/two.py": {"two": "1a2b3c4"}}
+    assert not again.commands(tmp_path, ["flows"])
+    (tmp_path / "benchmarks").mkdir()
+    (tmp_path / "benchmarks" / "one.py").write_text("import sys; print(sys.argv[1:])", encoding="utf-8")
+    (tmp_path / "benchmarks" / "two.py").write_text("while True: pass", encoding="utf-8")
+    monkeypatch.setattr(again, "HOUSE", tmp_path)
+    assert again.run(*one, tmp_path, tmp_path / "log", None)
+    assert (tmp_path / "log").read_text(encoding="utf-8").strip() == f"['--only', 'x y', '--out', {str(tmp_path)!r}]"
+    assert not again.run("python benchmarks/two.py", tmp_path, tmp_path / "log", 0.2)
+    assert not again.run("python benchmarks/three.py", tmp_path, tmp_path / "log", None)
+
+
 # primed flows against schemes -------------------------------------------------------------------------
 
 
@@ -283,7 +304,7 @@ def test_a_tiny_race_of_primed_flows(tmp_path, monkeypatch):
         assert all(value > 0 for value in row["faster"].values())
     assert len(list(tmp_path.glob("*.safetensors"))) == 1
     system = pendulum()
-    again = primed.fitted(system, *primed.FLOWS["pendulum"][0], tmp_path)  # not fitted again, but read
+    again = primed.fitted(system, *primed.FLOWS["pendulum"].starts[0], tmp_path)  # not fitted again, but read
     assert again.recipe["stages"][0]["restarts"] == 2
 
 
@@ -374,11 +395,9 @@ def test_a_tiny_search_for_drift():
 
 
 def test_scenes_of_the_drift_are_those_of_all_flows():
-    """But of driven systems, whose energy is not kept and has no drift, and of lattices beyond the first."""
-    scenes = drift.scenes()
+    """But of driven systems, whose energy is not kept and has no drift."""
+    scenes = [*drift.scenes(), systems.driven_pendulum(), weak_duffing()]
     for entry in shipped_flows(kind="sympflow"):
-        if entry.system in ("driven_pendulum", "duffing", "fput_beta"):
-            continue
         assert any(entry.is_of(system) for system in scenes), entry.name
 
 

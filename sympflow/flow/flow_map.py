@@ -23,7 +23,7 @@ from sympflow.flow.files import MAX_DT, MIN_DT, Description, write
 from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, same_system, without_friction
-from sympflow.hamiltonian.lattice_states import LatticeStates
+from sympflow.hamiltonian.local_states import LocalStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 
@@ -88,7 +88,7 @@ class FlowMap(nn.Module):
         Open intervals of t in which it was never compared with anything: those between the times of labels, if these
         were few and it was fitted to nothing else. Results there come with a warning.
     lattice_terms : mapping of str to str
-        The terms of a lattice, for messages; {} of another system.
+        The terms of a lattice or of like bodies, for messages; {} of another system.
     drive_times : (float, float) or None
         The interval of t0 + t that the flow of a drive without a period was fitted in: beyond it there is a warning.
     recipe, figures : dict
@@ -107,6 +107,8 @@ class FlowMap(nn.Module):
     """True if the maps of the family hold the friction of a damped system that they are made for."""
     takes_driving: ClassVar[bool] = False
     """True if the maps of the family take the time, of a driven system that they are made for."""
+    iterated: int = 0
+    """Evaluations of ∇H and ∇²H in each of Newton's iterations, of a flow whose steps are found by these."""
     identity: Identity | None = None  # these of flows in pickles of earlier versions, which did not have them
     lattice_terms: Mapping[str, str] = MappingProxyType({})
     unfitted: tuple[tuple[float, float], ...] = ()
@@ -525,14 +527,14 @@ class FlowMap(nn.Module):
             If the system has friction, and the family of the flow has not.
         """
         check_for_flows(system, self.takes_friction, self.takes_driving)
+        self.lattice_terms = {} if system.local is None else dict(system.local.terms)
         small = self.known_by(system)
         self.fingerprint, self.system_name = small.fingerprint, system.name
         self.identity = Identity.of(small, domain)
-        self.lattice_terms = {} if system.local is None else dict(system.local.terms)
 
     def known_by(self, system: HamiltonianSystem) -> HamiltonianSystem:
-        """The system whose H the flow keeps to know another: of a lattice, where its size is no part of the flow, few
-        of its sites; else that system itself."""
+        """The system whose H the flow keeps to know another: of a lattice or like bodies, where their number is no part
+        of the flow, a few of them; else that system itself."""
         return system
 
     @property
@@ -580,13 +582,13 @@ class FlowMap(nn.Module):
                 "accurate. Fit one to the damped system by sympflow.train(system), or from these numbers by "
                 "sympflow.train(system, flow=flow.transferred(system))."
             )
-        if system.local is not None and system.local.shape and self.lattice_terms:
+        if system.local is not None and system.local.has_piece and self.lattice_terms:
             reason = _difference(self.lattice_terms, system.local.terms)
             damped = system.damping is not None or len(self.fingerprint or ()) > PROBES
             reason = reason or " (its friction is another)" * damped
             raise ValueError(
-                f"`system` {system.name!r} is another lattice than that of this flow{reason}: its numbers cancel the "
-                f"errors of its own terms alone. {remedy[0].upper()}{remedy[1:]}"
+                f"`system` {system.name!r} is another {system.local.noun} than that of this flow{reason}: its numbers "
+                f"cancel the errors of its own terms alone. {remedy[0].upper()}{remedy[1:]}"
             )
         if system.ndof != self.ndof:
             raise ValueError(
@@ -631,7 +633,7 @@ class FlowMap(nn.Module):
     def domain_for(self, system: HamiltonianSystem) -> Domain | None:
         """Return Ω of the flow, or else of its system, ready to be asked for states; None if neither has one."""
         domain = self.domain or system.domain
-        if isinstance(domain, LatticeStates):
+        if isinstance(domain, LocalStates):
             return domain.of(system)
         if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
             return system.domain if domain == system.domain else domain.attach(system.hamiltonian)
@@ -786,7 +788,7 @@ class FlowMap(nn.Module):
 
 
 def _difference(mine: Mapping[str, str], theirs: Mapping[str, str]) -> str:
-    """The first term in which the lattice of a flow and another differ, as a clause; nothing where the texts agree."""
+    """The first term in which the system of a flow and another differ, as a clause; nothing where the texts agree."""
     for name in [*mine, *theirs]:
         if mine.get(name) != theirs.get(name):
             return f" (its {name} is {theirs.get(name, 'none')}, and not {mine.get(name, 'none')})"

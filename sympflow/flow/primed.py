@@ -43,8 +43,9 @@ from sympflow.flow.primed_potentials import (
 )
 from sympflow.flow.sympflow import SympFlow
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
+from sympflow.hamiltonian.domain import states_of
 from sympflow.hamiltonian.fingerprint import check_for_flows
-from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
+from sympflow.hamiltonian.local_states import DRAWN, LocalStates
 from sympflow.hamiltonian.monomials import MOST_MONOMIALS, Monomials, monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE as CURVATURE_LEVEL
@@ -52,6 +53,7 @@ from sympflow.schemes import POLYNOMIAL as POLYNOMIAL_LEVEL
 from sympflow.schemes import SCHEMES, Scheme, compose, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.kernels.flow_loops import PrimedFlowKernel
     from sympflow.kernels.stages import StageTable
 
@@ -84,8 +86,10 @@ class PrimedShape:
     timed : bool
         True if the drifts of the kernel add up to t at every t, as they must with friction, with an exact e^{−γt},
         and in a driven system, in which the time moves with them.
-    gradient_kicks, curvature_kicks : tuple of int, optional
-        The kicks of the kernel that have a force gradient and a curvature term, from 0; by default all.
+    gradient_kicks : tuple of int, optional
+        The kicks of the kernel, counted from 0, that have force gradients, where others have none.
+    curvature_kicks : tuple of int, optional
+        Those of them that have curvature terms, where others have none.
 
     Raises
     ------
@@ -122,35 +126,28 @@ class PrimedShape:
             raise ValueError("`curvature` goes with force gradients: leave it out.")
         if self.monomials and self.force_gradient:
             raise ValueError("`monomials` stand in place of force gradients: leave these out.")
+        if self.gradient_kicks is not None:
+            self._check_kicks("force_gradient", self.gradient_kicks, self.force_gradient)
+        if self.curvature_kicks is not None:
+            self._check_kicks("curvature", self.curvature_kicks, self.curvature)
+            if self.gradient_kicks is not None and not set(self.curvature_kicks) <= set(self.gradient_kicks):
+                raise ValueError(
+                    f"`curvature` {self.curvature_kicks!r} names kicks without force gradients: name some of "
+                    f"{self.gradient_kicks!r}."
+                )
+
+    def _check_kicks(self, name: str, kicks: tuple[int, ...], has: bool) -> None:
         n = self.kernel.count("kick")
-        for name, kicks, has in (
-            ("force_gradient", self.gradient_kicks, self.force_gradient),
-            ("curvature", self.curvature_kicks, self.curvature),
-        ):
-            if kicks is None:
-                continue
-            if not has or not kicks or sorted(set(kicks)) != list(kicks) or not 0 <= kicks[0] <= kicks[-1] < n:
-                raise ValueError(
-                    f"`{name}` {list(kicks)!r} names no kicks: count them from 0 to {n - 1}, each once and in order."
-                )
-            if self.palindromic and kicks != tuple(n - 1 - i for i in reversed(kicks)):
-                raise ValueError(
-                    f"`{name}` {list(kicks)!r} is not the same from either end of {n} kicks: name them from both, or "
-                    "take palindromic=False."
-                )
-        if self.curvature and not set(self._curved) <= set(self._with_gradient):
+        if not kicks or not has or list(kicks) != sorted(set(kicks) & set(range(n))):
             raise ValueError(
-                f"`curvature` {list(self._curved)!r} names kicks without a force gradient: take those of "
-                f"{list(self._with_gradient)!r}."
+                f"`{name}` {kicks!r} does not name kicks from 0 to {n - 1}, each once and in order: name some, "
+                "or take True for all, False for none."
             )
-
-    @property
-    def _with_gradient(self) -> tuple[int, ...]:
-        return self.gradient_kicks or tuple(range(self.kernel.count("kick")))
-
-    @property
-    def _curved(self) -> tuple[int, ...]:
-        return self.curvature_kicks or tuple(range(self.kernel.count("kick")))
+        if self.palindromic and kicks != tuple(n - 1 - i for i in reversed(kicks)):
+            raise ValueError(
+                f"`{name}` {kicks!r} is not the same from either end of {n} kicks: name their mirror images "
+                "too, or take palindromic=False."
+            )
 
     @property
     def kernel(self) -> tuple[Kind, ...]:
@@ -166,25 +163,19 @@ class PrimedShape:
         """Return untrained columns of the numbers of K, whose kicks and drifts have a `total` of 1, or of χ."""
         if not sequence:
             return Columns()
-        having = (None, None) if total is None else (self.gradient_kicks, self.curvature_kicks)
         powers, mirrored = range(0, self.degree, 2 if self.palindromic else 1), self.palindromic and total is not None
 
-        def column(
-            kind: Kind,
-            power: int,
-            total: float | None = None,
-            always: bool = False,
-            among: tuple[int, ...] | None = None,
-        ) -> Coefficients:
-            n = sequence.count(kind)
-            zero = () if among is None else tuple(i for i in range((n + 1) // 2 if mirrored else n) if i not in among)
-            return Coefficients(n, tuple(powers), dt, power, mirrored, total, always=always, zero=zero, **like)
+        def column(kind: Kind, power: int, total: float | None = None, **more: Any) -> Coefficients:
+            return Coefficients(sequence.count(kind), tuple(powers), dt, power, mirrored, total, **more, **like)
+
+        having, curved = (None, None) if total is None else (self.gradient_kicks, self.curvature_kicks)
+        curved = having if curved is None else curved
 
         return Columns(
             column("kick", 1, total),
-            column("drift", 1, total, self.timed and total is not None),
-            column("kick", 3, among=having[0]) if self.force_gradient else None,
-            column("kick", 5, among=having[1]) if self.curvature else None,
+            column("drift", 1, total, always=self.timed and total is not None),
+            column("kick", 3, present=having) if self.force_gradient else None,
+            column("kick", 5, present=curved) if self.curvature else None,
             nn.ModuleList(column("kick", 3) for _ in self.monomials) if self.monomials else None,
         )
 
@@ -200,8 +191,8 @@ class PrimedShape:
             "curvature": self.curvature,
             **({"monomials": [list(m) for m in self.monomials]} if self.monomials else {}),
             **({"timed": True} if self.timed else {}),
-            **({"gradient_kicks": list(self.gradient_kicks)} if self.gradient_kicks else {}),
-            **({"curvature_kicks": list(self.curvature_kicks)} if self.curvature_kicks else {}),
+            **({} if self.gradient_kicks is None else {"gradient_kicks": list(self.gradient_kicks)}),
+            **({} if self.curvature_kicks is None else {"curvature_kicks": list(self.curvature_kicks)}),
         }
 
     @classmethod
@@ -224,8 +215,8 @@ class PrimedShape:
         processor = plan.get("processor", 0)
         if processor != 0 or isinstance(processor, bool):
             processor = checked_integer(processor, "processor", MAX_LAYERS)
+        flags |= {name: _checked_kicks(plan.get(name)) for name in ("gradient_kicks", "curvature_kicks")}
         exponents = _checked_monomials(plan.get("monomials", []), ndof)
-        flags |= {name: _checked_kicks(plan.get(name), maps) for name in ("gradient_kicks", "curvature_kicks")}
         return cls(plan["first"], maps, degree, processor=processor, monomials=exponents, **flags)
 
 
@@ -235,13 +226,11 @@ def _alternating(first: Kind, n: int) -> tuple[Kind, ...]:
     return tuple(first if i % 2 == 0 else other for i in range(n))
 
 
-def _checked_kicks(plan: Any, maps: int) -> tuple[int, ...] | None:
+def _checked_kicks(plan: Any) -> tuple[int, ...] | None:
     if plan is None:
         return None
     if not isinstance(plan, list) or not all(isinstance(i, int) and not isinstance(i, bool) for i in plan):
-        raise Refused("its kicks with force gradients or curvature terms are no list of integers")
-    if len(plan) > maps:
-        raise Refused("it has more kicks with force gradients or curvature terms than kicks")
+        raise Refused("its kicks with force gradients or curvature terms are not a list of integers")
     return tuple(plan)
 
 
@@ -520,18 +509,15 @@ class PrimedFlow(SympFlow):
         device: torch.device | str | None,
     ) -> Self:
         """Return a flow that is, at every t, equal leapfrog steps or the given scheme: see `SympFlow.primed`."""
-        stages, palindromic, scheme, degree, force_gradient = map(
-            plain, (stages, palindromic, scheme, degree, force_gradient)
-        )
-        processor, curvature, polynomial = map(plain, (processor, curvature, polynomial))
+        stages, palindromic, scheme, degree = map(plain, (stages, palindromic, scheme, degree))
+        processor, polynomial = map(plain, (processor, polynomial))
+        some = None
+        if force_gradient is not None:
+            force_gradient, some = _kicks_of("force_gradient", force_gradient)
+        curvature, curved = _kicks_of("curvature", curvature)
         check_system(system)
         check_for_flows(system, cls.takes_friction, cls.takes_driving)
         check_flag("palindromic", palindromic)
-        curvature, curved = _some_kicks("curvature", curvature)
-        if force_gradient is not None:
-            force_gradient, with_gradient = _some_kicks("force_gradient", force_gradient)
-        else:
-            with_gradient = None
         if not system.separable:
             raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
         if system.kinetic_timed:
@@ -554,6 +540,11 @@ class PrimedFlow(SympFlow):
             raise ValueError(
                 f"`polynomial` stands in place of force gradients, as {scheme.name!r} has them: take another."
             )
+        if some is not None and any(s.three for i, s in enumerate(_kicks(scheme)) if i not in some):
+            raise ValueError(
+                f"`force_gradient` {some!r} leaves out kicks of {scheme.name!r} that have force gradients: name these "
+                "too, or leave it out."
+            )
         if any(scheme.gradients) and not force_gradient:
             raise ValueError(f"`force_gradient` is False but {scheme.name!r} has force gradients: leave it out.")
         substeps = scheme.substeps
@@ -567,17 +558,13 @@ class PrimedFlow(SympFlow):
             curvature=curvature,
             monomials=exponents,
             timed=_is_timed(system),
-            gradient_kicks=_unless_all(with_gradient, substeps),
-            curvature_kicks=_unless_all(curved, substeps),
+            gradient_kicks=some,
+            curvature_kicks=curved,
         )
         flow = cls(system.ndof, shape, dt, system, dtype, device)
-        kicks, drifts = ([s for s in substeps if s.kind == kind] for kind in ("kick", "drift"))
+        kicks, drifts = _kicks(scheme), [s for s in substeps if s.kind == "drift"]
         flow.kicks.set_constant([s.one for s in kicks])
         flow.drifts.set_constant([s.one for s in drifts])
-        if shape.gradient_kicks and any(s.three and i not in shape.gradient_kicks for i, s in enumerate(kicks)):
-            raise ValueError(
-                f"`force_gradient` leaves out kicks of {scheme.name!r} that have force gradients: name these too."
-            )
         if flow.gradients is not None:
             flow.gradients.set_constant([s.three for s in kicks])
         if flow.curvatures is not None:
@@ -728,7 +715,8 @@ class PrimedFlow(SympFlow):
         return self._binding.system if self._binding.known else None
 
     def known_by(self, system: HamiltonianSystem) -> HamiltonianSystem:
-        return system if self.monomials else system.few_sites
+        of_one_size = self.monomials or (self.fingerprint is not None and not self.lattice_terms)
+        return system if of_one_size else system.few_sites
 
     @property
     def kept_ndof(self) -> int:
@@ -737,7 +725,7 @@ class PrimedFlow(SympFlow):
     def bind(self, system: HamiltonianSystem) -> Self:
         """Give a flow that was loaded from a file the V and T of its system; itself.
 
-        The flow of a lattice takes the size of the one that it is given.
+        The flow of a lattice or of like bodies takes the size of the one that it is given.
 
         Raises
         ------
@@ -749,7 +737,7 @@ class PrimedFlow(SympFlow):
         if system.ndof != self.ndof:
             self.ndof = system.ndof
             self.layers = tuple(map(self._layer, range(len(self.substeps))))  # type: ignore[assignment]
-        if isinstance(self.domain, LatticeStates):
+        if isinstance(self.domain, LocalStates):
             self.domain = self.domain.of(system)
         return self
 
@@ -758,7 +746,7 @@ class PrimedFlow(SympFlow):
 
         They are a start for ``train(system, flow=flow.transferred(system))``. As they are they need not be near the
         exact flow of that system, with friction for instance. The numbers know the potential and dt, not the size: of a
-        lattice they serve any other one of the same terms, for which `solve` takes the flow as it is.
+        lattice, or of like bodies, they serve any other one of the same terms: `solve` takes the flow as it is.
 
         Raises
         ------
@@ -780,8 +768,8 @@ class PrimedFlow(SympFlow):
             )
         return self._of(system, replace(self.shape, timed=_is_timed(system)))
 
-    def of_lattice(self, system: HamiltonianSystem) -> Self:
-        """Return the flow of a lattice with the numbers of this one, of a few sites of it by their coordinates."""
+    def of_any_size(self, system: HamiltonianSystem) -> Self:
+        """Return the flow of a system with the numbers of this one, of a piece of it by its coordinates."""
         return self._of(system, self.shape).requires_grad_(False)
 
     def on_extended(self, extended: HamiltonianSystem) -> Self:
@@ -800,7 +788,7 @@ class PrimedFlow(SympFlow):
         if not self._binding.known:
             return self.bind(system)
         mine, theirs = self._binding.system.local, system.local
-        if mine is theirs or mine is None or theirs is None or (mine.shape, mine.ends) == (theirs.shape, theirs.ends):
+        if mine is theirs or mine is None or theirs is None or _size(mine) == _size(theirs):
             return self
         tables = self.tables
         if tables.carried is None or tables.carried.system is not system:
@@ -822,14 +810,14 @@ class PrimedFlow(SympFlow):
             )
 
     def _carried(self, system: HamiltonianSystem) -> Self:
-        """This flow of a lattice, of another shape of it, with what is known of it."""
+        """This flow, of another size of its system, with what is known of it."""
         other = self._of(system, self.shape).requires_grad_(False)
         other.describe(self.description)
-        if isinstance(self.domain, LatticeStates):
+        if isinstance(self.domain, LocalStates):
             other.domain = self.domain.of(system)
         elif self.domain is not None:
             assert self.system is not None
-            other.domain = LatticeStates.of_states(self.system, self.domain.sample(DRAWN)).of(system)
+            other.domain = states_of(self.system, self.domain.sample(DRAWN)).of(system)
         return other
 
     @property
@@ -843,6 +831,10 @@ class PrimedFlow(SympFlow):
     def initial_velocity(self, x: Tensor, t0: Any = None) -> Tensor:
         """d/dt ψ̄_t(x) at t = 0: that of its system, as the coefficients of V and T sum up to 1."""
         return super().initial_velocity(x, t0) if self.system is None else self.system.vector_field(x, t0)
+
+
+def _size(local: LocalHamiltonian) -> tuple[Any, ...]:
+    return local.shape, local.ends, local.ndof
 
 
 def _is_timed(system: HamiltonianSystem) -> bool:
@@ -879,6 +871,21 @@ def _starting_scheme(system: HamiltonianSystem, scheme: Any, stages: Any, first:
     return scheme
 
 
+def _kicks(scheme: Scheme) -> list[Any]:
+    return [s for s in scheme.substeps if s.kind == "kick"]
+
+
+def _kicks_of(name: str, asked: Any) -> tuple[bool, tuple[int, ...] | None]:
+    """Return True where a term of kicks is asked for, with the kicks that have it where not all do."""
+    asked = plain(asked)
+    if isinstance(asked, Sequence) and not isinstance(asked, str):
+        kicks = tuple(map(plain, asked))
+        if all(isinstance(i, int) and not isinstance(i, bool) for i in kicks):
+            return True, kicks
+    check_flag(name, asked)
+    return asked, None
+
+
 def _force_gradient_of(system: HamiltonianSystem, asked: bool | None, curvature: bool) -> bool:
     """Return True if the kicks have force gradients: if asked for, or by default where T is quadratic."""
     if asked is None:
@@ -896,22 +903,6 @@ def _force_gradient_of(system: HamiltonianSystem, asked: bool | None, curvature:
             f"`curvature` goes with force gradients of a symbolic system or a lattice, H = ½ pᵀM⁻¹p + V(q): {remedy}."
         )
     return asked
-
-
-def _some_kicks(name: str, given: Any) -> tuple[bool, tuple[int, ...] | None]:
-    """Return whether kicks have a term, and which of them: None for all."""
-    if isinstance(given, bool):
-        return given, None
-    if isinstance(given, str) or not isinstance(given, Iterable):
-        raise TypeError(f"`{name}` must be True or False; got {given!r}: or give the numbers of kicks, from 0.")
-    kicks = tuple(map(plain, given))
-    if not all(isinstance(i, int) and not isinstance(i, bool) for i in kicks):
-        raise TypeError(f"`{name}` must be True or False; got {given!r}: or give the numbers of kicks, from 0.")
-    return bool(kicks), tuple(sorted(set(kicks))) or None
-
-
-def _unless_all(kicks: tuple[int, ...] | None, substeps: Sequence[Any]) -> tuple[int, ...] | None:
-    return None if kicks == tuple(range(sum(s.kind == "kick" for s in substeps))) else kicks
 
 
 def _equal_steps(n: int, first: str) -> Scheme:

@@ -13,7 +13,9 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_number, checked_states, floats, sample_count, vector
 from sympflow.arrays import Array, to_numpy
+from sympflow.hamiltonian.cluster_states import ClusterStates
 from sympflow.hamiltonian.lattice_states import LatticeStates
+from sympflow.hamiltonian.local_states import LocalStates
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
@@ -253,10 +255,26 @@ class EnergySublevel:
 
 def domain_of(domain: Domain, system: Hamiltonian) -> Domain:
     """The domain of a system, ready to be asked for states: one that depends on H gets that of the system."""
-    return domain.of(system) if isinstance(domain, EnergySublevel | LatticeStates) else domain
+    return domain.of(system) if isinstance(domain, EnergySublevel | LocalStates) else domain
 
 
-def domain_from_dict(description: dict[str, Any]) -> Ball | Box | EnergySublevel | LatticeStates | Tube:
+OF_ANY_SIZE: dict[str, type[LocalStates]] = {"lattice": LatticeStates, "pairs": ClusterStates}
+"""The states of systems by one piece, by the `loops` of these."""
+
+
+def states_of(system: Hamiltonian, states: np.ndarray) -> LocalStates:
+    """The domain of any size that states (..., 2d) of a system by one piece are of.
+
+    Raises
+    ------
+    ValueError
+        If they have no energy above that of the system at rest, or there is no such domain.
+    """
+    assert system.local is not None
+    return OF_ANY_SIZE[system.local.loops].of_states(system, states)
+
+
+def domain_from_dict(description: dict[str, Any]) -> Ball | Box | EnergySublevel | LocalStates | Tube:
     """The domain that `to_dict` described.
 
     Raises
@@ -278,6 +296,8 @@ def domain_from_dict(description: dict[str, Any]) -> Ball | Box | EnergySublevel
                 return EnergySublevel(box=box, **_numbers(fields))
             case "LatticeStates":
                 return LatticeStates(**_numbers(fields))
+            case "ClusterStates":
+                return ClusterStates(**_numbers(fields))
             case "Tube":
                 return Tube(**_numbers(fields))
     except (KeyError, TypeError, ValueError) as error:

@@ -479,7 +479,7 @@ class Hamiltonian:
 
     @property
     def few_sites(self) -> Self:
-        """The system by which a flow that knows no size knows a lattice: a few of its sites. Else the system itself."""
+        """The system by which a flow that knows no size knows this one: a few of its sites or bodies. Else itself."""
         return self
 
     @property

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 BOUNDARIES = "periodic", "fixed", "free"
 MOST_AXES = 3
 FEW = 6, 4, 3
+MOST_JUDGED = 1024
+"""Degrees of freedom of the lattice on which a flow is judged, where it has more."""
 """Sites along each axis of a piece, of lattices of one, two and three axes."""
 WELLS, FAR = 8, 100.0
 """Starts from which minima of U are looked for, for each field, and how far they may be."""
@@ -51,7 +53,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         Letters of the parameters in the order of `params`.
     """
 
-    loops = "lattice"
+    loops = noun = "lattice"
 
     def __init__(
         self,
@@ -107,6 +109,16 @@ class LatticeHamiltonian(LocalHamiltonian):
         other._check_sizes("sites")
         other._set_mass()
         return other
+
+    has_piece = True
+
+    def judged(self) -> tuple[Any, ...]:
+        if not self.uniform or self.ndof <= MOST_JUDGED:
+            return ()
+        least, shape = self.few(), self.shape
+        while math.prod(shape) > MOST_JUDGED and shape > least:
+            shape = tuple(max(m, (n + 1) // 2) for n, m in zip(shape, least, strict=True))
+        return shape, self.boundary
 
     def few(self) -> tuple[int, ...]:
         """The sites along each axis of a piece of which nothing else is said."""

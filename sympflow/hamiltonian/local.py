@@ -7,6 +7,7 @@ operations. Nothing that it holds, but what depends on sites, is as long as the 
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Self
@@ -27,7 +28,7 @@ VECTORS_OF_A_RUN = 12
 """Vectors of d numbers that a run holds: its state, the next one, copies to look for what is not finite, forces."""
 
 
-class LocalHamiltonian(Definition):
+class LocalHamiltonian(Definition, ABC):
     """H = T(p) + V(q) as a sum over sites and bonds, or over pairs, by one expression for each kind of term.
 
     A subclass defines `potential`, `potential_gradient`, `hessian_vector`, `third_derivative` and, unless T is
@@ -45,17 +46,21 @@ class LocalHamiltonian(Definition):
         Sites along the axes of a lattice; () of another system.
     ends : tuple of str
         How each axis of a lattice ends.
+    noun : str
+        The kind of system, in messages.
     """
 
     separable = True
     has_third_derivative = True
     shape: tuple[int, ...] = ()
     ends: tuple[str, ...] = ()
+    noun: str = "system"
     loops: str
     inverse_mass: np.ndarray | None
     quadratic_kinetic: bool
     params: Mapping[str, Any]
 
+    @abstractmethod
     def with_params(self, values: Mapping[str, Any]) -> Self:
         """Return the definition with other values of some parameters.
 
@@ -64,7 +69,6 @@ class LocalHamiltonian(Definition):
         TypeError, ValueError
             If there is no such parameter, or values are bad.
         """
-        raise NotImplementedError(f"{type(self).__name__} must define with_params().")
 
     def check_names(self, names: Iterable[str]) -> None:
         """Refuse names that are no parameters, with those that there are."""
@@ -122,13 +126,27 @@ class LocalHamiltonian(Definition):
         )
 
     @property
+    def has_piece(self) -> bool:
+        """True if a few parts behave as those of a large system do: `piece` is defined."""
+        return False
+
+    def judged(self) -> tuple[Any, ...]:
+        """Arguments of `piece` for a system that is large, and small enough to judge a flow on; () for itself."""
+        return ()
+
+    @property
     def work(self) -> int:
         """About how many nanoseconds a force takes in compiled loops: threads are set to work where that pays."""
         return self.ndof
 
     @property
+    def numbers(self) -> int:
+        """Numbers that a force by array operations handles."""
+        return 2 * self.ndof
+
+    @property
     def uniform(self) -> bool:
-        """True if all sites are alike, so that a few of them tell all of the rest."""
+        """True if all sites or bodies are alike, so that a few of them tell all of the rest."""
         return False
 
     @property
@@ -136,9 +154,12 @@ class LocalHamiltonian(Definition):
         """The terms by name, as texts, for messages; {} where there are no pieces."""
         return {}
 
-    def written_out(self) -> sp.Expr:
-        """H of a lattice by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters."""
-        raise NotImplementedError(f"{type(self).__name__} must define written_out().")
+    def written_out(self) -> sp.Expr | None:
+        """H by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters.
+
+        None where a flow is fitted to the system as it is, by array operations, as of bodies, all of which meet.
+        """
+        return None
 
     def potential_hessian(self, q: Array, *t: Array) -> Array:
         """∇²V(q), dense: (..., d) to (..., d, d).

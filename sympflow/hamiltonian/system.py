@@ -27,9 +27,9 @@ from sympflow.hamiltonian.times import check_period, probe_times
 if TYPE_CHECKING:
     import sympy
 
-    from sympflow.hamiltonian.lattice_states import LatticeStates
     from sympflow.hamiltonian.linear_part import LinearPart
     from sympflow.hamiltonian.local import LocalHamiltonian
+    from sympflow.hamiltonian.local_states import LocalStates
 
 MOST_DEGREES = 1_000_000
 MOST_WRITTEN_OUT = 400
@@ -388,28 +388,31 @@ class HamiltonianSystem(Hamiltonian):
     def piece(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
     ) -> HamiltonianSystem:
-        """A few sites of a lattice, with the same terms: what a flow for the lattice is fitted on.
+        """A few sites of a lattice, or a few bodies, with the same terms: what a flow for a large one is fitted on.
 
-        A ring has as many bonds for each site as the inside of a large lattice, whatever the ends of that are.
+        A ring has as many bonds for each site as the inside of a large lattice, whatever the ends of that are. Bodies
+        have a piece if they are of one kind and mass, without `box`, and V has a minimum and a short range, so that it
+        holds a few of them together.
 
         Parameters
         ----------
         sites : int or sequence of ints, optional
             Sites along each axis; the default is 6 of a lattice of one axis, 4 by 4 of one of two and 3 by 3 by 3 of
-            one of three, more where bonds reach farther.
+            one of three, more where bonds reach farther. Of bodies their number: 4, 7 or 13 in one, two or three
+            dimensions.
         boundary : str, or one for each axis
-            As in `lattice`.
+            As in `lattice`; of lattices only.
 
         Returns
         -------
         HamiltonianSystem
-            With `sympflow.LatticeStates` of the same energy density as its domain, where the system has a domain or a
-            `y0` from which that is found. Arrays in `params` are cut to the first sites.
+            With `sympflow.LatticeStates` or `sympflow.ClusterStates` of the same energy density as its domain, where
+            the system has a domain or a `y0` from which that is found. Arrays in `params` are cut to the first sites.
 
         Raises
         ------
         TypeError, ValueError
-            If the system is no lattice, or has a rate of friction for each site, or the shape does not fit its bonds.
+            If the system has no piece, or has a rate of friction for each site, or the shape does not fit its bonds.
 
         Examples
         --------
@@ -424,27 +427,28 @@ class HamiltonianSystem(Hamiltonian):
         local = self.local.piece(sites, boundary)
         if self.damping is not None and self.damping.ndim:
             raise ValueError(
-                f"`damping` of {self.name!r} differs from site to site, and a piece is of a lattice whose sites are "
+                f"`damping` of {self.name!r} differs from place to place, and a piece is of a system whose parts are "
                 "alike: give one rate."
             )
         domain = None
         with suppress(ValueError):  # of states at rest none follow
-            domain = self.lattice_states()
+            domain = self.local_states()
         scene = None, self.t_span, self.dt, None
         return HamiltonianSystem._of_pieces(local, self.damping, self.name, domain, *scene)
 
-    def lattice_states(self) -> LatticeStates | None:
-        """The states of a lattice at the energy density of its domain, or else of its `y0`; None without both."""
+    def local_states(self) -> LocalStates | None:
+        """The states, for any size, at the energy density of the domain, or else of `y0`; None without both."""
         domain = self.domain
         if domain is None and self.y0 is None:
             return None
-        from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
+        from sympflow.hamiltonian.domain import states_of
+        from sympflow.hamiltonian.local_states import DRAWN, LocalStates
 
-        if isinstance(domain, LatticeStates):
+        if isinstance(domain, LocalStates):
             return domain
         states = self.y0 if domain is None else domain.sample(DRAWN)
         assert states is not None
-        return LatticeStates.of_states(self, states)
+        return states_of(self, states)
 
     @cached_property
     def _few_sites(self) -> HamiltonianSystem:
@@ -455,8 +459,9 @@ class HamiltonianSystem(Hamiltonian):
 
     @property
     def few_sites(self) -> HamiltonianSystem:
-        alike = self.local is not None and self.local.uniform and (self.damping is None or not self.damping.ndim)
-        return self._few_sites if alike else self
+        local = self.local
+        alike = local is not None and local.uniform and local.has_piece
+        return self._few_sites if alike and (self.damping is None or not self.damping.ndim) else self
 
     @classmethod
     def schroedinger(

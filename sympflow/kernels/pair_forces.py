@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from sympflow.kernels.modules import load_algebra, template
 from sympflow.kernels.sized_loops import SizedLoops, Team
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
-__all__ = ["PairLoops"]
+__all__ = ["PairForces", "PairLoops"]
 
 KINDS = {"gradient": (1,), "hessian_vector": (1, 2), "bend": (2, 3)}
 """The derivatives of V by s that are in ∇V, ∇²V·v and ½ ∇³V(v, v)."""
@@ -53,9 +54,7 @@ class PairLoops(SizedLoops):
         n_chunks = CHUNKS if local.work >= WORTH_CHUNKS else 1
         self._size = n if few else -(-n // LANES) * LANES
         self._geometry = np.array([n, 0 if few else n_chunks], dtype=np.int64)
-        end = np.inf if local.cutoff is None else local.cutoff**2 + local.softening**2
-        box = np.zeros(local.dim) if local.box is None else local.box
-        self._values = np.array([local.softening**2, end, *box, *local.constants])
+        self._values = _numbers(local)
         self._sites = np.zeros((local.dim + len(local.columns), self._size))
         self._sites[: local.dim, :n], self._sites[local.dim :, :n] = 1 / local.masses, local.columns
         self._dim = local.dim
@@ -95,6 +94,51 @@ class PairLoops(SizedLoops):
         return (X, before), j
 
 
+class PairForces:
+    """F = −∇V and G = ∇²V M⁻¹∇V of bodies at many states, and their derivatives, for the fits of tables.
+
+    States q are (d, P), directions (K, d, P), Jacobians (d, d, P), as in `sympflow.training.table_step`.
+
+    Parameters
+    ----------
+    local : PairsHamiltonian
+    level : int
+        See `Scheme`; there are no curvature terms.
+    """
+
+    def __init__(self, local: PairsHamiltonian, level: int) -> None:
+        assert level < CURVATURE
+        self._given, self._has_gradient = (local, level), level >= FORCE_GRADIENT
+        self._values = _numbers(local)
+        masses = np.broadcast_to(1 / local.masses, (local.dim, local.n_bodies))
+        self._sites = np.concatenate([masses, local.columns])
+        self._module = _rows_module(_Code(local))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return PairForces, self._given
+
+    def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
+        """F and G."""
+        rows = np.ascontiguousarray(q.T)
+        F, G = np.empty_like(rows), np.empty_like(rows)
+        self._module.force_rows(rows, self._sites, self._values, self._has_gradient, F, G)
+        return (F.T, G.T)[: 1 + self._has_gradient]
+
+    def along(self, q: np.ndarray, v: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        """These, and their derivatives along directions."""
+        values = self.values(q)
+        rows, F, W = (np.ascontiguousarray(x.T) for x in (q, values[0], v))  # (P, d), (P, d, K)
+        DF, DG = np.empty_like(W), np.empty_like(W)
+        self._module.product_rows(rows, F, W, self._sites, self._values, self._has_gradient, DF, DG)
+        return values, (DF.T, DG.T)[: 1 + self._has_gradient]
+
+    def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        """These, and their Jacobians."""
+        d, P = q.shape
+        values, changes = self.along(q, np.broadcast_to(np.eye(d)[..., None], (d, d, P)))
+        return values, [change.swapaxes(0, 1) for change in changes]
+
+
 class _Code:
     """Key of the code of bodies in pairs: all that the code depends on."""
 
@@ -132,6 +176,26 @@ def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleTyp
         PERIODIC=local.box is not None,
         LANES=LANES,
     )
+
+
+def _numbers(local: PairsHamiltonian) -> np.ndarray:
+    """The numbers of a system that `_Sums.numbers` names."""
+    end = np.inf if local.cutoff is None else local.cutoff**2 + local.softening**2
+    box = np.zeros(local.dim) if local.box is None else local.box
+    return np.array([local.softening**2, end, *box, *local.constants])
+
+
+@lru_cache(maxsize=64)
+def _rows_module(code: _Code) -> ModuleType:
+    local = code.local
+    lines = _Sums(local, "gradient").numbers()
+    for letters, body in ((local.first, "i"), (local.second, "j")):
+        lines += [f"{letter.name} = sites[{local.dim + k}, {body}]" for k, letter in enumerate(letters)]
+    lines += [*statements(["g_1", "g_2", "g_3"], local.slopes[1:]), "return g_1, g_2, g_3"]
+    head = "@njit(**OPTIONS)\ndef slopes(i, j, s, sites, values):\n"
+    source = head + "\n".join("    " + line for line in lines)
+    cut, periodic = local.cutoff is not None, local.box is not None
+    return load_algebra(source, ("pair_rows",), DIM=local.dim, CUT=cut, PERIODIC=periodic)
 
 
 def _functions(local: PairsHamiltonian, kind: str) -> str:

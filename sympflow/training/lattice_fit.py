@@ -1,22 +1,23 @@
-"""Flows of lattices: fitted on a few sites, judged on the lattice itself.
+"""Flows of lattices and of like bodies: fitted on a few of them, judged on many.
 
 The numbers of a primed flow know the potential and Δt, not the size. So they are fitted to the exact flow of a ring of
-a few sites, written out by its coordinates, at states of the energy density of the lattice. Held-out states and the
-certificate are those of the lattice, with its own ends.
+a few sites, written out by its coordinates, or of a small cluster, at states of the energy density of the large system.
+Held-out states and the certificate are those of the large one: a lattice with its own ends, 13 bodies of more.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
-from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.domain import Domain, states_of
 from sympflow.hamiltonian.lattice import BOUNDARIES
-from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
+from sympflow.hamiltonian.local_states import DRAWN, LocalStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors
 
@@ -26,10 +27,8 @@ TAIL = 2.0
 """Times the upper density that the states of a piece have.
 
 In a large lattice a few neighbours at a time have so much, and a flow's errors there decide about the energy of all."""
-MOST_JUDGED = 1024
-"""Sites of the lattice on which a flow is judged, where the lattice has more."""
 NUMBERS = 16_000
-"""Numbers of the states of a judgement, together."""
+"""Numbers that the functions of a judgement handle, of all states together."""
 FEWEST, MOST_ORBITS, MOST_STATES, TIMES, CERTIFIED = 8, 40, 200, 9, 250
 """The certificate: fewest and most orbits, states, times in [0, Δt], and the steps of the orbits."""
 STEPS, SEEN, COPIES, ENDS_STATES = 200, 5, 4, 16
@@ -37,8 +36,8 @@ STEPS, SEEN, COPIES, ENDS_STATES = 200, 5, 4, 16
 
 
 def on_piece(system: HamiltonianSystem) -> bool:
-    """Return True for a lattice, of which a piece may be written out by its coordinates."""
-    return system.local is not None and bool(system.local.shape) and (system.damping is None or not system.damping.ndim)
+    """Return True for a lattice or like bodies, which a flow is fitted to by a piece."""
+    return system.local is not None and system.local.has_piece and (system.damping is None or not system.damping.ndim)
 
 
 @dataclass(frozen=True)
@@ -53,32 +52,30 @@ class Piece:
         The piece as a lattice, the lattice itself where that is small.
     system, domain : HamiltonianSystem, Domain
         The piece by its coordinates, and the states to fit on.
-    states : LatticeStates
-        Those of the same density, of a lattice of any size.
+    states : LocalStates
+        Those of the same density, of any size.
     """
 
     lattice: HamiltonianSystem
     few: HamiltonianSystem
     system: HamiltonianSystem
     domain: Domain
-    states: LatticeStates
+    states: LocalStates
 
     @classmethod
     def of(cls, lattice: HamiltonianSystem, domain: Domain) -> Piece:
         """The piece of a lattice, for states of a domain of it."""
-        found = domain
-        if not isinstance(domain, LatticeStates):
-            found = LatticeStates.of_states(lattice, domain.sample(DRAWN))
-        assert isinstance(found, LatticeStates)
+        found = domain if isinstance(domain, LocalStates) else states_of(lattice, domain.sample(DRAWN))
         small = lattice.ndof <= MOST_FITTED
         few = lattice if small else lattice.piece()
         local = few.local
         assert local is not None
-        written = HamiltonianSystem.from_sympy(
-            local.written_out(), damping=lattice.damping, name=lattice.name, t_span=lattice.t_span, dt=lattice.dt
-        )
+        H, written = local.written_out(), few
+        if H is not None:
+            scene: Any = {"damping": lattice.damping, "t_span": lattice.t_span, "dt": lattice.dt}
+            written = HamiltonianSystem.from_sympy(H, name=lattice.name, **scene)
         low, high = found.bounds
-        excited = LatticeStates((low, TAIL * high)).of(few)
+        excited = replace(found, density=(low, TAIL * high)).of(few)
         return cls(lattice, few, written, domain if small else excited, found.of(lattice))
 
     def small(self, flow: FlowMap) -> PrimedFlow:
@@ -91,22 +88,25 @@ class Piece:
 
     def whole(self, fitted: PrimedFlow) -> PrimedFlow:
         """The flow of the lattice with the numbers that were fitted, and what it achieves there."""
-        flow = fitted.of_lattice(self.lattice)
+        flow = fitted.of_any_size(self.lattice)
         flow.domain = self.states
         flow.identify(self.lattice, self.states)
         flow.recipe = {name: value for name, value in fitted.recipe.items() if name != "scaling"}
         flow.recipe["fitted_on"] = self.few.ndof
         flow.figures, flow.history = dict(fitted.figures), fitted.history
-        if self.lattice.damping is None and self.lattice.local is not None and self.lattice.local.uniform:
+        local = self.lattice.local
+        if self.lattice.damping is None and local is not None and local.uniform and local.ends:
             flow.figures |= {f"ends_{end}": self._error_at(flow, end) for end in BOUNDARIES}
         judged, own = self._judged, flow
+        assert judged.local is not None
         if judged is not self.lattice:
             own = flow.bound(judged)
         domain = self.states.of(judged)
-        n = max(FEWEST, min(MOST_ORBITS, NUMBERS // (2 * judged.ndof)))
+        width = judged.local.numbers
+        n = max(FEWEST, min(MOST_ORBITS, NUMBERS // width))
         flow.figures |= self._step_figures(own, judged, domain, n)
         if judged.conservative:
-            size = max(FEWEST, min(MOST_STATES, NUMBERS // (2 * judged.ndof)))
+            size = max(FEWEST, min(MOST_STATES, NUMBERS // width))
             certificate = own.certificate(judged, states=size, times=TIMES, held_out=n, t_end=CERTIFIED * own.dt)
             flow.certified = certificate
             flow.figures |= {
@@ -119,16 +119,10 @@ class Piece:
 
     @property
     def _judged(self) -> HamiltonianSystem:
-        """The lattice, or a smaller one with the same ends."""
-        lattice, local = self.lattice, self.lattice.local
-        assert local is not None
-        if not local.uniform or lattice.ndof <= MOST_JUDGED:
-            return lattice
-        least = local.piece().shape
-        shape, sites = local.shape, MOST_JUDGED
-        while np.prod(shape) > sites and shape > least:
-            shape = tuple(max(m, (n + 1) // 2) for n, m in zip(shape, least, strict=True))
-        return lattice.piece(shape, local.ends)
+        """The system, or a smaller one with the same ends."""
+        assert self.lattice.local is not None
+        judged = self.lattice.local.judged()
+        return self.lattice.piece(*judged) if judged else self.lattice
 
     @torch.no_grad()
     def _step_figures(self, flow: PrimedFlow, system: HamiltonianSystem, domain: Domain, n: int) -> dict[str, float]:

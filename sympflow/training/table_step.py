@@ -52,8 +52,8 @@ class TableStep:
     monomials
         Of the polynomial.
     compiled : bool
-        Compile the step and its derivatives, where the system has symbols: that takes two seconds, and pays for a
-        hundred evaluations.
+        Compile the step and its derivatives, where the system has symbols, or the forces of bodies in pairs: that takes
+        two seconds, and pays for a hundred evaluations.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class TableStep:
         self._times_inverse_mass, self._friction = _velocities(system, 1.0), system.friction
         if self._driven and system.friction is not None:
             self._friction = Friction(_extended(system.friction.matrix(system.ndof), 0.0))
-        self._forces = forces_of(system, level, monomials)
+        self._forces = forces_of(system, level, monomials, compiled)
         n, terms = len(sequence), len(monomials) or level
         kicks = [i for i in range(n) if sequence[i] == "kick"]
         self.n_coefficients = n + terms * len(kicks)
@@ -288,8 +288,22 @@ class Forces(Protocol):
         """These, and their derivatives along directions v (k, d, P), of the same shape."""
 
 
-def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = ()) -> Forces:
+def _pair_forces(system: HamiltonianSystem, level: int) -> Forces:
+    from sympflow.hamiltonian.bodies import PairsHamiltonian
+    from sympflow.kernels.pair_forces import PairForces
+
+    assert isinstance(system.local, PairsHamiltonian)
+    return PairForces(system.local, level)
+
+
+LOCAL: Mapping[str, Callable[[HamiltonianSystem, int], Forces]] = {"pairs": _pair_forces}
+"""Compiled forces of systems that are given by one piece, by the `loops` of these."""
+
+
+def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = (), compiled: bool = False) -> Forces:
     """The forces of a separable system with T = ½ pᵀM⁻¹p: from its symbols, its Numba functions, or its own arrays."""
+    if compiled and system.local is not None and system.local.loops in LOCAL:
+        return LOCAL[system.local.loops](system, level)
     if system.symbols is not None and (system.ndof <= DENSE or level == CURVATURE or monomials):
         return SymbolicForces(system.symbols, level, monomials)
     return ArrayForces(system, level)

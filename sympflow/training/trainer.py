@@ -247,13 +247,27 @@ def fit_flow(
 ) -> Any:
     """`train`, its arguments sorted: a new flow or a given one, its fit, and the surroundings of the run."""
     domain = _domain_for(system, domain)
-    untold = flow is None and asked.restarts is None and asked.steps is None
     kind = _kind_of(system, flow, new, asked)
     check_for_flows(system, takes_friction=kind == "primed", takes_driving=kind in DRIVEN)
     if kind == "primed" and asked.searches and asked.data is None and on_piece(system):
         piece = Piece.of(system, domain)
         start = None if flow is None else piece.small(flow)
-        return piece.whole(fit_flow(piece.system, dt, start, new, asked, piece.domain, session))
+        return piece.whole(_fitted(piece.system, dt, start, kind, new, asked, piece.domain, session))
+    return _fitted(system, dt, flow, kind, new, asked, domain, session)
+
+
+def _fitted(
+    system: HamiltonianSystem,
+    dt: float | None,
+    flow: FlowMap | None,
+    kind: str,
+    new: NewFlow,
+    asked: NewFit,
+    domain: Domain,
+    session: Session,
+) -> Any:
+    """The fit of `fit_flow` to the system itself."""
+    untold = flow is None and asked.restarts is None and asked.steps is None
     hurried = untold and session.time_budget is None and session.resume is None and kind == "primed" and asked.searches
     if hurried:
         session.time_budget = SHORT_BUDGET if dt is None and trials.can_try(system) else BUDGET
@@ -327,8 +341,8 @@ def _is_data(value: Any) -> bool:
 def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
     """Ω of a training: the domain that is given, else that of the system; checked."""
     domain = system.domain if domain is None else domain
-    if domain is None and system.local is not None and system.local.shape and system.y0 is not None:
-        domain = system.lattice_states()
+    if domain is None and system.local is not None and system.local.has_piece and system.y0 is not None:
+        domain = system.local_states()
     if domain is None:
         raise ValueError(
             f"`domain` is not known for the system {system.name!r}: pass the states to train on, as by "

@@ -8,7 +8,9 @@ import torch
 
 from sympflow import HamiltonianSystem, solve, splitting_method
 from sympflow.kernels.modules import at_most
+from sympflow.kernels.pair_forces import PairForces
 from sympflow.schemes import SCHEMES
+from sympflow.training.table_step import ArrayForces
 
 GRAVITY, LENNARD_JONES = "-G*m1*m2/r", "4*(1/r**12 - 1/r**6)"
 
@@ -52,6 +54,21 @@ class TestFunctions:
         np.testing.assert_allclose(three.force(q), written.force(q), rtol=1e-10)
         np.testing.assert_allclose(three.hessian_vector(q, v), written.hessian_vector(q, v), rtol=1e-9)
         np.testing.assert_allclose(three.energy_density(Y).sum(-1), three.hamiltonian(Y), rtol=1e-12)
+
+    @pytest.mark.parametrize("system", [gravity(5), fluid(3, 1.5)], ids=["gravity", "Lennard-Jones"])
+    def test_compiled_for_fits_are_those_of_arrays(self, system):
+        rng = np.random.default_rng(4)
+        q = system.y0[: system.ndof, None] + 0.01 * rng.standard_normal((system.ndof, 3))
+        v = rng.standard_normal((2, *q.shape))
+        compiled, arrays = PairForces(system.local, 1), ArrayForces(system, 1)
+        for name, given in (("values", (q,)), ("along", (q, v)), ("all", (q,))):
+            found, known = (getattr(forces, name)(*given) for forces in (compiled, arrays))
+            for one, other in zip(found, known, strict=True):
+                scale = np.abs(other).max()  # of differences, in the slope of the gradient
+                np.testing.assert_allclose(np.asarray(one) / scale, np.asarray(other) / scale, atol=1e-4)
+        F, G = compiled.values(q)
+        np.testing.assert_allclose(F.T, system.force(q.T), rtol=1e-10, atol=1e-9)
+        np.testing.assert_allclose(G.T, -system.hessian_vector(q.T, system.velocity(F.T)), rtol=1e-9, atol=1e-6)
 
     @pytest.mark.parametrize("system", [gravity(5), fluid(3, 1.5)], ids=["gravity", "Lennard-Jones"])
     def test_of_tensors_are_derivatives_of_each_other(self, system):

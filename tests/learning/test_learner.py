@@ -200,7 +200,7 @@ def test_lagranges_equations_give_the_masses_of_a_double_pendulum():
 
 
 def test_bodies_whose_total_momentum_changes_are_no_bodies():
-    """Of four coordinates in the order x1, x2, y1, y2 two momenta cancel along each axis."""
+    """Two momenta cancel along each axis of coordinates in the order x1, x2, y1, y2."""
     x, y = np.random.default_rng(0).normal(size=(2, 50))
     runs = [(np.arange(50.0), np.stack([x, y, y, x, x, -x, y, -y]))]
     said = _said(Trajectories.read([*runs, *runs]), None, None, False, None, None)

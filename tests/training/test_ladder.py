@@ -332,7 +332,7 @@ def test_shipped_figures_hold(name):
 def test_what_costs_more_is_more_accurate(name):
     rungs = [f for f in shipped_flows(LADDERS[name][0].system()) if f.stages]
     errors = [f.energy_error for f in rungs]  # the cheapest first
-    cheap = {"outer_solar_system": 0.1, "toda_chain": 1e-2}  # the cheapest rung is better than 1e-4 already
+    cheap = {"outer_solar_system": 0.1}  # the cheapest rung is better than 1e-4 already
     assert errors[-1] < cheap.get(name, 1e-3) * errors[0]
     of_state = {  # polynomials that are fitted to the state alone, beside flows for the energy
         f"{name}-{r.name}" for r in LADDERS[name] if r.name.startswith("polynomial") and r.fits[0].energy_weight == 0.0

@@ -112,7 +112,7 @@ def ladders() -> list[Recipe]:
         *(rung(kepler, 3, dt, fit=plain) for dt in (0.2, 0.15, 0.1, 0.08, 0.06, 0.045, 0.03)),
         Recipe("kepler", "log-1", SYSTEMS[kepler], Clock(1.0), ByClock()),
         *(rung(planets, 3, dt, fit=short, judge=along) for dt in (300.0, 200.0, 100.0)),
-        *(lattice_rung("toda-chain", dt) for dt in (1.2, 0.7, 0.28)),
+        *(lattice_rung("toda-chain", dt) for dt in (1.2, 0.7, 0.28, 0.2)),
         *(lattice_rung("fput-beta", dt, 6) for dt in (0.8, 0.55, 0.25, 0.15)),
         *(driven_rung(SYSTEMS["driven-pendulum"], 6, dt) for dt in (2.0, 1.5, 1.0, 0.8, 0.4)),
         driven_rung(SYSTEMS["driven-pendulum"], 7, 100 / 51, 9),  # of T = 100
