@@ -272,14 +272,14 @@ def warn_of_domain(system: HamiltonianSystem, domain: Domain) -> None:
     met = _fastest_met(system, y[np.isfinite(rates)])
     if np.median(met) > 0.5 * FASTER * half:
         words += (
-            f"orbits that begin elsewhere come there, as to a wall, so that no smaller box holds them. The Δt of a flow "
-            f"suits these states, about {PHASE / q:.1e}{_less_energy(system, every, rate_of)}."
+            f"orbits that begin elsewhere come there, as to a wall, so that no smaller box holds them. The Δt of a "
+            f"flow suits these states, about {PHASE / q:.1e}{_less_energy(system, every, rate_of)}."
         )
     else:
         words += (
             f"the Δt of a flow for all of it suits these, about {PHASE / q:.1e}, where most others could have "
-            f"{PHASE / half:.1e}. Without them the domain is about Box({low}, {high}): take that, or a smaller one that "
-            "holds your orbits, or give `dt`."
+            f"{PHASE / half:.1e}. Without them the domain is about Box({low}, {high}): take that, or a smaller one "
+            "that holds your orbits, or give `dt`."
         )
     warnings.warn(words, UserWarning, stacklevel=4)
 
@@ -309,7 +309,7 @@ def _fastest_met(system: HamiltonianSystem, y: np.ndarray) -> np.ndarray:
 
 @np.errstate(all="ignore")
 def _less_energy(system: HamiltonianSystem, y: np.ndarray, rates: np.ndarray) -> str:
-    """A sublevel of the energy where the motion is half as fast or less, in words that go on; none where there is none."""
+    """A sublevel of the energy where the motion is half as fast or less, in words that go on; none if there is none."""
     energies = system.hamiltonian(y, start_times(system, 0.0, len(y), SEED, Stream.SCALING))
     fastest = np.quantile(rates[np.isfinite(rates)], QUANTILE)
     for share in ENERGIES if system.autonomous else ():
