@@ -13,7 +13,7 @@ import sympy as sp
 
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
-from sympflow.kernels.approximations import Letters, OnInterval, Ranges, on_interval, range_of
+from sympflow.kernels.approximations import UNTOUCHED, Letters, OnInterval, Ranges, on_interval, range_of
 from sympflow.kernels.codegen import as_factor, parameter_lines, printed, vectorised
 from sympflow.kernels.scheduling import ADD, FUSED, PRODUCTS, Schedule, nested
 from sympflow.kernels.stages import kicks_of
@@ -29,8 +29,6 @@ MOST_MULTIPLIED = 3000  # terms, of what is factored or multiplied out
 MOST_TERMS = 120  # of a sum multiplied out
 MOST_NESTED = 12  # of a momentum's sum that is nested
 B, G, C = sp.symbols("b g c", real=True)
-UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
-"""Functions of which an expression is left as it is."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +134,7 @@ def _source(
     for kick in reversed(kinds):
         name, terms = kick.name, len(kick.numbers)
         if ranges and isinstance(symbols, SymbolicHamiltonian):
-            tried = _tried_in(symbols, terms, f"{name[0]}_", ranges if kick is kinds[0] else ())
+            tried = _tried_in(symbols, terms, f"{name[0]}_", ranges)
         else:
             tried = _tried(symbols, terms, f"{name[0]}_", monomials)
         one = min(tried, key=lambda kick: (kick.cycles, kick.operations))
@@ -301,13 +299,8 @@ def _numbered(f: sp.Expr, states: set[sp.Symbol], numbers: dict[sp.Expr, sp.Symb
 
 
 def _tried_in(symbols: SymbolicHamiltonian, terms: int, prefix: str, ranges: Ranges) -> list[_Kick]:
-    """Shapes by letters for functions, of arithmetic alone, and in ranges of positions as polynomials.
-
-    Without ranges the first shape alone, of kicks that a flow hardly has.
-    """
+    """Shapes by letters for functions, of arithmetic alone, and in ranges of positions as polynomials."""
     tried = [_scheduled(symbols, next(shapes(symbols, terms)), prefix)]
-    if not ranges:
-        return tried
     parts = _parts(symbols, terms)
     if symbols.ndof == 1:
         tried += _whole_polynomials(symbols, parts, prefix, ranges)

@@ -57,6 +57,7 @@ FLOWS = {
     "processed, with curvature": lambda: random_flow(HH, scheme="verlet", processor=1, curvature=True),
     "polynomial": lambda: random_flow(HH, stages=2, degree=3, polynomial=4),
     "processed, with polynomials": lambda: random_flow(HH, size=0.01, scheme="verlet", processor=1, polynomial=4),
+    "some kicks with more terms": lambda: random_flow(HH, stages=3, degree=3, processor=1, curvature=[1]),
     "another dt": lambda: random_flow(HH, stages=2, dt=0.3, degree=1),
 }
 
@@ -349,6 +350,7 @@ def test_another_system_is_refused(tmp_path):
         {"gradient_kicks": [7]},
         {"gradient_kicks": [0]},
         {"gradient_kicks": 1},
+        {"curvature_kicks": [0]},
         {"monomials": [[0, 2]]},
         {"monomials": [[0, 2]], "force_gradient": False},
         {"monomials": [[0, 2, 1]], "force_gradient": False},
@@ -431,6 +433,8 @@ def test_it_trains_like_any_sympflow():
         ({"stages": 3, "force_gradient": [3]}, r"^`force_gradient` \(3,\) does not name kicks from 0 to 2, each once"),
         ({"stages": 3, "force_gradient": []}, r"^`force_gradient` \(\) does not name kicks from 0 to 2"),
         ({"stages": 3, "force_gradient": [2, 0]}, r"^`force_gradient` \(2, 0\) does not name kicks .* and in order"),
+        ({"stages": 3, "force_gradient": [1], "curvature": [0, 2]}, r"^`curvature` \(0, 2\) names kicks without"),
+        ({"stages": 3, "curvature": [0]}, r"^`curvature` \(0,\) is not the same from either end of 3 kicks"),
         ({"dt": -1.0}, r"^`dt` must be a positive"),
         ({"processor": -1}, r"^`processor` must be a non-negative integer"),
         ({"polynomial": 0}, r"^`polynomial` must be a positive integer, its degree; got 0"),
