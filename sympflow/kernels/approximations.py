@@ -136,25 +136,33 @@ def _powers(values: Sequence[Any], cosines: Sequence[Sequence[Any]], half: float
 class Letters:
     """Symbols for the functions of positions in expressions: one for each, and powers of it for exp(n·u).
 
+    Parameters
+    ----------
+    q : sequence of Symbol
+    split : bool
+        Take exp(u + v) for exp(u)·exp(v), functions of fewer positions each.
+
     Attributes
     ----------
     functions : dict of Symbol to Expr
         What the symbols stand for, each a function of one argument.
     """
 
-    def __init__(self, q: Sequence[sp.Symbol]) -> None:
+    def __init__(self, q: Sequence[sp.Symbol], split: bool = True) -> None:
         self.functions: dict[sp.Symbol, sp.Expr] = {}
-        self._q = set(q)
+        self._q, self._split = set(q), split
         self._exponents: dict[tuple[sp.Expr, bool], list[sp.Rational]] = {}
 
     def put_into(self, expressions: Sequence[sp.Expr]) -> list[sp.Expr]:
         """The expressions with symbols in place of functions."""
-        split = [f.replace(lambda e: isinstance(e, sp.exp), _split_exponential) for f in expressions]
+        split = list(expressions)
+        if self._split:
+            split = [f.replace(lambda e: isinstance(e, sp.exp), _split_exponential) for f in expressions]
         atoms = {a for f in split for a in f.atoms(sp.Function) if len(a.args) == 1 and a.free_symbols & self._q}
         outer = [a for a in atoms if not a.args[0].atoms(sp.Function)]
         for a in outer:
             if isinstance(a, sp.exp):
-                number, u = a.args[0].as_coeff_Mul()
+                number, u = _multiple(a.args[0])
                 if number.is_Rational:
                     self._exponents.setdefault((u, bool(number > 0)), []).append(number)
         places = {a: self._letter(a) for a in sorted(outer, key=sp.default_sort_key)}
@@ -162,7 +170,7 @@ class Letters:
 
     def _letter(self, atom: sp.Expr) -> sp.Expr:
         if isinstance(atom, sp.exp):
-            number, u = atom.args[0].as_coeff_Mul()
+            number, u = _multiple(atom.args[0])
             if number.is_Rational:
                 unit = sp.gcd_list([abs(n) for n in self._exponents[u, bool(number > 0)]])
                 unit = unit if number > 0 else -unit
@@ -180,6 +188,11 @@ class Letters:
     @cached_property
     def symbols(self) -> tuple[sp.Symbol, ...]:
         return tuple(self.functions)
+
+
+def _multiple(u: sp.Expr) -> tuple[sp.Expr, sp.Expr]:
+    """A number and what it multiplies; of a sum the number that divides all of it."""
+    return u.as_content_primitive() if u.is_Add else u.as_coeff_Mul()
 
 
 def _split_exponential(f: sp.Expr) -> sp.Expr:

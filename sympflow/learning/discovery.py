@@ -18,6 +18,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from sympflow.arguments import plain
 from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -27,7 +28,9 @@ from sympflow.learning.library import Library, library_for
 from sympflow.learning.regression import Regression
 from sympflow.learning.shooting import Fit, Method, Problem, chosen_method, minimized
 from sympflow.learning.smoothing import smoothed
+from sympflow.learning.symplecticity import POINTS, Reading, best_by_increments
 from sympflow.learning.trajectories import Run, Trajectories
+from sympflow.training.session import Session
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -56,6 +59,8 @@ BEYOND = 2
 """Terms by which the path goes on beyond the model that is chosen."""
 WORTH = 0.5
 """Gain of a term by the linear model, over its penalty, from which it is tried."""
+DOUBTED = 8
+"""Most terms of the only model that is fitted where no H explains the data."""
 SKETCHED = 8
 """Steps of the fits of models on the path with fewer terms than the one that was chosen."""
 HOPELESS = 10.0
@@ -200,6 +205,7 @@ def discover(
     domain: Domain | None = None,
     seed: int = 0,
     name: str = "discovered",
+    time_budget: float | None = None,
     progress: Callable[[str], None] | None = None,
     **reading: Any,
 ) -> DiscoveredSystem:
@@ -235,6 +241,8 @@ def discover(
         Of the trajectories that are held out.
     name : str
         Of the system.
+    time_budget : float, optional
+        Seconds, after which the best model so far is taken; Ctrl-C ends the search likewise.
     progress : callable, optional
         It is called with a line for each model on the way.
     **reading
@@ -251,7 +259,7 @@ def discover(
     UserWarning
         If no model explains the data: its residuals are larger than their noise. The message says by how much, and
         what the data rather look like: friction, velocities in place of momenta, columns in another order. If the noise
-        that was given is much larger than the residuals.
+        that was given is much larger than the residuals. If the time budget ended the search.
 
     Raises
     ------
@@ -265,6 +273,7 @@ def discover(
     .. [2] J. Chen, Z. Chen, Extended Bayesian information criteria for model selection with large model spaces,
        Biometrika 95 (2008) 759–771.
     """
+    session = Session(time_budget=plain(time_budget))
     if isinstance(data, FlowMap):
         if reading or noise is not None:
             raise TypeError(f"`{next(iter(reading), 'noise')}` is of trajectories, and `data` is a flow: leave it out.")
@@ -277,10 +286,10 @@ def discover(
     if piece is not None and not piece > 0:
         raise ValueError(f"`piece` must be a positive time; got {piece!r}: leave it out for about one period.")
     huber = limit_of(loss)
-    search = _Search(
-        trajectories, terms, degree, noise, held_out, piece, huber, most_terms, seed, progress or (lambda _: None)
-    )
-    discovery = search.run()
+    say = progress or (lambda _: None)
+    search = _Search(trajectories, terms, degree, noise, held_out, piece, huber, most_terms, seed, say, session)
+    with session.interruption:
+        discovery = search.run()
     box = np.array([trajectories.states.min(0), trajectories.states.max(0)])
     first = max(trajectories.runs, key=lambda run: run.span)
     scene = {"domain": domain or Box(box[0].tolist(), box[1].tolist()), "y0": trajectories.states[0]}
@@ -315,7 +324,10 @@ class _Search:
         most_terms: int,
         seed: int,
         say: Callable[[str], None],
+        session: Session,
     ) -> None:
+        self.session, self.over = session, session.deadline.over
+        self.doubt: Reading | None = None
         self.data, self.say, self.most_terms, self.huber = data, say, most_terms, huber
         self.known = _noise(noise, 2 * data.ndof)
         n = len(data.runs)
@@ -329,8 +341,8 @@ class _Search:
         points = self.smooth.points
         if not len(points):
             raise ValueError("`data` has no two successive points with all values: discover needs whole states.")
-        shown = points[np.random.default_rng(seed).permutation(len(points))[:COMPARED]]
-        library, self.superfluous = library_for(terms, data.ndof, degree, shown)
+        self.shown = points[np.random.default_rng(seed).permutation(len(points))[:COMPARED]]
+        library, self.superfluous = library_for(terms, data.ndof, degree, self.shown)
         self.library = library.by_kind()
         K = len(self.library)
         if not K:
@@ -372,17 +384,35 @@ class _Search:
     def run(self) -> Discovery:
         sigma = self.known if self.known is not None else np.maximum(self.smooth.sigma, 1e-2 * self.data.scales)
         self.sigma = np.maximum(sigma, self.floor)
-        chosen = self._steps(self._first())
+        self.doubt = self._doubted()
+        if self.doubt is not None:
+            chosen = self._first(DOUBTED, SKETCHED)
+            record = self._record(chosen, self._met(chosen))
+            if not record.explains:
+                return record
+            self.doubt = None
+            self._begin()
+        chosen = self._steps(self._first(self.most_terms, STEPS))
         for _ in range(3):  # steps short enough for the model that was found
             fit = self._known(chosen)
-            if fit.step_error(fit.problem.sigma) <= STEP_ERROR:
+            if fit.step_error(fit.problem.sigma) <= STEP_ERROR or self.over():
                 break
             self.refined += 1
+            self.guess = dict(zip(chosen, fit.theta, strict=True))
             self._begin()
             chosen = self._steps(chosen)
         return self._record(chosen, self._path(chosen))
 
-    def _first(self) -> list[int]:
+    def _doubted(self) -> Reading | None:
+        """Another explanation of the data, that leaves much less of increments than all terms; None for none."""
+        whole = self.data if len(self.data.runs) > 1 else self.data.pieces(POINTS)
+        if len(whole.runs) < 2:
+            return None
+        common, _ = library_for(None, self.data.ndof, 4, self.shown)
+        found = best_by_increments(*whole.split(), [self.library.model(), common.by_kind().model()])
+        return None if found is None else found[1]
+
+    def _first(self, most: int, steps: int) -> list[int]:
         """The best model of several regressions whose predictions do not diverge; pieces are shortened until it is so.
 
         Where terms are nearly alike, as the cosine of a difference and powers, adding them one at a time ends elsewhere
@@ -390,14 +420,17 @@ class _Search:
         """
         regression = Regression.of_slopes(self.library, self.smooth, self.data.scales)
         powers = [k for k, f in enumerate(self.library.expressions) if f.is_polynomial()]
-        ways = [regression.forward(self.most_terms), regression.backward(self.most_terms)]
-        if 0 < len(powers) < len(self.library):
-            ways.append(regression.forward(self.most_terms, powers))
+        most = min(most, self.most_terms)
+        ways = [regression.forward(most)]
+        if self.doubt is None:
+            ways.append(regression.backward(most))
+            if 0 < len(powers) < len(self.library):
+                ways.append(regression.forward(most, powers))
         for _ in range(8):
             starts = []
             for active in ways:
                 self.guess = dict(zip(active, regression.coefficients(active), strict=True))
-                if self._fit(sorted(active)) is not None:
+                if self._fit(sorted(active), steps=steps) is not None:
                     starts.append(sorted(active))
             if starts:
                 return min(starts, key=self._criterion)
@@ -426,33 +459,54 @@ class _Search:
     def _minimized(self, problem: Problem, theta: np.ndarray, states: np.ndarray, steps: int = STEPS) -> Fit | None:
         """The minimum, where the noise is estimated unless it is known; None if orbits diverge."""
         for _ in range(1 if self.known is not None else 5 if steps == STEPS else 2):
-            fit = minimized(problem, theta, states, iterations=steps, gain=CONVERGED, patience=1)
+            fit = minimized(problem, theta, states, iterations=steps, gain=CONVERGED, patience=1, stop=self._stop)
             if not math.isfinite(fit.cost):
                 return None
             found = np.maximum(fit.noise(), self.floor)
             settled = np.abs(np.log(found / problem.sigma)).max() < SETTLED
             problem, theta, states = replace(problem, sigma=found), fit.theta, fit.states
-            if settled:
+            if settled or self._stop():
                 break
         return fit
 
-    def _fit(self, active: Sequence[int], before: Fit | None = None, steps: int = STEPS) -> Fit | None:
-        """The fit of the terms, in ascending order; None if it diverges."""
+    def _stop(self) -> bool:
+        """True if the time is up and there is a model."""
+        return any(fit is not None for fit in self.fits.values()) and self.over()
+
+    def _fit(self, active: Sequence[int], origin: Sequence[int] | None = None, steps: int = STEPS) -> Fit | None:
+        """The fit of the terms, in ascending order, from that of others if these are given; None if it diverges."""
         key = frozenset(active)
-        if key in self.fits:
-            return self.fits[key]
-        theta = np.array([self.guess.get(k, 0.0) for k in active])
-        states, sigma = (self.starts, self.sigma) if before is None else (before.states, before.problem.sigma)
-        problem = self._problem(active, theta, sigma)
-        fit = self._minimized(problem, theta, states, steps)
-        if fit is None and before is not None:
-            fit = self._minimized(problem, theta, self.starts, steps)
-        self.fits[key] = fit
+        if key not in self.fits:
+            self.fits[key] = self._fitted(active, origin, steps)
+            self._tell(active)
+        return self.fits[key]
+
+    def _fitted(self, active: Sequence[int], origin: Sequence[int] | None, steps: int) -> Fit | None:
+        if origin is None:
+            theta = np.array([self.guess.get(k, 0.0) for k in active])
+            return self._minimized(self._problem(active, theta, self.sigma), theta, self.starts, steps)
+        before = self._known(origin)
+        theta = self._carried(active, origin, before)
+        problem = self._problem(active, theta, before.problem.sigma)
+        return self._minimized(problem, theta, before.states, steps) or self._minimized(
+            problem, theta, self.starts, steps
+        )
+
+    def _tell(self, active: Sequence[int]) -> None:
+        fit = self.fits[frozenset(active)]
         if fit is not None:
-            self.guess = self.guess | dict(zip(active, fit.theta, strict=True))
             said = " ".join(f"{c:+.4g}*{self.library.expressions[k]}" for k, c in zip(active, fit.theta, strict=True))
             self.say(f"{len(active)} terms, criterion {self._criterion(active):.6g}: {said}")
-        return fit
+
+    @staticmethod
+    def _carried(active: Sequence[int], origin: Sequence[int], before: Fit) -> np.ndarray:
+        """θ of some terms where the squares of a model with others are least, by their quadratic approximation."""
+        dropped = np.array([k not in active for k in origin])
+        theta, covariance = before.theta.copy(), before.covariance()
+        if dropped.any():
+            theta -= covariance[:, dropped] @ np.linalg.pinv(covariance[np.ix_(dropped, dropped)]) @ theta[dropped]
+        kept = dict(zip(origin, theta, strict=True))
+        return np.array([kept.get(k, 0.0) for k in active])
 
     def _criterion(self, active: Sequence[int]) -> float:
         fit = self.fits[frozenset(active)]
@@ -470,6 +524,8 @@ class _Search:
         """Terms added and dropped while the criterion falls."""
         self._fit(active)
         for _ in range(4 * self.most_terms):
+            if self.over():
+                break
             dropped = self._without_least(active)
             if dropped is not None and self._criterion(dropped) < self._criterion(active):
                 active = dropped
@@ -488,9 +544,28 @@ class _Search:
         significance = fit.theta**2 / np.maximum(np.diag(fit.covariance()), 1e-300)
         for weakest in np.argsort(significance)[:2]:
             rest = [k for i, k in enumerate(active) if i != weakest]
-            if self._fit(rest, fit, steps) is not None:
+            known = frozenset(rest) in self.fits
+            made = self._fit(rest, active, steps)
+            promised = self._criterion(active) - self.penalty + significance[weakest]
+            if (
+                known
+                and self._criterion(rest) > promised + WORTH * self.penalty
+                and significance[weakest] < self.penalty
+            ):
+                made = self._again(rest, active, steps)  # a former fit from elsewhere ended too early, or elsewhere
+            if made is not None:
                 return rest
         return None
+
+    def _again(self, active: Sequence[int], origin: Sequence[int], steps: int) -> Fit | None:
+        """The better of the former fit of the terms and one from that of others."""
+        key, former = frozenset(active), self._criterion(active)
+        kept = self.fits[key]
+        self.fits[key] = self._fitted(active, origin, steps)
+        if not self._criterion(active) < former:
+            self.fits[key] = kept
+        self._tell(active)
+        return self.fits[key]
 
     def _with_best(self, active: list[int], anyhow: bool = False) -> list[int] | None:
         """The model with the term that gains most by the linearized problem; None if none is worth it."""
@@ -503,9 +578,9 @@ class _Search:
         best = [int(k) for k in np.argsort(gains)[::-1][: 1 if anyhow else 3] if gains[k] > least]
         found: list[int] | None = None
         for k in best:
-            self.guess = self.guess | {k: 0.0}
             wider = sorted([*active, k])
-            if self._fit(wider, fit) is not None and (found is None or self._criterion(wider) < self._criterion(found)):
+            made = self._fit(wider, active)
+            if made is not None and (found is None or self._criterion(wider) < self._criterion(found)):
                 found = wider
             if found is not None and self._criterion(found) < self._criterion(active):
                 break
@@ -525,18 +600,22 @@ class _Search:
     # the path, and the record -----------------------------------------------------------------------------------
 
     def _path(self, chosen: list[int]) -> list[list[int]]:
-        """The best model of each number of terms, among those met and those on the way from the chosen one."""
+        """The best models of each number of terms, after those on the way from the chosen one were fitted."""
         active = chosen
-        while (rest := self._without_least(active, SKETCHED)) is not None:
+        while not self.over() and (rest := self._without_least(active, SKETCHED)) is not None:
             active = rest
             if self._criterion(active) > self._criterion(chosen) + HOPELESS * self.pieces.n_values:
                 break
         active = chosen
         for _ in range(BEYOND):
-            wider = self._with_best(active, anyhow=True)
+            wider = None if self.over() else self._with_best(active, anyhow=True)
             if wider is None:
                 break
             active = wider
+        return self._met(chosen)
+
+    def _met(self, chosen: list[int]) -> list[list[int]]:
+        """The best model of each number of terms among those that were fitted."""
         best: dict[int, list[int]] = {len(chosen): chosen}
         for key, fit in self.fits.items():
             if fit is None or len(key) > len(chosen) + BEYOND or len(key) == len(chosen):
@@ -558,7 +637,9 @@ class _Search:
         limit = UNEXPLAINED + 4 / math.sqrt(max(self.data.n_points, 1))
         explains = not (told & (excess > limit)).any()
         explains &= bool((noise < 0.5 * self.data.scales).all())
-        remark = self._doubt(noise) if explains else self._remark(noise, excess)
+        remark = self._too_loud(noise) if explains else self._remark(noise, excess)
+        if self.session.cut:
+            remark += " The time budget, or Ctrl-C, ended the search: give it more."
         order = np.argsort([str(self.library.expressions[k]) for k in chosen])
         return Discovery(
             tuple(self.library.expressions[chosen[i]] for i in order),
@@ -598,7 +679,7 @@ class _Search:
             held,
         )
 
-    def _doubt(self, noise: np.ndarray) -> str:
+    def _too_loud(self, noise: np.ndarray) -> str:
         """The remark that the noise which was given is too large, if it is."""
         if self.known is None or not (noise < QUIET * self.known).all():
             return ""
@@ -616,6 +697,8 @@ class _Search:
                 "`noise` out, or give that."
             )
         hint = diagnosis.hint(self.library, self.smooth, self.data, otherwise)
+        if self.doubt is not None and hint == otherwise:
+            hint = f"Of increments of trajectories {self.doubt.said} leaves {self.doubt.share:.1e} of the squares."
         return (
             f"No sparse Hamiltonian of the library's {len(self.library)} terms explains the data: of "
             f"{self.data.names[worst]} it leaves {noise[worst]:.3g}, {excess[worst]:.1f} times the noise. {hint} The "

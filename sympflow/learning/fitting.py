@@ -35,6 +35,7 @@ GROWTH = 1e3  # most that an error of an initial state may grow along a piece
 LEAST_GROWTH = 10.0
 PER_NOISE = 0.3  # of the spread of the data, that such an error may reach
 HOPELESS = 1.5  # noise over that of the best model, from which a model is given up
+COARSE, FINE = 1e-2, 1e-4  # gain of three steps at which a fit ends: the first or a poor one, and others
 STEP_ERROR = 0.1  # of the noise, to which the scheme's steps may change an orbit
 EXACT = 1e-9  # residuals, relative to the spread of the data, that need no explanation
 LOUDER = 2.0  # root mean square of held-out residuals, in σ, above which there are too few data, or another system
@@ -82,9 +83,20 @@ class Setting:
     seen: np.ndarray | None = None
     rival: np.ndarray | None = None
 
+    def plausible(self, noise: np.ndarray) -> bool:
+        """True unless a model leaves so much (2d,) that it is rejected whatever its last digits are."""
+        if self.seen is None or not (self.seen > 0).any():
+            return True
+        return bool((noise < LOUDER * self.seen)[self.seen > 0].all())
+
     def hopeless(self, noise: np.ndarray) -> bool:
         """True if a model that leaves this noise (2d,) of a few points is not worth longer orbits."""
         return self.rival is not None and float(np.mean(np.log(noise / self.rival))) > math.log(HOPELESS)
+
+    def turned(self, rows: Sequence[int]) -> Setting:
+        """The same for coordinates in another order."""
+        noise, seen = (None if sigma is None else sigma[[*rows]] for sigma in (self.noise, self.seen))
+        return replace(self, noise=noise, seen=seen, rival=None)
 
 
 @dataclass(frozen=True)
@@ -153,7 +165,8 @@ def fitted(
         tolerance = np.clip(0.02 * finer * sigma, 1e-12 * scales, 1e-4 * scales)
         method = chosen_method(model, theta, pieces, tolerance)
         problem = Problem(model, pieces, method, sigma, huber=setting.huber)
-        fit = minimized(problem, theta, states, gain=1e-2 if attempt == 0 else 1e-4, stop=setting.stop)
+        gain = FINE if attempt and setting.plausible(sigma) else COARSE
+        fit = minimized(problem, theta, states, gain=gain, stop=setting.stop)
         theta, before = fit.theta, sigma
         costs += [cost / data.n_values for cost in fit.costs]
         if given is None:

@@ -8,6 +8,7 @@ import warnings
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,25 +17,41 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_flag, floats, plain
 from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import hint
 from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Said, families, pruned, with_unit_mass
-from sympflow.learning.fitting import SILENT, Fitted, Held, Setting, fitted, gains, kept, left_out, limit_of, restored
+from sympflow.learning.fitting import (
+    SILENT,
+    Fitted,
+    Held,
+    Setting,
+    fitted,
+    gains,
+    judged,
+    kept,
+    left_out,
+    limit_of,
+    restored,
+)
 from sympflow.learning.library import library_for
 from sympflow.learning.models import Formula, FreeField, Model, Polynomial
-from sympflow.learning.shooting import Method
+from sympflow.learning.shooting import Field, Method
 from sympflow.learning.smoothing import smoothed
+from sympflow.learning.symplecticity import Reading, best_by_increments, free_reading
 from sympflow.learning.trajectories import Trajectories, periods_of
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
+from sympflow.training.starts import suited_step
 from sympflow.training.trainer import train
 from sympflow.workers import Crew
 
 HELD_OUT = 0.2  # of the trajectories
 TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
-NETWORK_SECONDS = 60.0  # for the weights of one, where H is not separable
+STEPPED = 100  # states by which the steps of a flow are chosen, where H is not separable
+DOUBTFUL_SECONDS = 5.0  # for a flow of data that no symplectic map explains
 TABLE_SHARE = 0.3  # of a time budget, likewise
 HORIZONS = (1, 10, 100)  # in Δt, of the held-out errors
 MOST_VALUES = 40_000  # numbers observed by which models are chosen; the chosen one is fitted to all
@@ -305,10 +322,14 @@ Chosen = tuple[Candidate, Fitted, Held]
 
 @dataclass(frozen=True)
 class Freedom:
-    """A vector field that need not be Hamiltonian, beside the best H.
+    """A vector field that need not be Hamiltonian, or another order of the coordinates, beside the best H.
 
     Attributes
     ----------
+    said : str
+        The field in words.
+    remedy : str
+        What to do where it has a form that is known; empty where it has none.
     share : float
         Of the squares of held-out residuals, that it leaves.
     defect : float
@@ -317,6 +338,8 @@ class Freedom:
         At which volumes of phase space grow.
     """
 
+    said: str
+    remedy: str
     share: float
     defect: float
     rate: float
@@ -340,6 +363,8 @@ class Search:
     cut: bool = False
     """True if the time was up before the search came to its end."""
     bar: Silent = field(default_factory=Silent)
+    reading: Reading | None = None
+    """Another explanation of the data, where increments make any H doubtful."""
     tested: list[Freedom | None] = field(default_factory=list)
     """The comparison with a vector field that need not be Hamiltonian, once it was made; None where H does as well."""
     final: Fitted = field(init=False)
@@ -387,6 +412,10 @@ class Search:
         setting = replace(self.setting, stop=deadline.over)
         total = sum(1 for name in names for _ in FAMILIES[name].models(self.said))
         with session.bar(total, "Models") as self.bar:
+            self._ask(names, setting, session)
+            if self.best is not None:
+                self.final, self.cut = self.winner[1], deadline.over()
+                return
             for name in names:
                 if self.best is not None and (self.best[2].explained or deadline.over()):
                     break
@@ -408,6 +437,32 @@ class Search:
         if not deadline.over():
             self.final = fitted(candidate.model, self.all, setting, self.final.theta)
         self.cut = deadline.over()
+
+    def _ask(self, names: list[str], setting: Setting, session: Session) -> None:
+        """Keep the best of the simple models if no H explains the data, which is known before any other is fitted.
+
+        Where increments say so, orbits of that model are compared with those of another reading.
+        """
+        linear = [c for name in names if FAMILIES[name].linear for c in FAMILIES[name].models(self.said)]
+        found = best_by_increments(*self.folds[0], [candidate.model for candidate in linear])
+        if found is None or found[1] is None:
+            return
+        place, self.reading = found
+        chosen = linear[place], *self._first_fold(linear[place].model, setting)
+        self.best = chosen
+        if chosen[2].explained or self.freedom(setting) is None:
+            self.best = self.reading = None
+            self.tested.clear()
+            return
+        self._note(chosen, session)
+
+    def _first_fold(self, model: Model, setting: Setting) -> tuple[Fitted, Held]:
+        """A model that is fitted to the first division of the trajectories, and what it leaves of the others there."""
+        data, held = self.folds[0]
+        if self.best is not None and self.best[0].model is model and (len(self.folds) == 1 or self.reading is not None):
+            return self.best[1], self.best[2]
+        found = fitted(model, data, setting, seed=self.seed)
+        return found, judged(found, held, self.setting)
 
     def _climb(self, name: str, setting: Setting, session: Session) -> None:
         """Fit the models of a family, until two that follow each other are no better than one before."""
@@ -431,7 +486,13 @@ class Search:
                 self.save(session)
         else:
             found = restored(candidate.model, self.data, numbers, setting)
-        held = left_out(found, self.folds, self.setting)
+        chosen = candidate, found, left_out(found, self.folds, self.setting)
+        self._note(chosen, session)
+        return chosen
+
+    def _note(self, chosen: Chosen, session: Session) -> None:
+        """The figures of a model, which join the history and are shown."""
+        candidate, found, held = chosen
         figures = {
             "parameters": candidate.model.n,
             "training_chi2": found.costs[-1],
@@ -443,7 +504,6 @@ class Search:
         self.bar.tries(len(self.history), f"{candidate.name}: held-out loss {held.loss:.3g}")
         if session.callback is not None:
             session.callback(len(self.history), figures)
-        return candidate, found, held
 
     def _try(self, candidate: Candidate, setting: Setting, session: Session) -> bool:
         """Fit a model; True if it is the best so far."""
@@ -508,10 +568,13 @@ class Search:
         free = None if deadline.over() else self.freedom(replace(self.setting, stop=deadline.over))
         if free is not None:
             said += (
-                f" No symplectic map explains these data: a vector field of polynomials that need not be Hamiltonian "
-                f"leaves {free.share:.1e} of the squares. Its Jacobian L fails the test of symplecticity: LᵀJ + JL, "
-                f"which is 0 for a Hamiltonian, is {free.defect:.2g} of L; volumes change at a rate of {free.rate:.3g}."
+                f" No symplectic map explains these data: {free.said} leaves {free.share:.1e} of the squares. Its "
+                f"Jacobian L fails the test of symplecticity: LᵀJ + JL, which is 0 for a Hamiltonian, is "
+                f"{free.defect:.2g} of L; volumes change at a rate of {free.rate:.3g}."
             )
+            if free.remedy:
+                warnings.warn(f"{said} {free.remedy}", UserWarning, stacklevel=3)
+                return
         smooth = smoothed(self.data)
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
         said += " " + hint(library_for(None, self.data.ndof, 4, smooth.points)[0], smooth, self.data, otherwise)
@@ -520,35 +583,37 @@ class Search:
     def freedom(self, setting: Setting) -> Freedom | None:
         """The comparison with a field that need not be Hamiltonian, where it explains much more than any H; else None.
 
-        The field of cubic polynomials has those of all H(q, p) of degree four, which must leave as much as the best
-        model: so that not only functions are missing.
+        A field of polynomials has those of all H(q, p) one degree higher, which must leave as much as the best model:
+        so that not only functions are missing.
         """
         if not self.tested:
             self.tested.append(self._freedom(setting))
         return self.tested[0]
 
     def _freedom(self, setting: Setting) -> Freedom | None:
-        held = self.winner[2]
-        for degree in (3, 2):
-            free = FreeField(self.data.scales, degree)
-            if self._affords_field(free):
-                break
-        else:
+        """The same by one division of the trajectories: a difference as large as is asked for needs no more."""
+        data, others = self.folds[0]
+        scales, rivals = data.scales, [self.winner[0].model]
+        reading = self.reading
+        if reading is None:
+            reading = next(
+                (r for r in map(partial(free_reading, scales), (3, 2)) if self._affords_field(r.field)), None
+            )
+        if reading is None:
             return None
-        found = fitted(free, self.data, setting)
-        theirs = left_out(found, self.folds, self.setting)
-        share = theirs.squares(self.data.scales) / held.squares(self.data.scales)
-        if not gains(held, theirs) or not share < FREER:
-            return None
-        H = Polynomial.up_to(degree + 1, "y", self.data.scales)
-        whole = left_out(fitted(self.said.whole(H), self.data, setting), self.folds, self.setting)
-        share = max(share, theirs.squares(self.data.scales) / whole.squares(self.data.scales))
-        if not gains(whole, theirs) or not share < FREER:
-            return None
-        states = found.states.T
-        return Freedom(share, free.defect(found.theta, states), float(np.mean(free.divergence(found.theta, states))))
+        if isinstance(reading.field, FreeField):
+            rivals.append(self.said.whole(Polynomial.up_to(reading.field.degree + 1, "y", scales)))
+        fit = fitted(reading.field, reading.of(data), setting.turned(reading.rows))
+        theirs = judged(fit, reading.of(others), self.setting.turned(reading.rows))
+        left, share = theirs.squares(scales[[*reading.rows]]), 0.0
+        for model in rivals:
+            _, held = self._first_fold(model, setting)
+            share = max(share, left / held.squares(scales))
+            if not gains(held, theirs) or not share < FREER:
+                return None
+        return Freedom(reading.said, reading.remedy(fit.theta), share, *reading.test(fit.theta, fit.states.T, scales))
 
-    def _affords_field(self, model: FreeField) -> bool:
+    def _affords_field(self, model: Field) -> bool:
         return model.n <= MOST_TERMS and self.numbers > 2 * model.n
 
     def bootstrap(self, n: int, session: Session) -> Replicas:
@@ -594,14 +659,7 @@ class Search:
     def flow(self, dt: float | None, name: str, session: Session) -> Any:
         """A flow of the H that was learned."""
         system = self.system(name)
-        options: dict[str, Any] = {"restarts": TABLE_STARTS}
-        if not system.separable:
-            options = {"optimizer": "gauss-newton", "time_budget": NETWORK_SECONDS}
-        if session.time_budget is not None:
-            options["time_budget"] = max(session.deadline.left, LEAST_SECONDS)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Training", category=RuntimeWarning)
-            flow = train(system, dt, progress=session.progress, seed=self.seed, **options)
+        flow = self._primed(system, dt, session) if system.separable else self._collocated(system, dt)
         flow.figures = {**flow.figures, **self.figures(flow.dt), "energy_scatter": self.energy_scatter(flow)}
         self._check_flow(flow)
         flow.history = self.history
@@ -610,6 +668,27 @@ class Search:
         flow.recipe = {**flow.recipe, "learned": {**learned, "damping": damping}}
         flow.take_learned(system)
         return flow
+
+    def _primed(self, system: HamiltonianSystem, dt: float | None, session: Session) -> FlowMap:
+        options: dict[str, Any] = {"restarts": TABLE_STARTS}
+        if session.time_budget is not None:
+            options["time_budget"] = max(session.deadline.left, LEAST_SECONDS)
+        if self.tested and self.tested[0] is not None:
+            options["time_budget"] = min(options.get("time_budget", math.inf), DOUBTFUL_SECONDS)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Training", category=RuntimeWarning)
+            return train(system, dt, progress=session.progress, seed=self.seed, **options)
+
+    def _collocated(self, system: HamiltonianSystem, dt: float | None) -> FlowMap:
+        """Steps of a Gauss method, as many as they take where the data are: no fit comes near their accuracy."""
+        states = self.final.states
+        states = states[np.random.default_rng(self.seed).permutation(len(states))[:STEPPED]]
+        if dt is not None:
+            try:
+                return SympFlow.collocated(system, dt=dt, states=states)
+            except ValueError as error:
+                warnings.warn(f"{error} The flow that was made has its own.", UserWarning, stacklevel=4)
+        return SympFlow.collocated(system, dt=suited_step(system, states), states=states)
 
     def _check_flow(self, flow: FlowMap) -> None:
         """Warn of a flow that is worse than the H of which it is."""
@@ -635,7 +714,9 @@ class Search:
             made["unconstrained_share"] = self.tested[0].share
         made |= {f"noise_{name}": float(s) for name, s in zip(self.data.names, found.sigma, strict=True)}
         passed = np.concatenate([run.t - run.t[0] for run in held.pieces])
-        squares = np.nanmean(np.concatenate(held.residuals, axis=1) ** 2, axis=0)
+        residuals = np.concatenate(held.residuals, axis=1)
+        seen = np.isfinite(residuals).any(axis=0)
+        passed, squares = passed[seen], np.nanmean(residuals[:, seen] ** 2, axis=0)
         for k in HORIZONS:
             near = np.abs(passed - k * dt) <= 0.5 * dt * max(1, k / 10)
             if near.any():

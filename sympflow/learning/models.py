@@ -744,7 +744,7 @@ class FreeField:
 
     def __init__(self, scales: Any, degree: int) -> None:
         m = len(scales)
-        self.ndof, self.scales = m // 2, np.asarray(scales, dtype=float)
+        self.ndof, self.degree = m // 2, degree
         self.polynomial = Polynomial("y", [(0,) * m, *Polynomial.up_to(degree, "y", scales).exponents.tolist()], scales)
         self.n = m * self.polynomial.n
 
@@ -767,20 +767,3 @@ class FreeField:
             for i in range(m):
                 columns[i, i * K : (i + 1) * K] = terms
         return Linear(rows @ terms, slopes, columns)
-
-    def defect(self, theta: np.ndarray, y: np.ndarray) -> float:
-        """The size of LᵀJ + JL over twice that of JL, L the Jacobian in units of the scales: at most 1, 0 for any H."""
-        d = self.ndof
-        slopes = self.field(theta, y, True, False).slope
-        assert slopes is not None
-        ratio = np.sqrt(self.scales[:d] / self.scales[d:])
-        units = np.concatenate([ratio, 1 / ratio])  # in which dq∧dp is what it is
-        L = slopes * (units / units[:, None])[..., None]
-        JL = np.concatenate([L[d:], -L[:d]])
-        return float(np.linalg.norm(JL - JL.transpose(1, 0, 2)) / (2 * np.linalg.norm(JL)))
-
-    def divergence(self, theta: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """The rate (N,) at which volumes of phase space grow."""
-        slopes = self.field(theta, y, True, False).slope
-        assert slopes is not None
-        return np.einsum("iin->n", slopes)

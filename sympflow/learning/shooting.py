@@ -706,6 +706,13 @@ def matched(model: Field, theta: np.ndarray, data: Trajectories, weights: np.nda
     return theta
 
 
+def increments_left(model: Field, theta: np.ndarray, data: Trajectories, weights: np.ndarray) -> float:
+    """The squares of y(t) − ∫ f_θ(y) dt less a constant for each piece, weighted (2d,): 0 of the field of the data."""
+    pieces = [run for run in map(_whole, data.runs) if run.n_points > 1]
+    r, _ = _increments(model, theta, pieces, weights) if pieces else (np.zeros(0), None)
+    return float(r @ r)
+
+
 def _whole(run: Run) -> Run:
     """The points at which all is observed."""
     kept = np.isfinite(run.y).all(axis=0)

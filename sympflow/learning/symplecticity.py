@@ -1,0 +1,176 @@
+"""The test whether any Hamiltonian explains the data, which takes a second and stands before all fits.
+
+Fields are compared by increments: y(t) − ∫ f(y) dt along a smoothed trajectory is constant if f is its field. Of an f
+that is linear in its numbers that is linear least squares, and no orbit is computed.
+
+References
+----------
+.. [1] D. A. Messenger, D. M. Bortz, Weak SINDy: Galerkin-based data-driven model selection, Multiscale Model. Simul. 19
+   (2021) 1474–1497, for integrals in place of derivatives.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sympflow.learning.models import FreeField, Model
+from sympflow.learning.shooting import Field, increments_left, matched
+from sympflow.learning.smoothing import smoothed
+from sympflow.learning.trajectories import Run, Trajectories
+
+DEGREES = (1, 2, 3)
+"""Of the fields that need not be Hamiltonian."""
+DOUBTFUL = 0.6
+"""Share of the squares of increments, left by another reading of the data, below which orbits are to decide."""
+PLAINER = 1.5
+"""Factor by which friction or another order of columns may leave more than a field without any structure."""
+POINTS = 24
+"""Of the pieces whose increments are compared."""
+LONG = 10
+"""Such pieces in a part of a trajectory that is smoothed."""
+COMPARED = 2000
+"""Points of trajectories that are compared."""
+PER_NUMBER = 3.0
+"""Values that there are at least for a number of a model."""
+MOST_NUMBERS = 400
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Another explanation of the data than a Hamiltonian in the coordinates as they are.
+
+    Attributes
+    ----------
+    field : Model or FreeField
+    rows : tuple of int
+        The order in which it takes the coordinates.
+    share : float
+        Squares of held-out increments that it leaves, over those of the best Hamiltonian.
+    said : str
+        The explanation in words.
+    advice : str
+        What to do then, with a place for the rates of friction.
+    """
+
+    field: Field
+    rows: tuple[int, ...]
+    share: float
+    said: str
+    advice: str = ""
+
+    def of(self, data: Trajectories) -> Trajectories:
+        """The data with the coordinates in this order."""
+        names = tuple(data.names[i] for i in self.rows)
+        return replace(data, runs=tuple(Run(run.t, run.y[[*self.rows]]) for run in data.runs), names=names)
+
+    def remedy(self, theta: np.ndarray) -> str:
+        """What to do."""
+        rates = theta[-self.field.ndof :]
+        return self.advice.format(", ".join(f"{rate:.3g}" for rate in rates))
+
+    def test(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
+        """The defect of symplecticity in the coordinates as they are, and the rate at which volumes grow.
+
+        Parameters
+        ----------
+        states : ndarray of shape (2d, n)
+            In the order of the reading.
+        scales : ndarray of shape (2d,)
+            Of the coordinates as they are.
+
+        Returns
+        -------
+        defect : float
+            The size of LᵀJ + JL over twice that of JL, L the Jacobian in units of the scales: at most 1, 0 for any H.
+        rate : float
+        """
+        slopes = self.field.field(theta, states, True, False).slope
+        assert slopes is not None
+        back = np.argsort(self.rows)
+        slopes = slopes[np.ix_(back, back)]
+        d = len(scales) // 2
+        ratio = np.sqrt(scales[:d] / scales[d:])
+        units = np.concatenate([ratio, 1 / ratio])  # in which dq∧dp remains as it is
+        L = slopes * (units / units[:, None])[..., None]
+        JL = np.concatenate([L[d:], -L[:d]])
+        defect = float(np.linalg.norm(JL - JL.transpose(1, 0, 2)) / (2 * np.linalg.norm(JL)))
+        return defect, float(np.einsum("iin->n", slopes).mean())
+
+
+FRICTION = (
+    "the best H with friction p' = -γp",
+    "There is friction, γ = {}: areas of phase space shrink as exp(-γt). Pass damping=True to `learn`.",
+)
+PAIRS = ("the same in the order q1, p1, q2, p2, … of columns", 'The columns look like that: pass order="pairs".')
+
+
+def free_reading(scales: np.ndarray, degree: int) -> Reading:
+    """A field of polynomials that need not be Hamiltonian."""
+    said = "a vector field of polynomials that need not be Hamiltonian"
+    return Reading(FreeField(scales, degree), tuple(range(len(scales))), math.inf, said)
+
+
+def best_by_increments(
+    data: Trajectories, held: Trajectories, models: Sequence[Model]
+) -> tuple[int, Reading | None] | None:
+    """The place of the model, linear in its numbers, that explains held-out increments best, and a doubt, if any.
+
+    Returns
+    -------
+    tuple of int and (Reading or None), or None
+        The reading of the data that leaves much less than all models, None if there is none; None in place of the pair
+        if there are too few points to tell.
+    """
+    scales, d = data.scales, data.ndof
+    fitted, others = _smooth(data), _smooth(held)
+    rows = tuple(range(2 * d))
+    affordable = [k for k, model in enumerate(models) if _affords(fitted, model)]
+    if not affordable or not others.runs:
+        return None
+    squares = {k: _left(models[k], fitted, others, scales) for k in affordable}
+    best = min(affordable, key=lambda k: squares[k])
+    if not 0 < squares[best] < math.inf:
+        return best, None
+
+    def compared(reading: Reading) -> Reading:
+        a, b = reading.of(fitted), reading.of(others)
+        return replace(reading, share=_left(reading.field, a, b, scales[[*reading.rows]]) / squares[best])
+
+    free = [free_reading(scales, degree) for degree in DEGREES]
+    found = [compared(reading) for reading in free if _affords(fitted, reading.field)]
+    rated = [replace(models[k], rates=d) for k in affordable if not models[k].rates]
+    plain = [Reading(model, rows, math.inf, *FRICTION) for model in rated if _affords(fitted, model)]
+    if d > 1:
+        turned = (*range(0, 2 * d, 2), *range(1, 2 * d, 2))
+        plain += [Reading(models[k], turned, math.inf, *PAIRS) for k in affordable]
+    plain = [compared(reading) for reading in plain]
+    likeliest = min(plain, key=lambda reading: reading.share, default=None)
+    freest = min(found, key=lambda reading: reading.share, default=None)
+    if likeliest is None or (freest is not None and likeliest.share > PLAINER * freest.share):
+        likeliest = freest
+    return best, (likeliest if likeliest is not None and likeliest.share < DOUBTFUL else None)
+
+
+def _affords(data: Trajectories, model: Field) -> bool:
+    return model.n <= MOST_NUMBERS and PER_NUMBER * model.n < data.n_values
+
+
+def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarray) -> float:
+    """The squares that a model which was fitted to increments leaves of held-out ones; infinite where it diverges."""
+    theta = matched(model, np.zeros(model.n), data, 1 / scales)
+    squares = increments_left(model, theta, held, 1 / scales)
+    return squares if math.isfinite(squares) else math.inf
+
+
+def _smooth(data: Trajectories) -> Trajectories:
+    """Pieces of smoothed trajectories, evenly chosen."""
+    pieces = data.pieces(LONG * POINTS)
+    n = max(1, min(len(pieces.runs), COMPARED * len(pieces.runs) // max(pieces.n_points, 1)))
+    some = pieces.subset(np.unique(np.linspace(0, len(pieces.runs) - 1, n).astype(int)).tolist())
+    curves = smoothed(some).states
+    runs = tuple(Run(run.t, y) for run, y in zip(some.runs, curves, strict=True) if run.n_points > 1)
+    return replace(some, runs=runs).pieces(POINTS)
