@@ -217,7 +217,7 @@ class SympFlow(FlowMap):
         degree: int | None = None,
         force_gradient: bool | Sequence[int] | None = None,
         processor: int = 0,
-        curvature: bool = False,
+        curvature: bool | Sequence[int] = False,
         polynomial: int | None = None,
         first: str = "drift",
         dtype: torch.dtype = torch.float64,
@@ -245,13 +245,15 @@ class SympFlow(FlowMap):
         force_gradient : bool or sequence of int, optional
             True for a term in ½|∇V|²_{M⁻¹} in the kicks, which is the default where T is quadratic. Of a sequence of
             integers these kicks of the kernel alone have it, counted from 0: ``[1, 3]`` of five. Where a force gradient
-            takes as long as a force, as on lattices of polynomials, more kicks with fewer of them go farther.
+            takes as long as a force, as on lattices of polynomials, more kicks with fewer of them go farther, and so do
+            two or three with one of them in few degrees of freedom.
         processor : int
             Number of kicks of χ in ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹, 0 for none. A run executes χ⁻¹ once, the kernel K of
             `stages` kicks in every step, and χ for every output.
-        curvature : bool
-            True for a further term in ½ v·∇²V v, v = M⁻¹∇V, which takes third derivatives of V: for symbolic systems. A
-            trained kick with it comes tens of times nearer, and takes 1.1 to 1.5 times as long.
+        curvature : bool or sequence of int
+            True for a further term in ½ v·∇²V v, v = M⁻¹∇V, which takes third derivatives of V: for symbolic systems.
+            Or the numbers of the kicks that have it, of those with force gradients. A trained kick with it comes tens
+            of times nearer, and takes 1.1 to 1.5 times as long.
         polynomial : int, optional
             In place of force gradients and curvatures every kick has a trained polynomial in q of this total degree,
             t³ Σ_m e_m(t) q^m: for symbolic systems in few degrees of freedom. Its monomials are those of V and of what

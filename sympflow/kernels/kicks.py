@@ -136,7 +136,7 @@ def _source(
     for kick in reversed(kinds):
         name, terms = kick.name, len(kick.numbers)
         if ranges and isinstance(symbols, SymbolicHamiltonian):
-            tried = _tried_in(symbols, terms, f"{name[0]}_", ranges if kick is kinds[0] else ())
+            tried = _tried_in(symbols, terms, f"{name[0]}_", ranges)
         else:
             tried = _tried(symbols, terms, f"{name[0]}_", monomials)
         one = min(tried, key=lambda kick: (kick.cycles, kick.operations))
@@ -301,13 +301,8 @@ def _numbered(f: sp.Expr, states: set[sp.Symbol], numbers: dict[sp.Expr, sp.Symb
 
 
 def _tried_in(symbols: SymbolicHamiltonian, terms: int, prefix: str, ranges: Ranges) -> list[_Kick]:
-    """Shapes by letters for functions, of arithmetic alone, and in ranges of positions as polynomials.
-
-    Without ranges the first shape alone, of kicks that a flow hardly has.
-    """
+    """Shapes by letters for functions, of arithmetic alone, and in ranges of positions as polynomials."""
     tried = [_scheduled(symbols, next(shapes(symbols, terms)), prefix)]
-    if not ranges:
-        return tried
     parts = _parts(symbols, terms)
     if symbols.ndof == 1:
         tried += _whole_polynomials(symbols, parts, prefix, ranges)

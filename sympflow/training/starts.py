@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Protocol
@@ -61,8 +62,8 @@ class Primed:
         Kicks of the kernel K.
     processor : int
         Kicks of the processor χ.
-    curvature : bool
-        Whether kicks have curvature terms.
+    curvature : bool or tuple of int
+        Whether, or which, kicks have curvature terms.
     polynomial : int, optional
         The degree of the polynomials in place of these.
     first : {"drift", "kick"}
@@ -76,13 +77,24 @@ class Primed:
     dt: float
     stages: int = 3
     processor: int = 6
-    curvature: bool = False
+    curvature: bool | tuple[int, ...] = False
     polynomial: int | None = None
     first: str = "drift"
     scheme: str | None = None
     force_gradient: bool | tuple[int, ...] | None = None
 
     kind: ClassVar[str] = "primed"
+
+    @property
+    def levels(self) -> list[int]:
+        """The terms of each kick of a step, see `sympflow.schemes.Scheme.level`; one that steps share counts once."""
+        n = self.stages + (self.first == "kick")
+
+        def having(which: bool | tuple[int, ...] | None) -> Iterable[int]:
+            return which if isinstance(which, tuple) else range(n if which or which is None else 0)
+
+        levels = [(i in having(self.force_gradient)) * (1 + (i in having(self.curvature))) for i in range(n)]
+        return levels if self.first == "drift" else levels[:-1]
 
     def flow(
         self, system: HamiltonianSystem, domain: Domain | None = None, earlier: FlowMap | None = None

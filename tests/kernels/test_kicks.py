@@ -39,8 +39,14 @@ ELEMENTARY = {
 }
 
 
-@pytest.mark.parametrize("terms", [1, 2, 3])
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    ("name", "terms"),
+    [
+        pytest.param(name, terms, marks=[pytest.mark.slow] * (terms == 3 and name in ("quartic", "masses")))
+        for name in SCENES
+        for terms in (1, 2, 3)
+    ],
+)
 def test_every_shape_gives_the_same_momenta(name, terms):
     system = SCENES[name]()
     forms = list(shapes(system.symbols, terms))
