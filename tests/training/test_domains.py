@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from sympflow import Box, HamiltonianSystem, systems, train
+from sympflow import Box, EnergySublevel, HamiltonianSystem, systems, train
 from sympflow.training.starts import frequency, warn_of_domain
 
 MORSE = "p**2/2 + (1 - exp(-q))**2"
@@ -38,6 +38,26 @@ def test_a_half_without_a_finite_energy_is_left_out():
     assert "is not finite at 175 of 400 states" in message
     assert 0 <= lower[0] < 0.05
     assert upper[0] > 0.9
+
+
+def test_a_wall_that_orbits_come_to_is_no_part_to_leave_out():
+    """A ball falls on exp(−20 q): where it falls freely nothing oscillates, but it comes back to the wall."""
+    system = HamiltonianSystem.from_sympy("p**2/2 + exp(-20*q) + q", domain=Box([-0.3, -2], [3, 2]))
+    with pytest.warns(UserWarning, match="no smaller box holds them") as found:
+        warn_of_domain(system, system.domain)
+    dt, energy, low, high = re.search(
+        r": (\S+) in EnergySublevel\((\S+), Box\(\[(.+)\], \[(.+)\]\)\)", str(found[0].message)
+    ).groups()
+    corners = [[float(x) for x in corner.split(",")] for corner in (low, high)]
+    smaller = EnergySublevel(float(energy), Box(*corners), hamiltonian=system.hamiltonian)
+    assert 1.0 / frequency(system, smaller) == pytest.approx(float(dt), rel=0.2)
+    assert 2 * frequency(system, smaller) < frequency(system, system.domain)
+
+
+def test_the_wall_of_a_logarithm_is_told():
+    _, message, (lower, _) = warned("p**2/2 + q - log(q)", [0.01, -2.0], [3.0, 2.0])
+    assert "take that, or a smaller one" in message
+    assert lower[0] >= 0.1
 
 
 @pytest.mark.parametrize("make", [systems.henon_heiles, systems.pendulum, systems.quartic, systems.kepler])
