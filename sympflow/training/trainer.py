@@ -349,9 +349,7 @@ def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
             f"domain={remedy_for(system)}."
         )
     if not isinstance(domain, Domain):
-        raise TypeError(
-            f"`domain` must be a domain of phase space; got {domain!r}: use {remedy_for(system)}."
-        )
+        raise TypeError(f"`domain` must be a domain of phase space; got {domain!r}: use {remedy_for(system)}.")
     domain = domain_of(domain, system)
     width = domain.sample(1, 0).shape[-1]
     if width != 2 * system.ndof:
