@@ -13,7 +13,7 @@ import sympy as sp
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
 
-__all__ = ["Letters", "OnInterval", "Ranges", "on_interval", "position_ranges", "range_of"]
+__all__ = ["UNTOUCHED", "Letters", "OnInterval", "Ranges", "on_interval", "position_ranges", "range_of"]
 
 Ranges = tuple[tuple[float, float], ...]
 """Intervals of q1 … qd in which kicks are computed by polynomials; none for none."""
@@ -25,11 +25,14 @@ EXACT = 2.0**-54  # of the largest value
 AMPLIFIED = 16.0  # by so much rounding errors may grow
 STATES, MARGIN = 1000, 0.05  # of a domain whose positions, with a margin on both sides, are a range
 
+UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
+"""Functions with kinks, of which an expression is left as it is."""
+
 
 def position_ranges(symbols: SymbolicHamiltonian, domain: Domain) -> Ranges:
     """The intervals of the positions in a domain; none for a V of which kicks make no use of them."""
     assert symbols.V is not None
-    if symbols.V.is_polynomial(*symbols.q):
+    if symbols.V.is_polynomial(*symbols.q) or symbols.V.has(*UNTOUCHED):
         return ()
     if symbols.ndof > 1 and not any(len(f.args) == 1 for f in symbols.V.atoms(sp.Function)):
         return ()

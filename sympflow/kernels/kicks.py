@@ -13,7 +13,7 @@ import sympy as sp
 
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
-from sympflow.kernels.approximations import Letters, OnInterval, Ranges, on_interval, range_of
+from sympflow.kernels.approximations import UNTOUCHED, Letters, OnInterval, Ranges, on_interval, range_of
 from sympflow.kernels.codegen import as_factor, parameter_lines, printed, vectorised
 from sympflow.kernels.scheduling import ADD, FUSED, PRODUCTS, Schedule, nested
 from sympflow.kernels.stages import kicks_of
@@ -29,8 +29,6 @@ MOST_MULTIPLIED = 3000  # terms, of what is factored or multiplied out
 MOST_TERMS = 120  # of a sum multiplied out
 MOST_NESTED = 12  # of a momentum's sum that is nested
 B, G, C = sp.symbols("b g c", real=True)
-UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
-"""Functions of which an expression is left as it is."""
 
 
 @dataclass(frozen=True)

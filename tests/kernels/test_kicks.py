@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from sympflow import SympFlow, systems
+from sympflow import Box, SympFlow, systems
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.approximations import on_interval
+from sympflow.kernels.approximations import on_interval, position_ranges
 from sympflow.kernels.codegen import printed
 from sympflow.kernels.kicks import _by_products, _function, _scheduled, kicks_source, shapes
 from sympflow.kernels.scheduling import ADD, FUSED, MULTIPLY, Schedule, nested
@@ -140,6 +140,12 @@ def test_kicks_in_ranges_of_positions_are_the_same_but_for_rounding(name, level)
         lane = functions[f"{kind}_kicked_lane"](q, p, numbers)
         np.testing.assert_allclose(alone, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
         np.testing.assert_allclose(lane, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
+
+
+def test_kinks_have_no_ranges():
+    system = HamiltonianSystem.from_sympy("p**2/2 + Abs(q)", domain=Box([-1, -1], [1, 1]))
+    assert position_ranges(system.symbols, system.domain) == ()
+    assert "DiracDelta" not in kicks_source(system.symbols, FORCE_GRADIENT)
 
 
 def test_functions_are_polynomials_where_few_powers_are_exact():
