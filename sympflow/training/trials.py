@@ -227,7 +227,7 @@ def shaped(start: Primed) -> list[Primed]:
 def dividing(dt: float) -> float:
     """The Δt nearest to dt that divides a power of ten, 10ᵏ/n with n ≤ 10: round times are on its grid.
 
-    An output there costs a third of one between steps, and the gain of a flow hardly depends on Δt.
+    An output there takes C kicks, one between steps 2C + S more, and the gain of a flow hardly depends on Δt.
     """
     unit = 10.0 ** math.floor(math.log10(dt))
     return min((10 * unit / n for n in range(1, 11)), key=lambda t: abs(math.log(t / dt)))

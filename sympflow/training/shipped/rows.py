@@ -100,7 +100,7 @@ def ladders() -> list[Recipe]:
         rung(hh, 1, 0.82, fit=NewFit(seed=4, energy_weight=1000.0)),
         *(rung(hh, 3, dt, curvature=True) for dt in (1.6, 1.4, 1.0, 0.8, 0.6, 0.4)),
         # Two kicks in a step, that which steps share with a force gradient alone.
-        *(rung(hh, 2, dt, 9, curvature=(1,), first="kick") for dt in (1.1, 0.65)),
+        *(rung(hh, 2, dt, 12, curvature=(1,), first="kick") for dt in (1.25, 0.7)),
         rung(swing, 2, 1.5, fit=plain),
         *(rung(swing, 3, dt, fit=plain, curvature=True) for dt in (2.0, 1.5)),
         *(rung(swing, 3, dt, curvature=True) for dt in (1.0, 0.8, 0.6, 0.4)),
