@@ -44,8 +44,7 @@ def rung(
     processor: int = 6,
     fit: NewFit | None = None,
     *,
-    curvature: bool | tuple[int, ...] = False,
-    force_gradient: tuple[int, ...] | None = None,
+    curvature: bool = False,
     polynomial: int | None = None,
     first: str = "drift",
     after: str | None = None,
@@ -57,7 +56,7 @@ def rung(
     ----------
     scene, after, judge
         See `Recipe`; it is judged by its certificate over T = 1000 by default.
-    stages, dt, processor, curvature, force_gradient, polynomial, first
+    stages, dt, processor, curvature, polynomial, first
         See `sympflow.training.starts.Primed`.
     fit : NewFit, optional
         The options of `train`.
@@ -65,7 +64,7 @@ def rung(
     fit = NewFit() if fit is None else fit
     fit = replace(fit, restarts=12) if fit.restarts is None else fit
     name = f"{'primed' if polynomial is None else 'polynomial'}-{stages}-{dt:g}"
-    start = Primed(dt, stages, processor, curvature, polynomial, first, force_gradient=force_gradient)
+    start = Primed(dt, stages, processor, curvature, polynomial, first)
     judge = ByCertificate() if judge is None else judge
     return Recipe(scene.replace("-", "_"), name, SYSTEMS[scene], start, judge, (fit,), after=after)
 
@@ -99,14 +98,11 @@ def ladders() -> list[Recipe]:
         # Of six seeds the one whose energy error over a long time is the lowest: the fit looks at single steps.
         rung(hh, 1, 0.82, fit=NewFit(seed=4, energy_weight=1000.0)),
         *(rung(hh, 3, dt, curvature=True) for dt in (1.6, 1.4, 1.0, 0.8, 0.6, 0.4)),
-        # Two kicks in a step, that which steps share with a force gradient alone.
-        *(rung(hh, 2, dt, 12, curvature=(1,), first="kick") for dt in (1.25, 0.7)),
         rung(swing, 2, 1.5, fit=plain),
         *(rung(swing, 3, dt, fit=plain, curvature=True) for dt in (2.0, 1.5)),
         *(rung(swing, 3, dt, curvature=True) for dt in (1.0, 0.8, 0.6, 0.4)),
         rung(quartic, 1, 0.5),
         *(rung(quartic, 3, dt) for dt in (0.75, 0.6, 0.5, 0.4)),
-        rung(quartic, 2, 0.4, 9, force_gradient=(1,), first="kick"),
         # Beside the first for the energy, those for the state; T = 100 and 1000 are whole numbers of their Δt.
         in_powers(8, 1.0, 8, replace(followed, restarts=40, steps=400, seed=1)),
         *(in_powers(6, dt, 8, replace(of_state, restarts=24, seed=1)) for dt in (100 / 62, 100 / 96)),
