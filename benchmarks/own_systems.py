@@ -188,7 +188,8 @@ def main(given: list[str] | None = None) -> None:
         parser.error(f"no system {', '.join(sorted(unknown))}: choose of {', '.join(SYSTEMS)}")
     lines = [
         "| system | flow: Δt, kicks + processor | training | energy error, T = 1000 "
-        "| one trajectory: best scheme takes | 1000 outputs | batch of 1000, T = 100 | batch, T = 1000 | Kahan–Li 8 takes |",
+        "| one trajectory: best scheme takes | 1000 outputs "
+        "| batch of 1000, T = 100 | batch of 1000, T = 1000 | Kahan–Li 8 takes |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     print(*lines, sep="\n")
