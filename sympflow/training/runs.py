@@ -263,6 +263,8 @@ class Unstarted(Run):
         return INTERRUPTED if session.interruption.asked else NO_LABELS
 
     def ended_early(self, reason: str) -> str:
+        if reason == INTERRUPTED:
+            return f"Training did not start because {reason}. What it was to start from is returned, the best so far."
         return (
             f"Training did not start because {reason}: {self.reached}. What it was to start from is returned. Give a "
             "longer `time_budget`, a shorter `dt`, or fewer `points`, `label_times` and `reference_states`; or a "
