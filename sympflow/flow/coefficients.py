@@ -27,6 +27,8 @@ class FreeTable(nn.Module):
         For how many k, from 0, the sum over i is fixed, whatever the parameters: Σ_i c_i0 = total, the others 0. The
         middle (or else the last) c_ik is what the others leave.
     total : float, optional
+    present : sequence of int, optional
+        The i of the c_ik that are not always 0; the default is all.
 
     Attributes
     ----------
@@ -48,12 +50,14 @@ class FreeTable(nn.Module):
         total: float | None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
+        present: Sequence[int] | None = None,
     ) -> None:
         super().__init__()
         representative = np.minimum(np.arange(n), np.arange(n)[::-1]) if palindromic else np.arange(n)
         count = np.bincount(representative)
         last = len(count) - 1
-        self._free = [(i, k) for i in range(last + 1) for k in range(terms) if i != last or k >= bound]
+        kept = range(n) if present is None else present
+        self._free = [(i, k) for i in range(last + 1) if i in kept for k in range(terms) if i != last or k >= bound]
         basis, offset = np.zeros((n, terms, len(self._free))), np.zeros((n, terms))
         for column, (i, k) in enumerate(self._free):
             basis[representative == i, k, column] = 1.0
@@ -95,9 +99,11 @@ class Coefficients(FreeTable):
     palindromic : bool
     total : float, optional
     always : bool
+    present : sequence of int, optional
+        The i of the c_i that are not always 0; the default is all.
     """
 
-    always = False  # of pickles of earlier versions, which did not have it
+    always, present = False, None  # of pickles of earlier versions, which did not have them
 
     def __init__(
         self,
@@ -110,10 +116,11 @@ class Coefficients(FreeTable):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
         always: bool = False,
+        present: Sequence[int] | None = None,
     ) -> None:
         bound = len(exponents) if always else int(total is not None)
-        super().__init__(n, len(exponents), palindromic, bound, total, dtype, device)
-        self.exponents, self.dt, self.power, self.always = exponents, dt, power, always
+        super().__init__(n, len(exponents), palindromic, bound, total, dtype, device, present)
+        self.exponents, self.dt, self.power, self.always, self.present = exponents, dt, power, always, present
 
     def set_constant(self, c: Sequence[Any]) -> None:
         """Let c_i(τ) be c_i at every τ."""

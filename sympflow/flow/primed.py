@@ -86,6 +86,10 @@ class PrimedShape:
     timed : bool
         True if the drifts of the kernel add up to t at every t, as they must with friction, with an exact e^{−γt},
         and in a driven system, in which the time moves with them.
+    gradient_kicks : tuple of int, optional
+        The kicks of the kernel, counted from 0, that have force gradients, where others have none.
+    curvature_kicks : tuple of int, optional
+        Those of them that have curvature terms, where others have none.
 
     Raises
     ------
@@ -102,6 +106,8 @@ class PrimedShape:
     curvature: bool = False
     monomials: Monomials = ()
     timed: bool = False
+    gradient_kicks: tuple[int, ...] | None = None
+    curvature_kicks: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         maps, degree, processor = self.maps, self.degree, self.processor
@@ -120,6 +126,28 @@ class PrimedShape:
             raise ValueError("`curvature` goes with force gradients: leave it out.")
         if self.monomials and self.force_gradient:
             raise ValueError("`monomials` stand in place of force gradients: leave these out.")
+        if self.gradient_kicks is not None:
+            self._check_kicks("force_gradient", self.gradient_kicks, self.force_gradient)
+        if self.curvature_kicks is not None:
+            self._check_kicks("curvature", self.curvature_kicks, self.curvature)
+            if self.gradient_kicks is not None and not set(self.curvature_kicks) <= set(self.gradient_kicks):
+                raise ValueError(
+                    f"`curvature` {self.curvature_kicks!r} names kicks without force gradients: name some of "
+                    f"{self.gradient_kicks!r}."
+                )
+
+    def _check_kicks(self, name: str, kicks: tuple[int, ...], has: bool) -> None:
+        n = self.kernel.count("kick")
+        if not kicks or not has or list(kicks) != sorted(set(kicks) & set(range(n))):
+            raise ValueError(
+                f"`{name}` {kicks!r} does not name kicks from 0 to {n - 1}, each once and in order: name some, "
+                "or take True for all, False for none."
+            )
+        if self.palindromic and kicks != tuple(n - 1 - i for i in reversed(kicks)):
+            raise ValueError(
+                f"`{name}` {kicks!r} is not the same from either end of {n} kicks: name their mirror images "
+                "too, or take palindromic=False."
+            )
 
     @property
     def kernel(self) -> tuple[Kind, ...]:
@@ -137,14 +165,17 @@ class PrimedShape:
             return Columns()
         powers, mirrored = range(0, self.degree, 2 if self.palindromic else 1), self.palindromic and total is not None
 
-        def column(kind: Kind, power: int, total: float | None = None, always: bool = False) -> Coefficients:
-            return Coefficients(sequence.count(kind), tuple(powers), dt, power, mirrored, total, always=always, **like)
+        def column(kind: Kind, power: int, total: float | None = None, **more: Any) -> Coefficients:
+            return Coefficients(sequence.count(kind), tuple(powers), dt, power, mirrored, total, **more, **like)
+
+        having, curved = (None, None) if total is None else (self.gradient_kicks, self.curvature_kicks)
+        curved = having if curved is None else curved
 
         return Columns(
             column("kick", 1, total),
-            column("drift", 1, total, self.timed and total is not None),
-            column("kick", 3) if self.force_gradient else None,
-            column("kick", 5) if self.curvature else None,
+            column("drift", 1, total, always=self.timed and total is not None),
+            column("kick", 3, present=having) if self.force_gradient else None,
+            column("kick", 5, present=curved) if self.curvature else None,
             nn.ModuleList(column("kick", 3) for _ in self.monomials) if self.monomials else None,
         )
 
@@ -160,6 +191,8 @@ class PrimedShape:
             "curvature": self.curvature,
             **({"monomials": [list(m) for m in self.monomials]} if self.monomials else {}),
             **({"timed": True} if self.timed else {}),
+            **({} if self.gradient_kicks is None else {"gradient_kicks": list(self.gradient_kicks)}),
+            **({} if self.curvature_kicks is None else {"curvature_kicks": list(self.curvature_kicks)}),
         }
 
     @classmethod
@@ -182,6 +215,7 @@ class PrimedShape:
         processor = plan.get("processor", 0)
         if processor != 0 or isinstance(processor, bool):
             processor = checked_integer(processor, "processor", MAX_LAYERS)
+        flags |= {name: _checked_kicks(plan.get(name)) for name in ("gradient_kicks", "curvature_kicks")}
         exponents = _checked_monomials(plan.get("monomials", []), ndof)
         return cls(plan["first"], maps, degree, processor=processor, monomials=exponents, **flags)
 
@@ -190,6 +224,14 @@ def _alternating(first: Kind, n: int) -> tuple[Kind, ...]:
     """Return the kinds of n maps."""
     other: Kind = "drift" if first == "kick" else "kick"
     return tuple(first if i % 2 == 0 else other for i in range(n))
+
+
+def _checked_kicks(plan: Any) -> tuple[int, ...] | None:
+    if plan is None:
+        return None
+    if not isinstance(plan, list) or not all(isinstance(i, int) and not isinstance(i, bool) for i in plan):
+        raise Refused("its kicks with force gradients or curvature terms are not a list of integers")
+    return tuple(plan)
 
 
 def _checked_monomials(plan: Any, ndof: int) -> Monomials:
@@ -458,25 +500,24 @@ class PrimedFlow(SympFlow):
         palindromic: bool,
         scheme: Scheme | str | None,
         degree: int | None,
-        force_gradient: bool | None,
+        force_gradient: bool | Sequence[int] | None,
         processor: int,
-        curvature: bool,
+        curvature: bool | Sequence[int],
         polynomial: int | None,
         first: str,
         dtype: torch.dtype,
         device: torch.device | str | None,
     ) -> Self:
         """Return a flow that is, at every t, equal leapfrog steps or the given scheme: see `SympFlow.primed`."""
-        stages, palindromic, scheme, degree, force_gradient = map(
-            plain, (stages, palindromic, scheme, degree, force_gradient)
-        )
-        processor, curvature, polynomial = map(plain, (processor, curvature, polynomial))
+        stages, palindromic, scheme, degree = map(plain, (stages, palindromic, scheme, degree))
+        processor, polynomial = map(plain, (processor, polynomial))
+        some = None
+        if force_gradient is not None:
+            force_gradient, some = _kicks_of("force_gradient", force_gradient)
+        curvature, curved = _kicks_of("curvature", curvature)
         check_system(system)
         check_for_flows(system, cls.takes_friction, cls.takes_driving)
         check_flag("palindromic", palindromic)
-        check_flag("curvature", curvature)
-        if force_gradient is not None:
-            check_flag("force_gradient", force_gradient)
         if not system.separable:
             raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
         if system.kinetic_timed:
@@ -499,6 +540,11 @@ class PrimedFlow(SympFlow):
             raise ValueError(
                 f"`polynomial` stands in place of force gradients, as {scheme.name!r} has them: take another."
             )
+        if some is not None and any(s.three for i, s in enumerate(_kicks(scheme)) if i not in some):
+            raise ValueError(
+                f"`force_gradient` {some!r} leaves out kicks of {scheme.name!r} that have force gradients: name these "
+                "too, or leave it out."
+            )
         if any(scheme.gradients) and not force_gradient:
             raise ValueError(f"`force_gradient` is False but {scheme.name!r} has force gradients: leave it out.")
         substeps = scheme.substeps
@@ -512,9 +558,11 @@ class PrimedFlow(SympFlow):
             curvature=curvature,
             monomials=exponents,
             timed=_is_timed(system),
+            gradient_kicks=some,
+            curvature_kicks=curved,
         )
         flow = cls(system.ndof, shape, dt, system, dtype, device)
-        kicks, drifts = ([s for s in substeps if s.kind == kind] for kind in ("kick", "drift"))
+        kicks, drifts = _kicks(scheme), [s for s in substeps if s.kind == "drift"]
         flow.kicks.set_constant([s.one for s in kicks])
         flow.drifts.set_constant([s.one for s in drifts])
         if flow.gradients is not None:
@@ -821,6 +869,21 @@ def _starting_scheme(system: HamiltonianSystem, scheme: Any, stages: Any, first:
     if (scheme.nystrom or any(scheme.gradients)) and not system.quadratic_kinetic:
         raise ValueError(f"`scheme` {scheme.name!r} needs a kinetic energy ½ pᵀM⁻¹p: take 'kahan_li8', for instance.")
     return scheme
+
+
+def _kicks(scheme: Scheme) -> list[Any]:
+    return [s for s in scheme.substeps if s.kind == "kick"]
+
+
+def _kicks_of(name: str, asked: Any) -> tuple[bool, tuple[int, ...] | None]:
+    """Return True where a term of kicks is asked for, with the kicks that have it where not all do."""
+    asked = plain(asked)
+    if isinstance(asked, Sequence) and not isinstance(asked, str):
+        kicks = tuple(map(plain, asked))
+        if all(isinstance(i, int) and not isinstance(i, bool) for i in kicks):
+            return True, kicks
+    check_flag(name, asked)
+    return asked, None
 
 
 def _force_gradient_of(system: HamiltonianSystem, asked: bool | None, curvature: bool) -> bool:

@@ -18,8 +18,8 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import (
     constants_source,
     elementary,
-    imports_source,
     load_algebra,
+    load_around,
     load_module,
     template,
 )
@@ -215,7 +215,7 @@ def family_loops(
         sources.append("@njit(**OPTIONS)\ndef apply_inverse_mass(v, out, work):\n    kinetic_gradient(v, out)")
     kinds = kicks_of(level, len(monomials))
     source, shared = _around_arrays(sources, symbols.ndof, kinds, compensated, friction, driving)
-    return _array_functions(vars(load_module(source, shared)))
+    return _array_functions(load_module(source, shared))
 
 
 def _around_arrays(
@@ -273,9 +273,9 @@ def _given_functions(level: int, driven: bool, time_first: bool = False) -> str:
     return "\n\n\n".join(sources)
 
 
-def _array_functions(module: dict[str, Any]) -> LoopFunctions:
+def _array_functions(module: ModuleType) -> LoopFunctions:
     names = ("rollout", "rollout_each", "rollout_processed", "rollout_processed_rows", "step_each")
-    return LoopFunctions(*(module[name] for name in names))
+    return LoopFunctions(*(getattr(module, name) for name in names))
 
 
 def array_loops(
@@ -293,9 +293,8 @@ def array_loops(
     sources = [_inverse_mass_source(inverse_mass), _given_functions(level, driven, time_first=True)]
     given = kicks_of(level), compensated, friction, TimeAlone() if driven else None
     source, shared = _around_arrays(sources, ndof, *given, cache=False)
-    functions: dict[str, Any] = {"INVERSE_MASS": inverse_mass, "gradient": gradient, "hessian_vector": hessian_vector}
-    exec(imports_source(shared) + source, functions)
-    return _array_functions(functions)
+    functions = {"INVERSE_MASS": inverse_mass, "gradient": gradient, "hessian_vector": hessian_vector}
+    return _array_functions(load_around(source, shared, **functions))
 
 
 def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool) -> SizedLoops:

@@ -37,6 +37,7 @@ __all__ = [
     "given",
     "imports_source",
     "load_algebra",
+    "load_around",
     "load_module",
     "run_one",
     "run_rows",
@@ -117,6 +118,14 @@ def load_module(source: str, shared: Sequence[str] = ()) -> ModuleType:
     return _loaded(source, tuple(shared))
 
 
+def load_around(source: str, shared: Sequence[str] = (), **given: Any) -> ModuleType:
+    """`load_module` of a source around compiled functions of the user, which it knows as `given`; kept on no disk."""
+    module = ModuleType("sympflow_kernel_around")
+    vars(module).update(given)
+    exec(imports_source(shared) + source, vars(module))
+    return _callable_part(module)
+
+
 @cache
 def _loaded(source: str, shared: tuple[str, ...]) -> ModuleType:
     return _callable_part(_imported(source, shared))
@@ -180,7 +189,7 @@ def _callable_part(module: ModuleType) -> ModuleType:
     """The constants, and the compiled functions that Python may call: those of `_CALLED` or that no other one names.
 
     The others are compiled without an entry from Python, which for functions as small as these is a third of the time
-    that compilation takes. Such a function must not be called: so the part has none.
+    that compilation takes. Such a function must not be called: so the part has none. C calls none of them.
     """
     functions = _functions(module)
     part = ModuleType(module.__name__)
@@ -192,6 +201,7 @@ def _callable_part(module: ModuleType) -> ModuleType:
         if name in inner - _CALLED:
             f.targetoptions.update(_INNER)
         else:
+            f.targetoptions["no_cfunc_wrapper"] = True
             setattr(part, name, f)
     return part
 

@@ -12,7 +12,7 @@ from numba import njit
 from numba.core.registry import CPUDispatcher
 from numpy.typing import ArrayLike
 
-from sympflow.kernels.modules import OPTIONS, load_module, template
+from sympflow.kernels.modules import OPTIONS, load_around, load_module, template
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
 
 __all__ = ["MLPFlowKernel", "NetworkLayer"]
@@ -69,9 +69,7 @@ class _Architecture:
         after = map(template, ("aligned", "network"))
         if own:  # a function of the user's: compiled for this process only
             slopes = self.slopes if isinstance(self.slopes, CPUDispatcher) else njit(**OPTIONS)(self.slopes)
-            functions: dict[str, Any] = {"activation": slopes}
-            exec("\n\n".join([constants, *after]), functions)
-            return functions["rollout"]
+            return load_around("\n\n".join([constants, *after]), activation=slopes).rollout
         activation = f"activation = {self.activation}\n"
         before = map(template, ("elementary", "activation_slopes"))
         source = "\n\n".join([constants, *before, activation, *after])

@@ -632,6 +632,7 @@ class Table:
                 self.flow.palindromic and j < self._kernel,
                 1.0 if c.always else None,
                 always=c.always,
+                present=c.present,
             )
             for j, c in enumerate(self.columns)
         ]

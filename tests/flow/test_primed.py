@@ -52,10 +52,12 @@ FLOWS = {
     "processed": lambda: random_flow(HH, stages=2, processor=2, degree=4),
     "processed, kick first": lambda: random_flow(MASSES, scheme="verlet", processor=1, palindromic=False),
     "processed, no gradients": lambda: random_flow(RELATIVISTIC, scheme="mclachlan4", palindromic=False, processor=3),
+    "gradients in some kicks": lambda: random_flow(HH, stages=3, processor=1, degree=3, force_gradient=[1]),
     "curvature": lambda: random_flow(HH, stages=2, degree=3, curvature=True),
     "processed, with curvature": lambda: random_flow(HH, scheme="verlet", processor=1, curvature=True),
     "polynomial": lambda: random_flow(HH, stages=2, degree=3, polynomial=4),
     "processed, with polynomials": lambda: random_flow(HH, size=0.01, scheme="verlet", processor=1, polynomial=4),
+    "some kicks with more terms": lambda: random_flow(HH, stages=3, degree=3, processor=1, curvature=[1]),
     "another dt": lambda: random_flow(HH, stages=2, dt=0.3, degree=1),
 }
 
@@ -310,7 +312,7 @@ def test_files_hold_the_numbers_and_solve_gives_the_system(flow, tmp_path):
     assert loaded.scheme(0.4 * flow.dt) == flow.scheme(0.4 * flow.dt)
     with pytest.raises(ValueError, match=r"^`flow` is primed with the V and T of a system"):
         loaded(0.1, x)
-    y0 = system.domain.sample(2, 0)
+    y0 = system.domain.sample(1, 0)[0]
     sol = solve(system, loaded, (0.0, 2.5 * flow.dt), y0=y0, on_domain_exit="ignore")
     np.testing.assert_array_equal(sol.y, solve(system, flow, (0.0, 2.5 * flow.dt), y0=y0, on_domain_exit="ignore").y)
     assert torch.equal(sympflow.load(path, system=system)(0.3, x), flow(0.3, x))
@@ -344,6 +346,11 @@ def test_another_system_is_refused(tmp_path):
         {"curvature": 1},
         {"curvature": True},
         {"curvature": True, "force_gradient": False},
+        {"gradient_kicks": [1.5]},
+        {"gradient_kicks": [7]},
+        {"gradient_kicks": [0]},
+        {"gradient_kicks": 1},
+        {"curvature_kicks": [0]},
         {"monomials": [[0, 2]]},
         {"monomials": [[0, 2]], "force_gradient": False},
         {"monomials": [[0, 2, 1]], "force_gradient": False},
@@ -382,6 +389,21 @@ def test_float32():
     assert solve(HH, flow.requires_grad_(False), (0.0, 2.0), dtype="float32").y.dtype == np.float32
 
 
+def test_kicks_without_force_gradients_keep_none(tmp_path):
+    """Whatever is drawn for them, or fitted, they are forces alone, and are counted so."""
+    flow = SympFlow.primed(PENDULUM, 5, processor=2, force_gradient=[1, 3], dt=0.5)
+    few = {"restarts": 2, "steps": 3, "points": 20, "label_times": 2, "reference_states": 5, "progress": False}
+    fitted = train(PENDULUM, flow=flow, **few)
+    path = tmp_path / "flow.safetensors"
+    fitted.save(path)
+    for each in (fitted, sympflow.load(path), fitted.transferred(PENDULUM)):
+        scheme = each.kernel_scheme()
+        kicks = [s.three for s in scheme.substeps if s.kind == "kick"]
+        assert [g != 0 for g in kicks] == [False, True, False, True, False]
+        assert (scheme.force_evaluations, scheme.hessian_evaluations) == (5, 2)
+        assert all(each.processor_scheme().gradients[1:])  # what is not executed step by step has all of them
+
+
 # training by its residual ----------------------------------------------------------------------------------------
 
 
@@ -406,6 +428,13 @@ def test_it_trains_like_any_sympflow():
         ({"scheme": "verlet", "first": "kick"}, r"^`first` and `scheme` were both given: leave out `first`"),
         ({"degree": 0}, r"^`degree` must be a positive integer"),
         ({"scheme": "chin4a", "force_gradient": False}, r"^`force_gradient` is False but 'chin4a'"),
+        ({"stages": 3, "force_gradient": [0]}, r"^`force_gradient` \(0,\) is not the same from either end of 3 kicks"),
+        ({"scheme": "chin4a", "force_gradient": [0]}, r"^`force_gradient` \(0,\) leaves out kicks of 'chin4a'"),
+        ({"stages": 3, "force_gradient": [3]}, r"^`force_gradient` \(3,\) does not name kicks from 0 to 2, each once"),
+        ({"stages": 3, "force_gradient": []}, r"^`force_gradient` \(\) does not name kicks from 0 to 2"),
+        ({"stages": 3, "force_gradient": [2, 0]}, r"^`force_gradient` \(2, 0\) does not name kicks .* and in order"),
+        ({"stages": 3, "force_gradient": [1], "curvature": [0, 2]}, r"^`curvature` \(0, 2\) names kicks without"),
+        ({"stages": 3, "curvature": [0]}, r"^`curvature` \(0,\) is not the same from either end of 3 kicks"),
         ({"dt": -1.0}, r"^`dt` must be a positive"),
         ({"processor": -1}, r"^`processor` must be a non-negative integer"),
         ({"polynomial": 0}, r"^`polynomial` must be a positive integer, its degree; got 0"),

@@ -61,7 +61,7 @@ def move(x, error, change):
 
 @njit(**OPTIONS)
 def workspace(table):
-    return np.empty(NDOF), np.empty(NDOF), np.empty(NDOF), np.empty(NDOF), table
+    return np.empty(NDOF), np.empty(NDOF), np.empty(NDOF), np.empty(NDOF)
 
 
 @njit(**OPTIONS)

@@ -19,6 +19,7 @@ EPS = 2.0**-52
 MOST_TRIALS = 80
 MOST_AT_ONCE = 1024  # steps between two looks
 CLOSE = 1e-3  # of the elapsed time, beyond which a residual means that no step leads to that time
+ZERO, ONE = np.int64(0), np.int64(1)  # a literal has a type of its own, for which `deliver` would be compiled again
 
 
 @njit(**OPTIONS)
@@ -146,7 +147,7 @@ def reach_times(table, step, h, clock, y0, targets, stride, most_steps, out, cou
             return False
         if then >= targets[saved]:
             saved, tried, counts[0, 0] = deliver(
-                start_q, start_p, begin, n, block, then, table, work, step, h, advance, clock, targets, saved, out, 0
+                start_q, start_p, begin, n, block, then, table, work, step, h, advance, clock, targets, saved, out, ZERO
             )
             counts[0, 1] += tried
             if saved < 0:
@@ -186,7 +187,7 @@ def reach_times_lanes(table, step, h, clock, y0, begin, end, targets, stride, mo
             if regular and now[count] >= targets[0]:
                 q, p = unpack(y0[following])
                 saved[count], tried, counts[following, 0] = deliver(
-                    q, p, 0, 0, 1, now[count], table, work, step, h, advance[count], clock, targets, 0, out,
+                    q, p, ZERO, ZERO, ONE, now[count], table, work, step, h, advance[count], clock, targets, ZERO, out,
                     following,
                 )  # fmt: skip
                 counts[following, 1] += tried

@@ -107,12 +107,11 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running,
             if OWN:
                 advance_own(Y, width, table, own, begin, block * link)
             else:
-                numbers, a = common_of(table, begin, n), drift_of(table, begin)
-                for k in range(n, n + block):
-                    stage_lanes(Y, error, width, numbers, a)
-                    for j in range(1, link):
-                        stage_lanes(Y, error, width, common_of(table, j, k), drift_of(table, j))
-                    numbers, a = common_of(table, link, k + 1), drift_of(table, link)
+                j, k = begin, n
+                for _ in range(block * link):
+                    stage_lanes(Y, error, width, common_of(table, j, k), drift_of(table, j))
+                    j = j + 1 if j < link else 1
+                    k = k + 1 if j == link else k
             next_saved = saved
             while next_saved < len(save) and save[next_saved] == n + block:
                 next_saved += 1

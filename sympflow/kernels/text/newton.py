@@ -67,7 +67,7 @@ def stages(y, h, t, work):
 
 
 @njit(**OPTIONS)
-def rollout(h, t0, y0, n_steps, save, out, work, stop, first, running):
+def rollout_one(h, t0, y0, n_steps, save, out, work, stop, first, running):
     """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``; later rows are NaN.
 
     Where `first` steps are made already, it goes on from the `running` state (2d or, if `COMPENSATED`, 4d), which is
@@ -107,10 +107,10 @@ def rollout(h, t0, y0, n_steps, save, out, work, stop, first, running):
 
 @njit(**OPTIONS)
 def rollout_each(h, t0, y0, n_steps, save, out, n_finite, iterations, stop, first, running):
-    """`rollout` of every row of `y0` (N, 2d)."""
+    """`rollout_one` of every row of `y0` (N, 2d)."""
     work = workspace()
     for i in range(y0.shape[0]):
-        n_finite[i], iterations[i] = rollout(h, t0, y0[i], n_steps, save, out[i], work, stop, first, running[i])
+        n_finite[i], iterations[i] = rollout_one(h, t0, y0[i], n_steps, save, out[i], work, stop, first, running[i])
 
 
 @njit(**OPTIONS)

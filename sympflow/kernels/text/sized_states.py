@@ -15,6 +15,9 @@ from numba import njit
 
 CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where nothing is saved
 
+# What `in_one` is called with: a literal has a type of its own, for which it and all that it calls were compiled again.
+ZERO, ONE, SINGLE, RUNNING = np.int64(0), np.int64(1), np.bool_(True), np.bool_(False)
+
 
 @njit(**OPTIONS)
 def copy_state(source, target):
@@ -40,7 +43,7 @@ def finite_numbers(X):
 def close(X, end_X, table, work, geometry, sites, values):
     """The end of a step into `end_X`, from the running state before its last stage."""
     copy_state(X, end_X)
-    in_one(end_X, table, table.shape[1] - 1, 1, True, work, geometry, sites, values)
+    in_one(end_X, table, table.shape[1] - 1, ONE, SINGLE, work, geometry, sites, values)
 
 
 @njit(**OPTIONS)
@@ -48,7 +51,7 @@ def first_non_finite(X, end_X, table, j, n_steps, work, geometry, sites, values)
     """The first of `n_steps` steps from a running state whose end is not finite, or `n_steps`."""
     link = table.shape[1] - 2
     for n in range(1, n_steps):
-        j = in_one(X, table, j, link, False, work, geometry, sites, values)
+        j = in_one(X, table, j, link, RUNNING, work, geometry, sites, values)
         close(X, end_X, table, work, geometry, sites, values)
         if not finite_numbers(end_X):
             return n
@@ -67,7 +70,7 @@ def rollout(table, y0, n_steps, save, out, stop, first, running, single, geometr
     X, width = np.zeros((N_SETS, N_FIELDS, size)), len(y0)
     if single:
         load(y0, X, 0, geometry)
-        in_one(X, table, 0, table.shape[1], True, work, geometry, sites, values)
+        in_one(X, table, ZERO, table.shape[1], SINGLE, work, geometry, sites, values)
         pack(X, 0, out[0], geometry)
         return 0
     start_X, end_X = np.zeros((N_SETS, N_FIELDS, size)), np.zeros((N_SETS, N_FIELDS, size))
@@ -87,7 +90,7 @@ def rollout(table, y0, n_steps, save, out, stop, first, running, single, geometr
             block = min(block, save[saved] - n)
         copy_state(X, start_X)
         before = j
-        j = in_one(X, table, j, block * link, False, work, geometry, sites, values)
+        j = in_one(X, table, j, block * link, RUNNING, work, geometry, sites, values)
         close(X, end_X, table, work, geometry, sites, values)
         if not finite_numbers(end_X):
             for i in range(saved, out.shape[0]):
