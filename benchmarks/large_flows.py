@@ -23,6 +23,7 @@ import argparse
 import json
 import math
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -94,43 +95,45 @@ def lattice(name: str, sites: int) -> HamiltonianSystem:
     return HamiltonianSystem.lattice(**terms, shape=(n,) * axes, name=name, domain=LatticeStates(DENSITY))
 
 
-def flows_of(system: HamiltonianSystem, folder: Path, fit: bool) -> list[PrimedFlow]:
-    """The flows of a lattice in a folder, fitted first if asked."""
-    if fit:
+def flows_of(
+    system: HamiltonianSystem, folder: Path, ladder: Sequence[Primed], fit: Mapping[str, Any] = FIT
+) -> list[PrimedFlow]:
+    """The flows of a system in a folder; those of a ladder that are not there are fitted first."""
+    for start in ladder:
         folder.mkdir(parents=True, exist_ok=True)
-        for start in LATTICES[system.name][3]:
-            path = folder / f"{system.name}-primed-{start.stages}-{start.dt:g}.safetensors"
-            if not path.exists():
-                begun = time.process_time()
-                flow = train(system, flow=start.flow(system), progress=False, **FIT)
-                flow.save(path)
-                print(f"{path.stem}: {time.process_time() - begun:.0f} s of a processor", flush=True)
+        path = folder / f"{system.name}-primed-{start.stages}-{start.dt:g}.safetensors"
+        if not path.exists():
+            begun = time.process_time()
+            flow = train(system, flow=start.flow(system), progress=False, **fit)
+            flow.save(path)
+            print(f"{path.stem}: {time.process_time() - begun:.0f} s of a processor", flush=True)
     found = [sympflow.load(path) for path in sorted(folder.glob(f"{system.name}-*.safetensors"))]
     return [flow.bound(system) for flow in found if isinstance(flow, PrimedFlow) and flow.matches(system)]
 
 
-def error(system: HamiltonianSystem, y0: np.ndarray, runner: Runner, n: int) -> float:
-    """The largest relative energy error in n steps, the median over states."""
-    save = np.unique(np.linspace(0, n, OUTPUTS + 1).round().astype(np.int64))
-    with np.errstate(all="ignore"):
-        H = system.hamiltonian(runner.many(T / n, y0, n, save)[0])
-        largest = np.abs(H - H[:, :1]).max(1) / H[:, 0]
-    return float(np.median(np.where(np.isnan(largest), np.inf, largest)))
-
-
 @dataclass
 class Race:
-    """The flows and schemes of a lattice."""
+    """The flows and schemes of a system, up to `t_end`; `rest` is its energy at rest."""
 
     system: HamiltonianSystem
     flows: list[Runner]
     schemes: list[Runner]
+    t_end: float = T
+    outputs: int = OUTPUTS
+    rest: float = 0.0
 
     @classmethod
-    def of(cls, name: str, sites: int, folder: Path, fit: bool) -> Race:
-        system = lattice(name, sites)
-        flows = [Runner.of_flow(flow, system) for flow in flows_of(system, folder, fit)]
-        return cls(system, flows, schemes(system))
+    def of(cls, system: HamiltonianSystem, folder: Path, ladder: Sequence[Primed], **more: Any) -> Race:
+        flows = [Runner.of_flow(flow, system) for flow in flows_of(system, folder, ladder)]
+        return cls(system, flows, schemes(system), **more)
+
+    def error(self, y0: np.ndarray, runner: Runner, n: int) -> float:
+        """The largest energy error in n steps, relative to the energy above rest, the median over states."""
+        save = np.unique(np.linspace(0, n, self.outputs + 1).round().astype(np.int64))
+        with np.errstate(all="ignore"):
+            H = self.system.hamiltonian(runner.many(self.t_end / n, y0, n, save)[0])
+            largest = np.abs(H - H[:, :1]).max(1) / (H[:, 0] - self.rest)
+        return float(np.median(np.where(np.isnan(largest), np.inf, largest)))
 
     def y0(self) -> np.ndarray:
         assert self.system.domain is not None
@@ -140,10 +143,10 @@ class Race:
         """The fewest steps up to T of each that meets a target."""
         y0, steps = self.y0(), {}
         for runner in [*self.flows, *self.schemes]:
-            least = max(1, math.ceil(T / runner.longest * (1 - 1e-12)))
+            least = max(1, math.ceil(self.t_end / runner.longest * (1 - 1e-12)))
             most = SHORTEST * least if runner in self.flows else MOST // runner.forces
             guess = max(least, round(1000 / runner.forces))
-            found = fewest_steps(partial(error, self.system, y0, runner), target, min(guess, most), least, most)
+            found = fewest_steps(partial(self.error, y0, runner), target, min(guess, most), least, most)
             if found is not None:
                 steps[runner.name] = found
         return steps
@@ -159,12 +162,12 @@ class Race:
         near = [r for side in sides for r in side if work[r] <= NEAR * min(work[s] for s in side)]
         seconds = dict.fromkeys(near, math.inf)
         for r in near:
-            r.one(T / steps[r.name], y0, 1, last(1))
+            r.one(self.t_end / steps[r.name], y0, 1, last(1))
         for _ in range(rounds):
             for r in near:
                 n = LONGER * steps[r.name]
                 begun = time.process_time()
-                r.one(LONGER * T / n, y0, n, last(n))
+                r.one(LONGER * self.t_end / n, y0, n, last(n))
                 seconds[r] = min(seconds[r], time.process_time() - begun)
         flow, rival = (min((r for r in side if r in seconds), key=seconds.__getitem__) for side in sides)
         fewest = min(steps[r.name] * r.forces for r in sides[1])
@@ -173,7 +176,7 @@ class Race:
             "sites": self.system.ndof,
             "target": target,
             "flow": flow.name,
-            "dt": T / steps[flow.name],
+            "dt": self.t_end / steps[flow.name],
             "seconds": seconds[flow],
             "rival": rival.name,
             "faster": seconds[rival] / seconds[flow],
@@ -207,13 +210,14 @@ def gradients_fragment(costs: dict[str, float]) -> str:
     )
 
 
-def fragment(rows: list[dict[str, Any]]) -> str:
-    titles = ["lattice, energy error", "sites", "flow: Δt, kicks + processor", "its step", "forces saved", "run time"]
+def fragment(rows: list[dict[str, Any]], titles: Mapping[str, str]) -> str:
+    """The table of a race; titles by the names of systems."""
+    columns = ["lattice, energy error", "sites", "flow: Δt, kicks + processor", "its step", "forces saved", "run time"]
     return fragments.table(
-        titles,
+        columns,
         [
             [
-                f"{LATTICES[r['lattice']][0]}, {r['target']:.0e}".replace("e-0", "e-"),
+                f"{titles[r['lattice']]}, {r['target']:.0e}".replace("e-0", "e-"),
                 f"{r['sites']:,}",
                 r["flow"].removeprefix("Δt = "),
                 f"{r['dt']:.3g}",
@@ -223,6 +227,11 @@ def fragment(rows: list[dict[str, Any]]) -> str:
             for r in rows
         ],
     )
+
+
+def found_before(path: Path | None) -> dict[str, dict[str, Any]]:
+    """What an earlier call kept."""
+    return json.loads(path.read_text("utf-8")) if path is not None and path.exists() else {}
 
 
 def main() -> None:
@@ -237,13 +246,12 @@ def main() -> None:
     fragments.add_out(parser)
     options = parser.parse_args()
     names = list(LATTICES) if options.only is None else options.only.split(",")
-    found: dict[str, dict[str, Any]] = {}
-    if options.json and options.json.exists():
-        found = json.loads(options.json.read_text("utf-8"))
+    found = found_before(options.json)
     for name in names:
         mine = found.setdefault(name, {})
         if "rows" not in mine:
-            entrants = Race.of(name, options.sites, options.flows, options.fit)
+            ladder = LATTICES[name][3] if options.fit else ()
+            entrants = Race.of(lattice(name, options.sites), options.flows, ladder)
             mine.setdefault("steps", [entrants.steps(target) for target in TARGETS])
             if not options.search:
                 of_targets = zip(TARGETS, mine["steps"], strict=True)
@@ -255,7 +263,10 @@ def main() -> None:
         return
     rows = [row for name in names for row in found[name]["rows"] if row is not None]
     costs = {name: found[name]["gradient"] for name in names}
-    for name, body in (("large-flows", fragment(rows)), ("large-gradients", gradients_fragment(costs))):
+    for name, body in (
+        ("large-flows", fragment(rows, {name: lattice[0] for name, lattice in LATTICES.items()})),
+        ("large-gradients", gradients_fragment(costs)),
+    ):
         fragments.write(options.out, name, body)
         print(body)
 

@@ -487,32 +487,41 @@ SWEEPS = {
 
 def sweeps(folder: Path | None, options: argparse.Namespace) -> list[list[str]]:
     """One-step errors on the authors' oscillator against noise, trajectories and times, of `learn` and of Adam."""
-    from matplotlib.figure import Figure
-
     system = systems.harmonic_oscillator()
-    figure = Figure(figsize=(9.0, 3.0), layout="constrained", facecolor="white")
     rows = []
-    for ax, (label, cases) in zip(figure.subplots(1, 3, sharey=True), SWEEPS.items(), strict=True):
-        points = []
+    for label, cases in SWEEPS.items():
         for eps, n, m in cases:
             data, held = authors_data(system, 1.2, eps, n, m, 0)
             flow, seconds = timed(lambda data=data: sympflow.learn(data, dt=1.0))  # type: ignore[misc]
             theirs = one_step_error(authors_adam(data, max(seconds, options.swept)), system, held)
             error = one_step_error(flow, system, held)
-            points.append(({"ε": eps, "N": n, "M": m}[label[-1]], error, theirs))
             numbers = [fragments.number(error), f"{seconds:.0f}", fragments.number(theirs)]
             rows.append([label, f"{eps:g}", str(n), str(m), *numbers])
             print(*rows[-1], sep=" | ", flush=True)
-        x, ours, adams = np.array(points).T
+    if folder is not None:
+        sweeps_figure(rows).savefig(folder / "learning_sweeps.svg")
+    return rows
+
+
+def sweeps_figure(rows: list[list[str]]) -> Any:
+    """The errors of the rows of `sweeps` against what is swept, one panel each."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 3.0), layout="constrained", facecolor="white")
+    for ax, label in zip(figure.subplots(1, 3, sharey=True), SWEEPS, strict=True):
+        swept = 1 + "εNM".index(label[-1])
+        x, ours, adams = np.array([[row[swept], row[4], row[6]] for row in rows if row[0] == label], dtype=float).T
         ax.plot(x, adams, "s--", color="#0072B2", label="SympFlow by Adam")
         ax.plot(x, ours, "o-", color="#D55E00", label="learn")
-        ax.set(xlabel=label, yscale="log", xscale="linear" if label[0] == "n" else "log")
+        ax.set(xlabel=label, yscale="log")
+        if label[-1] != "ε":
+            ax.set_xscale("log")
+            ax.set_xticks(x, [f"{value:g}" for value in x])
+            ax.set_xticks([], minor=True)
         ax.grid(alpha=0.3, which="both")
     figure.axes[0].set_ylabel("one-step error at Δt = 1")
     figure.axes[0].legend(frameon=False)
-    if folder is not None:
-        figure.savefig(folder / "learning_sweeps.svg")
-    return rows
+    return figure
 
 
 # all of them ----------------------------------------------------------------------------------------------------------

@@ -14,11 +14,18 @@ os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 # A compiler makes many objects that live on: looking through all of them for circles takes a sixth of its time.
 gc.set_threshold(50_000, 20, 50)
 
+
+def pytest_collection_finish():
+    """Let no search for circles go through what was imported: tests that force one wait for it."""
+    gc.collect()
+    gc.freeze()
+
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 KINDS = (
     *("verlet", "leapfrog", "srkn6b", "chin4a"),  # begins with a kick, a drift; for quadratic T; with force gradients
-    *("implicit_midpoint", "gauss_legendre4", "log_leapfrog"),
+    *("gauss_legendre4", "log_leapfrog"),
     *("impulse", "mollified_impulse", "implicit_explicit", "linear_omelyan4", "strang_parts", "kahan_li6_parts"),
     *("euler", "rk4", "explicit_adams", "implicit_adams"),
     *("rk45", "dop853", "dopri5", "adaptive_heun"),

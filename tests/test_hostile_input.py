@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from conftest import KINDS
 from numba import njit
 from watchdog import watched
 
@@ -552,7 +553,8 @@ def test_blow_up_is_reported(method):
     its domain, and says so.
     """
     t_star = 5.450984210235402
-    got = caught(lambda: solve(ESCAPE, method, (0, 20), backend="auto"))
+    loose = {"rtol": 1e-4, "atol": 1e-6} if method in ("bosh3", "fehlberg2", "adaptive_heun") else {}
+    got = caught(lambda: solve(ESCAPE, method, (0, 20), backend="auto" if method in KINDS else "array", **loose))
     assert not isinstance(got, Exception), got
     assert np.isfinite(got.y).all()
     if get(method).trained:

@@ -17,6 +17,7 @@ FAMILIES = {
     "split": "sympflow.flow.split:SplitFlow",
     "timed": "sympflow.flow.timed:TimedSympFlow",
     "clocked": "sympflow.flow.clocked:ClockedFlow",
+    "collocated": "sympflow.flow.collocated:CollocatedFlow",
     "mlp": "sympflow.flow.mlp:MLPFlow",
 }
 """The module and the class of each."""
@@ -24,7 +25,7 @@ FAMILIES = {
 KINDS = ("sympflow", "mlp")
 """The kinds that files name, which are the methods that run the flows: SympFlows, and their baseline."""
 
-_OF_SYMPFLOW = ("split", "clocked", "primed", "timed")
+_OF_SYMPFLOW = ("split", "clocked", "collocated", "primed", "timed")
 
 
 def family(name: str) -> Any:

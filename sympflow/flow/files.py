@@ -345,6 +345,8 @@ def _tensor_bytes(header: dict[str, Any]) -> int:
 
 
 def _dtype_of(header: dict[str, Any]) -> torch.dtype:
+    if not header:  # a flow without numbers of its own
+        return torch.float64
     names = {str(entry.get("dtype")) if isinstance(entry, dict) else "nothing" for entry in header.values()}
     if len(names) != 1 or not names <= set(DTYPES):
         raise Refused(f"its tensors must all be F32 or all F64, not {sorted(names)}")

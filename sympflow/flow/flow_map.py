@@ -107,6 +107,8 @@ class FlowMap(nn.Module):
     """True if the maps of the family hold the friction of a damped system that they are made for."""
     takes_driving: ClassVar[bool] = False
     """True if the maps of the family take the time, of a driven system that they are made for."""
+    iterated: int = 0
+    """Evaluations of ∇H and ∇²H in each of Newton's iterations, of a flow whose steps are found by these."""
     identity: Identity | None = None  # these of flows in pickles of earlier versions, which did not have them
     lattice_terms: Mapping[str, str] = MappingProxyType({})
     unfitted: tuple[tuple[float, float], ...] = ()

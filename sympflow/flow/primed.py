@@ -88,6 +88,8 @@ class PrimedShape:
         and in a driven system, in which the time moves with them.
     gradient_kicks : tuple of int, optional
         The kicks of the kernel, counted from 0, that have force gradients, where others have none.
+    curvature_kicks : tuple of int, optional
+        Those of them that have curvature terms, where others have none.
 
     Raises
     ------
@@ -105,6 +107,7 @@ class PrimedShape:
     monomials: Monomials = ()
     timed: bool = False
     gradient_kicks: tuple[int, ...] | None = None
+    curvature_kicks: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         maps, degree, processor = self.maps, self.degree, self.processor
@@ -124,18 +127,25 @@ class PrimedShape:
         if self.monomials and self.force_gradient:
             raise ValueError("`monomials` stand in place of force gradients: leave these out.")
         if self.gradient_kicks is not None:
-            self._check_gradient_kicks(self.gradient_kicks)
+            self._check_kicks("force_gradient", self.gradient_kicks, self.force_gradient)
+        if self.curvature_kicks is not None:
+            self._check_kicks("curvature", self.curvature_kicks, self.curvature)
+            if self.gradient_kicks is not None and not set(self.curvature_kicks) <= set(self.gradient_kicks):
+                raise ValueError(
+                    f"`curvature` {self.curvature_kicks!r} names kicks without force gradients: name some of "
+                    f"{self.gradient_kicks!r}."
+                )
 
-    def _check_gradient_kicks(self, kicks: tuple[int, ...]) -> None:
+    def _check_kicks(self, name: str, kicks: tuple[int, ...], has: bool) -> None:
         n = self.kernel.count("kick")
-        if not kicks or not self.force_gradient or list(kicks) != sorted(set(kicks) & set(range(n))):
+        if not kicks or not has or list(kicks) != sorted(set(kicks) & set(range(n))):
             raise ValueError(
-                f"`force_gradient` {kicks!r} does not name kicks from 0 to {n - 1}, each once and in order: name some, "
+                f"`{name}` {kicks!r} does not name kicks from 0 to {n - 1}, each once and in order: name some, "
                 "or take True for all, False for none."
             )
         if self.palindromic and kicks != tuple(n - 1 - i for i in reversed(kicks)):
             raise ValueError(
-                f"`force_gradient` {kicks!r} is not the same from either end of {n} kicks: name their mirror images "
+                f"`{name}` {kicks!r} is not the same from either end of {n} kicks: name their mirror images "
                 "too, or take palindromic=False."
             )
 
@@ -158,13 +168,14 @@ class PrimedShape:
         def column(kind: Kind, power: int, total: float | None = None, **more: Any) -> Coefficients:
             return Coefficients(sequence.count(kind), tuple(powers), dt, power, mirrored, total, **more, **like)
 
-        present = None if total is None else self.gradient_kicks
+        having, curved = (None, None) if total is None else (self.gradient_kicks, self.curvature_kicks)
+        curved = having if curved is None else curved
 
         return Columns(
             column("kick", 1, total),
             column("drift", 1, total, always=self.timed and total is not None),
-            column("kick", 3, present=present) if self.force_gradient else None,
-            column("kick", 5, present=present) if self.curvature else None,
+            column("kick", 3, present=having) if self.force_gradient else None,
+            column("kick", 5, present=curved) if self.curvature else None,
             nn.ModuleList(column("kick", 3) for _ in self.monomials) if self.monomials else None,
         )
 
@@ -181,6 +192,7 @@ class PrimedShape:
             **({"monomials": [list(m) for m in self.monomials]} if self.monomials else {}),
             **({"timed": True} if self.timed else {}),
             **({} if self.gradient_kicks is None else {"gradient_kicks": list(self.gradient_kicks)}),
+            **({} if self.curvature_kicks is None else {"curvature_kicks": list(self.curvature_kicks)}),
         }
 
     @classmethod
@@ -203,7 +215,7 @@ class PrimedShape:
         processor = plan.get("processor", 0)
         if processor != 0 or isinstance(processor, bool):
             processor = checked_integer(processor, "processor", MAX_LAYERS)
-        flags["gradient_kicks"] = _checked_kicks(plan.get("gradient_kicks"))
+        flags |= {name: _checked_kicks(plan.get(name)) for name in ("gradient_kicks", "curvature_kicks")}
         exponents = _checked_monomials(plan.get("monomials", []), ndof)
         return cls(plan["first"], maps, degree, processor=processor, monomials=exponents, **flags)
 
@@ -218,7 +230,7 @@ def _checked_kicks(plan: Any) -> tuple[int, ...] | None:
     if plan is None:
         return None
     if not isinstance(plan, list) or not all(isinstance(i, int) and not isinstance(i, bool) for i in plan):
-        raise Refused("its kicks with force gradients are not a list of integers")
+        raise Refused("its kicks with force gradients or curvature terms are not a list of integers")
     return tuple(plan)
 
 
@@ -490,7 +502,7 @@ class PrimedFlow(SympFlow):
         degree: int | None,
         force_gradient: bool | Sequence[int] | None,
         processor: int,
-        curvature: bool,
+        curvature: bool | Sequence[int],
         polynomial: int | None,
         first: str,
         dtype: torch.dtype,
@@ -498,12 +510,14 @@ class PrimedFlow(SympFlow):
     ) -> Self:
         """Return a flow that is, at every t, equal leapfrog steps or the given scheme: see `SympFlow.primed`."""
         stages, palindromic, scheme, degree = map(plain, (stages, palindromic, scheme, degree))
-        force_gradient, some = _gradient_kicks_of(force_gradient)
-        processor, curvature, polynomial = map(plain, (processor, curvature, polynomial))
+        processor, polynomial = map(plain, (processor, polynomial))
+        some = None
+        if force_gradient is not None:
+            force_gradient, some = _kicks_of("force_gradient", force_gradient)
+        curvature, curved = _kicks_of("curvature", curvature)
         check_system(system)
         check_for_flows(system, cls.takes_friction, cls.takes_driving)
         check_flag("palindromic", palindromic)
-        check_flag("curvature", curvature)
         if not system.separable:
             raise ValueError(f"`system` {system.name!r} is not separable, so it has no V and T: use SympFlow(ndof).")
         if system.kinetic_timed:
@@ -545,6 +559,7 @@ class PrimedFlow(SympFlow):
             monomials=exponents,
             timed=_is_timed(system),
             gradient_kicks=some,
+            curvature_kicks=curved,
         )
         flow = cls(system.ndof, shape, dt, system, dtype, device)
         kicks, drifts = _kicks(scheme), [s for s in substeps if s.kind == "drift"]
@@ -860,16 +875,14 @@ def _kicks(scheme: Scheme) -> list[Any]:
     return [s for s in scheme.substeps if s.kind == "kick"]
 
 
-def _gradient_kicks_of(asked: Any) -> tuple[bool | None, tuple[int, ...] | None]:
-    """Return True where force gradients are asked for, with the kicks that have them where not all do."""
+def _kicks_of(name: str, asked: Any) -> tuple[bool, tuple[int, ...] | None]:
+    """Return True where a term of kicks is asked for, with the kicks that have it where not all do."""
     asked = plain(asked)
-    if asked is None:
-        return None, None
     if isinstance(asked, Sequence) and not isinstance(asked, str):
         kicks = tuple(map(plain, asked))
         if all(isinstance(i, int) and not isinstance(i, bool) for i in kicks):
             return True, kicks
-    check_flag("force_gradient", asked)
+    check_flag(name, asked)
     return asked, None
 
 

@@ -24,10 +24,17 @@ if TYPE_CHECKING:
 
 
 class Binding:
-    """The system whose V and T a flow is primed with; shared by copies of the flow, stored in no file."""
+    """The system whose functions a flow evaluates; shared by copies of the flow, stored in no file.
 
-    def __init__(self, system: HamiltonianSystem | None) -> None:
-        self._system = system
+    Parameters
+    ----------
+    system : HamiltonianSystem or None
+    made : str
+        The use of them, for messages.
+    """
+
+    def __init__(self, system: HamiltonianSystem | None, made: str = "primed with the V and T of a system") -> None:
+        self._system, self._made = system, made
 
     @property
     def known(self) -> bool:
@@ -37,8 +44,8 @@ class Binding:
     def system(self) -> HamiltonianSystem:
         if self._system is None:
             raise ValueError(
-                "`flow` is primed with the V and T of a system, which its file does not hold: "
-                "give it by sympflow.load(path, system=system) or flow.bind(system)."
+                f"`flow` is {self._made}, which its file does not hold: give it by "
+                "sympflow.load(path, system=system) or flow.bind(system)."
             )
         return self._system
 
@@ -46,7 +53,7 @@ class Binding:
         self._system = system
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Binding:
-        return Binding(self._system)
+        return Binding(self._system, self._made)
 
 
 class Factor(Protocol):

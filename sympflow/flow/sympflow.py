@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from sympflow.arguments import plain
@@ -216,7 +217,7 @@ class SympFlow(FlowMap):
         degree: int | None = None,
         force_gradient: bool | Sequence[int] | None = None,
         processor: int = 0,
-        curvature: bool = False,
+        curvature: bool | Sequence[int] = False,
         polynomial: int | None = None,
         first: str = "drift",
         dtype: torch.dtype = torch.float64,
@@ -244,13 +245,15 @@ class SympFlow(FlowMap):
         force_gradient : bool or sequence of int, optional
             True for a term in ½|∇V|²_{M⁻¹} in the kicks, which is the default where T is quadratic. Of a sequence of
             integers these kicks of the kernel alone have it, counted from 0: ``[1, 3]`` of five. Where a force gradient
-            takes as long as a force, as on lattices of polynomials, more kicks with fewer of them go farther.
+            takes as long as a force, as on lattices of polynomials, more kicks with fewer of them go farther, and so do
+            two or three with one of them in few degrees of freedom.
         processor : int
             Number of kicks of χ in ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹, 0 for none. A run executes χ⁻¹ once, the kernel K of
             `stages` kicks in every step, and χ for every output.
-        curvature : bool
-            True for a further term in ½ v·∇²V v, v = M⁻¹∇V, which takes third derivatives of V: for symbolic systems. A
-            trained kick with it comes tens of times nearer, and takes 1.1 to 1.5 times as long.
+        curvature : bool or sequence of int
+            True for a further term in ½ v·∇²V v, v = M⁻¹∇V, which takes third derivatives of V: for symbolic systems.
+            Or the numbers of the kicks that have it, of those with force gradients. A trained kick with it comes tens
+            of times nearer, and takes 1.1 to 1.5 times as long.
         polynomial : int, optional
             In place of force gradients and curvatures every kick has a trained polynomial in q of this total degree,
             t³ Σ_m e_m(t) q^m: for symbolic systems in few degrees of freedom. Its monomials are those of V and of what
@@ -339,6 +342,54 @@ class SympFlow(FlowMap):
             linear_outside=linear_outside,
             dtype=dtype,
             device=device,
+        )
+
+    @staticmethod
+    def collocated(
+        system: HamiltonianSystem,
+        *,
+        dt: float = 1.0,
+        stages: int = 4,
+        steps: int | None = None,
+        states: ArrayLike | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> Any:
+        """Return a `CollocatedFlow`, of steps of a Gauss method with the system's own H, separable or not.
+
+        Nothing in it is trained. It is the flow of a Hamiltonian that is not separable and known, or was learned: exact
+        to the error of the method, at the cost of Newton's iteration in every step.
+
+        Parameters
+        ----------
+        system : HamiltonianSystem
+            Of any form, with friction too; not driven.
+        dt : float
+            Δt.
+        stages : int
+            s, of the method of order 2s.
+        steps : int, optional
+            Equal steps in Δt; by default so many that at 99 % of some states the error of ψ̄_Δt is below 1e-10 of
+            their spread.
+        states : array_like of shape (n, 2d), optional
+            These states; by default some of the domain of the system.
+        dtype, device
+            Of the states.
+
+        Raises
+        ------
+        ValueError
+            If the system is driven or has another force than friction, `dt` is so long that it takes more than
+            two hundred steps, or an argument is not admissible.
+
+        Examples
+        --------
+        >>> flow = SympFlow.collocated(sympflow.systems.double_pendulum(), dt=0.1)
+        >>> flow.hamiltonian(0.1, torch.zeros(5, 4, dtype=torch.float64)).shape
+        torch.Size([5])
+        """
+        return family("collocated").of(
+            system, dt=dt, stages=stages, steps=steps, states=states, dtype=dtype, device=device
         )
 
     @staticmethod

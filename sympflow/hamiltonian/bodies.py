@@ -223,7 +223,7 @@ class PairsHamiltonian(LocalHamiltonian):
 
     @property
     def numbers(self) -> int:
-        return self.dim * self.n_bodies * (self.n_bodies - 1)
+        return 4 * self.dim * self.n_bodies * (self.n_bodies - 1)
 
     def judged(self) -> tuple[Any, ...]:
         return (JUDGED,) if self.n_bodies > JUDGED else ()

@@ -262,6 +262,14 @@ OF_ANY_SIZE: dict[str, type[LocalStates]] = {"lattice": LatticeStates, "pairs": 
 """The states of systems by one piece, by the `loops` of these."""
 
 
+def remedy_for(system: Hamiltonian) -> str:
+    """Domains that a system of which none is known may be given, as code."""
+    local = system.local
+    own = [OF_ANY_SIZE[local.loops].__name__ + "(density)"] if local is not None and local.has_piece else []
+    names = [*own, "Box(low, high)", "Ball(center, radius)", "EnergySublevel(energy, box)"]
+    return ", ".join(f"sympflow.{name}" for name in names[:-1]) + f" or sympflow.{names[-1]}"
+
+
 def states_of(system: Hamiltonian, states: np.ndarray) -> LocalStates:
     """The domain of any size that states (..., 2d) of a system by one piece are of.
 

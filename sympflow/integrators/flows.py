@@ -259,8 +259,14 @@ class CompiledFlowStepper(KernelStepper):
         return super().shorter(y, h, t)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
+        if self.flow.iterated:
+            n = self.iterations * self.flow.iterated
+            return {"force_evaluations": n, "hessian_evaluations": n}
         counted = self.kernel.evaluations(n_steps, n_saved, n_extra)
         return self.flow.evaluations(n_steps, n_saved, n_extra, "compiled") if counted is None else counted
+
+    def more_stats(self) -> dict[str, int]:
+        return {"newton_iterations": self.iterations} if self.iterations else {}
 
 
 def _apply(function: Any, y: Array, h: float | Array, t: Any) -> Array:

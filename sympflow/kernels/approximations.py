@@ -13,7 +13,7 @@ import sympy as sp
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
 
-__all__ = ["Letters", "OnInterval", "Ranges", "on_interval", "position_ranges", "range_of"]
+__all__ = ["UNTOUCHED", "Letters", "OnInterval", "Ranges", "on_interval", "position_ranges", "range_of"]
 
 Ranges = tuple[tuple[float, float], ...]
 """Intervals of q1 … qd in which kicks are computed by polynomials; none for none."""
@@ -25,11 +25,14 @@ EXACT = 2.0**-54  # of the largest value
 AMPLIFIED = 16.0  # by so much rounding errors may grow
 STATES, MARGIN = 1000, 0.05  # of a domain whose positions, with a margin on both sides, are a range
 
+UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
+"""Functions with kinks, of which an expression is left as it is."""
+
 
 def position_ranges(symbols: SymbolicHamiltonian, domain: Domain) -> Ranges:
     """The intervals of the positions in a domain; none for a V of which kicks make no use of them."""
     assert symbols.V is not None
-    if symbols.V.is_polynomial(*symbols.q):
+    if symbols.V.is_polynomial(*symbols.q) or symbols.V.has(*UNTOUCHED):
         return ()
     if symbols.ndof > 1 and not any(len(f.args) == 1 for f in symbols.V.atoms(sp.Function)):
         return ()
@@ -136,25 +139,33 @@ def _powers(values: Sequence[Any], cosines: Sequence[Sequence[Any]], half: float
 class Letters:
     """Symbols for the functions of positions in expressions: one for each, and powers of it for exp(n·u).
 
+    Parameters
+    ----------
+    q : sequence of Symbol
+    split : bool
+        Take exp(u + v) for exp(u)·exp(v), functions of fewer positions each.
+
     Attributes
     ----------
     functions : dict of Symbol to Expr
         What the symbols stand for, each a function of one argument.
     """
 
-    def __init__(self, q: Sequence[sp.Symbol]) -> None:
+    def __init__(self, q: Sequence[sp.Symbol], split: bool = True) -> None:
         self.functions: dict[sp.Symbol, sp.Expr] = {}
-        self._q = set(q)
+        self._q, self._split = set(q), split
         self._exponents: dict[tuple[sp.Expr, bool], list[sp.Rational]] = {}
 
     def put_into(self, expressions: Sequence[sp.Expr]) -> list[sp.Expr]:
         """The expressions with symbols in place of functions."""
-        split = [f.replace(lambda e: isinstance(e, sp.exp), _split_exponential) for f in expressions]
+        split = list(expressions)
+        if self._split:
+            split = [f.replace(lambda e: isinstance(e, sp.exp), _split_exponential) for f in expressions]
         atoms = {a for f in split for a in f.atoms(sp.Function) if len(a.args) == 1 and a.free_symbols & self._q}
         outer = [a for a in atoms if not a.args[0].atoms(sp.Function)]
         for a in outer:
             if isinstance(a, sp.exp):
-                number, u = a.args[0].as_coeff_Mul()
+                number, u = _multiple(a.args[0])
                 if number.is_Rational:
                     self._exponents.setdefault((u, bool(number > 0)), []).append(number)
         places = {a: self._letter(a) for a in sorted(outer, key=sp.default_sort_key)}
@@ -162,7 +173,7 @@ class Letters:
 
     def _letter(self, atom: sp.Expr) -> sp.Expr:
         if isinstance(atom, sp.exp):
-            number, u = atom.args[0].as_coeff_Mul()
+            number, u = _multiple(atom.args[0])
             if number.is_Rational:
                 unit = sp.gcd_list([abs(n) for n in self._exponents[u, bool(number > 0)]])
                 unit = unit if number > 0 else -unit
@@ -180,6 +191,11 @@ class Letters:
     @cached_property
     def symbols(self) -> tuple[sp.Symbol, ...]:
         return tuple(self.functions)
+
+
+def _multiple(u: sp.Expr) -> tuple[sp.Expr, sp.Expr]:
+    """A number and what it multiplies; of a sum the number that divides all of it."""
+    return u.as_content_primitive() if u.is_Add else u.as_coeff_Mul()
 
 
 def _split_exponential(f: sp.Expr) -> sp.Expr:

@@ -10,9 +10,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.parts import ExactParts, Map
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.implicit_loops import implicit_kernel
 from sympflow.kernels.loop_functions import LoopFunctions
 from sympflow.kernels.parts_loops import parts_loops
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
@@ -23,6 +25,7 @@ from sympflow.schemes import CURVATURE, Scheme
 
 __all__ = [
     "ClockedFlowKernel",
+    "CollocatedFlowKernel",
     "MapSource",
     "PrimedFlowKernel",
     "SplitFlowKernel",
@@ -378,3 +381,55 @@ class ClockedFlowKernel(Kernel):
         """
         numbers = self._numbers() if numbers is None else numbers
         return reach_times(self.system, self._scheme, h, y0, times, stride, expected, numbers)
+
+
+class CollocatedFlowKernel(Kernel):
+    """Compiled loops of a flow of equal steps of a Gauss method, a `Kernel`.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+        Symbolic.
+    tableau : Tableau
+    steps : int
+        Steps of the method in one of the flow.
+    """
+
+    saves_finite = False
+
+    def __init__(self, system: HamiltonianSystem, tableau: Tableau, steps: int) -> None:
+        self._kernel, self._steps = implicit_kernel(system, tableau), steps
+
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
+        """`n_steps` times ψ̄_h from one state, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
+        return self._whole(self._kernel.run, h, y0, n_steps, save, carry)
+
+    def run_batch(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        threads: int | None = None,
+        carry: Carry | None = None,
+    ) -> Run:
+        """`run` for every row of `y0` (N, 2d), where it pays on several threads."""
+        return self._whole(partial(self._kernel.run_batch, threads=threads), h, y0, n_steps, save, carry)
+
+    def _whole(
+        self, run: Callable[..., Run], h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None
+    ) -> Run:
+        m = self._steps
+        inner = None if carry is None else Carry(m * carry.steps, carry.running, carry.spare)
+        states, n_finite, iterations = run(h / m, y0, m * n_steps, m * np.asarray(save), carry=inner)
+        if carry is not None and inner is not None:
+            carry.advance(n_steps, inner.running)
+        return Run(states, n_finite // m, iterations)
+
+    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
+        share, iterations = np.asarray(h, dtype=np.float64) / self._steps, 0
+        for _ in range(self._steps):
+            y, taken = self._kernel.step(share, y)
+            iterations += taken
+        return Steps(y, iterations)

@@ -11,6 +11,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels import terms
@@ -20,11 +21,6 @@ from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
 from sympflow.kernels.terms import is_large
 
 __all__ = ["ImplicitKernel", "implicit_kernel"]
-
-Tableau = tuple[tuple[tuple[float, ...], ...], tuple[float, ...], tuple[float, ...]]
-"""A, B and scale of the increments K_i = h scale_i f(y + Σ_j A_ij K_j) and the step y + Σ_i B_i K_i.
-
-In Butcher's letters a_ij = A_ij scale_j and b_i = B_i scale_i."""
 
 
 def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> ImplicitKernel:

@@ -13,7 +13,7 @@ import sympy as sp
 
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
-from sympflow.kernels.approximations import Letters, OnInterval, Ranges, on_interval, range_of
+from sympflow.kernels.approximations import UNTOUCHED, Letters, OnInterval, Ranges, on_interval, range_of
 from sympflow.kernels.codegen import as_factor, parameter_lines, printed, vectorised
 from sympflow.kernels.scheduling import ADD, FUSED, PRODUCTS, Schedule, nested
 from sympflow.kernels.stages import kicks_of
@@ -29,8 +29,6 @@ MOST_MULTIPLIED = 3000  # terms, of what is factored or multiplied out
 MOST_TERMS = 120  # of a sum multiplied out
 MOST_NESTED = 12  # of a momentum's sum that is nested
 B, G, C = sp.symbols("b g c", real=True)
-UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
-"""Functions of which an expression is left as it is."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +46,11 @@ class _Kick:
     operations: float
     condition: str = ""
     """Where the shape holds, of one that holds for some positions only."""
+
+    @property
+    def calls(self) -> bool:
+        """True if it calls the library's exp, which takes the lanes of a batch one by one."""
+        return any("math.exp(" in line for line in self.lines)
 
 
 def kicks_source(
@@ -131,11 +134,14 @@ def _source(
     for kick in reversed(kinds):
         name, terms = kick.name, len(kick.numbers)
         if ranges and isinstance(symbols, SymbolicHamiltonian):
-            tried = _tried_in(symbols, terms, f"{name[0]}_", ranges if kick is kinds[0] else ())
+            tried = _tried_in(symbols, terms, f"{name[0]}_", ranges)
         else:
             tried = _tried(symbols, terms, f"{name[0]}_", monomials)
         one = min(tried, key=lambda kick: (kick.cycles, kick.operations))
-        many = min((k for k in tried if not k.condition), key=lambda kick: (kick.operations, kick.cycles))
+        lanes = [k for k in tried if not k.condition]
+        if isinstance(symbols, SymbolicHamiltonian) and not monomials:
+            lanes += _by_products(symbols, terms, f"{name[0]}_")
+        many = min(lanes, key=lambda kick: (kick.calls, kick.operations, kick.cycles))
         used = [n for n in _names(one.coefficients) if any(_mentions(line, n) for line in [*one.lines, *one.results])]
         loads = [f"{n} = table[j, {len(stored) + i}]" for i, n in enumerate(used)]
         fill += one.coefficients
@@ -254,7 +260,7 @@ def _scheduled(
                     if (min(i, j), max(i, j)) in entries
                 ]
                 results.append(schedule.value(sp.Add(s, *terms, evaluate=False))[1])
-    schedule.busy[PRODUCTS] += sum(sp.diff(symbols.T, p).has(s) or s == p for p in symbols.p for s in symbols.p)
+    schedule.busy[PRODUCTS] += _moving(symbols)
     cycles = schedule.cycles(results) + FUSED  # the drift waits for the kick
     return _Kick(schedule.early, schedule.lines, results, cycles, schedule.operations, condition)
 
@@ -293,13 +299,8 @@ def _numbered(f: sp.Expr, states: set[sp.Symbol], numbers: dict[sp.Expr, sp.Symb
 
 
 def _tried_in(symbols: SymbolicHamiltonian, terms: int, prefix: str, ranges: Ranges) -> list[_Kick]:
-    """Shapes by letters for functions, of arithmetic alone, and in ranges of positions as polynomials.
-
-    Without ranges the first shape alone, of kicks that a flow hardly has.
-    """
+    """Shapes by letters for functions, of arithmetic alone, and in ranges of positions as polynomials."""
     tried = [_scheduled(symbols, next(shapes(symbols, terms)), prefix)]
-    if not ranges:
-        return tried
     parts = _parts(symbols, terms)
     if symbols.ndof == 1:
         tried += _whole_polynomials(symbols, parts, prefix, ranges)
@@ -382,6 +383,84 @@ def _argument(u: sp.Expr, found: OnInterval, name: str) -> tuple[sp.Symbol, dict
 
 def _within(u: sp.Expr, found: OnInterval) -> str:
     return f"{found.low!r} <= {printed(printable(u))} <= {found.high!r}"
+
+
+# kicks of lanes ---------------------------------------------------------------------------------------------------
+
+
+def _by_products(symbols: SymbolicHamiltonian, terms: int, prefix: str) -> list[_Kick]:
+    """The kick of a lane by values of s = ∇V, v = M⁻¹s and the entries of ∇²V: few operations, in long chains.
+
+    It is p − b s + ∇²V u with u = g v or, with a curvature term, u = g v − c M⁻¹∇²V v, and then less ½ c ∇³V(v, v).
+    Written out in positions, as in `shapes`, each momentum would be a sum of its own.
+    """
+    q, p, d = symbols.q, symbols.p, symbols.ndof
+    entries: list[dict[tuple[int, ...], sp.Expr]] = [{(i,): sp.diff(symbols.V, q[i]) for i in range(d)}]
+    for _ in range(1, terms):
+        entries.append({(*at, j): sp.diff(f, q[j]) for at, f in entries[-1].items() for j in range(at[-1], d)})
+    functions = [f for order in entries for f in order.values()]
+    if any(f.has(*UNTOUCHED) or sp.count_ops(f) > MOST_OPERATIONS or _length(f) > MOST_MULTIPLIED for f in functions):
+        return []
+    letters = Letters(q, split=False)
+    functions = letters.put_into(functions)
+    x = (*q, *letters.symbols)
+    known = {**dict.fromkeys(q, 0.0), **dict.fromkeys(p, -FUSED)}
+    schedule = Schedule(known, printed, prefix, PRODUCT, few=True)
+    for letter, f in zip(letters.functions, vectorised(list(letters.functions.values())), strict=True):
+        schedule.define(letter, f)
+    forms = [printable(_by_common_factors(_expanded(f, x), x)) for f in functions]
+    shared, forms = sp.cse(forms, symbols=sp.numbered_symbols("common_", real=True), list=True, order="none")
+    for symbol, f in shared:
+        schedule.define(symbol, f)
+
+    def value(name: str, f: sp.Expr) -> sp.Expr:
+        """A symbol for it, of a name that no variable has."""
+        if f.is_Symbol or f.is_number:
+            return f
+        symbol = sp.Symbol(name, real=True)
+        schedule.define(symbol, f)
+        return symbol
+
+    def applied(name: str, A: list[list[sp.Expr]], y: list[sp.Expr], *factors: sp.Expr) -> list[sp.Expr]:
+        """A y, or a multiple of it."""
+        return [value(f"{name} {i}", _sum_of([(*factors, a, y[k]) for k, a in enumerate(A[i])])) for i in range(d)]
+
+    places = [at for order in entries for at in order]
+    of = {at: value(f"derivative {at}", f) for at, f in zip(places, forms, strict=True)}
+    s = [of[i,] for i in range(d)]
+    products: list[list[tuple[sp.Expr, ...]]] = [[(p[i],), (-B, s[i])] for i in range(d)]
+    if terms > 1:
+        M = symbols.inverse_mass
+        assert M is not None
+        inverse = [[_number(M[i, j]) for j in range(d)] for i in range(d)]
+        hessian = [[of[min(i, j), max(i, j)] for j in range(d)] for i in range(d)]
+        if terms == 2:
+            u = applied("u", inverse, s, G)
+        else:
+            v = applied("v", inverse, s)
+            again = applied("again", inverse, applied("product", hessian, v), -C)
+            u = [value(f"u {i}", _sum_of([(G, v[i]), (again[i],)])) for i in range(d)]
+        for i in range(d):
+            products[i] += [(hessian[i][j], u[j]) for j in range(d)]
+    if terms == 3:
+        for j, k in itertools.combinations_with_replacement(range(d), 2):
+            square = value(f"square {j} {k}", sp.Mul(-C / 2 if j == k else -C, v[j], v[k], evaluate=False))
+            for i in range(d):
+                products[i].append((of[tuple(sorted((i, j, k)))], square))
+    results = [schedule.value(_sum_of(row))[1] for row in products]
+    schedule.busy[PRODUCTS] += _moving(symbols)
+    return [_Kick(schedule.early, schedule.lines, results, schedule.cycles(results) + FUSED, schedule.operations)]
+
+
+def _sum_of(products: Sequence[Sequence[sp.Expr]]) -> sp.Expr:
+    """Σ of products as they are, of which some are 0."""
+    terms = [[f for f in factors if f != 1] for factors in products if all(f != 0 for f in factors)]
+    return sp.Add(*[sp.Mul(*factors, evaluate=False) for factors in terms], evaluate=False)
+
+
+def _moving(symbols: SymbolicHamiltonian | Variations) -> int:
+    """The products of a drift."""
+    return sum(sp.diff(symbols.T, p).has(s) or s == p for p in symbols.p for s in symbols.p)
 
 
 # the shapes of a kick ---------------------------------------------------------------------------------------------

@@ -46,6 +46,8 @@ class Schedule:
     fused : str, optional
         The function of a, b and c that is a·b + c, where the compiler is not to choose what is fused: of a sum of two
         products it takes either for c, the one known late as well, and a product that is used twice it fuses nowhere.
+    few : bool
+        Write sums with few operations, as one chain each, however long these become: for many trajectories at once.
 
     Attributes
     ----------
@@ -61,12 +63,13 @@ class Schedule:
         printed: Callable[[sp.Expr], str],
         prefix: str = "s_",
         fused: str | None = None,
+        few: bool = False,
     ) -> None:
         self.early: list[str] = []
         self.lines: list[str] = []
         self.busy = {SUMS: 0.0, PRODUCTS: 0.0, DIVISIONS: 0.0}
         self.ready: dict[str, float] = {symbol.name: time for symbol, time in known.items()}
-        self._printed, self._prefix = printed, prefix
+        self._printed, self._prefix, self._few = printed, prefix, few
         self._fused = "{2} + {0}*{1}" if fused is None else fused + "({0}, {1}, {2})"
         self._names: dict[str, str] = {}
         self._values: dict[sp.Expr, _Item] = {}
@@ -164,8 +167,12 @@ class Schedule:
                 if item[0][1] == "1.0":
                     item = item[1:]
             items.append((max(time for time, _ in item), item))
-        items.sort(key=lambda entry: (entry[0], len(entry[1])))
-        best = min(range(1, min(MOST_CHAINS, len(items)) + 1), key=lambda n: (_chains(items, n)[0], n))
+        if self._few:  # what is no product begins the chain, so that all products are fused
+            items.sort(key=lambda entry: (len(entry[1]), entry[0]))
+        else:
+            items.sort(key=lambda entry: (entry[0], len(entry[1])))
+        most = 1 if self._few else min(MOST_CHAINS, len(items))
+        best = min(range(1, most + 1), key=lambda n: (_chains(items, n)[0], n))
         ends: list[_Item] = []
         for chain in _chains(items, best)[1]:
             total: _Item | None = None

@@ -398,6 +398,7 @@ class _Search:
             if fit.step_error(fit.problem.sigma) <= STEP_ERROR or self.over():
                 break
             self.refined += 1
+            self.guess = dict(zip(chosen, fit.theta, strict=True))
             self._begin()
             chosen = self._steps(chosen)
         return self._record(chosen, self._path(chosen))
@@ -472,23 +473,40 @@ class _Search:
         """True if the time is up and there is a model."""
         return any(fit is not None for fit in self.fits.values()) and self.over()
 
-    def _fit(self, active: Sequence[int], before: Fit | None = None, steps: int = STEPS) -> Fit | None:
-        """The fit of the terms, in ascending order; None if it diverges."""
+    def _fit(self, active: Sequence[int], origin: Sequence[int] | None = None, steps: int = STEPS) -> Fit | None:
+        """The fit of the terms, in ascending order, from that of others if these are given; None if it diverges."""
         key = frozenset(active)
-        if key in self.fits:
-            return self.fits[key]
-        theta = np.array([self.guess.get(k, 0.0) for k in active])
-        states, sigma = (self.starts, self.sigma) if before is None else (before.states, before.problem.sigma)
-        problem = self._problem(active, theta, sigma)
-        fit = self._minimized(problem, theta, states, steps)
-        if fit is None and before is not None:
-            fit = self._minimized(problem, theta, self.starts, steps)
-        self.fits[key] = fit
+        if key not in self.fits:
+            self.fits[key] = self._fitted(active, origin, steps)
+            self._tell(active)
+        return self.fits[key]
+
+    def _fitted(self, active: Sequence[int], origin: Sequence[int] | None, steps: int) -> Fit | None:
+        if origin is None:
+            theta = np.array([self.guess.get(k, 0.0) for k in active])
+            return self._minimized(self._problem(active, theta, self.sigma), theta, self.starts, steps)
+        before = self._known(origin)
+        theta = self._carried(active, origin, before)
+        problem = self._problem(active, theta, before.problem.sigma)
+        return self._minimized(problem, theta, before.states, steps) or self._minimized(
+            problem, theta, self.starts, steps
+        )
+
+    def _tell(self, active: Sequence[int]) -> None:
+        fit = self.fits[frozenset(active)]
         if fit is not None:
-            self.guess = self.guess | dict(zip(active, fit.theta, strict=True))
             said = " ".join(f"{c:+.4g}*{self.library.expressions[k]}" for k, c in zip(active, fit.theta, strict=True))
             self.say(f"{len(active)} terms, criterion {self._criterion(active):.6g}: {said}")
-        return fit
+
+    @staticmethod
+    def _carried(active: Sequence[int], origin: Sequence[int], before: Fit) -> np.ndarray:
+        """θ of some terms where the squares of a model with others are least, by their quadratic approximation."""
+        dropped = np.array([k not in active for k in origin])
+        theta, covariance = before.theta.copy(), before.covariance()
+        if dropped.any():
+            theta -= covariance[:, dropped] @ np.linalg.pinv(covariance[np.ix_(dropped, dropped)]) @ theta[dropped]
+        kept = dict(zip(origin, theta, strict=True))
+        return np.array([kept.get(k, 0.0) for k in active])
 
     def _criterion(self, active: Sequence[int]) -> float:
         fit = self.fits[frozenset(active)]
@@ -526,9 +544,28 @@ class _Search:
         significance = fit.theta**2 / np.maximum(np.diag(fit.covariance()), 1e-300)
         for weakest in np.argsort(significance)[:2]:
             rest = [k for i, k in enumerate(active) if i != weakest]
-            if self._fit(rest, fit, steps) is not None:
+            known = frozenset(rest) in self.fits
+            made = self._fit(rest, active, steps)
+            promised = self._criterion(active) - self.penalty + significance[weakest]
+            if (
+                known
+                and self._criterion(rest) > promised + WORTH * self.penalty
+                and significance[weakest] < self.penalty
+            ):
+                made = self._again(rest, active, steps)  # a former fit from elsewhere ended too early, or elsewhere
+            if made is not None:
                 return rest
         return None
+
+    def _again(self, active: Sequence[int], origin: Sequence[int], steps: int) -> Fit | None:
+        """The better of the former fit of the terms and one from that of others."""
+        key, former = frozenset(active), self._criterion(active)
+        kept = self.fits[key]
+        self.fits[key] = self._fitted(active, origin, steps)
+        if not self._criterion(active) < former:
+            self.fits[key] = kept
+        self._tell(active)
+        return self.fits[key]
 
     def _with_best(self, active: list[int], anyhow: bool = False) -> list[int] | None:
         """The model with the term that gains most by the linearized problem; None if none is worth it."""
@@ -541,9 +578,9 @@ class _Search:
         best = [int(k) for k in np.argsort(gains)[::-1][: 1 if anyhow else 3] if gains[k] > least]
         found: list[int] | None = None
         for k in best:
-            self.guess = self.guess | {k: 0.0}
             wider = sorted([*active, k])
-            if self._fit(wider, fit) is not None and (found is None or self._criterion(wider) < self._criterion(found)):
+            made = self._fit(wider, active)
+            if made is not None and (found is None or self._criterion(wider) < self._criterion(found)):
                 found = wider
             if found is not None and self._criterion(found) < self._criterion(active):
                 break

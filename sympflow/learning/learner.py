@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_flag, floats, plain
 from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -43,12 +44,13 @@ from sympflow.learning.symplecticity import Reading, best_by_increments, free_re
 from sympflow.learning.trajectories import Trajectories, periods_of
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
+from sympflow.training.starts import suited_step
 from sympflow.training.trainer import train
 from sympflow.workers import Crew
 
 HELD_OUT = 0.2  # of the trajectories
 TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
-NETWORK_SECONDS = 60.0  # for the weights of one, where H is not separable
+STEPPED = 100  # states by which the steps of a flow are chosen, where H is not separable
 DOUBTFUL_SECONDS = 5.0  # for a flow of data that no symplectic map explains
 TABLE_SHARE = 0.3  # of a time budget, likewise
 HORIZONS = (1, 10, 100)  # in Δt, of the held-out errors
@@ -657,16 +659,7 @@ class Search:
     def flow(self, dt: float | None, name: str, session: Session) -> Any:
         """A flow of the H that was learned."""
         system = self.system(name)
-        options: dict[str, Any] = {"restarts": TABLE_STARTS}
-        if not system.separable:
-            options = {"optimizer": "gauss-newton", "time_budget": NETWORK_SECONDS}
-        if session.time_budget is not None:
-            options["time_budget"] = max(session.deadline.left, LEAST_SECONDS)
-        if self.tested and self.tested[0] is not None:
-            options["time_budget"] = min(options.get("time_budget", math.inf), DOUBTFUL_SECONDS)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Training", category=RuntimeWarning)
-            flow = train(system, dt, progress=session.progress, seed=self.seed, **options)
+        flow = self._primed(system, dt, session) if system.separable else self._collocated(system, dt)
         flow.figures = {**flow.figures, **self.figures(flow.dt), "energy_scatter": self.energy_scatter(flow)}
         self._check_flow(flow)
         flow.history = self.history
@@ -675,6 +668,27 @@ class Search:
         flow.recipe = {**flow.recipe, "learned": {**learned, "damping": damping}}
         flow.take_learned(system)
         return flow
+
+    def _primed(self, system: HamiltonianSystem, dt: float | None, session: Session) -> FlowMap:
+        options: dict[str, Any] = {"restarts": TABLE_STARTS}
+        if session.time_budget is not None:
+            options["time_budget"] = max(session.deadline.left, LEAST_SECONDS)
+        if self.tested and self.tested[0] is not None:
+            options["time_budget"] = min(options.get("time_budget", math.inf), DOUBTFUL_SECONDS)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Training", category=RuntimeWarning)
+            return train(system, dt, progress=session.progress, seed=self.seed, **options)
+
+    def _collocated(self, system: HamiltonianSystem, dt: float | None) -> FlowMap:
+        """Steps of a Gauss method, as many as they take where the data are: no fit comes near their accuracy."""
+        states = self.final.states
+        states = states[np.random.default_rng(self.seed).permutation(len(states))[:STEPPED]]
+        if dt is not None:
+            try:
+                return SympFlow.collocated(system, dt=dt, states=states)
+            except ValueError as error:
+                warnings.warn(f"{error} The flow that was made has its own.", UserWarning, stacklevel=4)
+        return SympFlow.collocated(system, dt=suited_step(system, states), states=states)
 
     def _check_flow(self, flow: FlowMap) -> None:
         """Warn of a flow that is worse than the H of which it is."""

@@ -629,10 +629,16 @@ def chosen_method(model: Field, theta: np.ndarray, data: Trajectories, tolerance
     starts, gaps = _gaps(data)
     widest = float(gaps.max())
     best: tuple[float, Method] | None = None
-    for stepper in steppers(model):
+
+    def cost(method: Method) -> float:
+        return method.stepper.cost * float(np.mean([method.steps(gap[None]) for gap in gaps]))
+
+    for stepper in reversed(steppers(model)):  # those of a high order first: others are left when they cost more
         method = Method(stepper.within(tolerance), widest)
         end, before = _ends(model, theta, method, starts, gaps), math.inf
         for _ in range(12):
+            if best is not None and cost(method) > best[0]:
+                break
             finer = replace(method, longest=method.longest / 2)
             after = _ends(model, theta, finer, starts, gaps)
             with np.errstate(invalid="ignore", over="ignore"):
@@ -640,9 +646,8 @@ def chosen_method(model: Field, theta: np.ndarray, data: Trajectories, tolerance
             if error <= 1 or (error > before / 2 and error < 1e3):  # rounding
                 break
             method, end, before = finer, after, error
-        cost = stepper.cost * float(np.mean([method.steps(gap[None]) for gap in gaps]))
-        if best is None or cost < best[0]:
-            best = cost, method
+        if best is None or cost(method) <= best[0]:
+            best = cost(method), method
     assert best is not None
     return best[1]
 

@@ -260,6 +260,7 @@ class Labels:
             except OutOfTime:
                 raise OutOfTime(
                     f"the exact solution was followed from {len(y[-1])} states to t = {reached:.3g} of {t[-1]:.3g} only"
+                    f"{_fast_part(system, y[0][:, :width], float(t[-1]), t0)}"
                 ) from None
             exists = np.isfinite(after).all(-1)
             y, reached = [states[exists] for states in (*y, after)], time
@@ -304,6 +305,23 @@ class Labels:
     def times(self) -> np.ndarray | None:
         """The times of the states y (J, N), of a driven system."""
         return None if self.t0 is None else self.t[:, None] + self.t0
+
+
+@np.errstate(all="ignore")
+def _fast_part(system: HamiltonianSystem, x: np.ndarray, t: float, t0: np.ndarray | None) -> str:
+    """The states whose velocity would carry them across all others in the time t, in words that go on.
+
+    With a box without them; none where there is no such box. `t0` are the times of the states of a driven system.
+    """
+    velocity = np.asarray(system.vector_field(x) if t0 is None else system.vector_field(x, t0))
+    fast = ~(np.abs(velocity) * t <= np.ptp(x, axis=0)).all(1)
+    box = box_without(x[~fast], x[fast])
+    if box is None:
+        return ""
+    return (
+        f"; at {fast.sum()} of them the motion is so fast that it would leave `domain` in that time, as near a "
+        f"singularity or on the way to infinity, and none of these is in Box({box[0]}, {box[1]})"
+    )
 
 
 def box_without(good: np.ndarray, bad: np.ndarray) -> tuple[list[float], list[float]] | None:

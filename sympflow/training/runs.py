@@ -22,6 +22,7 @@ from sympflow.training.points import USELESS, drive_times
 from sympflow.training.session import Deadline, Path, Session
 
 OUT_OF_TIME = "the time budget was used up"
+NO_LABELS = "its labels were not known in their share of the time budget"
 INTERRUPTED = "it was interrupted"
 LABEL_SHARE = 0.3  # of the time left, that each set of labels may take
 
@@ -259,9 +260,11 @@ class Unstarted(Run):
         raise AssertionError
 
     def end(self, session: Session) -> str | None:
-        return INTERRUPTED if session.interruption.asked else OUT_OF_TIME
+        return INTERRUPTED if session.interruption.asked else NO_LABELS
 
     def ended_early(self, reason: str) -> str:
+        if reason == INTERRUPTED:
+            return f"Training did not start because {reason}. What it was to start from is returned, the best so far."
         return (
             f"Training did not start because {reason}: {self.reached}. What it was to start from is returned. Give a "
             "longer `time_budget`, a shorter `dt`, or fewer `points`, `label_times` and `reference_states`; or a "

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
+from scipy.integrate import DOP853
 
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.mlp import MLPFlow, matching_widths
@@ -31,8 +33,11 @@ PHASE = 1.0  # ω Δt of the default flow: energy errors of 1e-8 to 1e-5, where 
 KICK_PHASE = 0.25  # ω Δt for each kick of the kernel
 MOST_STAGES = 24
 MOST_PERIODS = 30  # of most states, that Δt may hold
-FASTER, SEVERAL_SAMPLES = 50.0, 400  # times the rate at half of so many states, beyond which a domain is too large
+FASTER, SEVERAL_SAMPLES = 20.0, 400  # times the rate at half of so many states, beyond which a domain is too large
 NARROWED = 10  # times at most
+ORBITS, ORBIT_STEPS, ORBIT_TOLERANCE = 12, 150, 1e-5  # by which is seen where orbits of a part of the domain come
+CROSSINGS = 4.0  # of the domain, by such an orbit
+ENERGIES = (0.9, 0.75, 0.5)  # shares of the states, with less energy than the others
 ITERATIONS, FEWER_SAMPLES = 40, 100  # of the power method, for many degrees of freedom
 
 
@@ -61,8 +66,8 @@ class Primed:
         Kicks of the kernel K.
     processor : int
         Kicks of the processor χ.
-    curvature : bool
-        Whether kicks have curvature terms.
+    curvature : bool or tuple of int
+        Whether, or which, kicks have curvature terms.
     polynomial : int, optional
         The degree of the polynomials in place of these.
     first : {"drift", "kick"}
@@ -76,13 +81,24 @@ class Primed:
     dt: float
     stages: int = 3
     processor: int = 6
-    curvature: bool = False
+    curvature: bool | tuple[int, ...] = False
     polynomial: int | None = None
     first: str = "drift"
     scheme: str | None = None
     force_gradient: bool | tuple[int, ...] | None = None
 
     kind: ClassVar[str] = "primed"
+
+    @property
+    def levels(self) -> list[int]:
+        """The terms of each kick of a step, see `sympflow.schemes.Scheme.level`; one that steps share counts once."""
+        n = self.stages + (self.first == "kick")
+
+        def having(which: bool | tuple[int, ...] | None) -> Iterable[int]:
+            return which if isinstance(which, tuple) else range(n if which or which is None else 0)
+
+        levels = [(i in having(self.force_gradient)) * (1 + (i in having(self.curvature))) for i in range(n)]
+        return levels if self.first == "drift" else levels[:-1]
 
     def flow(
         self, system: HamiltonianSystem, domain: Domain | None = None, earlier: FlowMap | None = None
@@ -195,6 +211,14 @@ def check_step(system: HamiltonianSystem, domain: Domain, dt: float) -> None:
         )
 
 
+def suited_step(system: HamiltonianSystem, y: np.ndarray) -> float:
+    """Δt such that the fastest rate of the linearized motion, at 99 % of states y (n, 2d), times it is about 1."""
+    rates = _rates(system, y)
+    rates = rates[np.isfinite(rates)]
+    rate = float(np.quantile(rates, QUANTILE)) if len(rates) else 0.0
+    return _rounded(PHASE / rate) if rate > 0 else 1.0
+
+
 @np.errstate(all="ignore")
 def _rates(system: HamiltonianSystem, y: np.ndarray) -> np.ndarray:
     """The fastest rate of the linearized motion at each of the states (n, 2d): (n,), NaN where it is not finite."""
@@ -211,7 +235,8 @@ def _rates(system: HamiltonianSystem, y: np.ndarray) -> np.ndarray:
 def warn_of_domain(system: HamiltonianSystem, domain: Domain) -> None:
     """Warn of a domain where H is not defined in part of it, or the motion far faster than at half of its states.
 
-    Δt is made for the fastest ones. The warning names a box without that part.
+    Δt is made for the fastest ones. The warning names a box without that part or, where orbits come to it from
+    elsewhere, a sublevel of the energy.
     """
     y = domain.sample(SEVERAL_SAMPLES, SEED)
     with np.errstate(all="ignore"):
@@ -232,6 +257,7 @@ def warn_of_domain(system: HamiltonianSystem, domain: Domain) -> None:
     known = rates[np.isfinite(rates)]
     if not len(known) or not np.quantile(known, QUANTILE) > FASTER * np.median(known) > 0:
         return
+    every, rate_of = y, rates
     low, high = y.min(0).tolist(), y.max(0).tolist()
     for _ in range(NARROWED):
         slow = rates <= 0.5 * FASTER * np.median(rates[np.isfinite(rates)])
@@ -242,14 +268,59 @@ def warn_of_domain(system: HamiltonianSystem, domain: Domain) -> None:
         inside = ((y >= low) & (y <= high)).all(1)
         y, rates = y[inside], rates[inside]
     q, half = np.quantile(known, QUANTILE), np.median(known)
-    warnings.warn(
-        f"`domain` has states at which the motion is {q / half:.1e} times faster than at half of them, and the Δt of a "
-        f"flow for all of it suits these, about {PHASE / q:.1e}, where most others could have {PHASE / half:.1e}. "
-        f"Without them the domain is about Box({low}, {high}): take that, or a smaller one that holds your orbits, or "
-        "give `dt`.",
-        UserWarning,
-        stacklevel=4,
-    )
+    words = f"`domain` has states at which the motion is {q / half:.1e} times faster than at half of them, and "
+    met = _fastest_met(system, y[np.isfinite(rates)])
+    if np.median(met) > 0.5 * FASTER * half:
+        words += (
+            f"orbits that begin elsewhere come there, as to a wall, so that no smaller box holds them. The Δt of a "
+            f"flow suits these states, about {PHASE / q:.1e}{_less_energy(system, every, rate_of)}."
+        )
+    else:
+        words += (
+            f"the Δt of a flow for all of it suits these, about {PHASE / q:.1e}, where most others could have "
+            f"{PHASE / half:.1e}. Without them the domain is about Box({low}, {high}): take that, or a smaller one "
+            "that holds your orbits, or give `dt`."
+        )
+    warnings.warn(words, UserWarning, stacklevel=4)
+
+
+@np.errstate(all="ignore")
+def _fastest_met(system: HamiltonianSystem, y: np.ndarray) -> np.ndarray:
+    """The fastest rate that the orbits of a few of the states meet while they cross these several times."""
+    y, d = y[:: max(1, len(y) // ORBITS)][:ORBITS], system.ndof
+    time = None if system.autonomous else 0.0
+    speeds = np.abs(system.vector_field(y, *(() if time is None else (np.zeros(len(y)),)))[:, :d])
+    span = CROSSINGS * float(np.max(np.ptp(y[:, :d], axis=0) / np.maximum(np.median(speeds, axis=0), 1e-300)))
+
+    def slope(t: float, x: np.ndarray) -> np.ndarray:
+        return np.asarray(system.vector_field(x) if time is None else system.vector_field(x, t))
+
+    met = []
+    for start in y:
+        orbit = DOP853(slope, 0.0, start, span, rtol=ORBIT_TOLERANCE, atol=ORBIT_TOLERANCE)
+        passed = [start]
+        while orbit.status == "running" and len(passed) < ORBIT_STEPS:
+            orbit.step()
+            passed.append(orbit.y)
+        rates = _rates(system, np.array(passed))
+        met.append(np.max(rates[np.isfinite(rates)], initial=0.0))
+    return np.array(met)
+
+
+@np.errstate(all="ignore")
+def _less_energy(system: HamiltonianSystem, y: np.ndarray, rates: np.ndarray) -> str:
+    """A sublevel of the energy where the motion is half as fast or less, in words that go on; none if there is none."""
+    energies = system.hamiltonian(y, start_times(system, 0.0, len(y), SEED, Stream.SCALING))
+    fastest = np.quantile(rates[np.isfinite(rates)], QUANTILE)
+    for share in ENERGIES if system.autonomous else ():
+        below = energies <= np.quantile(energies, share)
+        if 2 * (rate := np.quantile(rates[below & np.isfinite(rates)], QUANTILE)) <= fastest:
+            low, high = ([float(f"{v:.2g}") for v in corner] for corner in (y[below].min(0), y[below].max(0)))
+            return (
+                f"; with less energy it is longer: {PHASE / rate:.1e} in EnergySublevel("
+                f"{energies[below].max():.3g}, Box({low}, {high}))"
+            )
+    return ""
 
 
 def _sizes(matrices: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from sympflow.flow.flow_map import FlowMap, check_system
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
-from sympflow.hamiltonian.domain import Domain, domain_of
+from sympflow.hamiltonian.domain import Domain, domain_of, remedy_for
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
@@ -359,13 +359,10 @@ def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
     if domain is None:
         raise ValueError(
             f"`domain` is not known for the system {system.name!r}: pass the states to train on, as by "
-            "domain=sympflow.Box(low, high), sympflow.Ball(center, radius) or sympflow.EnergySublevel(energy, box)."
+            f"domain={remedy_for(system)}."
         )
     if not isinstance(domain, Domain):
-        raise TypeError(
-            f"`domain` must be a domain of phase space; got {domain!r}: use sympflow.Box(low, high), "
-            "sympflow.Ball(center, radius) or sympflow.EnergySublevel(energy, box)."
-        )
+        raise TypeError(f"`domain` must be a domain of phase space; got {domain!r}: use {remedy_for(system)}.")
     domain = domain_of(domain, system)
     width = domain.sample(1, 0).shape[-1]
     if width != 2 * system.ndof:

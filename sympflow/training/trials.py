@@ -28,14 +28,24 @@ FEWER, REFERENCE = (
     1e-10,
 )  # steps of orbits of which the energy changes, and the tolerance of the exact ones beside them
 SHAPES = (
-    (1, 9, "drift", 1.5),
-    (2, 9, "drift", 1.2),
-    (3, 9, "drift", 1.0),
-    (4, 8, "kick", 1.0),
-    (5, 8, "kick", 1.0),
-    (6, 8, "kick", 1.0),
+    ("111", 9, 1.0),
+    ("010", 6, 1.0),
+    ("010", 9, 1.2),
+    ("k010", 9, 1.2),
+    ("k101", 9, 1.2),
+    ("k1001", 6, 1.0),
+    ("k01010", 6, 0.9),
+    ("k10101", 6, 0.9),
+    ("1", 9, 1.5),
+    ("222", 9, 1.0),
+    ("121", 6, 1.0),
+    ("k121", 6, 1.2),
+    ("k121", 9, 1.5),
+    ("k1221", 9, 1.0),
+    ("2", 9, 1.5),
 )
-"""Kicks of K and of χ, what a step begins with, and how much longer it is for its kicks, of flows that are tried too.
+"""Kicks of K, "k" in front where a step begins with one, those of χ, and how much longer Δt is for the kicks of K, of
+flows that are tried too: a kick is 0, plain, 1, with a force gradient, or 2, with a curvature term besides.
 
 A step of one kick or two leaves more to the processor, and is longer for its kicks. With processors of twelve long runs
 gain some per cent more, but an output between steps, of 25 to 29 kicks, makes runs with many outputs slower."""
@@ -74,10 +84,10 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     time, times e^(1/p), p = 6. Curvature terms are tried with the best Δt, unless they make kicks twice as dear. What
     kicks with and without them take is estimated in cycles (`kick_cycles`), and where that does not decide, by a
     quarter, measured: the loops of both flows are compiled and run, as they will be by `solve`. Then `SHAPES` are tried
-    with kicks of the better kind, about as many in a unit of time as at that Δt and at the next shorter one; a larger
-    processor must gain a twentieth. Where all errors are above 1e-5 it is the flow with the smallest, or of those with
-    up to twice that the one that gains most. The machine has a say in the kind of the kicks alone, and time only if
-    two thirds of that of the session are not enough for the trials.
+    with kicks of the better kind, some of which have fewer terms or none: about as many in a unit of time as at that Δt
+    and at the next shorter one; a larger processor must gain a twentieth. Where all errors are above 1e-5 it is the
+    flow with the smallest, or of those with up to twice that the one that gains most. The machine has a say in the kind
+    of the kicks alone, and time only if two thirds of that of the session are not enough for the trials.
 
     Parameters
     ----------
@@ -94,7 +104,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     starts = tried_starts(system, domain, curvature=False)
     try:
         ranges = position_ranges(system.symbols, domain) if system.autonomous else ()
-        costs = [kick_cycles(system.symbols, level, ranges) for level in (FORCE_GRADIENT, CURVATURE)]
+        costs = [kick_cycles(system.symbols, level, ranges) for level in (0, FORCE_GRADIENT, CURVATURE)]
     except ValueError:  # H has no compiled form
         return Trial(starts[0], math.inf)
     session, found = Session() if session is None else session, dict[Primed, Trial]()
@@ -105,8 +115,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         least = min(found[start].error for start in tried)
         worst = GOAL if least <= GOAL else ALIKE * least
         return {
-            start: costs[start.curvature]
-            * start.stages
+            start: sum(costs[level] for level in start.levels)
             / start.dt
             * found[start].error ** (1 / ORDER)
             * LARGER ** (start.processor > starts[0].processor)
@@ -118,7 +127,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         work = good(tried)
         return min(work, key=work.__getitem__)
 
-    bends = costs[1] <= DEAREST * costs[0]
+    bends = costs[CURVATURE] <= DEAREST * costs[FORCE_GRADIENT]
     with session.bar(len(starts) + bends + 2 * len(SHAPES), f"{system.name} trials") as bar:
 
         def attempt(wanted: list[Primed]) -> None:
@@ -151,7 +160,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         if len(work) == 2 and max(work.values()) <= BEHIND * min(work.values()) and not deadline.over():
             measured = [_kick_seconds(found[start].flow, system, domain) for start in both]
             if all(measured):
-                costs = [measured[0], SURE * measured[1]]
+                costs = [measured[0] * costs[0] / costs[FORCE_GRADIENT], measured[0], SURE * measured[1]]
         chosen = best(both) if bent in found else straight
         shorter = replace(starts[max(0, starts.index(straight) - 1)], curvature=chosen.curvature)
         others = list(dict.fromkeys([*shaped(chosen), *shaped(shorter)]))
@@ -190,16 +199,36 @@ def all_starts(system: HamiltonianSystem, domain: Domain) -> list[Primed]:
 
 
 def shaped(start: Primed) -> list[Primed]:
-    """The flow in each of the `SHAPES`, with about as many kicks in a unit of time."""
-    return [
-        replace(start, dt=float(f"{start.dt * longer * n / start.stages:.3g}"), stages=n, processor=c, first=first)
-        for n, c, first, longer in SHAPES
-    ]
+    """The flow in each of the `SHAPES` with kicks of its kind, with about as many of them in a unit of time."""
+    made = []
+    for shape, processor, longer in SHAPES:
+        levels = [int(level) for level in shape.removeprefix("k")]
+        first, n = ("kick", len(levels) - 1) if shape[0] == "k" else ("drift", len(levels))
+        if bool(start.curvature) != (CURVATURE in levels):
+            continue
+        some = {
+            name: True if min(levels) >= least else tuple(i for i, level in enumerate(levels) if level >= least)
+            for name, least in (("force_gradient", FORCE_GRADIENT), ("curvature", CURVATURE))
+        }
+        dt = float(f"{start.dt * longer * n / start.stages:.3g}")
+        made.append(
+            replace(
+                start,
+                dt=dt,
+                stages=n,
+                processor=processor,
+                first=first,
+                force_gradient=some["force_gradient"],
+                curvature=some["curvature"] if start.curvature else False,
+            )
+        )
+    return made
 
 
 def _described(start: Primed) -> str:
-    kicks = f"{start.stages} kicks and {start.processor}{', with curvature terms' * start.curvature}"
-    return f"Δt = {start.dt:g}, {kicks}"
+    words = {0: "plain", FORCE_GRADIENT: "with a force gradient", CURVATURE: "with a curvature term"}
+    kinds = ", ".join(f"{start.levels.count(level)} {words[level]}" for level in sorted({*start.levels}))
+    return f"Δt = {start.dt:g}, kicks: {kinds}; processor of {start.processor}"
 
 
 def _trial_of(common: tuple[HamiltonianSystem, Domain, Deadline], start: Primed) -> Trial:

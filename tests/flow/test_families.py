@@ -6,7 +6,7 @@ import pickle
 import pytest
 import torch
 
-from sympflow import MLPFlow, SympFlow, solve, systems, time_transformed
+from sympflow import HamiltonianSystem, MLPFlow, SympFlow, solve, systems, time_transformed
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.families import FAMILIES, family, family_of
 from sympflow.flow.flow_map import FlowMap
@@ -15,11 +15,13 @@ from sympflow.kernels.protocol import Kernel
 
 PENDULUM, KEPLER = systems.pendulum(), systems.kepler()
 TRANSFORMED, DRIVEN = time_transformed(KEPLER), systems.driven_pendulum()
+WHOLE = HamiltonianSystem.from_sympy("p**2*(1 + q**2)/2 + q**2/2", y0=[0.4, 0.3])
 FLOWS = {
     "sympflow": (lambda: SympFlow(1, hidden=(4, 3)), PENDULUM),
     "primed": (lambda: SympFlow.primed(PENDULUM, 2, dt=0.3, processor=2, curvature=True), PENDULUM),
     "split": (lambda: SympFlow.split(PENDULUM, 2, dt=0.1, parts=("1 - cos(q1)", "p1**2/2")), PENDULUM),
     "clocked": (lambda: ClockedFlow(TRANSFORMED.ndof, "leapfrog", 3, 0.2, TRANSFORMED), TRANSFORMED),
+    "collocated": (lambda: SympFlow.collocated(WHOLE, dt=0.2, stages=2, steps=2), WHOLE),
     "timed": (lambda: SympFlow.timed(DRIVEN, 2, hidden=(4,)), DRIVEN),
     "mlp": (lambda: MLPFlow(1, (4, 5)), PENDULUM),
 }
@@ -75,7 +77,7 @@ def test_what_is_asked_of_a_flow_map(name):
     assert flow.matches(systems.henon_heiles()) == (flow.fingerprint is None and flow.ndof == 2)
     assert flow.origin is None
     assert len(flow.clock_numbers()) == (3 if name == "clocked" else 0)
-    assert any(flow.evaluations(10, 1, 0, "array").values()) == (name in ("primed", "split", "clocked"))
+    assert any(flow.evaluations(10, 1, 0, "array").values()) == (name in ("primed", "split", "clocked", "collocated"))
     begun = started(flow)
     slope = flow.initial_velocity(x, **begun)
     torch.testing.assert_close(slope, flow.velocity(0.0, x, **begun), rtol=1e-12, atol=1e-13)
@@ -100,7 +102,8 @@ def test_compiled_loops_are_kept_while_no_weight_changes(name):
         assert other.kernel_for(system) is not kernel
     with pytest.raises(ValueError, match=r"^`flow` is torch.float32 on cpu: compiled flows are float64 on the CPU"):
         copy.deepcopy(flow).float().kernel_for(system)
-    next(flow.parameters()).mul_(1.5).add_(0.1)
+    for weights in list(flow.parameters())[:1]:  # a collocated flow has none
+        weights.mul_(1.5).add_(0.1)
     x = torch.as_tensor(system.y0)
     after = flow.kernel_for(system).step(flow.dt, x[None].numpy()).states
     torch.testing.assert_close(torch.as_tensor(after[0]), flow.psi(flow.dt, x), rtol=1e-12, atol=1e-13)

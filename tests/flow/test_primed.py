@@ -57,6 +57,7 @@ FLOWS = {
     "processed, with curvature": lambda: random_flow(HH, scheme="verlet", processor=1, curvature=True),
     "polynomial": lambda: random_flow(HH, stages=2, degree=3, polynomial=4),
     "processed, with polynomials": lambda: random_flow(HH, size=0.01, scheme="verlet", processor=1, polynomial=4),
+    "some kicks with more terms": lambda: random_flow(HH, stages=3, degree=3, processor=1, curvature=[1]),
     "another dt": lambda: random_flow(HH, stages=2, dt=0.3, degree=1),
 }
 
@@ -311,7 +312,7 @@ def test_files_hold_the_numbers_and_solve_gives_the_system(flow, tmp_path):
     assert loaded.scheme(0.4 * flow.dt) == flow.scheme(0.4 * flow.dt)
     with pytest.raises(ValueError, match=r"^`flow` is primed with the V and T of a system"):
         loaded(0.1, x)
-    y0 = system.domain.sample(2, 0)
+    y0 = system.domain.sample(1, 0)[0]
     sol = solve(system, loaded, (0.0, 2.5 * flow.dt), y0=y0, on_domain_exit="ignore")
     np.testing.assert_array_equal(sol.y, solve(system, flow, (0.0, 2.5 * flow.dt), y0=y0, on_domain_exit="ignore").y)
     assert torch.equal(sympflow.load(path, system=system)(0.3, x), flow(0.3, x))
@@ -349,6 +350,7 @@ def test_another_system_is_refused(tmp_path):
         {"gradient_kicks": [7]},
         {"gradient_kicks": [0]},
         {"gradient_kicks": 1},
+        {"curvature_kicks": [0]},
         {"monomials": [[0, 2]]},
         {"monomials": [[0, 2]], "force_gradient": False},
         {"monomials": [[0, 2, 1]], "force_gradient": False},
@@ -431,6 +433,8 @@ def test_it_trains_like_any_sympflow():
         ({"stages": 3, "force_gradient": [3]}, r"^`force_gradient` \(3,\) does not name kicks from 0 to 2, each once"),
         ({"stages": 3, "force_gradient": []}, r"^`force_gradient` \(\) does not name kicks from 0 to 2"),
         ({"stages": 3, "force_gradient": [2, 0]}, r"^`force_gradient` \(2, 0\) does not name kicks .* and in order"),
+        ({"stages": 3, "force_gradient": [1], "curvature": [0, 2]}, r"^`curvature` \(0, 2\) names kicks without"),
+        ({"stages": 3, "curvature": [0]}, r"^`curvature` \(0,\) is not the same from either end of 3 kicks"),
         ({"dt": -1.0}, r"^`dt` must be a positive"),
         ({"processor": -1}, r"^`processor` must be a non-negative integer"),
         ({"polynomial": 0}, r"^`polynomial` must be a positive integer, its degree; got 0"),

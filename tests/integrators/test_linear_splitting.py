@@ -23,7 +23,9 @@ def test_the_order_is_the_slope(name):
     assert -0.5 < np.log2(errors[0] / errors[1]) - order < 2
 
 
-@pytest.mark.parametrize("name", ["impulse", "mollified_impulse", "linear_omelyan4", "strang_parts"])
+@pytest.mark.parametrize(
+    "name", ["impulse", "mollified_impulse", pytest.param("linear_omelyan4", marks=pytest.mark.slow), "strang_parts"]
+)
 def test_compiled_array_and_tensor_runs_agree(name):
     system = henon_heiles()
     y0 = system.y0 * np.linspace(0.7, 1.0, 3)[:, None]

@@ -22,7 +22,7 @@ OURS = [
     if issubclass(get(name), FixedStep) and get(name).on_grid and name not in (*FIXED, "sympflow", "mlp")
 ]
 METHODS = [*OURS, "sympflow"]
-KINDS = ["verlet", "leapfrog", "chin4a", "implicit_midpoint", "mollified_impulse", "linear_omelyan4", "strang_parts"]
+KINDS = ["verlet", "leapfrog", "chin4a", "gauss_legendre4", "mollified_impulse", "linear_omelyan4", "strang_parts"]
 
 
 def flow(seed=0, **options):

@@ -48,7 +48,9 @@ def test_schemes_keep_their_order_where_the_kinetic_energy_depends_on_the_time(n
     assert slope(IN_DRIFT, SCHEMES[name]) > SCHEMES[name].order - 0.35
 
 
-@pytest.mark.parametrize("method", ["verlet", "leapfrog", "omelyan6", "gauss_legendre4"])
+@pytest.mark.parametrize(
+    "method", ["verlet", "leapfrog", pytest.param("omelyan6", marks=pytest.mark.slow), "gauss_legendre4"]
+)
 def test_compiled_runs_are_those_of_arrays(method):
     times = np.append(np.linspace(T0 + 0.03, T0 + 1.9, 17), T0 + 2.0)
     span = (T0, T0 + 2.0)

@@ -1,17 +1,17 @@
 """Kicks as generated code: every shape gives the same momenta; the costs by which one is chosen."""
 
-import itertools
 import math
+import re
 
 import numpy as np
 import pytest
 import sympy as sp
 
-from sympflow import SympFlow, systems
+from sympflow import Box, SympFlow, systems
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.approximations import on_interval
+from sympflow.kernels.approximations import on_interval, position_ranges
 from sympflow.kernels.codegen import printed
-from sympflow.kernels.kicks import _function, _scheduled, kicks_source, shapes
+from sympflow.kernels.kicks import _by_products, _function, _scheduled, kicks_source, shapes
 from sympflow.kernels.scheduling import ADD, FUSED, MULTIPLY, Schedule, nested
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
@@ -31,23 +31,48 @@ ELEMENTARY = {
     "math": math,
     "fast_sin": math.sin,
     "fast_cos": math.cos,
+    "fast_exp": math.exp,
+    "fast_tanh": math.tanh,
     "fused_multiply_add": lambda a, b, c: a * b + c,
     "njit": lambda **_: lambda f: f,
     "OPTIONS": {},
 }
 
 
-@pytest.mark.parametrize("terms", [1, 2, 3])
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    ("name", "terms"),
+    [
+        pytest.param(name, terms, marks=[pytest.mark.slow] * (terms == 3 and name in ("quartic", "masses")))
+        for name in SCENES
+        for terms in (1, 2, 3)
+    ],
+)
 def test_every_shape_gives_the_same_momenta(name, terms):
     system = SCENES[name]()
-    symbols, d = system.symbols, system.ndof
-    rng = np.random.default_rng(0)
-    forms = list(shapes(symbols, terms))
+    forms = list(shapes(system.symbols, terms))
     rewritten = name != "kinks" and (name, terms) != ("roots", 3)  # that one is too long
     assert len(forms) >= (3 if rewritten else 1)
-    for shape, common in itertools.product(forms, (True, False)):
-        kick = _scheduled(symbols, shape, "s_", common)
+    check_kicks(
+        system,
+        terms,
+        [_scheduled(system.symbols, form, "s_", common) for form in forms for common in (True, False)],
+    )
+
+
+@pytest.mark.parametrize("terms", [1, 2, 3])
+@pytest.mark.parametrize("name", [*SCENES, "bonds"])
+def test_so_do_kicks_of_lanes_by_products(name, terms):
+    system = RANGED[name][0]() if name == "bonds" else SCENES[name]()
+    found = _by_products(system.symbols, terms, "s_")
+    assert len(found) == (name != "kinks")
+    check_kicks(system, terms, found)
+
+
+def check_kicks(system, terms, kicks):
+    """They give p − b∇V + g∇²V v − c∇(½ v·∇²V v), or as many of these terms."""
+    symbols, d = system.symbols, system.ndof
+    rng = np.random.default_rng(0)
+    for kick in kicks:
         functions = dict(ELEMENTARY)
         lines = [*kick.coefficients, *kick.lines]
         exec(_function(symbols, "kick", "q, p, b, g, c", lines, kick.results), functions)
@@ -61,6 +86,22 @@ def test_every_shape_gives_the_same_momenta(name, terms):
                 expected = expected - c * system.curvature_gradient(q)
             found = functions["kick"](q.tolist(), p.tolist(), float(b), float(g), float(c))
             np.testing.assert_allclose(found, expected, rtol=0, atol=3e-14 * (1 + np.abs(expected).max()))
+
+
+@pytest.mark.parametrize(
+    ("H", "most", "exponentials"),
+    [
+        ("p1**2/4 + p2**2 + 2*p1*p2/5 + (q1**2 + q2**2)/2 + 3*q1**2*q2/10 + (q1**4 + q2**4)/5", 21, 0),
+        ("(p1**2 + p2**2)/2 + (1 - exp(-q1))**2 + (1 - exp(q1 - q2))**2", 24, 2),
+    ],
+)
+def test_a_force_gradient_of_a_lane_takes_few_operations_and_no_function_of_the_library(H, most, exponentials):
+    source = kicks_source(HamiltonianSystem.from_sympy(H).symbols, FORCE_GRADIENT)
+    body = source.partition("def gradient_kicked_lane(")[2].partition("return")[0]
+    operations = [line for line in body.splitlines() if re.search(r"= .*[qp]\d|= .*g_\d", line)]
+    assert len(operations) <= most
+    assert body.count("fast_exp(") == exponentials
+    assert "math." not in source.partition("def kicked_lane(")[2].partition("return")[0] + body
 
 
 RANGED = {
@@ -99,6 +140,12 @@ def test_kicks_in_ranges_of_positions_are_the_same_but_for_rounding(name, level)
         lane = functions[f"{kind}_kicked_lane"](q, p, numbers)
         np.testing.assert_allclose(alone, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
         np.testing.assert_allclose(lane, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
+
+
+def test_kinks_have_no_ranges():
+    system = HamiltonianSystem.from_sympy("p**2/2 + Abs(q)", domain=Box([-1, -1], [1, 1]))
+    assert position_ranges(system.symbols, system.domain) == ()
+    assert "DiracDelta" not in kicks_source(system.symbols, FORCE_GRADIENT)
 
 
 def test_functions_are_polynomials_where_few_powers_are_exact():

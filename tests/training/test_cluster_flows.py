@@ -78,6 +78,15 @@ def test_bad_arguments_of_a_piece_are_refused():
         LatticeStates(0.1).of(cluster())
 
 
+@pytest.mark.parametrize(
+    ("system", "states"),
+    [(cluster(), "ClusterStates"), (HamiltonianSystem.lattice(bond="r**2/2", shape=6), "LatticeStates")],
+)
+def test_states_that_are_not_known_are_asked_for_by_their_name(system, states):
+    with pytest.raises(ValueError, match=rf"^`domain` is not known .*domain=sympflow\.{states}\(density\), "):
+        train(system)
+
+
 def test_a_flow_serves_any_number_of_bodies(flow, tmp_path):
     assert flow.ndof == 20
     assert flow.recipe["fitted_on"] == 14

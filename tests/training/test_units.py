@@ -48,7 +48,7 @@ def test_trials_and_the_choice_by_them_are_alike_in_all_units(monkeypatch):
     monkeypatch.setattr(trials, "trial", noted)
     systems = [oscillator(*unit) for unit in UNITS[:2]]
     chosen = [trials.chosen_trial(system, system.domain).start for system in systems]
-    assert [start.curvature for start in chosen] == [True, True]
+    assert all(start.curvature for start in chosen)
     first, second = (replace(start, dt=start.dt / T) for start, T in zip(chosen, PERIODS, strict=False))
     assert first == replace(second, dt=first.dt)
     assert first.dt == pytest.approx(second.dt, rel=1e-12)

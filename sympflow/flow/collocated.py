@@ -1,0 +1,299 @@
+"""Collocated flows: steps of Gauss's methods with a system's own H, separable or not; nothing in them is trained.
+
+    K_i = s f(x + Σ_j a_ij K_j),   χ_s(x) = x + Σ_i b_i K_i,   f = J∇H,      ψ̄_t = (χ_{t/m})^m
+
+Every χ_s is symplectic, and χ_{−s} its inverse. Its generating function is the action of the collocation polynomial,
+which is stationary in the stages, so that the derivative by s is the explicit one: χ is the exact flow of
+
+    𝓗(s, χ_s(x)) = Σ_i b_i H(Y_i),   Y_i = x + Σ_j a_ij K_j,
+
+the mean of H over the stages, and ψ̄ of the mean over those of all m steps.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from sympflow.arguments import floats, plain
+from sympflow.arrays import jvp, per_state
+from sympflow.flow.files import Refused, checked_integer
+from sympflow.flow.flow_map import FlowMap, check_system
+from sympflow.flow.layers import Layer
+from sympflow.flow.potentials import Time
+from sympflow.flow.primed_potentials import Binding
+from sympflow.flow.sympflow import UNCOMPENSATED, SympFlow
+from sympflow.flow.weights import check_compilable, checked_device, checked_dtype
+from sympflow.hamiltonian import collocation
+from sympflow.hamiltonian.fingerprint import check_for_flows
+from sympflow.hamiltonian.system import HamiltonianSystem
+
+if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+    from sympflow.kernels.flow_loops import CollocatedFlowKernel
+
+MOST_STAGES, MOST_STEPS = 8, 200
+SAMPLED = 100
+"""States of Ω by which the number of steps is chosen."""
+QUANTILE = 0.99
+TOLERANCE = 1e-10
+"""Error of ψ̄_Δt that 99 % of the states stay below, in units of their spread."""
+
+
+class CollocationLayer(Layer):
+    """One step χ_{t/m} of a Gauss method."""
+
+    kind = "collocation"
+
+    def __init__(self, flow: CollocatedFlow) -> None:
+        super().__init__()
+        self.ndof = flow.ndof
+        self._of = (flow,)  # in a tuple: a layer does not own its flow
+
+    @property
+    def flow(self) -> CollocatedFlow:
+        return self._of[0]
+
+    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self._step(t / self.flow.steps, q, p)
+
+    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self._step(-t / self.flow.steps, q, p)
+
+    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        def along(s: Tensor) -> Tensor:
+            return torch.cat(self(t + s, q + s * dq, p + s * dp))
+
+        x, dx = jvp(along, q.new_zeros(()), q.new_ones(()))
+        return (*_halves(x), *_halves(dx))
+
+    def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        flow, y, h = self.flow, torch.cat([q, p]).T, -t / self.flow.steps
+        flow.bound_system.check_conservative("so that `flow` is that of no Hamiltonian", "ask its system for H")
+        K, _ = flow.stages_of(y, h)  # of the way back, whose stages are those of the step
+        A = torch.as_tensor(flow.tableau[0], dtype=y.dtype, device=y.device)
+        mean = (flow.weights * flow.bound_system.hamiltonian(y[:, None, :] + A @ K)).sum(-1)
+        return (*_halves(flow.ended(y, K, h).T), mean / flow.steps)
+
+    def _step(self, h: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        y = torch.cat([q, p]).T
+        return _halves(self.flow.ended(y, self.flow.stages_of(y, h)[0], h).T)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": self.kind}
+
+
+def _halves(y: Tensor) -> tuple[Tensor, Tensor]:
+    """The q and p of columns (2d, N)."""
+    q, p = y.chunk(2)
+    return q, p
+
+
+class CollocatedFlow(SympFlow):
+    """The SympFlow of m equal steps of a Gauss method, for any H; made by `SympFlow.collocated`.
+
+    Nothing in it is trained: its error is that of the method, which more steps make as small as one likes. It is
+    symplectic to the rounding of Newton's iteration, and time-reversible, ψ̄_{−t} = (ψ̄_t)⁻¹. With friction it is
+    conformally symplectic, and has no 𝓗.
+
+    Parameters
+    ----------
+    ndof : int
+    stages : int
+        s, of the method of order 2s.
+    steps : int
+        m.
+    dt : float
+        Δt.
+    system : HamiltonianSystem, optional
+        Without it the flow has no values.
+    dtype, device
+        Of the states. A file holds no number of the flow, and is read as one in float64.
+
+    Attributes
+    ----------
+    tableau : tuple
+        See `sympflow.hamiltonian.collocation.Tableau`.
+
+    References
+    ----------
+    .. [1] E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, 2nd ed. (Springer 2006): II.1.3, and VI.5
+       for the action.
+    """
+
+    takes_friction = True
+
+    def __init__(
+        self,
+        ndof: int,
+        stages: int = 4,
+        steps: int = 1,
+        dt: float = 1.0,
+        system: HamiltonianSystem | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> None:
+        FlowMap.__init__(self, ndof, dt)
+        self.stages, self.steps = _count("stages", stages, MOST_STAGES), _count("steps", steps, MOST_STEPS)
+        self.tableau = collocation.gauss_legendre(self.stages)
+        _, B, scale = self.tableau
+        weights = [b * unit for b, unit in zip(B, scale, strict=True)] if self.stages > 2 else list(B)
+        like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
+        self.register_buffer("weights", torch.tensor(weights, **like), persistent=False)
+        self._binding = Binding(system, "made of steps with the H of a system")
+        self._loops: tuple[HamiltonianSystem, CollocatedFlowKernel] | None = None
+        # A tuple, not a ModuleList: the layers own nothing.
+        self.layers = tuple(CollocationLayer(self) for _ in range(self.steps))  # type: ignore[assignment]
+        if system is not None:
+            self.identify(system)
+
+    @classmethod
+    def of(
+        cls,
+        system: HamiltonianSystem,
+        *,
+        dt: float,
+        stages: int,
+        steps: int | None,
+        states: ArrayLike | None,
+        dtype: torch.dtype,
+        device: torch.device | str | None,
+    ) -> Self:
+        """Return a flow with as many steps as the system needs: see `SympFlow.collocated`."""
+        check_system(system)
+        check_for_flows(system, cls.takes_friction, cls.takes_driving)
+        flow = cls(system.ndof, stages, 1 if steps is None else steps, dt)  # all arguments are looked at before work
+        if steps is None:
+            if states is None and system.domain is not None:
+                states = system.domain.sample(SAMPLED, 0)
+            if states is None:
+                raise ValueError(
+                    "`steps` is needed, for the system has no domain over which errors could be compared: give it, or "
+                    "`states`."
+                )
+            steps = enough_steps(system, flow.tableau, flow.dt, floats("states", states))
+        made = cls(system.ndof, stages, steps, flow.dt, system, dtype, device)
+        made.domain = system.domain
+        if system.domain is not None:
+            made.identify(system, system.domain)
+        return made
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_loops": None}  # copies and pickles make their own
+
+    @classmethod
+    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
+        """Return a flow that has no system yet: `bind` will give it one."""
+        described = plan["collocated"]
+        if not isinstance(described, dict):
+            raise Refused("its plan of a collocated flow is missing")
+        stages = checked_integer(described.get("stages"), "number of stages", MOST_STAGES)
+        steps = checked_integer(described.get("steps"), "number of steps", MOST_STEPS)
+        return cls(ndof, stages, steps, dt, dtype=dtype)
+
+    def architecture(self) -> dict[str, Any]:
+        return {"ndof": self.ndof, "collocated": {"stages": self.stages, "steps": self.steps}}
+
+    # the maps -----------------------------------------------------------------------------------------------
+
+    def stages_of(self, y: Tensor, h: Time) -> tuple[Tensor, int]:
+        """The increments K (N, s, 2d) of a step of length h from states y (N, 2d), and Newton's iterations."""
+        return collocation.stages(self.bound_system, self.tableau, y, per_state(h, y), None)
+
+    def ended(self, y: Tensor, K: Tensor, h: Time) -> Tensor:
+        """The states (N, 2d) at the end of that step."""
+        return collocation.advanced(self.bound_system, self.tableau, y, K, per_state(h, y))
+
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> CollocatedFlowKernel:
+        if compensated:
+            raise ValueError(UNCOMPENSATED)
+        check_compilable(self.dtype, self.device)
+        if self._loops is None or self._loops[0] is not system:
+            from sympflow.kernels.flow_loops import CollocatedFlowKernel
+
+            self._loops = system, CollocatedFlowKernel(system, self.tableau, self.steps)
+        return self._loops[1]
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Count those of one iteration of Newton's method in each step, the least that there can be."""
+        n = self.iterated * self.steps * (n_steps + n_extra)
+        return {"force_evaluations": n, "hessian_evaluations": n}
+
+    @property
+    def iterated(self) -> int:  # type: ignore[override]
+        return self.stages
+
+    # its system ---------------------------------------------------------------------------------------------
+
+    @property
+    def bound_system(self) -> HamiltonianSystem:
+        """The system whose H the flow uses.
+
+        Raises
+        ------
+        ValueError
+            If it was loaded without it.
+        """
+        return self._binding.system
+
+    @property
+    def system(self) -> HamiltonianSystem | None:
+        """The system whose H the flow uses, None for one loaded without it."""
+        return self._binding.system if self._binding.known else None
+
+    def bind(self, system: HamiltonianSystem) -> Self:
+        """Give a flow that was loaded from a file its system; itself.
+
+        Raises
+        ------
+        ValueError
+            If it is not the system that the flow was made for.
+        """
+        self.check_system(system)
+        self._binding.bind(system)
+        return self
+
+    def bound(self, system: HamiltonianSystem) -> Self:
+        return self if self._binding.known else self.bind(system)
+
+
+def _count(name: str, value: Any, most: int) -> int:
+    value = plain(value)
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+        raise ValueError(f"`{name}` must be an integer from 1 to {most}; got {value!r}.")
+    return value
+
+
+@np.errstate(all="ignore")  # of steps that are too long
+def enough_steps(system: HamiltonianSystem, tableau: collocation.Tableau, dt: float, x: np.ndarray) -> int:
+    """The number of equal steps of a Gauss method with which ψ̄_Δt of states (n, 2d) errs by less than `TOLERANCE`.
+
+    Raises
+    ------
+    ValueError
+        If more steps are needed than a flow may have.
+    """
+    unit, order = np.maximum(x.std(axis=0), np.finfo(float).tiny), 2 * len(tableau[1])
+
+    def stepped(m: int) -> np.ndarray:
+        y = x
+        for _ in range(m):
+            y, _ = collocation.counted_step(system, tableau, 0.0, y, dt / m)
+        return y
+
+    steps = 1
+    while steps <= MOST_STEPS:
+        error = np.abs((stepped(steps) - stepped(2 * steps)) / unit).max(axis=1)
+        found = float(np.quantile(np.where(np.isfinite(error), error, np.inf), QUANTILE))
+        if found <= TOLERANCE:
+            return steps
+        more = (found / TOLERANCE) ** (1 / order) if found < 1 else 2.0
+        steps = max(steps + 1, math.ceil(steps * more))
+    raise ValueError(
+        f"`dt` = {dt:g} is so long for the system {system.name!r} that it takes more than {MOST_STEPS} steps: give a "
+        "shorter one."
+    )

@@ -1,0 +1,81 @@
+"""Collocated flows: symplectic, reversible, and the exact flow of the mean of H over their stages."""
+
+import numpy as np
+import pytest
+import torch
+
+import sympflow
+from sympflow import Box, HamiltonianSystem, SympFlow, conformal_defect, solve, systems
+from sympflow.flow.collocated import TOLERANCE, CollocatedFlow
+
+PENDULUMS = systems.double_pendulum()
+WHOLE = HamiltonianSystem.from_sympy("p**2*(1 + q**2)/2 + q**2/2", domain=Box([-1, -1], [1, 1]), y0=[0.4, 0.3])
+DAMPED = HamiltonianSystem.from_sympy("p**2*(1 + q**2)/2 + q**2/2", damping=0.2, y0=[0.4, 0.3])
+STATES = torch.as_tensor(PENDULUMS.domain.sample(5, 1))
+J = torch.kron(torch.tensor([[0.0, 1.0], [-1.0, 0.0]]), torch.eye(2)).double()
+
+
+@pytest.mark.parametrize(("stages", "steps"), [(1, 3), (3, 1)])
+def test_it_is_the_exact_flow_of_the_mean_of_H_over_its_stages(stages, steps):
+    flow = SympFlow.collocated(PENDULUMS, dt=0.5, stages=stages, steps=steps)
+    t = torch.tensor([0.0, 0.1, 0.2, 0.4, 0.5], dtype=torch.float64)
+    y, velocity = flow.psi_and_velocity(t, STATES)
+    y = y.detach().requires_grad_()
+    (slope,) = torch.autograd.grad(flow.hamiltonian(t, y).sum(), y)
+    torch.testing.assert_close(velocity, slope @ J.T, rtol=1e-12, atol=1e-12)
+    M = torch.func.jacrev(lambda x: flow.psi(0.4, x))(STATES[0])
+    torch.testing.assert_close(M.T @ J @ M, J, rtol=0, atol=1e-13)
+    torch.testing.assert_close(flow.inverse(1.3, flow(1.3, STATES)), STATES, rtol=0, atol=1e-13)
+
+
+def test_steps_are_as_many_as_the_tolerance_takes():
+    flow = SympFlow.collocated(WHOLE, dt=1.0)
+    x = WHOLE.domain.sample(50, 1)
+    fine = solve(WHOLE, "gauss_legendre8", (0, 1), x, dt=0.02).y[:, :, -1]
+    error = np.abs(solve(WHOLE, flow, (0, 1), x).y[:, :, -1] - fine) / x.std(axis=0)
+    assert flow.steps > 1
+    assert np.quantile(error, 0.95) < 2 * TOLERANCE
+    assert SympFlow.collocated(WHOLE, dt=1.0, states=1e-3 * x).steps < flow.steps
+
+
+def test_it_is_solved_and_saved_as_any_flow(tmp_path):
+    flow = SympFlow.collocated(WHOLE, dt=0.5, stages=2)
+    compiled, arrays = (solve(WHOLE, flow, (0, 5.3), backend=backend) for backend in ("auto", "array"))
+    np.testing.assert_allclose(compiled.y, arrays.y, rtol=0, atol=1e-13)
+    assert compiled.stats["force_evaluations"] == 2 * compiled.stats["newton_iterations"] > 0
+    flow.save(tmp_path / "flow.safetensors")
+    again = sympflow.load(tmp_path / "flow.safetensors", system=WHOLE)
+    assert type(again) is CollocatedFlow
+    assert np.array_equal(solve(WHOLE, again, (0, 5.3)).y, compiled.y)
+    with pytest.raises(ValueError, match="made of steps with the H of a system, which its file does not hold"):
+        sympflow.load(tmp_path / "flow.safetensors").psi(0.1, torch.zeros(2, dtype=torch.float64))
+    pieces = solve(WHOLE, flow, (0, 5.0), t_eval=[1.7, 4.0])
+    np.testing.assert_allclose(pieces.y[:, 1], compiled.y[:, 8], rtol=0, atol=1e-14)
+    x = torch.as_tensor(WHOLE.y0)
+    single = flow.float()
+    torch.testing.assert_close(single(0.7, x.float()).double(), again(0.7, x), rtol=0, atol=1e-6)
+
+
+def test_gradients_of_runs_are_those_of_differences():
+    flow = SympFlow.collocated(WHOLE, dt=0.5, stages=2)
+    x = torch.tensor([0.4, 0.3], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: flow(1.2, x), x)
+
+
+def test_with_friction_it_is_conformally_symplectic_and_the_flow_of_no_hamiltonian():
+    flow = SympFlow.collocated(DAMPED, dt=0.5, steps=1)
+    sol = solve(DAMPED, flow, (0, 5))
+    assert np.max(conformal_defect(sol)) < 1e-13
+    with pytest.raises(ValueError, match="flow` is that of no Hamiltonian"):
+        flow.hamiltonian(0.1, torch.as_tensor(DAMPED.y0))
+
+
+def test_what_it_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="`steps` is needed"):
+        SympFlow.collocated(DAMPED)
+    with pytest.raises(ValueError, match="`stages` must be an integer from 1 to 8; got 9"):
+        SympFlow.collocated(WHOLE, stages=9)
+    with pytest.raises(ValueError, match="depends on t"):
+        SympFlow.collocated(systems.driven_pendulum())
+    with pytest.raises(ValueError, match="more than 200 steps"):
+        SympFlow.collocated(WHOLE, dt=1e4)
