@@ -63,20 +63,11 @@ SOME = 6, (1, 4)
 ALL = 4, None
 
 
+PHI4 = {"onsite": "(q**2 - 1)**2/4", "bond": "r**2/2"}
 LATTICES: dict[str, tuple[str, dict[str, Any], int, tuple[Primed, ...]]] = {
     "fput_beta": ("FPUT-β", {"bond": "r**2/2 + r**4/4"}, 1, _ladder((0.65, 3, (1,)), (0.76, *SOME), (0.355, *SOME))),
-    "phi4": (
-        "φ⁴",
-        {"onsite": "(q**2 - 1)**2/4", "bond": "r**2/2"},
-        1,
-        _ladder((1.0, 3, (1,)), (0.98, *SOME), (0.46, *SOME)),
-    ),
-    "phi4_sheet": (
-        "φ⁴, two axes",
-        {"onsite": "(q**2 - 1)**2/4", "bond": "r**2/2"},
-        2,
-        _ladder((0.7, 3, (1,)), (0.7, *SOME)),
-    ),
+    "phi4": ("φ⁴", PHI4, 1, _ladder((1.0, 3, (1,)), (0.98, *SOME), (0.46, *SOME))),
+    "phi4_sheet": ("φ⁴, two axes", PHI4, 2, _ladder((0.7, 3, (1,)), (0.7, *SOME))),
     "toda_chain": ("Toda", {"bond": "exp(-r) + r - 1"}, 1, _ladder((1.65, *ALL), (1.2, *ALL), (0.46, 6, None))),
     "sine_gordon": (
         "sine-Gordon",

@@ -109,9 +109,9 @@ def fit_to_runs(fitted: PrimedFlow, piece: Piece, runs: int, seed: int, deadline
     They stay as they are, with a warning, where the runs of the flow are not finite, or there is no time.
     """
     lattice, dt = piece.lattice, fitted.dt
-    assert lattice.local is not None
-    axes = len(lattice.local.shape)
-    ring = lattice.piece(tuple(max(SITES[axes], n) for n in lattice.local.few()))
+    few = lattice.piece().local
+    assert few is not None
+    ring = lattice.piece(tuple(max(SITES[len(few.shape)], n) for n in few.shape))
     domain = piece.states.of(ring)
     x = states(domain, runs, seed, Stream.RUNS)
     t_end = PERIODS * 2 * math.pi / frequency(ring, domain)
