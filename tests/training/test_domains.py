@@ -74,9 +74,7 @@ def test_nothing_is_said_of_domains_that_suit(make):
 def test_labels_that_are_late_name_the_part_of_the_domain_that_is_fast():
     system = HamiltonianSystem.from_sympy("p**2/2 - q**4/4", domain=Box([-4, -4], [4, 4]))
     x = system.domain.sample(250, 0)
-    with pytest.raises(
-        OutOfTime, match=r"from 250 states to t = 0 of 0\.5 only; at .* none of these is in Box"
-    ) as late:
+    with pytest.raises(OutOfTime, match=r"from 250 states .*of 0\.5 only; at .* none of these is in Box") as late:
         Labels.of(system, x, np.array([0.5]), Session(time_budget=1e-9).deadline)
     lower, _ = re.findall(r"\[([^]]+)\]", str(late.value))
     assert -3.0 < float(lower.split(",")[0]) < -2.0
