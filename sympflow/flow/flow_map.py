@@ -31,6 +31,7 @@ if TYPE_CHECKING:  # Numba, which a flow needs only to be compiled
     from sympflow.kernels.network_tangents import NetworkTangents
 
 MAX_STEPS = 10_000_000  # of one call
+MEAN_TIMES = (0.5 - 0.75**0.5 / 3, 0.5 + 0.75**0.5 / 3)  # in Δt, at which 𝓗 is averaged: Gauss's
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,17 @@ def check_system(system: Any) -> None:
         )
     if system.functions_given:
         system.check_functions(torch.empty(0, dtype=torch.float64) if system.takes_tensors else None)
+
+
+@dataclass(frozen=True, eq=False)
+class MeanHamiltonian:
+    """The mean of a flow's 𝓗(t, x) over t ∈ [0, Δt], as a function of q and p: tensors (..., d)."""
+
+    flow: FlowMap
+
+    def __call__(self, q: Tensor, p: Tensor) -> Tensor:
+        x, flow = torch.cat([q, p], -1), self.flow
+        return torch.stack([flow.hamiltonian_unchecked(flow.dt * t, x) for t in MEAN_TIMES]).mean(0)
 
 
 class FlowMap(nn.Module):
@@ -607,9 +619,24 @@ class FlowMap(nn.Module):
                 f"parameters differ): {remedy}"
             )
 
+    def mean_system(self, **scene: Any) -> HamiltonianSystem:
+        """Return the system of the flow's own Hamiltonian, the mean of 𝓗(ψ̄)(t, x) over t ∈ [0, Δt].
+
+        Of a flow that was fitted to data without an H: its orbits are those of the flow to the order of what 𝓗 changes
+        with t. It is evaluated by array operations.
+
+        Parameters
+        ----------
+        **scene
+            Of `HamiltonianSystem`: name, domain, y0, t_span, dt.
+        """
+        return HamiltonianSystem(hamiltonian=MeanHamiltonian(self), ndof=self.ndof, check=False, **scene)
+
     def take_learned(self, system: HamiltonianSystem | None = None) -> None:
         """Bind the system that was learned with the flow: as it was found, or as the file tells that has the flow."""
         told = self.recipe.get("learned")
+        if system is None and told is not None and told.get("own_hamiltonian"):
+            system = self.mean_system(name="learned", domain=self.domain, dt=self.dt)
         if system is None and told is not None and self.identity is not None and self.identity.expression is not None:
             expression, damping = self.identity.expression, told.get("damping")
             name = self.system_name or "learned"

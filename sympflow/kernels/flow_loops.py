@@ -154,7 +154,10 @@ class PrimedFlowKernel(Kernel):
             rollout(*tables, *rest)
 
         size = y0.shape[1]
-        width, work = size * (1 + self._compensated), _stages(tables, n_steps, save) * size // 2
+        width, work = (
+            size * (1 + self._compensated),
+            _stages(tables, n_steps, save) * size / 2 / self._splitting.abreast,
+        )
         return run_states(rows, y0, n_steps, save, threads, carry, width, work)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:

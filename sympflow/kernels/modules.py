@@ -269,7 +269,7 @@ def at_most(threads: int) -> Iterator[None]:
         _most_threads.reset(token)
 
 
-def run_one(call: Callable[[np.ndarray], T], work: int) -> T:
+def run_one(call: Callable[[np.ndarray], T], work: float) -> T:
     """``call(stop)``, whose work takes about so many nanoseconds or more; it must end soon once ``stop[0]`` is set.
 
     Compiled code in the main thread holds Ctrl-C off until it returns. So what takes long runs in another thread, and
@@ -280,16 +280,16 @@ def run_one(call: Callable[[np.ndarray], T], work: int) -> T:
     return _run_in_threads([call])[0]
 
 
-def threads_for(n_pieces: int, work: int, threads: int | None) -> int:
+def threads_for(n_pieces: int, work: float, threads: int | None) -> int:
     """The number of threads for so many pieces and nanoseconds of work: that given, or as many as pay."""
     threads = _most_threads.get() if threads is None else threads
     if threads is None:
         threads = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
-        threads = min(threads, 1 + work // _WORTH_A_THREAD)
+        threads = min(threads, 1 + int(work // _WORTH_A_THREAD))
     return max(1, min(threads, n_pieces))
 
 
-def run_rows(rows: Callable[[slice, np.ndarray], None], n_rows: int, work_per_row: int, threads: int | None) -> None:
+def run_rows(rows: Callable[[slice, np.ndarray], None], n_rows: int, work_per_row: float, threads: int | None) -> None:
     """Call ``rows(slice, stop)`` over 0 … n_rows, on several threads if the work is worth it.
 
     `rows` releases the GIL; for `stop` see `run_one`.

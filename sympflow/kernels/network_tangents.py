@@ -77,6 +77,7 @@ class NetworkTangents:
         constants: np.ndarray,
         by_state: np.ndarray,
         by_velocity: np.ndarray | None = None,
+        by_start: np.ndarray | None = None,
     ) -> np.ndarray:
         """J (n, 2d, N), the derivatives of 2d functions of ψ̄ and d/dt ψ̄ by the parameters.
 
@@ -88,6 +89,8 @@ class NetworkTangents:
             The derivatives of the functions by ψ̄_t(x).
         by_velocity : ndarray, shape (2d,), optional
             Those of each function by its component of d/dt ψ̄_t(x), if they depend on that.
+        by_start : ndarray, shape (2d, 2d, N), optional
+            Filled with the derivatives of the functions by x, without those of constants.
         """
         velocity = by_velocity is not None
         key, shape = (velocity, len(t)), (len(parameters), 2 * self.ndof, len(t))
@@ -95,7 +98,7 @@ class NetworkTangents:
             self._kept = {k: J for k, J in self._kept.items() if k[0] != velocity} | {key: np.empty(shape)}
         J = self._kept[key]
         factors = by_state, by_velocity if velocity else np.zeros(2 * self.ndof)
-        rest = self._units, *factors, J
+        rest = self._units, *factors, J, np.empty((0, 0, 0)) if by_start is None else by_start
         self._run(velocity, "differentiate", len(t), 10 * self.ndof, parameters, t, x, constants, rest)
         return J
 

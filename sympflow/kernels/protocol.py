@@ -82,7 +82,7 @@ def run_states(
     threads: int | None,
     carry: Carry | None,
     width: int,
-    work: int,
+    work: float,
 ) -> Run:
     """`run_state` of every row of `y0` (N, 2d), as many threads as pay.
 

@@ -49,6 +49,9 @@ def splitting_loops(system: HamiltonianSystem) -> SplittingLoops:
 
 _LOOPS: WeakKeyDictionary[HamiltonianSystem, SplittingLoops] = WeakKeyDictionary()
 
+LANES_OF_SUMS, LANES = 16.0, 2.0
+"""By how much less a kick takes in a batch than `SplittingLoops.work`: of sums and products alone, and of functions."""
+
 
 class SplittingLoops:
     """Compiled loops that run any `Scheme` on one system; states are [q, p], float64.
@@ -69,6 +72,8 @@ class SplittingLoops:
         or each trajectory of a batch has its own.
     work : int
         About how many nanoseconds a kick takes.
+    abreast : float
+        By how much less it takes in a batch, whose lanes run side by side.
     driven : bool
         True if H depends on t.
     closes : bool
@@ -80,6 +85,7 @@ class SplittingLoops:
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.closes = False
+        self.abreast = 1.0
         self.driven = not system.autonomous
         if not system.separable:
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
@@ -101,6 +107,8 @@ class SplittingLoops:
                 damped = damped_drift(system, False)
                 self._compile = partial(symbolic_loops, system.symbols, algebra_source(system.symbols), damped)
                 self._has_ranges = True
+                V = system.symbols.V
+                self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial(*system.symbols.q) else LANES
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
@@ -288,7 +296,7 @@ class SplittingKernel(Kernel):
         def rows(i: slice, _: np.ndarray, *rest: Any) -> None:
             rollout(table, start[i], *rest)
 
-        work = table.shape[1] * self.loops.work
+        work = table.shape[1] * self.loops.work / self.loops.abreast
         return run_states(rows, y0, n_steps, save, threads, carry, self._width, work)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:

@@ -295,7 +295,7 @@ def discover(
     scene = {"domain": domain or Box(box[0].tolist(), box[1].tolist()), "y0": trajectories.states[0]}
     system = _system(discovery, trajectories.ndof, name=name, t_span=(0.0, first.span), dt=STEP / search.rate, **scene)
     if discovery.remark:
-        warnings.warn(discovery.remark, stacklevel=2)
+        warnings.warn(discovery.remark, stacklevel=3)
     return system
 
 
@@ -792,5 +792,5 @@ def _of_flow(
     )
     system = _system(discovery, flow.ndof, name=name, domain=found, y0=x[0], dt=flow.dt / 10)
     if not explains:
-        warnings.warn(remark, stacklevel=3)
+        warnings.warn(remark, stacklevel=4)
     return system

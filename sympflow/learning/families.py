@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from sympflow.flow.scaling import Scaling
 from sympflow.learning.inertia import Inertia
+from sympflow.learning.maps import NetworkFlow
 from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Network, Pairs, Part, Polynomial, Waves
 
 DEGREES = (2, 3, 4, 5, 6, 8, 10)
@@ -17,6 +20,8 @@ ORDERS = (1, 2, 3, 4)
 """Highest harmonics of angles, or powers of other coordinates, in a mass matrix M(q) and its potential."""
 WIDTHS = (6, 12, 24)
 WHOLE_WIDTHS = (12, 24, 40)
+FLOW_SIZES = ((2, 6, False), (2, 6, True), (3, 10, True), (5, 12, True))
+"""Pairs of layers, of half of them where it is palindromic, neurons of each, and True for palindromic SympFlows."""
 POWERS = ((-1,), (-2, -1, 0, 1, 2))
 """Powers of the distances of pairs, 0 for the logarithm."""
 CHANGING = 0.5
@@ -43,6 +48,8 @@ class Said:
         Parts of H.
     momenta : ndarray of shape (d, d) or None
         The covariance of the momenta along a trajectory, in their mean; None where it is not known.
+    flow_scaling : Scaling or None
+        The units of a flow that is fitted itself, and its Δt; None for none.
     """
 
     scales: np.ndarray
@@ -52,6 +59,7 @@ class Said:
     periods: np.ndarray
     known: tuple[Formula, ...] = ()
     momenta: np.ndarray | None = None
+    flow_scaling: Scaling | None = None
 
     @property
     def ndof(self) -> int:
@@ -93,7 +101,7 @@ class Candidate:
     """A model with its name."""
 
     name: str
-    model: Model
+    model: Any
 
 
 T = "T = ½ pᵀM⁻¹p"
@@ -174,6 +182,17 @@ def _whole_networks(said: Said) -> Iterator[Candidate]:
         yield Candidate(name, said.whole(_quadratic("y", said.scales, said.periods), network))
 
 
+def _flows(said: Said) -> Iterator[Candidate]:
+    scaling = said.flow_scaling
+    told = said.rates or said.known or said.inverse_mass is not None or said.angles
+    if scaling is None or told:
+        return
+    for pairs, width, palindromic in FLOW_SIZES:
+        kind, all_pairs = ("palindromic SympFlow", 2 * pairs) if palindromic else ("SympFlow", pairs)
+        name = f"{kind} of {all_pairs} pairs of layers of {width} neurons, Δt = {scaling.t:.3g}"
+        yield Candidate(name, NetworkFlow(scaling, pairs, width, palindromic))
+
+
 def _quadratic(of: str, scales: np.ndarray, periods: np.ndarray) -> Polynomial:
     """The quadratic polynomials of the coordinates that are no angles."""
     whole = Polynomial.up_to(2, of, scales)
@@ -209,10 +228,12 @@ FAMILIES = {
     "whole-waves": Family(False, _whole_waves),
     "whole-polynomial": Family(False, _whole_polynomials),
     "whole-network": Family(False, _whole_networks, linear=False),
+    "sympflow": Family(False, _flows, linear=False),
 }
 """In the order in which they are tried: potentials of the distances of bodies; Fourier series, where a `period` is
 given; polynomials; networks of one layer. The first four have H = ½ pᵀM⁻¹p + V(q); "inertia" has a mass matrix that
-depends on q, as of pendulums that hang on each other; the others are functions H(q, p)."""
+depends on q, as of pendulums that hang on each other; the next three are functions H(q, p). "sympflow" is last: flow
+maps with neural potentials, which are fitted to the data themselves, and no H is learned."""
 
 
 def families(said: Said, name: str | None) -> list[str]:
@@ -234,7 +255,8 @@ def families(said: Said, name: str | None) -> list[str]:
     if name is not None and not any(True for _ in FAMILIES[name].models(said)):
         raise ValueError(
             f"`family` {name!r} does not apply: series need the `period` of an angle, pairs the coordinates of two "
-            "bodies or more in two or three dimensions, and other families not too many degrees of freedom."
+            "bodies or more in two or three dimensions, flows nothing that is known of H, and other families not too "
+            "many degrees of freedom."
         )
     if name is not None:
         return [name]

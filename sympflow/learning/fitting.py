@@ -36,6 +36,7 @@ LEAST_GROWTH = 10.0
 PER_NOISE = 0.3  # of the spread of the data, that such an error may reach
 HOPELESS = 1.5  # noise over that of the best model, from which a model is given up
 COARSE, FINE = 1e-2, 1e-4  # gain of three steps at which a fit ends: the first or a poor one, and others
+STEPS, OWN_STEPS = 50, 100  # most of a fit of an H, and of a map of its own, whose valleys are longer
 STEP_ERROR = 0.1  # of the noise, to which the scheme's steps may change an orbit
 EXACT = 1e-9  # residuals, relative to the spread of the data, that need no explanation
 LOUDER = 2.0  # root mean square of held-out residuals, in σ, above which there are too few data, or another system
@@ -153,10 +154,13 @@ def fitted(
             assert isinstance(model, Model)
             smooth = smoothed(data)
             theta = model.lagrangian_start(smooth.points.T, smooth.slopes.T, scales)
-        theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales, 1 if model.linear else MATCHED_STEPS)
+        if model.stepper is None:
+            steps = 1 if model.linear else MATCHED_STEPS
+            theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales, steps)
     given = None if setting.noise is None else np.maximum(setting.noise, FINEST * scales)
     sigma = 1e-2 * scales if given is None else given
-    pieces, span = data.pieces(FIRST_POINTS), 0.0
+    span = 0.0 if model.stepper is None else model.stepper.longest  # a map of its own is fitted over all of a step
+    pieces = data.pieces(span=span) if span else data.pieces(FIRST_POINTS)
     states = first_states(pieces)
     costs: list[float] = []
     finer = 1.0
@@ -166,7 +170,8 @@ def fitted(
         method = chosen_method(model, theta, pieces, tolerance)
         problem = Problem(model, pieces, method, sigma, huber=setting.huber)
         gain = FINE if attempt and setting.plausible(sigma) else COARSE
-        fit = minimized(problem, theta, states, gain=gain, stop=setting.stop)
+        most = STEPS if model.stepper is None else OWN_STEPS
+        fit = minimized(problem, theta, states, iterations=most, gain=gain, stop=setting.stop)
         theta, before = fit.theta, sigma
         costs += [cost / data.n_values for cost in fit.costs]
         if given is None:

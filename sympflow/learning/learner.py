@@ -169,7 +169,9 @@ def learn(
     if dt is not None and (isinstance(dt, bool) or not isinstance(dt, int | float) or not 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
     session = Session(checkpoint, resume, plain(time_budget), progress, callback, Crew(workers))
-    setting = Setting(_noise(noise, data), huber, seen=smoothed(data).sigma if data.n_points >= ROUGH else None)
+    smooth = smoothed(data)
+    setting = Setting(_noise(noise, data), huber, seen=smooth.sigma if data.n_points >= ROUGH else None)
+    said = replace(said, flow_scaling=data.scaling._replace(t=_step(data, smooth.slopes) if dt is None else float(dt)))
     chosen = families(said, family)
     folds = data.folds(HELD_OUT, seed)
     if len(folds) == 1:
@@ -187,6 +189,14 @@ def learn(
         if replicas:
             flow.replicas = search.bootstrap(replicas, session)
         return flow
+
+
+def _step(data: Trajectories, slopes: np.ndarray) -> float:
+    """Δt of a flow that is fitted itself: in which states move by about their spread, but no longer than the data."""
+    rate = float(np.sqrt(np.mean((slopes / data.scales) ** 2))) if len(slopes) else 0.0
+    longest = max(run.span for run in data.runs)
+    step = min(1 / rate, longest) if rate > 0 else longest
+    return float(f"{step:.1g}")
 
 
 def _few(data: Trajectories, seed: int) -> Trajectories:
@@ -294,12 +304,9 @@ class Replicas:
             raise ValueError(f"`t` must be ascending times (n,), the first that of y0; got {t!r}.")
         orbits = []
         for theta in self.thetas:
-            x = floats("y0", y0).reshape(-1, 1)
-            orbit = [x[:, 0]]
-            for gap in np.diff(times):
-                x, _ = self.method.over(self.model, theta, x.copy(), None, np.array([gap]))
-                orbit.append(x[:, 0])
-            orbits.append(np.stack(orbit, axis=1))
+            x, gaps = floats("y0", y0).reshape(-1, 1), np.diff(times, prepend=times[0])[:, None]
+            orbit = self.method.stepper.orbit(self.method, self.model, theta, x.copy(), None, gaps)
+            orbits.append(np.stack([state[:, 0].copy() for state, _ in orbit], axis=1))
         return np.stack(orbits)
 
     def bands(self, y0: ArrayLike, t: ArrayLike, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
@@ -555,7 +562,7 @@ class Search:
                     f"{share:.0%} of the spread of every coordinate or more. Points may be in no order, of other "
                     "trajectories or too far apart; else there is only noise.",
                     UserWarning,
-                    stacklevel=3,
+                    stacklevel=4,
                 )
             return
         said = (
@@ -573,12 +580,12 @@ class Search:
                 f"{free.defect:.2g} of L; volumes change at a rate of {free.rate:.3g}."
             )
             if free.remedy:
-                warnings.warn(f"{said} {free.remedy}", UserWarning, stacklevel=3)
+                warnings.warn(f"{said} {free.remedy}", UserWarning, stacklevel=4)
                 return
         smooth = smoothed(self.data)
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
         said += " " + hint(library_for(None, self.data.ndof, 4, smooth.points)[0], smooth, self.data, otherwise)
-        warnings.warn(said, UserWarning, stacklevel=3)
+        warnings.warn(said, UserWarning, stacklevel=4)
 
     def freedom(self, setting: Setting) -> Freedom | None:
         """The comparison with a field that need not be Hamiltonian, where it explains much more than any H; else None.
@@ -630,19 +637,23 @@ class Search:
             warnings.warn(
                 f"The time budget ended the bootstrap after {len(thetas)} of {n} replicas: bands are rough.",
                 UserWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
         return Replicas(model, self.final.method, self.final.theta, np.stack(thetas))
 
     # the flow ---------------------------------------------------------------------------------------------------------
 
+    def _box(self) -> tuple[Box, np.ndarray]:
+        """A box around the states (n, 2d) of all orbits, and these."""
+        states = self.final.states
+        low, high = states.min(axis=0), states.max(axis=0)
+        wider = MARGIN * (high - low)
+        return Box(low - wider, high + wider), states
+
     def system(self, name: str) -> HamiltonianSystem:
         """The H that was learned."""
         found, model = self.final, self.winner[0].model
-        states = found.states
-        low, high = states.min(axis=0), states.max(axis=0)
-        wider = MARGIN * (high - low)
-        box = Box(low - wider, high + wider)
+        box, states = self._box()
         energies = model.hamiltonian(found.theta, states.T)
         top = float(energies.max())
         rates = found.theta[model.n - model.rates :]
@@ -657,16 +668,32 @@ class Search:
         )
 
     def flow(self, dt: float | None, name: str, session: Session) -> Any:
-        """A flow of the H that was learned."""
+        """A flow of the H that was learned, or the flow that was fitted itself."""
+        own = self.winner[0].model.flow(self.final.theta)
+        if own is not None:
+            return self._own(own, name)
         system = self.system(name)
         flow = self._primed(system, dt, session) if system.separable else self._collocated(system, dt)
         flow.figures = {**flow.figures, **self.figures(flow.dt), "energy_scatter": self.energy_scatter(flow)}
         self._check_flow(flow)
         flow.history = self.history
-        learned = {"model": self.winner[0].name, "reason": self.reason, "models": self.history}
         damping = None if system.friction is None else system.friction.damping.tolist()
-        flow.recipe = {**flow.recipe, "learned": {**learned, "damping": damping}}
+        flow.recipe = {**flow.recipe, "learned": {**self._learned, "damping": damping}}
         flow.take_learned(system)
+        return flow
+
+    @property
+    def _learned(self) -> dict[str, Any]:
+        return {"model": self.winner[0].name, "reason": self.reason, "models": self.history}
+
+    def _own(self, flow: Any, name: str) -> Any:
+        """The flow that was fitted itself, with the system of its own Hamiltonian."""
+        box, states = self._box()
+        flow.domain, flow.history = box, self.history
+        flow.recipe = {"learned": {**self._learned, "own_hamiltonian": True}}
+        flow.figures = {**self.figures(flow.dt), "energy_scatter": self.energy_scatter(flow)}
+        longest = max(run.span for run in self.data.runs)
+        flow.take_learned(flow.mean_system(name=name, domain=box, y0=states[0], t_span=(0.0, longest), dt=flow.dt))
         return flow
 
     def _primed(self, system: HamiltonianSystem, dt: float | None, session: Session) -> FlowMap:
@@ -698,7 +725,7 @@ class Search:
                 f"The flow is worse than the H that was learned: its one-step error is {error:.1e}, the noise "
                 f"{noise:.1e}. Give a longer `time_budget` or a shorter `dt`, or solve `flow.system` with a scheme.",
                 UserWarning,
-                stacklevel=4,
+                stacklevel=5,
             )
 
     def figures(self, dt: float) -> dict[str, float]:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, combinations_with_replacement, pairwise, product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -607,6 +607,8 @@ class Model:
     ndof: int
     parts: tuple[Part, ...]
     rates: int = 0
+    stepper: ClassVar[Any] = None
+    """The steps of a map of its own; None where schemes follow a field."""
 
     @property
     def n(self) -> int:
@@ -725,6 +727,10 @@ class Model:
         kept = [part.subset(~dropped[place]) for part, place in zip(self.parts, self.places, strict=True)]
         return replace(self, parts=tuple(kept))
 
+    def flow(self, theta: np.ndarray) -> Any:
+        """The flow that was fitted itself; None where one is trained to the H that was learned."""
+        return None
+
     def start(self, rng: np.random.Generator) -> np.ndarray:
         """θ before anything is known; friction 0."""
         return np.concatenate([part.start(rng) for part in self.parts] + [np.zeros(self.rates)])
@@ -741,6 +747,7 @@ class FreeField:
 
     separable = nystrom = lagrangian = False
     linear = True
+    stepper = None
 
     def __init__(self, scales: Any, degree: int) -> None:
         m = len(scales)

@@ -52,6 +52,8 @@ class Stepper(ABC):
 
     cost: float
     """Cost of a step, in evaluations of the force with its derivatives."""
+    longest: float | None = None
+    """Δt of a map that is fitted itself, whose steps have no error; None of a scheme."""
 
     def within(self, tolerance: np.ndarray) -> Stepper:
         """The same scheme, whose equations are solved no better than is needed for an error (2d,) of a step."""
@@ -63,6 +65,15 @@ class Stepper(ABC):
 
         The first 2d columns of X are those by the initial state, the others those by θ, if there are any.
         """
+
+    def orbit(
+        self, method: Method, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+        """States and derivatives after each of the gaps (k, N) between points."""
+        for gap in gaps:
+            if gap.any():
+                x, X = method.over(model, theta, x, X, gap)
+            yield x, X
 
 
 @dataclass(frozen=True)
@@ -179,7 +190,9 @@ STAGES = (2, 3, 4)
 
 
 def steppers(model: Field) -> list[Stepper]:
-    """The schemes that can follow a model."""
+    """The schemes that can follow a model, or its own map."""
+    if model.stepper is not None:
+        return [model.stepper]
     if not model.separable:
         return [Gauss(s) for s in STAGES]
     schemes = map(scheme_named, SPLITTINGS)
@@ -385,9 +398,8 @@ class Problem:
         if derivatives:
             X = np.zeros((m, m + (0 if self.frozen else self.model.n), x.shape[1]))
             X[np.arange(m), np.arange(m)] = 1.0
-        for k, gaps in enumerate(batch.gaps):
-            if k:
-                x, X = self.method.over(self.model, theta, x, X, gaps)
+        orbit = self.method.stepper.orbit(self.method, self.model, theta, x, X, batch.gaps)
+        for k, (x, X) in enumerate(orbit):
             yield k, x, X
 
     def _weighted(self, batch: Batch, k: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -525,6 +537,8 @@ class Fit:
     def step_error(self, sigma: np.ndarray) -> float:
         """Largest change of an orbit, in σ (2d,), when the steps of the scheme are halved."""
         method = self.problem.method
+        if method.stepper.longest is not None:
+            return 0.0
         finer = replace(self.problem, method=replace(method, longest=method.longest / 2))
         moved = finer.orbits(self.theta, self.states)
         return max(
@@ -626,6 +640,8 @@ def chosen_method(model: Field, theta: np.ndarray, data: Trajectories, tolerance
 
     The error is that over single gaps, from observed states, against half the step.
     """
+    if model.stepper is not None:
+        return Method(model.stepper, model.stepper.longest)
     starts, gaps = _gaps(data)
     widest = float(gaps.max())
     best: tuple[float, Method] | None = None

@@ -374,6 +374,8 @@ def _check_flow(flow: FlowMap, system: HamiltonianSystem, dt: float | None) -> N
     if dt is not None and dt != flow.dt:
         raise ValueError(f"`dt` is {dt!r} but the flow has {flow.dt!r}: leave `dt` out to train it further.")
     flow.check_system(system)
+    if not flow.n_parameters:
+        raise ValueError(f"`flow` is a {type(flow).__name__}, which has no numbers to be fitted: use it as it is.")
 
 
 # which flow -------------------------------------------------------------------------------------------------------

@@ -79,3 +79,5 @@ def test_what_it_cannot_be_is_refused():
         SympFlow.collocated(systems.driven_pendulum())
     with pytest.raises(ValueError, match="more than 200 steps"):
         SympFlow.collocated(WHOLE, dt=1e4)
+    with pytest.raises(ValueError, match="no numbers to be fitted"):
+        sympflow.train(WHOLE, flow=SympFlow.collocated(WHOLE, steps=1))

@@ -42,6 +42,13 @@ def trained(system):
     )  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def hardly(system):
+    """Trained for a few steps that compile nothing: it is a flow of this drive, and not a good one."""
+    few = {"points": 20, "validation_points": 20, "reference_states": 5, "label_weight": 0.0, "progress": False}
+    return sympflow.train(system, kind="sympflow", pairs=2, hidden=(8,), dt=DT, optimizer="adam", steps=3, **few)
+
+
 @pytest.mark.parametrize("t0", [0.0, 1.3, 40.1])
 def test_it_is_symplectic_and_has_an_inverse_at_every_start(bare, t0):
     for t in (0.3, 2.9, -1.7):
@@ -86,6 +93,7 @@ def test_steps_of_solve_are_chained_calls(system, bare):
     np.testing.assert_allclose(back.y[..., -1], end, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow  # compiles for fifteen seconds: tests/training/test_network_tangents.py has the same code
 def test_training_fits_it_at_all_times_of_the_drive(system, trained):
     assert type(trained) is TimedSympFlow
     start, end = trained.history[0], trained.figures
@@ -102,24 +110,24 @@ def test_training_fits_it_at_all_times_of_the_drive(system, trained):
     assert sympflow.symplecticity_defect(sol).max() < 1e-13
 
 
-def test_scipy_and_torchdiffeq_tell_it_the_time(system, trained):
+def test_scipy_and_torchdiffeq_tell_it_the_time(system, hardly):
     times = np.array([2.9, 1.75, 1.35])
-    expected = solve(system, trained, (2.9, 1.35), t_eval=times).y
-    scipy = solve_ivp(system, (2.9, 1.35), system.y0, method=as_scipy(trained, system), t_eval=times)
+    expected = solve(system, hardly, (2.9, 1.35), t_eval=times).y
+    scipy = solve_ivp(system, (2.9, 1.35), system.y0, method=as_scipy(hardly, system), t_eval=times)
     np.testing.assert_allclose(scipy.y, expected, rtol=0, atol=1e-13)
-    y = ours.odeint(system, torch.tensor(system.y0), torch.tensor(times), method=trained)
+    y = ours.odeint(system, torch.tensor(system.y0), torch.tensor(times), method=hardly)
     np.testing.assert_allclose(y.T, expected, rtol=0, atol=1e-13)
 
 
-def test_a_file_holds_it_with_its_drive(system, trained, tmp_path):
-    trained.save(tmp_path / "flow.safetensors")
+def test_a_file_holds_it_with_its_drive(system, hardly, tmp_path):
+    hardly.save(tmp_path / "flow.safetensors")
     again = sympflow.load(tmp_path / "flow.safetensors", system=system)
-    torch.testing.assert_close(again(1.7, X, t0=0.3), trained(1.7, X, t0=0.3), rtol=0, atol=0)
-    assert (again.drive, again.period) == (trained.drive, system.period)
+    torch.testing.assert_close(again(1.7, X, t0=0.3), hardly(1.7, X, t0=0.3), rtol=0, atol=0)
+    assert (again.drive, again.period) == (hardly.drive, system.period)
     with pytest.raises(ValueError, match="was trained with another drive"):
         solve(driven(a=0.2), again, (0, 1))
     other = again.transferred(driven(a=0.2))
-    torch.testing.assert_close(other(1.7, X, t0=0.3), trained(1.7, X, t0=0.3), rtol=0, atol=0)
+    torch.testing.assert_close(other(1.7, X, t0=0.3), hardly(1.7, X, t0=0.3), rtol=0, atol=0)
     solve(driven(a=0.2), other, (0, 1))
 
 

@@ -18,7 +18,11 @@ Y0 = np.array([[0.5, 0.1], [0.2, 0.4]])
 @pytest.mark.parametrize(("method", "order"), [("verlet", 2), ("chin4c", 4), ("gauss_legendre4", 4), ("rk4", 4)])
 def test_the_balance_is_kept_to_the_order_of_the_method(method, order):
     times = np.linspace(0.3, 8.3, 11)
-    errors = [energy_balance_error(solve(PENDULUM, method, (0.3, 8.3), Y0, dt=dt, t_eval=times)) for dt in (0.1, 0.05)]
+    runs = [
+        solve(PENDULUM, method, (0.3, 8.3), Y0, dt=dt, t_eval=times, backend="auto" if method == "verlet" else "array")
+        for dt in (0.1, 0.05)
+    ]
+    errors = [energy_balance_error(run) for run in runs]
     assert errors[0].shape == (2, 11)
     assert (errors[0][:, 0] == 0).all()
     assert math.log2(errors[0].max() / errors[1].max()) > order - 0.4

@@ -22,7 +22,7 @@ cases = [
     (hh, "verlet", hh.y0, {"dt": 1e-2, "compensated": True}, 1e9),
     (hh, "sympflow", hh.y0, {"tol": 1e-4}, 1e11),
     (hh, "sympflow", hh.y0, {}, 1e9),
-    (hh, "implicit_midpoint", hh.y0, {"dt": 1e-2}, 1e8),
+    (hh, "gauss_legendre4", hh.y0, {"dt": 1e-2}, 1e8),
     (fput, "linear_srkn6b", fput.y0, {"dt": 1e-2}, 1e8),
     (fput, "sympflow", np.stack([fput.y0] * 9), {}, 1e9),
 ]

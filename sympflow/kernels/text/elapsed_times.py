@@ -131,7 +131,7 @@ def reach_times(table, step, h, clock, y0, targets, stride, most_steps, out, cou
     q, p = unpack(y0[0])
     advance = clock_advance(clock, h, p[NDOF - 1])
     q_error, p_error = no_error(q), no_error(p)
-    n, saved, j, now = 0, 0, 0, 0.0
+    n, saved, j, now = ZERO, ZERO, ZERO, 0.0
     while saved < len(targets) and stop[0] == 0:
         block = stride
         if now > 0.0:  # far from the next output: half of the steps left, by the pace so far
@@ -201,10 +201,10 @@ def reach_times_lanes(table, step, h, clock, y0, begin, end, targets, stride, mo
             q, p = unpack_lane(Y, count - 1)
             pack_lane(q, p, Y, lane)
         copy_lanes(Y, start)
-        for _ in range(stride):
-            stage_lanes(Y, error, width, numbers_of(table, link), table[0, link])
-            for j in range(1, link):
-                stage_lanes(Y, error, width, numbers_of(table, j), table[0, j])
+        j = link
+        for _ in range(stride * link):
+            stage_lanes(Y, error, width, numbers_of(table, j), table[0, j])
+            j = j + 1 if j < link else 1
         lane = 0
         while lane < count:
             i = row[lane]

@@ -12,7 +12,10 @@ the rows of y0 (N, 2d + `N_VALUES`) as in those of the blocks.
 # ruff: noqa: F821
 # mypy: ignore-errors
 
+import numpy as np
 from numba import njit
+
+FIRST_COLUMN = np.int64(0)  # a literal has a type of its own, for which `take_values` would be compiled again
 
 
 @njit(**OPTIONS)
@@ -125,7 +128,7 @@ def rollout_lanes(table, y0, n_steps, save, out, n_finite, stop, first, running,
                 else:
                     q, p = unpack_lane(Y, lane)
                 if not is_finite(q, p):
-                    take_values(table, work, Y, lane, 0)
+                    take_values(table, work, Y, lane, FIRST_COLUMN)
                     q, p = unpack_lane(start, lane)
                     before = first_non_finite(q, p, table, begin, n, block, work) - 1
                     n_finite[i] = n + before

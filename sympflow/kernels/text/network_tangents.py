@@ -260,11 +260,11 @@ def map_points(theta, plan, is_kick, t, x, features, first, last, y, velocity):
 
 
 @njit(**OPTIONS)
-def differentiate(theta, plan, is_kick, t, x, features, first, last, units, by_state, by_velocity, J):
+def differentiate(theta, plan, is_kick, t, x, features, first, last, units, by_state, by_velocity, J, by_start):
     """The derivatives of what is fitted by the weights, J (n, 2d, N), of blocks `first` … `last` of points.
 
     ``by_state`` (N, 2d, 2d) and ``by_velocity`` (2d,) are its derivatives by ψ̄ and, one by one, by d/dt ψ̄; `units`
-    (n,) those of `theta` by the weights.
+    (n,) those of `theta` by the weights. Its derivatives by x go into ``by_start`` (2d, 2d, N) unless that is empty.
     """
     ndof, inputs, widths, size = plan[0], plan[1], plan[2], plan[7]
     depth, width = len(widths), max(widths)
@@ -313,3 +313,7 @@ def differentiate(theta, plan, is_kick, t, x, features, first, last, units, by_s
                     for c in range(count):
                         target[begin + c] = unit * total[c]
             pull_back(ndof, P, M, sign, is_kick[layer], H, dH)
+        for row in range(len(by_start)):
+            for m in range(2 * ndof):
+                for c in range(count):
+                    by_start[row, m, begin + c] = P[row, m, c]

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where nothing is saved
+FIRST_STEP = np.int64(0)  # a literal has a type of its own, for which `apply_map` would be compiled again
 
 
 @njit(**OPTIONS, forceinline=True)  # called, it would take and give its states in memory
@@ -92,7 +93,7 @@ def step_each(codes, tables, z, in_modes, out):
         if not in_modes:
             x, y = to_modes(x, y)
         for j in range(len(codes)):
-            x, y = apply_map(x, y, codes[j], tables[i], j, 0)
+            x, y = apply_map(x, y, codes[j], tables[i], j, FIRST_STEP)
         if not in_modes:
             x, y = from_modes(x, y)
         pack(x, y, out[i])
