@@ -199,7 +199,7 @@ def all_starts(system: HamiltonianSystem, domain: Domain) -> list[Primed]:
 
 
 def shaped(start: Primed) -> list[Primed]:
-    """The flow in each of the `SHAPES` with kicks of its kind, with about as many of them in a unit of time."""
+    """The flow in each of the `SHAPES` with kicks of its kind, about as many in a unit of time: see `dividing`."""
     made = []
     for shape, processor, longer in SHAPES:
         levels = [int(level) for level in shape.removeprefix("k")]
@@ -210,11 +210,10 @@ def shaped(start: Primed) -> list[Primed]:
             name: True if min(levels) >= least else tuple(i for i, level in enumerate(levels) if level >= least)
             for name, least in (("force_gradient", FORCE_GRADIENT), ("curvature", CURVATURE))
         }
-        dt = float(f"{start.dt * longer * n / start.stages:.3g}")
         made.append(
             replace(
                 start,
-                dt=dt,
+                dt=dividing(start.dt * longer * n / start.stages),
                 stages=n,
                 processor=processor,
                 first=first,
@@ -223,6 +222,15 @@ def shaped(start: Primed) -> list[Primed]:
             )
         )
     return made
+
+
+def dividing(dt: float) -> float:
+    """The Δt nearest to dt that divides a power of ten, 10ᵏ/n with n ≤ 10: round times are on its grid.
+
+    An output there takes C kicks, one between steps 2C + S more, and the gain of a flow hardly depends on Δt.
+    """
+    unit = 10.0 ** math.floor(math.log10(dt))
+    return min((10 * unit / n for n in range(1, 11)), key=lambda t: abs(math.log(t / dt)))
 
 
 def _described(start: Primed) -> str:

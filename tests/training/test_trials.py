@@ -88,8 +88,17 @@ def test_another_shape_is_taken_where_its_error_is_less_at_as_many_kicks(monkeyp
         start = trials.chosen_trial(HH, HH.domain).start
         assert start == best
         assert best.levels == [int(level) for level in levels.removeprefix("k")][: best.stages]
-        assert longer * start.stages / start.dt == pytest.approx(chosen.stages / chosen.dt, rel=5e-3)
+        dt = chosen.dt * longer * start.stages / chosen.stages
+        assert start.dt == trials.dividing(dt)
         assert start in trials.all_starts(HH, HH.domain)
+
+
+@pytest.mark.parametrize("unit", [1e-15, 1.0, 1e4])
+def test_steps_divide_round_times(unit):
+    for dt in np.geomspace(0.01, 9.9, 40) * unit:
+        steps = 100 * unit / trials.dividing(dt)
+        assert steps == pytest.approx(round(steps), rel=1e-12)
+        assert abs(np.log2(trials.dividing(dt) / dt)) <= 0.5 + 1e-12
 
 
 @pytest.mark.parametrize("seconds", [1e-8, 3e-8])

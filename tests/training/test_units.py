@@ -10,6 +10,7 @@ from sympflow.training import trials
 from sympflow.training.table_fit import Table
 
 QUICK = {"PHASES": (1.5,), "STARTS": 2, "STEPS": 20, "FINAL_STEPS": 40, "POINTS": 40, "LENGTH": 50}
+QUICK |= {"SHAPES": (("222", 9, 1.0), ("121", 6, 1.0))}  # of more some are as good as each other but for rounding
 UNITS = [(1.0, 1.0, 1.0), (1e11, 1e30, 1e20), (1e11, 1.0, 1e-22), (1e-10, 1e-19, 1e-26)]  # of length, energy and mass
 PERIODS = [1.0, 1e6, 1.0, 10**-13.5]  # L √(m/E)
 
