@@ -536,6 +536,7 @@ def _far(symbols: SymbolicHamiltonian) -> bool:
 
     Written by powers of q it would be a small difference of large numbers. Parameters may have any value.
     """
+    assert symbols.V is not None
     for u in symbols.V.atoms(sp.Add):
         constant, rest = u.as_independent(*symbols.q, as_Add=True)
         if constant == 0 or not rest.is_polynomial(*symbols.q):
