@@ -68,7 +68,7 @@ class Reading:
         return replace(data, runs=tuple(Run(run.t, run.y[[*self.rows]]) for run in data.runs), names=names)
 
     def remedy(self, theta: np.ndarray) -> str:
-        """What to do."""
+        """The advice, with the fitted rates in it."""
         rates = theta[-self.field.ndof :]
         return self.advice.format(", ".join(f"{rate:.3g}" for rate in rates))
 
