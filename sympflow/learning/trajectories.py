@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import floats
+from sympflow.arguments import floats, plain
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.flow.scaling import Scaling
 from sympflow.storage.layout import DOF, ORBIT, TIME, imported
@@ -306,9 +307,9 @@ class Trajectories:
             The longest time of a piece, which holds two points at least. Of chaotic orbits this is one or two
             Lyapunov times.
         """
-        most = sys.maxsize if points is None else points
-        if most < 2:
-            raise ValueError(f"`points` must be 2 or more; got {points!r}.")
+        most = sys.maxsize if points is None else plain(points)
+        if isinstance(most, bool) or not isinstance(most, int) or most < 2:
+            raise ValueError(f"`points` must be an integer, 2 or more; got {points!r}.")
         if not span > 0:
             raise ValueError(f"`span` must be positive; got {span!r}.")
         return replace(self, runs=tuple(piece for run in self.runs for piece in _cut(run, most, span)))
@@ -442,7 +443,7 @@ def _of_pair(t: Any, y: Any) -> Iterator[Found]:
     if y.ndim == 2:
         yield "the trajectory", t, y
         return
-    for i, one in enumerate(y.reshape(-1, *y.shape[-2:])):
+    for i, one in enumerate(y.reshape(math.prod(y.shape[:-2]), *y.shape[-2:])):
         yield f"trajectory {i}", t, one
 
 
@@ -583,6 +584,8 @@ def _numbered(columns: list[str], letter: str) -> list[str]:
 def _width(found: list[Found], ndof: int | None) -> int:
     widths: dict[int, str] = {}
     for label, t, y in found:
+        if not y.size:
+            raise ValueError(f"`data` has no numbers ({label}): give at least two points of each trajectory.")
         if y.ndim != 2 or t.ndim != 1:
             raise ValueError(f"`data` has times of shape {t.shape}, states {y.shape} ({label}): give (n,) and (2d, n).")
         if y.shape[1] != len(t):
@@ -616,9 +619,12 @@ def _rows(order: str | Sequence[int], width: int) -> list[int]:
 
 def _factors(units: Mapping[str, str | float] | None, names: tuple[str, ...]) -> tuple[np.ndarray, float]:
     """The factors of the coordinates (2d,) and of the times that convert the units."""
+    if units is not None and not isinstance(units, Mapping):
+        raise TypeError(f'`units` must be a dictionary such as {{"t": "ms", "q": "deg"}}; got {units!r}.')
     d, factors, of_time = len(names) // 2, np.ones(len(names)), 1.0
-    for name, unit in (units or {}).items():
-        factor = _factor(name, unit)
+    given = {} if units is None else units
+    for name in sorted(given, key=lambda name: name in names):  # a column's own unit goes before that of all q or p
+        factor = _factor(name, given[name])
         if name in names:
             factors[names.index(name)] = factor
         elif name in ("q", "p"):
@@ -646,9 +652,14 @@ def _factor(name: str, unit: str | float) -> float:
 
 def _momenta(mass: ArrayLike, v: np.ndarray) -> np.ndarray:
     """M v."""
-    M, d = np.asarray(mass, dtype=float), len(v)
+    M, d = floats("velocity_mass", mass), len(v)
     if M.shape not in ((), (d,), (d, d)):
         raise ValueError(f"`velocity_mass` must be a number, ({d},) or ({d}, {d}); got the shape {M.shape}.")
+    whole = M if M.ndim == 2 else np.diag(np.broadcast_to(M, d))
+    if not (np.isfinite(M).all() and np.allclose(whole, whole.T) and (np.linalg.eigvalsh(whole) > 0).all()):
+        raise ValueError(
+            f"`velocity_mass` must be finite, symmetric and positive definite, by which p = M v; got {mass!r}."
+        )
     return M @ v if M.ndim == 2 else (M if M.ndim == 0 else M[:, None]) * v
 
 

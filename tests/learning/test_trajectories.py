@@ -145,7 +145,7 @@ def test_sets_are_divided_by_trajectory_and_long_runs_into_pieces():
     assert np.array_equal(np.concatenate([run.y for run in one.pieces(span=0.4).runs], 1), RUN)
     with pytest.raises(ValueError, match="one trajectory only"):
         one.split()
-    with pytest.raises(ValueError, match="`points` must be 2 or more"):
+    with pytest.raises(ValueError, match="`points` must be an integer, 2 or more"):
         one.pieces(points=1)
 
 
@@ -206,12 +206,23 @@ def test_angles_that_were_wrapped_are_noticed_and_continued():
         ((t, RUN), {"units": {"p": "furlong"}}, "are known; else give a factor"),
         ((t, RUN), {"units": {"x": "m"}}, "`units` names 'x'"),
         ((t, RUN), {"velocity_mass": [1, 2]}, "`velocity_mass` must be"),
+        ((t, RUN), {"velocity_mass": 0.0}, "`velocity_mass` must be finite"),
+        ((t, FOUR), {"velocity_mass": [[1, 2], [2, 1]]}, "positive definite"),
+        ((t[:0], FOUR[None, :, :0]), {}, "has no numbers"),
         ((np.eye(2), [1, 2, 3], np.eye(2)), {}, r"give x \(N, 2d\), t \(N,\)"),
     ],
 )  # fmt: skip
 def test_bad_data_are_refused_with_the_remedy(data, options, message):
     with pytest.raises(ValueError, match=message):
         Trajectories.read(data, **options)
+
+
+def test_the_unit_of_a_column_goes_before_that_of_all():
+    for units in ({"q": "deg", "q1": "rad"}, {"q1": "rad", "q": "deg"}):
+        q = Trajectories.read((t, FOUR), units=units).runs[0].y[:2]
+        assert np.allclose(q, FOUR[:2] * [[1], [np.pi / 180]], rtol=1e-15)
+    with pytest.raises(TypeError, match="`units` must be a dictionary"):
+        Trajectories.read((t, FOUR), units="ms")
 
 
 @pytest.mark.parametrize("data", [None, 3.0, "no.such.kind", [1, 2], [(t,)], (t, RUN * 1j)])
