@@ -21,6 +21,12 @@ def learn(
     noise: Annotated[float | None, typer.Option(help="Standard deviation of the data. Default: estimated.")] = None,
     period: Annotated[float | None, typer.Option(help="Of all q, if these are angles.")] = None,
     damping: Annotated[bool, typer.Option("--damping", help="Learn a rate of friction as well.")] = False,
+    family: Annotated[
+        str | None, typer.Option(help="The only family of models, as polynomial, network or sympflow. Default: all.")
+    ] = None,
+    order: Annotated[
+        str, typer.Option(help="Of columns without the names q1 …: halves, q1 q2 p1 p2, or pairs, q1 p1 q2 p2.")
+    ] = "halves",
     loss: Annotated[str, typer.Option(help="squares, or huber for data with outliers.")] = "squares",
     unit: Annotated[
         list[str] | None, typer.Option("--unit", help="Units of columns, as t=ms, q=deg, p=deg/ms; may be repeated.")
@@ -50,7 +56,7 @@ def learn(
         ready_file(to)
         if plot is not None:
             ready_file(plot, "--plot")
-        runs = Trajectories.read(data, ndof, units=_units(unit))
+        runs = Trajectories.read(data, ndof, units=_units(unit), order=order)
         out.print(f"{len(runs.runs)} trajectories, {runs.n_points} points, {runs.ndof} degree(s) of freedom")
         flow = learn_flow(
             runs,
@@ -58,6 +64,7 @@ def learn(
             noise=noise,
             period=period,
             damping=damping,
+            family=family,
             loss=loss,
             seed=seed,
             time_budget=time_budget,
@@ -74,7 +81,8 @@ def learn(
         print_table(titles, rows)
         learned = flow.recipe["learned"]
         out.print(f"Chosen: {learned['model']}, for {learned['reason']}", markup=False)
-        show(f"H = {flow.system.expression}")
+        formula = flow.system.expression
+        show("H is the flow's own, of no formula." if formula is None else f"H = {formula}")
         if flow.system.friction is not None:
             show(f"damping = {flow.system.friction.damping.tolist()}")
         shown = {k: v for k, v in flow.figures.items() if k.startswith(("held_out_error", "noise", "energy_scatter"))}

@@ -124,6 +124,7 @@ class NewFit(_Asked):
     label_times: int | None = None
     frozen_weight: float | None = None
     energy_weight: float | None = None
+    runs: int | None = None
 
     @property
     def searches(self) -> bool:

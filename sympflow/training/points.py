@@ -44,6 +44,7 @@ class Stream(IntEnum):
     RESTARTS = 5
     LABELS = 6
     TIMES = 7
+    RUNS = 8
 
 
 @dataclass(frozen=True)

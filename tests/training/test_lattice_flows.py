@@ -7,6 +7,7 @@ import pytest
 
 import sympflow
 from sympflow import Box, HamiltonianSystem, LatticeStates, SympFlow, solve, train
+from sympflow.training import energy_runs
 from sympflow.training.lattice_fit import TAIL, Piece
 
 BOND = "r**2/2 + r**4/4"
@@ -93,6 +94,37 @@ def test_a_flow_serves_every_shape(flow, tmp_path):
         H = lattice.hamiltonian(runs[0].states)
         assert np.ptp(H) / H[0] < 10 * flow.figures["energy_error_95"]
     assert sympflow.load(tmp_path / "flow.safetensors", system=ring(12)).system.ndof == 12
+
+
+def test_a_fit_to_long_runs_keeps_the_energy_of_other_states(flow, monkeypatch):
+    """With the table that they found at Δt, which the numbers at shorter times lead to."""
+    monkeypatch.setattr(energy_runs, "ITERATIONS", 8)
+    lattice = ring(domain=LatticeStates(0.2))
+    further = train(lattice, flow=flow, runs=32, seed=1, **FIT | {"steps": 1})
+    assert [stage["loss"] for stage in further.recipe["stages"]] == ["labels", "labels", "energy"]
+    large = ring(200, domain=LatticeStates(0.2))
+    y0 = large.domain.sample(4, seed=77)
+    errors = []
+    for each in (flow, further):
+        H = large.hamiltonian(solve(large, each, (0, 40), y0, t_eval=np.linspace(0, 40, 9)).states)
+        errors.append(np.sqrt(np.mean((H / H[:, :1] - 1) ** 2)))
+    assert errors[1] < errors[0]
+    numbers = [further.scheme(t).drifts for t in (0.2, 0.25)]
+    np.testing.assert_allclose(*numbers, atol=0.02)
+
+
+def test_long_runs_are_of_lattices_that_keep_their_energy(flow):
+    lattice = ring(domain=LatticeStates(0.2))
+    with pytest.raises(ValueError, match=r"^`runs` must be a positive integer; got 0"):
+        train(lattice, flow=flow, runs=0, **FIT)
+    with pytest.raises(ValueError, match=r"^`runs` are of lattices that keep their energy, and 'lattice' is none"):
+        train(ring(damping=0.1, domain=LatticeStates(0.2)), dt=0.2, runs=4, **FIT)
+    pendulum = HamiltonianSystem.from_sympy("p**2/2 - cos(q)", domain=Box([-1, -1], [1, 1]))
+    with pytest.raises(TypeError, match=r"^`runs` is not an option of the optimizer 'gauss-newton' for primed flows"):
+        train(pendulum, dt=0.5, runs=4, **FIT)
+    with pytest.warns(RuntimeWarning) as seen:
+        train(lattice, flow=flow, runs=4, time_budget=1e-3, **FIT)
+    assert "The flow was not fitted to `runs`, because the time was up." in [str(w.message) for w in seen]
 
 
 @pytest.mark.parametrize(
