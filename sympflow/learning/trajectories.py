@@ -107,10 +107,10 @@ class Trajectories:
             NaN marks a value that is missing. Points without any value are left out. A trajectory whose times all
             descend is turned around.
         ndof : int, optional
-            Degrees of freedom d; else read off the data. With it a table's columns may bear any names, q's first.
+            Degrees of freedom d; else read off the data. With it a table's columns may bear any names, in this `order`.
         order : {"halves", "pairs"} or sequence of int
-            The order of the rows of y where these have no names: q1 … qd, p1 … pd; q1, p1, q2, p2, …; or the places of
-            q1 … qd, p1 … pd.
+            The order of the rows of y, or of columns whose names are not those of coordinates: q1 … qd, p1 … pd; q1,
+            p1, q2, p2, …; or the places of q1 … qd, p1 … pd.
         time, run : str, optional
             Columns of the time and of the trajectory; else those of common names ("t", "time"; "orbit", "run", …).
         q, p : str or sequence of str, optional
@@ -142,9 +142,8 @@ class Trajectories:
         """
         if isinstance(data, Trajectories):
             found, names = list(_labelled(data.runs)), data.names
-            order = "halves"
         elif _is_a("pandas", "DataFrame", data):
-            found, names = _of_table(data, ndof, time, run, q, p, velocity_mass is not None)
+            found, names = _of_table(data, ndof, order, time, run, q, p, velocity_mass is not None)
             order = "halves"
         elif _is_a("xarray", "Dataset", data):
             found, names = _of_dataset(data), ()
@@ -159,7 +158,8 @@ class Trajectories:
             raise ValueError("`data` has no trajectories: give at least one, (t, y).")
         width = _width(found, ndof)
         rows = _rows(order, width)
-        names = names or tuple(f"{letter}{i + 1}" for letter in "qp" for i in range(width // 2))
+        plainly = tuple(f"{letter}{i + 1}" for letter in "qp" for i in range(width // 2))
+        names = plainly if names in ((), plainly) else tuple(names[i] for i in rows)
         factors, of_time = _factors(units, names)
         runs = []
         for label, times, states in found:
@@ -227,10 +227,10 @@ class Trajectories:
         """The trajectories with angles of these periods (d,) continued where they jump by more than half a period."""
         return replace(self, runs=tuple(Run(run.t, _unwrapped(run.y, periods)) for run in self.runs))
 
-    def check_angles(self, known: np.ndarray | None = None) -> None:
-        """Raise ValueError if a coordinate jumps as a wrapped angle does, and it is not known (d,) if it is one."""
+    def check_angles(self, none: np.ndarray | None = None) -> None:
+        """Raise ValueError if a coordinate jumps as a wrapped angle does, and is not known (d,) to be none."""
         for i, name in enumerate(self.names[: self.ndof]):
-            if known is not None and known[i]:
+            if none is not None and none[i]:
                 continue
             rows = [run.y[i][np.isfinite(run.y[i])] for run in self.runs]
             steps = np.concatenate([np.diff(row) for row in rows])
@@ -508,7 +508,14 @@ def _opened(path: Path) -> Any:
 
 
 def _of_table(
-    table: Any, ndof: int | None, time: str | None, run: str | None, q: Any, p: Any, velocities: bool
+    table: Any,
+    ndof: int | None,
+    order: str | Sequence[int],
+    time: str | None,
+    run: str | None,
+    q: Any,
+    p: Any,
+    velocities: bool,
 ) -> tuple[list[Found], tuple[str, ...]]:
     columns = [str(c) for c in table.columns]
     table = table.set_axis(columns, axis=1)
@@ -519,7 +526,7 @@ def _of_table(
     one = _column(columns, run, RUNS, "run")
     ids = ids or ([] if one is None else [one])
     rest = [c for c in columns if c not in (*ids, of_time, *BESIDE)]
-    names = _coordinates(rest, ndof, q, p, velocities)
+    names = _coordinates(rest, ndof, order, q, p, velocities)
     groups = [("the trajectory", table)]
     if ids:
         grouped = table.groupby(ids if len(ids) > 1 else ids[0], sort=False, dropna=False)
@@ -544,7 +551,9 @@ def _column(columns: list[str], given: str | None, known: Sequence[str], argumen
     return given
 
 
-def _coordinates(rest: list[str], ndof: int | None, q: Any, p: Any, velocities: bool) -> tuple[str, ...]:
+def _coordinates(
+    rest: list[str], ndof: int | None, order: str | Sequence[int], q: Any, p: Any, velocities: bool
+) -> tuple[str, ...]:
     """The columns of q1 … qd, p1 … pd."""
     if (q is None) != (p is None):
         raise ValueError("`q` and `p` go together: name the columns of both.")
@@ -565,10 +574,10 @@ def _coordinates(rest: list[str], ndof: int | None, q: Any, p: Any, velocities: 
             "`velocity_mass`, by which p = M v, or columns p1 …"
         )
     if ndof is not None and len(rest) == 2 * ndof:
-        return tuple(rest)
+        return tuple(rest[i] for i in _rows(order, len(rest)))
     raise ValueError(
         f"`data` has columns {', '.join(rest)}, of which the coordinates and momenta are not recognized: name them by "
-        "`q` and `p`, or give `ndof` if they are all, q's first."
+        "`q` and `p`, or give `ndof` if they are all, q's first, or in another `order`."
     )
 
 

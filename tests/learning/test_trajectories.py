@@ -172,7 +172,7 @@ def test_angles_that_were_wrapped_are_noticed_and_continued():
         data = Trajectories.read([(times, turning), (times, wrapped * [[scale], [1]])][1:])
         with pytest.raises(ValueError, match=rf"2 jumps of q1 by about {period}, the first in trajectory 0"):
             data.check_angles()
-        data.check_angles(np.array([True]))  # it was said
+        data.check_angles(np.array([True]))  # it is none
     continued = Trajectories.read((times, wrapped), period=2 * np.pi)
     continued.check_angles()
     seen = np.isfinite(wrapped[0])
@@ -215,6 +215,19 @@ def test_angles_that_were_wrapped_are_noticed_and_continued():
 def test_bad_data_are_refused_with_the_remedy(data, options, message):
     with pytest.raises(ValueError, match=message):
         Trajectories.read(data, **options)
+
+
+def test_the_order_is_that_of_columns_with_names_of_their_own_and_of_trajectories_read_before():
+    pandas = pytest.importorskip("pandas")
+    table = pandas.DataFrame({"t": t, **dict(zip("abcd", FOUR, strict=True))})
+    read = Trajectories.read(table, 2, order="pairs")
+    assert read.names == ("a", "c", "b", "d")
+    assert np.array_equal(read.runs[0].y, FOUR[[0, 2, 1, 3]])
+    for before in (Trajectories.read(table, 2), Trajectories.read((t, FOUR))):
+        turned = Trajectories.read(before, order="pairs")
+        assert np.array_equal(turned.runs[0].y, FOUR[[0, 2, 1, 3]])
+    named = table.rename(columns={"a": "q1", "b": "p1", "c": "q2", "d": "p2"})
+    assert Trajectories.read(named, order="pairs").names == ("q1", "q2", "p1", "p2")
 
 
 def test_the_unit_of_a_column_goes_before_that_of_all():
