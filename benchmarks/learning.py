@@ -179,7 +179,7 @@ def one_step_error(flow: Any, system: HamiltonianSystem, held: np.ndarray) -> fl
 
 
 def authors(system: HamiltonianSystem, width: float, eps: float, options: argparse.Namespace) -> list[Row]:
-    """What `learn` chooses, which must meet the target, and beside it networks that it fits to the same data."""
+    """The model that `learn` chooses, which must meet the target, and beside it networks fitted to the same data."""
     data, held = authors_data(system, width, eps, 100, 50, 0)
     flow, seconds = timed(lambda: sympflow.learn(data, dt=1.0))
     budget = max(seconds, options.baseline)
