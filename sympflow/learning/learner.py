@@ -160,7 +160,7 @@ def learn(
     """
     data = Trajectories.read(trajectories, ndof, period=period, **reading)
     data.check_moving()
-    data.check_angles(None if period is None else np.full(data.ndof, True))
+    data.check_angles(None if period is None else np.isinf(periods_of(period, data.ndof)))
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
     said = _said(data, separable, mass, damping, period, known)
