@@ -216,7 +216,7 @@ def fragment(rows: list[dict[str, Any]], titles: Mapping[str, str]) -> str:
 
 
 def found_before(path: Path | None) -> dict[str, dict[str, Any]]:
-    """What an earlier call kept."""
+    """Rows that an earlier call kept."""
     return json.loads(path.read_text("utf-8")) if path is not None and path.exists() else {}
 
 

@@ -56,7 +56,7 @@ def learn(
         ready_file(to)
         if plot is not None:
             ready_file(plot, "--plot")
-        runs = Trajectories.read(data, ndof, units=_units(unit), order=order)
+        runs = Trajectories.read(data, ndof, units=_units(unit), order=order, period=period)
         out.print(f"{len(runs.runs)} trajectories, {runs.n_points} points, {runs.ndof} degree(s) of freedom")
         flow = learn_flow(
             runs,

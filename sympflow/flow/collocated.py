@@ -41,7 +41,7 @@ SAMPLED = 100
 """States of Ω by which the number of steps is chosen."""
 QUANTILE = 0.99
 TOLERANCE = 1e-10
-"""Error of ψ̄_Δt that 99 % of the states stay below, in units of their spread."""
+"""Error of ψ̄_Δt that 99 % of the states stay below, in units of their spread, 1 where they have none."""
 
 
 class CollocationLayer(Layer):
@@ -175,7 +175,7 @@ class CollocatedFlow(SympFlow):
                     "`steps` is needed, for the system has no domain over which errors could be compared: give it, or "
                     "`states`."
                 )
-            steps = enough_steps(system, flow.tableau, flow.dt, floats("states", states))
+            steps = enough_steps(system, flow.tableau, flow.dt, _checked_states(states, system.ndof))
         made = cls(system.ndof, stages, steps, flow.dt, system, dtype, device)
         made.domain = system.domain
         if system.domain is not None:
@@ -268,6 +268,13 @@ def _count(name: str, value: Any, most: int) -> int:
     return value
 
 
+def _checked_states(states: ArrayLike, ndof: int) -> np.ndarray:
+    x = floats("states", states)
+    if x.ndim != 2 or x.shape[1] != 2 * ndof or not len(x) or not np.isfinite(x).all():
+        raise ValueError(f"`states` must be finite and of shape (n, {2 * ndof}); got {x.shape}: give some, or `steps`.")
+    return x
+
+
 @np.errstate(all="ignore")  # of steps that are too long
 def enough_steps(system: HamiltonianSystem, tableau: collocation.Tableau, dt: float, x: np.ndarray) -> int:
     """The number of equal steps of a Gauss method with which ψ̄_Δt of states (n, 2d) errs by less than `TOLERANCE`.
@@ -277,7 +284,8 @@ def enough_steps(system: HamiltonianSystem, tableau: collocation.Tableau, dt: fl
     ValueError
         If more steps are needed than a flow may have.
     """
-    unit, order = np.maximum(x.std(axis=0), np.finfo(float).tiny), 2 * len(tableau[1])
+    spread, order = x.std(axis=0), 2 * len(tableau[1])
+    unit = np.where(spread > 0, spread, 1.0)
 
     def stepped(m: int) -> np.ndarray:
         y = x

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 BOUNDARIES = "periodic", "fixed", "free"
 MOST_AXES = 3
 FEW = 6, 4, 3
+"""Sites along each axis of a piece, of lattices of one, two and three axes."""
 MOST_JUDGED = 1024
 """Degrees of freedom of the lattice on which a flow is judged, where it has more."""
-"""Sites along each axis of a piece, of lattices of one, two and three axes."""
 WELLS, FAR = 8, 100.0
 """Starts from which minima of U are looked for, for each field, and how far they may be."""
 
@@ -87,7 +87,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return other
 
     def piece(self, sites: Any = None, boundary: Any = "periodic") -> Self:
-        shape = self.few() if sites is None else checked_shape(sites)
+        shape = self.few() if sites is None else checked_shape(sites, "sites")
         if len(shape) == 1:
             shape *= len(self.shape)
         if len(shape) != len(self.shape):
@@ -228,7 +228,7 @@ class LatticeHamiltonian(LocalHamiltonian):
 
     def _read(self, onsite: Any, bond: Any, kinetic: Any) -> None:
         names = self.names
-        if onsite is None and bond is None:
+        if onsite is None and (bond is None or bond == {}):
             raise TypeError("`onsite` or `bond` must be given: the potential of one site, of one bond, or both.")
         values = dict(zip(self.params, self.c, strict=True))
         written = [name for row in names.values() for name in row]
@@ -584,7 +584,7 @@ def _joined(fields: Sequence[Array], n_axes: int) -> Array:
     return flat[0] if len(flat) == 1 else _join(flat, -1)
 
 
-def checked_shape(shape: Any) -> tuple[int, ...]:
+def checked_shape(shape: Any, argument: str = "shape") -> tuple[int, ...]:
     """The sites along each axis, of an argument `shape`."""
     sizes = tuple(shape) if isinstance(shape, Sequence | np.ndarray) and not isinstance(shape, str) else (shape,)
     sizes = tuple(map(plain, sizes))
@@ -592,7 +592,7 @@ def checked_shape(shape: Any) -> tuple[int, ...]:
         isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in sizes
     ):
         raise ValueError(
-            f"`shape` must be one to {MOST_AXES} positive integers, the sites along each axis, such as (1024,) or "
+            f"`{argument}` must be one to {MOST_AXES} positive integers, the sites along each axis, such as (1024,) or "
             f"(64, 64); got {reprlib.repr(shape)}."
         )
     return sizes

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
 
 SPREAD, CALM = 8.0, 2.0
-"""How many times the density of the densest few neighbours may exceed the upper one, and fall below the lower one; and
-how many times it does in a calm system, where no density is known but theirs."""
+"""Factor by which the density of the densest few neighbours may exceed the upper one, and fall below the lower one; and
+the factor in a calm system, where no density is known but theirs."""
 RELAXED, PHASE = 60, 0.3
 """Verlet steps by which drawn states are relaxed, and their length times the fastest frequency."""
 HALVINGS, POWERS = 60, 12

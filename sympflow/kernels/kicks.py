@@ -28,6 +28,7 @@ MOST_FACTORED = 160  # see `_work_of_factoring`: what takes SymPy a second or tw
 MOST_MULTIPLIED = 3000  # terms, of what is factored or multiplied out
 MOST_TERMS = 120  # of a sum multiplied out
 MOST_NESTED = 12  # of a momentum's sum that is nested
+NEAR = 4.0  # from 0, where powers multiplied out cancel little
 B, G, C = sp.symbols("b g c", real=True)
 
 
@@ -395,6 +396,8 @@ def _by_products(symbols: SymbolicHamiltonian, terms: int, prefix: str) -> list[
     Written out in positions, as in `shapes`, each momentum would be a sum of its own.
     """
     q, p, d = symbols.q, symbols.p, symbols.ndof
+    if _far(symbols):
+        return []
     entries: list[dict[tuple[int, ...], sp.Expr]] = [{(i,): sp.diff(symbols.V, q[i]) for i in range(d)}]
     for _ in range(1, terms):
         entries.append({(*at, j): sp.diff(f, q[j]) for at, f in entries[-1].items() for j in range(at[-1], d)})
@@ -491,6 +494,8 @@ def shapes(symbols: SymbolicHamiltonian, terms: int, monomials: Monomials = ()) 
             bent = [_dot([_dot([sp.diff(h, s) for h in row], velocity) for row in hessian], velocity) for s in q]
             changes = [f - C * (_dot(hessian[i], again) + bent[i] / 2) for i, f in enumerate(changes)]
         yield [printable(p[i] + f) for i, f in enumerate(changes)]
+        if _far(symbols):
+            return
         W = [_dot(slope, velocity) / 2, _dot(velocity, products) / 2][: terms - 1]
         if any(f.has(*UNTOUCHED) or sp.count_ops(f) > MOST_OPERATIONS for f in W):
             return
@@ -510,7 +515,7 @@ def _forms(
 ) -> Iterator[list[sp.Expr]]:
     """Ways to write p and its changes, functions of arguments that are known at these times."""
     p, q = symbols.p, tuple(known)
-    if any(f.has(*UNTOUCHED) or sp.count_ops(f) > MOST_OPERATIONS for f in changes):
+    if _far(symbols) or any(f.has(*UNTOUCHED) or sp.count_ops(f) > MOST_OPERATIONS for f in changes):
         return
     yield [printable(p[i] + f) for i, f in enumerate(changes)]
     if any(_work_of_factoring(f) > MOST_FACTORED or _length(f) > MOST_MULTIPLIED for f in changes):
@@ -524,6 +529,26 @@ def _forms(
         if max(len(f.args) for f in expanded) <= MOST_NESTED:
             for sums, last in itertools.product((False, True), repeat=2):
                 yield [_nested(known, p[i], f, sums, last) for i, f in enumerate(expanded)]
+
+
+def _far(symbols: SymbolicHamiltonian) -> bool:
+    """Return True for a V by differences from positions that may be far from 0, like (q − 50)⁴.
+
+    Written by powers of q it would be a small difference of large numbers. Parameters may have any value.
+    """
+    assert symbols.V is not None
+    for u in symbols.V.atoms(sp.Add):
+        constant, rest = u.as_independent(*symbols.q, as_Add=True)
+        if constant == 0 or not rest.is_polynomial(*symbols.q):
+            continue
+        slopes = [sp.diff(rest, s) for s in symbols.q if rest.has(s)]
+        if any(slope.has(*symbols.q) for slope in slopes):
+            continue
+        if constant.free_symbols or abs(constant) > NEAR * max(
+            abs(slope) if slope.is_number else 1 for slope in slopes
+        ):
+            return _degree(symbols.V) > 2
+    return False
 
 
 def _with_products_of_both(symbols: SymbolicHamiltonian, W: sp.Expr) -> Iterator[list[sp.Expr]]:

@@ -29,7 +29,7 @@ from sympflow.learning.regression import Regression
 from sympflow.learning.shooting import Fit, Method, Problem, chosen_method, minimized
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import POINTS, Reading, best_by_increments
-from sympflow.learning.trajectories import Run, Trajectories
+from sympflow.learning.trajectories import Run, Trajectories, periods_of
 from sympflow.training.session import Session
 
 if TYPE_CHECKING:
@@ -280,7 +280,8 @@ def discover(
         return _of_flow(data, terms, degree, most_terms, domain, seed, name)
     trajectories = Trajectories.read(data, ndof, **reading)
     trajectories.check_moving()
-    trajectories.check_angles(None if reading.get("period") is None else np.full(trajectories.ndof, True))
+    period = reading.get("period")
+    trajectories.check_angles(None if period is None else np.isinf(periods_of(period, trajectories.ndof)))
     if not 0 <= held_out < 1:
         raise ValueError(f"`held_out` must be at least 0 and less than 1; got {held_out!r}: 0.2 keeps a fifth.")
     if piece is not None and not piece > 0:

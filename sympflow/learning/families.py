@@ -206,11 +206,11 @@ class Family:
     Attributes
     ----------
     separable : bool
-        Whether they have the form T(p) + V(q).
+        True of the form T(p) + V(q).
     models : callable
         models(said): candidates from simple to rich, none where the family does not apply.
     linear : bool
-        Whether they are linear in their numbers, and soon fitted. Before those that are not, the data are asked
+        True of models that are linear in their numbers, and soon fitted. Before those that are not, the data are asked
         whether any H explains them.
     """
 

@@ -160,7 +160,7 @@ def learn(
     """
     data = Trajectories.read(trajectories, ndof, period=period, **reading)
     data.check_moving()
-    data.check_angles(None if period is None else np.full(data.ndof, True))
+    data.check_angles(None if period is None else np.isinf(periods_of(period, data.ndof)))
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
     said = _said(data, separable, mass, damping, period, known)
@@ -302,10 +302,12 @@ class Replicas:
         times = floats("t", t)
         if times.ndim != 1 or len(times) < 1 or (np.diff(times) < 0).any():
             raise ValueError(f"`t` must be ascending times (n,), the first that of y0; got {t!r}.")
+        start, gaps = floats("y0", y0), np.diff(times, prepend=times[0])[:, None]
+        if start.shape != (2 * self.model.ndof,) or not np.isfinite(start).all():
+            raise ValueError(f"`y0` must be one finite state ({2 * self.model.ndof},); got {y0!r}.")
         orbits = []
         for theta in self.thetas:
-            x, gaps = floats("y0", y0).reshape(-1, 1), np.diff(times, prepend=times[0])[:, None]
-            orbit = self.method.stepper.orbit(self.method, self.model, theta, x.copy(), None, gaps)
+            orbit = self.method.stepper.orbit(self.method, self.model, theta, start[:, None].copy(), None, gaps)
             orbits.append(np.stack([state[:, 0].copy() for state, _ in orbit], axis=1))
         return np.stack(orbits)
 

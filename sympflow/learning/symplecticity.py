@@ -23,13 +23,13 @@ from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Run, Trajectories
 
 DEGREES = (1, 2, 3)
-"""Of the fields that need not be Hamiltonian."""
+"""Degrees of the polynomial fields that need not be Hamiltonian."""
 DOUBTFUL = 0.6
 """Share of the squares of increments, left by another reading of the data, below which orbits are to decide."""
 PLAINER = 1.5
 """Factor by which friction or another order of columns may leave more than a field without any structure."""
 POINTS = 24
-"""Of the pieces whose increments are compared."""
+"""Number of points of a piece whose increments are compared."""
 LONG = 10
 """Such pieces in a part of a trajectory that is smoothed."""
 COMPARED = 2000
@@ -68,7 +68,7 @@ class Reading:
         return replace(data, runs=tuple(Run(run.t, run.y[[*self.rows]]) for run in data.runs), names=names)
 
     def remedy(self, theta: np.ndarray) -> str:
-        """What to do."""
+        """Advice, with the rates of friction that were found."""
         rates = theta[-self.field.ndof :]
         return self.advice.format(", ".join(f"{rate:.3g}" for rate in rates))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import floats
+from sympflow.arguments import floats, plain
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.flow.scaling import Scaling
 from sympflow.storage.layout import DOF, ORBIT, TIME, imported
@@ -106,10 +107,10 @@ class Trajectories:
             NaN marks a value that is missing. Points without any value are left out. A trajectory whose times all
             descend is turned around.
         ndof : int, optional
-            Degrees of freedom d; else read off the data. With it a table's columns may bear any names, q's first.
+            Degrees of freedom d; else read off the data. With it a table's columns may bear any names, in this `order`.
         order : {"halves", "pairs"} or sequence of int
-            The order of the rows of y where these have no names: q1 … qd, p1 … pd; q1, p1, q2, p2, …; or the places of
-            q1 … qd, p1 … pd.
+            The order of the rows of y, or of columns whose names are not those of coordinates: q1 … qd, p1 … pd; q1,
+            p1, q2, p2, …; or the places of q1 … qd, p1 … pd.
         time, run : str, optional
             Columns of the time and of the trajectory; else those of common names ("t", "time"; "orbit", "run", …).
         q, p : str or sequence of str, optional
@@ -141,9 +142,8 @@ class Trajectories:
         """
         if isinstance(data, Trajectories):
             found, names = list(_labelled(data.runs)), data.names
-            order = "halves"
         elif _is_a("pandas", "DataFrame", data):
-            found, names = _of_table(data, ndof, time, run, q, p, velocity_mass is not None)
+            found, names = _of_table(data, ndof, order, time, run, q, p, velocity_mass is not None)
             order = "halves"
         elif _is_a("xarray", "Dataset", data):
             found, names = _of_dataset(data), ()
@@ -158,7 +158,8 @@ class Trajectories:
             raise ValueError("`data` has no trajectories: give at least one, (t, y).")
         width = _width(found, ndof)
         rows = _rows(order, width)
-        names = names or tuple(f"{letter}{i + 1}" for letter in "qp" for i in range(width // 2))
+        plainly = tuple(f"{letter}{i + 1}" for letter in "qp" for i in range(width // 2))
+        names = plainly if names in ((), plainly) else tuple(names[i] for i in rows)
         factors, of_time = _factors(units, names)
         runs = []
         for label, times, states in found:
@@ -226,10 +227,10 @@ class Trajectories:
         """The trajectories with angles of these periods (d,) continued where they jump by more than half a period."""
         return replace(self, runs=tuple(Run(run.t, _unwrapped(run.y, periods)) for run in self.runs))
 
-    def check_angles(self, known: np.ndarray | None = None) -> None:
-        """Raise ValueError if a coordinate jumps as a wrapped angle does, and it is not known (d,) if it is one."""
+    def check_angles(self, none: np.ndarray | None = None) -> None:
+        """Raise ValueError if a coordinate jumps as a wrapped angle does, and is not known (d,) to be none."""
         for i, name in enumerate(self.names[: self.ndof]):
-            if known is not None and known[i]:
+            if none is not None and none[i]:
                 continue
             rows = [run.y[i][np.isfinite(run.y[i])] for run in self.runs]
             steps = np.concatenate([np.diff(row) for row in rows])
@@ -306,9 +307,9 @@ class Trajectories:
             The longest time of a piece, which holds two points at least. Of chaotic orbits this is one or two
             Lyapunov times.
         """
-        most = sys.maxsize if points is None else points
-        if most < 2:
-            raise ValueError(f"`points` must be 2 or more; got {points!r}.")
+        most = sys.maxsize if points is None else plain(points)
+        if isinstance(most, bool) or not isinstance(most, int) or most < 2:
+            raise ValueError(f"`points` must be an integer, 2 or more; got {points!r}.")
         if not span > 0:
             raise ValueError(f"`span` must be positive; got {span!r}.")
         return replace(self, runs=tuple(piece for run in self.runs for piece in _cut(run, most, span)))
@@ -442,7 +443,7 @@ def _of_pair(t: Any, y: Any) -> Iterator[Found]:
     if y.ndim == 2:
         yield "the trajectory", t, y
         return
-    for i, one in enumerate(y.reshape(-1, *y.shape[-2:])):
+    for i, one in enumerate(y.reshape(math.prod(y.shape[:-2]), *y.shape[-2:])):
         yield f"trajectory {i}", t, one
 
 
@@ -507,7 +508,14 @@ def _opened(path: Path) -> Any:
 
 
 def _of_table(
-    table: Any, ndof: int | None, time: str | None, run: str | None, q: Any, p: Any, velocities: bool
+    table: Any,
+    ndof: int | None,
+    order: str | Sequence[int],
+    time: str | None,
+    run: str | None,
+    q: Any,
+    p: Any,
+    velocities: bool,
 ) -> tuple[list[Found], tuple[str, ...]]:
     columns = [str(c) for c in table.columns]
     table = table.set_axis(columns, axis=1)
@@ -518,7 +526,7 @@ def _of_table(
     one = _column(columns, run, RUNS, "run")
     ids = ids or ([] if one is None else [one])
     rest = [c for c in columns if c not in (*ids, of_time, *BESIDE)]
-    names = _coordinates(rest, ndof, q, p, velocities)
+    names = _coordinates(rest, ndof, order, q, p, velocities)
     groups = [("the trajectory", table)]
     if ids:
         grouped = table.groupby(ids if len(ids) > 1 else ids[0], sort=False, dropna=False)
@@ -543,7 +551,9 @@ def _column(columns: list[str], given: str | None, known: Sequence[str], argumen
     return given
 
 
-def _coordinates(rest: list[str], ndof: int | None, q: Any, p: Any, velocities: bool) -> tuple[str, ...]:
+def _coordinates(
+    rest: list[str], ndof: int | None, order: str | Sequence[int], q: Any, p: Any, velocities: bool
+) -> tuple[str, ...]:
     """The columns of q1 … qd, p1 … pd."""
     if (q is None) != (p is None):
         raise ValueError("`q` and `p` go together: name the columns of both.")
@@ -564,10 +574,10 @@ def _coordinates(rest: list[str], ndof: int | None, q: Any, p: Any, velocities: 
             "`velocity_mass`, by which p = M v, or columns p1 …"
         )
     if ndof is not None and len(rest) == 2 * ndof:
-        return tuple(rest)
+        return tuple(rest[i] for i in _rows(order, len(rest)))
     raise ValueError(
         f"`data` has columns {', '.join(rest)}, of which the coordinates and momenta are not recognized: name them by "
-        "`q` and `p`, or give `ndof` if they are all, q's first."
+        "`q` and `p`, or give `ndof` if they are all, q's first, or in another `order`."
     )
 
 
@@ -583,6 +593,8 @@ def _numbered(columns: list[str], letter: str) -> list[str]:
 def _width(found: list[Found], ndof: int | None) -> int:
     widths: dict[int, str] = {}
     for label, t, y in found:
+        if not y.size:
+            raise ValueError(f"`data` has no numbers ({label}): give at least two points of each trajectory.")
         if y.ndim != 2 or t.ndim != 1:
             raise ValueError(f"`data` has times of shape {t.shape}, states {y.shape} ({label}): give (n,) and (2d, n).")
         if y.shape[1] != len(t):
@@ -616,9 +628,12 @@ def _rows(order: str | Sequence[int], width: int) -> list[int]:
 
 def _factors(units: Mapping[str, str | float] | None, names: tuple[str, ...]) -> tuple[np.ndarray, float]:
     """The factors of the coordinates (2d,) and of the times that convert the units."""
+    if units is not None and not isinstance(units, Mapping):
+        raise TypeError(f'`units` must be a dictionary such as {{"t": "ms", "q": "deg"}}; got {units!r}.')
     d, factors, of_time = len(names) // 2, np.ones(len(names)), 1.0
-    for name, unit in (units or {}).items():
-        factor = _factor(name, unit)
+    given = {} if units is None else units
+    for name in sorted(given, key=lambda name: name in names):  # a column's own unit goes before that of all q or p
+        factor = _factor(name, given[name])
         if name in names:
             factors[names.index(name)] = factor
         elif name in ("q", "p"):
@@ -646,9 +661,14 @@ def _factor(name: str, unit: str | float) -> float:
 
 def _momenta(mass: ArrayLike, v: np.ndarray) -> np.ndarray:
     """M v."""
-    M, d = np.asarray(mass, dtype=float), len(v)
+    M, d = floats("velocity_mass", mass), len(v)
     if M.shape not in ((), (d,), (d, d)):
         raise ValueError(f"`velocity_mass` must be a number, ({d},) or ({d}, {d}); got the shape {M.shape}.")
+    whole = M if M.ndim == 2 else np.diag(np.broadcast_to(M, d))
+    if not (np.isfinite(M).all() and np.allclose(whole, whole.T) and (np.linalg.eigvalsh(whole) > 0).all()):
+        raise ValueError(
+            f"`velocity_mass` must be finite, symmetric and positive definite, by which p = M v; got {mass!r}."
+        )
     return M @ v if M.ndim == 2 else (M if M.ndim == 0 else M[:, None]) * v
 
 

@@ -147,6 +147,7 @@ def test_a_pickle_does_not_grow_with_the_lattice():
         ({"bond": "r +* 2"}, "`bond` cannot be parsed"),
         ({"bond": {0: "r**2"}}, "`bond` by distances"),
         ({"bond": None}, "`onsite` or `bond`"),
+        ({"bond": {}}, "`onsite` or `bond`"),
         ({"onsite": "p"}, "`onsite` holds p"),
         ({"onsite": "q*cos(t)"}, "`onsite` holds t, and systems by one piece do not depend on the time"),
         ({"kinetic": "p**2/2 + q"}, "`kinetic` holds q"),

@@ -360,7 +360,10 @@ def test_gauss_methods_keep_their_order_with_friction(name, order, ends):
         assert order - 0.2 < np.log2(errors[0] / errors[1]) < order + 0.5
 
 
-@pytest.mark.parametrize("name", ["gauss_legendre4", "gauss_legendre8"])
+@pytest.mark.parametrize(
+    "name",
+    [n if n in ("gauss_legendre4", "gauss_legendre8") else pytest.param(n, marks=pytest.mark.slow) for n in GAUSS],
+)
 def test_gauss_methods_are_conformally_symplectic_for_any_h(name):
     sol = solve(TURNING, name, (0, 20.0), dt=0.4, backend="array")
     assert sympflow.conformal_defect(sol) < 1e-14

@@ -117,8 +117,8 @@ def test_first_and_second_derivatives_pass_through_a_step(method):
     assert torch.autograd.gradgradcheck(step, y)
 
 
-def test_events_and_failure_beside_them():
-    method = "gauss_legendre4"
+@pytest.mark.parametrize("method", ["gauss_legendre4", pytest.param("implicit_midpoint", marks=pytest.mark.slow)])
+def test_events_and_failure_beside_them(method):
     sol = solve(PRODUCT, method, (0.0, 20.0), events=lambda t, y: y[0])
     zeros = sol.t_events[0]
     assert len(zeros) > 4

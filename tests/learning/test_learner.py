@@ -353,7 +353,10 @@ def test_replicas_tell_how_certain_a_prediction_is():
     model = Model(1, (FixedKinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
     found = fitted(model, data, Setting())
     thetas = np.stack([replica((model, data, Setting(), found.theta, 0), k) for k in range(6)])
-    low, high = Replicas(model, found.method, found.theta, thetas).bands([0.5, 0.0], np.linspace(0, 4, 5))
+    replicas = Replicas(model, found.method, found.theta, thetas)
+    low, high = replicas.bands([0.5, 0.0], np.linspace(0, 4, 5))
+    with pytest.raises(ValueError, match="`y0` must be one finite state"):
+        replicas.bands([[0.5, 0.0], [0.1, 0.0]], [0, 1])
     assert (low[:, 0] == high[:, 0]).all()
     assert 0 < (high - low)[0, -1] < 0.1
     theta = found.theta

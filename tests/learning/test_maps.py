@@ -51,7 +51,7 @@ def test_orbits_are_those_of_the_flow():
 
 @pytest.fixture(scope="module")
 def learned():
-    """Of H = ½p²(1 + q²/2) + ½q² + q⁴/8, which is not separable."""
+    """Trajectories of H = ½p²(1 + q²/2) + ½q² + q⁴/8, which is not separable, and flows that are learned from them."""
     random, t = np.random.default_rng(0), np.linspace(0, 2.4, 13)
     data = []
     for _ in range(40):

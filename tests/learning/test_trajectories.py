@@ -145,7 +145,7 @@ def test_sets_are_divided_by_trajectory_and_long_runs_into_pieces():
     assert np.array_equal(np.concatenate([run.y for run in one.pieces(span=0.4).runs], 1), RUN)
     with pytest.raises(ValueError, match="one trajectory only"):
         one.split()
-    with pytest.raises(ValueError, match="`points` must be 2 or more"):
+    with pytest.raises(ValueError, match="`points` must be an integer, 2 or more"):
         one.pieces(points=1)
 
 
@@ -172,7 +172,7 @@ def test_angles_that_were_wrapped_are_noticed_and_continued():
         data = Trajectories.read([(times, turning), (times, wrapped * [[scale], [1]])][1:])
         with pytest.raises(ValueError, match=rf"2 jumps of q1 by about {period}, the first in trajectory 0"):
             data.check_angles()
-        data.check_angles(np.array([True]))  # it was said
+        data.check_angles(np.array([True]))  # it is none
     continued = Trajectories.read((times, wrapped), period=2 * np.pi)
     continued.check_angles()
     seen = np.isfinite(wrapped[0])
@@ -206,12 +206,36 @@ def test_angles_that_were_wrapped_are_noticed_and_continued():
         ((t, RUN), {"units": {"p": "furlong"}}, "are known; else give a factor"),
         ((t, RUN), {"units": {"x": "m"}}, "`units` names 'x'"),
         ((t, RUN), {"velocity_mass": [1, 2]}, "`velocity_mass` must be"),
+        ((t, RUN), {"velocity_mass": 0.0}, "`velocity_mass` must be finite"),
+        ((t, FOUR), {"velocity_mass": [[1, 2], [2, 1]]}, "positive definite"),
+        ((t[:0], FOUR[None, :, :0]), {}, "has no numbers"),
         ((np.eye(2), [1, 2, 3], np.eye(2)), {}, r"give x \(N, 2d\), t \(N,\)"),
     ],
 )  # fmt: skip
 def test_bad_data_are_refused_with_the_remedy(data, options, message):
     with pytest.raises(ValueError, match=message):
         Trajectories.read(data, **options)
+
+
+def test_the_order_is_that_of_columns_with_names_of_their_own_and_of_trajectories_read_before():
+    pandas = pytest.importorskip("pandas")
+    table = pandas.DataFrame({"t": t, **dict(zip("abcd", FOUR, strict=True))})
+    read = Trajectories.read(table, 2, order="pairs")
+    assert read.names == ("a", "c", "b", "d")
+    assert np.array_equal(read.runs[0].y, FOUR[[0, 2, 1, 3]])
+    for before in (Trajectories.read(table, 2), Trajectories.read((t, FOUR))):
+        turned = Trajectories.read(before, order="pairs")
+        assert np.array_equal(turned.runs[0].y, FOUR[[0, 2, 1, 3]])
+    named = table.rename(columns={"a": "q1", "b": "p1", "c": "q2", "d": "p2"})
+    assert Trajectories.read(named, order="pairs").names == ("q1", "q2", "p1", "p2")
+
+
+def test_the_unit_of_a_column_goes_before_that_of_all():
+    for units in ({"q": "deg", "q1": "rad"}, {"q1": "rad", "q": "deg"}):
+        q = Trajectories.read((t, FOUR), units=units).runs[0].y[:2]
+        assert np.allclose(q, FOUR[:2] * [[1], [np.pi / 180]], rtol=1e-15)
+    with pytest.raises(TypeError, match="`units` must be a dictionary"):
+        Trajectories.read((t, FOUR), units="ms")
 
 
 @pytest.mark.parametrize("data", [None, 3.0, "no.such.kind", [1, 2], [(t,)], (t, RUN * 1j)])

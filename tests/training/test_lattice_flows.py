@@ -55,6 +55,8 @@ def test_a_piece_has_the_states_of_the_lattice():
     assert ring(200).piece(8).domain is None
     with pytest.raises(TypeError, match=r"^`system` 'custom' is no lattice"):
         HamiltonianSystem.from_sympy("p**2/2 + q**2/2").piece()
+    with pytest.raises(ValueError, match=r"^`sites` must be one to 3 positive integers"):
+        ring(200).piece(0)
     with pytest.raises(ValueError, match=r"^`density` must be positive"):
         LatticeStates((0.3, 0.2))
     with pytest.raises(ValueError, match="`domain` is not known"):
