@@ -28,7 +28,7 @@ from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import report_lanes, run_and_search
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
-from sympflow.integrators.domain_exit import check_domain, check_system_along
+from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_leap
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
 from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, naming_plugin
@@ -259,6 +259,8 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
         from sympflow.integrators.diagnosis import note_singularities
 
         note_singularities(outcome, integrator, problem)
+    if system.leaps_over and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
+        warn_of_leap(outcome, system, y_start, stacklevel=4)
     if system.functions_given and readable(outcome.y):
         system.check_functions_along(outcome.y)
     if integrator.trained:

@@ -25,7 +25,7 @@ QUANTILE, CONFIDENCE = 0.95, 0.99  # of the energy errors, and that its limit is
 SAVED_VALUES = 1_000_000  # of a piece of the measured runs, which are never held whole
 WORST = 16  # states of a time from which the largest rate is searched
 OFFSPRING, ROUNDS = 16, 16  # new states of each, and how often
-SEARCHED = 4_000_000  # numbers of these states, of many degrees of freedom
+SEARCHED = 4_000_000  # numbers that are handled for these states, of many degrees of freedom
 GOLDEN = (math.sqrt(5) - 1) / 2
 FIRST_STEP, SHRINK = 0.2, 0.65  # how far these are, in standard deviations of Ω, and how much nearer each time
 
@@ -260,17 +260,20 @@ def _largest_nearby(
     x: np.ndarray,
     values: np.ndarray,
     rng: np.random.Generator,
+    numbers: int,
 ) -> np.ndarray:
     """The largest value of a function of (t, x) at each time, from its values (J, n) at states x (n, 2d) of Ω.
 
-    From the worst states of each time by random steps in Ω, ever shorter, of which the best are kept.
+    From the worst states of each time by random steps in Ω, ever shorter, of which the best are kept; of fewer states
+    and steps where the function handles many `numbers` for each.
     """
-    worst = np.argsort(values, axis=1)[:, -WORST:]
+    few = SEARCHED // (OFFSPRING * len(t) * numbers)
+    worst = np.argsort(values, axis=1)[:, -max(1, min(WORST, few)) :]
     best, found = x[worst], np.take_along_axis(values, worst, 1)  # (J, W, 2d), (J, W)
     if not np.isfinite(found).all():
         return found.max(1)
     length, times = FIRST_STEP * x.std(0), np.broadcast_to(t[:, None], (OFFSPRING, *found.shape))
-    for _ in range(min(ROUNDS, SEARCHED // (OFFSPRING * best.size))):
+    for _ in range(min(ROUNDS, few // worst.shape[1])):
         new = best + rng.normal(size=(OFFSPRING, *best.shape)) * length
         inside = domain.contains(new)
         rates = np.full(inside.shape, -math.inf)
@@ -303,6 +306,7 @@ def _over_sample(
         at, z = (torch.as_tensor(a, dtype=flow.dtype, device=flow.device) for a in (t, states))
         return _finite(_array(gained(at, z)[1]))
 
+    numbers = x.shape[1] if system.local is None else system.local.numbers
     instants = np.linspace(0.0, flow.dt, times)
     for t in instants.tolist():
         defect, gain = gained(t, points)
@@ -311,7 +315,7 @@ def _over_sample(
         difference = flow.hamiltonian_unchecked(t, points) - H
         mismatches.append(difference - difference.mean())
     rates = np.array([list(asdict(Quantiles.of(row)).values()) for row in gains])  # (times, 3)
-    rates[:, 2] = _largest_nearby(rate, domain, instants, x, np.array(gains), rng)
+    rates[:, 2] = _largest_nearby(rate, domain, instants, x, np.array(gains), rng, numbers)
     delta = Quantiles(*(float(np.trapezoid(column, dx=flow.dt / (times - 1))) for column in rates.T))
     return Quantiles.of(_array(torch.stack(defects))), Quantiles.of(_array(torch.stack(mismatches))), delta
 

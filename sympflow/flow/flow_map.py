@@ -602,6 +602,11 @@ class FlowMap(nn.Module):
                 f"`system` {system.name!r} is another {system.local.noun} than that of this flow{reason}: its numbers "
                 f"cancel the errors of its own terms alone. {remedy[0].upper()}{remedy[1:]}"
             )
+        if system.local is not None and self.lattice_terms:
+            raise ValueError(
+                f"`system` {system.name!r} is of another kind than that of this flow: its parts differ, or it has "
+                f"other forces or a box. {remedy[0].upper()}{remedy[1:]}"
+            )
         if system.ndof != self.ndof:
             raise ValueError(
                 f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: {remedy}"

@@ -882,7 +882,8 @@ def _kicks_of(name: str, asked: Any) -> tuple[bool, tuple[int, ...] | None]:
         kicks = tuple(map(plain, asked))
         if all(isinstance(i, int) and not isinstance(i, bool) for i in kicks):
             return True, kicks
-    check_flag(name, asked)
+    if not isinstance(asked, bool):
+        raise TypeError(f"`{name}` must be True or False; got {asked!r}: or name kicks, as a list of integers from 0.")
     return asked, None
 
 

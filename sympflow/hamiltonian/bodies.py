@@ -6,7 +6,7 @@ import copy
 import math
 import reprlib
 from collections.abc import Callable, Iterator, Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -21,6 +21,8 @@ MOST_NEAR = 300
 """About how many bodies each is compared with where there are cells."""
 MOST_PAIRS = 1_000_000
 """Pairs whose values stand in memory at a time."""
+ALL_AT_ONCE = 24
+"""Bodies up to which the pairs are met by one product with the matrix of their ends, which is faster than indices."""
 SHORTEST, LONGEST, SCANNED = 1e-4, 1e4, 4001
 """Distances between which a minimum of V is looked for."""
 FAR, REACH = (10.0, 100.0), 2.0
@@ -300,14 +302,14 @@ class PairsHamiltonian(LocalHamiltonian):
     def hessian_vector(self, q: Array, v: Array, *t: Array) -> Array:
         def product(pairs: Pairs) -> Array:
             x, w = pairs.x
-            return pairs.values(1)[..., None] * w + (pairs.values(2) * (x * w).sum(-1))[..., None] * x
+            return pairs.values(1)[..., None] * w + (pairs.values(2) * _dot(x, w))[..., None] * x
 
         return self._forces(product, q, v)
 
     def third_derivative(self, q: Array, v: Array, w: Array, *t: Array) -> Array:
         def product(pairs: Pairs) -> Array:
             x, a, b = pairs.x
-            xa, xb, ab = ((y * z).sum(-1) for y, z in ((x, a), (x, b), (a, b)))
+            xa, xb, ab = (_dot(y, z) for y, z in ((x, a), (x, b), (a, b)))
             two, three = pairs.values(2), pairs.values(3)
             along = (three * xa * xb + two * ab)[..., None] * x
             return along + (two * xa)[..., None] * b + (two * xb)[..., None] * a
@@ -322,6 +324,19 @@ class PairsHamiltonian(LocalHamiltonian):
             half = pairs.values(0)[..., None] / 2
             density = _added(_added(density, pairs.i, half), pairs.j, half)
         return density[..., 0]
+
+    @property
+    def leaps_over(self) -> int:  # type: ignore[override]
+        """The pairs, of which each may meet at r = 0 without softening."""
+        return 0 if self.softening else self.n_bodies * (self.n_bodies - 1) // 2
+
+    def leap(self, y: np.ndarray, start: np.ndarray) -> str:
+        before, after = ((self._of_bodies(x[self.ndof :]) ** 2).sum(-1) / self.masses for x in (start, y))
+        i, j = sorted(np.argsort(after - before)[-2:].tolist()) if self.n_bodies > 1 else (0, 0)
+        return (
+            f"the bodies {i} and {j} have gained most: they met between two steps, which saw nothing of it. Take "
+            "shorter steps, `softening`, or a method with a clock of its own, such as 'log_leapfrog'"
+        )
 
     def remark(self, q: np.ndarray) -> str:
         from scipy.spatial import cKDTree
@@ -360,6 +375,11 @@ class PairsHamiltonian(LocalHamiltonian):
         out: Any = 0 * self._of_bodies(sum(arrays[1:], q))
         for pairs in self._pairs(*arrays):
             f = value(pairs)
+            if self._all_at_once:
+                *lead, _, dim = f.shape
+                sums = f.swapaxes(-1, -2).reshape(-1, len(pairs.i)) @ self._like(_incidence(self.n_bodies), f)
+                out = out + sums.reshape(*lead, dim, self.n_bodies).swapaxes(-1, -2)
+                continue
             out = _added(_added(out, pairs.i, f), pairs.j, -f)
         return out.reshape(*out.shape[:-2], self.ndof)
 
@@ -372,11 +392,20 @@ class PairsHamiltonian(LocalHamiltonian):
             yield Pairs(self, i, j, [self._between(x, i, j, k == 0) for k, x in enumerate(bodies)])
 
     def _between(self, x: Array, i: np.ndarray, j: np.ndarray, positions: bool) -> Array:
-        difference = x[..., i, :] - x[..., j, :]
+        if self._all_at_once:
+            *lead, n, dim = x.shape
+            rows = x.swapaxes(-1, -2).reshape(-1, n) @ self._like(_incidence(n), x).T
+            difference = rows.reshape(*lead, dim, len(i)).swapaxes(-1, -2)
+        else:
+            difference = x[..., i, :] - x[..., j, :]
         if positions and self.box is not None:
             box = self._like(self.box, x)
             difference = difference - box * (difference / box).round()
         return difference
+
+    @property
+    def _all_at_once(self) -> bool:
+        return self.n_bodies <= ALL_AT_ONCE and self.cutoff is None
 
     def _ends(self, q: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Indices i < j of pairs, `most` at a time, of all states q (..., n, dim) together."""
@@ -386,7 +415,7 @@ class PairsHamiltonian(LocalHamiltonian):
             for start in range(0, len(near), most):
                 yield near[start : start + most, 0], near[start : start + most, 1]
             return
-        rows = max(1, most // n)
+        rows = n if self._all_at_once else max(1, most // n)
         for start in range(0, n - 1, rows):
             i, j = np.triu_indices(min(rows, n - 1 - start), 1, n - start)
             yield i + start, j + start
@@ -406,7 +435,7 @@ class Pairs:
 
     def __init__(self, local: PairsHamiltonian, i: np.ndarray, j: np.ndarray, x: list[Array]) -> None:
         self.local, self.i, self.j, self.x = local, i, j, x
-        self.s = (x[0] * x[0]).sum(-1) + local.softening**2
+        self.s = _dot(x[0], x[0]) + local.softening**2
 
     def values(self, k: int) -> Array:
         """2ᵏ times the k-th derivative of V by s, 0 beyond the cut-off: (..., P)."""
@@ -420,6 +449,18 @@ class Pairs:
             return value
         outside = s >= local.cutoff**2 + local.softening**2
         return value.masked_fill(outside, 0.0) if is_tensor(s) else np.where(outside, 0.0, value)
+
+
+@cache
+def _incidence(n: int) -> np.ndarray:
+    """1 at the first and −1 at the second end of each pair of n bodies: (P, n)."""
+    i, j = np.triu_indices(n, 1)
+    return np.eye(n)[i] - np.eye(n)[j]
+
+
+def _dot(x: Array, y: Array) -> Array:
+    """Products of vectors (..., dim), axis by axis, of which there are too few for a sum along the last."""
+    return sum((x[..., k] * y[..., k] for k in range(1, x.shape[-1])), x[..., 0] * y[..., 0])
 
 
 def _added(out: Array, ends: np.ndarray, values: Array) -> Array:

@@ -44,6 +44,8 @@ class Definition:
         `sympflow.hamiltonian.local`.
     instead : str
         The methods that are advised where H is not separable, in words.
+    leaps_over : int
+        Places where V is infinite and which a step may leap over, such as pairs of bodies; 0 for none.
     """
 
     ndof: int
@@ -58,6 +60,7 @@ class Definition:
     shortest_piece: float = inf
     has_third_derivative: bool = False
     loops: str = ""
+    leaps_over: int = 0
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
@@ -81,6 +84,13 @@ class Definition:
     def hessian_vector(self, q: Array, v: Array, *t: Array) -> Array:
         """∇²V(q)·v: (..., d), each, to (..., d)."""
         return (self.potential_hessian(q, *t) @ v[..., None])[..., 0]
+
+    def leap(self, y: np.ndarray, start: np.ndarray) -> str:
+        """Remark on a state (2d,) of a run that gained energy from nothing since its start (2d,): a clause, or nothing.
+
+        Only of a system with places where V is infinite, which a step may leap over: see `leaps_over`.
+        """
+        return ""
 
     def remark(self, q: np.ndarray) -> str:
         """Remark on the last positions (d,) of a run that could not go on: a clause, or nothing."""

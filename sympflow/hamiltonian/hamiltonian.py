@@ -463,6 +463,15 @@ class Hamiltonian:
         """The methods that are advised where H is not separable, in words."""
         return self._definition.instead
 
+    @property
+    def leaps_over(self) -> int:
+        """Places where V is infinite and which a step may leap over, such as pairs of bodies; 0 for none."""
+        return self._definition.leaps_over
+
+    def leap(self, y: np.ndarray, start: np.ndarray) -> str:
+        """A clause on a state (2d,) of a run that gained energy from nothing since its start (2d,); or nothing."""
+        return self._definition.leap(y, start)
+
     def remark(self, q: np.ndarray) -> str:
         """A clause on the last positions (d,) of a run that could not go on, such as bodies that met; or nothing."""
         return self._definition.remark(q)

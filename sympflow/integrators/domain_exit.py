@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sympflow.arrays import Array, finite_states, has_values, is_tensor, one_lane, readable
+from sympflow.arrays import Array, finite_states, has_values, is_tensor, one_lane, readable, to_numpy
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Outcome
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
 
 STATES_COMPARED, MOST_COMPARED = 16, 64
 """Outputs of a run, and states of a batch, at which H is compared with that of the flow."""
+
+CHEAP_PAIRS, MANY_STEPS = 2016, 1000
+"""Pairs up to which the energy of the last output is always looked at, and steps beside which it costs nothing."""
 
 
 def _surely_within(flow: FlowMap | None, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:
@@ -69,6 +73,44 @@ def check_system_along(outcome: Outcome, integrator: Integrator, system: Hamilto
     raise ValueError(
         f"`system` {system.name!r} is not the one that the flow was trained for: at the state ({shown}) of this run "
         "its H is another. Pass the flow of this system, or train one with sympflow.train(system)."
+    )
+
+
+def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array, stacklevel: int) -> None:
+    """Warn of a run that leapt over a singularity of V: of an energy that is off by more than T + |V| of the start.
+
+    A fixed step sees nothing of two bodies that meet between its ends, and goes on with any energy. Looked at is the
+    last output, where T is more than twice that of the start, unless V by array operations took long beside the run.
+    """
+    if not (len(outcome.t) and system.conservative and system.autonomous):
+        return
+    d, n = system.ndof, len(outcome.t)
+    starts, outputs = to_numpy(y0).reshape(-1, 2 * d), to_numpy(outcome.y).reshape(n, -1, 2 * d)
+    inverse = np.ones(d) if system.inverse_mass is None else system.inverse_mass
+    T0, T = (np.einsum("nd,nd,d->n", p, p, inverse) / 2 for p in (starts[:, d:], outputs[-1, :, d:]))
+    if not (T > 2 * T0).any():
+        return
+    if system.leaps_over > CHEAP_PAIRS and np.max(outcome.stats.get("n_steps", 0)) < MANY_STEPS:
+        return
+    with np.errstate(all="ignore"):
+        H0 = system.hamiltonian(starts)
+        scale = T0 + np.abs(H0 - T0)
+        off = np.abs(system.hamiltonian(outputs[-1]) - H0) > scale
+        if not off.any():
+            return
+        row = int(np.argmax(off))
+        energies = system.hamiltonian(outputs[:, row])
+    first = int(np.argmax(np.abs(energies - H0[row]) > scale[row]))
+    after = (
+        f"between t = {outcome.t[first - 1]:.10g} and {outcome.t[first]:.10g}" if first else "before the first output"
+    )
+    which = "" if len(off) == 1 else f" of trajectory {row}, the first of {off.sum()},"
+    clause = system.leap(outputs[first, row], starts[row])
+    warnings.warn(
+        f"The energy{which} went from {H0[row]:.6g} to {energies[-1]:.6g}, more than T + |V| of the start, and the run "
+        f"means nothing after that. It was lost {after}, where {clause}.",
+        RuntimeWarning,
+        stacklevel=stacklevel + 1,
     )
 
 

@@ -3,6 +3,7 @@
 import copy
 import json
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -449,10 +450,10 @@ def test_bad_arguments_are_named(arguments, message):
         SympFlow.primed(HH, **arguments)
 
 
-@pytest.mark.parametrize("value", ["yes", 2, "x", 1.0])
+@pytest.mark.parametrize("value", ["yes", 2, "x", 1.0, [1.0]])
 @pytest.mark.parametrize("flag", ["palindromic", "force_gradient", "curvature"])
 def test_flags_are_true_or_false(flag, value):
-    with pytest.raises(TypeError, match=rf"^`{flag}` must be True or False; got {value!r}"):
+    with pytest.raises(TypeError, match=rf"^`{flag}` must be True or False; got {re.escape(repr(value))}"):
         SympFlow.primed(HH, 3, **{flag: value})
 
 

@@ -1,5 +1,6 @@
 """Bodies that interact in pairs: forces, conservation laws, cells, and bad input."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -216,6 +217,25 @@ class TestBadInput:
         given = {"potential": GRAVITY, "masses": [1.0, 2.0], "params": {"G": 1.0}} | change
         with pytest.raises((ValueError, TypeError), match=message):
             HamiltonianSystem.pairs(**given)
+
+    @pytest.mark.parametrize("softening", [None, 0.1])
+    def test_bodies_that_a_step_leaps_over_are_named(self, softening):
+        system = HamiltonianSystem.pairs("-1/r", masses=np.ones(2), dim=1, softening=softening)
+        y0 = np.array([[0.0, 9.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])  # the second pair meets at t = π/4
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            for start in (y0, y0[1]):
+                assert solve(system, "verlet", (0, 1), start, dt=0.01, backend="array").success
+        if softening:
+            assert not found
+            return
+        assert [str(w.message).partition("It was lost")[0].split(" went")[0] for w in found] == [
+            "The energy of trajectory 1, the first of 1,",
+            "The energy",
+        ]
+        for w in found:
+            assert w.category is RuntimeWarning
+            assert "between t = 0.77 and 0.78, where the bodies 0 and 1 have gained most" in str(w.message)
 
     def test_bodies_at_one_place_are_named(self):
         system = gravity(4, softening=None, y0=None)

@@ -109,11 +109,13 @@ def test_a_flow_serves_any_number_of_bodies(flow, tmp_path):
     [
         ({"params": {"e": 1.1}}, r"another system of bodies .*its pair potential is"),
         ({"masses": np.full(10, 2.0)}, "its mass is 2, and not 1"),
+        ({"masses": np.arange(1.0, 13.0)}, "is of another kind than that of this flow"),
+        ({"box": 20.0}, "is of another kind than that of this flow"),
         ({"softening": 0.1}, "its softening is 0.1"),
         ({"cutoff": 3.0}, "its pair potential is"),
         ({"dim": 3}, "its number of coordinates of a body is 3"),
         ({"damping": 0.1}, "has friction"),
-        ({"potential": "e/r"}, "degrees of freedom but the flow|is not the one"),
+        ({"potential": "e/r"}, "is of another kind than that of this flow"),
     ],
 )
 def test_another_potential_is_refused(flow, options, reason):
