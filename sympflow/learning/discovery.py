@@ -286,6 +286,9 @@ def discover(
         raise ValueError(f"`held_out` must be at least 0 and less than 1; got {held_out!r}: 0.2 keeps a fifth.")
     if piece is not None and not piece > 0:
         raise ValueError(f"`piece` must be a positive time; got {piece!r}: leave it out for about one period.")
+    for argument, value, least in (("degree", degree, 1), ("most_terms", most_terms, 1), ("seed", seed, 0)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ValueError(f"`{argument}` must be an integer, {least} or more; got {value!r}.")
     huber = limit_of(loss)
     say = progress or (lambda _: None)
     search = _Search(trajectories, terms, degree, noise, held_out, piece, huber, most_terms, seed, say, session)
@@ -640,7 +643,7 @@ class _Search:
         explains &= bool((noise < 0.5 * self.data.scales).all())
         remark = self._too_loud(noise) if explains else self._remark(noise, excess)
         if self.session.cut:
-            remark += " The time budget, or Ctrl-C, ended the search: give it more."
+            remark = f"{remark} The time budget, or Ctrl-C, ended the search: give it more.".strip()
         order = np.argsort([str(self.library.expressions[k]) for k in chosen])
         return Discovery(
             tuple(self.library.expressions[chosen[i]] for i in order),

@@ -645,9 +645,15 @@ class Search:
 
     # the flow ---------------------------------------------------------------------------------------------------------
 
+    def _states(self) -> np.ndarray:
+        """The states (n, 2d) of all orbits that do not diverge; those of the data where all do."""
+        states = self.final.states
+        finite = np.isfinite(states).all(axis=1)
+        return states[finite] if finite.any() else self.all.states
+
     def _box(self) -> tuple[Box, np.ndarray]:
         """A box around the states (n, 2d) of all orbits, and these."""
-        states = self.final.states
+        states = self._states()
         low, high = states.min(axis=0), states.max(axis=0)
         wider = MARGIN * (high - low)
         return Box(low - wider, high + wider), states
@@ -706,11 +712,17 @@ class Search:
             options["time_budget"] = min(options.get("time_budget", math.inf), DOUBTFUL_SECONDS)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Training", category=RuntimeWarning)
-            return train(system, dt, progress=session.progress, seed=self.seed, **options)
+            try:
+                return train(system, dt, progress=session.progress, seed=self.seed, **options)
+            except ValueError as error:
+                if dt is None:
+                    raise
+                warnings.warn(f"{error} The flow that was made has its own.", UserWarning, stacklevel=4)
+            return train(system, None, progress=session.progress, seed=self.seed, **options)
 
     def _collocated(self, system: HamiltonianSystem, dt: float | None) -> FlowMap:
         """Steps of a Gauss method, as many as they take where the data are: no fit comes near their accuracy."""
-        states = self.final.states
+        states = self._states()
         states = states[np.random.default_rng(self.seed).permutation(len(states))[:STEPPED]]
         if dt is not None:
             try:
