@@ -10,6 +10,7 @@ from sympflow.kernels.kicks import kick_cycles
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.least_squares import Minimum
+from sympflow.training.session import OutOfTime, Session
 from sympflow.training.starts import default_primed
 from sympflow.training.table_fit import TableFit, TableRun
 
@@ -189,3 +190,20 @@ def test_a_run_is_resumed_without_trials(monkeypatch, tmp_path):
         train(HH, resume=path, time_budget=100.0, progress=False)
     with pytest.raises(ValueError, match="`resume` is a run with another architecture"):
         train(HH, flow=SympFlow.primed(HH, 4), resume=path, progress=False)
+
+
+def test_a_trial_that_runs_out_of_time_on_the_exact_orbits_of_friction_says_nothing(monkeypatch):
+    asked = []
+
+    def out_of_time(*arguments):
+        asked.append(arguments)
+        raise OutOfTime
+
+    monkeypatch.setattr(trials, "reference_step", out_of_time)
+    for name in ("STARTS", "STEPS", "FINAL_STEPS"):
+        monkeypatch.setattr(trials, name, 1)
+    system = systems.damped_pendulum()
+    found = trials._trial_of((system, system.domain, Session().deadline), default_primed(system))
+    assert asked
+    assert found.flow is None
+    assert found.error == float("inf")
