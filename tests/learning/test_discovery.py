@@ -110,6 +110,9 @@ def test_bad_arguments_are_refused():
     data = measured(pendulum(), 0.01, n=1)
     with pytest.raises(ValueError, match="`data` has 62 values, 60 beside the initial states, and the library"):
         sympflow.discover(data, degree=12)
+    for argument, value in (("degree", 1.5), ("most_terms", 0), ("seed", -1)):
+        with pytest.raises(ValueError, match=f"`{argument}` must be an integer"):
+            sympflow.discover(data, **{argument: value})
     with pytest.raises(ValueError, match=r"`terms` has 'x\*\*2': `expression` holds x"):
         sympflow.discover(data, ["x**2"])
     with pytest.raises(ValueError, match=r"`terms` has 'q2', which holds q2: write it in q1 … q1"):

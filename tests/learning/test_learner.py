@@ -1,5 +1,7 @@
 """A flow from trajectories: shooting recovers H to rounding, to what the noise allows, and says what it did."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import sympy
@@ -346,6 +348,14 @@ def test_data_of_no_hamiltonian_are_called_so():
     assert freedom.share < 1e-3
     assert 0.05 < freedom.defect < 0.2  # of L the friction is a fifth of the frequency, about 1, in one entry of four
     assert "damping" in str(record[0].message)
+
+
+def test_orbits_that_diverge_are_left_out_of_the_region_of_a_flow():
+    data = Trajectories.read(trajectories(8, 15))
+    search = Search(data, [data.split(0.2, 0)], _said(data, None, None, False, None, None), Setting(), 0)
+    for lost, kept in ((np.array([[np.nan, 1.0], [2.0, 3.0]]), [[2.0, 3.0]]), (np.full((2, 2), np.inf), data.states)):
+        search.final = SimpleNamespace(states=lost)
+        assert np.array_equal(search._states(), kept)
 
 
 def test_replicas_tell_how_certain_a_prediction_is():

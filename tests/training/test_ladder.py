@@ -289,6 +289,7 @@ SCENES = [
     systems.fput(1000.0),
     systems.spring_pendulum(1e6, coordinates="polar"),
     LADDERS["duffing"][0].system(),
+    LADDERS["sine_gordon"][0].system(),
 ]
 
 

@@ -19,7 +19,16 @@ from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.solver import solve
-from sympflow.systems import SYSTEMS, duffing, fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum
+from sympflow.systems import (
+    SYSTEMS,
+    duffing,
+    fput,
+    harmonic_oscillator,
+    henon_heiles,
+    pendulum,
+    sine_gordon,
+    spring_pendulum,
+)
 from sympflow.training.clock_fit import train_clock
 from sympflow.training.options import NewFit
 from sympflow.training.shipped.judges import AsPublished, ByBalance, ByCertificate, ByClock, ByRuns, OfStiff
@@ -116,8 +125,9 @@ def ladders() -> list[Recipe]:
         *(rung(kepler, 3, dt, fit=plain) for dt in (0.2, 0.15, 0.1, 0.08, 0.06, 0.045, 0.03)),
         Recipe("kepler", "log-1", SYSTEMS[kepler], Clock(1.0), ByClock()),
         *(rung(planets, 3, dt, fit=short, judge=along) for dt in (300.0, 200.0, 100.0)),
-        *(lattice_rung("toda-chain", dt) for dt in (1.2, 0.7, 0.28, 0.2)),
-        *(lattice_rung("fput-beta", dt, 6) for dt in (0.8, 0.55, 0.25, 0.15)),
+        *(lattice_rung(SYSTEMS["toda-chain"], dt) for dt in (1.2, 0.7, 0.28, 0.2)),
+        *(lattice_rung(SYSTEMS["fput-beta"], dt, 6) for dt in (0.8, 0.55, 0.25, 0.15)),
+        *(lattice_rung(coupled_pendulums, dt, fit=LONG_RUNS) for dt in (2.1, 1.08, 0.43)),
         *(driven_rung(SYSTEMS["driven-pendulum"], 6, dt) for dt in (2.0, 1.5, 1.0, 0.8, 0.4)),
         driven_rung(SYSTEMS["driven-pendulum"], 7, 100 / 51, 9),  # of T = 100
         driven_rung(SYSTEMS["driven-pendulum"], 6, 0.5, 10, seed=2),
@@ -152,17 +162,33 @@ def weak_duffing() -> HamiltonianSystem:
     return duffing(damping=0.0, force=0.1, frequency=2.7, alpha=1.0)
 
 
-def lattice_rung(scene: str, dt: float, processor: int = 12, density: tuple[float, float] = (0.02, 0.2)) -> Recipe:
-    """A primed flow of a lattice, fitted on a few sites, and judged on 256 at these energy densities.
+def coupled_pendulums(n: int) -> HamiltonianSystem:
+    """The sine-Gordon equation on sites one apart: Σ p²/2 + 1 − cos q + r²/2, pendulums coupled by springs."""
+    return sine_gordon(n=n, length=float(n), accuracy=2)
+
+
+LABELS_ALONE = NewFit(restarts=20, energy_weight=300.0, frozen_weight=1000.0, label_times=5)
+LONG_RUNS = NewFit(restarts=12, energy_weight=300.0, label_times=2, steps=300, runs=48)
+"""Fits of flows of lattices: to labels of a few sites, and further to the energy errors of runs of a ring."""
+
+
+def lattice_rung(
+    system: Callable[[int], HamiltonianSystem],
+    dt: float,
+    processor: int = 12,
+    density: tuple[float, float] = (0.02, 0.2),
+    fit: NewFit = LABELS_ALONE,
+) -> Recipe:
+    """A primed flow of a lattice of any n, fitted on a few sites, and judged on 256 at these energy densities.
 
     Force gradients of a polynomial bond are polynomials of a higher degree: those of a processor of 12, one after the
     other, spoil the rare states with much energy in a few sites.
     """
-    fit = NewFit(restarts=20, energy_weight=300.0, frozen_weight=1000.0, label_times=5)
+    many = partial(system, n=256)
     return Recipe(
-        scene.replace("-", "_"),
+        many().name,
         f"primed-4-{dt:g}",
-        partial(SYSTEMS[scene], n=256),
+        many,
         Primed(dt, 4, processor),
         ByCertificate(200.0, states=100, times=9, held_out=100),
         (fit,),
