@@ -30,6 +30,7 @@ FIRST_POINTS = 10  # of the pieces that a fit begins with
 MATCHED_POINTS = 24  # of those whose increments give its start
 MATCHED_STEPS = 60
 ROUNDS = 4  # of longer pieces, or of another noise
+HALVINGS, FIRST_HALVINGS = 12, 6  # of the widest gap between points, at most; a start that needs more is a poor one
 SETTLED = 0.05  # change of the noise, relative, that ends them
 GROWTH = 1e3  # most that an error of an initial state may grow along a piece
 LEAST_GROWTH = 10.0
@@ -167,7 +168,7 @@ def fitted(
     for attempt in range(1 + ROUNDS):
         reached = span
         tolerance = np.clip(0.02 * finer * sigma, 1e-12 * scales, 1e-4 * scales)
-        method = chosen_method(model, theta, pieces, tolerance)
+        method = chosen_method(model, theta, pieces, tolerance, HALVINGS if attempt else FIRST_HALVINGS)
         problem = Problem(model, pieces, method, sigma, huber=setting.huber)
         gain = FINE if attempt and setting.plausible(sigma) else COARSE
         most = STEPS if model.stepper is None else OWN_STEPS

@@ -635,10 +635,13 @@ def _stepped(
 # starts and methods ---------------------------------------------------------------------------------------------------
 
 
-def chosen_method(model: Field, theta: np.ndarray, data: Trajectories, tolerance: np.ndarray) -> Method:
+def chosen_method(
+    model: Field, theta: np.ndarray, data: Trajectories, tolerance: np.ndarray, halvings: int = 12
+) -> Method:
     """The cheapest scheme and step whose error over the gaps between points is below a tolerance (2d,).
 
-    The error is that over single gaps, from observed states, against half the step.
+    The error is that over single gaps, from observed states, against half the step. The step is the widest gap, halved
+    so many times at most.
     """
     if model.stepper is not None:
         return Method(model.stepper, model.stepper.longest)
@@ -652,7 +655,7 @@ def chosen_method(model: Field, theta: np.ndarray, data: Trajectories, tolerance
     for stepper in reversed(steppers(model)):  # those of a high order first: others are left when they cost more
         method = Method(stepper.within(tolerance), widest)
         end, before = _ends(model, theta, method, starts, gaps), math.inf
-        for _ in range(12):
+        for _ in range(halvings):
             if best is not None and cost(method) > best[0]:
                 break
             finer = replace(method, longest=method.longest / 2)
