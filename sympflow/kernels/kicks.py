@@ -539,7 +539,7 @@ def _far(symbols: SymbolicHamiltonian) -> bool:
     assert symbols.V is not None
     for u in symbols.V.atoms(sp.Add):
         constant, rest = u.as_independent(*symbols.q, as_Add=True)
-        if constant == 0 or not rest.is_polynomial(*symbols.q):
+        if constant == 0 or rest == 0 or not rest.is_polynomial(*symbols.q):
             continue
         slopes = [sp.diff(rest, s) for s in symbols.q if rest.has(s)]
         if any(slope.has(*symbols.q) for slope in slopes):

@@ -30,8 +30,9 @@ def test_the_balance_is_kept_to_the_order_of_the_method(method, order):
 
 def test_the_balance_does_not_grow_in_a_long_run():
     sol = solve(PENDULUM, "verlet", (0, 2000 * PENDULUM.period), Y0, dt=PENDULUM.period / 20, save_every=40)
-    error = energy_balance_error(sol)
-    assert error[:, -100:].max() < 1.1 * error[:, :100].max()
+    chaotic, regular = energy_balance_error(sol)
+    assert regular[-100:].max() < 1.1 * regular[:100].max()
+    assert chaotic[500:].max() < 1.1 * chaotic[:500].max()  # halves: a tenth of a chaotic orbit is a matter of rounding
 
 
 def test_kinetic_energies_that_depend_on_the_time_and_autonomous_systems():

@@ -173,7 +173,7 @@ LONG_RUNS = NewFit(restarts=12, energy_weight=300.0, label_times=2, steps=300, r
 
 
 def lattice_rung(
-    system: Callable[[int], HamiltonianSystem],
+    system: Callable[..., HamiltonianSystem],
     dt: float,
     processor: int = 12,
     density: tuple[float, float] = (0.02, 0.2),
