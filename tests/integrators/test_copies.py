@@ -32,9 +32,8 @@ def test_orders(system, method, order, dt):
 
 def test_a_run_is_symplectic_on_the_two_copies_and_keeps_the_energy(system):
     sol = sympflow.solve(system, "tao4", (0, 200), dt=0.05, t_eval=np.linspace(0, 200, 401))
-    few = sympflow.solve(system, "tao4", (0, 20), dt=0.05)
-    assert sympflow.symplecticity_defect(few) < 1e-13
-    assert abs(sympflow.volume_error(few)) < 1e-10
+    assert sympflow.symplecticity_defect(sol) < 1e-13
+    assert abs(sympflow.volume_error(sol)) < 1e-10
     error = np.abs(sol.energy_error())
     assert error.max() < 1e-4
     assert error[200:].max() < 2 * error[:200].max()  # no drift

@@ -70,7 +70,13 @@ def test_quadratic_invariants_are_conserved_to_rounding(method):
     assert max_energy_error(sol) > 1e3 * EPS * n  # H itself is none
 
 
-@pytest.mark.parametrize(("method", "backend"), list(zip(METHODS, ["compiled", "array"] * 2, strict=True)))
+@pytest.mark.parametrize(
+    ("method", "backend"),
+    [
+        *zip(METHODS, ["compiled", "array"] * 2, strict=True),
+        *(pytest.param(m, "compiled", marks=pytest.mark.slow) for m in METHODS[1::2]),
+    ],
+)
 @pytest.mark.parametrize("z", [20.0, 1e3])
 def test_no_step_is_too_long_for_an_oscillator(method, backend, z):
     omega, n = 1e6, {"compiled": 10_000, "array": 300}[backend]

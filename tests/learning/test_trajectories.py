@@ -13,7 +13,7 @@ RUN = np.stack([np.cos(t), -np.sin(t)])
 FOUR = np.arange(24.0).reshape(4, 6)
 
 
-def same(read, runs):
+def assert_same(read, runs):
     assert len(read.runs) == len(runs)
     for one, (times, states) in zip(read.runs, runs, strict=True):
         np.testing.assert_array_equal(one.t, times)
@@ -22,14 +22,14 @@ def same(read, runs):
 
 def test_lists_pairs_and_ends_are_the_same_trajectories():
     irregular = [(t, RUN), (t[:3], RUN[:, :3])]
-    same(Trajectories.read(irregular), irregular)
-    same(Trajectories.read([irregular[0]]), irregular[:1])
-    same(Trajectories.read((t, RUN)), [(t, RUN)])
-    same(Trajectories.read((t, np.stack([RUN, 2 * RUN]))), [(t, RUN), (t, 2 * RUN)])
+    assert_same(Trajectories.read(irregular), irregular)
+    assert_same(Trajectories.read([irregular[0]]), irregular[:1])
+    assert_same(Trajectories.read((t, RUN)), [(t, RUN)])
+    assert_same(Trajectories.read((t, np.stack([RUN, 2 * RUN]))), [(t, RUN), (t, 2 * RUN)])
     x, y = np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[5.0, 6.0], [7.0, 8.0]])
     ends = Trajectories.read((x, [0.5, -0.5], y))
-    same(ends, [([0, 0.5], [[1, 5], [2, 6]]), ([-0.5, 0], [[7, 3], [8, 4]])])  # the second runs backward
-    same(Trajectories.read(ends), [(run.t, run.y) for run in ends.runs])
+    assert_same(ends, [([0, 0.5], [[1, 5], [2, 6]]), ([-0.5, 0], [[7, 3], [8, 4]])])  # the second runs backward
+    assert_same(Trajectories.read(ends), [(run.t, run.y) for run in ends.runs])
     assert "2 trajectories, ndof 1, 4 points" in repr(ends)
 
 
@@ -38,7 +38,7 @@ def test_missing_values_stay_missing_and_empty_points_go():
     y[0, 1] = np.nan
     y[:, 3] = np.nan
     read = Trajectories.read((t, y))
-    same(read, [(t[[0, 1, 2, 4, 5]], y[:, [0, 1, 2, 4, 5]])])
+    assert_same(read, [(t[[0, 1, 2, 4, 5]], y[:, [0, 1, 2, 4, 5]])])
     assert (read.n_values, read.n_points, len(read.states)) == (9, 5, 4)
     masked = Trajectories.read((t, np.ma.masked_invalid(y)))
     np.testing.assert_array_equal(masked.runs[0].y, read.runs[0].y)
@@ -48,12 +48,12 @@ def test_results_of_solvers_are_read():
     system = pendulum()
     states = np.array([[1.0, 0.0], [0.5, 0.2]])
     sol = sympflow.solve(system, "verlet", (0, 1), states, t_eval=t)
-    same(Trajectories.read(sol), [(t, sol.y[0]), (t, sol.y[1])])
-    same(Trajectories.read([sol, sol]), [(t, y) for y in (*sol.y, *sol.y)])
+    assert_same(Trajectories.read(sol), [(t, sol.y[0]), (t, sol.y[1])])
+    assert_same(Trajectories.read([sol, sol]), [(t, y) for y in (*sol.y, *sol.y)])
     result = sympflow.ensemble(system, "verlet", (0, 1), states, t_eval=t)
-    same(Trajectories.read(result), [(t, y) for y in result.y])
+    assert_same(Trajectories.read(result), [(t, y) for y in result.y])
     scipy = solve_ivp(system, (0, 1), [1.0, 0.0], t_eval=t)
-    same(Trajectories.read(scipy), [(t, scipy.y)])
+    assert_same(Trajectories.read(scipy), [(t, scipy.y)])
 
 
 def no_engine(path):
@@ -64,26 +64,26 @@ def test_parquet_is_read_where_it_can_be(tmp_path):
     pd = pytest.importorskip("pandas")
     pytest.importorskip("pyarrow")
     pd.DataFrame({"t": t, "q": RUN[0], "p": RUN[1]}).to_parquet(tmp_path / "run.parquet")
-    same(Trajectories.read(tmp_path / "run.parquet"), [(t, RUN)])
+    assert_same(Trajectories.read(tmp_path / "run.parquet"), [(t, RUN)])
 
 
 def test_tables_and_datasets_are_read_by_their_names(tmp_path, monkeypatch):
     pd, xr = pytest.importorskip("pandas"), pytest.importorskip("xarray")
     sol = sympflow.solve(henon_heiles(), "verlet", (0, 1), np.full((2, 4), 0.1) * [[1], [2]], t_eval=t)
     runs = [(t, y) for y in sol.y]
-    same(Trajectories.read(sol.to_xarray()), runs)
+    assert_same(Trajectories.read(sol.to_xarray()), runs)
     table = sol.to_dataframe()
-    same(Trajectories.read(table), runs)
-    same(Trajectories.read(table[["p2", "q1", "time", "q2", "orbit", "p1"]]), runs)  # the order does not count
+    assert_same(Trajectories.read(table), runs)
+    assert_same(Trajectories.read(table[["p2", "q1", "time", "q2", "orbit", "p1"]]), runs)  # the order does not count
     table.to_csv(tmp_path / "runs.csv", index=False)
     (tmp_path / "runs.parquet").write_bytes(b"PAR1")
     with monkeypatch.context() as patch, pytest.raises(ImportError, match=r"a Parquet file, which .* pip install"):
         patch.setattr(pd, "read_parquet", no_engine)
         Trajectories.read(tmp_path / "runs.parquet")
     sol.to_xarray().to_netcdf(tmp_path / "runs.nc", engine="scipy")
-    same(Trajectories.read(tmp_path / "runs.nc"), runs)
+    assert_same(Trajectories.read(tmp_path / "runs.nc"), runs)
     sol.to_xarray().to_zarr(tmp_path / "runs.zarr", consolidated=False)
-    same(Trajectories.read(tmp_path / "runs.zarr"), runs)
+    assert_same(Trajectories.read(tmp_path / "runs.zarr"), runs)
     with pytest.raises(ValueError, match=r"names a file \.mat: \.csv, \.parquet, \.nc and \.zarr are read"):
         (tmp_path / "runs.mat").touch()
         Trajectories.read(tmp_path / "runs.mat")
@@ -91,19 +91,19 @@ def test_tables_and_datasets_are_read_by_their_names(tmp_path, monkeypatch):
     np.testing.assert_allclose([run.y for run in read.runs], sol.y, rtol=1e-15)
     assert read.names == ("q1", "q2", "p1", "p2")
     other = pd.DataFrame({"t": t, "theta": RUN[0], "w": RUN[1]})
-    same(Trajectories.read(other, q="theta", p="w"), [(t, RUN)])
-    same(Trajectories.read(other, ndof=1), [(t, RUN)])
+    assert_same(Trajectories.read(other, q="theta", p="w"), [(t, RUN)])
+    assert_same(Trajectories.read(other, ndof=1), [(t, RUN)])
     dated = other.assign(t=pd.to_timedelta(t, "s"))
     np.testing.assert_allclose(Trajectories.read(dated, ndof=1).runs[0].t, t)
     padded = xr.Dataset({"q": (("orbit", "time"), [RUN[0], RUN[0]]), "p": (("orbit", "time"), [RUN[1], RUN[1]])})
     padded["time"] = ("time", t)
-    same(Trajectories.read(padded), [(t, RUN), (t, RUN)])
+    assert_same(Trajectories.read(padded), [(t, RUN), (t, RUN)])
     with pytest.raises(ValueError, match=r"coordinates and momenta are not recognized: name them by `q`"):
         Trajectories.read(other)
     with pytest.raises(ValueError, match=r"velocities, v1, and no momenta: give the mass matrix as `velocity_mass`"):
         Trajectories.read(other.set_axis(["t", "q1", "v1"], axis=1))
     moving = Trajectories.read(other.set_axis(["t", "q1", "v1"], axis=1), velocity_mass=2.0)
-    same(moving, [(t, RUN * [[1], [2]])])
+    assert_same(moving, [(t, RUN * [[1], [2]])])
     with pytest.raises(ValueError, match=r"no column of the trajectory is recognized: name it by `run`"):
         Trajectories.read(pd.concat([other, other]), ndof=1)
     with pytest.raises(ValueError, match=r"no column of the time among theta, w: name it by `time`"):
@@ -120,9 +120,9 @@ def test_units_and_orders():
     np.testing.assert_allclose(degrees.runs[0].y, RUN)
     assert Trajectories.read((t, RUN), units={"p1": "g*cm^2/s"}).runs[0].y[1, 1] == pytest.approx(RUN[1, 1] * 1e-7)
     pairs = Trajectories.read((t, FOUR), order="pairs")
-    same(pairs, [(t, FOUR[[0, 2, 1, 3]])])
-    same(Trajectories.read((t, FOUR), order=[0, 2, 1, 3]), [(t, FOUR[[0, 2, 1, 3]])])
-    same(
+    assert_same(pairs, [(t, FOUR[[0, 2, 1, 3]])])
+    assert_same(Trajectories.read((t, FOUR), order=[0, 2, 1, 3]), [(t, FOUR[[0, 2, 1, 3]])])
+    assert_same(
         pairs.scaled(sympflow.flow.scaling.Scaling((2, 1), (1, 2), 0.5)),
         [(2 * t, FOUR[[0, 2, 1, 3]] / [[2], [1], [1], [2]])],
     )
@@ -179,7 +179,7 @@ def test_angles_that_were_wrapped_are_noticed_and_continued():
     np.testing.assert_allclose(continued.runs[0].y[0, seen], turning[0, seen], atol=1e-12)
     swinging = Trajectories.read((times, np.stack([3.1 * np.sin(3 * times), np.cos(times)])))
     swinging.check_angles()  # large steps of all sizes are no jumps
-    same(swinging.unwrapped(np.array([np.inf])), [(run.t, run.y) for run in swinging.runs])
+    assert_same(swinging.unwrapped(np.array([np.inf])), [(run.t, run.y) for run in swinging.runs])
     with pytest.raises(ValueError, match="pass period=2"):
         sympflow.discover((times, np.stack([wrapped, wrapped])))
     with pytest.raises(ValueError, match="`period` must be positive"):
