@@ -176,15 +176,32 @@ def map_lanes(table, steps, y, out):
     for block_start in range(0, y.shape[0], MANY_LANES):
         count = min(MANY_LANES, y.shape[0] - block_start)
         width = (count + VECTOR - 1) // VECTOR * VECTOR
-        zero_lanes(error)
-        for lane in range(width):
-            q, p = unpack(y[block_start + min(lane, count - 1)])
-            pack_lane(q, p, Y, lane)
+        if COMPENSATED:
+            zero_lanes(error)
+        load_rows(y, block_start, count, Y)
         for j in range(table.shape[1]):
             stage_lanes(Y, error, width, numbers_of(table, j), drift_of(table, j))
-        for lane in range(count):
-            q, p = unpack_lane(Y, lane)
-            pack(q, p, out[block_start + lane])
+        store_rows(Y, block_start, count, out)
 
 
-map_rows, rollout_rows = map_each if DRIVEN else map_lanes, rollout_lanes
+@njit(**OPTIONS)
+def map_lanes_at(table, steps, y, out):
+    """`map_each`, `MANY_LANES` rows at a time, of systems that depend on the time; not of compensated sums."""
+    widest_vectors()
+    Y, counts = empty_lanes(), aligned_zeros(MANY_LANES)
+    for block_start in range(0, y.shape[0], MANY_LANES):
+        count = min(MANY_LANES, y.shape[0] - block_start)
+        width = (count + VECTOR - 1) // VECTOR * VECTOR
+        for lane in range(width):
+            counts[lane] = steps[(block_start + min(lane, count - 1)) % len(steps)]
+        load_rows(y, block_start, count, Y)
+        for j in range(table.shape[1]):
+            stage_lanes_at(Y, width, table, j, counts)
+        store_rows(Y, block_start, count, out)
+
+
+if not DRIVEN:
+    map_rows = map_lanes
+elif SCHEDULED:
+    map_rows = map_lanes_at
+rollout_rows = rollout_lanes
