@@ -62,6 +62,25 @@ def advance_own(Y, width, table, own, first, n_stages):
 
 
 @njit(**OPTIONS)
+def first_non_finite(q, p, table, first, k, n_steps, work):
+    """The first of `n_steps` steps from a running state, that of step k, whose end is not finite, or `n_steps`."""
+    link = columns_of(table) - 2
+    q_error, p_error = no_error(q), no_error(p)
+    j = first
+    for n in range(1, n_steps):
+        for _ in range(link):
+            q, p, q_error, p_error = called_stage(
+                q, p, q_error, p_error, numbers_of(table, j, k), drift_of(table, j), j, work
+            )
+            j = j + 1 if j < link else 1
+            k = k + 1 if j == link else k
+        end_q, end_p = close(q, p, q_error, p_error, table, k, work)
+        if not is_finite(end_q, end_p):
+            return n
+    return n_steps
+
+
+@njit(**OPTIONS)
 def close_lane(Y, error, lane, table, k, work):
     q, p = unpack_lane(Y, lane)
     q_error, p_error = no_error(q), no_error(p)
