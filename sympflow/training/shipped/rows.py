@@ -128,8 +128,8 @@ def ladders() -> list[Recipe]:
         *(rung(planets, 3, dt, fit=short, judge=along) for dt in (300.0, 200.0, 100.0)),
         *(lattice_rung(SYSTEMS["toda-chain"], dt) for dt in (1.2, 0.7, 0.28, 0.2)),
         *(lattice_rung(SYSTEMS["fput-beta"], dt, 6) for dt in (0.8, 0.55, 0.25, 0.15)),
-        *(with_few_gradients(SYSTEMS["fput-beta"], dt) for dt in (0.76, 0.33))  # HOLD,
         *(lattice_rung(coupled_pendulums, dt, fit=LONG_RUNS) for dt in (2.1, 1.08, 0.43)),
+        lattice_rung(double_wells, 1.9, fit=LONG_RUNS),
         *(with_few_gradients(double_wells, dt) for dt in (0.98, 0.5)),
         *(driven_rung(SYSTEMS["driven-pendulum"], 6, dt) for dt in (2.0, 1.5, 1.0, 0.8, 0.4)),
         driven_rung(SYSTEMS["driven-pendulum"], 7, 100 / 51, 9),  # of T = 100
