@@ -90,6 +90,23 @@ class Driving:
         names = [s.name for s in self.form.parameters]
         return f"{common}\n\n\n{_function('numbers_of_lane(Y, common, lane)', lines, [*given, *names])}"
 
+    def later_source(self, kinds: Sequence[Kick], n_rows: int) -> str:
+        """``timed_numbers(table, j)`` and ``numbers_after(common, k)``: see `stages.LaneNumbers`."""
+        numbers, _ = numbers_of_kicks(kinds)
+        fixed = [s.name for s in self.form.parameters[: len(self.form.values)]]
+        kept = [f"common_{i}" for i in range(len(numbers))]
+        rows = range(n_rows, n_rows + len(fixed) + 3)
+        common = [*numbers, *(f"table[{i}, j]" for i in rows), "table[0, j]"]
+        letters = [s.name for s in (*self.letters, *self.means)]
+        lines = [
+            f"{', '.join([*kept, *fixed, 'before', 'first', 'step', 'length'])} = common",
+            "time = first + (k * step + before)",
+            f"{', '.join(letters)}, = letters_at({', '.join(['time', 'length', *fixed])})",
+        ]
+        names = [s.name for s in self.form.parameters]
+        of_stage = _function("timed_numbers(table, j)", [], common)
+        return f"{of_stage}\n\n\n{_function('numbers_after(common, k)', lines, [*kept, *names])}"
+
     @cached_property
     def _letter_lines(self) -> list[str]:
         """The letters at `time`, and their means over the `length` from there."""

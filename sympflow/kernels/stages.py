@@ -389,10 +389,14 @@ class TimedNumbers(Protocol):
 
 
 class LaneNumbers(Protocol):
-    """The numbers of varied lanes as code, where they depend on the time."""
+    """The numbers of lanes as code, where they depend on the time."""
 
     def lane_source(self, kinds: Sequence[Kick], n_rows: int) -> str:
-        """``common_of(table, j, k)`` and ``numbers_of_lane(Y, common, lane)`` of `lanes_source`."""
+        """``common_of(table, j, k)`` and ``numbers_of_lane(Y, common, lane)`` of `lanes_source`, of varied lanes."""
+        ...
+
+    def later_source(self, kinds: Sequence[Kick], n_rows: int) -> str:
+        """``timed_numbers(table, j)``, and ``numbers_after(common, k)`` of these, the numbers of kick j of step k."""
         ...
 
 
@@ -539,7 +543,8 @@ def lanes_source(
     ``stage_lanes`` is a kick and a drift of all lanes by the same numbers, ``stage_each`` of each lane by its own, by
     column j of a table. `varied` lanes have their own values of the parameters in both, and take the rest from
     ``common_of(table, j, k)``; where there is one kind of kick and no time, scheduled ones take what depends on these
-    values from a table in ``own_stages``, which makes two stages: `OWN`.
+    values from a table in ``own_stages``, which makes two stages: `OWN`. With `driving` there is ``stage_lanes_at``
+    too, whose lanes are at times of their own.
     """
 
     given = "numbers, " if n_parameters else ""
@@ -579,6 +584,9 @@ def stage_lanes(Y, error, width, {passed}, a):
     {_cases(kinds, passed + "[{0}] != 0.0", [together(kick) for kick in kinds])}"""
     if not scheduled:
         return source
+    if driving is not None:
+        later = driving.later_source(kinds, _rows_before_values(kinds, friction))
+        source += f"\n\n\n{later}\n\n\n{_stages_at_source(kinds, friction, n_parameters)}"
     if own:
         source += "\n\n\n" + _own_stages_source(friction, n_parameters)
     return f"""{source}
@@ -619,6 +627,19 @@ def _own_stages_source(friction: DampedDrift | None, n_parameters: int) -> str:
             ("two_own_stages_lanes", "common_1, a_1, own_1, common_2, a_2, own_2", [*one, *other]),
         )
     )
+
+
+def _stages_at_source(kinds: Sequence[Kick], friction: DampedDrift | None, n_parameters: int) -> str:
+    """``stage_lanes_at``, the kick and the drift of column j of a table, of lanes after so many steps of their own."""
+
+    def lines(kick: Kick) -> list[str]:
+        numbers = "numbers = numbers_after(common, counts[lane])"
+        return _over_lanes([numbers, *kick.application(True, lane=True), *_drifted_lane(friction, n_parameters)])
+
+    return f"""@njit(**OPTIONS, inline="always")
+def stage_lanes_at(Y, width, table, j, counts):
+    common, a = timed_numbers(table, j), drift_of(table, j)
+    {_cases(kinds, "common[{0}] != 0.0", [lines(kick) for kick in kinds])}"""
 
 
 def _over_lanes(lines: Sequence[str]) -> list[str]:

@@ -68,6 +68,17 @@ def test_a_flow_is_fitted_at_all_times_of_the_drive(system, flow):
     assert flow.shape.timed
 
 
+def test_many_outputs_are_those_of_single_ones(system, flow):
+    """χ of 300 outputs, more than are made at once and no multiple of those in a vector, each at its own time."""
+    x, span = states(system, 3), (T0, T0 + 299 * DT)
+    one, rows, arrays = (
+        solve(system, flow, span, y0, **more).y for y0, more in ((x[0], {}), (x, {}), (x, {"backend": "array"}))
+    )
+    assert one.shape == (2, 300)
+    np.testing.assert_allclose(rows[0], one, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(rows, arrays, rtol=0, atol=1e-12)
+
+
 def test_it_is_symplectic_and_goes_back_and_keeps_the_energy_balance(system, flow):
     sol = solve(system, flow, (T0, T0 + 400.0), t_eval=np.linspace(T0, T0 + 400.0, 100))
     assert sol.stats["backend"] == "compiled"

@@ -209,6 +209,9 @@ def test_outputs_of_a_processed_flow_change_nothing():
     flow, span = processed(), (0.0, 40.0)
     few, many = (solve(HH, flow, span, t_eval=t).y[:, -1] for t in ([40.0], np.linspace(*span, 81)))
     np.testing.assert_array_equal(few, many)
+    for steps in (80, 301):  # χ of several outputs at once, and of those that are left
+        end = solve(HH, flow, (0.0, float(steps)), save_every=1).y
+        np.testing.assert_array_equal(end[:, -1], solve(HH, flow, (0.0, float(steps)), t_eval=[steps]).y[:, -1])
     every = solve(HH, flow, span)
     np.testing.assert_array_equal(every.y[:, 0], HH.y0)
     np.testing.assert_allclose(every.y[:, -1], few, atol=1e-13)

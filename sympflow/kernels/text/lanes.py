@@ -62,6 +62,25 @@ def advance_own(Y, width, table, own, first, n_stages):
 
 
 @njit(**OPTIONS)
+def first_non_finite(q, p, table, first, k, n_steps, work):
+    """The first of `n_steps` steps from a running state, that of step k, whose end is not finite, or `n_steps`."""
+    link = columns_of(table) - 2
+    q_error, p_error = no_error(q), no_error(p)
+    j = first
+    for n in range(1, n_steps):
+        for _ in range(link):
+            q, p, q_error, p_error = called_stage(
+                q, p, q_error, p_error, numbers_of(table, j, k), drift_of(table, j), j, work
+            )
+            j = j + 1 if j < link else 1
+            k = k + 1 if j == link else k
+        end_q, end_p = close(q, p, q_error, p_error, table, k, work)
+        if not is_finite(end_q, end_p):
+            return n
+    return n_steps
+
+
+@njit(**OPTIONS)
 def close_lane(Y, error, lane, table, k, work):
     q, p = unpack_lane(Y, lane)
     q_error, p_error = no_error(q), no_error(p)
@@ -176,15 +195,32 @@ def map_lanes(table, steps, y, out):
     for block_start in range(0, y.shape[0], MANY_LANES):
         count = min(MANY_LANES, y.shape[0] - block_start)
         width = (count + VECTOR - 1) // VECTOR * VECTOR
-        zero_lanes(error)
-        for lane in range(width):
-            q, p = unpack(y[block_start + min(lane, count - 1)])
-            pack_lane(q, p, Y, lane)
+        if COMPENSATED:
+            zero_lanes(error)
+        load_rows(y, block_start, count, Y)
         for j in range(table.shape[1]):
             stage_lanes(Y, error, width, numbers_of(table, j), drift_of(table, j))
-        for lane in range(count):
-            q, p = unpack_lane(Y, lane)
-            pack(q, p, out[block_start + lane])
+        store_rows(Y, block_start, count, out)
 
 
-map_rows, rollout_rows = map_each if DRIVEN else map_lanes, rollout_lanes
+@njit(**OPTIONS)
+def map_lanes_at(table, steps, y, out):
+    """`map_each`, `MANY_LANES` rows at a time, of systems that depend on the time; not of compensated sums."""
+    widest_vectors()
+    Y, counts = empty_lanes(), aligned_zeros(MANY_LANES)
+    for block_start in range(0, y.shape[0], MANY_LANES):
+        count = min(MANY_LANES, y.shape[0] - block_start)
+        width = (count + VECTOR - 1) // VECTOR * VECTOR
+        for lane in range(width):
+            counts[lane] = steps[(block_start + min(lane, count - 1)) % len(steps)]
+        load_rows(y, block_start, count, Y)
+        for j in range(table.shape[1]):
+            stage_lanes_at(Y, width, table, j, counts)
+        store_rows(Y, block_start, count, out)
+
+
+if not DRIVEN:
+    map_rows = map_lanes
+elif SCHEDULED:
+    map_rows = map_lanes_at
+rollout_rows = rollout_lanes

@@ -55,25 +55,6 @@ def close(q, p, q_error, p_error, table, k, work):
 
 
 @njit(**OPTIONS)
-def first_non_finite(q, p, table, first, k, n_steps, work):
-    """The first of `n_steps` steps from a running state, that of step k, whose end is not finite, or `n_steps`."""
-    link = columns_of(table) - 2
-    q_error, p_error = no_error(q), no_error(p)
-    j = first
-    for n in range(1, n_steps):
-        for _ in range(link):
-            q, p, q_error, p_error = called_stage(
-                q, p, q_error, p_error, numbers_of(table, j, k), drift_of(table, j), j, work
-            )
-            j = j + 1 if j < link else 1
-            k = k + 1 if j == link else k
-        end_q, end_p = close(q, p, q_error, p_error, table, k, work)
-        if not is_finite(end_q, end_p):
-            return n
-    return n_steps
-
-
-@njit(**OPTIONS)
 def rollout(table, y0, n_steps, save, out, stop, first, running, closed=True):
     """The steps from `first` to `n_steps` from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
 
@@ -83,28 +64,33 @@ def rollout(table, y0, n_steps, save, out, stop, first, running, closed=True):
     link = columns_of(table) - 2
     work = prepared(table)
     q, p, q_error, p_error = opened(y0, first, running)
-    n, saved, j = first, 0, link if first > 0 else 0
+    n, saved, j, longest = first, 0, link if first > 0 else 0, CHECK_EVERY
     while saved < len(save) and save[saved] <= 0:
         pack(q, p, out[saved])
         saved += 1
     while n < n_steps and stop[0] == 0:
-        block = min(CHECK_EVERY, n_steps - n)
+        block = min(longest, n_steps - n)
         if saved < len(save):
             block = min(block, save[saved] - n)
         start_q, start_p, begin = copy(q), copy(p), j
+        start_q_error, start_p_error = copy(q_error), copy(p_error)
         k = n
         for _ in range(block * link):
             q, p, q_error, p_error = stage(q, p, q_error, p_error, numbers_of(table, j, k), drift_of(table, j), j, work)
             j = j + 1 if j < link else 1
             k = k + 1 if j == link else k
-        if closed:
+        if closed or longest == 1:
             end_q, end_p = close(q, p, q_error, p_error, table, k, work)
         else:
             end_q, end_p = copy(q), copy(p)
         if not is_finite(end_q, end_p):
-            fill_with_nan(out, saved)
-            set_nan(running)
-            return n - 1 + first_non_finite(start_q, start_p, table, begin, n, block, work)
+            if block == 1:
+                fill_with_nan(out, saved)
+                set_nan(running)
+                return n
+            q, p, j, longest = start_q, start_p, begin, 1  # again, step by step, and each to its end
+            q_error, p_error = start_q_error, start_p_error
+            continue
         n += block
         while saved < len(save) and save[saved] == n:
             pack(end_q, end_p, out[saved])

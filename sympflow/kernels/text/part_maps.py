@@ -34,19 +34,6 @@ def closed(x, y, codes, table, in_modes, k):
 
 
 @njit(**OPTIONS)
-def first_non_finite(x, y, codes, table, first, n_steps, in_modes, k):
-    """The first of `n_steps` steps, from step k on, whose end is not finite; `n_steps` if none is."""
-    link = len(codes) - 2
-    for n in range(1, n_steps):
-        x, y = one_step(x, y, codes, table, first, link, k + n - 1)
-        first = link
-        end_x, end_y = closed(x, y, codes, table, in_modes, k + n - 1)
-        if not is_finite(end_x, end_y):
-            return n
-    return n_steps
-
-
-@njit(**OPTIONS)
 def rollout(codes, table, y0, in_modes, n_steps, save, out, stop, first, running):
     """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
 
@@ -55,7 +42,7 @@ def rollout(codes, table, y0, in_modes, n_steps, save, out, stop, first, running
     """
     link = len(codes) - 2
     x, y = unpack(y0)
-    n, saved, begin = first, 0, link if first > 0 else 0
+    n, saved, begin, longest = first, 0, link if first > 0 else 0, CHECK_EVERY
     while saved < len(save) and save[saved] <= 0:
         pack(x, y, out[saved])
         saved += 1
@@ -64,7 +51,7 @@ def rollout(codes, table, y0, in_modes, n_steps, save, out, stop, first, running
     elif not in_modes:
         x, y = to_modes(x, y)
     while n < n_steps and stop[0] == 0:
-        block = min(CHECK_EVERY, n_steps - n)
+        block = min(longest, n_steps - n)
         if saved < len(save):
             block = min(block, save[saved] - n)
         start_x, start_y, start = x, y, begin
@@ -73,9 +60,12 @@ def rollout(codes, table, y0, in_modes, n_steps, save, out, stop, first, running
             begin = link
         end_x, end_y = closed(x, y, codes, table, in_modes, n + block - 1)
         if not is_finite(end_x, end_y):
-            fill_with_nan(out, saved)
-            set_nan(running)
-            return n - 1 + first_non_finite(start_x, start_y, codes, table, start, block, in_modes, n)
+            if block == 1:
+                fill_with_nan(out, saved)
+                set_nan(running)
+                return n
+            x, y, begin, longest = start_x, start_y, start, 1  # again, step by step
+            continue
         n += block
         while saved < len(save) and save[saved] == n:
             pack(end_x, end_y, out[saved])
@@ -166,6 +156,19 @@ def step_lanes(codes, coefficients, dt, t, y, in_modes, out):
             if not in_modes:
                 q, p = from_modes(q, p)
             pack(q, p, out[block_start + lane])
+
+
+@njit(**OPTIONS)
+def first_non_finite(x, y, codes, table, first, n_steps, in_modes, k):
+    """The first of `n_steps` steps, from step k on, whose end is not finite; `n_steps` if none is."""
+    link = len(codes) - 2
+    for n in range(1, n_steps):
+        x, y = one_step(x, y, codes, table, first, link, k + n - 1)
+        first = link
+        end_x, end_y = closed(x, y, codes, table, in_modes, k + n - 1)
+        if not is_finite(end_x, end_y):
+            return n
+    return n_steps
 
 
 @njit(**OPTIONS)

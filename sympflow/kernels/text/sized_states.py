@@ -47,18 +47,6 @@ def close(X, end_X, table, work, geometry, sites, values):
 
 
 @njit(**OPTIONS)
-def first_non_finite(X, end_X, table, j, n_steps, work, geometry, sites, values):
-    """The first of `n_steps` steps from a running state whose end is not finite, or `n_steps`."""
-    link = table.shape[1] - 2
-    for n in range(1, n_steps):
-        j = in_one(X, table, j, link, RUNNING, work, geometry, sites, values)
-        close(X, end_X, table, work, geometry, sites, values)
-        if not finite_numbers(end_X):
-            return n
-    return n_steps
-
-
-@njit(**OPTIONS)
 def rollout(table, y0, n_steps, save, out, stop, first, running, single, geometry, size, sites, values):
     """The steps from `first` to `n_steps` from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
 
@@ -80,12 +68,12 @@ def rollout(table, y0, n_steps, save, out, stop, first, running, single, geometr
             load(running[width:], X, 2, geometry)
     else:
         load(y0, X, 0, geometry)
-    n, saved, j = first, 0, link if first > 0 else 0
+    n, saved, j, longest = first, 0, link if first > 0 else 0, CHECK_EVERY
     while saved < len(save) and save[saved] <= 0:
         pack(X, 0, out[saved], geometry)
         saved += 1
     while n < n_steps and stop[0] == 0:
-        block = min(CHECK_EVERY, n_steps - n)
+        block = min(longest, n_steps - n)
         if saved < len(save):
             block = min(block, save[saved] - n)
         copy_state(X, start_X)
@@ -93,11 +81,15 @@ def rollout(table, y0, n_steps, save, out, stop, first, running, single, geometr
         j = in_one(X, table, j, block * link, RUNNING, work, geometry, sites, values)
         close(X, end_X, table, work, geometry, sites, values)
         if not finite_numbers(end_X):
-            for i in range(saved, out.shape[0]):
-                for k in range(width):
-                    out[i, k] = math.nan
-            running[:] = math.nan
-            return n - 1 + first_non_finite(start_X, end_X, table, before, block, work, geometry, sites, values)
+            if block == 1:
+                for i in range(saved, out.shape[0]):
+                    for k in range(width):
+                        out[i, k] = math.nan
+                running[:] = math.nan
+                return n
+            copy_state(start_X, X)
+            j, longest = before, 1  # again, step by step
+            continue
         n += block
         while saved < len(save) and save[saved] == n:
             pack(end_X, 0, out[saved], geometry)
