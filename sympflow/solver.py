@@ -28,7 +28,7 @@ from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import report_lanes, run_and_search
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
-from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_leap
+from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_leap, warn_of_loss
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
 from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, naming_plugin
@@ -268,6 +268,8 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
         check_system_along(outcome, integrator, system, y_start)
     if action != "ignore" and readable(outcome.y):
         check_domain(outcome, integrator, system, action)
+        if problem.store is None and not failed:
+            warn_of_loss(outcome, integrator, system, y_start, stacklevel=4)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
     sol = (Solution if problem.store is None else StoredSolution)(
         t=outcome.t,

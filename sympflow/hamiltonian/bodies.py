@@ -31,6 +31,8 @@ FEW = 4, 7, 13
 """Bodies of a piece in one, two and three dimensions."""
 JUDGED = 13
 """Bodies of the cluster on which a flow is judged, where there are more."""
+MANY = 8, 19, 38
+"""Bodies of a cluster of which long runs are made, in one, two and three dimensions."""
 MOST_SHAKEN, SHAKEN, SHAKE = 13, 6, 0.3
 """Bodies of clusters of which several minima are compared, their number, and how far their starts are apart."""
 
@@ -229,6 +231,9 @@ class PairsHamiltonian(LocalHamiltonian):
 
     def judged(self) -> tuple[Any, ...]:
         return (JUDGED,) if self.n_bodies > JUDGED else ()
+
+    def many(self) -> tuple[Any, ...]:
+        return (MANY[self.dim - 1],)
 
     @cached_property
     def terms(self) -> dict[str, str]:

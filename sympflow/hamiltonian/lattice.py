@@ -25,6 +25,8 @@ BOUNDARIES = "periodic", "fixed", "free"
 MOST_AXES = 3
 FEW = 6, 4, 3
 """Sites along each axis of a piece, of lattices of one, two and three axes."""
+MANY = 64, 10, 5
+"""The same, of a ring of which long runs are made; as many as a piece has, if that is more."""
 MOST_JUDGED = 1024
 """Degrees of freedom of the lattice on which a flow is judged, where it has more."""
 WELLS, FAR = 8, 100.0
@@ -119,6 +121,9 @@ class LatticeHamiltonian(LocalHamiltonian):
         while math.prod(shape) > MOST_JUDGED and shape > least:
             shape = tuple(max(m, (n + 1) // 2) for n, m in zip(shape, least, strict=True))
         return shape, self.boundary
+
+    def many(self) -> tuple[Any, ...]:
+        return (tuple(max(MANY[len(self.shape) - 1], n) for n in self.few()),)
 
     def few(self) -> tuple[int, ...]:
         """The sites along each axis of a piece of which nothing else is said."""

@@ -134,6 +134,10 @@ class LocalHamiltonian(Definition, ABC):
         """Arguments of `piece` for a system that is large, and small enough to judge a flow on; () for itself."""
         return ()
 
+    def many(self) -> tuple[Any, ...]:
+        """Arguments of `piece` for a system that is large enough to change as slowly as larger ones, of cheap runs."""
+        return ()
+
     @property
     def work(self) -> int:
         """About how many nanoseconds a force takes in compiled loops: threads are set to work where that pays."""

@@ -24,6 +24,9 @@ STATES_COMPARED, MOST_COMPARED = 16, 64
 CHEAP_PAIRS, MANY_STEPS = 2016, 1000
 """Pairs up to which the energy of the last output is always looked at, and steps beside which it costs nothing."""
 
+MANY_TIMES = 1000.0
+"""Times the certified energy error of a flow beyond which an error outside its domain is warned of."""
+
 
 def _surely_within(flow: FlowMap | None, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:
     """True if all states y (..., 2d) are in the domain of the flow and compiled code can tell."""
@@ -109,6 +112,36 @@ def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array, stackle
     warnings.warn(
         f"The energy{which} went from {H0[row]:.6g} to {energies[-1]:.6g}, more than T + |V| of the start, and the run "
         f"means nothing after that. It was lost {after}, where {clause}.",
+        RuntimeWarning,
+        stacklevel=stacklevel + 1,
+    )
+
+
+def warn_of_loss(
+    outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, y0: Array, stacklevel: int
+) -> None:
+    """Warn of a run that left the domain of its flow and lost far more energy than the flow does inside.
+
+    Looked at is the last output of a conservative system.
+    """
+    flow = integrator.flow_for(system)
+    certificate = None if flow is None else flow.certified
+    if certificate is None or "domain_exit" not in outcome.stats or not (system.conservative and system.autonomous):
+        return
+    width = 2 * system.ndof
+    with np.errstate(all="ignore"):
+        H0, H = (system.hamiltonian(to_numpy(y).reshape(-1, width)) for y in (y0, outcome.y[-1]))
+        error = np.abs(H - H0) / (system.energy_scale or np.maximum(np.abs(H0), np.abs(H)))
+    held = certificate.relative_limit or certificate.relative_energy_error.largest
+    off = error > MANY_TIMES * held
+    if not off.any():
+        return
+    row = int(np.argmax(np.where(off, error, 0)))
+    which = "" if len(off) == 1 else f" of trajectory {row}, the worst of {off.sum()},"
+    warnings.warn(
+        f"The state left the domain of the flow at t = {outcome.stats['domain_exit']:.10g}, and the relative energy "
+        f"error{which} is {error[row]:.2g} at t = {outcome.t[-1]:.10g}: the flow is certified for {held:.2g} inside. "
+        "Start inside its `domain`, train a flow on one that holds these states, or take a scheme such as 'srkn11b'.",
         RuntimeWarning,
         stacklevel=stacklevel + 1,
     )

@@ -7,12 +7,14 @@ on both bodies of a pair are the same number, added to one and taken from the ot
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+import sympy as sp
 
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.kernels.codegen import statements
@@ -65,6 +67,9 @@ class PairLoops(SizedLoops):
     def _in_pieces(self, threads: int) -> bool:
         return threads > 1 or self._work > LONG
 
+    def _team(self, stages: int, threads: int | None) -> Team:
+        return super()._team(stages, threads if os.name == "posix" else 1)  # else threads cannot leave a core
+
     def _states(self) -> np.ndarray:
         return np.zeros((4 if self._compensated else 2, self._dim, self._size))
 
@@ -79,19 +84,15 @@ class PairLoops(SizedLoops):
     ) -> tuple[tuple[np.ndarray, np.ndarray], int]:
         before, X = states
         X[...] = before
-        module, link = self._module, table.shape[1] - 2
-        work = module.room(self._size, self._geometry)
-        cells = np.empty(0, dtype=np.int64), np.ones(3, dtype=np.int64)
-        for _ in range(count):
-            first, last = module.kick_of(table, j)
-            for phase in range(first, last):
-                cells = module.begun(phase, first, X, work, *cells, self._sites, self._values)
-                given = (phase, work, *cells, self._geometry, self._values)
-                team(lambda lo, hi, given=given: module.shared(lo, hi, *given), self._n_pieces)  # type: ignore[misc]
-                module.kicked(X, table, j, phase, work, self._sites)
-            module.drifted(X, table, j, self._sites)
-            j = j + 1 if single or j < link else 1
-        return (X, before), j
+        sums = np.zeros((2, self._n_pieces, self._dim * self._size))
+        meeting = np.zeros(3, dtype=np.int64)
+
+        def member(k: int) -> int:
+            own = before.copy() if k else X
+            given = (sums, meeting, own, table, j, count, single)
+            return self._module.in_team(k, team.threads, *given, *self._arguments)
+
+        return (X, before), team.together(member, meeting)
 
 
 class PairForces:
@@ -160,7 +161,7 @@ def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleTyp
     cells = [] if local.cutoff is None else [template("cells")]
     return load_algebra(
         "\n\n\n".join([*cells, *(_functions(local, kind) for kind in kinds)]),
-        ("sized_states", "pairs"),
+        ("sized_states", "barrier", "pairs"),
         N_SETS=4 if compensated else 2,
         N_FIELDS=local.dim,
         N_HELPERS={0: 1, FORCE_GRADIENT: 2, CURVATURE: 3}[level],
@@ -191,11 +192,26 @@ def _rows_module(code: _Code) -> ModuleType:
     lines = _Sums(local, "gradient").numbers()
     for letters, body in ((local.first, "i"), (local.second, "j")):
         lines += [f"{letter.name} = sites[{local.dim + k}, {body}]" for k, letter in enumerate(letters)]
-    lines += [*statements(["g_1", "g_2", "g_3"], local.slopes[1:]), "return g_1, g_2, g_3"]
+    lines += [*_slopes(local, ["g_1", "g_2", "g_3"], (1, 2, 3)), "return g_1, g_2, g_3"]
     head = "@njit(**OPTIONS)\ndef slopes(i, j, s, sites, values):\n"
     source = head + "\n".join("    " + line for line in lines)
     cut, periodic = local.cutoff is not None, local.box is not None
     return load_algebra(source, ("pair_rows",), DIM=local.dim, CUT=cut, PERIODIC=periodic)
+
+
+def _slopes(local: PairsHamiltonian, names: Sequence[str], kinds: Sequence[int]) -> list[str]:
+    """The derivatives of V by s: negative powers of s by one division, which takes as long as all else of a pair."""
+    s, slopes = local.s, [local.slopes[k] for k in kinds]
+    powers = {
+        f for g in slopes for f in g.atoms(sp.Pow) if f.base == s and f.exp.is_negative and (2 * f.exp).is_integer
+    }
+    if len(powers) < 2:
+        return statements(names, slopes)
+    root = 2 if any(not f.exp.is_integer for f in powers) else 1
+    inverse = sp.Symbol("inverse", positive=True)
+    slopes = [g.xreplace({f: inverse ** (-root * f.exp) for f in powers}) for g in slopes]
+    slopes = [sp.horner(g, wrt=inverse) if g.is_polynomial(inverse) else g for g in slopes]
+    return statements(["inverse"], [s ** sp.Rational(-1, root)]) + statements(names, slopes)
 
 
 def _functions(local: PairsHamiltonian, kind: str) -> str:
@@ -279,7 +295,7 @@ class _Sums:
         if self.vector:
             lines += [f"u_{k} = w_{k} - w_{k}_j" for k in self.axes]
         lines.append("s = " + " + ".join([*(f"d_{k} * d_{k}" for k in self.axes), "softening"]))
-        return lines + statements(self.g, [self.local.slopes[k] for k in KINDS[self.kind]])
+        return lines + _slopes(self.local, self.g, KINDS[self.kind])
 
     def force(self) -> list[str]:
         """The part f_k of a pair in the sum of its first body."""

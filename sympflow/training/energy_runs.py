@@ -1,11 +1,11 @@
-"""The fit of a lattice's flow to long runs: to the energy errors of rings of many sites.
+"""The fit of a flow of a lattice or of like bodies to long runs: to the energy errors of many sites or bodies.
 
 One step of the exact flow on a few sites tells little of what a large lattice does to its energy in a thousand. The
 modified energy that a flow keeps differs from H by terms that hardly change in a step, such as the actions of waves
 whose frequencies are a bit wrong; these change as waves exchange energy, and a few sites have few wave lengths. So the
-table at Δt, found by labels, is fitted further: to the errors of H in runs from many states of a ring. The labels stay
-as a weak bound. Then the table is made to vary with t as little as may be, so that steps somewhat shorter than Δt keep
-energy as well.
+table at Δt, found by labels, is fitted further: to the errors of H in runs from many states of a ring, or of a cluster.
+The labels stay as a weak bound. Then the table is made to vary with t as little as may be, so that steps somewhat
+shorter than Δt keep energy as well.
 """
 
 from __future__ import annotations
@@ -28,8 +28,6 @@ from sympflow.training.table_step import Check, TableStep
 if TYPE_CHECKING:
     from sympflow.training.lattice_fit import Piece
 
-SITES = {1: 64, 2: 10, 3: 5}
-"""Sites along each axis of the rings, by the number of axes; as many as a piece has, if that is more."""
 PERIODS, LOOKS = 25.0, 6
 """Length of a run in periods of the fastest waves, and how often its energy is looked at."""
 LABEL_WEIGHT, ENERGY_WEIGHT = 1e-5, 100.0
@@ -41,18 +39,18 @@ PROBE = 1e-6
 
 
 class EnergyRuns(Fit):
-    """Relative energy errors in runs of a lattice, as a function of the frozen parameters of a flow.
+    """Relative energy errors in runs of a lattice or of like bodies, as a function of the frozen parameters of a flow.
 
     Parameters
     ----------
     flow : PrimedFlow
-        Of the lattice; its numbers are changed.
+        Of the system; its numbers are changed.
     system : HamiltonianSystem
-        The lattice.
+        The lattice or the bodies.
     x : ndarray of shape (N, 2d)
         Where the runs begin.
     rest : float
-        H of the lattice at rest.
+        H of the system at rest.
     t_end : float
     """
 
@@ -96,26 +94,27 @@ class EnergyRuns(Fit):
         return r, J
 
 
-def check_runs(lattice: HamiltonianSystem, runs: int) -> None:
+def check_runs(system: HamiltonianSystem, runs: int) -> None:
     """Raise ValueError unless a flow of the system can be fitted to so many runs."""
     check_counts(runs=runs)
-    if lattice.local is None or not lattice.local.shape or not lattice.conservative:
-        raise ValueError(f"`runs` are of lattices that keep their energy, and {lattice.name!r} is none: leave it out.")
+    if not (system.local is not None and system.local.has_piece and system.conservative):
+        raise ValueError(
+            f"`runs` are of lattices and like bodies that keep their energy, and {system.name!r} is none: leave it out."
+        )
 
 
 def fit_to_runs(fitted: PrimedFlow, piece: Piece, runs: int, seed: int, deadline: Deadline) -> None:
-    """Fit the numbers of a flow of a piece further, to so many runs of a larger ring.
+    """Fit the numbers of a flow of a piece further, to so many runs of a larger one.
 
     They stay as they are, with a warning, where the runs of the flow are not finite, or there is no time.
     """
-    lattice, dt = piece.lattice, fitted.dt
-    few = lattice.piece().local
-    assert few is not None
-    ring = lattice.piece(tuple(max(SITES[len(few.shape)], n) for n in few.shape))
-    domain = piece.states.of(ring)
+    whole, dt = piece.lattice, fitted.dt
+    assert whole.local is not None
+    larger = whole.piece(*whole.local.many())
+    domain = piece.states.of(larger)
     x = states(domain, runs, seed, Stream.RUNS)
-    t_end = PERIODS * 2 * math.pi / frequency(ring, domain)
-    energies = EnergyRuns(fitted.of_any_size(ring), ring, x, float(ring.hamiltonian(domain.at_rest)), t_end)
+    t_end = PERIODS * 2 * math.pi / frequency(larger, domain)
+    energies = EnergyRuns(fitted.of_any_size(larger), larger, x, float(larger.hamiltonian(domain.at_rest)), t_end)
     theta = energies.start()
     late = deadline.over()
     if late or not np.isfinite(energies.residuals(theta)).all():

@@ -153,9 +153,9 @@ def train(
         Of "gauss-newton" on a primed flow: how much an error in the energy counts beside those of the coordinates. 10
         by default; 1000 for runs of which only the energy matters, 0 for none.
     runs : int, optional
-        Of a primed flow of a lattice: after the search its numbers are fitted further to the energy errors of so many
-        long runs of a larger ring; 48 is usual. Large lattices lose several times less energy then, and the fit takes
-        about twice as long. The default is none.
+        Of a primed flow of a lattice or of like bodies: after the search its numbers are fitted further to the energy
+        errors of so many long runs of a larger ring or cluster; 48 is usual. Large systems lose several times less
+        energy then, and the fit takes about twice as long. The default is none.
     checkpoint : path, optional
         Write the state of the run there every `checkpoint_every` steps, atomically; of a primed flow after each start
         of the search, and first as soon as there is a run: of one that is killed in the trials nothing is kept.

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from sympflow import HamiltonianSystem, solve, splitting_method
+from sympflow.kernels import pair_forces
 from sympflow.kernels.modules import at_most
 from sympflow.kernels.pair_forces import PairForces
 from sympflow.schemes import SCHEMES
@@ -130,6 +131,20 @@ class TestRuns:
         sol = solve(together, "verlet", (0, 1), y0)
         assert sol.status == -1
         assert len(sol.t) == 1
+
+    def test_a_thread_that_fails_ends_the_others(self, monkeypatch):
+        system = gravity(330)
+        module = pair_forces._module(pair_forces._Code(system.local), 0, False, False)
+        in_team = module.in_team
+
+        def failing(member, *given):
+            if member == 1:
+                raise MemoryError("no room")
+            return in_team(member, *given)
+
+        monkeypatch.setattr(module, "in_team", failing)
+        with at_most(3), pytest.raises(MemoryError, match="no room"):
+            solve(system, "verlet", (0, 1), t_eval=[1], backend="compiled")
 
     def test_friction_of_one_rate_is_compiled(self):
         system = gravity(4, damping=0.1)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import sympflow
 from sympflow import ClusterStates, HamiltonianSystem, LatticeStates, SympFlow, solve, train
+from sympflow.training import energy_runs
+from sympflow.training.lattice_fit import Piece
+from sympflow.training.session import Session
 
 LENNARD_JONES = "4*e*(r**-12 - r**-6)"
 FIT = {"restarts": 1, "steps": 8, "points": 20, "label_times": 3, "reference_states": 10, "progress": False}
@@ -102,6 +107,33 @@ def test_a_flow_serves_any_number_of_bodies(flow, tmp_path):
         H = system.hamiltonian(runs[0].states)
         above = H[0] - system.potential(system.domain.at_rest[: system.ndof])
         assert np.ptp(H) < 0.2 * above  # a rough flow, of two kicks and eight steps of the fit
+
+
+def test_a_fit_to_long_runs_is_of_a_larger_cluster(flow, monkeypatch):
+    monkeypatch.setattr(energy_runs, "ITERATIONS", 3)
+    piece = Piece.of(cluster(domain=STATES), STATES)
+    further = piece.small(flow)
+    energy_runs.fit_to_runs(further, piece, 8, 1, Session().deadline)
+    assert further.recipe["stages"][-1]["loss"] == "energy"
+    large = cluster(25, domain=STATES)
+    y0 = large.domain.sample(4, seed=77)
+    H0, rest = large.hamiltonian(y0), large.hamiltonian(large.domain.at_rest)
+    errors = []
+    for each in (flow, further.of_any_size(large)):
+        H = large.hamiltonian(solve(large, each, (0, 2), y0, t_eval=np.linspace(0, 2, 5)).states)
+        errors.append(np.sqrt(np.mean(((H.T - H0) / (H0 - rest)) ** 2)))
+    assert errors[1] < errors[0]
+
+
+def test_a_run_far_outside_that_loses_energy_is_warned_of(flow, monkeypatch):
+    monkeypatch.setattr(flow, "certified", replace(flow.certified, relative_limit=1e-7))
+    system = cluster(domain=STATES)
+    y0 = system.domain.sample(1)[0]
+    solve(system, flow, (0, 0.2), y0, t_eval=[0.2])
+    y0[20:] *= 8
+    with pytest.warns(RuntimeWarning, match=r"^The state left the domain of the flow at t = 0, and the "):
+        solve(system, flow, (0, 0.2), y0, t_eval=[0.0, 0.2])
+    solve(system, flow, (0, 0.2), y0, t_eval=[0.0, 0.2], on_domain_exit="ignore")
 
 
 @pytest.mark.parametrize(

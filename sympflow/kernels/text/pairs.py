@@ -1,4 +1,6 @@
-"""The stages of splitting methods on bodies that interact in pairs. Source text, pasted after `sized_states` and sums.
+"""The stages of splitting methods on bodies that interact in pairs.
+
+Source text, pasted after `sized_states`, `barrier` and sums.
 
 A state is an array X (sets, `DIM`, size) of that text, the coordinates of all bodies in rows. `sites` has `DIM` rows of
 1/m, then what else a pair depends on; `values` are ε², the largest s, the box and the parameters; `geometry` the number
@@ -57,12 +59,17 @@ def pack(X, first, y, geometry):
 
 
 @njit(**OPTIONS)
+def room(F, meeting, size, geometry):
+    """Sums and velocities; the sums of chunks; bodies in blocks, their order, and a sum in that; where threads meet."""
+    blocks = size if geometry[1] > 0 else 0
+    A, P, total = np.zeros((N_HELPERS, DIM, size)), np.zeros(WIDTH * blocks), np.zeros(DIM * blocks)
+    return A, F, P, np.arange(geometry[0]), total, meeting
+
+
+@njit(**OPTIONS)
 def workspace(size, geometry):
-    """Sums and velocities; the sums of chunks, and bodies, in blocks; the order of bodies in these."""
-    n_chunks = geometry[1]
-    blocks = size if n_chunks > 0 else 0
-    A, F = np.zeros((N_HELPERS, DIM, size)), np.zeros((n_chunks, DIM * blocks))
-    return A, F, np.zeros(WIDTH * blocks), np.arange(geometry[0])
+    """The same of one thread."""
+    return room(np.zeros((1, geometry[1], DIM * size)), np.zeros(3, dtype=np.int64), size, geometry)
 
 
 @njit(**OPTIONS)
@@ -82,7 +89,7 @@ def fill_rows(P, row, n_rows, source, first, order):
 @njit(**OPTIONS)
 def fill_blocks(phase, first, X, work, starts, shape, sites, values):
     """Put the bodies into blocks, once in a kick, and the velocity of a phase; returns what `sorted_cells` does."""
-    A, _, P, order = work
+    A, P, order = work[0], work[2], work[3]
     if phase == first:
         if CUT:
             starts, shape = sorted_cells(X[0], values, order)
@@ -94,9 +101,8 @@ def fill_blocks(phase, first, X, work, starts, shape, sites, values):
 
 
 @njit(**OPTIONS)
-def sum_chunk(kind, chunk, work, starts, shape, geometry, values):
+def sum_chunk(kind, chunk, F, P, starts, shape, geometry, values):
     """The part of a chunk in a sum."""
-    F, P = work[1], work[2]
     if kind == 0:
         gradient_of_chunk(chunk, P, F, starts, shape, values, geometry)
     if HAS_GRADIENT and kind == 1:
@@ -117,15 +123,17 @@ def sum_of_few(kind, X, along, work, geometry, sites, values):
 
 
 @njit(**OPTIONS)
-def sum_of_chunks(work):
+def sum_of_chunks(F, work):
     """Add the sums of chunks up, in the order of the bodies."""
-    total, F, order = work[0][0], work[1], work[3]
+    A, order, total = work[0], work[3], work[4]
+    for k in range(len(total)):
+        total[k] = F[0, k]
     for chunk in range(1, F.shape[0]):
-        for k in range(F.shape[1]):
-            F[0, k] += F[chunk, k]
+        for k in range(len(total)):
+            total[k] += F[chunk, k]
     for k in range(DIM):
         for i in range(len(order)):
-            total[k, order[i]] = F[0, (i // LANES * DIM + k) * LANES + i % LANES]
+            A[0, k, order[i]] = total[(i // LANES * DIM + k) * LANES + i % LANES]
 
 
 @njit(**OPTIONS, forceinline=True)
@@ -164,8 +172,13 @@ def drift(X, table, column, sites):
 
 
 @njit(**OPTIONS)
-def in_one(X, table, column, n_stages, single, work, geometry, sites, values):
-    link, n_chunks = table.shape[1] - 2, geometry[1]
+def stages(member, members, X, table, column, n_stages, single, work, geometry, sites, values):
+    """Stages by one of so many threads, each of which has all bodies, and makes its part of the chunks of each sum.
+
+    All else each of them does as well, so that they meet once in a sum. Others may still add up the sums of chunks when
+    one begins the next: it has other room for these.
+    """
+    link, n_chunks, sums, turn = table.shape[1] - 2, geometry[1], work[1], 0
     starts, shape = np.empty(0, dtype=np.int64), np.ones(3, dtype=np.int64)
     for _ in range(n_stages):
         first, last = phases_of(table, column)
@@ -174,48 +187,28 @@ def in_one(X, table, column, n_stages, single, work, geometry, sites, values):
                 sum_of_few(SUMS[phase], X, ALONG[phase], work, geometry, sites, values)
             else:
                 starts, shape = fill_blocks(phase, first, X, work, starts, shape, sites, values)
-                for chunk in range(n_chunks):
-                    sum_chunk(SUMS[phase], chunk, work, starts, shape, geometry, values)
-                sum_of_chunks(work)
+                turn = (turn + 1) % sums.shape[0]
+                for chunk in range(n_chunks * member // members, n_chunks * (member + 1) // members):
+                    sum_chunk(SUMS[phase], chunk, sums[turn], work[2], starts, shape, geometry, values)
+                if not meet(work[5], members):
+                    return column
+                sum_of_chunks(sums[turn], work)
             kick(X, table, column, phase, work, sites)
         drift(X, table, column, sites)
         column = column + 1 if single or column < link else 1
     return column
 
 
-# The same where threads share the chunks of a sum.
+@njit(**OPTIONS)
+def in_one(X, table, column, n_stages, single, work, geometry, sites, values):
+    return stages(ZERO, ONE, X, table, column, n_stages, single, work, geometry, sites, values)
 
 
 @njit(**OPTIONS)
-def kick_of(table, column):
-    return phases_of(table, column)
-
-
-@njit(**OPTIONS)
-def begun(phase, first, X, work, starts, shape, sites, values):
-    return fill_blocks(phase, first, X, work, starts, shape, sites, values)
-
-
-@njit(**OPTIONS)
-def shared(lo, hi, phase, work, starts, shape, geometry, values):
-    for chunk in range(lo, hi):
-        sum_chunk(SUMS[phase], chunk, work, starts, shape, geometry, values)
-
-
-@njit(**OPTIONS)
-def kicked(X, table, column, phase, work, sites):
-    sum_of_chunks(work)
-    kick(X, table, column, phase, work, sites)
-
-
-@njit(**OPTIONS)
-def drifted(X, table, column, sites):
-    drift(X, table, column, sites)
-
-
-@njit(**OPTIONS)
-def room(size, geometry):
-    return workspace(size, geometry)
+def in_team(member, members, sums, meeting, X, table, column, n_stages, single, geometry, size, sites, values):
+    """The same by one of so many threads."""
+    work = room(sums, meeting, size, geometry)
+    return stages(member, members, X, table, column, n_stages, single, work, geometry, sites, values)
 
 
 @njit(**OPTIONS)
