@@ -30,6 +30,7 @@ from measuring import fragments
 import sympflow
 from sympflow import HamiltonianSystem, energy_drift, solve, systems
 from sympflow.flow.shipped import ShippedFlow
+from sympflow.training.shipped.rows import double_wells_in_a_plane
 
 STEPS, OUTPUTS, BLOCKS = 1_000_000, 1000, 20
 QUICK_STEPS = 20_000
@@ -39,6 +40,7 @@ REGULAR = {
     "toda_chain": [*np.zeros(128), *0.45 * np.sin(2 * np.pi * np.arange(128) / 16)],  # not one soliton: a wave
     "fput_beta": [*np.zeros(64), *0.45 * np.sin(2 * np.pi * np.arange(64) / 16)],  # its y0 is unstable
     "phi4": [*np.ones(16), *0.1 * np.cos(2 * np.pi * (np.arange(16) + 0.5) / 16)],  # in one well
+    "phi4_sheet": [*np.ones(64), *np.repeat(0.2 * np.cos(2 * np.pi * np.arange(8) / 8), 8)],
     "sine_gordon": [*np.zeros(16), *0.3 * np.sin(2 * np.pi * np.arange(16) / 16)],  # as long as the ring: stable
 }
 
@@ -60,6 +62,7 @@ def scenes() -> list[HamiltonianSystem]:
         systems.fput_beta(),
         systems.sine_gordon(n=16, length=16.0, accuracy=2),
         systems.phi4(n=16, length=16.0, accuracy=2),
+        double_wells_in_a_plane(64),
     ]
 
 

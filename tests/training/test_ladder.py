@@ -291,6 +291,7 @@ SCENES = [
     LADDERS["duffing"][0].system(),
     LADDERS["sine_gordon"][0].system(),
     LADDERS["phi4"][0].system(),
+    LADDERS["phi4_sheet"][0].system(),
 ]
 
 
