@@ -238,7 +238,8 @@ def main() -> None:
         if "rows" not in mine:
             ladder = LATTICES[name][3] if options.fit else ()
             entrants = Race.of(lattice(name, options.sites), options.flows, ladder)
-            mine.setdefault("steps", [entrants.steps(target) for target in TARGETS])
+            if "steps" not in mine:
+                mine["steps"] = [entrants.steps(target) for target in TARGETS]
             if not options.search:
                 of_targets = zip(TARGETS, mine["steps"], strict=True)
                 mine["rows"] = [entrants.row(target, steps, options.rounds) for target, steps in of_targets]
