@@ -47,6 +47,9 @@ class _Kick:
     operations: float
     condition: str = ""
     """Where the shape holds, of one that holds for some positions only."""
+    drift: Sequence[str] = ()
+    moved: Sequence[str] = ()
+    """The lines of the drift that follows, and the positions after it, where it is joined with the kick."""
 
     @property
     def calls(self) -> bool:
@@ -61,6 +64,7 @@ def kicks_source(
     vectors: int = 0,
     varied: bool = False,
     ranges: Ranges = (),
+    joined: bool = False,
 ) -> str:
     """The new p after each kind of kick of a level, each in two shapes, equal but for rounding: see `Kick`.
 
@@ -80,21 +84,25 @@ def kicks_source(
     With `ranges` of positions functions in V are written as letters, whose powers and products are shared, and those of
     one trajectory may be polynomials that are exact to rounding in these ranges; beyond, ``kicked`` is ``kicked_lane``.
 
+    Kicks may be `joined` with the drift that follows: instead of ``kicked`` there is ``kicked_and_drifted(q, p, table,
+    j, a)``, which returns the new q as well. It does not wait for the new p: q + a (p + f·F) is (q + a p) + (a f)·F,
+    with as many operations from one q to the next as a kick alone has, and equal but for rounding.
+
     Raises
     ------
     ValueError
         If a function in H has no counterpart in compiled code.
     """
-    key = symbols.H, symbols.parameters, level, monomials, vectors, ranges
+    key = symbols.H, symbols.parameters, level, monomials, vectors, ranges, joined
     if key not in _SOURCES:
         if len(_SOURCES) >= MOST_KEPT:
             del _SOURCES[next(iter(_SOURCES))]
-        _SOURCES[key] = _source(Variations(symbols, vectors) if vectors else symbols, level, monomials, ranges)
+        _SOURCES[key] = _source(Variations(symbols, vectors) if vectors else symbols, level, monomials, ranges, joined)
     source, own = _SOURCES[key]
     return f"{source}\n\n{own}" if varied else source
 
 
-def kick_cycles(symbols: SymbolicHamiltonian, level: int, ranges: Ranges = ()) -> float:
+def kick_cycles(symbols: SymbolicHamiltonian, level: int, ranges: Ranges = (), joined: bool = False) -> float:
     """Cycles of a kick and the drift before it in a single trajectory, as its terms are first written down.
 
     That is not the fastest way to write them, for which the compiler looks much longer (`kicks_source`); but
@@ -107,6 +115,8 @@ def kick_cycles(symbols: SymbolicHamiltonian, level: int, ranges: Ranges = ()) -
         0 for the force alone, 1 with a force gradient, 2 with a curvature term too.
     ranges
         Of positions, where one degree of freedom may have its kick as a polynomial.
+    joined : bool
+        True where the drift does not wait for the kick: see `kicks_source`.
 
     Raises
     ------
@@ -114,18 +124,18 @@ def kick_cycles(symbols: SymbolicHamiltonian, level: int, ranges: Ranges = ()) -
         If a function in H has no counterpart in compiled code.
     """
     shape = next(iter(shapes(symbols, level + 1)))
-    tried = [_scheduled(symbols, shape, "kick_", common) for common in (True, False)]
+    tried = [_scheduled(symbols, shape, "kick_", common, joined=joined) for common in (True, False)]
     if ranges and symbols.ndof == 1 and level:
-        tried += _whole_polynomials(symbols, _parts(symbols, level + 1), "kick_", ranges)
+        tried += _whole_polynomials(symbols, _parts(symbols, level + 1), "kick_", ranges, joined)
     return min(kick.cycles for kick in tried)
 
 
-_SOURCES: dict[tuple[sp.Expr, tuple[sp.Symbol, ...], int, Monomials, int, Ranges], tuple[str, str]] = {}
+_SOURCES: dict[tuple[sp.Expr, tuple[sp.Symbol, ...], int, Monomials, int, Ranges, bool], tuple[str, str]] = {}
 """Sources, and those of varied lanes, by H: systems are often made again, and the search takes a tenth of a second."""
 
 
 def _source(
-    symbols: SymbolicHamiltonian | Variations, level: int, monomials: Monomials, ranges: Ranges
+    symbols: SymbolicHamiltonian | Variations, level: int, monomials: Monomials, ranges: Ranges, joined: bool
 ) -> tuple[str, str]:
     functions: list[str] = []
     fill: list[str] = []
@@ -135,32 +145,35 @@ def _source(
     for kick in reversed(kinds):
         name, terms = kick.name, len(kick.numbers)
         if ranges and isinstance(symbols, SymbolicHamiltonian):
-            tried = _tried_in(symbols, terms, f"{name[0]}_", ranges)
+            tried = _tried_in(symbols, terms, f"{name[0]}_", ranges, joined)
         else:
-            tried = _tried(symbols, terms, f"{name[0]}_", monomials)
+            tried = _tried(symbols, terms, f"{name[0]}_", monomials, joined)
         one = min(tried, key=lambda kick: (kick.cycles, kick.operations))
         lanes = [k for k in tried if not k.condition]
         if isinstance(symbols, SymbolicHamiltonian) and not monomials:
             lanes += _by_products(symbols, terms, f"{name[0]}_")
         many = min(lanes, key=lambda kick: (kick.calls, kick.operations, kick.cycles))
-        used = [n for n in _names(one.coefficients) if any(_mentions(line, n) for line in [*one.lines, *one.results])]
+        body = [*one.lines, *one.drift, *one.results, *one.moved]
+        used = [n for n in _names(one.coefficients) if any(_mentions(line, n) for line in body)]
         loads = [f"{n} = table[j, {len(stored) + i}]" for i, n in enumerate(used)]
         fill += one.coefficients
         stored += used
-        taken = [v for v in kept if any(_mentions(line, v) for line in [*one.lines, *one.results])]
+        taken = [v for v in kept if any(_mentions(line, v) for line in body)]
         loads += [f"{v} = table[j, -{len(kept) - kept.index(v)}]" for v in taken]
-        lines = [*loads, *one.lines]
+        lines = [*loads, *one.lines, *one.drift]
+        given = "q, p, table, j" + (", a" if joined else "")
         if one.condition:
-            beyond = f"{name}_lane(q, p, ({''.join(f'table[j, -{n}], ' for n in range(len(kept), 0, -1))}))"
-            functions.append(f"@njit(**OPTIONS)\ndef {name}_beyond(q, p, table, j):\n    return {beyond}")
-            lines = [f"if not ({one.condition}):", f"    return {name}_beyond(q, p, table, j)", *lines]
-        functions.append(_function(symbols, name, "q, p, table, j", lines, one.results))
-        numbers = [f"{v} = numbers[{i}]" for i, v in enumerate(kick.numbers)]
+            numbers = "".join(f"table[j, -{n}], " for n in range(len(kept), 0, -1))
+            beyond = [f"p = {name}_lane(q, p, ({numbers}))", f"return {'drifted(q, p, a), ' if joined else ''}p"]
+            functions.append(f"@njit(**OPTIONS)\ndef {name}_beyond({given}):\n    " + "\n    ".join(beyond))
+            lines = [f"if not ({one.condition}):", f"    return {name}_beyond({given})", *lines]
+        one_name = f"{name}_and_drifted" if joined else name
+        functions.append(_function(symbols, one_name, given, lines, *([one.moved] if joined else []), one.results))
+        given_numbers = [f"{v} = numbers[{i}]" for i, v in enumerate(kick.numbers)]
         lines = [*many.coefficients, *many.lines]
-        lines = [*numbers, *parameter_lines(symbols, [*lines, *many.results]), *lines]
+        lines = [*given_numbers, *parameter_lines(symbols, [*lines, *many.results]), *lines]
         functions.append(_function(symbols, f"{name}_lane", "q, p, numbers", lines, many.results))
-    given = f"{', '.join(kept)}, = numbers"
-    rows = [given, *fill, *(f"row[{i}] = {name}" for i, name in enumerate([*stored, *kept]))]
+    rows = [f"{', '.join(kept)}, = numbers", *fill, *(f"row[{i}] = {name}" for i, name in enumerate([*stored, *kept]))]
     filled = "\n    ".join(["@njit(**OPTIONS)\ndef fill_coefficients(numbers, row):", *rows])
     drifts = _drift_source(symbols)
     source = "\n\n\n".join([f"N_COEFFICIENTS = {len(stored) + len(kept)}", filled, *functions, drifts]) + "\n"
@@ -216,10 +229,11 @@ def _mentions(code: str, name: str) -> bool:
 
 
 def _function(
-    symbols: SymbolicHamiltonian | Variations, name: str, arguments: str, lines: Sequence[str], results: Sequence[str]
+    symbols: SymbolicHamiltonian | Variations, name: str, arguments: str, lines: Sequence[str], *results: Sequence[str]
 ) -> str:
+    """A compiled function that returns a tuple, or several."""
     unpacked = [f"{', '.join(s.name for s in v)}, = {x}" for v, x in ((symbols.q, "q"), (symbols.p, "p"))]
-    returned = f"return ({''.join(f'{value}, ' for value in results)})"
+    returned = "return " + ", ".join(f"({''.join(f'{value}, ' for value in values)})" for values in results)
     return "\n    ".join([f"@njit(**OPTIONS, forceinline=True)\ndef {name}({arguments}):", *unpacked, *lines, returned])
 
 
@@ -230,12 +244,13 @@ def _scheduled(
     common: bool = True,
     letters: Mapping[sp.Symbol, sp.Expr] = MappingProxyType({}),
     condition: str = "",
+    joined: bool = False,
 ) -> _Kick:
-    """The shape as code. Momenta are known before positions, whose drift waited for them.
+    """The shape as code. Momenta are known before positions, whose drift waited for them if it is not joined.
 
     Without `common` only whole factors and terms are shared, not products within products, which may be known later.
     """
-    known = {**dict.fromkeys(symbols.q, 0.0), **dict.fromkeys(symbols.p, -FUSED)}
+    known = {**dict.fromkeys(symbols.q, 0.0), **dict.fromkeys(symbols.p, 0.0 if joined else -FUSED)}
     schedule = Schedule(known, printed, prefix, PRODUCT)
     numbers: dict[sp.Expr, sp.Symbol] = {}
     states = {*symbols.q, *symbols.p, *letters}
@@ -261,9 +276,31 @@ def _scheduled(
                     if (min(i, j), max(i, j)) in entries
                 ]
                 results.append(schedule.value(sp.Add(s, *terms, evaluate=False))[1])
+    operations = schedule.operations + _moving(symbols)
+    if joined:
+        lines = [*schedule.lines]
+        drift, moved = _joined(symbols, schedule, results)
+        cycles = schedule.paced([*results, *moved])
+        return _Kick(schedule.early, lines, results, cycles, operations, condition, drift, moved)
     schedule.busy[PRODUCTS] += _moving(symbols)
     cycles = schedule.cycles(results) + FUSED  # the drift waits for the kick
-    return _Kick(schedule.early, schedule.lines, results, cycles, schedule.operations, condition)
+    return _Kick(schedule.early, schedule.lines, results, cycles, operations, condition)
+
+
+def _joined(
+    symbols: SymbolicHamiltonian | Variations, schedule: Schedule, momenta: Sequence[str]
+) -> tuple[list[str], list[str]]:
+    """The lines of q + a M⁻¹p after those of p in a schedule, and their results."""
+    M, n = symbols.inverse_mass, len(schedule.lines)
+    assert M is not None
+    numbers: dict[sp.Expr, str] = {}
+    rows = [
+        (s.name, [(numbers.setdefault(m, f"a_{len(numbers)}"), p) for m, p in zip(row, momenta, strict=True) if m != 0])
+        for s, row in zip(symbols.q, M.tolist(), strict=True)
+    ]
+    moved = schedule.moved(rows)
+    factors = [f"{name} = a" if m == 1 else f"{name} = a*{as_factor(m)}" for m, name in numbers.items()]
+    return [*factors, *schedule.lines[n:]], moved
 
 
 def _linearised(shape: Sequence[sp.Expr], symbols: Variations) -> dict[tuple[int, int], sp.Expr]:
@@ -273,10 +310,12 @@ def _linearised(shape: Sequence[sp.Expr], symbols: Variations) -> dict[tuple[int
     return {place: printable(f) for place, f in entries.items() if f != 0}
 
 
-def _tried(symbols: SymbolicHamiltonian | Variations, terms: int, prefix: str, monomials: Monomials) -> list[_Kick]:
+def _tried(
+    symbols: SymbolicHamiltonian | Variations, terms: int, prefix: str, monomials: Monomials, joined: bool
+) -> list[_Kick]:
     own = symbols.symbols if isinstance(symbols, Variations) else symbols
     return [
-        _scheduled(symbols, shape, prefix, common)
+        _scheduled(symbols, shape, prefix, common, joined=joined)
         for shape in shapes(own, terms, monomials)
         for common in (True, False)
     ]
@@ -299,12 +338,12 @@ def _numbered(f: sp.Expr, states: set[sp.Symbol], numbers: dict[sp.Expr, sp.Symb
 # kicks in ranges of positions -------------------------------------------------------------------------------------
 
 
-def _tried_in(symbols: SymbolicHamiltonian, terms: int, prefix: str, ranges: Ranges) -> list[_Kick]:
+def _tried_in(symbols: SymbolicHamiltonian, terms: int, prefix: str, ranges: Ranges, joined: bool) -> list[_Kick]:
     """Shapes by letters for functions, of arithmetic alone, and in ranges of positions as polynomials."""
-    tried = [_scheduled(symbols, next(shapes(symbols, terms)), prefix)]
+    tried = [_scheduled(symbols, next(shapes(symbols, terms)), prefix, joined=joined)]
     parts = _parts(symbols, terms)
     if symbols.ndof == 1:
-        tried += _whole_polynomials(symbols, parts, prefix, ranges)
+        tried += _whole_polynomials(symbols, parts, prefix, ranges, joined)
     letters = Letters(symbols.q)
     columns = [letters.put_into(part) for part in parts]
     if not letters.functions:
@@ -322,7 +361,9 @@ def _tried_in(symbols: SymbolicHamiltonian, terms: int, prefix: str, ranges: Ran
     known = {**dict.fromkeys(symbols.q, 0.0), **{x: schedule.value(x)[0] for x in letters.symbols}}
     for shape in _forms(symbols, changes, known):
         for meaning, condition in ways:
-            tried += [_scheduled(symbols, shape, prefix, common, meaning, condition) for common in (True, False)]
+            tried += [
+                _scheduled(symbols, shape, prefix, common, meaning, condition, joined) for common in (True, False)
+            ]
     return tried
 
 
@@ -333,7 +374,7 @@ def _parts(symbols: SymbolicHamiltonian, terms: int) -> list[list[sp.Expr]]:
 
 
 def _whole_polynomials(
-    symbols: SymbolicHamiltonian, parts: Sequence[Sequence[sp.Expr]], prefix: str, ranges: Ranges
+    symbols: SymbolicHamiltonian, parts: Sequence[Sequence[sp.Expr]], prefix: str, ranges: Ranges, joined: bool
 ) -> list[_Kick]:
     """The kick of one degree of freedom as one polynomial, whatever V is."""
     (q,), (p,) = symbols.q, symbols.p
@@ -348,7 +389,7 @@ def _whole_polynomials(
     change = sp.Add(*[_times(c, x**k) for k, c in enumerate(sums) if c != 0], evaluate=False)
     known, condition = {x: 0.0 if x == q else ADD}, _within(q, found)
     return [
-        _scheduled(symbols, [_nested(known, p, change, False, last)], prefix, False, letters, condition)
+        _scheduled(symbols, [_nested(known, p, change, False, last)], prefix, False, letters, condition, joined)
         for last in (False, True)
     ]
 

@@ -85,7 +85,7 @@ def symbolic_loops(
     compensated: bool,
     monomials: Monomials,
     varied: bool = False,
-    ranges: Ranges = (),
+    ranges: Ranges | None = None,
 ) -> LoopFunctions:
     """The loops of an autonomous symbolic system of few terms; parameters are numbers where `takes_values`."""
     if (varied or (friction is None and takes_values(level))) and symbols.parametric is not symbols:
@@ -129,21 +129,22 @@ def symbolic_module(
     friction: DampedDrift | None = None,
     driving: Driving | None = None,
     varied: bool = False,
-    ranges: Ranges = (),
+    ranges: Ranges | None = None,
 ) -> ModuleType:
     """The algebra of a symbolic system, its kicks and the texts of loops `after` them, as a module.
 
-    In `varied` ones each lane has its own values of the parameters.
+    In `varied` ones each lane has its own values of the parameters. For `ranges` see `SplittingLoops.functions`.
     """
     from sympflow.kernels.kicks import kicks_source
 
     kinds, scheduled = kicks_of(level, len(monomials)), not compensated
     n, n_values = len(symbols.parameters), len(symbols.values) if varied else 0
     sources = [algebra] if driving is None else [algebra, numbers_source(kinds, friction, n, driving)]
-    sources.append(stages_source(kinds, scheduled, friction, n, driving))
+    joined = ranges is not None and scheduled and friction is None and symbols.inverse_mass is not None
+    sources.append(stages_source(kinds, scheduled, friction, n, driving, joined))
     sources.append(lanes_source(kinds, scheduled, friction, n, varied, driving))
     if scheduled:
-        sources.append(kicks_source(symbols, level, monomials, varied=varied, ranges=ranges))
+        sources.append(kicks_source(symbols, level, monomials, varied=varied, ranges=ranges or (), joined=joined))
     else:
         sources += plain_kicks_source(symbols, level, monomials)
     shared = shared_by_lanes(symbols.ndof, kinds, friction, n, compensated, n_values)

@@ -12,6 +12,7 @@ import bisect
 import heapq
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import sympy as sp
@@ -25,6 +26,10 @@ THROUGHPUT = {DIVIDE: 10.0, ROOT: 12.0, FUNCTION: 30.0, OTHER: 60.0}
 SUMS, PRODUCTS, DIVISIONS = "sums", "products", "divisions"  # units
 ALWAYS = -1000.0  # when constants are known
 UNITS = 2  # that start a multiplication each cycle, and as many for additions, on current x86-64 cores
+MOST_AHEAD = 5  # operations of a value that `Schedule.moved` takes apart
+BETWEEN_STAGES, OVERLAPPED, MANY = 2.0, 1.3, 20.0
+"""Of stages that overlap: cycles that are added to the longest chain, operations a cycle, and what these delay the
+chain; a fit to measured kicks of 11 to 33 operations."""
 MOST_CHAINS = 3  # sums are split into up to so many chains, added at their ends
 FEW_TERMS = 8  # of a polynomial, of which more ways to split it are tried
 MOST_FORMS = 1000  # of sums and parts of them; after so many the next ones are split in one way only
@@ -73,6 +78,7 @@ class Schedule:
         self._fused = "{2} + {0}*{1}" if fused is None else fused + "({0}, {1}, {2})"
         self._names: dict[str, str] = {}
         self._values: dict[sp.Expr, _Item] = {}
+        self._made_of: dict[str, tuple[tuple[_Item, ...], tuple[_Item, ...]]] = {}  # factors, and what is added
 
     @property
     def operations(self) -> float:
@@ -83,6 +89,13 @@ class Schedule:
         """The cost of the lines in one trajectory: the time that these results wait, or that units are busy."""
         return max([*(self.ready.get(name, ALWAYS) for name in results), *(n / UNITS for n in self.busy.values())])
 
+    def paced(self, results: Iterable[str]) -> float:
+        """The cost of the lines in one trajectory whose stages overlap: of the chains and of the operations.
+
+        Where a chain is hardly longer than the units are busy, it waits for what else these have begun.
+        """
+        return _paced(max(self.ready.get(name, ALWAYS) for name in results), self.operations)
+
     def define(self, symbol: sp.Symbol, expression: sp.Expr) -> None:
         """Let the symbol, of a common subexpression, stand for the value of the expression."""
         self._values[symbol] = self.value(expression)
@@ -92,6 +105,53 @@ class Schedule:
         if expression not in self._values:
             self._values[expression] = self._compute(expression)
         return self._values[expression]
+
+    def moved(self, places: Sequence[tuple[str, Sequence[tuple[str, str]]]]) -> list[str]:
+        """x + Σ factor·value for each (x, [(factor, value), …]), by names, known early.
+
+        Where a value is made as a·b + c, x + factor·value is (factor·a)·b + (x + factor·c) as well, which does not wait
+        for the value. Numbers alone are never multiplied by the factor before: their product would be rounded alike in
+        each step, and the errors would add up.
+        """
+        found = []
+        for x, terms in places:
+            plans = [_Plan(self.ready.get(x, ALWAYS), 0.0, partial(self._item, x))]
+            for factor, value in sorted(terms, key=lambda term: self._item(term[1])):
+                plans = _best(p for plan in plans for p in self._plans(plan, factor, self._item(value)))
+            found.append(plans)
+        begun, ways = self.operations, []
+        for by in {plan.time for plans in found for plan in plans}:
+            if all(plans[0].time <= by for plans in found):
+                way = [max((p for p in plans if p.time <= by), key=lambda p: p.time) for plans in found]
+                ways.append((_paced(by, begun + sum(plan.operations for plan in way)), by, way))
+        return [plan.written()[1] for plan in min(ways, key=lambda way: way[:2])[2]]
+
+    def _item(self, name: str) -> _Item:
+        return self.ready.get(name, ALWAYS), name
+
+    def _plans(self, base: _Plan, factor: str, value: _Item, depth: int = MOST_AHEAD) -> list[_Plan]:
+        """Ways to write base + factor·value."""
+        return _best(self._all_plans(base, factor, value, depth))
+
+    def _all_plans(self, base: _Plan, factor: str, value: _Item, depth: int) -> Iterator[_Plan]:
+        scale = ALWAYS, factor
+
+        def after(start: _Plan, a: Callable[[], _Item], b: _Item, operations: float, *times: float) -> _Plan:
+            time = max(start.time, b[0], *times) + FUSED
+            return _Plan(time, start.operations + operations, lambda: self._fused_sum(a(), b, start.written()))
+
+        yield after(base, lambda: scale, value, 1.0)
+        factors, added = self._made_of.get(value[1], ((), ()))
+        if not depth:
+            return
+        for one, other in itertools.permutations(factors or added, 2):
+            if not factors:
+                for plan in self._plans(base, factor, one, depth - 1):
+                    yield from self._plans(plan, factor, other, depth - 1)
+            elif one[0] > ALWAYS:
+                starts = self._plans(base, factor, added[0], depth - 1) if added else [base]
+                for plan in starts:
+                    yield after(plan, partial(self._times, scale, one), other, 2.0, one[0] + MULTIPLY)
 
     def _compute(self, f: sp.Expr) -> _Item:
         if f.is_Symbol:
@@ -142,7 +202,9 @@ class Schedule:
             if one[1] == "1.0":
                 return other
         first, second = sorted((a[1], b[1]))
-        return self._line(f"{first}*{second}", max(a[0], b[0]), MULTIPLY)
+        product = self._line(f"{first}*{second}", max(a[0], b[0]), MULTIPLY)
+        self._made_of.setdefault(product[1], ((a, b), ()))
+        return product
 
     def _pair(self, factors: Sequence[_Item]) -> tuple[_Item, _Item] | tuple[_Item]:
         """The product of factors as one of two, those known first multiplied first."""
@@ -176,7 +238,7 @@ class Schedule:
         ends: list[_Item] = []
         for chain in _chains(items, best)[1]:
             total: _Item | None = None
-            for time, item in chain:
+            for _, item in chain:
                 if total is None:
                     total = item[0] if len(item) == 1 else self._times(*item)
                 elif len(item) == 1:
@@ -184,8 +246,7 @@ class Schedule:
                 elif item[0][1] == "-1.0":
                     total = self._line(f"{total[1]} - {item[1][1]}", max(total[0], item[1][0]), ADD, SUMS)
                 else:
-                    text = self._fused.format(item[0][1], item[1][1], total[1])
-                    total = self._line(text, max(total[0], time), FUSED)
+                    total = self._fused_sum(item[0], item[1], total)
             assert total is not None
             heapq.heappush(ends, total)
         while len(ends) > 1:
@@ -193,7 +254,15 @@ class Schedule:
         return ends[0]
 
     def _added(self, a: _Item, b: _Item) -> _Item:
-        return self._line(f"{a[1]} + {b[1]}", max(a[0], b[0]), ADD, SUMS)
+        total = self._line(f"{a[1]} + {b[1]}", max(a[0], b[0]), ADD, SUMS)
+        self._made_of.setdefault(total[1], ((), (a, b)))
+        return total
+
+    def _fused_sum(self, a: _Item, b: _Item, c: _Item) -> _Item:
+        """a·b + c."""
+        total = self._line(self._fused.format(a[1], b[1], c[1]), max(a[0], b[0], c[0]), FUSED)
+        self._made_of.setdefault(total[1], ((a, b), (c,)))
+        return total
 
     def _line(self, text: str, start: float, latency: float, unit: str = PRODUCTS) -> _Item:
         if text not in self._names:
@@ -205,6 +274,27 @@ class Schedule:
                 self.busy[unit] += THROUGHPUT.get(latency, 1.0)
         name = self._names[text]
         return self.ready[name], name
+
+
+class _Plan(NamedTuple):
+    """A way to make a value: when it is known, at how many operations, and what writes its lines."""
+
+    time: float
+    operations: float
+    written: Callable[[], _Item]
+
+
+def _paced(time: float, operations: float) -> float:
+    return max(time + BETWEEN_STAGES, operations / OVERLAPPED) + operations / MANY
+
+
+def _best(plans: Iterable[_Plan]) -> list[_Plan]:
+    """The plans to which no other is equal or better in both costs, the one known soonest first."""
+    best: list[_Plan] = []
+    for plan in sorted(plans, key=lambda plan: plan[:2]):
+        if not best or plan.operations < best[-1].operations:
+            best.append(plan)
+    return best
 
 
 def _factors(product: sp.Expr) -> list[sp.Expr]:

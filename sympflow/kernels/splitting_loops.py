@@ -132,13 +132,13 @@ class SplittingLoops:
             )
         self._system: ref[HamiltonianSystem] | None = ref(system)  # which keeps these loops
         self._has_curvature = system.symbols is not None or system.local is not None
-        self._variants: dict[tuple[int, bool, Monomials, bool, Ranges], LoopFunctions] = {}
+        self._variants: dict[tuple[int, bool, Monomials, bool, Ranges | None], LoopFunctions] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes, with the ranges, for which the system would be asked."""
         return vars(self) | {"_ranges": self._ranges, "_system": None}
 
-    def kernel(self, scheme: Scheme, compensated: bool = False, ranges: Ranges = ()) -> SplittingKernel:
+    def kernel(self, scheme: Scheme, compensated: bool = False, ranges: Ranges | None = None) -> SplittingKernel:
         """The loops of one scheme.
 
         Parameters
@@ -160,11 +160,17 @@ class SplittingLoops:
         return bool(self.values) and self.friction is None and takes_values(level)
 
     def functions(
-        self, level: int, compensated: bool, monomials: Monomials = (), varied: bool = False, ranges: Ranges = ()
+        self,
+        level: int,
+        compensated: bool,
+        monomials: Monomials = (),
+        varied: bool = False,
+        ranges: Ranges | None = None,
     ) -> LoopFunctions:
         """The compiled functions for kicks of a level, see `Scheme`; `varied` for `VariedKernel`.
 
-        `ranges` of positions are for kicks that are faster there, see `kicks_source`, and equal but for rounding.
+        Where `ranges` of positions are given, which may be none, kicks and drifts are joined, and faster in these
+        ranges, see `kicks_source`: equal but for rounding.
 
         Raises
         ------
@@ -182,15 +188,15 @@ class SplittingLoops:
                 what = "curvature terms" if level == CURVATURE else "polynomials"
                 raise ValueError(f"`scheme` has {what}, which need a symbolic system: take one without them.")
             more: dict[str, Any] = {"varied": True} if varied else {}
-            more |= {"ranges": ranges} if ranges else {}
+            more |= {} if ranges is None else {"ranges": ranges}
             self._variants[variant] = self._compile(level, compensated, monomials, **more)
         return self._variants[variant]
 
-    def ranges(self, level: int, compensated: bool) -> Ranges:
+    def ranges(self, level: int, compensated: bool) -> Ranges | None:
         """The positions of the system's domain, for `functions` of a flow: none where they would change nothing."""
-        if compensated or level not in (FORCE_GRADIENT, CURVATURE):
-            return ()
-        return self._ranges
+        if compensated or not self._has_ranges:
+            return None
+        return self._ranges if level in (FORCE_GRADIENT, CURVATURE) else ()
 
     @cached_property
     def _ranges(self) -> Ranges:
@@ -222,7 +228,8 @@ class SplittingLoops:
         monomials: Monomials = (),
         t: ArrayLike = 0.0,
         varied: bool = False,
-        ranges: Ranges = (),
+        ranges: Ranges | None = None,
+        rows: np.ndarray | None = None,
     ) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
 
@@ -242,13 +249,15 @@ class SplittingLoops:
             True if the values of its parameters follow each state in its row.
         ranges
             Of positions: see `functions`.
+        rows : ndarray, optional
+            `rows` of the table, where the caller keeps them.
         """
         y = given(y)
         out = np.empty((len(y), 2 * self.ndof))
         x, h = given(x), given(h)
         t = given(np.broadcast_to(t, h.shape)) if self.driven else h
         functions = self.functions(table.level, False, monomials, varied, ranges)
-        functions.step_rows(self.rows(table, varied=varied), x, h, t, y, out)
+        functions.step_rows(self.rows(table, varied=varied) if rows is None else rows, x, h, t, y, out)
         return out
 
 
@@ -257,7 +266,9 @@ class SplittingKernel(Kernel):
 
     saves_finite = True
 
-    def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool = False, ranges: Ranges = ()) -> None:
+    def __init__(
+        self, loops: SplittingLoops, scheme: Scheme, compensated: bool = False, ranges: Ranges | None = None
+    ) -> None:
         self.loops, self.scheme, self.compensated, self._ranges = loops, scheme, compensated, ranges
         self._width = 2 * loops.ndof * (1 + compensated)
 

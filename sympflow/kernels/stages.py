@@ -482,24 +482,23 @@ def stages_source(
     friction: DampedDrift | None = None,
     n_parameters: int = 0,
     driving: TimedNumbers | None = None,
+    joined: bool = False,
 ) -> str:
-    """``stage`` of the text `loops`, a kick and a drift of one trajectory."""
+    """``stage`` of the text `loops`, a kick and a drift of one trajectory; `joined`, these are one function."""
+    head = "@njit(**OPTIONS, forceinline=True)\ndef stage(q, p, q_error, p_error, numbers, a, j, work):\n    "
+    if joined:
+        bodies = [[f"q, p = {k.name}_and_drifted(q, p, work, j, a)", "return q, p, q_error, p_error"] for k in kinds]
+        return head + _cases(kinds, "numbers[{0}] != 0.0", bodies)
     given = "numbers, " if n_parameters else ""
-    drifted = f"return move(q, q_error, drift(p, a, {given}work))"
+    move = f"q, q_error = move(q, q_error, drift({{p}}, {{a}}, {given}work))"
     if scheduled:
-        drifted = f"return drifted(q, p, {given}a), q_error"
-    move = f"q, q_error = drift_by(q, {{p}}, q_error, {given}{{a}}, work)"
+        move = f"q = drifted(q, {{p}}, {given}{{a}})"
     moved = [move.format(p="p", a="a")] if friction is None else friction.drifted(move)
     end = [*moved, "return q, p, q_error, p_error"]
     begin = ["fill_coefficients(numbers, work[j])"] if driving is not None and scheduled else []
-    return f"""@njit(**OPTIONS, forceinline=True)
-def drift_by(q, p, q_error, {given}a, work):
-    {drifted}
-
-
-@njit(**OPTIONS, forceinline=True)
-def stage(q, p, q_error, p_error, numbers, a, j, work):
-    {_cases(kinds, "numbers[{0}] != 0.0", [[*begin, *kick.application(scheduled, False), *end] for kick in kinds])}"""
+    return head + _cases(
+        kinds, "numbers[{0}] != 0.0", [[*begin, *kick.application(scheduled, False), *end] for kick in kinds]
+    )
 
 
 def _rows_before_values(kinds: Sequence[Kick], friction: DampedDrift | None) -> int:

@@ -104,7 +104,8 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     starts = tried_starts(system, domain, curvature=False)
     try:
         ranges = position_ranges(system.symbols, domain) if system.autonomous else ()
-        costs = [kick_cycles(system.symbols, level, ranges) for level in (0, FORCE_GRADIENT, CURVATURE)]
+        joined = system.autonomous and system.friction is None
+        costs = [kick_cycles(system.symbols, level, ranges, joined) for level in (0, FORCE_GRADIENT, CURVATURE)]
     except ValueError:  # H has no compiled form
         return Trial(starts[0], math.inf)
     session, found = Session() if session is None else session, dict[Primed, Trial]()

@@ -160,6 +160,46 @@ def test_kicks_in_ranges_of_positions_are_the_same_but_for_rounding(name, level)
         np.testing.assert_allclose(lane, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
 
 
+MATRIX = HamiltonianSystem.from_sympy("3*p1**2/4 + p1*p2/2 + p2**2/3 + q1**4/4 + q1**2*q2**2/3 + q2**2/2")
+JOINED = {
+    "henon_heiles": (systems.henon_heiles(), ()),
+    "quartic": (systems.quartic(), ()),
+    "matrix": (MATRIX, ()),
+    **{name: (make(), ranges) for name, (make, ranges) in RANGED.items()},
+}
+
+
+@pytest.mark.parametrize("level", [0, FORCE_GRADIENT, CURVATURE])
+@pytest.mark.parametrize("name", JOINED)
+def test_kicks_joined_with_drifts_are_the_same_but_for_rounding(name, level):
+    system, ranges = JOINED[name]
+    functions = ELEMENTARY | {"fast_exp": math.exp, "fast_tanh": math.tanh}
+    source = kicks_source(system.symbols, level, ranges=ranges if level else (), joined=True)
+    exec(source, functions)
+    rng = np.random.default_rng(3)
+    numbers = rng.normal(size=level + 1) * [0.5, 0.05, 0.005][: level + 1]
+    table = np.empty((1, functions["N_COEFFICIENTS"]))
+    functions["fill_coefficients"](numbers, table[0])
+    kind = {0: "", FORCE_GRADIENT: "gradient_", CURVATURE: "curvature_"}[level]
+    for q in rng.uniform(-0.4, 0.4, (5, system.ndof)) + np.array([[0.0]] * 4 + [[3.0 if ranges else 0.0]]):
+        p, a = rng.normal(size=system.ndof), 0.3
+        moved, kicked = functions[f"{kind}kicked_and_drifted"](q, p, table, 0, a)
+        expected = functions[f"{kind}kicked_lane"](q, p, numbers)
+        scale = np.abs(expected).max() + np.abs(q).max()
+        np.testing.assert_allclose(kicked, expected, rtol=0, atol=1e-14 * scale)
+        np.testing.assert_allclose(moved, functions["drifted"](q, expected, a), rtol=0, atol=1e-14 * scale)
+
+
+def test_drifts_do_not_wait_for_the_kicks_that_they_are_joined_with():
+    """Beside the old state, the new q is made of no new p: only products and sums that come before."""
+    source = kicks_source(systems.henon_heiles().symbols, FORCE_GRADIENT, joined=True)
+    body = source.partition("def gradient_kicked_and_drifted(")[2].partition("return ")
+    q, p = body[2].splitlines()[0].strip("()").split(", ), (")
+    made = {line.split(" = ")[0].strip(): line for line in body[0].splitlines() if " = " in line}
+    for new in q.split(", "):
+        assert not any(name in made[new] for name in p.rstrip(", )").split(", "))
+
+
 def test_kinks_have_no_ranges():
     system = HamiltonianSystem.from_sympy("p**2/2 + Abs(q)", domain=Box([-1, -1], [1, 1]))
     assert position_ranges(system.symbols, system.domain) == ()

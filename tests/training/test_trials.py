@@ -20,8 +20,9 @@ QUICK = {"STARTS": 2, "STEPS": 20, "FINAL_STEPS": 20, "POINTS": 40, "LENGTH": 50
 
 @pytest.mark.parametrize("system", [HH, PENDULUM, systems.quartic()], ids=lambda s: s.name)
 def test_each_term_makes_a_kick_dearer(system):
-    cycles = [kick_cycles(system.symbols, level) for level in range(3)]
-    assert 0 < cycles[0] < cycles[1] < cycles[2]
+    for joined in (False, True):
+        cycles = [kick_cycles(system.symbols, level, joined=joined) for level in range(3)]
+        assert 0 < cycles[0] < cycles[1] < cycles[2]
 
 
 def law(monkeypatch, error):
@@ -67,7 +68,7 @@ def test_a_map_that_keeps_the_energy_alone_is_no_candidate(monkeypatch):
 
 def test_curvature_is_taken_where_its_error_is_worth_its_cycles(monkeypatch):
     """Kicks that are r times dearer must make the error r⁶ times less."""
-    plain, bent = (kick_cycles(HH.symbols, level) for level in (1, 2))
+    plain, bent = (kick_cycles(HH.symbols, level, joined=True) for level in (1, 2))
     needed = (bent / plain) ** trials.ORDER
     for gain, taken in ((1.1 * needed, True), (0.9 * needed, False)):
         chosen = law(monkeypatch, lambda x, c, gain=gain: 1e-9 * x**12 / (gain if c else 1.0))
@@ -105,7 +106,7 @@ def test_steps_divide_round_times(unit):
 @pytest.mark.parametrize("seconds", [1e-8, 3e-8])
 def test_what_kicks_take_is_measured_where_estimates_do_not_decide(monkeypatch, seconds):
     """Errors by which the estimates are equal: curvature terms that take longer than that are left, others taken."""
-    plain, bent = (kick_cycles(HH.symbols, level) for level in (1, 2))
+    plain, bent = (kick_cycles(HH.symbols, level, joined=True) for level in (1, 2))
     measured = {False: 1e-8, True: seconds}
     monkeypatch.setattr(trials, "_kick_seconds", lambda flow, *_: measured[flow])
     monkeypatch.setattr(trials, "SHAPES", ())
