@@ -70,7 +70,8 @@ def main() -> None:
     if options.json:
         options.json.write_text(json.dumps({NAME: found}, indent=1), encoding="utf-8")
     if not options.search:
-        body = fragment([row for row in found["rows"] if row is not None], {NAME: "Lennard-Jones"})
+        rows = [{**row, "sites": options.bodies} for row in found["rows"] if row is not None]
+        body = fragment(rows, {NAME: "Lennard-Jones"}, "bodies")
         fragments.write(options.out, "large-clusters", body)
         print(body)
 
