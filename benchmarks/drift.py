@@ -7,8 +7,8 @@
 The slope of the relative energy error is fitted to the means over 20 blocks of the run, and its standard error to their
 scatter (`sympflow.energy_drift`). A flow passes if |slope|·T ≤ max(3 standard errors · T, 10 ε √N), N steps of Δt in T,
 with ε the rounding unit. The orbit starts at the `y0` of the scene, but for Hénon–Heiles, whose y0 is chaotic: there it
-is near the periodic orbit along q1; and for the Toda and sine-Gordon chains, whose solitons leave the domain: there it
-is a wave. A thousand states count, at equal times. A flow that fails does not pass.
+is near the periodic orbit along q1; and for lattices, whose solitons leave the domain or whose waves are unstable:
+there it is another wave. A thousand states count, at equal times. A flow that fails does not pass.
 """
 
 # ruff: noqa: E402
@@ -38,6 +38,7 @@ REGULAR = {
     "henon_heiles": [0.0, 0.1, 0.35, 0.0],  # E = 0.0659: near the periodic orbit in the q1 direction
     "toda_chain": [*np.zeros(128), *0.45 * np.sin(2 * np.pi * np.arange(128) / 16)],  # not one soliton: a wave
     "fput_beta": [*np.zeros(64), *0.45 * np.sin(2 * np.pi * np.arange(64) / 16)],  # its y0 is unstable
+    "phi4": [*np.ones(16), *0.1 * np.cos(2 * np.pi * (np.arange(16) + 0.5) / 16)],  # in one well
     "sine_gordon": [*np.zeros(16), *0.3 * np.sin(2 * np.pi * np.arange(16) / 16)],  # as long as the ring: stable
 }
 
@@ -58,6 +59,7 @@ def scenes() -> list[HamiltonianSystem]:
         systems.toda_chain(),
         systems.fput_beta(),
         systems.sine_gordon(n=16, length=16.0, accuracy=2),
+        systems.phi4(n=16, length=16.0, accuracy=2),
     ]
 
 

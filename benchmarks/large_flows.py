@@ -2,16 +2,16 @@
 
     python benchmarks/large_flows.py [--out docs/measured]
     python benchmarks/large_flows.py --only fput_beta,toda_chain  some of the lattices
-    python benchmarks/large_flows.py --fit --flows folder       flows that are fitted first, and kept in a folder
+    python benchmarks/large_flows.py --flows folder             with the flows of a folder beside those that ship
     python benchmarks/large_flows.py --json found.json --search   numbers of steps alone, to be timed when all is quiet
-    python benchmarks/large_flows.py --sites 8192               another size of chains and, squared, of sheets
+    python benchmarks/large_flows.py --sites 10000              another size of chains and, squared, of sheets
 
-Lattices of 1024 sites at energy densities of 0.02 to 0.2 above rest. The flows are those that ship, and those of a
-folder; `--fit` fits them by the seeded recipes below, each on 6 or 4 × 4 sites. The Δt of the recipes were chosen on
-other states. The error is the largest of the energy up to
-T = 100, relative to the energy above rest, the median over a few held-out states of the lattice. For each target every
-scheme, and every flow with steps of a quarter of its Δt and longer, gets the fewest steps that meet it. Then they run
-in turn over T = 1000, one thread, one state of which the end is kept: the least process time of several.
+Lattices of 1024 sites at energy densities of 0.02 to 0.2 above rest. The flows are those that ship, fitted on 6 or
+4 × 4 sites by the recipes of `sympflow/training/shipped/rows.py`, whose Δt were chosen on other states. The error is
+the largest of the energy up to T = 100, relative to the energy above rest, the median over a few held-out states of the
+lattice. For each target every scheme, and every flow with steps of a quarter of its Δt and longer, gets the fewest
+steps that meet it. Then they run in turn over T = 1000, one thread, one state of which the end is kept: the least
+process time of several.
 
 A second table says how much longer a kick takes that has a force gradient.
 """
@@ -54,34 +54,27 @@ MOST = 5000  # forces up to T of a scheme that is in the race
 SHIPPED = Path(sympflow.__file__).parent / "pretrained"
 
 
-def _ladder(*steps: tuple[float, int, tuple[int, ...] | None], processor: int = 12) -> tuple[Primed, ...]:
-    """Flows with these Δt and kicks, those with force gradients by number; None for all."""
-    return tuple(Primed(dt, n, processor, force_gradient=which) for dt, n, which in steps)
-
-
-SOME = 6, (1, 4)
-"""Six kicks of which two have force gradients: where a gradient takes as long as a force."""
 PHI4 = {"onsite": "(q**2 - 1)**2/4", "bond": "r**2/2"}
-LATTICES: dict[str, tuple[str, dict[str, Any], int, tuple[Primed, ...]]] = {
-    "fput_beta": ("FPUT-β", {"bond": "r**2/2 + r**4/4"}, 1, _ladder((0.76, *SOME), (0.355, *SOME))),
-    "phi4": ("φ⁴", PHI4, 1, _ladder((0.98, *SOME), (0.46, *SOME))),
-    "phi4_sheet": ("φ⁴, two axes", PHI4, 2, _ladder((0.7, 3, (1,)), (0.7, *SOME))),
-    "toda_chain": ("Toda", {"bond": "exp(-r) + r - 1"}, 1, _ladder((1.65, 4, None))),
-    "sine_gordon": ("sine-Gordon", {"onsite": "1 - cos(q)", "bond": "r**2/2"}, 1, ()),
+LATTICES: dict[str, tuple[str, dict[str, Any], int]] = {
+    "fput_beta": ("FPUT-β", {"bond": "r**2/2 + r**4/4"}, 1),
+    "phi4": ("φ⁴", PHI4, 1),
+    "phi4_sheet": ("φ⁴, two axes", PHI4, 2),
+    "toda_chain": ("Toda", {"bond": "exp(-r) + r - 1"}, 1),
+    "sine_gordon": ("sine-Gordon", {"onsite": "1 - cos(q)", "bond": "r**2/2"}, 1),
 }
-"""Title, terms, number of axes, and the flows that `--fit` fits beside those that ship. The fastest frequency is 2 to
-3.2."""
+"""Title, terms and number of axes. The fastest frequency is 2 to 3.2."""
 FIT: dict[str, Any] = {"restarts": 12, "energy_weight": 300.0, "label_times": 2, "steps": 300, "runs": 48}
+"""Options of the fit of a flow that does not ship."""
 
 
 def lattice(name: str, sites: int) -> HamiltonianSystem:
-    _, terms, axes, _ = LATTICES[name]
+    _, terms, axes = LATTICES[name]
     n = sites if axes == 1 else round(sites ** (1 / axes))
     return HamiltonianSystem.lattice(**terms, shape=(n,) * axes, name=name, domain=LatticeStates(DENSITY))
 
 
 def flows_of(
-    system: HamiltonianSystem, folder: Path, ladder: Sequence[Primed], fit: Mapping[str, Any] = FIT
+    system: HamiltonianSystem, folder: Path, ladder: Sequence[Primed] = (), fit: Mapping[str, Any] = FIT
 ) -> list[PrimedFlow]:
     """The flows of a system that ship or are in a folder, where those of a ladder are fitted first if they are not."""
     for start in ladder:
@@ -109,8 +102,8 @@ class Race:
     rest: float = 0.0
 
     @classmethod
-    def of(cls, system: HamiltonianSystem, folder: Path, ladder: Sequence[Primed], **more: Any) -> Race:
-        flows = [Runner.of_flow(flow, system) for flow in flows_of(system, folder, ladder)]
+    def of(cls, system: HamiltonianSystem, folder: Path, **more: Any) -> Race:
+        flows = [Runner.of_flow(flow, system) for flow in flows_of(system, folder)]
         return cls(system, flows, schemes(system), **more)
 
     def error(self, y0: np.ndarray, runner: Runner, n: int) -> float:
@@ -224,7 +217,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", help=f"some of {', '.join(LATTICES)}, with commas")
     parser.add_argument("--flows", type=Path, default=SHIPPED, help="folder of flows beside those that ship")
-    parser.add_argument("--fit", action="store_true", help="fit the flows that are not there, and keep them")
     parser.add_argument("--sites", type=int, default=1024)
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--json", type=Path, help="file for what is found; what is in it is not measured again")
@@ -236,8 +228,7 @@ def main() -> None:
     for name in names:
         mine = found.setdefault(name, {})
         if "rows" not in mine:
-            ladder = LATTICES[name][3] if options.fit else ()
-            entrants = Race.of(lattice(name, options.sites), options.flows, ladder)
+            entrants = Race.of(lattice(name, options.sites), options.flows)
             mine.setdefault("steps", [entrants.steps(target) for target in TARGETS])
             if not options.search:
                 of_targets = zip(TARGETS, mine["steps"], strict=True)

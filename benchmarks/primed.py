@@ -10,11 +10,11 @@
 
 The flows are those that the package ships, or those in `--flows`. For each target each of them, and each scheme, gets
 the fewest steps (for a flow, of at most its Δt and at least a quarter of it) with which the median error over 20
-held-out states is no larger; the flow that is then the fastest is the row. Everything runs in the same compiled loops,
-in turn, on one thread: one trajectory of which the end is kept; one of which 1000 outputs are kept, with the processor
-executed at each; and a batch of 1000. On Kepler's problem the logarithmic methods (log_leapfrog, log_blanes_moan4,
-log_kahan_li8) and the flow with a trained clock race as well, through `solve`, with steps of at most 0.5; the exact
-linear flows of `linear_*` do not.
+held-out states is no larger; the flow that is then the fastest is the row. In each column the fastest flow is compared
+with the fastest scheme. Everything runs in the same compiled loops, in turn, on one thread: one trajectory of which the
+end is kept; one of which 1000 outputs are kept, with the processor executed at each; and a batch of 1000. On Kepler's
+problem the logarithmic methods (log_leapfrog, log_blanes_moan4, log_kahan_li8) and the flow with a trained clock race
+as well, through `solve`, with steps of at most 0.5; the exact linear flows of `linear_*` do not.
 """
 
 # ruff: noqa: E402

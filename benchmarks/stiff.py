@@ -93,7 +93,7 @@ def run_scheme(system: HamiltonianSystem, method: Any, n: int) -> Run:
     """n steps over T, 1000 outputs on the grid."""
     save = np.linspace(0, n, INSTANTS + 1).round().astype(np.int64)
     loops = partial(method_loops(system, method), T_END / n, system.y0, n, save)
-    call = partial(solve, system, replace(method, dt=T_END / n), t_eval=T_END / n * save)
+    call = partial(solve, system, replace(method, dt=T_END / n), t_eval=np.minimum(T_END / n * save, T_END))
     scheme = method.scheme
     forces, hessians = n * scheme.force_evaluations, n * scheme.hessian_evaluations
     turn = T_END / n * system.params["omega"]
@@ -104,7 +104,7 @@ def run_flow(system: HamiltonianSystem, flow: Any) -> Run:
     n = round(T_END / flow.dt)
     save = np.linspace(0, n, INSTANTS + 1).round().astype(np.int64)
     loops = partial(flow_loops(system, flow).one, flow.dt, system.y0, n, save)
-    call = partial(solve, system, flow, t_eval=flow.dt * save)
+    call = partial(solve, system, flow, t_eval=np.minimum(flow.dt * save, T_END))
     counts = flow.evaluations(n, 0, 0, "compiled")
     turn = flow.dt * system.params["omega"]
     cost = counts["force_evaluations"], counts["hessian_evaluations"]

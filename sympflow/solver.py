@@ -233,7 +233,8 @@ def _answered(integrator: Integrator, problem: Problem, action: str, rows: Param
 def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     """The solution of a validated problem."""
     system, y_start = problem.system, problem.y0
-    integrator = integrator.resolved(system, y_start, abs(problem.t1 - problem.t0))
+    n_times = 0 if problem.t_eval is None else len(problem.t_eval)
+    integrator = integrator.resolved(system, y_start, abs(problem.t1 - problem.t0), n_times)
     check_applies(integrator, system, y_start)
     integrator.check_library(y_start)
     if not system.autonomous:

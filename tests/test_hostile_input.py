@@ -31,6 +31,10 @@ OSCILLATOR = systems.harmonic_oscillator()  # every method applies to it, and ha
 ESCAPE = systems.henon_heiles_escape()
 METHODS = [m for m in available() if m in NAMES]  # other tests register more
 FLOWS = ("sympflow", "mlp")
+OTHERS = [m for m in METHODS if m not in KINDS]
+EACH = [*KINDS, *(pytest.param(m, marks=pytest.mark.slow) for m in OTHERS)]
+"""Methods one by one; those whose kind another one shows are long tests."""
+SEVERAL = [pytest.param(KINDS, id="a method of each kind"), pytest.param(OTHERS, id="others", marks=pytest.mark.slow)]
 
 
 class Loud:
@@ -409,12 +413,13 @@ def test_arguments(row):
     assert_each(outcomes, error, message)
 
 
+@pytest.mark.parametrize("methods", SEVERAL)
 @pytest.mark.parametrize("row", CALLABLES)
-def test_callables(row):
+def test_callables(row, methods):
     """Every method that takes the same system with a sound function; the others refuse it for the same reason."""
     make, function, error, message = CALLABLES[row]
     system, outcomes, failed = make(function), [], {}
-    for method in [m for m in METHODS if m not in FLOWS]:
+    for method in [m for m in methods if m not in FLOWS]:
         backend = "auto" if method == "verlet" else "array"  # Numba functions are compiled anew for each kernel
         sound = of_the_sound(make, method)
         got = caught(lambda m=method, b=backend: solve(system, m, (0, 0.5), backend=b))
@@ -527,12 +532,13 @@ def test_driven_and_damped(row):
     assert_each([(row, (None, None), caught(ask))], error, message)
 
 
-def test_every_method_solves_a_drive_and_friction_or_says_why_not():
+@pytest.mark.parametrize("methods", SEVERAL)
+def test_every_method_solves_a_drive_and_friction_or_says_why_not(methods):
     """None leaves one of them out."""
     wrong = {}
     for system in (DRIVEN, DAMPED, BOTH):
         truth = solve(system, "dop853", t_eval=[0.8], rtol=1e-10, atol=1e-12).y
-        for method in METHODS:
+        for method in methods:
             got = caught(lambda s=system, m=method: solve(s, m, t_eval=[0.8], backend="array"))
             if isinstance(got, Exception):
                 says = re.match(r"`system` '\w+' (has friction|is driven|has no )", str(got))
@@ -544,7 +550,7 @@ def test_every_method_solves_a_drive_and_friction_or_says_why_not():
     assert not wrong, wrong
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", EACH)
 def test_blow_up_is_reported(method):
     """Above the escape energy of Hénon and Heiles the solution ends at t*: status −1, and no state that is not finite.
 

@@ -234,7 +234,7 @@ def race(
         times["one"][flow.name],
     )  # fmt: skip
     for kind, of in times.items():
-        mine = min(of[r.name] for r in near if r in own) if kind == "batch" else of[flow.name]
+        mine = min(of[r.name] for r in near if r in own)
         rivals = {r.name: of[r.name] for r in near if r not in own}
         row.rival[kind] = min(rivals, key=rivals.__getitem__)
         row.faster[kind] = rivals[row.rival[kind]] / mine

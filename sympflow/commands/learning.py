@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sympflow.commands.console import Quiet, out, print_table, ready_file, reporting, show
+from sympflow.commands.words import Usage, one_scene
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.system import HamiltonianSystem
     from sympflow.learning.trajectories import Trajectories
 
 
@@ -21,6 +23,14 @@ def learn(
     noise: Annotated[float | None, typer.Option(help="Standard deviation of the data. Default: estimated.")] = None,
     period: Annotated[float | None, typer.Option(help="Of all q, if these are angles.")] = None,
     damping: Annotated[bool, typer.Option("--damping", help="Learn a rate of friction as well.")] = False,
+    separable: Annotated[
+        bool | None,
+        typer.Option("--separable/--not-separable", help="H = T(p) + V(q), or known not to be. Default: by the data."),
+    ] = None,
+    mass: Annotated[str | None, typer.Option(help="M of T = p²/2M, one number or d of them, as 1,2.5.")] = None,
+    known: Annotated[
+        str | None, typer.Option(help="A system that is a part of H, as own.toml or pendulum; the rest is learned.")
+    ] = None,
     family: Annotated[
         str | None, typer.Option(help="The only family of models, as polynomial, network or sympflow. Default: all.")
     ] = None,
@@ -48,6 +58,8 @@ def learn(
       sympflow learn pendulum.csv --period 360 --unit t=ms --plot report.png
 
       sympflow learn spring.parquet --damping --time-budget 60
+
+      sympflow learn orbits.csv --mass 1,2.5 --known own.toml --family polynomial
     """
     with reporting(ctx):
         from sympflow.learning.learner import learn as learn_flow
@@ -63,7 +75,10 @@ def learn(
             dt=dt,
             noise=noise,
             period=period,
+            separable=separable,
+            mass=_masses(mass),
             damping=damping,
+            known=_known(known),
             family=family,
             loss=loss,
             seed=seed,
@@ -102,6 +117,25 @@ def _units(given: list[str] | None) -> dict[str, str]:
             raise ValueError(f"`--unit` must be a column and its unit, as t=ms; got {one!r}.")
         made[name] = unit
     return made
+
+
+def _masses(given: str | None) -> float | list[float] | None:
+    """One mass for all coordinates, or one for each."""
+    if given is None:
+        return None
+    try:
+        masses = [float(number) for number in given.split(",")]
+    except ValueError:
+        raise ValueError(f"`--mass` must be a number, or numbers with commas, as 1,2.5; got {given!r}.") from None
+    return masses[0] if len(masses) == 1 else masses
+
+
+def _known(word: str | None) -> HamiltonianSystem | None:
+    """The part of H that is known."""
+    try:
+        return None if word is None else one_scene([word]).system
+    except ValueError as error:
+        raise Usage(str(error).replace("`system`", "`--known`")) from error
 
 
 def _draw(flow: Any, runs: Trajectories, seed: int, path: Path) -> None:

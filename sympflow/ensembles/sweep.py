@@ -149,7 +149,7 @@ def ensemble(
     if fixed:
         system = system.with_params(**fixed)
     first = orbits.states(0, min(len(orbits), SHORTEST_CHUNK))
-    integrator = integrator.resolved(system, first, abs(t1 - t0))
+    integrator = integrator.resolved(system, first, abs(t1 - t0), 0 if times is None else len(times))
     check_applies(integrator, system, first)
     for system_of in _telling(system, axes):
         kept.check(system_of)

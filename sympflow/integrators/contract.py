@@ -242,8 +242,11 @@ class Integrator:
         if is_tensor(y0) and self.arrays_only:
             raise TypeError(f"`y0` is a tensor, but method {self.name!r} {self.arrays_only}.")
 
-    def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> Integrator:
-        """Return the integrator that runs from y0 over a time `length`, where the method leaves a choice."""
+    def resolved(self, system: HamiltonianSystem, y0: Array, length: float, n_times: int = 0) -> Integrator:
+        """Return the integrator that runs from y0 over a time `length`, where the method leaves a choice.
+
+        `n_times` is the number of given times at which states are asked for.
+        """
         return self
 
     @property

@@ -35,7 +35,9 @@ from sympflow.kernels.carry import Carry
 T = TypeVar("T")
 
 SEARCH, SEARCH_OF_EACH = 50_000, 2_000
-"""Forces that take as long as finding the outputs of a run, or of each trajectory in a batch, by their times."""
+"""Forces that take as long as what a run in another time needs besides, and each trajectory in a batch."""
+AT_A_TIME, AT_A_TIME_OF_EACH = 25, 200
+"""Forces that take as long as finding the state of one trajectory, or of each in a batch, at a physical time."""
 _KNOWN: dict[tuple[Any, ...], Any] = {}
 
 
@@ -341,10 +343,11 @@ class SympFlowIntegrator(FlowIntegrator):
         """True for a flow that was given and is one in another time."""
         return self.flow is not None and self.flow.origin is not None
 
-    def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> FixedStep:
+    def resolved(self, system: HamiltonianSystem, y0: Array, length: float, n_times: int = 0) -> FixedStep:
         """Return the integrator that runs: with `tol`, over a `length` that is worth it, a flow in another time.
 
         So does a flow in another time of this system that is given. A `tol` that no other meets is worth any length.
+        The more of its states are asked for at given times, the longer that is.
         """
         if self.flow is not None:
             return self._given_in_another_time(system)
@@ -356,7 +359,8 @@ class SympFlowIntegrator(FlowIntegrator):
             return self
         flow, shift, saved = other
         trajectories = y0.size // y0.shape[-1]
-        if trajectories * length * saved < SEARCH + SEARCH_OF_EACH * trajectories:
+        of_each = SEARCH_OF_EACH + n_times * (AT_A_TIME if trajectories == 1 else AT_A_TIME_OF_EACH)
+        if trajectories * length * saved < SEARCH + of_each * trajectories:
             return self
         check_start(flow, system, y0, False)
         return LogSympFlow(flow=flow, shift=shift)
@@ -480,7 +484,7 @@ class LogSympFlow(FixedStep):
             return self.shift
         return checked_shift(self.flow.origin.shift)
 
-    def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> LogSympFlow:
+    def resolved(self, system: HamiltonianSystem, y0: Array, length: float, n_times: int = 0) -> LogSympFlow:
         """Return the integrator with the flow that ships for the system unless one is given, and its shift."""
         if self.flow is not None:
             return self

@@ -60,7 +60,7 @@ class _Scipy(RungeKutta):
         if self.max_steps is not None:
             check_counts(max_steps=self.max_steps)
 
-    def resolved(self, system: HamiltonianSystem, y0: Array, length: float) -> Self:
+    def resolved(self, system: HamiltonianSystem, y0: Array, length: float, n_times: int = 0) -> Self:
         if self.first_step is not None and self.first_step > length > 0:
             raise ValueError(
                 f"`first_step` {self.first_step:g} exceeds the interval, of length {length:g}: reduce it, or leave it "

@@ -184,10 +184,14 @@ class PrimedFlowKernel(Kernel):
         return Steps(out)
 
     def _stepped(self, h: np.ndarray, y: np.ndarray, back: bool, t: ArrayLike) -> np.ndarray:
-        tables = self._tables
-        return self._splitting.step_rows(
-            tables.polynomials(back), tables.variable(h), h, y, tables.monomials, t, ranges=self._ranges
-        )
+        tables, loops = self._tables, self._splitting
+
+        def make() -> tuple[StageTable, np.ndarray]:
+            table = tables.polynomials(back)
+            return table, loops.rows(table)
+
+        table, rows = tables.kept(("rows", back, loops.values), make)
+        return loops.step_rows(table, tables.variable(h), h, y, tables.monomials, t, ranges=self._ranges, rows=rows)
 
     def _kernel(self, h: float) -> SplittingKernel:
         """K_h, or for h < 0 its inverse."""

@@ -266,8 +266,8 @@ class PartsKernel(Kernel):
         rollout, mixed = loops.functions(sequence).rollout, loops.mixed
         codes, table = loops.run_table(sequence, h, t0)
 
-        def steps(start: np.ndarray, *rest: Any) -> int:
-            return rollout(codes, table, start, mixed, *rest)
+        def steps(start: np.ndarray, n_steps: int, save: np.ndarray, out: np.ndarray, *rest: Any) -> int:
+            return rollout(codes, table, start, mixed, n_steps, save, out.T, *rest)  # one type, of a single output too
 
         out = np.empty((len(y0), len(save))).T  # each component in one piece, as a solution has them
         start, work = loops.modes(y0), len(codes) * loops.parts.ndof

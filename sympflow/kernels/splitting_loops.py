@@ -229,6 +229,7 @@ class SplittingLoops:
         t: ArrayLike = 0.0,
         varied: bool = False,
         ranges: Ranges | None = None,
+        rows: np.ndarray | None = None,
     ) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
 
@@ -248,13 +249,15 @@ class SplittingLoops:
             True if the values of its parameters follow each state in its row.
         ranges
             Of positions: see `functions`.
+        rows : ndarray, optional
+            `rows` of the table, where the caller keeps them.
         """
         y = given(y)
         out = np.empty((len(y), 2 * self.ndof))
         x, h = given(x), given(h)
         t = given(np.broadcast_to(t, h.shape)) if self.driven else h
         functions = self.functions(table.level, False, monomials, varied, ranges)
-        functions.step_rows(self.rows(table, varied=varied), x, h, t, y, out)
+        functions.step_rows(self.rows(table, varied=varied) if rows is None else rows, x, h, t, y, out)
         return out
 
 

@@ -490,19 +490,15 @@ def stages_source(
         bodies = [[f"q, p = {k.name}_and_drifted(q, p, work, j, a)", "return q, p, q_error, p_error"] for k in kinds]
         return head + _cases(kinds, "numbers[{0}] != 0.0", bodies)
     given = "numbers, " if n_parameters else ""
-    drifted = f"return move(q, q_error, drift(p, a, {given}work))"
+    move = f"q, q_error = move(q, q_error, drift({{p}}, {{a}}, {given}work))"
     if scheduled:
-        drifted = f"return drifted(q, p, {given}a), q_error"
-    move = f"q, q_error = drift_by(q, {{p}}, q_error, {given}{{a}}, work)"
+        move = f"q = drifted(q, {{p}}, {given}{{a}})"
     moved = [move.format(p="p", a="a")] if friction is None else friction.drifted(move)
     end = [*moved, "return q, p, q_error, p_error"]
     begin = ["fill_coefficients(numbers, work[j])"] if driving is not None and scheduled else []
-    return f"""@njit(**OPTIONS, forceinline=True)
-def drift_by(q, p, q_error, {given}a, work):
-    {drifted}
-
-
-{head}{_cases(kinds, "numbers[{0}] != 0.0", [[*begin, *kick.application(scheduled, False), *end] for kick in kinds])}"""
+    return head + _cases(
+        kinds, "numbers[{0}] != 0.0", [[*begin, *kick.application(scheduled, False), *end] for kick in kinds]
+    )
 
 
 def _rows_before_values(kinds: Sequence[Kick], friction: DampedDrift | None) -> int:

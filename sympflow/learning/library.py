@@ -275,9 +275,11 @@ def library_for(terms: Any, ndof: int, degree: int, states: np.ndarray) -> tuple
     Raises
     ------
     ValueError
-        If an expression is none of the coordinates, or not finite at the states.
+        If there are no terms, or an expression is none of the coordinates, or not finite at the states.
     """
     given = LIBRARIES if terms is None else [terms] if isinstance(terms, str | sp.Expr) else list(terms)
+    if not given:
+        raise ValueError(f"`terms` is an empty list: name terms, or some of {', '.join(LIBRARIES)}, or leave it out.")
     near = _near_the_centre(states[:, :ndof])
     expressions: list[sp.Expr] = []
     named: set[sp.Expr] = set()

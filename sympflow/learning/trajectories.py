@@ -490,6 +490,8 @@ def _opened(path: Path) -> Any:
         raise FileNotFoundError(f"`data` names the file {str(path)!r}, which does not exist: check the path.")
     if ending in (".csv", ".tsv", ".txt"):
         pandas = imported("pandas", "Reading a table")
+        if ending == ".csv":
+            _check_commas(path)
         return pandas.read_csv(path, sep=None if ending == ".txt" else "\t" if ending == ".tsv" else ",", comment="#")
     if ending in (".parquet", ".pq"):
         pandas = imported("pandas", "Reading a table")
@@ -505,6 +507,17 @@ def _opened(path: Path) -> Any:
     if ending in (".nc", ".netcdf"):
         return xarray.load_dataset(path)
     raise ValueError(f"`data` names a file {ending or 'without an ending'}: .csv, .parquet, .nc and .zarr are read.")
+
+
+def _check_commas(path: Path) -> None:
+    """Refuse a CSV file whose columns are separated by semicolons, as where numbers have decimal commas."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        names = next((line for line in file if line.strip() and not line.startswith("#")), "")
+    if ";" in names and "," not in names:
+        raise ValueError(
+            f"`data` names the file {str(path)!r}, whose columns are separated by semicolons: write it with commas, "
+            "and points in numbers, or give the table of pandas.read_csv(path, sep=';', decimal=',')."
+        )
 
 
 def _of_table(

@@ -79,7 +79,10 @@ class EnergyRuns(Fit):
     @np.errstate(all="ignore")  # of tables that are far from the exact flow
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
         check()
-        self.table.assign(self.parameters(theta))
+        wanted = self.parameters(theta)
+        if not np.isfinite(wanted).all():  # of a step that overflowed
+            return np.full(len(self._x) * (len(self._save) - 1), np.inf)
+        self.table.assign(wanted)
         kernel, n = self.flow.kernel_for(self.system), int(self._save[-1])
         H = self.system.hamiltonian(kernel.run_batch(self.flow.dt, self._x, n, self._save)[0])
         return ((H[:, 1:] - self._H[:, None]) / self._scale[:, None]).ravel()

@@ -310,6 +310,10 @@ def test_a_tolerance_takes_it_where_it_is_the_faster_one():
     assert max_energy_error(long) < 1e-12
     for options in ({"t_span": (0.0, 1.0)}, {"t_span": (0.0, 2000.0), "compensated": True, "t_eval": [2000.0]}):
         assert solve(kepler, "sympflow", tol=1e-8, **options).integrator.name == "sympflow"
+    rows = kepler.domain.sample(30, seed=1)
+    for times, name in ((2, "log_sympflow"), (400, "sympflow")):  # in another time each output is searched for
+        options = {"y0": rows, "t_eval": np.linspace(0.0, 400.0, times)}
+        assert solve(kepler, "sympflow", (0.0, 400.0), tol=1e-6, **options).integrator.name == name
     tensor = torch.as_tensor(kepler.y0)
     assert isinstance(solve(kepler, "sympflow", (0.0, 0.1), y0=tensor, tol=1e-8).y, torch.Tensor)
     with pytest.raises(ValueError, match=r"^`y0` is outside the domain"):

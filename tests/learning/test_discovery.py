@@ -113,6 +113,8 @@ def test_bad_arguments_are_refused():
     for argument, value in (("degree", 1.5), ("most_terms", 0), ("seed", -1)):
         with pytest.raises(ValueError, match=f"`{argument}` must be an integer"):
             sympflow.discover(data, **{argument: value})
+    with pytest.raises(ValueError, match="`terms` is an empty list: name terms, or some of polynomials, "):
+        sympflow.discover(data, [])
     with pytest.raises(ValueError, match=r"`terms` has 'x\*\*2': `expression` holds x"):
         sympflow.discover(data, ["x**2"])
     with pytest.raises(ValueError, match=r"`terms` has 'q2', which holds q2: write it in q1 … q1"):

@@ -273,6 +273,8 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
         "--unit",
         "t=ms",
         "--damping",
+        "--separable",
+        *("--mass", "2.5", "--known", "pendulum", "--family", "polynomial"),
         "--out",
         str(to),
         "--plot",
@@ -283,9 +285,20 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
     assert "3 trajectories, 18 points" in found.output
     assert "noise = 0.0" in found.output
     assert asked["damping"] is True
+    assert (asked["separable"], asked["mass"], asked["family"]) == (True, 2.5, "polynomial")
+    assert asked["known"].name == "pendulum"
     assert asked["span"] < 2.0  # seconds
     assert sympflow.load(to).figures == noisy.figures
     assert plot.stat().st_size > 10_000
+    assert CliRunner().invoke(app, [*arguments, "--mass", "1,2", "--not-separable"]).exit_code == 0
+    assert (asked["separable"], asked["mass"]) == (False, [1.0, 2.0])
+    for option, message in (
+        ("--mass", "`--mass` must be a number, or numbers with commas"),
+        ("--known", "`--known` 'nonsense' is unknown"),
+    ):
+        found = CliRunner().invoke(app, [*arguments, option, "nonsense"])
+        assert found.exit_code == 2
+        assert message in " ".join(found.output.split())
 
 
 @pytest.mark.parametrize(

@@ -290,6 +290,7 @@ SCENES = [
     systems.spring_pendulum(1e6, coordinates="polar"),
     LADDERS["duffing"][0].system(),
     LADDERS["sine_gordon"][0].system(),
+    LADDERS["phi4"][0].system(),
 ]
 
 

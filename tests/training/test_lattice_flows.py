@@ -115,6 +115,20 @@ def test_a_fit_to_long_runs_keeps_the_energy_of_other_states(flow, monkeypatch):
     np.testing.assert_allclose(*numbers, atol=0.02)
 
 
+def test_a_table_that_overflowed_is_as_bad_as_can_be(flow):
+    """And is left out of the flow: a search that took too long a step goes on."""
+    lattice = ring(12, domain=LatticeStates(0.2))
+    mine = flow.of_any_size(lattice)
+    runs = energy_runs.EnergyRuns(mine, lattice, lattice.domain.sample(2), 0.0, 1.0)
+    theta = runs.start()
+    before = runs.residuals(theta)
+    after = runs.residuals(np.full_like(theta, np.nan))
+    assert np.isfinite(before).all()
+    assert after.shape == before.shape
+    assert np.isinf(after).all()
+    np.testing.assert_array_equal(runs.residuals(theta), before)
+
+
 def test_long_runs_are_of_lattices_that_keep_their_energy(flow):
     lattice = ring(domain=LatticeStates(0.2))
     with pytest.raises(ValueError, match=r"^`runs` must be a positive integer; got 0"):

@@ -32,6 +32,7 @@ def fill_lanes(Y, width, table, j):
 
     There are one or at least three terms. Returns how many numbers the kick has.
     """
+    widest_vectors()
     last, n = table.shape[2] - 1, numbers_that_apply(table, j)
     for i in range(n + 1):
         row, factor, c0 = A + i, POWERS[i], table[i, j, 0]

@@ -168,23 +168,27 @@ def step_lanes(table, x, h, t, y, out):
 
     All numbers lie in one array: of several the compiler would have to find out that they do not overlap.
     """
+    widest_vectors()
     rows = NUMBERS + N_NUMBERS + N_VALUES
-    Y = aligned_zeros(rows * LANES).reshape((rows, LANES))
-    for block_start in range(0, y.shape[0], LANES):
-        count = min(LANES, y.shape[0] - block_start)
+    Y = aligned_zeros(rows * MANY_LANES).reshape((rows, MANY_LANES))
+    for block_start in range(0, y.shape[0], MANY_LANES):
+        count = min(MANY_LANES, y.shape[0] - block_start)
         width = (count + VECTOR - 1) // VECTOR * VECTOR
+        if N_VALUES > 0:
+            for lane in range(width):
+                i = block_start + min(lane, count - 1)
+                q, p = unpack(y[i])
+                pack_lane(q, p, Y, lane)
+                for k in range(N_VALUES):
+                    Y[NUMBERS + N_NUMBERS + k, lane] = y[i, 2 * NDOF + k]
+        else:
+            load_rows(y, block_start, count, Y)
         for lane in range(width):
             i = block_start + min(lane, count - 1)
-            q, p = unpack(y[i])
-            pack_lane(q, p, Y, lane)
             Y[X, lane], Y[H, lane], Y[H3, lane], Y[H5, lane] = x[i], h[i], h[i] ** 3, h[i] ** 5
-            for k in range(N_VALUES):
-                Y[NUMBERS + N_NUMBERS + k, lane] = y[i, 2 * NDOF + k]
         for j in range(table.shape[1]):
             stage_each(Y, width, table, j)
-        for lane in range(count):
-            q, p = unpack_lane(Y, lane)
-            pack(q, p, out[block_start + lane])
+        store_rows(Y, block_start, count, out)
 
 
 @njit(**OPTIONS)

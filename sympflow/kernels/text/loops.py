@@ -50,7 +50,7 @@ def close(q, p, q_error, p_error, table, k, work):
     """The end of step k, from the running state before its last stage, which is left as it is."""
     q, p, q_error, p_error = copy(q), copy(p), copy(q_error), copy(p_error)
     last = columns_of(table) - 1
-    q, p, _, _ = called_stage(q, p, q_error, p_error, numbers_of(table, last, k), drift_of(table, last), last, work)
+    q, p, _, _ = stage(q, p, q_error, p_error, numbers_of(table, last, k), drift_of(table, last), last, work)
     return q, p
 
 

@@ -34,13 +34,13 @@ def closed(x, y, codes, table, in_modes, k):
 
 
 @njit(**OPTIONS)
-def rollout(codes, table, y0, in_modes, n_steps, save, out, stop, first, running):
-    """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``.
+def rollout(codes, table, y0, in_modes, n_steps, save, columns, stop, first, running):
+    """`n_steps` steps from `y0` (2d,), the states after ``save[i]`` steps into ``columns[:, i]``.
 
     Returns the index of the last step that ends in a finite state; rows of later steps are NaN. Ends early, with
     rows unset, when another thread sets ``stop[0]``.
     """
-    link = len(codes) - 2
+    link, out = len(codes) - 2, columns.T
     x, y = unpack(y0)
     n, saved, begin, longest = first, 0, link if first > 0 else 0, CHECK_EVERY
     while saved < len(save) and save[saved] <= 0:

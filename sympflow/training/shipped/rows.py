@@ -26,6 +26,7 @@ from sympflow.systems import (
     harmonic_oscillator,
     henon_heiles,
     pendulum,
+    phi4,
     sine_gordon,
     spring_pendulum,
 )
@@ -128,6 +129,8 @@ def ladders() -> list[Recipe]:
         *(lattice_rung(SYSTEMS["toda-chain"], dt) for dt in (1.2, 0.7, 0.28, 0.2)),
         *(lattice_rung(SYSTEMS["fput-beta"], dt, 6) for dt in (0.8, 0.55, 0.25, 0.15)),
         *(lattice_rung(coupled_pendulums, dt, fit=LONG_RUNS) for dt in (2.1, 1.08, 0.43)),
+        lattice_rung(double_wells, 1.9, fit=LONG_RUNS),
+        *(with_few_gradients(double_wells, dt) for dt in (0.98, 0.5)),
         *(driven_rung(SYSTEMS["driven-pendulum"], 6, dt) for dt in (2.0, 1.5, 1.0, 0.8, 0.4)),
         driven_rung(SYSTEMS["driven-pendulum"], 7, 100 / 51, 9),  # of T = 100
         driven_rung(SYSTEMS["driven-pendulum"], 6, 0.5, 10, seed=2),
@@ -167,6 +170,11 @@ def coupled_pendulums(n: int) -> HamiltonianSystem:
     return sine_gordon(n=n, length=float(n), accuracy=2)
 
 
+def double_wells(n: int) -> HamiltonianSystem:
+    """The equation of φ⁴ on sites one apart: Σ p²/2 + (q² − 1)²/4 + r²/2, with free ends."""
+    return phi4(n=n, length=float(n), accuracy=2)
+
+
 LABELS_ALONE = NewFit(restarts=20, energy_weight=300.0, frozen_weight=1000.0, label_times=5)
 LONG_RUNS = NewFit(restarts=12, energy_weight=300.0, label_times=2, steps=300, runs=48)
 """Fits of flows of lattices: to labels of a few sites, and further to the energy errors of runs of a ring."""
@@ -178,6 +186,9 @@ def lattice_rung(
     processor: int = 12,
     density: tuple[float, float] = (0.02, 0.2),
     fit: NewFit = LABELS_ALONE,
+    *,
+    stages: int = 4,
+    force_gradient: tuple[int, ...] | None = None,
 ) -> Recipe:
     """A primed flow of a lattice of any n, fitted on a few sites, and judged on 256 at these energy densities.
 
@@ -187,13 +198,18 @@ def lattice_rung(
     many = partial(system, n=256)
     return Recipe(
         many().name,
-        f"primed-4-{dt:g}",
+        f"primed-{stages}-{dt:g}",
         many,
-        Primed(dt, 4, processor),
+        Primed(dt, stages, processor, force_gradient=force_gradient),
         ByCertificate(200.0, states=100, times=9, held_out=100),
         (fit,),
         partial(_at_density, density=density),
     )
+
+
+def with_few_gradients(system: Callable[..., HamiltonianSystem], dt: float) -> Recipe:
+    """A rung of six kicks of which two have force gradients: on a polynomial lattice one takes as long as a force."""
+    return lattice_rung(system, dt, fit=LONG_RUNS, stages=6, force_gradient=(1, 4))
 
 
 def _at_density(system: HamiltonianSystem, density: tuple[float, float]) -> Domain:
