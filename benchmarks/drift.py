@@ -1,6 +1,6 @@
 """No drift: the energy error of every shipped symplectic flow over a million steps, along a bounded regular orbit.
 
-    python benchmarks/drift.py                    every file, ten minutes or so on one core
+    python benchmarks/drift.py                    every file, four minutes or so on one core
     python benchmarks/drift.py --quick            20,000 steps of the flows of the pendulum
     python benchmarks/drift.py --system kepler
 

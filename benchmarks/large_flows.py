@@ -189,9 +189,9 @@ def gradients_fragment(costs: dict[str, float]) -> str:
     )
 
 
-def fragment(rows: list[dict[str, Any]], titles: Mapping[str, str]) -> str:
-    """The table of a race; titles by the names of systems."""
-    columns = ["lattice, energy error", "sites", "flow: Δt, kicks + processor", "its step", "forces saved", "run time"]
+def fragment(rows: list[dict[str, Any]], titles: Mapping[str, str], parts: str = "sites") -> str:
+    """The table of a race; titles by the names of systems, and of what they are made."""
+    columns = ["system, energy error", parts, "flow: Δt, kicks + processor", "its step", "forces saved", "run time"]
     return fragments.table(
         columns,
         [
@@ -229,7 +229,8 @@ def main() -> None:
         mine = found.setdefault(name, {})
         if "rows" not in mine:
             entrants = Race.of(lattice(name, options.sites), options.flows)
-            mine.setdefault("steps", [entrants.steps(target) for target in TARGETS])
+            if "steps" not in mine:
+                mine["steps"] = [entrants.steps(target) for target in TARGETS]
             if not options.search:
                 of_targets = zip(TARGETS, mine["steps"], strict=True)
                 mine["rows"] = [entrants.row(target, steps, options.rounds) for target, steps in of_targets]

@@ -120,6 +120,7 @@ def turn_lanes(typing_context, lanes, rows):
 @njit(**OPTIONS)
 def load_rows(y, first, count, Y):
     """Set the lanes of a block to `count` rows of y (N, 2d) from `first` on, the last of them as often as need be."""
+    widest_vectors()
     whole = count // VECTOR * VECTOR if NDOF <= MOST_SHUFFLED else 0
     if NDOF <= MOST_SHUFFLED:
         rows, lanes = y.ctypes.data + 16 * NDOF * first, Y.ctypes.data
@@ -133,6 +134,7 @@ def load_rows(y, first, count, Y):
 @njit(**OPTIONS)
 def store_rows(Y, first, count, out):
     """Write `count` lanes of a block into rows of `out` (N, 2d) from `first` on."""
+    widest_vectors()
     whole = count // VECTOR * VECTOR if NDOF <= MOST_SHUFFLED else 0
     if NDOF <= MOST_SHUFFLED:
         rows, lanes = out.ctypes.data + 16 * NDOF * first, Y.ctypes.data

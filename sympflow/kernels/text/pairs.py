@@ -82,6 +82,11 @@ def chunk_begin(chunk, n, n_chunks, in_cells):
 def fill_rows(P, row, n_rows, source, first, order):
     """Rows of the blocks, by rows of an array from `first` on."""
     for k in range(n_rows):
+        if not CUT:  # in the order that they have
+            for block in range(source.shape[1] // LANES):
+                for lane in range(LANES):
+                    P[(block * WIDTH + row + k) * LANES + lane] = source[first + k, block * LANES + lane]
+            continue
         for i in range(len(order)):
             P[(i // LANES * WIDTH + row + k) * LANES + i % LANES] = source[first + k, order[i]]
 
@@ -132,6 +137,11 @@ def sum_of_chunks(F, work):
         for k in range(len(total)):
             total[k] += F[chunk, k]
     for k in range(DIM):
+        if not CUT:
+            for block in range(A.shape[2] // LANES):
+                for lane in range(LANES):
+                    A[0, k, block * LANES + lane] = total[(block * DIM + k) * LANES + lane]
+            continue
         for i in range(len(order)):
             A[0, k, order[i]] = total[(i // LANES * DIM + k) * LANES + i % LANES]
 
