@@ -137,7 +137,7 @@ def warn_of_loss(
     if not off.any():
         return
     row = int(np.argmax(np.where(off, error, 0)))
-    which = "" if len(off) == 1 else f" of trajectory {row}, the worst of {off.sum()},"
+    which = "" if len(off) == 1 else f" of trajectory {row}, the worst of {off.sum()} such,"
     warnings.warn(
         f"The state left the domain of the flow at t = {outcome.stats['domain_exit']:.10g}, and the relative energy "
         f"error{which} is {error[row]:.2g} at t = {outcome.t[-1]:.10g}: the flow is certified for {held:.2g} inside. "

@@ -22,6 +22,7 @@ from sympflow.kernels.variations import Variations
 __all__ = ["kick_cycles", "kicks_source", "shapes"]
 
 PRODUCT = "fused_multiply_add"  # of `elementary`
+NEXT_SUM = 2.0  # cycles of a sum that waits for the result before, in kicks that are joined with drifts
 MOST_KEPT = 200  # sources
 MOST_OPERATIONS = 400  # of a kick whose shapes are tried: rewriting longer ones takes longer than it saves
 MOST_FACTORED = 160  # see `_work_of_factoring`: what takes SymPy a second or two
@@ -251,7 +252,7 @@ def _scheduled(
     Without `common` only whole factors and terms are shared, not products within products, which may be known later.
     """
     known = {**dict.fromkeys(symbols.q, 0.0), **dict.fromkeys(symbols.p, 0.0 if joined else -FUSED)}
-    schedule = Schedule(known, printed, prefix, PRODUCT)
+    schedule = Schedule(known, printed, prefix, PRODUCT, add=NEXT_SUM if joined else ADD)
     numbers: dict[sp.Expr, sp.Symbol] = {}
     states = {*symbols.q, *symbols.p, *letters}
     for letter, function in letters.items():

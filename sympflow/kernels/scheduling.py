@@ -54,6 +54,9 @@ class Schedule:
     few : bool
         Write sums with few operations, as one chain each, however long these become: for many trajectories at once.
 
+    add : float
+        Cycles of a sum of two.
+
     Attributes
     ----------
     early, lines : list of str
@@ -69,12 +72,13 @@ class Schedule:
         prefix: str = "s_",
         fused: str | None = None,
         few: bool = False,
+        add: float = ADD,
     ) -> None:
         self.early: list[str] = []
         self.lines: list[str] = []
         self.busy = {SUMS: 0.0, PRODUCTS: 0.0, DIVISIONS: 0.0}
         self.ready: dict[str, float] = {symbol.name: time for symbol, time in known.items()}
-        self._printed, self._prefix, self._few = printed, prefix, few
+        self._printed, self._prefix, self._few, self._add = printed, prefix, few, add
         self._fused = "{2} + {0}*{1}" if fused is None else fused + "({0}, {1}, {2})"
         self._names: dict[str, str] = {}
         self._values: dict[sp.Expr, _Item] = {}
@@ -234,9 +238,9 @@ class Schedule:
         else:
             items.sort(key=lambda entry: (entry[0], len(entry[1])))
         most = 1 if self._few else min(MOST_CHAINS, len(items))
-        best = min(range(1, most + 1), key=lambda n: (_chains(items, n)[0], n))
+        best = min(range(1, most + 1), key=lambda n: (_chains(items, n, self._add)[0], n))
         ends: list[_Item] = []
-        for chain in _chains(items, best)[1]:
+        for chain in _chains(items, best, self._add)[1]:
             total: _Item | None = None
             for _, item in chain:
                 if total is None:
@@ -244,7 +248,7 @@ class Schedule:
                 elif len(item) == 1:
                     total = self._added(total, item[0])
                 elif item[0][1] == "-1.0":
-                    total = self._line(f"{total[1]} - {item[1][1]}", max(total[0], item[1][0]), ADD, SUMS)
+                    total = self._line(f"{total[1]} - {item[1][1]}", max(total[0], item[1][0]), self._add, SUMS)
                 else:
                     total = self._fused_sum(item[0], item[1], total)
             assert total is not None
@@ -254,7 +258,7 @@ class Schedule:
         return ends[0]
 
     def _added(self, a: _Item, b: _Item) -> _Item:
-        total = self._line(f"{a[1]} + {b[1]}", max(a[0], b[0]), ADD, SUMS)
+        total = self._line(f"{a[1]} + {b[1]}", max(a[0], b[0]), self._add, SUMS)
         self._made_of.setdefault(total[1], ((), (a, b)))
         return total
 
@@ -309,7 +313,7 @@ def _factors(product: sp.Expr) -> list[sp.Expr]:
     return factors
 
 
-def _chains(items: Sequence[tuple[float, tuple[_Item, ...]]], n: int) -> tuple[float, list[list]]:
+def _chains(items: Sequence[tuple[float, tuple[_Item, ...]]], n: int, add: float) -> tuple[float, list[list]]:
     """When the sum is known if it is dealt out to n chains, and these."""
     chains: list[list] = [[] for _ in range(n)]
     ends = [ALWAYS] * n
@@ -321,13 +325,13 @@ def _chains(items: Sequence[tuple[float, tuple[_Item, ...]]], n: int) -> tuple[f
             ends[k] = ready + (MULTIPLY if len(item) == 2 and ready > ALWAYS else 0.0)
         else:
             start = max(ends[k], ready)
-            ends[k] = start + (FUSED if len(item) == 2 else ADD) if start > ALWAYS else ALWAYS
+            ends[k] = start + (FUSED if len(item) == 2 else add) if start > ALWAYS else ALWAYS
         chains[k].append((ready, item))
     ends = sorted(end for end, chain in zip(ends, chains, strict=True) if chain)
     chains = [chain for chain in chains if chain]
     while len(ends) > 1:
         a, b = heapq.heappop(ends), heapq.heappop(ends)
-        heapq.heappush(ends, max(a, b) + ADD)
+        heapq.heappush(ends, max(a, b) + add)
     return ends[0], chains
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -96,6 +98,11 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     domain : Domain
     session : Session, optional
         It shows the trials, and may end them: then it is the best so far.
+
+    Warns
+    -----
+    RuntimeWarning
+        If the time that the session has for trials ended them.
     """
     from sympflow.kernels.approximations import position_ranges
     from sympflow.kernels.kicks import kick_cycles
@@ -151,6 +158,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
 
         attempt(starts)
         if not found:
+            _warn_if_cut(session, 0, starts)
             return Trial(starts[0], math.inf)
         straight = best([*found])
         bent = replace(straight, curvature=True)
@@ -166,7 +174,20 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         shorter = replace(starts[max(0, starts.index(straight) - 1)], curvature=chosen.curvature)
         others = list(dict.fromkeys([*shaped(chosen), *shaped(shorter)]))
         attempt(others)
+        _warn_if_cut(session, len(found), {*starts, *others, *([bent] if bends else [])})
         return found[best([chosen, *(start for start in others if start in found)])]
+
+
+def _warn_if_cut(session: Session, n_tried: int, wanted: Collection[Primed]) -> None:
+    """Warn where the time ended the trials, not Ctrl-C: the flow may be far from what `train` finds else."""
+    if n_tried < len(wanted) and not session.interruption.asked:
+        warnings.warn(
+            f"`time_budget`: the share for trials of {session.time_budget:g} s was over, as on a busy machine, after "
+            f"{n_tried} of {len(wanted)} or more flows; another one may take far less time than that which is fitted. "
+            "Give a longer `time_budget`.",
+            RuntimeWarning,
+            stacklevel=7,
+        )
 
 
 def _kick_seconds(flow: PrimedFlow | None, system: HamiltonianSystem, domain: Domain) -> float:

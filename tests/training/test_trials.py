@@ -1,5 +1,6 @@
 """The flow that `train` fits to a system of which nothing else is said: the cost of kicks, and short trials."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,21 @@ from sympflow.training.table_fit import TableFit, TableRun
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
 QUICK = {"STARTS": 2, "STEPS": 20, "FINAL_STEPS": 20, "POINTS": 40, "LENGTH": 50}
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.02], ids=["none", "some"])
+def test_trials_that_the_time_ended_are_warned_of(monkeypatch, seconds):
+    monkeypatch.setattr("sympflow.training.session.LEAST_PART", 3.5 * seconds)
+
+    def trial(start, *_):
+        time.sleep(seconds)
+        return trials.Trial(start, 1e-8)
+
+    monkeypatch.setattr(trials, "trial", trial)
+    with pytest.warns(RuntimeWarning, match="longer `time_budget`"):
+        trials.chosen_trial(HH, HH.domain, Session(time_budget=1e-3))
+    monkeypatch.setattr(trials, "SHAPES", trials.SHAPES[:1])
+    trials.chosen_trial(HH, HH.domain, Session(time_budget=100.0))  # warnings are errors
 
 
 @pytest.mark.parametrize("system", [HH, PENDULUM, systems.quartic()], ids=lambda s: s.name)

@@ -111,12 +111,14 @@ def ladders() -> list[Recipe]:
         *(rung(hh, 3, dt, curvature=True) for dt in (1.6, 1.4, 1.0, 0.8, 0.6, 0.4)),
         rung(hh, 3, 1.75, 12, NewFit(restarts=24), curvature=True),
         # a force gradient in the kick that steps share, a curvature term besides in the one between
+        rung(hh, 2, 1.12, 12, NewFit(restarts=60), curvature=(1,), first="kick"),
         rung(hh, 2, 0.77, 12, NewFit(restarts=24), curvature=(1,), first="kick"),
         rung(swing, 2, 1.5, fit=plain),
         *(rung(swing, 3, dt, fit=plain, curvature=True) for dt in (2.0, 1.5)),
         *(rung(swing, 3, dt, curvature=True) for dt in (1.0, 0.8, 0.6, 0.4)),
         rung(quartic, 1, 0.5),
         *(rung(quartic, 3, dt) for dt in (0.75, 0.6, 0.5, 0.4)),
+        rung(quartic, 4, 0.83, 9, NewFit(restarts=40), force_gradient=(1, 3), first="kick"),
         # Beside the first for the energy, those for the state; T = 100 and 1000 are whole numbers of their Δt.
         in_powers(8, 1.0, 8, replace(followed, restarts=40, steps=400, seed=1)),
         *(in_powers(6, dt, 8, replace(of_state, restarts=24, seed=1)) for dt in (100 / 62, 100 / 96)),
