@@ -59,6 +59,7 @@ SHARE = 0.65  # of a time budget
 DEAREST = 2.0  # times the cycles of a kick without them, beyond which curvature terms are not tried
 BEHIND = 1.25  # times the estimated work of the best, beyond which kicks of another kind are not compiled and timed
 NEAR, NEAREST = 1.2, 3  # times the estimated work of the best up to which flows are timed, and how many
+CLEAR = 1.03  # times the measured work, by which another flow must be better than the best by estimate
 SURE = 1.05  # times the measured work, by which kicks with more terms must be better
 GOAL = 1e-5  # the energy error of a trial that a default flow shall not exceed, if one of those tried does not
 ALIKE = 2.0  # energy errors above that which differ by no more are the same
@@ -95,9 +96,9 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     and at the next shorter one; a larger processor must gain a twentieth. Where all errors are above 1e-5 it is the
     flow with the smallest, or of those with up to twice that the one that gains most. At last up to three that are
     within a fifth of the least work are run as compiled loops, and it is the one with the least measured time at equal
-    energy error in longer runs, outputs not counted. So where two are nearly as good the choice may differ from machine
-    to machine; `timed` says what was measured. Time has a say else only if two thirds of that of the session are not
-    enough for the trials.
+    energy error in longer runs, outputs not counted, if it gains 3 % on the best by estimate. So the choice may differ
+    from machine to machine; `timed` says what was measured. Time has a say else only if two thirds of that of the
+    session are not enough for the trials.
 
     Parameters
     ----------
@@ -186,8 +187,10 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         _warn_if_cut(session, len(found), {*starts, *others, *([bent] if bends else [])})
         work = good([chosen, *(start for start in others if start in found)])
         measured = {} if deadline.over() else _measured(work, found, system, domain)
-        ranked = measured or work
-        trial = found[min(ranked, key=ranked.__getitem__)]
+        first = min(work, key=work.__getitem__)
+        trial = found[
+            min(measured, key=lambda start: measured[start] * (1.0 if start == first else CLEAR), default=first)
+        ]
         kept = ("dt", "first", "levels", "processor")
         timed = [{**{name: getattr(start, name) for name in kept}, "work": measured[start]} for start in measured]
         return replace(trial, timed=timed)

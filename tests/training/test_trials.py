@@ -201,7 +201,7 @@ def test_only_where_nothing_is_said_there_are_trials(monkeypatch, tmp_path):
 
     def chosen(system, domain, session):
         made.append(system)
-        return trials.Trial(replace(default_primed(system), dt=1.25, curvature=True), 1e-6)
+        return trials.Trial(replace(default_primed(system), dt=1.25, curvature=True), 1e-6, timed=[{"dt": 1.25}])
 
     def start(self, *_):
         raise Started(self.flow)
@@ -215,6 +215,7 @@ def test_only_where_nothing_is_said_there_are_trials(monkeypatch, tmp_path):
     monkeypatch.setattr(TableRun, "go", start)
     flow = flow_of(seed=3)
     assert (flow.dt, flow.curvatures is not None, made) == (1.25, True, [HH])
+    assert flow.recipe == {"timed": [{"dt": 1.25}]}
     for options in ({"dt": 1.0}, {"restarts": 2}, {"points": 60}, {"time_budget": 5.0}, {"stages": 2}):
         assert flow_of(**options).curvatures is None
     assert made == [HH]
