@@ -453,7 +453,10 @@ def _new_primed(
                 return flow, None
     elif can_try and _fit_is_untold(asked, session):
         trial = trials.chosen_trial(system, domain, session)
-        return trial.start.flow(system), trial.flow
+        flow = trial.start.flow(system)
+        if trial.timed:
+            flow.recipe = {"timed": trial.timed}
+        return flow, trial.flow
     if system.separable and (dt is None or stages is None or processor is None):
         default = default_primed(system, domain, dt)
         if dt is None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import time
 import warnings
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from sympflow.training.points import USELESS, Stream, shares_missed, start_times
 from sympflow.training.session import Deadline, OutOfTime, Session
 from sympflow.training.starts import PHASE, SEED, Primed, default_primed
 from sympflow.training.table_fit import TableRun
+from sympflow.training.timing import kick_seconds, long_errors
 
 PHASES = (PHASE, 1.25, 1.5)  # ω Δt of the flows that are tried
 STARTS, STEPS, FINAL_STEPS, POINTS = 6, 40, 160, 80  # of a trial's search, and what follows the best start
@@ -57,7 +58,8 @@ MOST_NDOF = 3  # beyond which trials take too long
 SHARE = 0.65  # of a time budget
 DEAREST = 2.0  # times the cycles of a kick without them, beyond which curvature terms are not tried
 BEHIND = 1.25  # times the estimated work of the best, beyond which kicks of another kind are not compiled and timed
-TIMED, TIMES = 20_000, 5  # kicks, and how often, of which the least time counts
+NEAR, NEAREST = 1.2, 3  # times the estimated work of the best up to which flows are timed, and how many
+CLEAR = 1.03  # times the measured work, by which another flow must be better than the best by estimate
 SURE = 1.05  # times the measured work, by which kicks with more terms must be better
 GOAL = 1e-5  # the energy error of a trial that a default flow shall not exceed, if one of those tried does not
 ALIKE = 2.0  # energy errors above that which differ by no more are the same
@@ -65,11 +67,15 @@ ALIKE = 2.0  # energy errors above that which differ by no more are the same
 
 @dataclass(frozen=True)
 class Trial:
-    """The flow of a short fit, None if it leads nowhere, and its energy error."""
+    """The flow of a short fit, None if it leads nowhere, and its energy error.
+
+    Of the chosen one also those that were timed, with their measured work, for `flow.recipe["timed"]`.
+    """
 
     start: Primed
     error: float
     flow: PrimedFlow | None = None
+    timed: list[dict[str, Any]] = field(default_factory=list)
 
 
 def can_try(system: HamiltonianSystem) -> bool:
@@ -88,8 +94,11 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     quarter, measured: the loops of both flows are compiled and run, as they will be by `solve`. Then `SHAPES` are tried
     with kicks of the better kind, some of which have fewer terms or none: about as many in a unit of time as at that Δt
     and at the next shorter one; a larger processor must gain a twentieth. Where all errors are above 1e-5 it is the
-    flow with the smallest, or of those with up to twice that the one that gains most. The machine has a say in the kind
-    of the kicks alone, and time only if two thirds of that of the session are not enough for the trials.
+    flow with the smallest, or of those with up to twice that the one that gains most. At last up to three that are
+    within a fifth of the least work are run as compiled loops, and it is the one with the least measured time at equal
+    energy error in longer runs, outputs not counted, if it gains 3 % on the best by estimate. So the choice may differ
+    from machine to machine; `timed` says what was measured. Time has a say else only if two thirds of that of the
+    session are not enough for the trials.
 
     Parameters
     ----------
@@ -167,15 +176,24 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         both = [straight, bent]
         work = good(both) if bent in found else {}
         if len(work) == 2 and max(work.values()) <= BEHIND * min(work.values()) and not deadline.over():
-            measured = [_kick_seconds(found[start].flow, system, domain) for start in both]
-            if all(measured):
-                costs = [measured[0] * costs[0] / costs[FORCE_GRADIENT], measured[0], SURE * measured[1]]
+            flows = [flow for start in both if (flow := found[start].flow) is not None]
+            seconds = kick_seconds(flows, system, domain)
+            if len(seconds) == 2 and all(seconds):
+                costs = [seconds[0] * costs[0] / costs[FORCE_GRADIENT], seconds[0], SURE * seconds[1]]
         chosen = best(both) if bent in found else straight
         shorter = replace(starts[max(0, starts.index(straight) - 1)], curvature=chosen.curvature)
         others = list(dict.fromkeys([*shaped(chosen), *shaped(shorter)]))
         attempt(others)
         _warn_if_cut(session, len(found), {*starts, *others, *([bent] if bends else [])})
-        return found[best([chosen, *(start for start in others if start in found)])]
+        work = good([chosen, *(start for start in others if start in found)])
+        measured = {} if deadline.over() else _measured(work, found, system, domain)
+        first = min(work, key=work.__getitem__)
+        trial = found[
+            min(measured, key=lambda start: measured[start] * (1.0 if start == first else CLEAR), default=first)
+        ]
+        kept = ("dt", "first", "levels", "processor")
+        timed = [{**{name: getattr(start, name) for name in kept}, "work": measured[start]} for start in measured]
+        return replace(trial, timed=timed)
 
 
 def _warn_if_cut(session: Session, n_tried: int, wanted: Collection[Primed]) -> None:
@@ -190,22 +208,25 @@ def _warn_if_cut(session: Session, n_tried: int, wanted: Collection[Primed]) -> 
         )
 
 
-def _kick_seconds(flow: PrimedFlow | None, system: HamiltonianSystem, domain: Domain) -> float:
-    """The time that a kick of the flow and its share of all else take in the compiled loops; 0 if it cannot be told.
+def _measured(
+    work: dict[Primed, float], found: dict[Primed, Trial], system: HamiltonianSystem, domain: Domain
+) -> dict[Primed, float]:
+    """The measured work of those that are nearly as good as the best by estimate; none where that stands alone.
 
-    Compiling them is not lost: it is kept for the flow's first run.
+    It is the time that a unit of time takes, times e^(1/6), e the energy error in long runs, where energy is kept.
     """
-    if flow is None:
-        return 0.0
-    kicks = flow.kernel_scheme().force_evaluations
-    kernel, y0, n = flow.kernel_for(system), states(domain, 1, SEED, Stream.REFERENCE)[0], TIMED // kicks
-    least = math.inf
-    for _ in range(1 + TIMES):  # the first compiles
-        began = time.perf_counter()
-        if kernel.run(flow.dt, y0, n, np.array([n])).n_finite < n:
-            return 0.0
-        least = min(least, time.perf_counter() - began)
-    return least / (n * kicks)
+    near = [start for start in sorted(work, key=work.__getitem__) if work[start] <= NEAR * min(work.values())][:NEAREST]
+    flows = [flow for start in near if (flow := found[start].flow) is not None]
+    if len(near) < 2 or len(flows) < len(near):
+        return {}
+    seconds = kick_seconds(flows, system, domain)
+    long = system.autonomous and system.conservative
+    errors = long_errors(flows, system, domain) if long else [found[start].error for start in near]
+    return {
+        start: a_kick * len(start.levels) / start.dt * error ** (1 / ORDER)
+        for start, a_kick, error in zip(near, seconds, errors, strict=True)
+        if a_kick and math.isfinite(error)
+    }
 
 
 def tried_starts(system: HamiltonianSystem, domain: Domain, curvature: bool = True) -> list[Primed]:
