@@ -157,9 +157,10 @@ def test_the_measured_errors_are_those_of_solve():
     runs = [solve(HH, flow, (0.0, 100.0), y0=y, on_domain_exit="stop") for y in x]
     errors = [np.abs(run.energy() - run.energy()[0]).max() for run in runs]
     assert found.left == sum(run.status != 0 for run in runs)
-    assert found.energy_error.largest == pytest.approx(max(errors), rel=1e-9)
+    # single runs round a kick otherwise than batches do, and some of these orbits are chaotic
+    assert found.energy_error.largest == pytest.approx(max(errors), rel=1e-6)
     relative = [e / abs(run.energy()[0]) for e, run in zip(errors, runs, strict=True)]
-    assert found.relative_energy_error.largest == pytest.approx(max(relative), rel=1e-9)
+    assert found.relative_energy_error.largest == pytest.approx(max(relative), rel=1e-6)
 
 
 def test_long_runs_go_piece_by_piece(monkeypatch):

@@ -1,6 +1,7 @@
 """Limits of a training: a time budget that every piece of it keeps, memory, and a Δt that can be learnt."""
 
 import math
+import re
 import warnings
 
 import numpy as np
@@ -141,8 +142,10 @@ def test_labels_that_take_too_long_are_a_message_with_what_was_reached(clock, ki
 def test_no_time_for_labels_is_told_where_nothing_else_is_said(clock, dt):
     """A search that its time ends is what is meant then, but not a flow that was never fitted."""
     clock.costs_seconds(Hamiltonian, "vector_field", 0.2)
-    with pytest.warns(RuntimeWarning, match=r"^Training did not start .* kink"):
+    with pytest.warns(RuntimeWarning) as told:
         flow = train(PENDULUM, dt, time_budget=20.0, progress=False)
+    assert re.match(r"Training did not start .* kink", str(told[-1].message))
+    assert ["share for trials" in str(w.message) for w in told[:-1]] == ([True] if dt is None else [])
     assert ended_early(flow).startswith("its labels were not known")
 
 
@@ -182,10 +185,12 @@ def test_trials_take_at_most_two_thirds_of_the_time(clock, monkeypatch):
     monkeypatch.setattr(trials, "trial", trial)
     first, second, *_ = trials.tried_starts(HH, HH.domain)
     session = Session(time_budget=60.0)
-    assert trials.chosen_trial(HH, HH.domain, session).start in (first, second)
+    with pytest.warns(RuntimeWarning, match="trials of 60 s was over, .* after 3 of"):
+        assert trials.chosen_trial(HH, HH.domain, session).start in (first, second)
     assert len(taken) == 4
     clock.now = 59.5
-    assert trials.chosen_trial(HH, HH.domain, Session(time_budget=1.0)).start in (first, second)
+    with pytest.warns(RuntimeWarning, match="trials of 1 s was over"):
+        assert trials.chosen_trial(HH, HH.domain, Session(time_budget=1.0)).start in (first, second)
 
 
 # networks -----------------------------------------------------------------------------------------------------
