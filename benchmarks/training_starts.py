@@ -75,6 +75,8 @@ def main(given: list[str] | None = None) -> None:
     unknown = set(options.systems) - set(SYSTEMS)
     if unknown:
         parser.error(f"no system {', '.join(sorted(unknown))}: choose of {', '.join(SYSTEMS)}")
+    if options.before is not None and not (options.before / "sympflow" / "__init__.py").is_file():
+        parser.error(f"--before {options.before} has no package: git worktree add {options.before} 23c1e20")
     names = options.systems or (["duffing"] if options.quick else [*SYSTEMS])
     starts = 1 if options.quick else options.starts
     cases = [(name, curvature) for name in names for curvature in (False, True)]
