@@ -28,7 +28,7 @@ ALWAYS = -1000.0  # when constants are known
 UNITS = 2  # that start a multiplication each cycle, and as many for additions, on current x86-64 cores
 MOST_AHEAD = 5  # operations of a value that `Schedule.moved` takes apart
 BETWEEN_STAGES, OVERLAPPED, MANY = 2.0, 1.3, 20.0
-"""Of stages that overlap: cycles that are added to the longest chain, operations a cycle, and what these delay the
+"""Costs of overlapping stages: cycles added to the longest chain, operations a cycle, and what these delay the
 chain; a fit to measured kicks of 11 to 33 operations."""
 MOST_CHAINS = 3  # sums are split into up to so many chains, added at their ends
 FEW_TERMS = 8  # of a polynomial, of which more ways to split it are tried
