@@ -82,7 +82,6 @@ PRODUCT = _Pass(("q", "v"), _product, turns=True)
 TURN = _Pass(("q", "v"), _product, 1, turns=True)
 BEND = _Pass(("q", "v", "w"), _bent)
 _LETTERS = {"q": "x", "v": "v", "w": "w"}
-_ARRAYS = {"q": "X[0]", "v": "A[0]", "w": "A[1]"}
 
 
 class LatticeLoops(SizedLoops):
@@ -207,6 +206,7 @@ def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleTyp
     return load_algebra(
         "import numpy as np\n\n\n" + _stages_source(lattice, level, compensated, rate),
         ("sized_states", "lattice"),
+        N_VECTORS=len(_vectors(lattice)),
         N_AXES=len(lattice.shape),
         N_FIELDS=len(lattice.fields),
         N_SETS=4 if compensated else 2,
@@ -219,6 +219,20 @@ def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleTyp
     )
 
 
+def _vectors(lattice: LatticeHamiltonian) -> dict[str, str]:
+    """The vectors of a state and of the working arrays: their names in the code, and where they are.
+
+    For each field f, q_f and p_f have the errors of compensated sums, and v_f and w_f are the helpers.
+    """
+    fields = range(len(lattice.fields))
+    arrays = sum(isinstance(value, np.ndarray) for value in lattice.params.values())
+    sets = {"q": "X[0", "p": "X[1", "q_error": "X[2", "p_error": "X[3", "v": "A[0", "w": "A[1"}
+    found = {f"{name}_of_{f}": f"{of_set}, {f}]" for name, of_set in sets.items() for f in fields}
+    found |= {f"curvature_{k}": f"C[{k}]" for k in range(len(fields) * (len(fields) + 1))}
+    found |= {f"flux_{k}": f"T[{k}]" for k in range(sum(k > 1 for k in lattice.bonds) * len(fields))}
+    return found | {f"parameter_{i}": f"sites[{i}]" for i in range(arrays)}
+
+
 class _Row:
     """The places in vectors where the rows begin that a loop reads, each computed once.
 
@@ -228,24 +242,42 @@ class _Row:
     def __init__(self, lattice: LatticeHamiltonian) -> None:
         self.lines: list[str] = []
         self._names: dict[str, str] = {}
+        self._numbers = {name: k for k, name in enumerate(_vectors(lattice))}
         self.arrays = [name for name, value in lattice.params.items() if isinstance(value, np.ndarray)]
         self._letters = dict(zip(lattice.params, lattice.c, strict=True))
 
-    def at(self, array: str, start: str) -> str:
-        """Element j of a row of an array, such as "X[0, 1]", that begins at `start`."""
+    def _element(self, vector: str, start: str) -> str:
         if start not in self._names:
             self._names[start] = f"place_{len(self._names)}"
             self.lines.append(f"{self._names[start]} = np.uint64({start})")
-        return f"{array[:-1]}, {self._names[start]} + j]"
+        return f"{self._numbers[vector]}, {vector}, {self._names[start]} + j"
+
+    def at(self, vector: str, start: str) -> str:
+        """Element j of a row of a vector that begins at `start`."""
+        return f"element({self._element(vector, start)})"
+
+    def put(self, vector: str, start: str, value: str) -> str:
+        """The line that sets that element."""
+        return f"set_element({self._element(vector, start)}, {value})"
 
     def parameters(self, f: Sequence[sp.Expr], start: str) -> dict[sp.Symbol, str]:
         """The elements that hold parameters of sites, for expressions at a place."""
         used = set().union(*(each.free_symbols for each in f))
         return {
-            self._letters[name]: self.at(f"sites[{i}]", f"offset + {start}")
+            self._letters[name]: self.at(f"parameter_{i}", f"offset + {start}")
             for i, name in enumerate(self.arrays)
             if self._letters[name] in used
         }
+
+
+class _Single(_Row):
+    """The same of single elements, where a loop begins."""
+
+    def at(self, vector: str, start: str) -> str:
+        return f"{vector}[{start}]"
+
+    def put(self, vector: str, start: str, value: str) -> str:
+        return f"{vector}[{start}] = {value}"
 
 
 def _value_lines(lattice: LatticeHamiltonian) -> list[str]:
@@ -269,12 +301,11 @@ def _indented(lines: Sequence[str]) -> list[str]:
     return [f"    {line}" for line in lines]
 
 
-def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> list[str]:
+def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool, drifts: bool) -> list[str]:
     """p −= b × the slopes of the sites of planes low … high; of passes that keep M⁻¹ × these, the last one does so.
 
-    That of the accelerations keeps them and leaves p as it is, the next one makes both kicks: p is written once.
-
-    The drift is a pass of its own: made in the same one, it keeps compilers from vector instructions.
+    That of the accelerations keeps them and leaves p as it is, the next one makes both kicks: p is written once. If it
+    `drifts`, q += drift × ∇T(p) follows at each site.
     """
     body: list[str] = []
     n_fields, fields = len(lattice.fields), range(len(lattice.fields))
@@ -285,7 +316,7 @@ def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> 
     row = _Row(lattice)
     known: set[sp.Symbol] = set()
     lines: list[str] = []
-    targets: dict[str, sp.Expr] = {}
+    stored: dict[str, sp.Expr] = {}
     slopes: list[sp.Expr] = [sp.S.Zero] * n_fields
 
     def read(symbol: sp.Symbol, element: str) -> sp.Symbol:
@@ -306,11 +337,10 @@ def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> 
             read(s, element)
         for s, array in taken.items():
             read(s, row.at(array, "s"))
-        targets = {row.at(array, "s"): f for array, f in stored.items()}
         slopes = [a + b for a, b in zip(slopes, own, strict=True)]
     for (k, f), place in places.items():
-        forward = read(sp.Symbol(f"forward_{place}", real=True), row.at(f"T[{place}]", str(k)))
-        backward = read(sp.Symbol(f"backward_{place}", real=True), row.at(f"T[{place}]", "0"))
+        forward = read(sp.Symbol(f"forward_{place}", real=True), row.at(f"flux_{place}", str(k)))
+        backward = read(sp.Symbol(f"backward_{place}", real=True), row.at(f"flux_{place}", "0"))
         slopes[f] += backward - forward
     for axis in range(len(lattice.shape) - 1):
         for k, V in lattice.bonds.items():
@@ -319,20 +349,20 @@ def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool) -> 
     nearest = _Nearest.of(lattice, kind, row)
     for f in nearest.fields:
         slopes[f] += sp.Symbol(f"behind_{f}", real=True) - sp.Symbol(f"ahead_{f}", real=True)
-    lines += statements([*(f"g_{f}" for f in fields), *targets], vectorised([*slopes, *targets.values()]))
+    lines += statements([*(f"g_{f}" for f in fields), *map(_kept, stored)], vectorised([*slopes, *stored.values()]))
+    lines += [row.put(array, "s", _kept(array)) for array in stored]
     lines += [f"behind_{f} = ahead_{f}" for f in nearest.fields]
     if kind.turns:
-        lines += _impulse(lattice, row, [row.at(f"A[0, {f}]", "s") for f in fields])
-    momenta = [row.at(f"X[1, {f}]", "s") for f in fields]
-    for f in fields:
-        error = row.at(f"X[3, {f}]", "s") if compensated else None
-        if kind.turns:
-            lines += _moved(momenta[f], f"-force*impulse_{f}", error)
-        if not kind.opens:
-            lines += _moved(momenta[f], f"-b*g_{f}", error)
+        lines += _impulse(lattice, row, [row.at(f"v_of_{f}", "s") for f in fields])
+    if not kind.opens:
+        for f in fields:
+            turned = [f"-force*impulse_{f}"] if kind.turns else []
+            lines += _moved(row, "p", f, [*turned, f"-b*g_{f}"], compensated)
     if kind.keeps is not None:
         lines += _velocity(lattice, row, [f"g_{f}" for f in fields], "u")
-        lines += [f"{row.at(f'A[{kind.keeps}, {f}]', 's')} = u_{f}" for f in fields]
+        lines += [row.put(f"{'vw'[kind.keeps]}_of_{f}", "s", f"u_{f}") for f in fields]
+    if drifts:
+        lines += _drifted(lattice, row, [f"new_p_{f}" for f in fields], compensated)
     free = bool(nearest.fields) and lattice.boundary[-1] == "free"
     loop = [*row.lines, *nearest.before, f"m = {'min(n, last - 1 - s)' if free else 'n'}"]
     loop += ["for j in range(np.uint64(m)):", *_indented([*nearest.lines, *lines])]
@@ -369,7 +399,7 @@ def _with_curvatures(
     """
     V, x = (lattice.U, lattice.x) if name == "onsite" else (lattice.bonds[1], lattice.r)
     slopes = kind.slopes(V, x, lattice)
-    kept = [(f"C[{k}]", *of) for k, (potential, *of) in enumerate(_curvatures(lattice)) if potential == name]
+    kept = [(f"curvature_{k}", *of) for k, (potential, *of) in enumerate(_curvatures(lattice)) if potential == name]
     if kind.opens:
         return slopes, {array: f for array, _, _, f in kept}, {}
     if not kind.turns:
@@ -408,28 +438,32 @@ class _Nearest:
         wanted = [f for f, slope in enumerate(found) if slope != 0]
         expressions = [*(found[f] for f in wanted), *stored.values()]
 
-        def lines(at: Callable[[str, str], str], parameters: dict[sp.Symbol, str], start: str, name: str) -> list[str]:
+        def lines(
+            at: Callable[[str, str], str],
+            put: Callable[[str, str, str], str],
+            parameters: dict[sp.Symbol, str],
+            start: str,
+            name: str,
+        ) -> list[str]:
             code = [
                 f"{s} = {at(_field(vector, f), f'{start} + 1')} - {at(_field(vector, f), start)}"
                 for vector, f, s in _differences(lattice, kind, expressions)
             ]
             code += [f"{s} = {element}" for s, element in parameters.items()]
             code += [f"{s} = {at(array, start)}" for s, array in taken.items()]
-            targets = [*(f"{name}_{f}" for f in wanted), *(at(array, start) for array in stored)]
-            return code + statements(targets, vectorised(expressions))
+            targets = [*(f"{name}_{f}" for f in wanted), *map(_kept, stored)]
+            code += statements(targets, vectorised(expressions))
+            return code + [put(array, start, _kept(array)) for array in stored]
 
-        ahead = lines(row.at, row.parameters(expressions, "s"), "s", "ahead")
-        other = _Row(lattice)
-        places = {s: text.replace(" + j]", "]") for s, text in other.parameters(expressions, "s - 1").items()}
-        first = [*other.lines, *lines(lambda array, at: f"{array[:-1]}, {at}]", places, "s - 1", "behind")]
+        ahead = lines(row.at, row.put, row.parameters(expressions, "s"), "s", "ahead")
+        one = _Single(lattice)
+        first = lines(one.at, one.put, one.parameters(expressions, "s - 1"), "s - 1", "behind")
         if lattice.boundary[-1] == "free":
             first = [
                 *(f"behind_{f} = 0.0" for f in wanted),
                 "if s > first:",
-                *_indented([line.replace("place_", "first_place_") for line in first]),
+                *_indented(first),
             ]
-        else:
-            first = [line.replace("place_", "first_place_") for line in first]
         return cls(wanted, ahead, first)
 
 
@@ -446,7 +480,11 @@ def _differences(
 
 
 def _field(vector: str, f: int) -> str:
-    return f"{_ARRAYS[vector][:-1]}, {f}]"
+    return f"{vector}_of_{f}"
+
+
+def _kept(array: str) -> str:
+    return f"kept_{array}"
 
 
 def _fluxes(
@@ -471,7 +509,7 @@ def _fluxes(
     for f, _ in wanted:
         places[k, f] = len(places)
         start = f"u - s + {k}"
-        lines.append(f"{row.at(f'T[{places[k, f]}]', start)} = g_{f}")
+        lines.append(row.put(f"flux_{places[k, f]}", start, f"g_{f}"))
     body = [*head, *row.lines, "for j in range(np.uint64(m)):", *_indented(lines)]
     if free:
         for f, _ in wanted:
@@ -541,32 +579,45 @@ def _impulse(lattice: LatticeHamiltonian, row: _Row, velocities: Sequence[str]) 
     return lines + statements([f"impulse_{f}" for f in range(len(letters))], [f.xreplace(put) for f in found])
 
 
-def _moved(x: str, change: str, error: str | None) -> list[str]:
-    if error is None:
-        return [f"{x} += {change}"]
-    return [
-        f"before = {x}",
-        f"corrected = {change} - {error}",
-        "total = before + corrected",
-        f"{error} = (total - before) - corrected",
-        f"{x} = total",
-    ]
+def _moved(row: _Row, vector: str, f: int, changes: Sequence[str], compensated: bool) -> list[str]:
+    """Lines that add changes to q or p of field f at one site, and leave its value in ``new_q_f`` or ``new_p_f``."""
+    x, error = f"new_{vector}_{f}", f"{vector}_error_of_{f}"
+    lines = [f"{x} = {row.at(_field(vector, f), 's')}"]
+    if not compensated:
+        return [*lines, *(f"{x} += {change}" for change in changes), row.put(_field(vector, f), "s", x)]
+    lines.append(f"error = {row.at(error, 's')}")
+    for change in changes:
+        lines += [
+            f"corrected = {change} - error",
+            f"total = {x} + corrected",
+            f"error = (total - {x}) - corrected",
+            f"{x} = total",
+        ]
+    return [*lines, row.put(_field(vector, f), "s", x), row.put(error, "s", "error")]
+
+
+def _drifted(lattice: LatticeHamiltonian, row: _Row, momenta: Sequence[str], compensated: bool) -> list[str]:
+    """Lines for q += drift × ∇T of one site at these momenta."""
+    lines = _velocity(lattice, row, momenta, "u")
+    for f in range(len(momenta)):
+        lines += _moved(row, "q", f, [f"drift*u_{f}"], compensated)
+    return lines
 
 
 def _drift_lines(lattice: LatticeHamiltonian, compensated: bool) -> list[str]:
-    """q += b ∇T(p)."""
+    """q += drift × ∇T(p)."""
     row, fields = _Row(lattice), range(len(lattice.fields))
-    lines = [f"old_{f} = {row.at(f'X[1, {f}]', 's')}" for f in fields]
-    lines += _velocity(lattice, row, [f"old_{f}" for f in fields], "u")
-    for f in fields:
-        lines += _moved(row.at(f"X[0, {f}]", "s"), f"b*u_{f}", row.at(f"X[2, {f}]", "s") if compensated else None)
+    lines = [f"old_{f} = {row.at(_field('p', f), 's')}" for f in fields]
+    lines += _drifted(lattice, row, [f"old_{f}" for f in fields], compensated)
     return _rows_source(lattice, [*row.lines, "for j in range(np.uint64(n)):", *_indented(lines)])
 
 
 def _decay_lines(lattice: LatticeHamiltonian) -> list[str]:
     """p *= b."""
     row = _Row(lattice)
-    lines = [f"{row.at(f'X[1, {f}]', 's')} *= b" for f in range(len(lattice.fields))]
+    lines = [
+        row.put(_field("p", f), "s", f"b*{row.at(_field('p', f), 's')}") for f in range(len(lattice.fields))
+    ]
     return _rows_source(lattice, [*row.lines, "for j in range(np.uint64(n)):", *_indented(lines)])
 
 
@@ -577,51 +628,53 @@ def _stages_source(lattice: LatticeHamiltonian, level: int, compensated: bool, r
     as a pass over a hundred sites.
     """
     inside = "low, high = max(lo, begin), min(hi, end)"
+    fused = len(lattice.shape) == 1
 
-    def passed(kind: _Pass, b: str, vector: str) -> list[str]:
+    def passed(kind: _Pass, b: str, vector: str, last: bool = False) -> list[str]:
         return [
             "if not whole:",
             "    lo, hi = lo + REACH, hi - REACH",
             f"b, {inside.replace(' = ', f' = {b}, ')}",
             *_refreshed(lattice, vector),
-            *_pass_lines(lattice, kind, compensated),
+            *_pass_lines(lattice, kind, compensated, last and fused),
         ]
 
-    accelerated = ["force = table[1, column]", *passed(ACCELERATION, "force", "X[0")]
-    cases = [("table[1, column] != 0.0", passed(KICK, "table[1, column]", "X[0"))]
+    accelerated = ["force = table[1, column]", *passed(ACCELERATION, "force", "q")]
+    cases = [("table[1, column] != 0.0", passed(KICK, "table[1, column]", "q", True))]
     if level:
-        turned = [*accelerated, *passed(PRODUCT, "-table[2, column]", "A[0")]
+        turned = [*accelerated, *passed(PRODUCT, "-table[2, column]", "v", True)]
         cases.insert(0, ("table[2, column] != 0.0", turned))
     if level == CURVATURE:
-        turned = [*accelerated, *passed(TURN, "-table[2, column]", "A[0"), *passed(BEND, "table[3, column]", "A[1")]
+        turned = [*accelerated, *passed(TURN, "-table[2, column]", "v"), *passed(BEND, "table[3, column]", "w", True)]
         cases.insert(0, ("table[3, column] != 0.0", turned))
-    lines: list[str] = []
-    for condition, body in cases:
-        lines += [f"{'elif' if lines else 'if'} {condition}:", *_indented(body)]
     row = 0
     if rate:
         row = {0: 2, FORCE_GRADIENT: 3, CURVATURE: 4}[level]
-    lines += [f"b, {inside.replace(' = ', f' = table[{row}, column], ')}"]
-    lines += ["if b != 0.0:", *_indented(_drift_lines(lattice, compensated))]
+    drifts = [inside, *_drift_lines(lattice, compensated)]
+    lines = [f"drift = table[{row}, column]"]
+    for k, (condition, body) in enumerate(cases):
+        lines += [f"{'elif' if k else 'if'} {condition}:", *_indented(body)]
+    lines += [f"{'elif' if fused else 'if'} drift != 0.0:", *_indented(drifts)]
     if rate:
-        lines += [f"b = table[{row + 1}, column]", *_decay_lines(lattice)]
+        lines += [f"b, {inside.replace(' = ', f' = table[{row + 1}, column], ')}", *_decay_lines(lattice)]
     lines += ["column = column + 1 if single or column < link else 1"]
     arguments = "X, table, column, n_stages, single, work, whole, lo, hi, begin, end, geometry, sites, offset, values"
     head = [f"@njit(**OPTIONS)\ndef stages({arguments}):", "link = table.shape[1] - 2", "A, T, C = work"]
+    used = [f"{name} = {place}" for name, place in _vectors(lattice).items() if any(name in line for line in lines)]
     return "\n    ".join(
-        [*head, *_value_lines(lattice), "for _ in range(n_stages):", *_indented(lines), "return column"]
+        [*head, *_value_lines(lattice), *used, "for _ in range(n_stages):", *_indented(lines), "return column"]
     )
 
 
 def _refreshed(lattice: LatticeHamiltonian, vector: str) -> list[str]:
-    """The ghosts of a vector, before a pass over planes low … high."""
+    """The ghosts of a vector of each field, before a pass over planes low … high."""
     if len(lattice.shape) > 1:
-        array, _, place = vector.partition("[")
-        return [f"refresh({array}, {place}, low, high, begin, end, whole, geometry)"]
+        place = {"q": "X, 0", "v": "A, 0", "w": "A, 1"}[vector]
+        return [f"refresh({place}, low, high, begin, end, whole, geometry)"]
     if lattice.boundary[0] != "periodic":
         return []
     lines = [
-        f"{vector}, {f}, np.uint64({place})] = {vector}, {f}, np.uint64({other})]"
+        f"{_field(vector, f)}[np.uint64({place})] = {_field(vector, f)}[np.uint64({other})]"
         for f in range(len(lattice.fields))
         for k in range(max(lattice.bonds, default=0))
         for place, other in ((f"begin - {k + 1}", f"end - {k + 1}"), (f"end + {k}", f"begin + {k}"))

@@ -18,7 +18,40 @@ many stages from column j on, of a run or a `single` map, in place, and returns 
 # mypy: ignore-errors
 
 import numpy as np
-from numba import njit
+from numba import njit, types
+from numba.extending import intrinsic
+
+
+def apart(builder, access, k):
+    """Say of a load or a store that it is one of vector k, which shares no memory with the others."""
+    module = builder.module
+    scopes = [module.add_metadata([f"vector {i}", module.add_metadata(["lattice"])]) for i in range(N_VECTORS)]
+    access.set_metadata("alias.scope", module.add_metadata([scopes[k]]))
+    access.set_metadata("noalias", module.add_metadata(scopes[:k] + scopes[k + 1 :]))
+    return access
+
+
+@intrinsic(prefer_literal=True)
+def element(typing_context, k, x, i):
+    """x[i] of vector number k, in loops that are to become vector instructions."""
+
+    def generate(context, builder, signature, arguments):
+        place = builder.gep(context.make_array(x)(context, builder, arguments[1]).data, [arguments[2]])
+        return apart(builder, builder.load(place, align=8), k.literal_value)
+
+    return types.float64(k, x, i), generate
+
+
+@intrinsic(prefer_literal=True)
+def set_element(typing_context, k, x, i, value):
+    """x[i] = value, of the same."""
+
+    def generate(context, builder, signature, arguments):
+        place = builder.gep(context.make_array(x)(context, builder, arguments[1]).data, [arguments[2]])
+        apart(builder, builder.store(arguments[3], place, align=8), k.literal_value)
+        return context.get_dummy_value()
+
+    return types.void(k, x, i, types.float64), generate
 
 
 @njit(**OPTIONS, forceinline=True)
