@@ -29,6 +29,8 @@ LARGER_TILE = 16384
 """Sites of a tile of other lattices."""
 MARGIN = 32
 """A tile has so many times as many planes as one of its margins, so that little is computed twice."""
+ALIGNED = 8
+"""The first site of a chain, and the first of its momenta, are at multiples of so many numbers."""
 FEWEST_TILES = 8
 """Lattices of fewer tiles are executed in one piece."""
 
@@ -112,8 +114,11 @@ class LatticeLoops(SizedLoops):
         self._tiled = of_a_stage > 0 and planes >= FEWEST_TILES * tile
         self._planes = tile
         self._of_a_stage = of_a_stage
-        self._margin = max(of_a_stage, tile // MARGIN) if self._tiled else self._reach
-        self._padded = (planes + 2 * self._margin, *(n + 2 * self._reach for n in lattice.shape[1:]))
+        margin = max(of_a_stage, tile // MARGIN) if self._tiled else self._reach
+        unit = ALIGNED if len(lattice.shape) == 1 else 1
+        self._margin = -(-margin // unit) * unit
+        padded = -(-(planes + 2 * self._margin) // unit) * unit
+        self._padded = (padded, *(n + 2 * self._reach for n in lattice.shape[1:]))
         self._size = math.prod(self._padded)
         last, row = lattice.shape[-1], self._padded[-1]
         self._geometry = np.array(
@@ -130,12 +135,12 @@ class LatticeLoops(SizedLoops):
     def _padded_parameters(self) -> np.ndarray:
         """The values of parameters of sites, with ghosts: at walls those of the first and last site."""
         arrays = [v for v in self._lattice.params.values() if isinstance(v, np.ndarray)]
-        found = np.zeros((len(arrays), self._size))
+        found, margins = np.zeros((len(arrays), self._size)), self._margins()
         for row, values in zip(found, arrays, strict=True):
             padded = values
             for axis, boundary in enumerate(self._lattice.boundary):
                 widths = [(0, 0)] * values.ndim
-                widths[axis] = (self._margin if axis == 0 else self._reach,) * 2
+                widths[axis] = margins[axis], self._padded[axis] - margins[axis] - values.shape[axis]
                 padded = np.pad(padded, widths, mode="wrap" if boundary == "periodic" else "edge")
             row[:] = padded.ravel()
         return found
@@ -158,14 +163,16 @@ class LatticeLoops(SizedLoops):
             j = j + n if single else (j - 1 + n) % link + 1
         return (here, there), j
 
+    def _margins(self) -> tuple[int, ...]:
+        return (self._margin, *(self._reach,) * (len(self._lattice.shape) - 1))
+
     def _states(self) -> np.ndarray:
         return np.zeros((4 if self._compensated else 2, len(self._lattice.fields), self._size))
 
     def _inner(self, X: np.ndarray, first: int) -> np.ndarray:
         """A view of two sets without ghosts."""
         n, shape = len(self._lattice.fields), self._lattice.shape
-        margins = (self._margin, *(self._reach,) * (len(shape) - 1))
-        inside = tuple(slice(m, m + k) for m, k in zip(margins, shape, strict=True))
+        inside = tuple(slice(m, m + k) for m, k in zip(self._margins(), shape, strict=True))
         return X[first : first + 2].reshape(2, n, *self._padded)[(slice(None), slice(None), *inside)]
 
     def _load(self, y: np.ndarray, X: np.ndarray, first: int) -> None:
@@ -205,7 +212,7 @@ def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleTyp
     lattice = code.lattice
     return load_algebra(
         "import numpy as np\n\n\n" + _stages_source(lattice, level, compensated, rate),
-        ("sized_states", "lattice"),
+        ("aligned", "sized_states", "lattice"),
         N_VECTORS=len(_vectors(lattice)),
         N_AXES=len(lattice.shape),
         N_FIELDS=len(lattice.fields),

@@ -161,7 +161,7 @@ def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleTyp
     cells = [] if local.cutoff is None else [template("cells")]
     return load_algebra(
         "\n\n\n".join([*cells, *(_functions(local, kind) for kind in kinds)]),
-        ("sized_states", "barrier", "pairs"),
+        ("aligned", "sized_states", "barrier", "pairs"),
         N_SETS=4 if compensated else 2,
         N_FIELDS=local.dim,
         N_HELPERS={0: 1, FORCE_GRADIENT: 2, CURVATURE: 3}[level],

@@ -1,4 +1,4 @@
-"""Working arrays that begin where a vector register's load may. Source text, pasted before `lanes` and `flow_loops`."""
+"""Working arrays that begin where a vector register's load may. Source text, pasted before what needs them."""
 # ruff: noqa: F821
 # mypy: ignore-errors
 

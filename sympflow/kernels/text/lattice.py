@@ -156,8 +156,8 @@ def row_size(size, geometry):
 @njit(**OPTIONS)
 def workspace(size, geometry):
     row = row_size(size, geometry)
-    A, T = np.zeros((N_HELPERS, N_FIELDS, size)), np.empty((N_BONDS, row + 2 * REACH))
-    return A, T, np.empty((N_CURVATURES, size))
+    C = aligned_zeros(N_CURVATURES * size).reshape((N_CURVATURES, size))
+    return zero_state(N_HELPERS, size), np.empty((N_BONDS, row + 2 * REACH)), C
 
 
 @njit(**OPTIONS)
@@ -185,7 +185,7 @@ def sweep(X, to, table, j, n_stages, single, planes, first, last, geometry, site
     """
     stride, margin, n_planes = geometry[1], geometry[4], geometry[5]
     size = (planes + 2 * margin) * stride
-    work, local = workspace(size, geometry), np.zeros((N_SETS, N_FIELDS, size))
+    work, local = workspace(size, geometry), zero_state(N_SETS, size)
     for tile in range(first, last):
         low = tile * planes
         n = min(planes, n_planes - low)

@@ -1,4 +1,5 @@
-"""The loops of splitting methods on systems of any size, by states that are changed in place. Source text.
+"""The loops of splitting methods on systems of any size, by states that are changed in place. Source text for `lattice`
+and `pairs`, after `aligned`.
 
 A state is an array X (sets, fields, size): q, p and, if `COMPENSATED`, their errors. What is pasted with it, `lattice`
 or `pairs`, defines ``load``, ``pack``, ``workspace``, and ``in_one(X, table, j, n_stages, single, work, geometry,
@@ -17,6 +18,12 @@ CHECK_EVERY = 1024  # steps between two looks for a non-finite state, where noth
 
 # What `in_one` is called with: a literal has a type of its own, for which it and all that it calls were compiled again.
 ZERO, ONE, SINGLE, RUNNING = np.int64(0), np.int64(1), np.bool_(True), np.bool_(False)
+
+
+@njit(**OPTIONS)
+def zero_state(n_sets, size):
+    """Vectors of 0, for each field so many, the first of them where a register's load may begin."""
+    return aligned_zeros(n_sets * N_FIELDS * size).reshape((n_sets, N_FIELDS, size))
 
 
 @njit(**OPTIONS)
@@ -55,13 +62,13 @@ def rollout(table, y0, n_steps, save, out, stop, first, running, single, geometr
     """
     link = table.shape[1] - 2
     work = workspace(size, geometry)
-    X, width = np.zeros((N_SETS, N_FIELDS, size)), len(y0)
+    X, width = zero_state(N_SETS, size), len(y0)
     if single:
         load(y0, X, 0, geometry)
         in_one(X, table, ZERO, table.shape[1], SINGLE, work, geometry, sites, values)
         pack(X, 0, out[0], geometry)
         return 0
-    start_X, end_X = np.zeros((N_SETS, N_FIELDS, size)), np.zeros((N_SETS, N_FIELDS, size))
+    start_X, end_X = zero_state(N_SETS, size), zero_state(N_SETS, size)
     if first > 0:
         load(running[:width], X, 0, geometry)
         if COMPENSATED:
