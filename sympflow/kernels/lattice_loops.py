@@ -12,12 +12,13 @@ from functools import lru_cache, partial
 from types import ModuleType
 from typing import Any
 
+import llvmlite.binding
 import numpy as np
 import sympy as sp
 
 from sympflow.hamiltonian.lattice import LatticeHamiltonian
 from sympflow.kernels.codegen import statements, vectorised
-from sympflow.kernels.modules import load_algebra
+from sympflow.kernels.modules import constants_source, load_algebra, template
 from sympflow.kernels.sized_loops import SizedLoops, Team
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
@@ -31,6 +32,8 @@ MARGIN = 32
 """A tile has so many times as many planes as one of its margins, so that little is computed twice."""
 ALIGNED = 8
 """The first site of a chain, and the first of its momenta, are at multiples of so many numbers."""
+VECTOR = 8 if llvmlite.binding.get_host_cpu_features().get("avx512f", False) else 4
+"""Numbers side by side in a register."""
 FEWEST_TILES = 8
 """Lattices of fewer tiles are executed in one piece."""
 
@@ -126,7 +129,10 @@ class LatticeLoops(SizedLoops):
         )
         self._shared = self._geometry, self._padded_parameters(), values
         module = _module(_definition(lattice), level, compensated, rate)
-        arguments = (self._geometry, self._size, *self._shared[1:])
+        size = self._size
+        if _in_registers(lattice, level):
+            size = (-(-planes // VECTOR) + (6 if level else 2)) * VECTOR
+        arguments = (self._geometry, size, *self._shared[1:])
         super().__init__(module, compensated, lattice.ndof, -(-planes // tile), arguments)
 
     def _padded_rows(self) -> int:
@@ -210,6 +216,19 @@ def _definition(lattice: LatticeHamiltonian) -> _Code:
 @lru_cache(maxsize=64)
 def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleType:
     lattice = code.lattice
+    if _in_registers(lattice, level):
+        return load_algebra(
+            "import numpy as np\n\n\n" + _chain_source(lattice, level, compensated, rate),
+            ("aligned", "sized_states", "chains"),
+            (f"{constants_source(VECTOR=VECTOR)}\n\n\n{template('vectors')}",),
+            VECTOR=VECTOR,
+            GHOSTS=3 if level else 1,
+            N_FIELDS=len(lattice.fields),
+            N_SETS=4 if compensated else 2,
+            PERIODIC=lattice.boundary[0] == "periodic",
+            FREE=lattice.boundary[0] == "free",
+            COMPENSATED=compensated,
+        )
     return load_algebra(
         "import numpy as np\n\n\n" + _stages_source(lattice, level, compensated, rate),
         ("aligned", "sized_states", "lattice"),
@@ -591,7 +610,7 @@ def _moved(row: _Row, vector: str, f: int, changes: Sequence[str], compensated: 
     x, error = f"new_{vector}_{f}", f"{vector}_error_of_{f}"
     lines = [f"{x} = {row.at(_field(vector, f), 's')}"]
     if not compensated:
-        return [*lines, *(f"{x} += {change}" for change in changes), row.put(_field(vector, f), "s", x)]
+        return [*lines, *(f"{x} = {x} + {change}" for change in changes), row.put(_field(vector, f), "s", x)]
     lines.append(f"error = {row.at(error, 's')}")
     for change in changes:
         lines += [
@@ -687,3 +706,160 @@ def _refreshed(lattice: LatticeHamiltonian, vector: str) -> list[str]:
         for place, other in ((f"begin - {k + 1}", f"end - {k + 1}"), (f"end + {k}", f"begin + {k}"))
     ]
     return ["if whole:", *_indented(lines)] if lines else []
+
+
+# chains in vector registers -----------------------------------------------------------------------------------------
+
+
+def _in_registers(lattice: LatticeHamiltonian, level: int) -> bool:
+    """True for chains of which the text `chains` makes the stages: bonds to the next site, and rational slopes."""
+    if len(lattice.shape) > 1 or set(lattice.bonds) != {1} or level == CURVATURE:
+        return False
+    slopes = [*_slopes(lattice.U, lattice.x, lattice), *_slopes(lattice.bonds[1], lattice.r, lattice)]
+    slopes += [sp.diff(lattice.T, s) for s in lattice.p]
+    return all(f.is_rational_function(*f.free_symbols) for f in slopes)
+
+
+class _LaneRow(_Row):
+    """Rows of sites side by side, see the text `chains`: the present one is "s", those after it "s + 1", "s + 2"."""
+
+    def at(self, vector: str, start: str) -> str:
+        return f"lanes_at({vector}, {self._place(start)})"
+
+    def put(self, vector: str, start: str, value: str) -> str:
+        return f"put_lanes({vector}, {self._place(start)}, {value})"
+
+    def parameters(self, f: Sequence[sp.Expr], start: str) -> dict[sp.Symbol, str]:
+        used = set().union(*(each.free_symbols for each in f))
+        return {
+            self._letters[name]: self.at(f"parameter_{i}", start)
+            for i, name in enumerate(self.arrays)
+            if self._letters[name] in used
+        }
+
+    @staticmethod
+    def _place(start: str) -> str:
+        return start.replace("s", "place").replace("1", "VECTOR").replace("2", "2 * VECTOR")
+
+
+def _chain_lines(lattice: LatticeHamiltonian, level: int, compensated: bool) -> list[str]:
+    """Lines of a stage with a kick: rows one after the other, first those before the segments, of which none moves.
+
+    With a force gradient the accelerations are made one row ahead of the kicks.
+    """
+    fields, row = range(len(lattice.fields)), _LaneRow(lattice)
+    free, fixed = (lattice.boundary[0] == end for end in ("free", "fixed"))
+    ahead, shift = ("s + 1", 1) if level else ("s", 0)
+
+    def named(symbols: Sequence[sp.Symbol], tag: str) -> dict[sp.Symbol, sp.Symbol]:
+        return {s: sp.Symbol(f"{s}_{tag}", real=True) for s in symbols}
+
+    def put(f: Sequence[sp.Expr], names: Sequence[str], start: str, letters: dict[sp.Symbol, sp.Symbol]) -> list[str]:
+        """The lines of expressions whose parameters are those of a row."""
+        elements = row.parameters(f, start)
+        own = {s: sp.Symbol(f"{s}_here", real=True) for s in elements}
+        lines = [f"{own[s]} = {element}" for s, element in elements.items()]
+        return lines + statements(names, [each.xreplace(letters | own) for each in f])
+
+    forces = _slopes(lattice.bonds[1], lattice.r, lattice)
+    bent = [sp.diff(f, s) for f in forces for s in lattice.r] if level else []
+    behind = [f for f in fields if forces[f] != 0]
+    lines = [f"x_{f}_next = {row.at(_field('q', f), f's + {shift + 1}')}" for f in fields]
+    lines += [f"r_{f} = x_{f}_next - x_{f}_ahead" for f in fields]
+    kept = [k for k, f in enumerate(bent) if f.free_symbols & set(lattice.r)]
+    lines += put(
+        [*(forces[f] for f in behind), *(bent[k] for k in kept)],
+        [*(f"tension_{f}_next" for f in behind), *(f"bent_{k}_next" for k in kept)],
+        ahead,
+        {},
+    )
+    if free:
+        lines += [f"tension_{f}_next = tension_{f}_next*{row.at('factors', ahead)}" for f in behind]
+    own = _slopes(lattice.U, lattice.x, lattice)
+    pulled = [sp.Symbol(f"tension_{f}", real=True) - sp.Symbol(f"tension_{f}_next", real=True) if f in behind else 0 for f in fields]
+    lines += put([a + b for a, b in zip(own, pulled, strict=True)], [f"slope_{f}_next" for f in fields], ahead, named(lattice.x, "ahead"))
+    moved: list[str]
+    if not level:
+        moved = []
+        for f in fields:
+            moved += _moved(row, "p", f, [f"-b*slope_{f}_next"], compensated)
+    else:
+        found = [sp.diff(lattice.T, s) for s in lattice.p]
+        put_in = {s: sp.Symbol(f"slope_{f}_next", real=True) for f, s in enumerate(lattice.p)}
+        lines += put(found, [f"v_{f}_next" for f in fields], ahead, put_in)
+        if fixed:
+            lines += [f"v_{f}_next = v_{f}_next*{row.at('factors', ahead)}" for f in fields]
+        n = len(fields)
+        products = [
+            sp.Add(*[
+                (sp.Symbol(f"bent_{k}", real=True) if k in kept else bent[k]) * sp.Symbol(f"relative_{g}", real=True)
+                for g in fields
+                for k in (f * n + g,)
+            ])
+            for f in fields
+        ]
+        lines += [f"relative_{f} = v_{f}_next - v_{f}" for f in fields]
+        turned = [f for f in fields if products[f] != 0]
+        lines += put([products[f] for f in turned], [f"turn_{f}_next" for f in turned], "s", {})
+        if free:
+            lines += [f"turn_{f}_next = turn_{f}_next*{row.at('factors', 's')}" for f in turned]
+        along = [
+            a + (sp.Symbol(f"turn_{f}", real=True) - sp.Symbol(f"turn_{f}_next", real=True) if f in turned else 0)
+            for f, a in enumerate(_product(lattice.U, lattice.x, lattice))
+        ]
+        moved = put(along, [f"g_{f}" for f in fields], "s", named(lattice.x, "here"))
+        for f in fields:
+            moved += _moved(row, "p", f, [f"-force*slope_{f}", f"-b*g_{f}"], compensated)
+    moved += _drifted(lattice, row, [f"new_p_{f}" for f in fields], compensated)
+    windows = [f"tension_{f}" for f in behind]
+    if level:
+        windows += [*(f"bent_{k}" for k in kept), *(f"v_{f}" for f in fields)]
+        windows += [*(f"slope_{f}" for f in fields), *(f"turn_{f}" for f in turned)]
+    after = [f"{name} = all_lanes({name}_next)" for name in windows]
+    if level:
+        after += [f"x_{f}_here = x_{f}_ahead" for f in fields]
+    after += [f"x_{f}_ahead = x_{f}_next" for f in fields]
+    nothing = windows + ([f"x_{f}_here" for f in fields] if level else [])
+    rows = 2 * shift + 1
+    return [
+        "for i in range(len(ghosts)):",
+        *_indented([f"{_field('q', f)}[ghosts[i, 0]] = {_field('q', f)}[ghosts[i, 1]]" for f in fields]),
+        *(f"{name} = all_lanes(0.0)" for name in nothing),
+        f"place = (GHOSTS - {rows}) * VECTOR",
+        *(f"x_{f}_ahead = {row.at(_field('q', f), ahead)}" for f in fields),
+        f"for k in range({rows}):",
+        f"    place = (GHOSTS - {rows} + k) * VECTOR",
+        *_indented([*lines, *after]),
+        "for k in range(rows):",
+        "    place = (GHOSTS + k) * VECTOR",
+        *_indented([*lines, *moved, *after]),
+    ]
+
+
+def _chain_source(lattice: LatticeHamiltonian, level: int, compensated: bool, rate: bool) -> str:
+    """``stages`` of the text `chains`."""
+    row, fields = _LaneRow(lattice), range(len(lattice.fields))
+    cases = [("table[1, column] != 0.0", ["b = table[1, column]", *_chain_lines(lattice, 0, compensated)])]
+    if level:
+        numbers = ["force, b = table[1, column], -table[2, column]"]
+        cases.insert(0, ("table[2, column] != 0.0", [*numbers, *_chain_lines(lattice, level, compensated)]))
+    old = [f"old_{f} = {row.at(_field('p', f), 's')}" for f in fields]
+    alone = [*old, *_drifted(lattice, row, [f"old_{f}" for f in fields], compensated)]
+    each = ["for k in range(rows):", "    place = (GHOSTS + k) * VECTOR"]
+    cases.append(("drift != 0.0", [*each, *_indented(alone)]))
+    lines = [f"drift = table[{2 + level if rate else 0}, column]"]
+    for k, (condition, body) in enumerate(cases):
+        lines += [f"{'elif' if k else 'if'} {condition}:", *_indented(body)]
+    if rate:
+        decay = [row.put(_field("p", f), "s", f"b*{row.at(_field('p', f), 's')}") for f in fields]
+        lines += [f"b = table[{3 + level}, column]", *each, *_indented(decay)]
+    lines += ["column = column + 1 if single or column < link else 1"]
+    head = [
+        "@njit(**OPTIONS)\ndef stages(X, table, column, n_stages, single, work, rows, values):",
+        "link = table.shape[1] - 2",
+        "ghosts, factors, sites = work",
+    ]
+    used = [f"{name} = {place}" for name, place in _vectors(lattice).items() if any(name in line for line in lines)]
+    return "\n    ".join(
+        [*head, *_value_lines(lattice), *used, "for _ in range(n_stages):", *_indented(lines), "return column"]
+    )

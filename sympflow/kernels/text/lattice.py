@@ -154,7 +154,7 @@ def row_size(size, geometry):
 
 
 @njit(**OPTIONS)
-def workspace(size, geometry):
+def workspace(size, geometry, sites):
     row = row_size(size, geometry)
     C = aligned_zeros(N_CURVATURES * size).reshape((N_CURVATURES, size))
     return zero_state(N_HELPERS, size), np.empty((N_BONDS, row + 2 * REACH)), C
@@ -185,7 +185,7 @@ def sweep(X, to, table, j, n_stages, single, planes, first, last, geometry, site
     """
     stride, margin, n_planes = geometry[1], geometry[4], geometry[5]
     size = (planes + 2 * margin) * stride
-    work, local = workspace(size, geometry), zero_state(N_SETS, size)
+    work, local = workspace(size, geometry, sites), zero_state(N_SETS, size)
     for tile in range(first, last):
         low = tile * planes
         n = min(planes, n_planes - low)

@@ -67,7 +67,7 @@ def room(F, meeting, size, geometry):
 
 
 @njit(**OPTIONS)
-def workspace(size, geometry):
+def workspace(size, geometry, sites):
     """The same of one thread."""
     return room(np.zeros((1, geometry[1], DIM * size)), np.zeros(3, dtype=np.int64), size, geometry)
 

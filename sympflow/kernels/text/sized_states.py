@@ -61,7 +61,7 @@ def rollout(table, y0, n_steps, save, out, stop, first, running, single, geometr
     whose value goes into ``out[0]``: a function of its own for that would be compiled as long as this one.
     """
     link = table.shape[1] - 2
-    work = workspace(size, geometry)
+    work = workspace(size, geometry, sites)
     X, width = zero_state(N_SETS, size), len(y0)
     if single:
         load(y0, X, 0, geometry)
