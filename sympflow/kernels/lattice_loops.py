@@ -223,6 +223,7 @@ def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleTyp
             (f"{constants_source(VECTOR=VECTOR)}\n\n\n{template('vectors')}",),
             VECTOR=VECTOR,
             GHOSTS=3 if level else 1,
+            COPIED=2 if level else 1,
             N_FIELDS=len(lattice.fields),
             N_SETS=4 if compensated else 2,
             PERIODIC=lattice.boundary[0] == "periodic",
@@ -822,7 +823,7 @@ def _chain_lines(lattice: LatticeHamiltonian, level: int, compensated: bool) -> 
     nothing = windows + ([f"x_{f}_here" for f in fields] if level else [])
     rows = 2 * shift + 1
     return [
-        "for i in range(len(ghosts)):",
+        f"for i in range({'len(ghosts)' if level else 'nearest'}):",
         *_indented([f"{_field('q', f)}[ghosts[i, 0]] = {_field('q', f)}[ghosts[i, 1]]" for f in fields]),
         *(f"{name} = all_lanes(0.0)" for name in nothing),
         f"place = (GHOSTS - {rows}) * VECTOR",
@@ -857,7 +858,7 @@ def _chain_source(lattice: LatticeHamiltonian, level: int, compensated: bool, ra
     head = [
         "@njit(**OPTIONS)\ndef stages(X, table, column, n_stages, single, work, rows, values):",
         "link = table.shape[1] - 2",
-        "ghosts, factors, sites = work",
+        "ghosts, nearest, factors, sites = work",
     ]
     used = [f"{name} = {place}" for name, place in _vectors(lattice).items() if any(name in line for line in lines)]
     return "\n    ".join(

@@ -6,7 +6,7 @@ as well, and what neighbours need stays in registers from row to row: a state pa
 with a force gradient too. Segments overlap where their sum is not the number of sites. What two of them hold is
 computed twice, with the same bits.
 
-Each segment has `GHOSTS` rows before and behind, copies from the segment beside it or the other end of a ring. At fixed
+Each segment has `GHOSTS` rows before and behind, `COPIED` of them copies from the segment beside it or the other end of a ring. At fixed
 ends they are 0, at free ends those of the bond before, which is taken times 0.
 
 Large chains are executed in tiles, as `lattice` says.
@@ -47,32 +47,37 @@ def width_of(n):
 
 @njit(**OPTIONS)
 def segments_of(n, low_end, high_end, whole):
-    """What the ghosts of n sites are copies of, as rows of (place, source), and the factors of the ends.
+    """What the ghosts of n sites are copies of, and the factors of the ends.
 
-    `low_end` and `high_end` say whether the chain ends there. These are factors of the sites, 0 of those beyond fixed
-    ends; where ends are free, of the bonds from each site to the next.
+    `low_end` and `high_end` say whether the chain ends there. The ghosts are rows (place, source), those of the rows
+    next to the segments first, and how many these are. The factors are of the sites, 0 of those beyond fixed ends;
+    where ends are free, of the bonds from each site to the next.
     """
-    rows, n_ghosts = rows_of(n), 0
+    rows, n_ghosts, nearest = rows_of(n), 0, 0
     ghosts, factors = np.empty((2 * GHOSTS * VECTOR, 2), dtype=np.int64), aligned_zeros(width_of(n))
-    for lane in range(VECTOR):
-        for row in range(-GHOSTS, rows + GHOSTS):
+    first, last = (0, n - 1) if FREE else (0, n)
+    for row in range(-GHOSTS, rows + GHOSTS):
+        for lane in range(VECTOR):
             site = start_of(lane, n) + row
-            first, last = (0, n) if not FREE else (0, n - 1)
             there = (site >= first or not low_end) and (site < last or not high_end)
             factors[(row + GHOSTS) * VECTOR + lane] = 1.0 if there else 0.0
-            if 0 <= row < rows:
-                continue
-            if PERIODIC and whole:
-                site = site % n
-            elif FREE and low_end and site < 0:
-                site = min(-site, n - 1)
-            elif FREE and high_end and site >= n:
-                site = max(2 * n - 2 - site, 0)
-            if 0 <= site < n:
-                ghosts[n_ghosts, 0] = (row + GHOSTS) * VECTOR + lane
-                ghosts[n_ghosts, 1] = place_of(site, n)
-                n_ghosts += 1
-    return ghosts[:n_ghosts], factors
+    for distance in range(1, COPIED + 1):
+        for row in (-distance, rows - 1 + distance):
+            for lane in range(VECTOR):
+                site = start_of(lane, n) + row
+                if PERIODIC and whole:
+                    site = site % n
+                elif FREE and low_end and site < 0:
+                    site = min(-site, n - 1)
+                elif FREE and high_end and site >= n:
+                    site = max(2 * n - 2 - site, 0)
+                if 0 <= site < n:
+                    ghosts[n_ghosts, 0] = (row + GHOSTS) * VECTOR + lane
+                    ghosts[n_ghosts, 1] = place_of(site, n)
+                    n_ghosts += 1
+        if distance == 1:
+            nearest = n_ghosts
+    return ghosts[:n_ghosts], nearest, factors
 
 
 @njit(**OPTIONS)
@@ -124,8 +129,8 @@ def from_lanes(x, n, low, high, to, first):
 @njit(**OPTIONS)
 def workspace(size, geometry, sites):
     n = geometry[5]
-    ghosts, factors = segments_of(n, True, True, True)
-    return ghosts, factors, parameters_of(sites, geometry[4], n)
+    ghosts, nearest, factors = segments_of(n, True, True, True)
+    return ghosts, nearest, factors, parameters_of(sites, geometry[4], n)
 
 
 @njit(**OPTIONS)
@@ -160,8 +165,9 @@ def sweep(X, to, table, j, n_stages, single, planes, first, last, geometry, site
         if not PERIODIC:
             begin, end = max(begin, 0), min(end, n_sites)
         n = end - begin
-        ghosts, factors = segments_of(n, not PERIODIC and begin == 0, not PERIODIC and end == n_sites, False)
-        work = ghosts, factors, parameters_of(sites, margin + begin, n)
+        low_end, high_end = not PERIODIC and begin == 0, not PERIODIC and end == n_sites
+        ghosts, nearest, factors = segments_of(n, low_end, high_end, False)
+        work = ghosts, nearest, factors, parameters_of(sites, margin + begin, n)
         local = zero_state(N_SETS, width_of(n))
         for s in range(N_SETS):
             for f in range(N_FIELDS):
