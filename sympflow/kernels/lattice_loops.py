@@ -34,6 +34,8 @@ ALIGNED = 8
 """The first site of a chain, and the first of its momenta, are at multiples of so many numbers."""
 VECTOR = 8 if llvmlite.binding.get_host_cpu_features().get("avx512f", False) else 4
 """Numbers side by side in a register."""
+HIGHEST_POWER = 16
+"""Lower powers are products, of derivatives too."""
 FEWEST_TILES = 8
 """Lattices of fewer tiles are executed in one piece."""
 
@@ -642,9 +644,7 @@ def _drift_lines(lattice: LatticeHamiltonian, compensated: bool) -> list[str]:
 def _decay_lines(lattice: LatticeHamiltonian) -> list[str]:
     """p *= b."""
     row = _Row(lattice)
-    lines = [
-        row.put(_field("p", f), "s", f"b*{row.at(_field('p', f), 's')}") for f in range(len(lattice.fields))
-    ]
+    lines = [row.put(_field("p", f), "s", f"b*{row.at(_field('p', f), 's')}") for f in range(len(lattice.fields))]
     return _rows_source(lattice, [*row.lines, "for j in range(np.uint64(n)):", *_indented(lines)])
 
 
@@ -713,12 +713,16 @@ def _refreshed(lattice: LatticeHamiltonian, vector: str) -> list[str]:
 
 
 def _in_registers(lattice: LatticeHamiltonian, level: int) -> bool:
-    """True for chains of which the text `chains` makes the stages: bonds to the next site, and rational slopes."""
+    """True for chains of which the text `chains` makes the stages: bonds to the next site, sums, products and ratios.
+
+    Other functions are faster in loops that LLVM turns into vector instructions, which is where most of the time goes.
+    """
     if len(lattice.shape) > 1 or set(lattice.bonds) != {1} or level == CURVATURE:
         return False
-    slopes = [*_slopes(lattice.U, lattice.x, lattice), *_slopes(lattice.bonds[1], lattice.r, lattice)]
-    slopes += [sp.diff(lattice.T, s) for s in lattice.p]
-    return all(f.is_rational_function(*f.free_symbols) for f in slopes)
+    terms = lattice.U, lattice.bonds[1], lattice.T
+    powers = set[sp.Expr]().union(*(f.atoms(sp.Pow) for f in terms))
+    rational = all(f.is_rational_function(*f.free_symbols) for f in terms)
+    return rational and all(abs(power.exp) < HIGHEST_POWER for power in powers)
 
 
 class _LaneRow(_Row):
@@ -746,7 +750,9 @@ class _LaneRow(_Row):
 def _chain_lines(lattice: LatticeHamiltonian, level: int, compensated: bool) -> list[str]:
     """Lines of a stage with a kick: rows one after the other, first those before the segments, of which none moves.
 
-    With a force gradient the accelerations are made one row ahead of the kicks.
+    The force of the bond to the next site is its tension. With a force gradient, slopes and M⁻¹ × these are made one
+    row ahead of the kicks, and a bond turns p by its second derivatives, its bends, along the difference of these.
+    What ends in ``_next`` goes over to the next row.
     """
     fields, row = range(len(lattice.fields)), _LaneRow(lattice)
     free, fixed = (lattice.boundary[0] == end for end in ("free", "fixed"))
@@ -775,10 +781,18 @@ def _chain_lines(lattice: LatticeHamiltonian, level: int, compensated: bool) -> 
         {},
     )
     if free:
-        lines += [f"tension_{f}_next = tension_{f}_next*{row.at('factors', ahead)}" for f in behind]
+        lines += [f"tension_{f}_next = lanes_where({row.at('there', ahead)}, tension_{f}_next)" for f in behind]
     own = _slopes(lattice.U, lattice.x, lattice)
-    pulled = [sp.Symbol(f"tension_{f}", real=True) - sp.Symbol(f"tension_{f}_next", real=True) if f in behind else 0 for f in fields]
-    lines += put([a + b for a, b in zip(own, pulled, strict=True)], [f"slope_{f}_next" for f in fields], ahead, named(lattice.x, "ahead"))
+    pulled = [
+        sp.Symbol(f"tension_{f}", real=True) - sp.Symbol(f"tension_{f}_next", real=True) if f in behind else 0
+        for f in fields
+    ]
+    lines += put(
+        [a + b for a, b in zip(own, pulled, strict=True)],
+        [f"slope_{f}_next" for f in fields],
+        ahead,
+        named(lattice.x, "ahead"),
+    )
     moved: list[str]
     if not level:
         moved = []
@@ -789,21 +803,16 @@ def _chain_lines(lattice: LatticeHamiltonian, level: int, compensated: bool) -> 
         put_in = {s: sp.Symbol(f"slope_{f}_next", real=True) for f, s in enumerate(lattice.p)}
         lines += put(found, [f"v_{f}_next" for f in fields], ahead, put_in)
         if fixed:
-            lines += [f"v_{f}_next = v_{f}_next*{row.at('factors', ahead)}" for f in fields]
+            lines += [f"v_{f}_next = lanes_where({row.at('there', ahead)}, v_{f}_next)" for f in fields]
         n = len(fields)
-        products = [
-            sp.Add(*[
-                (sp.Symbol(f"bent_{k}", real=True) if k in kept else bent[k]) * sp.Symbol(f"relative_{g}", real=True)
-                for g in fields
-                for k in (f * n + g,)
-            ])
-            for f in fields
-        ]
+        bends = [sp.Symbol(f"bent_{k}", real=True) if k in kept else f for k, f in enumerate(bent)]
+        relative = [sp.Symbol(f"relative_{f}", real=True) for f in fields]
+        products = list(sp.Matrix(n, n, bends) * sp.Matrix(relative))
         lines += [f"relative_{f} = v_{f}_next - v_{f}" for f in fields]
         turned = [f for f in fields if products[f] != 0]
         lines += put([products[f] for f in turned], [f"turn_{f}_next" for f in turned], "s", {})
         if free:
-            lines += [f"turn_{f}_next = turn_{f}_next*{row.at('factors', 's')}" for f in turned]
+            lines += [f"turn_{f}_next = lanes_where({row.at('there', 's')}, turn_{f}_next)" for f in turned]
         along = [
             a + (sp.Symbol(f"turn_{f}", real=True) - sp.Symbol(f"turn_{f}_next", real=True) if f in turned else 0)
             for f, a in enumerate(_product(lattice.U, lattice.x, lattice))
@@ -858,7 +867,7 @@ def _chain_source(lattice: LatticeHamiltonian, level: int, compensated: bool, ra
     head = [
         "@njit(**OPTIONS)\ndef stages(X, table, column, n_stages, single, work, rows, values):",
         "link = table.shape[1] - 2",
-        "ghosts, nearest, factors, sites = work",
+        "ghosts, nearest, there, sites = work",
     ]
     used = [f"{name} = {place}" for name, place in _vectors(lattice).items() if any(name in line for line in lines)]
     return "\n    ".join(

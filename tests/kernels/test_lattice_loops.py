@@ -65,6 +65,63 @@ def test_loops_make_the_steps_of_array_operations(method):
     )
 
 
+@pytest.mark.parametrize(
+    ("boundary", "method"),
+    [
+        ("free", "chin4c"),
+        pytest.param("fixed", "chin4c", marks=pytest.mark.slow),
+        pytest.param("periodic", "chin4c", marks=pytest.mark.slow),
+        pytest.param("free", "verlet", marks=pytest.mark.slow),
+    ],
+)
+def test_chains_in_vector_registers(boundary, method):
+    """Whatever the number of sites: segments of one site, of two, and such as overlap.
+
+    The force of the bonds does not vanish where r = 0, and it has a pole.
+    """
+    for n in (5, 8, 13, 40):
+        a, m = np.random.default_rng(n).uniform(0.5, 1.5, (2, n))
+        system = HamiltonianSystem.lattice(
+            onsite="a*q**4/4",
+            bond="a*r**2/2 + b*r**3/3 + 1/(2 + r)",
+            kinetic="p**2/(2*m)",
+            shape=n,
+            boundary=boundary,
+            params={"a": a, "b": 0.3, "m": m},
+        )
+        assert compared(system, method, start(system)) == LOOPS_AND_ARRAYS
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("boundary", ["free", "periodic"])
+def test_two_fields_in_vector_registers(boundary):
+    system = HamiltonianSystem.lattice(
+        onsite="u**2*v**2/2 + u**4/4",
+        bond="r_u**2/2 + r_v**2/2 + r_u**2*r_v",
+        fields=("u", "v"),
+        shape=21,
+        boundary=boundary,
+    )
+    assert compared(system, "chin4c", start(system)) == LOOPS_AND_ARRAYS
+
+
+@pytest.mark.parametrize("boundary", ["free", pytest.param("fixed", marks=pytest.mark.slow)])
+def test_tiles_of_chains_with_ends(boundary, monkeypatch):
+    """What is computed of a site is the same in tiles, to the bit: no loop has a rest that is computed otherwise."""
+
+    def make():
+        return HamiltonianSystem.lattice(
+            bond="r**2/2 + r**4/4", kinetic="m*p**2", shape=270, boundary=boundary, params=params
+        )
+
+    params = {"m": np.random.default_rng(5).uniform(0.5, 1.5, 270)}
+    y0, options = start(make()), {"t_span": (0.0, 3.0), "dt": 0.05, "t_eval": np.array([0.0, 1.5, 3.0])}
+    whole = solve(make(), "chin4c", y0=y0, **options)
+    monkeypatch.setattr(lattice_loops, "TILE", 25)
+    monkeypatch.setattr(lattice_loops, "MARGIN", 5)
+    np.testing.assert_array_equal(solve(make(), "chin4c", y0=y0, backend="compiled", **options).y, whole.y)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("boundary", [("fixed", "free"), ("periodic", "periodic")])
 def test_lattices_of_two_axes(boundary):

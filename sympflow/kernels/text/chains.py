@@ -6,8 +6,8 @@ as well, and what neighbours need stays in registers from row to row: a state pa
 with a force gradient too. Segments overlap where their sum is not the number of sites. What two of them hold is
 computed twice, with the same bits.
 
-Each segment has `GHOSTS` rows before and behind, `COPIED` of them copies from the segment beside it or the other end of a ring. At fixed
-ends they are 0, at free ends those of the bond before, which is taken times 0.
+Each segment has `GHOSTS` rows before and behind. `COPIED` of them are copies from the segment beside it or from the
+other end of a ring. Beyond walls they are 0, and what must not act there is left out.
 
 Large chains are executed in tiles, as `lattice` says.
 """
@@ -47,37 +47,33 @@ def width_of(n):
 
 @njit(**OPTIONS)
 def segments_of(n, low_end, high_end, whole):
-    """What the ghosts of n sites are copies of, and the factors of the ends.
+    """The ghosts of n sites and what they are copies of, and which sites there are.
 
-    `low_end` and `high_end` say whether the chain ends there. The ghosts are rows (place, source), those of the rows
-    next to the segments first, and how many these are. The factors are of the sites, 0 of those beyond fixed ends;
-    where ends are free, of the bonds from each site to the next.
+    `low_end` and `high_end` say whether the chain ends there. The ghosts are rows (place, source), those next to the
+    segments first, and the number of these. Sites that there are have a 1, those beyond an end a 0; where ends are
+    free, it is the bonds from each site to the next.
     """
     rows, n_ghosts, nearest = rows_of(n), 0, 0
-    ghosts, factors = np.empty((2 * GHOSTS * VECTOR, 2), dtype=np.int64), aligned_zeros(width_of(n))
+    ghosts, there = np.empty((2 * GHOSTS * VECTOR, 2), dtype=np.int64), aligned_zeros(width_of(n))
     first, last = (0, n - 1) if FREE else (0, n)
     for row in range(-GHOSTS, rows + GHOSTS):
         for lane in range(VECTOR):
             site = start_of(lane, n) + row
-            there = (site >= first or not low_end) and (site < last or not high_end)
-            factors[(row + GHOSTS) * VECTOR + lane] = 1.0 if there else 0.0
+            within = (site >= first or not low_end) and (site < last or not high_end)
+            there[(row + GHOSTS) * VECTOR + lane] = 1.0 if within else 0.0
     for distance in range(1, COPIED + 1):
         for row in (-distance, rows - 1 + distance):
             for lane in range(VECTOR):
                 site = start_of(lane, n) + row
                 if PERIODIC and whole:
                     site = site % n
-                elif FREE and low_end and site < 0:
-                    site = min(-site, n - 1)
-                elif FREE and high_end and site >= n:
-                    site = max(2 * n - 2 - site, 0)
                 if 0 <= site < n:
                     ghosts[n_ghosts, 0] = (row + GHOSTS) * VECTOR + lane
                     ghosts[n_ghosts, 1] = place_of(site, n)
                     n_ghosts += 1
         if distance == 1:
             nearest = n_ghosts
-    return ghosts[:n_ghosts], nearest, factors
+    return ghosts[:n_ghosts], nearest, there
 
 
 @njit(**OPTIONS)
@@ -129,8 +125,8 @@ def from_lanes(x, n, low, high, to, first):
 @njit(**OPTIONS)
 def workspace(size, geometry, sites):
     n = geometry[5]
-    ghosts, nearest, factors = segments_of(n, True, True, True)
-    return ghosts, nearest, factors, parameters_of(sites, geometry[4], n)
+    ghosts, nearest, there = segments_of(n, True, True, True)
+    return ghosts, nearest, there, parameters_of(sites, geometry[4], n)
 
 
 @njit(**OPTIONS)
@@ -166,8 +162,8 @@ def sweep(X, to, table, j, n_stages, single, planes, first, last, geometry, site
             begin, end = max(begin, 0), min(end, n_sites)
         n = end - begin
         low_end, high_end = not PERIODIC and begin == 0, not PERIODIC and end == n_sites
-        ghosts, nearest, factors = segments_of(n, low_end, high_end, False)
-        work = ghosts, nearest, factors, parameters_of(sites, margin + begin, n)
+        ghosts, nearest, there = segments_of(n, low_end, high_end, False)
+        work = ghosts, nearest, there, parameters_of(sites, margin + begin, n)
         local = zero_state(N_SETS, width_of(n))
         for s in range(N_SETS):
             for f in range(N_FIELDS):

@@ -43,7 +43,7 @@ def define(operation, name):
 
     @infer_global(operation)
     class Typing(ConcreteTemplate):
-        cases = [signature(LANES, *pair) for pair in pairs]
+        cases = tuple(signature(LANES, *pair) for pair in pairs)
 
     def generate(context, builder, signature, arguments):
         return getattr(builder, name)(*(spread(builder, value) for value in arguments), flags=("contract",))
@@ -60,7 +60,7 @@ define(operator.truediv, "fdiv")
 
 @infer_global(operator.neg)
 class Negation(ConcreteTemplate):
-    cases = [signature(LANES, LANES)]
+    cases = (signature(LANES, LANES),)
 
 
 @lower_builtin(operator.neg, LANES)
@@ -76,6 +76,19 @@ def all_lanes(typing_context, value):
         return spread(builder, arguments[0])
 
     return LANES(value), generate
+
+
+@intrinsic
+def lanes_where(typing_context, there, value):
+    """Lanes as they are where others are not 0, and 0 where these are."""
+
+    def generate(context, builder, signature, arguments):
+        nothing = ir.Constant(REGISTER, [0.0] * VECTOR)
+        return builder.select(
+            builder.fcmp_unordered("!=", arguments[0], nothing), spread(builder, arguments[1]), nothing
+        )
+
+    return LANES(there, value), generate
 
 
 def address(context, builder, x, arguments):
