@@ -3,15 +3,15 @@
 One step of the exact flow on a few sites tells little of what a large lattice does to its energy in a thousand. The
 modified energy that a flow keeps differs from H by terms that hardly change in a step, such as the actions of waves
 whose frequencies are a bit wrong; these change as waves exchange energy, and a few sites have few wave lengths. So the
-table at Δt, found by labels, is fitted further: to the errors of H in runs from many states of a ring, or of a cluster.
-The labels stay as a weak bound. Then the table is made to vary with t as little as may be, so that steps somewhat
-shorter than Δt keep energy as well.
+best few tables at Δt that labels find are fitted further, to the errors of H in runs from many states of a ring, or of
+a cluster: which of them is best is not seen in a step. The labels stay as a weak bound. Then the table is made to vary
+with t as little as may be, so that steps somewhat shorter than Δt keep energy as well.
 """
 
 from __future__ import annotations
 
+import copy
 import math
-import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,26 +19,21 @@ import numpy as np
 from sympflow.flow.primed import PrimedFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.options import check_counts
-from sympflow.training.points import Labels, Stream, states
-from sympflow.training.session import Deadline
+from sympflow.training.points import Stream, states
 from sympflow.training.starts import frequency
-from sympflow.training.table_fit import Fit, StackedFit, Table, TableFit, energy_slope
-from sympflow.training.table_step import Check, TableStep
+from sympflow.training.table_fit import RunsFit, Table
+from sympflow.training.table_step import Check
 
 if TYPE_CHECKING:
     from sympflow.training.lattice_fit import Piece
 
-PERIODS, LOOKS = 25.0, 6
+PERIODS, LOOKS = 25.0, 10
 """Length of a run in periods of the fastest waves, and how often its energy is looked at."""
-LABEL_WEIGHT, ENERGY_WEIGHT = 1e-5, 100.0
-"""Weight of the labels at Δt beside the energies of runs, and among labels that of the energy."""
-POINTS, ITERATIONS = 60, 30
-"""Labelled states, and most iterations of the fit."""
 PROBE = 1e-6
 """Step of differences, in units of Δt or of the number that is changed, if that is more."""
 
 
-class EnergyRuns(Fit):
+class EnergyRuns(RunsFit):
     """Relative energy errors in runs of a lattice or of like bodies, as a function of the frozen parameters of a flow.
 
     Parameters
@@ -54,6 +49,8 @@ class EnergyRuns(Fit):
     t_end : float
     """
 
+    compiled = True
+
     def __init__(self, flow: PrimedFlow, system: HamiltonianSystem, x: np.ndarray, rest: float, t_end: float) -> None:
         self.flow, self.system, self._x = flow, system, x
         self.table = Table(flow)
@@ -65,16 +62,19 @@ class EnergyRuns(Fit):
         offset, design = self.table.polynomial(np.array([flow.dt]))
         self._at_dt = offset[0], design[0]
         self._back = np.linalg.pinv(design[0])
+        self.record = {"runs": len(x), "runs_t_end": t_end}
+
+    def own(self) -> EnergyRuns:  # the parameters are put into the flow
+        other = copy.copy(self)
+        other.flow = copy.deepcopy(self.flow)
+        other.table = Table(other.flow)
+        return other
 
     def parameters(self, theta: np.ndarray) -> np.ndarray:
         """The flow's parameters that make the table of `theta` at Δt and vary with t as little as may be."""
         wanted = self._frozen[0] + self._frozen[1] @ theta
         found = self.table.continued(wanted)
         return found + self._back @ (wanted - self._at_dt[0] - self._at_dt[1] @ found)
-
-    def start(self) -> np.ndarray:
-        """The frozen parameters of the flow as it was given."""
-        return self.table.frozen_parameters(self._at_dt[0] + self._at_dt[1] @ self.table.parameters())
 
     @np.errstate(all="ignore")  # of tables that are far from the exact flow
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
@@ -106,30 +106,12 @@ def check_runs(system: HamiltonianSystem, runs: int) -> None:
         )
 
 
-def fit_to_runs(fitted: PrimedFlow, piece: Piece, runs: int, seed: int, deadline: Deadline) -> None:
-    """Fit the numbers of a flow of a piece further, to so many runs of a larger one.
-
-    They stay as they are, with a warning, where the runs of the flow are not finite, or there is no time.
-    """
-    whole, dt = piece.lattice, fitted.dt
+def runs_of(piece: Piece, runs: int, seed: int, fitted: PrimedFlow) -> EnergyRuns:
+    """Return the energy errors in so many runs of a larger piece, by the numbers of a flow of the piece."""
+    whole = piece.lattice
     assert whole.local is not None
     larger = whole.piece(*whole.local.many())
     domain = piece.states.of(larger)
     x = states(domain, runs, seed, Stream.RUNS)
     t_end = PERIODS * 2 * math.pi / frequency(larger, domain)
-    energies = EnergyRuns(fitted.of_any_size(larger), larger, x, float(larger.hamiltonian(domain.at_rest)), t_end)
-    theta = energies.start()
-    late = deadline.over()
-    if late or not np.isfinite(energies.residuals(theta)).all():
-        reason = "the time was up" if late else "those of the flow do not stay finite: take a shorter `dt`"
-        warnings.warn(f"The flow was not fitted to `runs`, because {reason}.", RuntimeWarning, stacklevel=4)
-        return
-    step = TableStep(piece.system, fitted.sequence, fitted.tables.level, compiled=True)
-    labels = Labels.needed(piece.system, states(piece.domain, POINTS, seed, Stream.LABELS), np.array([dt]))
-    table, unit = Table(fitted), np.full(2 * piece.system.ndof, labels.x.std(0).mean())
-    slope = energy_slope(piece.system, labels, ENERGY_WEIGHT)
-    bound = TableFit(step, labels, *table.frozen(dt), unit, np.ones(1), slope)
-    found = StackedFit((1.0, energies), (LABEL_WEIGHT, bound)).minimize(theta, ITERATIONS, deadline)
-    table.assign(energies.parameters(found.x))
-    stage = {"optimizer": "gauss-newton", "loss": "energy", "runs": runs, "seed": seed, "t_end": t_end}
-    fitted.recipe["stages"] = [*fitted.recipe["stages"], stage]
+    return EnergyRuns(fitted.of_any_size(larger), larger, x, float(larger.hamiltonian(domain.at_rest)), t_end)

@@ -8,6 +8,9 @@ to labels at several times in (0, Δt].
 Other losses (the residual of the flow, Hamiltonian matching) join in the last stage. Without labels there is that stage
 alone, from each start.
 
+Where long runs count, those of a lattice for instance, the best few tables are fitted to these in the end, and the
+polynomials follow from the best of them alone.
+
 Every piece of it has a deadline, which is asked within each evaluation.
 """
 
@@ -16,6 +19,7 @@ from __future__ import annotations
 import copy
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -57,6 +61,7 @@ WIDE_SPREAD = 2.0  # without force gradients, where an order above 2 needs negat
 PROCESSOR_SPREAD = 0.1
 STIFFNESS = 1e-3  # how reluctantly a table is made to vary with t where that is not called for
 FINALISTS = 4  # tables of the search that are followed to the end
+LABEL_WEIGHT, RUN_STEPS = 1e-3, 40  # weight of the labels at Δt beside long runs, and most iterations of that fit
 FITTED = 2  # tables from which the polynomials are fitted
 FITTED_STEPS = 200  # iterations of that at most: each takes as long as ten of a table, and more gain a few per cent
 HOPELESS = 100.0  # times the cost of the best table at Δt: polynomials are not fitted from there
@@ -84,6 +89,8 @@ class TableRun(SearchRun):
     ----------
     tried : PrimedFlow or None
         A flow like this one from a trial, which the result of an interrupted run is to be no worse than.
+    runs : RunsFit or None
+        Long runs, to which the best tables are fitted in the end.
     kept_start : bool
         Whether the flow is returned as it was given.
     at_start, at_end : ndarray
@@ -99,6 +106,7 @@ class TableRun(SearchRun):
     whole: Fit
     held_out: Labels
     tried: PrimedFlow | None = None
+    runs: RunsFit | None = None
     kept_start: bool = field(default=False, init=False)
     at_start: np.ndarray = field(init=False)
     at_end: np.ndarray = field(init=False)
@@ -120,8 +128,11 @@ class TableRun(SearchRun):
         data: Labelled | None = None,
         tried: PrimedFlow | None = None,
         deadline: Deadline | None = None,
+        made_runs: MadeRuns | None = None,
     ) -> TableRun:
         """A run for labels made on the spot, or for `data`: times (n,), states and where they go, (n, 2d).
+
+        `made_runs` gives the `runs` of a flow.
 
         Raises
         ------
@@ -187,7 +198,8 @@ class TableRun(SearchRun):
         t0 = start_times(system, flow.dt, len(x), options.seed, Stream.REFERENCE)
         held_out = Labels.of(system, x, np.append(t, flow.dt), deadline.part(LABEL_SHARE), t0)
         whole = parts[0][1] if len(parts) == 1 else StackedFit(*parts)  # one weight changes nothing
-        run = cls(flow, system, domain, scaling, options, step, frozen, weighted, whole, held_out, tried)
+        runs = None if made_runs is None else made_runs(flow)
+        run = cls(flow, system, domain, scaling, options, step, frozen, weighted, whole, held_out, tried, runs)
         began = deadline.session.passed
         run.at_start = run.differences()
         run.closing = LAST_EVALUATIONS * (deadline.session.passed - began)
@@ -215,6 +227,8 @@ class TableRun(SearchRun):
                 common = (fit, steps, self._frozen_end, True)
                 found = [m.x for m in finalists]
                 finalists = list(session.each(descended, common, found, self._frozen_end, fit.compiled))
+            if self.runs is not None and self._completed_by_runs(session, self.runs, finalists):
+                return
         starts = [self._continued(m) for m in _distinct(finalists)[:FITTED]]
         if not finalists or frozen is None or self._frozen_cost(self.given) < HOPELESS * min(m.cost for m in finalists):
             starts.insert(0, self.given)
@@ -225,6 +239,24 @@ class TableRun(SearchRun):
             raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
         self.table.assign(best.x)
         self._record(best, self._keep_better(session))
+
+    def _completed_by_runs(self, session: Session, runs: RunsFit, finalists: list[Minimum]) -> bool:
+        """Fit the finalists to long runs and take the best; False, with a warning, where there are none to compare."""
+        labels = self.weighted or self.frozen
+        assert labels is not None
+        fit = StackedFit((1.0, runs), (LABEL_WEIGHT, labels))
+        tables = [m.x for m in _distinct(finalists) if np.isfinite(fit.residuals(m.x)).all()]
+        late = self.whole_end.over()
+        if late or not tables:
+            reason = "the time was up" if late else "those of the flow do not stay finite: take a shorter `dt`"
+            warnings.warn(f"The flow was not fitted to `runs`, because {reason}.", RuntimeWarning, stacklevel=8)
+            self.runs = None
+            return False
+        common = fit, min(self.options.steps, RUN_STEPS), self.whole_end, False
+        best = min(session.each(descended, common, tables, self.whole_end, fit.compiled), key=lambda m: m.cost)
+        self.table.assign(runs.parameters(best.x))
+        self._record(best)
+        return True
 
     @property
     def remedy(self) -> str:
@@ -287,7 +319,8 @@ class TableRun(SearchRun):
             return float(r @ r) if np.isfinite(r).all() else math.inf
 
     def remarks(self, reason: str | None) -> dict[str, Any]:
-        return super().remarks(reason) | ({"kept_start": True} if self.kept_start else {})
+        kept = {"kept_start": True} if self.kept_start else {}
+        return super().remarks(reason) | kept | ({} if self.runs is None else self.runs.record)
 
     def _keep_better(self, session: Session) -> np.ndarray:
         """Go back to where the run began, or to `tried`, if that is nearer to the exact flow at the held-out states.
@@ -450,6 +483,25 @@ class StackedFit(Fit):
     def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
         pieces = [(math.sqrt(weight), *fit.linearized(theta, check)) for weight, fit in self.parts]
         return np.concatenate([w * r for w, r, _ in pieces]), np.concatenate([w * J for w, _, J in pieces])
+
+
+class RunsFit(Fit):
+    """Errors in long runs by the frozen parameters of a table.
+
+    Attributes
+    ----------
+    record : dict
+        The choices of the runs, for the recipe of a flow.
+    """
+
+    record: dict[str, Any]
+
+    def parameters(self, theta: np.ndarray) -> np.ndarray:
+        """The flow's parameters that make the table of `theta` at Δt."""
+        raise NotImplementedError
+
+
+MadeRuns = Callable[[PrimedFlow], RunsFit]
 
 
 class LossFit(Fit):

@@ -8,6 +8,7 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
-from sympflow.training.energy_runs import check_runs, fit_to_runs
+from sympflow.training.energy_runs import check_runs, runs_of
 from sympflow.training.lattice_fit import Piece, on_piece
 from sympflow.training.network_fit import LossRun
 from sympflow.training.options import (
@@ -45,7 +46,7 @@ from sympflow.training.runs import Run, Unstarted
 from sympflow.training.session import Deadline, OutOfTime, Path, Session
 from sympflow.training.split_fit import SplitRun
 from sympflow.training.starts import check_step, default_primed, new_network, scaling_of, warn_of_domain
-from sympflow.training.table_fit import TableRun
+from sympflow.training.table_fit import MadeRuns, TableRun
 from sympflow.workers import Crew
 
 DRIVEN = ("primed", "sympflow")  # kinds that are fitted to driven systems
@@ -259,12 +260,11 @@ def fit_flow(
     if kind == "primed" and asked.searches and asked.data is None and on_piece(system):
         piece = Piece.of(system, domain)
         start = None if flow is None else piece.small(flow)
+        runs = None
         if asked.runs is not None:
             check_runs(system, asked.runs)
-        fitted = _fitted(piece.system, dt, start, kind, new, replace(asked, runs=None), piece.domain, session)
-        if asked.runs is not None:
-            with session.interruption:
-                fit_to_runs(fitted, piece, asked.runs, asked.seed, session.deadline)
+            runs = partial(runs_of, piece, asked.runs, asked.seed)
+        fitted = _fitted(piece.system, dt, start, kind, new, replace(asked, runs=None), piece.domain, session, runs)
         return piece.whole(fitted)
     return _fitted(system, dt, flow, kind, new, asked, domain, session)
 
@@ -278,8 +278,9 @@ def _fitted(
     asked: NewFit,
     domain: Domain,
     session: Session,
+    runs: MadeRuns | None = None,
 ) -> Any:
-    """The fit of `fit_flow` to the system itself."""
+    """The fit of `fit_flow` to the system itself; `runs` makes those to whose energy errors the table is fitted too."""
     untold = flow is None and asked.restarts is None and asked.steps is None
     hurried = untold and session.time_budget is None and session.resume is None and kind == "primed" and asked.searches
     if hurried:
@@ -311,7 +312,7 @@ def _fitted(
         bought = bought and session.time_budget is not None and session.resume is None and trials.can_try(system)
         if bought:
             asked = replace(asked, restarts=STARTS if hurried else BOUGHT)
-        run = _run_of(system, domain, kind, flow, tried, dt, new, asked, session.deadline)
+        run = _run_of(system, domain, kind, flow, tried, dt, new, asked, session.deadline, runs)
         if session.resume is not None:
             run.load(session.resume)
         reason = run.go(session)
@@ -493,6 +494,7 @@ def _run_of(
     new: NewFlow,
     asked: NewFit,
     deadline: Deadline,
+    runs: MadeRuns | None = None,
 ) -> Run:
     """The run of a copy of a flow, or of a new network if there is none."""
     searched = kind in ("primed", "split") and asked.searches
@@ -518,7 +520,7 @@ def _run_of(
         table = TableOptions.of(asked, checksum)
         scaling = scaling_of(domain, dt, table.seed)
         try:
-            run: Run = TableRun.start(flow, system, domain, scaling, table, labels, tried, deadline)
+            run: Run = TableRun.start(flow, system, domain, scaling, table, labels, tried, deadline, runs)
         except OutOfTime as cut:
             return Unstarted(flow if tried is None else tried, system, domain, scaling, table, str(cut))
         if labels is not None and table.loss == "labels":

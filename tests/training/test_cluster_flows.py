@@ -9,9 +9,7 @@ import pytest
 
 import sympflow
 from sympflow import ClusterStates, HamiltonianSystem, LatticeStates, SympFlow, solve, train
-from sympflow.training import energy_runs
-from sympflow.training.lattice_fit import Piece
-from sympflow.training.session import Session
+from sympflow.training import table_fit
 
 LENNARD_JONES = "4*e*(r**-12 - r**-6)"
 FIT = {"restarts": 1, "steps": 8, "points": 20, "label_times": 3, "reference_states": 10, "progress": False}
@@ -110,16 +108,14 @@ def test_a_flow_serves_any_number_of_bodies(flow, tmp_path):
 
 
 def test_a_fit_to_long_runs_is_of_a_larger_cluster(flow, monkeypatch):
-    monkeypatch.setattr(energy_runs, "ITERATIONS", 3)
-    piece = Piece.of(cluster(domain=STATES), STATES)
-    further = piece.small(flow)
-    energy_runs.fit_to_runs(further, piece, 8, 1, Session().deadline)
-    assert further.recipe["stages"][-1]["loss"] == "energy"
+    monkeypatch.setattr(table_fit, "RUN_STEPS", 3)
+    further = train(cluster(domain=STATES), flow=flow, runs=8, seed=1, **FIT)
+    assert further.recipe["stages"][-1]["runs"] == 8
     large = cluster(25, domain=STATES)
     y0 = large.domain.sample(4, seed=77)
     H0, rest = large.hamiltonian(y0), large.hamiltonian(large.domain.at_rest)
     errors = []
-    for each in (flow, further.of_any_size(large)):
+    for each in (flow, further):
         H = large.hamiltonian(solve(large, each, (0, 2), y0, t_eval=np.linspace(0, 2, 5)).states)
         errors.append(np.sqrt(np.mean(((H.T - H0) / (H0 - rest)) ** 2)))
     assert errors[1] < errors[0]

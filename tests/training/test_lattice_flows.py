@@ -7,7 +7,7 @@ import pytest
 
 import sympflow
 from sympflow import Box, HamiltonianSystem, LatticeStates, SympFlow, solve, train
-from sympflow.training import energy_runs
+from sympflow.training import energy_runs, table_fit
 from sympflow.training.lattice_fit import TAIL, Piece
 
 BOND = "r**2/2 + r**4/4"
@@ -100,10 +100,10 @@ def test_a_flow_serves_every_shape(flow, tmp_path):
 
 def test_a_fit_to_long_runs_keeps_the_energy_of_other_states(flow, monkeypatch):
     """With the table that they found at Δt, which the numbers at shorter times lead to."""
-    monkeypatch.setattr(energy_runs, "ITERATIONS", 8)
+    monkeypatch.setattr(table_fit, "RUN_STEPS", 8)
     lattice = ring(domain=LatticeStates(0.2))
-    further = train(lattice, flow=flow, runs=32, seed=1, **FIT | {"steps": 1})
-    assert [stage["loss"] for stage in further.recipe["stages"]] == ["labels", "labels", "energy"]
+    further = train(lattice, flow=flow, runs=32, seed=1, **FIT | {"steps": 8})
+    assert [stage.get("runs") for stage in further.recipe["stages"]] == [None, 32]
     large = ring(200, domain=LatticeStates(0.2))
     y0 = large.domain.sample(4, seed=77)
     errors = []
@@ -120,7 +120,8 @@ def test_a_table_that_overflowed_is_as_bad_as_can_be(flow):
     lattice = ring(12, domain=LatticeStates(0.2))
     mine = flow.of_any_size(lattice)
     runs = energy_runs.EnergyRuns(mine, lattice, lattice.domain.sample(2), 0.0, 1.0)
-    theta = runs.start()
+    offset, design = runs.table.polynomial(np.array([flow.dt]))
+    theta = runs.table.frozen_parameters(offset[0] + design[0] @ runs.table.parameters())
     before = runs.residuals(theta)
     after = runs.residuals(np.full_like(theta, np.nan))
     assert np.isfinite(before).all()
