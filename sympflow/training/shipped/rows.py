@@ -128,14 +128,16 @@ def ladders() -> list[Recipe]:
         *(rung(kepler, 3, dt, fit=plain) for dt in (0.2, 0.15, 0.1, 0.08, 0.06, 0.045, 0.03)),
         Recipe("kepler", "log-1", SYSTEMS[kepler], Clock(1.0), ByClock()),
         *(rung(planets, 3, dt, fit=short, judge=along) for dt in (300.0, 200.0, 100.0)),
-        *(lattice_rung(SYSTEMS["toda-chain"], dt) for dt in (1.2, 0.7, 0.28, 0.2)),
-        *(lattice_rung(SYSTEMS["fput-beta"], dt, 6) for dt in (0.8, 0.55, 0.15)),
-        *(with_few_gradients(SYSTEMS["fput-beta"], dt, 6) for dt in (0.72, 0.33)),
-        *(lattice_rung(coupled_pendulums, dt, fit=LONG_RUNS) for dt in (2.1, 1.08, 0.43)),
-        lattice_rung(double_wells, 1.7, fit=replace(LONG_RUNS, seed=1)),  # the better of two seeds
-        *(with_few_gradients(double_wells, dt) for dt in (0.98, 0.5)),
-        lattice_rung(double_wells_in_a_plane, 0.68, fit=LONG_RUNS, stages=3, force_gradient=(1,)),
-        *(with_few_gradients(double_wells_in_a_plane, dt) for dt in (0.85, 0.45)),
+        lattice_rung(SYSTEMS["toda-chain"], 0.87, fit=LONG_RUNS, stages=2, first="kick"),
+        *(lattice_rung(SYSTEMS["toda-chain"], dt) for dt in (1.2, 0.7, 0.2)),
+        lattice_rung(SYSTEMS["toda-chain"], 0.48, fit=LONG_RUNS, stages=6),
+        lattice_rung(SYSTEMS["fput-beta"], 0.99, 8, LONG_RUNS, stages=3),
+        lattice_rung(SYSTEMS["fput-beta"], 0.62, fit=LONG_RUNS, stages=5, force_gradient=(1, 3)),
+        lattice_rung(SYSTEMS["fput-beta"], 0.44, 8, OTHER_RUNS, stages=8, force_gradient=(1, 6)),
+        *(lattice_rung(SYSTEMS["fput-beta"], dt, 6) for dt in (0.55, 0.15)),
+        *(lattice_rung(coupled_pendulums, dt, fit=FEWER_RUNS) for dt in (2.1, 1.08, 0.43)),
+        *of_double_wells(double_wells, 0.85, 0.82, 0.57),
+        *of_double_wells(double_wells_in_a_plane, 0.76, 0.72, 0.51),
         *(driven_rung(SYSTEMS["driven-pendulum"], 6, dt) for dt in (2.0, 1.5, 1.0, 0.8, 0.4)),
         driven_rung(SYSTEMS["driven-pendulum"], 7, 100 / 51, 9),  # of T = 100
         driven_rung(SYSTEMS["driven-pendulum"], 6, 0.5, 10, seed=2),
@@ -187,7 +189,9 @@ def double_wells_in_a_plane(n: int) -> HamiltonianSystem:
 
 
 LABELS_ALONE = NewFit(restarts=20, energy_weight=300.0, frozen_weight=1000.0, label_times=5)
-LONG_RUNS = NewFit(restarts=12, energy_weight=300.0, label_times=2, steps=300, runs=48)
+LONG_RUNS = NewFit(restarts=24, energy_weight=300.0, label_times=2, steps=300, runs=48)
+OTHER_RUNS = replace(LONG_RUNS, seed=1)
+FEWER_RUNS = replace(LONG_RUNS, restarts=12)
 """Fits of flows of lattices: to labels of a few sites, and further to the energy errors of runs of a ring."""
 
 
@@ -195,11 +199,12 @@ def lattice_rung(
     system: Callable[..., HamiltonianSystem],
     dt: float,
     processor: int = 12,
-    density: tuple[float, float] = (0.02, 0.2),
     fit: NewFit = LABELS_ALONE,
     *,
     stages: int = 4,
     force_gradient: tuple[int, ...] | None = None,
+    first: str = "drift",
+    density: tuple[float, float] = (0.02, 0.2),
 ) -> Recipe:
     """A primed flow of a lattice of any n, fitted on a few sites, and judged on 256 at these energy densities.
 
@@ -211,16 +216,20 @@ def lattice_rung(
         many().name,
         f"primed-{stages}-{dt:g}",
         many,
-        Primed(dt, stages, processor, force_gradient=force_gradient),
+        Primed(dt, stages, processor, force_gradient=force_gradient, first=first),
         ByCertificate(200.0, states=100, times=9, held_out=100),
         (fit,),
         partial(_at_density, density=density),
     )
 
 
-def with_few_gradients(system: Callable[..., HamiltonianSystem], dt: float, processor: int = 12) -> Recipe:
-    """A rung of six kicks of which two have force gradients: on a polynomial lattice one takes as long as a force."""
-    return lattice_rung(system, dt, processor, fit=LONG_RUNS, stages=6, force_gradient=(1, 4))
+def of_double_wells(system: Callable[..., HamiltonianSystem], two: float, five: float, eight: float) -> list[Recipe]:
+    """Rungs of two, five and eight kicks with these Δt: all have force gradients, or two of them."""
+    return [
+        lattice_rung(system, two, fit=LONG_RUNS, stages=2, first="kick"),
+        lattice_rung(system, five, fit=LONG_RUNS, stages=5, force_gradient=(1, 3)),
+        lattice_rung(system, eight, fit=OTHER_RUNS, stages=8, force_gradient=(1, 6)),
+    ]
 
 
 def _at_density(system: HamiltonianSystem, density: tuple[float, float]) -> Domain:
