@@ -170,12 +170,17 @@ def _module(code: _Code, registers: bool, level: int, compensated: bool, rate: b
         "COMPENSATED": compensated,
     }
     if registers:
+        own = constants_of(lattice, level)
+        shared = {"VECTOR": VECTOR, "GHOSTS": own["GHOSTS"]}
         return load_algebra(
             "import numpy as np\n\n\n" + stages_in_registers(lattice, level, compensated, rate),
-            ("aligned", "sized_states", "segments", "chains" if len(lattice.shape) == 1 else "sheets"),
-            (f"{constants_source(VECTOR=VECTOR)}\n\n\n{template('vectors')}",),
+            ("aligned", "sized_states", "chains" if len(lattice.shape) == 1 else "sheets"),
+            (
+                f"{constants_source(VECTOR=VECTOR)}\n\n\n{template('vectors')}",
+                f"{constants_source(**shared)}\n\n\n{template('segments')}",
+            ),
             VECTOR=VECTOR,
-            **constants_of(lattice, level),
+            **own,
             **constants,
         )
     return load_algebra(

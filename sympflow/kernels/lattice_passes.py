@@ -11,7 +11,6 @@ from sympflow.hamiltonian.lattice import LatticeHamiltonian
 from sympflow.kernels.codegen import statements, vectorised
 from sympflow.kernels.lattice_sites import (
     Row,
-    along,
     drifted,
     field,
     indented,
@@ -52,10 +51,14 @@ class _Pass:
     turns: bool = False
 
 
+def _along(f: sp.Expr, x: Sequence[sp.Symbol], v: Sequence[sp.Symbol]) -> sp.Expr:
+    return sp.Add(*[s * sp.diff(f, z) for z, s in zip(x, v, strict=True)])
+
+
 def _bent(f: sp.Expr, x: Sequence[sp.Symbol], lattice: LatticeHamiltonian) -> list[sp.Expr]:
     """∇²V w + ½ ∇³V(v, v)."""
-    twice = along(along(f, x, lattice.v), x, lattice.v) / 2
-    return slopes_of(along(f, x, lattice.w) + twice, x, lattice)
+    twice = _along(_along(f, x, lattice.v), x, lattice.v) / 2
+    return slopes_of(_along(f, x, lattice.w) + twice, x, lattice)
 
 
 KICK = _Pass(("q",), slopes_of)

@@ -47,11 +47,12 @@ def in_registers(lattice: LatticeHamiltonian, level: int) -> bool:
 
 def constants_of(lattice: LatticeHamiltonian, level: int) -> dict[str, Any]:
     """The constants of the text `chains` or `sheets`."""
-    periodic, free = (tuple(b == end for b in lattice.boundary) for end in ("periodic", "free"))
+    first, last = lattice.boundary[0], lattice.boundary[-1]
+    found = {"ARRAYS": not lattice.uniform, "PERIODIC": first == "periodic", "FREE": first == "free"}
     if len(lattice.shape) == 1:
-        return {"GHOSTS": 3 if level else 1, "PERIODIC": periodic[0], "FREE": free[0]}
-    kept = len(_KEPT) if level else 1
-    return {"GHOSTS": 1, "BEYOND": 2 if level else 1, "N_KEPT": kept, "PERIODIC": periodic, "FREE": free}
+        return found | {"GHOSTS": 3 if level else 1}
+    row = {"ROW_PERIODIC": last == "periodic", "ROW_FREE": last == "free"}
+    return found | row | {"GHOSTS": 1, "BEYOND": 2 if level else 1, "N_KEPT": len(_KEPT) if level else 1}
 
 
 def size_in_registers(lattice: LatticeHamiltonian, level: int) -> int:
@@ -356,7 +357,7 @@ def _sheet_lines(lattice: LatticeHamiltonian, level: int, compensated: bool) -> 
         moves += row.code(total, _named("g", fields), "s", _tagged(lattice.x, "here"))
         moves += _handed_on(turns)
         handed += [*_handed_on(velocities), *(f"x_{f}_here = x_{f}_beside" for f in fields)]
-        closing = [f"refresh_row(kept_{v}, GHOSTS * VECTOR, n, 1, PERIODIC[1])" for v in velocities]
+        closing = [f"refresh_row(kept_{v}, GHOSTS * VECTOR, n, 1, ROW_PERIODIC)" for v in velocities]
     for f in fields:
         moves += moved(row, "p", f, [change.format(f) for change in changes], compensated)
     moves += drifted(lattice, row, [f"new_p_{f}" for f in fields], compensated)

@@ -12,7 +12,6 @@ from sympflow.kernels.codegen import statements, vectorised
 
 __all__ = [
     "Row",
-    "along",
     "drifted",
     "field",
     "indented",
@@ -29,12 +28,9 @@ def slopes_of(f: sp.Expr, x: Sequence[sp.Symbol], lattice: LatticeHamiltonian) -
     return [sp.diff(f, s) for s in x]
 
 
-def along(f: sp.Expr, x: Sequence[sp.Symbol], v: Sequence[sp.Symbol]) -> sp.Expr:
-    return sp.Add(*[s * sp.diff(f, z) for z, s in zip(x, v, strict=True)])
-
-
 def products_of(f: sp.Expr, x: Sequence[sp.Symbol], lattice: LatticeHamiltonian) -> list[sp.Expr]:
-    return slopes_of(along(f, x, lattice.v), x, lattice)
+    """∇²V v."""
+    return list(sp.hessian(f, x) * sp.Matrix(lattice.v))
 
 
 def vectors_of(lattice: LatticeHamiltonian) -> dict[str, str]:

@@ -14,12 +14,16 @@ START = GHOSTS * VECTOR  # of the row
 
 
 @njit(**OPTIONS)
-def parameters_of(sites, first, n):
-    """The parameters of n sites, the first of which is given, and of their ghosts."""
+def work_of(sites, first, n, low_end, high_end):
+    """What `stages` of n sites, the first of which is given, need beside the state: see `mark_there`; parameters."""
+    there = aligned_zeros(width_of(n))
+    if not PERIODIC:
+        mark_there(there, START, n, low_end, high_end, FREE)
     found = aligned_zeros(len(sites) * width_of(n)).reshape((len(sites), width_of(n)))
-    for i in range(len(sites)):
-        parameters_to_lanes(sites[i], first, found[i], START, n)
-    return found
+    if ARRAYS:
+        for i in range(len(sites)):
+            parameters_to_lanes(sites[i], first, found[i], START, n)
+    return there, found
 
 
 @njit(**OPTIONS)
@@ -40,8 +44,7 @@ def pack(X, first, y, geometry):
 
 @njit(**OPTIONS)
 def workspace(size, geometry, sites):
-    n = geometry[5]
-    return there_of(n, True, True, FREE), parameters_of(sites, geometry[4], n)
+    return work_of(sites, geometry[4], geometry[5], True, True)
 
 
 @njit(**OPTIONS)
@@ -76,8 +79,7 @@ def sweep(X, to, table, j, n_stages, single, planes, first, last, geometry, site
         if not PERIODIC:
             begin, end = max(begin, 0), min(end, n_sites)
         n = end - begin
-        there = there_of(n, not PERIODIC and begin == 0, not PERIODIC and end == n_sites, FREE)
-        work = there, parameters_of(sites, margin + begin, n)
+        work = work_of(sites, margin + begin, n, begin == 0, end == n_sites)
         local = zero_state(N_SETS, width_of(n))
         for s in range(N_SETS):
             for f in range(N_FIELDS):

@@ -60,16 +60,14 @@ def parameters_to_lanes(x, first, to, at, n):
 
 
 @njit(**OPTIONS)
-def there_of(n, low_end, high_end, free):
+def mark_there(there, at, n, low_end, high_end, free):
     """A row of 1 where there are sites and 0 beyond the ends of a lattice; if `free`, of bonds to the next sites."""
-    there, at = aligned_zeros(width_of(n)), GHOSTS * VECTOR
     first, last = (0, n - 1) if free else (0, n)
     for j in range(-GHOSTS, rows_of(n) + GHOSTS):
         for lane in range(VECTOR):
             site = lane * stride_of(n) + j
             within = (site >= first or not low_end) and (site < last or not high_end)
             there[at + j * VECTOR + lane] = 1.0 if within else 0.0
-    return there
 
 
 @njit(**OPTIONS, forceinline=True)

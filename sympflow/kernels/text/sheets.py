@@ -30,18 +30,23 @@ def size_of(n_rows, n):
 def work_of(sites, first, n_rows, low_end, high_end, geometry):
     """What `stages` of so many rows need beside the state, the first of these being row `first` of X.
 
-    Where there are bonds along a row, and rows, as `there_of` says; parameters; and vectors of the length of a row.
+    Where there are bonds along a row, and rows, as `mark_there` says; parameters; and vectors of the length of a row.
     """
-    n, stride, rows = geometry[0], geometry[1], np.zeros(n_rows + 2 * BEYOND)
-    last = n_rows - 1 if FREE[0] else n_rows
-    for i in range(-BEYOND, n_rows + BEYOND):
-        rows[i + BEYOND] = 1.0 if (i >= 0 or not low_end) and (i < last or not high_end) else 0.0
-    found = aligned_zeros(len(sites) * size_of(n_rows, n)).reshape((len(sites), size_of(n_rows, n)))
-    for k in range(len(sites)):
+    n, stride = geometry[0], geometry[1]
+    there, rows = aligned_zeros(width_of(n)), np.zeros(n_rows + 2 * BEYOND)
+    if not ROW_PERIODIC:
+        mark_there(there, GHOSTS * VECTOR, n, True, True, ROW_FREE)
+    if not PERIODIC:
+        last = n_rows - 1 if FREE else n_rows
         for i in range(-BEYOND, n_rows + BEYOND):
-            row = min(max(first + i, 0), sites.shape[1] // stride - 1)
-            parameters_to_lanes(sites[k], row * stride + GHOSTS, found[k], start_of(i, n), n)
-    return there_of(n, True, True, FREE[1]), rows, found, zero_state(N_KEPT, width_of(n))
+            rows[i + BEYOND] = 1.0 if (i >= 0 or not low_end) and (i < last or not high_end) else 0.0
+    found = aligned_zeros(len(sites) * size_of(n_rows, n)).reshape((len(sites), size_of(n_rows, n)))
+    if ARRAYS:
+        for k in range(len(sites)):
+            for i in range(-BEYOND, n_rows + BEYOND):
+                row = min(max(first + i, 0), sites.shape[1] // stride - 1)
+                parameters_to_lanes(sites[k], row * stride + GHOSTS, found[k], start_of(i, n), n)
+    return there, rows, found, zero_state(N_KEPT, width_of(n))
 
 
 @njit(**OPTIONS)
@@ -71,7 +76,7 @@ def workspace(size, geometry, sites):
 @njit(**OPTIONS)
 def in_one(X, table, j, n_stages, single, work, geometry, sites, values):
     """`stages` of a sheet in one piece."""
-    return stages(X, table, j, n_stages, single, work, geometry[5], geometry[0], PERIODIC[0], values)
+    return stages(X, table, j, n_stages, single, work, geometry[5], geometry[0], PERIODIC, values)
 
 
 @njit(**OPTIONS, forceinline=True)
@@ -79,7 +84,7 @@ def refresh(x, n_rows, n, distance, ring):
     """The ghosts of all rows, and so many rows before and behind a ring of them."""
     width = width_of(n)
     for i in range(n_rows):
-        refresh_row(x, start_of(i, n), n, 1, PERIODIC[1])
+        refresh_row(x, start_of(i, n), n, 1, ROW_PERIODIC)
     if ring:
         first, behind = BEYOND * width, (BEYOND + n_rows) * width
         for k in range(1, distance + 1):
@@ -91,7 +96,7 @@ def refresh(x, n_rows, n, distance, ring):
 @njit(**OPTIONS)
 def wrap_ends(X, geometry):
     """The rows before and behind a ring of them, the whole margin of them."""
-    if PERIODIC[0]:
+    if PERIODIC:
         stride, margin, n_rows = geometry[1], geometry[4], geometry[5]
         for s in range(N_SETS):
             for f in range(N_FIELDS):
@@ -111,10 +116,9 @@ def sweep(X, to, table, j, n_stages, single, planes, first, last, geometry, site
         low = tile * planes
         high = min(low + planes, n_rows)
         begin, end = low - margin, high + margin
-        if not PERIODIC[0]:
+        if not PERIODIC:
             begin, end = max(begin, 0), min(end, n_rows)
-        low_end, high_end = not PERIODIC[0] and begin == 0, not PERIODIC[0] and end == n_rows
-        work = work_of(sites, margin + begin, end - begin, low_end, high_end, geometry)
+        work = work_of(sites, margin + begin, end - begin, begin == 0, end == n_rows, geometry)
         local = zero_state(N_SETS, size_of(end - begin, n))
         for s in range(N_SETS):
             for f in range(N_FIELDS):
