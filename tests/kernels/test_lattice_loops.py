@@ -105,6 +105,46 @@ def test_two_fields_in_vector_registers(boundary):
     assert compared(system, "chin4c", start(system)) == LOOPS_AND_ARRAYS
 
 
+@pytest.mark.parametrize(
+    ("boundary", "method"),
+    [
+        (("free", "fixed"), "chin4c"),
+        pytest.param(("fixed", "free"), "chin4c", marks=pytest.mark.slow),
+        pytest.param(("periodic", "periodic"), "chin4c", marks=pytest.mark.slow),
+        pytest.param(("fixed", "periodic"), "verlet", marks=pytest.mark.slow),
+        pytest.param(("periodic", "free"), "verlet", marks=pytest.mark.slow),
+    ],
+)
+def test_sheets_in_vector_registers(boundary, method):
+    """As `test_chains_in_vector_registers`, with rows of several lengths."""
+    for shape in ((5, 8), (7, 13), (3, 18)):
+        a, m = np.random.default_rng(shape).uniform(0.5, 1.5, (2, *shape))
+        system = HamiltonianSystem.lattice(
+            onsite="a*q**4/4 + q",
+            bond="a*r**2/2 + b*r**3/3 + 1/(4 + r)",
+            kinetic="p**2/(2*m)",
+            shape=shape,
+            boundary=boundary,
+            params={"a": a, "b": 0.3, "m": m},
+        )
+        assert compared(system, method, start(system)) == LOOPS_AND_ARRAYS
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damping", [None, 0.3])
+def test_two_fields_on_a_sheet_in_vector_registers(damping):
+    system = HamiltonianSystem.lattice(
+        onsite="u**2*v**2/2 + u**4/4",
+        bond="r_u**2/2 + r_v**2/2 + r_u**2*r_v",
+        fields=("u", "v"),
+        shape=(6, 10),
+        boundary=("free", "periodic"),
+        damping=damping,
+    )
+    method = "verlet" if damping else "chin4c"
+    assert compared(system, method, start(system)) == LOOPS_AND_ARRAYS
+
+
 @pytest.mark.parametrize("boundary", ["free", pytest.param("fixed", marks=pytest.mark.slow)])
 def test_tiles_of_chains_with_ends(boundary, monkeypatch):
     """What is computed of a site is the same in tiles, to the bit: no loop has a rest that is computed otherwise."""
@@ -120,6 +160,28 @@ def test_tiles_of_chains_with_ends(boundary, monkeypatch):
     monkeypatch.setattr(lattice_loops, "TILE", 25)
     monkeypatch.setattr(lattice_loops, "MARGIN", 5)
     np.testing.assert_array_equal(solve(make(), "chin4c", y0=y0, backend="compiled", **options).y, whole.y)
+
+
+@pytest.mark.parametrize(
+    "boundary",
+    [("free", "periodic"), *(pytest.param((b, "free"), marks=pytest.mark.slow) for b in ("periodic", "fixed"))],
+)
+def test_tiles_of_sheets(boundary, monkeypatch):
+    def make():
+        return HamiltonianSystem.lattice(
+            bond="r**2/2 + r**4/4", kinetic="m*p**2", shape=(180, 9), boundary=boundary, params=params
+        )
+
+    params = {"m": np.random.default_rng(5).uniform(0.5, 1.5, (180, 9))}
+    y0, options = start(make()), {"t_span": (0.0, 3.0), "dt": 0.05, "t_eval": np.array([0.0, 1.5, 3.0])}
+    whole = solve(make(), "chin4c", y0=y0, **options)
+    monkeypatch.setattr(lattice_loops, "LARGER_TILE", 90)
+    monkeypatch.setattr(lattice_loops, "MARGIN", 3)
+    for threads in (1, 2):
+        with at_most(threads):
+            found = solve(make(), "chin4c", y0=y0, backend="compiled", **options)
+        assert splitting_loops(found.system).functions(SCHEMES["chin4c"].level, False).rollout.__self__._tiled
+        np.testing.assert_array_equal(found.y, whole.y)
 
 
 @pytest.mark.slow
@@ -213,9 +275,10 @@ def test_friction_is_the_same_in_loops():
 
 
 @pytest.mark.slow
-def test_compensated_sums_lower_the_rounding():
+@pytest.mark.parametrize("shape", [48, (6, 9)])
+def test_compensated_sums_lower_the_rounding(shape):
     """There and back by a symmetric scheme: what is left is rounding, whatever the error of the method."""
-    system = ring()
+    system = ring(shape)
     y0, left = start(system), []
     for compensated in (False, True):
         how = {"dt": 0.02, "compensated": compensated}

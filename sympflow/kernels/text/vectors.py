@@ -115,3 +115,25 @@ def put_lanes(typing_context, x, i, value):
         return context.get_dummy_value()
 
     return types.void(x, i, LANES), generate
+
+
+@intrinsic
+def lanes_behind(typing_context, value, last):
+    """Each lane of `value` in the lane after its own, and the last lane of `last` in the first one."""
+
+    def generate(context, builder, signature, arguments):
+        order = [2 * VECTOR - 1, *range(VECTOR - 1)]
+        return builder.shuffle_vector(*arguments, ir.Constant(ir.VectorType(ir.IntType(32), VECTOR), order))
+
+    return LANES(value, last), generate
+
+
+@intrinsic
+def lanes_ahead(typing_context, value, first):
+    """Each lane of `value` in the lane before its own, and the first lane of `first` in the last one."""
+
+    def generate(context, builder, signature, arguments):
+        order = [*range(1, VECTOR), VECTOR]
+        return builder.shuffle_vector(*arguments, ir.Constant(ir.VectorType(ir.IntType(32), VECTOR), order))
+
+    return LANES(value, first), generate
