@@ -131,7 +131,7 @@ def ladders() -> list[Recipe]:
         lattice_rung(SYSTEMS["toda-chain"], 0.87, fit=LONG_RUNS, stages=2, first="kick"),
         *(lattice_rung(SYSTEMS["toda-chain"], dt) for dt in (1.2, 0.7, 0.2)),
         lattice_rung(SYSTEMS["toda-chain"], 0.48, fit=LONG_RUNS, stages=6),
-        lattice_rung(SYSTEMS["fput-beta"], 0.99, 8, LONG_RUNS, stages=3),
+        lattice_rung(SYSTEMS["fput-beta"], 0.9, 8, LONG_RUNS, stages=3),
         lattice_rung(SYSTEMS["fput-beta"], 0.62, fit=LONG_RUNS, stages=5, force_gradient=(1, 3)),
         lattice_rung(SYSTEMS["fput-beta"], 0.44, 8, OTHER_RUNS, stages=8, force_gradient=(1, 6)),
         *(lattice_rung(SYSTEMS["fput-beta"], dt, 6) for dt in (0.55, 0.15)),
