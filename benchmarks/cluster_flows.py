@@ -33,8 +33,9 @@ DENSITY = 0.02, 0.2
 NAME, T, OUTPUTS = "lennard_jones", 10.0, 20
 FOLDER = Path(__file__).parents[1] / "out" / "cluster_flows"
 LADDER = {
-    Primed(0.05, 4, 12, force_gradient=False): 6,
-    Primed(0.06, 6, 8, force_gradient=(1, 4)): 4,  # a gradient is a sum that takes a third longer than that of forces
+    Primed(0.05, 4, 8, first="kick", force_gradient=(1, 3)): 6,
+    Primed(0.05, 5, 8, force_gradient=(1, 3)): 6,
+    Primed(0.036, 8, 8, force_gradient=(1, 6)): 4,
 }
 """The flows, and the starts of their searches. The fastest frequency is 26."""
 QUICK = {**FIT, "steps": 150, "points": 16, "reference_states": 10, "frozen_weight": 1000.0, "runs": 32}

@@ -62,7 +62,6 @@ PROCESSOR_SPREAD = 0.1
 STIFFNESS = 1e-3  # how reluctantly a table is made to vary with t where that is not called for
 FINALISTS = 4  # tables of the search that are followed to the end
 LABEL_WEIGHT, RUN_STEPS = 1e-3, 40  # weight of the labels at Δt beside long runs, and most iterations of that fit
-RIDGE = 0.1  # of the numbers of the processor beside them, times the residual of the best table before
 FITTED = 2  # tables from which the polynomials are fitted
 FITTED_STEPS = 200  # iterations of that at most: each takes as long as ten of a table, and more gain a few per cent
 HOPELESS = 100.0  # times the cost of the best table at Δt: polynomials are not fitted from there
@@ -247,9 +246,6 @@ class TableRun(SearchRun):
         assert labels is not None
         fit = StackedFit((1.0, runs), (LABEL_WEIGHT, labels))
         tables = [m.x for m in _distinct(finalists) if np.isfinite(fit.residuals(m.x)).all()]
-        if tables and self.flow.processor:
-            level = min(float(np.linalg.norm(fit.residuals(x))) for x in tables)
-            fit = StackedFit(*fit.parts, ((RIDGE * level) ** 2, Ridge(self.table.processor_sizes())))
         late = self.whole_end.over()
         if late or not tables:
             reason = "the time was up" if late else "those of the flow do not stay finite: take a shorter `dt`"
@@ -508,24 +504,6 @@ class RunsFit(Fit):
 MadeRuns = Callable[[PrimedFlow], RunsFit]
 
 
-class Ridge(Fit):
-    """The numbers of a processor, times `sizes` (f,): of those that do equally well the smaller ones are taken.
-
-    A processor has many more numbers than conditions, and what it does to rare states grows with their size.
-    """
-
-    compiled = True
-
-    def __init__(self, sizes: np.ndarray) -> None:
-        self._rows = np.diag(sizes)[sizes > 0]
-
-    def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
-        return self._rows @ theta
-
-    def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
-        return self._rows @ theta, self._rows
-
-
 class LossFit(Fit):
     """The residuals of a `Loss` (the flow's residual, Hamiltonian matching, labels at any times) at given points."""
 
@@ -710,12 +688,6 @@ class Table:
             )
             for j, c in enumerate(self.columns)
         ]
-
-    def processor_sizes(self) -> np.ndarray:
-        """The sizes of a unit of each parameter of `frozen`, in units of Δt; 0 for those of the kernel."""
-        columns = self._unbound()
-        sizes = [(j >= self._kernel) * self.dt ** (c.power - 1.0) for j, c in enumerate(columns)]
-        return np.repeat(sizes, [_array(c.basis).shape[-1] for c in columns])
 
     def _assembled(self, columns: list[Coefficients], t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         offset, blocks = np.zeros((len(t), self.n)), []
