@@ -133,11 +133,11 @@ def ladders() -> list[Recipe]:
         lattice_rung(SYSTEMS["toda-chain"], 0.48, fit=LONG_RUNS, stages=6),
         lattice_rung(SYSTEMS["fput-beta"], 0.9, 8, LONG_RUNS, stages=3),
         lattice_rung(SYSTEMS["fput-beta"], 0.62, fit=LONG_RUNS, stages=5, force_gradient=(1, 3)),
-        lattice_rung(SYSTEMS["fput-beta"], 0.44, 8, OTHER_RUNS, stages=8, force_gradient=(1, 6)),
+        lattice_rung(SYSTEMS["fput-beta"], 0.33, 6, LONG_RUNS, stages=6, force_gradient=(1, 4)),
         *(lattice_rung(SYSTEMS["fput-beta"], dt, 6) for dt in (0.8, 0.55, 0.15)),
         *(lattice_rung(coupled_pendulums, dt, fit=FEWER_RUNS) for dt in (2.1, 1.08, 0.43)),
-        *of_double_wells(double_wells, 0.85, 0.82, 0.57),
-        *of_double_wells(double_wells_in_a_plane, 0.76, 0.72, 0.51),
+        *of_double_wells(double_wells, 0.85, 0.82, 0.5),
+        *of_double_wells(double_wells_in_a_plane, 0.76, 0.72, 0.45),
         *(driven_rung(SYSTEMS["driven-pendulum"], 6, dt) for dt in (2.0, 1.5, 1.0, 0.8, 0.4)),
         driven_rung(SYSTEMS["driven-pendulum"], 7, 100 / 51, 9),  # of T = 100
         driven_rung(SYSTEMS["driven-pendulum"], 6, 0.5, 10, seed=2),
@@ -190,7 +190,6 @@ def double_wells_in_a_plane(n: int) -> HamiltonianSystem:
 
 LABELS_ALONE = NewFit(restarts=20, energy_weight=300.0, frozen_weight=1000.0, label_times=5)
 LONG_RUNS = NewFit(restarts=24, energy_weight=300.0, label_times=2, steps=300, runs=48)
-OTHER_RUNS = replace(LONG_RUNS, seed=1)
 FEWER_RUNS = replace(LONG_RUNS, restarts=12)
 """Fits of flows of lattices: to labels of a few sites, and further to the energy errors of runs of a ring."""
 
@@ -223,12 +222,12 @@ def lattice_rung(
     )
 
 
-def of_double_wells(system: Callable[..., HamiltonianSystem], two: float, five: float, eight: float) -> list[Recipe]:
-    """Rungs of two, five and eight kicks with these Δt: all have force gradients, or two of them."""
+def of_double_wells(system: Callable[..., HamiltonianSystem], two: float, five: float, six: float) -> list[Recipe]:
+    """Rungs of two, five and six kicks with these Δt: all have force gradients, or two of them."""
     return [
         lattice_rung(system, two, fit=LONG_RUNS, stages=2, first="kick"),
         lattice_rung(system, five, fit=LONG_RUNS, stages=5, force_gradient=(1, 3)),
-        lattice_rung(system, eight, fit=OTHER_RUNS, stages=8, force_gradient=(1, 6)),
+        lattice_rung(system, six, fit=LONG_RUNS, stages=6, force_gradient=(1, 4)),
     ]
 
 
