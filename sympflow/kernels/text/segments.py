@@ -35,18 +35,19 @@ def width_of(n):
 @njit(**OPTIONS)
 def to_lanes(x, first, to, at, n):
     """n numbers into a row."""
-    for lane in range(VECTOR):
-        start = first + lane * stride_of(n)
-        for j in range(rows_of(n)):
-            to[at + j * VECTOR + lane] = x[start + j]
+    stride = stride_of(n)
+    for j in range(rows_of(n)):
+        for lane in range(VECTOR):
+            to[at + j * VECTOR + lane] = x[first + lane * stride + j]
 
 
 @njit(**OPTIONS)
 def from_lanes(x, at, n, low, high, to, first):
     """The numbers low … high of a row of n sites."""
+    stride, rows = stride_of(n), rows_of(n)
     for lane in range(VECTOR):
-        start = lane * stride_of(n)
-        for j in range(max(0, low - start), min(rows_of(n), high - start)):
+        start, its_own = lane * stride, rows if lane == VECTOR - 1 else stride
+        for j in range(max(0, low - start), min(its_own, high - start)):
             to[first + start + j - low] = x[at + j * VECTOR + lane]
 
 
