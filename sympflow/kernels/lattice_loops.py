@@ -80,7 +80,7 @@ class LatticeLoops(SizedLoops):
             [last, self._size // self._padded[0], row, self._padded_rows(), self._margin, planes], dtype=np.int64
         )
         self._shared = self._geometry, self._padded_parameters(), values
-        registers = in_registers(lattice, level)
+        registers = in_registers(lattice, level) and not (self._tiled and len(lattice.shape) == 2)
         module = _module(_definition(lattice), registers, level, compensated, rate)
         size = size_in_registers(lattice, level) if registers else self._size
         arguments = (self._geometry, size, *self._shared[1:])

@@ -181,7 +181,7 @@ def test_tiles_of_sheets(boundary, monkeypatch):
         with at_most(threads):
             found = solve(make(), "chin4c", y0=y0, backend="compiled", **options)
         assert splitting_loops(found.system).functions(SCHEMES["chin4c"].level, False).rollout.__self__._tiled
-        np.testing.assert_array_equal(found.y, whole.y)
+        np.testing.assert_allclose(found.y, whole.y, rtol=0, atol=1e-12)  # in passes, the whole in registers
 
 
 @pytest.mark.slow

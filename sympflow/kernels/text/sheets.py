@@ -5,7 +5,8 @@ The neighbours of `VECTOR` sites in the rows beside theirs are `VECTOR` numbers 
 kept in vectors of the length of a row, which stay in the cache: a state passes through memory once in a stage, with a
 force gradient too.
 
-Large sheets are executed in tiles, as `lattice` says. What must not act beyond walls is left out.
+What must not act beyond walls is left out. Large sheets, which are executed in tiles, are not in registers: a tile would
+be turned into segments and back for each stage or two that it makes.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors
@@ -27,24 +28,22 @@ def size_of(n_rows, n):
 
 
 @njit(**OPTIONS)
-def work_of(sites, first, n_rows, low_end, high_end, geometry):
-    """What `stages` of so many rows need beside the state, the first of these being row `first` of X.
+def workspace(size, geometry, sites):
+    """What `stages` need beside the state.
 
     Where there are bonds along a row, and rows, as `mark_there` says; parameters; and vectors of the length of a row.
     """
-    n, stride = geometry[0], geometry[1]
+    n, stride, margin, n_rows = geometry[0], geometry[1], geometry[4], geometry[5]
     there, rows = aligned_zeros(width_of(n)), np.zeros(n_rows + 2 * BEYOND)
     if not ROW_PERIODIC:
         mark_there(there, GHOSTS * VECTOR, n, True, True, ROW_FREE)
     if not PERIODIC:
-        last = n_rows - 1 if FREE else n_rows
-        for i in range(-BEYOND, n_rows + BEYOND):
-            rows[i + BEYOND] = 1.0 if (i >= 0 or not low_end) and (i < last or not high_end) else 0.0
+        rows[BEYOND : BEYOND + (n_rows - 1 if FREE else n_rows)] = 1.0
     found = aligned_zeros(len(sites) * size_of(n_rows, n)).reshape((len(sites), size_of(n_rows, n)))
     if ARRAYS:
         for k in range(len(sites)):
             for i in range(-BEYOND, n_rows + BEYOND):
-                row = min(max(first + i, 0), sites.shape[1] // stride - 1)
+                row = min(max(margin + i, 0), sites.shape[1] // stride - 1)
                 parameters_to_lanes(sites[k], row * stride + GHOSTS, found[k], start_of(i, n), n)
     return there, rows, found, zero_state(N_KEPT, width_of(n))
 
@@ -69,11 +68,6 @@ def pack(X, first, y, geometry):
 
 
 @njit(**OPTIONS)
-def workspace(size, geometry, sites):
-    return work_of(sites, geometry[4], geometry[5], True, True, geometry)
-
-
-@njit(**OPTIONS)
 def in_one(X, table, j, n_stages, single, work, geometry, sites, values):
     """`stages` of a sheet in one piece."""
     return stages(X, table, j, n_stages, single, work, geometry[5], geometry[0], PERIODIC, values)
@@ -91,42 +85,3 @@ def refresh(x, n_rows, n, distance, ring):
             for j in range(0, width, VECTOR):
                 put_lanes(x, first - k * width + j, lanes_at(x, behind - k * width + j))
                 put_lanes(x, behind + (k - 1) * width + j, lanes_at(x, first + (k - 1) * width + j))
-
-
-@njit(**OPTIONS)
-def wrap_ends(X, geometry):
-    """The rows before and behind a ring of them, the whole margin of them."""
-    if PERIODIC:
-        stride, margin, n_rows = geometry[1], geometry[4], geometry[5]
-        for s in range(N_SETS):
-            for f in range(N_FIELDS):
-                x = X[s, f]
-                for j in range(margin * stride):
-                    x[j], x[(margin + n_rows) * stride + j] = x[n_rows * stride + j], x[margin * stride + j]
-
-
-@njit(**OPTIONS)
-def sweep(X, to, table, j, n_stages, single, planes, first, last, geometry, sites, values):
-    """`n_stages` stages of the tiles first … last of a state X, `planes` rows of them each, into the state `to`.
-
-    From column j of a run on, or of a `single` map. The margins of X are wrapped; X and `to` are as `lattice` says.
-    """
-    n, stride, margin, n_rows = geometry[0], geometry[1], geometry[4], geometry[5]
-    for tile in range(first, last):
-        low = tile * planes
-        high = min(low + planes, n_rows)
-        begin, end = low - margin, high + margin
-        if not PERIODIC:
-            begin, end = max(begin, 0), min(end, n_rows)
-        work = work_of(sites, margin + begin, end - begin, begin == 0, end == n_rows, geometry)
-        local = zero_state(N_SETS, size_of(end - begin, n))
-        for s in range(N_SETS):
-            for f in range(N_FIELDS):
-                for i in range(begin, end):
-                    to_lanes(X[s, f], (margin + i) * stride + GHOSTS, local[s, f], start_of(i - begin, n), n)
-        stages(local, table, j, n_stages, single, work, end - begin, n, False, values)
-        for s in range(N_SETS):
-            for f in range(N_FIELDS):
-                for i in range(low, high):
-                    x, place = local[s, f], (margin + i) * stride + GHOSTS
-                    from_lanes(x, start_of(i - begin, n), n, 0, n, to[s, f], place)

@@ -133,7 +133,7 @@ def ladders() -> list[Recipe]:
         lattice_rung(SYSTEMS["toda-chain"], 0.48, fit=LONG_RUNS, stages=6),
         lattice_rung(SYSTEMS["fput-beta"], 0.9, 8, LONG_RUNS, stages=3),
         lattice_rung(SYSTEMS["fput-beta"], 0.62, fit=LONG_RUNS, stages=5, force_gradient=(1, 3)),
-        lattice_rung(SYSTEMS["fput-beta"], 0.33, 6, LONG_RUNS, stages=6, force_gradient=(1, 4)),
+        lattice_rung(SYSTEMS["fput-beta"], 0.33, 6, FEWER_RUNS, stages=6, force_gradient=(1, 4)),
         *(lattice_rung(SYSTEMS["fput-beta"], dt, 6) for dt in (0.8, 0.55, 0.15)),
         *(lattice_rung(coupled_pendulums, dt, fit=FEWER_RUNS) for dt in (2.1, 1.08, 0.43)),
         *of_double_wells(double_wells, 0.85, 0.82, 0.5),
