@@ -65,7 +65,7 @@ LATTICES: dict[str, tuple[str, dict[str, Any], int]] = {
     "sine_gordon": ("sine-Gordon", {"onsite": "1 - cos(q)", "bond": "r**2/2"}, 1),
 }
 """Title, terms and number of axes. The fastest frequency is 2 to 3.2."""
-FIT: dict[str, Any] = {"restarts": 24, "energy_weight": 300.0, "label_times": 2, "steps": 300, "runs": 48}
+FIT: dict[str, Any] = {"restarts": 24, "energy_weight": 300.0, "steps": 300, "runs": 48}
 """Options of the fit of a flow that does not ship."""
 
 

@@ -4,8 +4,8 @@ One step of the exact flow on a few sites tells little of what a large lattice d
 modified energy that a flow keeps differs from H by terms that hardly change in a step, such as the actions of waves
 whose frequencies are a bit wrong; these change as waves exchange energy, and a few sites have few wave lengths. So the
 best few tables at Δt that labels find are fitted further, to the errors of H in runs from many states of a ring, or of
-a cluster: which of them is best is not seen in a step. The labels stay as a weak bound. Then the table is made to vary
-with t as little as may be, so that steps somewhat shorter than Δt keep energy as well.
+a cluster: which of them is best is not seen in a step. The labels stay as a weak bound. The polynomials in t vary as
+little as may be, or are fitted to labels before Δt from there.
 """
 
 from __future__ import annotations

@@ -8,8 +8,8 @@ to labels at several times in (0, Δt].
 Other losses (the residual of the flow, Hamiltonian matching) join in the last stage. Without labels there is that stage
 alone, from each start.
 
-Where long runs count, those of a lattice for instance, the best few tables are fitted to these in the end, and the
-polynomials follow from the best of them alone.
+Where long runs count, those of a lattice for instance, the best few tables are fitted to these in the end. The best of
+them is the table at Δt, and the polynomials are fitted to the labels before it, if there are as many times as powers.
 
 Every piece of it has a deadline, which is asked within each evaluation.
 """
@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
+from scipy.linalg import null_space
 
 from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
@@ -254,7 +255,11 @@ class TableRun(SearchRun):
             return False
         common = fit, min(self.options.steps, RUN_STEPS), self.whole_end, False
         best = min(session.each(descended, common, tables, self.whole_end, fit.compiled), key=lambda m: m.cost)
-        self.table.assign(runs.parameters(best.x))
+        theta = runs.parameters(best.x)
+        if self.options.label_times >= self.flow.shape.degree:  # fewer would leave the polynomials open in between
+            between = Restricted(self.whole, theta, self.table.free_at_dt())
+            theta = between.point(between.minimize(between.start, RUN_STEPS, self.whole_end).x)
+        self.table.assign(theta)
         self._record(best)
         return True
 
@@ -504,6 +509,25 @@ class RunsFit(Fit):
 MadeRuns = Callable[[PrimedFlow], RunsFit]
 
 
+class Restricted(Fit):
+    """A fit of parameters that are a point and some directions (f, k) times what is to be found, (k,)."""
+
+    def __init__(self, fit: Fit, point: np.ndarray, directions: np.ndarray) -> None:
+        self._fit, self._origin, self._directions = fit, point, directions
+        self.start = np.zeros(directions.shape[1])
+
+    def point(self, z: np.ndarray) -> np.ndarray:
+        """The parameters."""
+        return self._origin + self._directions @ z
+
+    def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
+        return self._fit.residuals(self.point(theta), check)
+
+    def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
+        r, J = self._fit.linearized(self.point(theta), check)
+        return r, J @ self._directions
+
+
 class LossFit(Fit):
     """The residuals of a `Loss` (the flow's residual, Hamiltonian matching, labels at any times) at given points."""
 
@@ -696,6 +720,13 @@ class Table:
             blocks.append(np.einsum("mn,nkf,jk->jmf", place, _array(c.basis), powers, optimize=True))
             offset += powers @ _array(c.offset).T @ place.T
         return offset, np.concatenate(blocks, axis=-1)
+
+    def free_at_dt(self) -> np.ndarray:
+        """Directions (f, k) of the parameters along which the table at Δt stays as it is."""
+        design = self.polynomial(np.array([self.dt]))[1][0]
+        sizes = np.abs(design).max(0)
+        sizes[sizes == 0] = 1.0
+        return null_space(design / sizes) / sizes[:, None]
 
     def continued(self, coefficients: np.ndarray) -> np.ndarray:
         """The parameters for which the table at Δt is the given one (n,), and varies with t as little as may be."""

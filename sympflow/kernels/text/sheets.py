@@ -5,8 +5,8 @@ The neighbours of `VECTOR` sites in the rows beside theirs are `VECTOR` numbers 
 kept in vectors of the length of a row, which stay in the cache: a state passes through memory once in a stage, with a
 force gradient too.
 
-What must not act beyond walls is left out. Large sheets, which are executed in tiles, are not in registers: a tile would
-be turned into segments and back for each stage or two that it makes.
+What must not act beyond walls is left out. Large sheets, which are executed in tiles, are not in registers: to turn a
+tile into segments and back takes longer than the stage or two that it makes.
 """
 # ruff: noqa: F821
 # mypy: ignore-errors

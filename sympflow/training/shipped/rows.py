@@ -132,7 +132,7 @@ def ladders() -> list[Recipe]:
         *(lattice_rung(SYSTEMS["toda-chain"], dt) for dt in (1.2, 0.7, 0.2)),
         lattice_rung(SYSTEMS["toda-chain"], 0.48, fit=LONG_RUNS, stages=6),
         lattice_rung(SYSTEMS["fput-beta"], 0.9, 8, LONG_RUNS, stages=3),
-        lattice_rung(SYSTEMS["fput-beta"], 0.62, fit=LONG_RUNS, stages=5, force_gradient=(1, 3)),
+        lattice_rung(SYSTEMS["fput-beta"], 0.62, 6, LONG_RUNS, stages=5, force_gradient=(1, 3)),
         lattice_rung(SYSTEMS["fput-beta"], 0.33, 6, FEWER_RUNS, stages=6, force_gradient=(1, 4)),
         *(lattice_rung(SYSTEMS["fput-beta"], dt, 6) for dt in (0.8, 0.55, 0.15)),
         *(lattice_rung(coupled_pendulums, dt, fit=FEWER_RUNS) for dt in (2.1, 1.08, 0.43)),
@@ -189,7 +189,7 @@ def double_wells_in_a_plane(n: int) -> HamiltonianSystem:
 
 
 LABELS_ALONE = NewFit(restarts=20, energy_weight=300.0, frozen_weight=1000.0, label_times=5)
-LONG_RUNS = NewFit(restarts=24, energy_weight=300.0, label_times=2, steps=300, runs=48)
+LONG_RUNS = NewFit(restarts=24, energy_weight=300.0, steps=300, runs=48)
 FEWER_RUNS = replace(LONG_RUNS, restarts=12)
 """Fits of flows of lattices: to labels of a few sites, and further to the energy errors of runs of a ring."""
 
