@@ -134,7 +134,7 @@ def _pass_lines(lattice: LatticeHamiltonian, kind: _Pass, compensated: bool, dri
         slopes[f] += backward - forward
     for axis in range(len(lattice.shape) - 1):
         for k, V in lattice.bonds.items():
-            more = _across(lattice, kind, axis, k, V, row, read, body)
+            more = _across(lattice, kind, axis, k, V, row, read, body, lines)
             slopes = [a + b for a, b in zip(slopes, more, strict=True)]
     nearest = _Nearest.of(lattice, kind, row)
     for f in nearest.fields:
@@ -248,12 +248,8 @@ class _Nearest:
         ahead = lines(row.at, row.put, row.parameters(expressions, "s"), "s", "ahead")
         one = _Single(lattice)
         first = lines(one.at, one.put, one.parameters(expressions, "s - 1"), "s - 1", "behind")
-        if lattice.boundary[-1] == "free":
-            first = [
-                *(f"behind_{f} = 0.0" for f in wanted),
-                "if s > first:",
-                *indented(first),
-            ]
+        if lattice.boundary[-1] == "free" and first:
+            first = [*(f"behind_{f} = 0.0" for f in wanted), "if s > first:", *indented(first)]
         return cls(wanted, ahead, first)
 
 
@@ -313,24 +309,19 @@ def _across(
     row: Row,
     read: Callable[[sp.Symbol, str], sp.Symbol],
     body: list[str],
+    lines: list[str],
 ) -> list[sp.Expr]:
     """The slopes of sites by the bonds of length k to the rows before and behind, along another axis.
 
-    Where an end is free and a bond is missing, that of the other side stands for it, times 0.
+    Where an end is free, that of a missing bond is left out: it may be anything, and 0 times it no number.
     """
     stride = f"geometry[{1 if axis == 0 else 2}]"
     free = lattice.boundary[axis] == "free"
+    position, low, high = ("i", "begin", "end") if axis == 0 else ("k", "0", "geometry[3]")
     total: list[sp.Expr] = [sp.S.Zero] * len(lattice.fields)
     for side, sign in (("up", -1), ("down", 1)):
         tag = f"{side}_{axis}_{k}"
         start = "s" if side == "up" else f"s - {k} * {stride}"
-        factor: sp.Expr = sp.S.One
-        if free:
-            position, low, high = ("i", "begin", "end") if axis == 0 else ("k", "0", "geometry[3]")
-            there = f"{position} + {k} < {high}" if side == "up" else f"{position} - {k} >= {low}"
-            other = f"s - {k} * {stride}" if side == "up" else "s"
-            body += [f"start_{tag} = {start} if {there} else {other}", f"factor_{tag} = 1.0 if {there} else 0.0"]
-            start, factor = f"start_{tag}", sp.Symbol(f"factor_{tag}", real=True)
         found = kind.slopes(V, lattice.r, lattice)
         renamed: dict[sp.Symbol, sp.Symbol] = {}
         for vector, f, s in _differences(lattice, kind, found):
@@ -338,7 +329,15 @@ def _across(
             renamed[s] = read(sp.Symbol(f"{s}_{tag}", real=True), f"{far} - {near}")
         for s, element in row.parameters(found, start).items():
             renamed[s] = read(sp.Symbol(f"{s}_{tag}", real=True), element)
-        total = [a + sign * factor * slope.xreplace(renamed) for a, slope in zip(total, found, strict=True)]
+        slopes = [slope.xreplace(renamed) for slope in found]
+        if free:
+            there = f"{position} + {k} < {high}" if side == "up" else f"{position} - {k} >= {low}"
+            body.append(f"there_{tag} = {there}")
+            names = [f"slope_{tag}_{f}" for f in range(len(slopes))]
+            lines += statements(names, vectorised(slopes))
+            lines += [f"{name} = {name} if there_{tag} else 0.0" for name in names]
+            slopes = [sp.Symbol(name, real=True) for name in names]
+        total = [a + sign * slope for a, slope in zip(total, slopes, strict=True)]
     return total
 
 

@@ -29,7 +29,7 @@ __all__ = ["VECTOR", "constants_of", "in_registers", "size_in_registers", "stage
 VECTOR = 8 if llvmlite.binding.get_host_cpu_features().get("avx512f", False) else 4
 """Numbers side by side in a register."""
 HIGHEST_POWER = 16
-"""Lower powers are products, of derivatives too."""
+"""Lower powers are products."""
 
 
 def in_registers(lattice: LatticeHamiltonian, level: int) -> bool:
@@ -39,10 +39,17 @@ def in_registers(lattice: LatticeHamiltonian, level: int) -> bool:
     """
     if len(lattice.shape) > 2 or lattice.shape[-1] < VECTOR or set(lattice.bonds) != {1} or level == CURVATURE:
         return False
-    terms = lattice.U, lattice.bonds[1], lattice.T
-    powers = set[sp.Expr]().union(*(f.atoms(sp.Pow) for f in terms))
+    terms = {lattice.U: lattice.x, lattice.bonds[1]: lattice.r, lattice.T: lattice.p}
+    derived = [f for V, x in terms.items() for f in _derivatives(V, x, 2 if level else 1)]
+    powers = set[sp.Expr]().union(*(f.atoms(sp.Pow) for f in derived))
     rational = all(f.is_rational_function(*f.free_symbols) for f in terms)
     return rational and all(abs(power.exp) < HIGHEST_POWER for power in powers)
+
+
+def _derivatives(f: sp.Expr, x: Sequence[sp.Symbol], order: int) -> list[sp.Expr]:
+    """The first derivatives of f, and those up to an order."""
+    found = [sp.diff(f, s) for s in x]
+    return found + [g for each in found for g in _derivatives(each, x, order - 1)] if order > 1 else found
 
 
 def constants_of(lattice: LatticeHamiltonian, level: int) -> dict[str, Any]:
@@ -184,6 +191,11 @@ def _next(names: Sequence[str]) -> list[str]:
     return [f"{name}_next" for name in names]
 
 
+def _in_lanes(names: Sequence[str]) -> list[str]:
+    """What may be a number, of bonds whose slope is one."""
+    return [f"{name} = all_lanes({name})" for name in names]
+
+
 def _handed_on(names: Sequence[str]) -> list[str]:
     """What goes over to the next site."""
     return [f"{name} = all_lanes({name}_next)" for name in names]
@@ -301,6 +313,7 @@ def _sheet_lines(lattice: LatticeHamiltonian, level: int, compensated: bool) -> 
 
     opening = ["place = start", *(f"x_{f}_ahead = {x}" for f, x in enumerate(at(ahead)))]
     opening += [*differences("x_{}_ahead", at(f"{ahead} - VECTOR")), *tension(tensions, f"{ahead} - VECTOR", "0")]
+    opening += _in_lanes(tensions)
     lines = ["window = (GHOSTS + k) * VECTOR", *(f"x_{f}_next = {x}" for f, x in enumerate(at(f"{ahead} + VECTOR")))]
     lines += differences("x_{}_next", [f"x_{f}_ahead" for f in fields]) + tension(_next(tensions), ahead, "window")
     lines += differences("x_{}_ahead", at(beyond))  # the other way round, in which what is loaded is subtracted
@@ -343,7 +356,7 @@ def _sheet_lines(lattice: LatticeHamiltonian, level: int, compensated: bool) -> 
         opening += [f"x_{f}_here = {x}" for f, x in enumerate(at("s"))] + differences("x_{}_here", at("s - VECTOR"))
         opening += [f"{v} = lanes_at(kept_{v}, GHOSTS * VECTOR)" for v in velocities]
         opening += [f"relative_{f} = v_{f} - lanes_at(kept_v_{f}, 0)" for f in fields]
-        opening += turn(turns, "s - VECTOR", "0")
+        opening += [*turn(turns, "s - VECTOR", "0"), *_in_lanes(turns)]
         moves += differences("x_{}_beside", [f"x_{f}_here" for f in fields])
         moves += [f"relative_{f} = v_{f}_next - v_{f}" for f in fields]
         moves += turn(_next(turns), "s", "window")

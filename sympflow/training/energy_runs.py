@@ -18,7 +18,7 @@ import numpy as np
 
 from sympflow.flow.primed import PrimedFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.training.options import check_counts
+from sympflow.training.options import NewFit, check_counts
 from sympflow.training.points import Stream, states
 from sympflow.training.starts import frequency
 from sympflow.training.table_fit import RunsFit, Table
@@ -97,12 +97,16 @@ class EnergyRuns(RunsFit):
         return r, J
 
 
-def check_runs(system: HamiltonianSystem, runs: int) -> None:
-    """Raise ValueError unless a flow of the system can be fitted to so many runs."""
-    check_counts(runs=runs)
+def check_runs(system: HamiltonianSystem, asked: NewFit) -> None:
+    """Raise ValueError unless a flow of the system can be fitted to the `runs` that are asked for."""
+    check_counts(runs=asked.runs)
     if not (system.local is not None and system.local.has_piece and system.conservative):
         raise ValueError(
             f"`runs` are of lattices and like bodies that keep their energy, and {system.name!r} is none: leave it out."
+        )
+    if asked.data is not None:
+        raise ValueError(
+            "`runs` begin in states of a larger piece of the system, and `data` are of itself: leave out one of them."
         )
 
 

@@ -17,7 +17,7 @@ SCHEDULES = ("one-cycle", "cosine", "constant")
 WEIGHTS = ("residual_weight", "matching_weight", "label_weight")
 OF_LOSSES = (*WEIGHTS, "matching_times")
 OF_GRADIENTS = ("learning_rate", "schedule", "clip")
-OF_SEARCHES = ("restarts", "frozen_weight", "energy_weight")
+OF_SEARCHES = ("restarts", "frozen_weight", "energy_weight", "runs")
 
 Options = TypeVar("Options")
 

@@ -256,14 +256,13 @@ def fit_flow(
     """`train`, its arguments sorted: a new flow or a given one, its fit, and the surroundings of the run."""
     domain = _domain_for(system, domain)
     kind = _kind_of(system, flow, new, asked)
+    if asked.runs is not None:
+        check_runs(system, asked)
     check_for_flows(system, takes_friction=kind == "primed", takes_driving=kind in DRIVEN)
     if kind == "primed" and asked.searches and asked.data is None and on_piece(system):
         piece = Piece.of(system, domain)
         start = None if flow is None else piece.small(flow)
-        runs = None
-        if asked.runs is not None:
-            check_runs(system, asked.runs)
-            runs = partial(runs_of, piece, asked.runs, asked.seed)
+        runs = None if asked.runs is None else partial(runs_of, piece, asked.runs, asked.seed)
         fitted = _fitted(piece.system, dt, start, kind, new, replace(asked, runs=None), piece.domain, session, runs)
         return piece.whole(fitted)
     return _fitted(system, dt, flow, kind, new, asked, domain, session)

@@ -131,6 +131,37 @@ def test_sheets_in_vector_registers(boundary, method):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("definition", "shape"),
+    [
+        ({"onsite": "q", "bond": "r"}, (3, 8)),
+        pytest.param(
+            {"onsite": "q**2/2", "bond": "r", "boundary": ("free", "periodic")}, (3, 8), marks=pytest.mark.slow
+        ),
+        ({"onsite": "cos(q)", "bond": "r", "boundary": "free"}, 12),
+        pytest.param({"bond": {1: "r", 2: "r**2/2"}, "boundary": "free"}, 12, marks=pytest.mark.slow),
+    ],
+)
+def test_bonds_of_constant_force(definition, shape):
+    """Whose products of a Hessian vanish, and which do not take a register."""
+    system = HamiltonianSystem.lattice(shape=shape, **definition)
+    assert compared(system, "chin4c", start(system)) == LOOPS_AND_ARRAYS
+
+
+@pytest.mark.parametrize("power", [pytest.param(14, marks=pytest.mark.slow), 15])
+def test_powers_that_only_derivatives_have(power):
+    system = HamiltonianSystem.lattice(bond=f"1/(2 + r)**{power} + r**2", shape=13, boundary="free")
+    assert compared(system, "chin4c", start(system)) == LOOPS_AND_ARRAYS
+
+
+def test_a_bond_that_is_not_there_may_be_infinite():
+    """Along the axis of three sites the middle one has no bond of length 2, and zeros beyond the ends are far away."""
+    system = HamiltonianSystem.lattice(bond={1: "r**2/2", 2: "exp(r) - r"}, shape=(3, 9), boundary="free")
+    y0 = start(system)
+    y0[: system.ndof] += 800
+    assert compared(system, "verlet", y0) == LOOPS_AND_ARRAYS
+
+
 @pytest.mark.parametrize("damping", [None, 0.3])
 def test_two_fields_on_a_sheet_in_vector_registers(damping):
     system = HamiltonianSystem.lattice(

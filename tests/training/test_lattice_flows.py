@@ -7,6 +7,7 @@ import pytest
 
 import sympflow
 from sympflow import Box, HamiltonianSystem, LatticeStates, SympFlow, solve, train
+from sympflow.flow.primed import PrimedFlow
 from sympflow.training import energy_runs, table_fit
 from sympflow.training.lattice_fit import TAIL, Piece
 
@@ -115,6 +116,13 @@ def test_a_fit_to_long_runs_keeps_the_energy_of_other_states(flow, monkeypatch):
     np.testing.assert_allclose(*numbers, atol=0.02)
 
 
+def test_runs_alone_ask_for_a_primed_flow():
+    """As the page on large systems has it: no other option says so."""
+    with pytest.warns(RuntimeWarning):  # wherever the time is up
+        flow = train(ring(domain=LatticeStates(0.2)), runs=2, time_budget=0.5, progress=False)
+    assert isinstance(flow, PrimedFlow)
+
+
 def test_a_table_that_overflowed_is_as_bad_as_can_be(flow):
     """And is left out of the flow: a search that took too long a step goes on."""
     lattice = ring(12, domain=LatticeStates(0.2))
@@ -137,8 +145,12 @@ def test_long_runs_are_of_lattices_that_keep_their_energy(flow):
     with pytest.raises(ValueError, match=r"^`runs` are of lattices and like bodies that keep their energy, and"):
         train(ring(damping=0.1, domain=LatticeStates(0.2)), dt=0.2, runs=4, **FIT)
     pendulum = HamiltonianSystem.from_sympy("p**2/2 - cos(q)", domain=Box([-1, -1], [1, 1]))
-    with pytest.raises(TypeError, match=r"^`runs` is not an option of the optimizer 'gauss-newton' for primed flows"):
+    with pytest.raises(ValueError, match=r"^`runs` are of lattices and like bodies that keep their energy, and"):
         train(pendulum, dt=0.5, runs=4, **FIT)
+    with pytest.raises(ValueError, match=r"^`runs` begin in states of a larger piece of the system, and `data`"):
+        train(lattice, runs=4, data=([0.1], np.zeros((1, 512)), np.zeros((1, 512))))
+    with pytest.raises(TypeError, match=r"^`runs` is not an option of the optimizer 'adam' for flows of kind 'sympf"):
+        train(lattice, runs=4, kind="sympflow")
     with pytest.warns(RuntimeWarning) as seen:
         train(lattice, flow=flow, runs=4, time_budget=1e-3, **FIT)
     assert "The flow was not fitted to `runs`, because the time was up." in [str(w.message) for w in seen]
