@@ -95,6 +95,14 @@ def run_threaded(q, p, h, n):
                 q[i] += h * p[i]
 
 
+def apart(q: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Copies that begin 512 bytes more than whole pages apart: others share places in the caches of some processors."""
+    start = len(q) + (64 - len(q)) % 512
+    both = np.empty(start + len(p))
+    both[: len(q)], both[start:] = q, p
+    return both[: len(q)], both[start:]
+
+
 def fput(rounds: int, threads: int) -> str:
     """On one thread, or on several."""
     rows, clock = [], time.process_time if threads == 1 else time.perf_counter
@@ -108,7 +116,7 @@ def fput(rounds: int, threads: int) -> str:
                 return solve(system, "verlet", t_span=(0.0, n * H), y0=y0, dt=H, t_eval=[n * H]).y[:, -1]
 
         def by_hand(run: Callable[..., None], size: int = size, y0: np.ndarray = y0, n: int = n) -> np.ndarray:
-            q, p = y0[:size].copy(), y0[size:].copy()
+            q, p = apart(y0[:size], y0[size:])
             run(q, p, H, n)
             return np.concatenate([q, p])
 

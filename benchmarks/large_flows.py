@@ -156,7 +156,9 @@ class Race:
         seconds = dict.fromkeys(near, math.inf)
         for r in near:
             r.one(self.t_end / steps[r.name], y0, 1, last(1))
+        held: list[np.ndarray] = []
         for _ in range(rounds):
+            elsewhere(held)
             for r in near:
                 n = LONGER * steps[r.name]
                 begun = time.process_time()
@@ -179,6 +181,11 @@ class Race:
         }
 
 
+def elsewhere(held: list[np.ndarray]) -> None:
+    """Take some memory, so that working arrays lie elsewhere in the next round, on which their loops' times depend."""
+    held.append(np.empty(2_000 + 600 * len(held)))
+
+
 def gradient_cost(name: str, sites: int, rounds: int) -> float:
     """Times that a kick with a force gradient and the drift after it take as long as they do without.
 
@@ -191,7 +198,9 @@ def gradient_cost(name: str, sites: int, rounds: int) -> float:
     seconds = [math.inf, math.inf]
     for r in runners:
         r.one(STEP, y0, 1, last(1))
+    held: list[np.ndarray] = []
     for _ in range(rounds):
+        elsewhere(held)
         for i, r in enumerate(runners):
             begun = time.process_time()
             r.one(STEP, y0, STEPS, last(STEPS))

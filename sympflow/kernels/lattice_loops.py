@@ -167,6 +167,7 @@ def _module(code: _Code, registers: bool, level: int, compensated: bool, rate: b
     constants: dict[str, Any] = {
         "N_FIELDS": len(lattice.fields),
         "N_SETS": 4 if compensated else 2,
+        "SPACED": True,
         "COMPENSATED": compensated,
     }
     if registers:

@@ -163,6 +163,7 @@ def _module(code: _Code, level: int, compensated: bool, rate: bool) -> ModuleTyp
         "\n\n\n".join([*cells, *(_functions(local, kind) for kind in kinds)]),
         ("aligned", "sized_states", "barrier", "pairs"),
         N_SETS=4 if compensated else 2,
+        SPACED=False,  # passes over all numbers of a vector
         N_FIELDS=local.dim,
         N_HELPERS={0: 1, FORCE_GRADIENT: 2, CURVATURE: 3}[level],
         DRIFT=0 if not rate else {0: 2, FORCE_GRADIENT: 3, CURVATURE: 4}[level],

@@ -80,7 +80,7 @@ def sweep(X, to, table, j, n_stages, single, planes, first, last, geometry, site
             begin, end = max(begin, 0), min(end, n_sites)
         n = end - begin
         work = work_of(sites, margin + begin, n, begin == 0, end == n_sites)
-        local = zero_state(N_SETS, width_of(n))
+        local = zero_running(width_of(n))
         for s in range(N_SETS):
             for f in range(N_FIELDS):
                 to_lanes(X[s, f], margin + begin, local[s, f], START, n)

@@ -185,7 +185,7 @@ def sweep(X, to, table, j, n_stages, single, planes, first, last, geometry, site
     """
     stride, margin, n_planes = geometry[1], geometry[4], geometry[5]
     size = (planes + 2 * margin) * stride
-    work, local = workspace(size, geometry, sites), zero_state(N_SETS, size)
+    work, local = workspace(size, geometry, sites), zero_running(size)
     for tile in range(first, last):
         low = tile * planes
         n = min(planes, n_planes - low)
