@@ -94,7 +94,7 @@ def flows_of(
 
 @dataclass
 class Race:
-    """The flows and schemes of a system, up to `t_end`, timed up to `longer` times that; `rest` is its energy at rest."""
+    """The flows and schemes of a system up to `t_end`, timed up to `longer` times that; `rest` is H at rest."""
 
     system: HamiltonianSystem
     flows: list[Runner]
