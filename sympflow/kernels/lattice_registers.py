@@ -192,7 +192,7 @@ def _next(names: Sequence[str]) -> list[str]:
 
 
 def _in_lanes(names: Sequence[str]) -> list[str]:
-    """What may be a number, of bonds whose slope is one."""
+    """Spread over lanes what may be a number, of bonds whose slope is one."""
     return [f"{name} = all_lanes({name})" for name in names]
 
 
