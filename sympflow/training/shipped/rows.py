@@ -130,6 +130,7 @@ def ladders() -> list[Recipe]:
         *(rung(planets, 3, dt, fit=short, judge=along) for dt in (300.0, 200.0, 100.0)),
         lattice_rung(SYSTEMS["toda-chain"], 0.94, fit=LONG_RUNS, stages=2, first="kick"),
         *(lattice_rung(SYSTEMS["toda-chain"], dt) for dt in (1.2, 0.7, 0.2)),
+        lattice_rung(SYSTEMS["toda-chain"], 0.5, fit=LONG_RUNS, stages=6, force_gradient=(1, 4)),
         lattice_rung(SYSTEMS["toda-chain"], 0.48, fit=LONG_RUNS, stages=6),
         lattice_rung(SYSTEMS["fput-beta"], 0.96, 6, LONG_RUNS, stages=3),
         lattice_rung(SYSTEMS["fput-beta"], 0.62, 6, LONG_RUNS, stages=5, force_gradient=(1, 3)),
